@@ -1,0 +1,98 @@
+"""SparseRob: sparse robust optimal control of uncertain linear systems, with the proof.
+
+Every public name is an attribute of this module, and is imported when it is first used. To read the package, follow the data:
+
+1. ``control/``     ``sets``, ``system``, ``problem``: what is to be controlled; ``dictionary``: how controls are written;
+   ``response``, ``transcription``: the problem as a convex semi-infinite program.
+2. ``sip/``         ``program``: such a program in general; ``finite``, ``solver``: finitely many of its constraints, and who solves them;
+   ``method``, ``exchange``: from there to the whole continuum; ``result``: what was found and what of it was proven.
+3. ``experiment/``  ``config``: a file that names components; ``registry``: who offers them; ``run``: the whole walk; ``cli``: the commands.
+
+``experiment`` imports ``control``, ``control`` imports ``sip``, never the other way; plugins import this module only.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sparserob_core.control.dictionary import Dictionary, DictionaryFactory
+    from sparserob_core.control.problem import OptimalControlProblem, PathConstraint, ProblemFactory
+    from sparserob_core.control.sets import Ellipsoid, Equality, NormBall, Polytope, cylinder, intersection
+    from sparserob_core.control.system import LinearSystem
+    from sparserob_core.control.transcription import transcribe
+    from sparserob_core.errors import ConfigError, InputError, PluginError, SolverError, SparseRobError
+    from sparserob_core.experiment.events import Observer, RunFinished, RunStarted
+    from sparserob_core.experiment.plugin import (
+        DictionaryPlugin,
+        MaximiserPlugin,
+        MethodPlugin,
+        ObserverPlugin,
+        ProblemPlugin,
+        RegulariserPlugin,
+        SolverPlugin,
+    )
+    from sparserob_core.experiment.problems import LinearKeys, LinearProblem
+    from sparserob_core.experiment.registry import hookimpl, load_registry
+    from sparserob_core.experiment.run import Outcome, run
+    from sparserob_core.experiment.set_options import SetOptions
+    from sparserob_core.experiment.solve import maximise, solve
+    from sparserob_core.options import Options
+    from sparserob_core.sip.convex_set import Array, Box, ConvexSet
+    from sparserob_core.sip.events import EvaluationsFinished, Event, ProofProgress, RoundFinished
+    from sparserob_core.sip.maximiser import EvaluationError, Maximiser, Objective, Report, SearchEnded, Trace
+    from sparserob_core.sip.method import Continuation, Method, Tools
+    from sparserob_core.sip.program import ConstraintFamily, Enclosure, SemiInfiniteProgram, Separation
+    from sparserob_core.sip.regulariser import ControlImage, Regulariser
+    from sparserob_core.sip.result import Cut, Result, Witness
+    from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
+
+__all__ = [
+    "Array", "Box", "Claim", "ConfigError", "ConstraintFamily", "Continuation", "ControlImage", "ConvexSet", "Cut", "Dictionary",
+    "DictionaryFactory", "DictionaryPlugin", "Ellipsoid", "Enclosure", "Equality", "EvaluationError", "EvaluationsFinished", "Event",
+    "InputError", "LinearKeys", "LinearProblem", "LinearSystem", "Maximiser", "MaximiserPlugin", "Method", "MethodPlugin", "NormBall",
+    "Objective", "Observer", "ObserverPlugin", "OptimalControlProblem", "Options", "Outcome", "PathConstraint", "PluginError", "Polytope",
+    "ProblemFactory", "ProblemPlugin", "ProofProgress", "QuadraticProgram", "Regulariser", "RegulariserPlugin", "Report", "Result",
+    "RoundFinished", "RunFinished", "RunStarted", "SearchEnded", "SemiInfiniteProgram", "Separation", "SetOptions", "Solver",
+    "SolverError", "SolverPlugin", "SparseRobError", "Tools", "Trace", "Witness", "cylinder", "hookimpl", "intersection", "load_registry",
+    "maximise", "run", "solve", "transcribe",
+]
+
+_MODULES = {
+    "errors": "ConfigError InputError PluginError SolverError SparseRobError",
+    "options": "Options",
+    "sip.convex_set": "Array Box ConvexSet",
+    "sip.program": "ConstraintFamily Enclosure SemiInfiniteProgram Separation",
+    "sip.solver": "Claim QuadraticProgram Solver",
+    "sip.regulariser": "ControlImage Regulariser",
+    "sip.maximiser": "EvaluationError Maximiser Objective Report SearchEnded Trace",
+    "sip.method": "Continuation Method Tools",
+    "sip.result": "Cut Result Witness",
+    "sip.events": "EvaluationsFinished Event ProofProgress RoundFinished",
+    "control.dictionary": "Dictionary DictionaryFactory",
+    "control.sets": "Ellipsoid Equality NormBall Polytope cylinder intersection",
+    "control.system": "LinearSystem",
+    "control.problem": "OptimalControlProblem PathConstraint ProblemFactory",
+    "control.transcription": "transcribe",
+    "experiment.events": "Observer RunFinished RunStarted",
+    "experiment.plugin": "DictionaryPlugin MaximiserPlugin MethodPlugin ObserverPlugin ProblemPlugin RegulariserPlugin SolverPlugin",
+    "experiment.problems": "LinearKeys LinearProblem",
+    "experiment.registry": "hookimpl load_registry",
+    "experiment.run": "Outcome run",
+    "experiment.set_options": "SetOptions",
+    "experiment.solve": "maximise solve",
+}
+_HOME = {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names.split()}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(_HOME[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

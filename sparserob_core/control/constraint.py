@@ -1,0 +1,221 @@
+"""State constraints as families of a semi-infinite program: ``c'x(t) <= h(c)`` for all times of a window, parameters and disturbances."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+
+from sparserob_core.control.enclosure import CellEnclosure
+from sparserob_core.control.functional import WorstCase
+from sparserob_core.control.lifted import LiftedSystem, lift
+from sparserob_core.control.parameters import ParameterIndex
+from sparserob_core.control.peaks import climb, local_maxima, vertex_times
+from sparserob_core.control.push import Push
+from sparserob_core.control.response import distinct_times, transitions
+from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.program import Enclosure, Explanation, Separation
+
+T = TypeVar("T")
+REMEMBERED = 256    # cells of parameters whose matrices are kept
+INSIDE = 3         # times sampled inside every piece, beside its ends
+KEPT = 12          # separated constraints per row and round
+ZOOMS = 26         # halvings of the zoom around a candidate (t, p)
+
+
+@dataclass(frozen=True, eq=False)
+class FlatConstraint:
+    """``H x(t) <= h`` for all ``t`` in ``[start, stop]``, ``p`` and ``w``; the index is ``(t, p)``.
+
+    ``H (r, d)``, ``h (r,)``. A terminal constraint is the window ``[T, T]``.
+    """
+
+    name: str
+    functionals: WorstCase
+    H: Array
+    h: Array
+    start: float
+    stop: float
+    parameters: ParameterIndex
+
+    @property
+    def index_set(self) -> Box:
+        if not self.parameters.count:
+            return Box(np.array([self.start]), np.array([self.stop]))
+        box = self.parameters.box
+        return Box(np.concatenate([[self.start], box.lower]), np.concatenate([[self.stop], box.upper]))
+
+    def rows(self, indices: Array) -> tuple[Array, Array]:
+        """``G (k, r, n)``, ``rhs (k, r)`` at indices ``(k, 1 + nu)``."""
+        count, r = indices.shape[0], self.h.size
+        G, offset = self.functionals.rows(*self._expand(indices))
+        return G.reshape(count, r, -1), self.h - offset.reshape(count, r)
+
+    def violations(self, x: Array, indices: Array, rows: np.ndarray) -> Array:
+        """``row x - rhs`` for one row per index, ``(k,)``, without building rows."""
+        parameters = self.parameters.clamp(indices[:, 1:])
+        return self.functionals.values(x, indices[:, 0], self.H[rows], parameters) - self.h[rows]
+
+    def worst(self, x: Array) -> Separation:
+        """The largest local maxima of the violation over the index set, times refined between the nodes, parameters between lattice points."""
+        values = self._on_lattice(x)
+        positions = local_maxima(values, self._lattice[1], KEPT)
+        indices = np.hstack([vertex_times(values, positions, self.times)[:, None], self._lattice[0][positions[:, 0]]])
+        rows = positions[:, 1]
+        if self.parameters.count:
+            indices, found = self._zoomed(x, indices, rows)
+        else:
+            found = self.violations(x, indices, rows)
+        order = np.argsort(-found, kind="stable")
+        return Separation(indices[order], rows[order], found[order])
+
+    def explain(self, index: Array, row: int) -> Explanation:
+        """One constraint in words: what is bounded, when, and what the uncertainty does to it."""
+        time, parameter = float(index[0]), self.parameters.clamp(index[None, 1:])[0]
+        direction, bound = self.H[row], float(self.h[row])
+        sign = -1.0 if np.count_nonzero(direction) == 1 and direction.sum() < 0 else 1.0
+        text = f"{self.name}: {_combination(sign * direction, time)} {'>=' if sign < 0 else '<='} {sign * bound:.6g}"
+        push = float(self.functionals.offsets(np.array([time]), direction[None], parameter[None])[0])
+        remarks = [] if time > 0 else ["the initial state is given"]
+        remarks += [f"the disturbance alone moves it by {push:.4g}"] if push > 0 else []
+        remarks += [f"at {self.functionals.response.system.describe(parameter)}"] if parameter.size else []
+        disturbance = self.functionals.worst_disturbance(time, direction, parameter)
+        return Explanation(f"{text} ({', '.join(remarks)})" if remarks else text, time, parameter, disturbance)
+
+    def nominal(self) -> FlatConstraint:
+        """The same constraint without uncertainty: a middle parameter, and no disturbance (or a middle one where none is not admissible)."""
+        return replace(self, functionals=self.functionals.nominal(), parameters=ParameterIndex(None))
+
+    @property
+    def cells(self) -> tuple[Array, Array]:
+        """The window cut at the breakpoints, times the whole box of parameters: ``(lower, upper)``, ``(k, 1 + nu)`` each."""
+        breaks = self.functionals.response.grid.breakpoints
+        points = distinct_times(np.concatenate([[self.start], breaks[(breaks > self.start) & (breaks < self.stop)], [self.stop]]), breaks[-1])
+        starts, stops = (points[:-1], points[1:]) if points.size > 1 else (points, points)
+        box = self.index_set
+        return (np.hstack([starts[:, None], np.tile(box.lower[1:], (starts.size, 1))]),
+                np.hstack([stops[:, None], np.tile(box.upper[1:], (starts.size, 1))]))
+
+    def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
+        """Proven upper bounds of the violation on cells ``(k, 1 + nu)``, each within one piece; cells of parameters share their work."""
+        bounds, split = np.full(lower.shape[0], -np.inf), np.zeros(lower.shape[0], dtype=int)
+        touched = np.flatnonzero(self.parameters.touches(lower[:, 1:], upper[:, 1:]))
+        keys = np.hstack([lower[touched, 1:], upper[touched, 1:]])
+        _, which = np.unique(keys, axis=0, return_inverse=True) if keys.shape[1] else (keys, np.zeros(touched.size, dtype=int))
+        for group in range(int(which.max(initial=-1)) + 1):
+            members = touched[which.reshape(-1) == group]
+            cell = self._cell(x, lower[members[0], 1:], upper[members[0], 1:])
+            bounds[members], drift, spread = cell.bounds(lower[members, 0], upper[members, 0])
+            split[members] = self._advice(drift, spread, bounds[members])
+        return Enclosure(bounds, split)
+
+    def _cell(self, x: Array, low: Array, high: Array) -> CellEnclosure:
+        key = x.tobytes() + low.tobytes() + high.tobytes()
+        if key not in self._cells:
+            lifted, push = self._lifted(low, high)
+            control = x.reshape(-1, self.functionals.dictionary.functions) @ self.functionals.dictionary.values
+            _remember(self._cells, key, CellEnclosure(lifted, push, self.H, self.h, control))
+        return self._cells[key]
+
+    def _lifted(self, low: Array, high: Array) -> tuple[LiftedSystem, Push | None]:
+        key = low.tobytes() + high.tobytes()
+        if key not in self._pushes:
+            response, model = self.functionals.response, self.functionals.disturbance
+            lifted = lift(response.system, response.grid, response.initial_state, (low + high) / 2, (high - low) / 2)
+            push = None if model is None else Push(lifted, model, self.H @ lifted.transform)
+            _remember(self._pushes, key, (lifted, push))
+        return self._pushes[key]
+
+    @cached_property
+    def _cells(self) -> dict[bytes, CellEnclosure]:
+        return {}
+
+    @cached_property
+    def _pushes(self) -> dict[bytes, tuple[LiftedSystem, Push | None]]:
+        return {}
+
+    @staticmethod
+    def _advice(drift: Array, spread: Array, bounds: Array) -> np.ndarray:
+        """Halve the times where they matter most, else one parameter, the same for the whole group so that its cells stay shared."""
+        if not spread.shape[1]:
+            return np.zeros(drift.size, dtype=int)
+        open_ = bounds > 0
+        total = spread[open_].sum(axis=0) if open_.any() else spread.sum(axis=0)
+        widest = int(total.argmax())
+        return np.where(drift > spread.max(axis=1), 0, 1 + widest)
+
+    @cached_property
+    def times(self) -> Array:
+        """Sampled times: the window's ends, the breakpoints in it, and `INSIDE` times in every piece, increasing."""
+        grid = self.functionals.response.grid
+        fractions = np.arange(INSIDE + 1) / (INSIDE + 1)
+        inside = (grid.breakpoints[:-1, None] + grid.lengths[:, None] * fractions).ravel()
+        inside = inside[(inside > self.start) & (inside < self.stop)]
+        return distinct_times(np.concatenate([[self.start], inside, [self.stop]]), float(grid.breakpoints[-1]))
+
+    @cached_property
+    def _lattice(self) -> tuple[Array, tuple[int, ...]]:
+        return self.parameters.lattice()
+
+    @cached_property
+    def _margins(self) -> Array:
+        """``h - sigma`` on the lattice, ``(v, r, times)``: what the worst disturbance leaves of every side."""
+        points, _ = self._lattice
+        if self.functionals.disturbance is None:
+            return np.broadcast_to(self.h[None, :, None], (points.shape[0], self.h.size, self.times.size))
+        return self.h[None, :, None] - np.stack([self.functionals.profile(self.times, self.H, p).T for p in points])
+
+    def _on_lattice(self, x: Array) -> Array:
+        """Violations ``(v, r, times)`` at every lattice point and sampled time."""
+        response, points = self.functionals.response, self._lattice[0]
+        control = x.reshape(-1, self.functionals.dictionary.functions) @ self.functionals.dictionary.values
+        nodes = response.states(control, points)
+        pieces, flow, driven = self._sampling
+        steps = response.steps(points)
+        drive = np.einsum("vdm,ml->vld", steps.B, self.functionals.on_grid(x))
+        states = np.einsum("vtij,vtj->vti", flow, nodes[:, pieces]) + np.einsum("vtij,vtj->vti", driven, drive[:, pieces])
+        return np.einsum("ri,vti->vrt", self.H, states) - self._margins
+
+    @cached_property
+    def _sampling(self) -> tuple[np.ndarray, Array, Array]:
+        response = self.functionals.response
+        pieces = response.grid.locate(self.times)
+        within = np.round((self.times - response.grid.breakpoints[pieces]) / response.grid.breakpoints[-1], 15)
+        distinct, which = np.unique(within, return_inverse=True)
+        A = response.steps(self._lattice[0]).A
+        flow, driven = transitions(A[:, None], distinct[None] * response.grid.breakpoints[-1])
+        return pieces, flow[:, which], driven[:, which]
+
+    def _zoomed(self, x: Array, indices: Array, rows: np.ndarray) -> tuple[Array, Array]:
+        """Climb from every candidate ``(t, p)``; the set of parameters is never left."""
+        box = self.index_set
+        radius = np.concatenate([[np.max(np.diff(self.times), initial=0.0)], (box.upper - box.lower)[1:] / 4])
+
+        def project(points: Array) -> Array:
+            inside = np.clip(points, box.lower, box.upper)
+            return np.hstack([inside[:, :1], self.parameters.clamp(inside[:, 1:])])
+
+        return climb(lambda points, which: self.violations(x, points, rows[which]), indices, radius, project, ZOOMS)
+
+    def _expand(self, indices: Array) -> tuple[Array, Array, Array]:
+        parameters = np.repeat(self.parameters.clamp(indices[:, 1:]), self.h.size, axis=0)
+        return np.repeat(indices[:, 0], self.h.size), np.tile(self.H, (indices.shape[0], 1)), parameters
+
+
+def _combination(direction: Array, time: float) -> str:
+    """``c'x(t)`` in words, such as ``x1(5)`` or ``x1(5) - 0.5 x2(5)``."""
+    parts = []
+    for state in np.flatnonzero(direction):
+        size = abs(direction[state])
+        sign = "-" if direction[state] < 0 else "+" if parts else ""
+        parts.append(f"{sign}{' ' if parts else ''}{'' if size == 1 else f'{size:.4g} '}x{state + 1}({time:.6g})")
+    return " ".join(parts) or "0"
+
+
+def _remember(cache: dict[bytes, T], key: bytes, value: T) -> None:
+    """Keep the last `REMEMBERED` cells."""
+    while len(cache) >= REMEMBERED:
+        cache.pop(next(iter(cache)))
+    cache[key] = value

@@ -1,0 +1,127 @@
+"""Proven upper bounds of the worst-case violation on cells of times and parameters.
+
+On a cell ``[a, b]`` of times inside one piece of the grid, every Taylor coefficient of the state lies within ``(b - a)^2 / 8 max |second
+derivative|`` of its chord, and a support function of a chord lies below the chord of the support functions. So the violation is at most
+the larger of its bounds at ``a`` and at ``b``, plus that curvature, plus what the Taylor models neglect.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from sparserob_core.control.lifted import LiftedSystem
+from sparserob_core.control.polynomial import polynomial_bound
+from sparserob_core.control.push import Push
+from sparserob_core.sip.convex_set import Array
+
+TAYLOR_TERMS = 1e-17    # relative size below which further terms of the exponential series are left out
+
+
+@dataclass(frozen=True, eq=False)
+class CellEnclosure:
+    """Bounds of ``H x(t) - h`` for one decision over one cell of parameters.
+
+    ``H (r, d)``, ``h (r,)``; ``control (m, K)`` on the pieces of the control's dictionary.
+    """
+
+    lifted: LiftedSystem
+    push: Push | None
+    H: Array
+    h: Array
+    control: Array
+
+    def bounds(self, start: Array, stop: Array) -> tuple[Array, Array, Array]:
+        """For time cells ``[start, stop]`` (``(k,)``, each inside one piece): upper bounds ``(k,)``, the part of them that halving the
+        times would reduce, and the parts ``(k, nu)`` that halving each parameter would."""
+        pieces = self.lifted.grid.locate(stop)
+        ends, which = _ends(start, stop, pieces)
+        bounds, spreads = self._at(*ends)
+        left, right = bounds[which[:start.size]], bounds[which[start.size:]]
+        bend = self._curvature(start, stop, pieces)
+        neglected = self._neglected[:, pieces].T
+        total = np.maximum(left, right) + bend + neglected
+        worst = total.argmax(axis=1)
+        pick = (np.arange(worst.size), worst)
+        spread = np.maximum(spreads[which[:start.size]][pick], spreads[which[start.size:]][pick]) + self._shares * neglected[pick][:, None]
+        drift = np.abs(right - left)[pick] + bend[pick]
+        return total[pick], drift, spread
+
+    def _at(self, times: Array, pieces: np.ndarray) -> tuple[Array, Array]:
+        """Bounds ``(k, r)`` at single times, and how much of them each parameter accounts for, ``(k, r, nu)``."""
+        states = self._states(times, pieces)
+        coefficients = np.einsum("ri,kai->kra", self._rows, states)
+        coefficients[:, :, 0] -= self.h
+        excess: Array | float = 0.0
+        if self.push is not None:
+            pushed, excess = self.push.at(times)
+            coefficients = coefficients + pushed
+        bound, spread = polynomial_bound(self.lifted.space, coefficients)
+        return bound + excess, spread + (self._shares * np.asarray(excess)[..., None] if self.lifted.space.nu else 0.0)
+
+    def _states(self, times: Array, pieces: np.ndarray) -> Array:
+        """Taylor coefficients ``(k, M, d)`` of the state under the control alone: the exponential series from the last breakpoint."""
+        within = (times - self.lifted.grid.breakpoints[pieces])[:, None]
+        matrix = self.lifted.matrix
+        term = self._slopes[pieces]
+        total = self._nodes.reshape(self._nodes.shape[0], -1)[pieces] + within * term
+        order, size = 1, self.lifted.norm * float(within.max(initial=0.0))
+        bound = size
+        while bound > TAYLOR_TERMS:
+            order += 1
+            term = term @ matrix.T * (within / order)
+            total = total + within * term
+            bound = bound * size / order
+        return total.reshape(times.size, self.lifted.space.size, -1)
+
+    def _curvature(self, start: Array, stop: Array, pieces: np.ndarray) -> Array:
+        """``(b - a)^2 / 8`` times the largest second time derivative, summed over the Taylor coefficients, ``(k, r)``."""
+        space, matrix, width = self.lifted.space, self.lifted.matrix, stop - start
+        states = self._states(start, pieces).reshape(start.size, -1)
+        second = (states @ matrix.T + self._drive[pieces]) @ matrix.T
+        growth = np.expm1(self.lifted.norm * width)
+        by_row = np.abs(np.einsum("ri,kai->kra", self._rows, second.reshape(start.size, space.size, -1))).sum(axis=2)
+        loose = np.sqrt(space.size) * np.linalg.norm(second, axis=1) * growth
+        total = by_row + np.linalg.norm(self._rows, axis=1) * loose[:, None]
+        if self.push is not None:
+            total = total + self.push.curvature[pieces]
+        return total * (width**2 / 8)[:, None]
+
+    @property
+    def _rows(self) -> Array:
+        return self.H @ self.lifted.transform
+
+    @cached_property
+    def _nodes(self) -> Array:
+        return self.lifted.nodes(self.control)
+
+    @cached_property
+    def _drive(self) -> Array:
+        inputs = self.control[:, self.lifted.grid.control_piece]
+        return np.asarray(inputs.T @ self.lifted.B.reshape(-1, self.lifted.B.shape[2]).T)
+
+    @cached_property
+    def _slopes(self) -> Array:
+        start = self._nodes[:-1].reshape(self.lifted.grid.pieces, -1)
+        return np.asarray(start @ self.lifted.matrix.T + self._drive)
+
+    @cached_property
+    def _shares(self) -> Array:
+        nu = self.lifted.space.nu
+        return np.full(nu, 1.0 / max(1, nu))
+
+    @cached_property
+    def _neglected(self) -> Array:
+        """What the Taylor models neglect, ``(r, L)``."""
+        state = self.lifted.state_remainder(self._nodes, self.control)
+        total = np.outer(np.linalg.norm(self._rows, axis=1), state)
+        return total if self.push is None else total + self.push.neglected
+
+
+def _ends(start: Array, stop: Array, pieces: np.ndarray) -> tuple[tuple[Array, np.ndarray], np.ndarray]:
+    """The distinct ends of the cells with the piece that each is looked at from, and where each of ``start`` and then ``stop`` is among them."""
+    both = np.stack([np.concatenate([start, stop]), np.concatenate([pieces, pieces])])
+    unique, which = np.unique(both, axis=1, return_inverse=True)
+    return (unique[0], unique[1].astype(int)), which.reshape(-1)

@@ -1,0 +1,172 @@
+"""An uncertain system over a cell of parameters, as one larger known system.
+
+With ``p = centre + radius delta`` and ``A(p) = sum_g A_g delta^g + remainder``, the Taylor coefficients of the state in ``delta`` obey
+``x_a' = sum_{g + b = a} A_g x_b + B_a u``: a known linear system of dimension ``d M``, propagated exactly. What the truncation at degree
+``q`` neglects obeys the same equation with a small drive, and is bounded by Gronwall's inequality with the logarithmic norm
+(Dahlquist 1958). A known system is the case ``M = 1`` without any remainder.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import accumulate
+
+import numpy as np
+
+from sparserob_core.control.response import Response, TimeGrid
+from sparserob_core.control.system import LinearSystem
+from sparserob_core.control.taylor import TaylorSpace
+from sparserob_core.sip.convex_set import Array
+
+DEGREES = {0: 0, 1: 6, 2: 4, 3: 3}   # of the Taylor models, by the number of parameters; 2 beyond
+KNOWN = np.zeros((1, 0))
+WELL_CONDITIONED = 1e3
+
+
+@dataclass(frozen=True, eq=False)
+class LiftedSystem:
+    """The Taylor models of a system over the cell ``centre +- radius`` (``(nu,)`` each) on a time grid.
+
+    ``A (M, d, d)``, ``B (M, d, m)``, ``W (M, d, mw)`` are coefficients, ``slack_*`` norm bounds of their remainders.
+    """
+
+    space: TaylorSpace
+    grid: TimeGrid
+    initial_state: Array
+    A: Array
+    B: Array
+    W: Array
+    transform: Array
+    slack_A: float
+    slack_B: float
+    slack_W: float
+
+    @property
+    def states(self) -> int:
+        return int(self.A.shape[1])
+
+    @cached_property
+    def growth(self) -> float:
+        """An upper bound of the logarithmic norm of ``A(p)`` over the cell."""
+        symmetric = (self.A + np.swapaxes(self.A, 1, 2)) / 2
+        return float(np.linalg.eigvalsh(symmetric[0])[-1] + np.linalg.norm(symmetric[1:], axis=(1, 2)).sum() + self.slack_A)
+
+    @cached_property
+    def norm(self) -> float:
+        """An upper bound of the 2-norm of the lifted matrix, on columns and on rows (Golub and Van Loan 2013, 2.3.3)."""
+        size = max(np.abs(matrix).sum(axis=0).max() * np.abs(matrix).sum(axis=1).max() for matrix in (self.matrix, self.row_matrix))
+        return float(np.sqrt(size))
+
+    @cached_property
+    def matrix(self) -> Array:
+        """The lifted matrix ``(M d, M d)`` that acts on columns: block (target, source) is ``A_g`` with ``g + source = target``."""
+        return _blocks(self.space, self.A, rows=False)
+
+    @cached_property
+    def row_matrix(self) -> Array:
+        """The lifted matrix that acts on rows from the right."""
+        return _blocks(self.space, self.A, rows=True)
+
+    @cached_property
+    def forward(self) -> Response:
+        """The lifted system as a response; its states are the Taylor coefficients of the state, ``(M d,)``."""
+        start = np.zeros(self.matrix.shape[0])
+        start[:self.states] = self.initial_state
+        drive = self.B.reshape(-1, self.B.shape[2])
+        return Response(LinearSystem(self.matrix, drive), self.grid, start)
+
+    @cached_property
+    def backward(self) -> Response:
+        """The adjoint of the lifted system; its functionals are Taylor coefficients of ``c'e^{A(p) t}``."""
+        size = self.row_matrix.shape[0]
+        return Response(LinearSystem(self.row_matrix, np.zeros((size, 1))), self.grid, np.zeros(size))
+
+    def nodes(self, control: Array) -> Array:
+        """Taylor coefficients ``(L+1, M, d)`` of the state at the breakpoints, under ``control (m, K)``."""
+        return self.forward.states(control, KNOWN)[0].reshape(self.grid.pieces + 1, self.space.size, self.states)
+
+    def state_remainder(self, nodes: Array, control: Array) -> Array:
+        """Norm bounds ``(L,)``, per piece, of the neglected part of the state."""
+        if self.space.nu == 0:
+            return np.zeros(self.grid.pieces)
+        inputs = control[:, self.grid.control_piece]
+        driven = inputs.T @ self.forward.system.matrices(KNOWN)[1][0].T
+        return self._neglected(nodes, driven, self.matrix, np.abs(inputs).sum(axis=0) * self.slack_B)
+
+    def row_remainder(self, direction: Array) -> Array:
+        """Norm bounds ``(L,)``, per piece of ``[0, t]`` read backwards, of the neglected part of ``c'e^{A(p) s}``."""
+        if self.space.nu == 0:
+            return np.zeros(self.grid.pieces)
+        return self._neglected(self.row_nodes(direction), np.zeros(1), self.row_matrix.T, np.zeros(self.grid.pieces))
+
+    def row_nodes(self, direction: Array) -> Array:
+        """Taylor coefficients ``(L+1, M, d)`` of ``c'e^{A(p) s}`` at the breakpoints ``s``."""
+        row = np.zeros(self.row_matrix.shape[0])
+        row[:self.states] = direction
+        path = Response(LinearSystem(self.row_matrix.T, np.zeros((row.size, 1))), self.grid, row).states(np.zeros((1, self.grid.control_piece.max() + 1)), KNOWN)
+        return path[0].reshape(self.grid.pieces + 1, self.space.size, self.states)
+
+    def _neglected(self, nodes: Array, driven: Array, matrix: Array, extra: Array) -> Array:
+        """Gronwall: ``|e|' <= growth |e| + residual``, with the residual of the truncation bounded on every piece."""
+        lengths = self.grid.lengths
+        start = nodes[:-1].reshape(lengths.size, -1)
+        bend = np.linalg.norm((start @ matrix.T + driven) @ matrix.T, axis=1) * np.exp(self.norm * lengths)
+        norms = np.linalg.norm(nodes, axis=2)
+        norms = np.maximum(norms[:-1], norms[1:]) + (lengths**2 / 8 * bend)[:, None]
+        residual = norms @ self._overflow + norms.sum(axis=1) * self.slack_A + extra
+        factor = np.exp(self.growth * lengths)
+        added = residual * (np.expm1(self.growth * lengths) / self.growth if abs(self.growth) > 1e-12 else lengths)
+        bound = np.array(list(accumulate(zip(factor.tolist(), added.tolist(), strict=True), lambda b, step: b * step[0] + step[1], initial=0.0)))
+        return bound[:-1] * np.maximum(factor, 1.0) + np.maximum(added, residual * lengths)
+
+    @cached_property
+    def _overflow(self) -> Array:
+        """For every monomial of the state, the norms of the coefficients of ``A`` that push it out of the space, ``(M,)``."""
+        size = np.linalg.norm(self.A, axis=(1, 2))
+        leaves = self.space.degrees[:, None] + self.space.degrees[None, :] > self.space.degree
+        return leaves @ size
+
+
+def lift(system: LinearSystem, grid: TimeGrid, initial_state: Array, centre: Array, radius: Array) -> LiftedSystem:
+    """The lifted system over a cell, in the coordinates ``x = T z`` with ``T`` its `transform`; raises `NotEnclosable` when it has none."""
+    space = _space(centre.size)
+    A, slack_A, B, slack_B, W, slack_W = system.taylor(space, centre, radius)
+    T = _modal(A[0]) if centre.size else np.eye(A.shape[1])
+    inverse = np.linalg.inv(T)
+    norm = np.linalg.norm
+    return LiftedSystem(space, grid, inverse @ initial_state, inverse @ A @ T, inverse @ B, inverse @ W, T,
+                        float(norm(inverse, 2) * norm(slack_A) * norm(T, 2)), float(norm(inverse, 2) * norm(slack_B)),
+                        float(norm(inverse, 2) * norm(slack_W)))
+
+
+def frozen(system: LinearSystem, grid: TimeGrid, initial_state: Array, parameter: Array) -> LiftedSystem:
+    """The system at one parameter, without any expansion."""
+    A, B, W = system.matrices(parameter[None])
+    return LiftedSystem(_space(0), grid, initial_state, A, B, W, np.eye(A.shape[1]), 0.0, 0.0, 0.0)
+
+
+def _modal(A: Array) -> Array:
+    """Real modal coordinates, in which the logarithmic norm is the spectral abscissa; the identity where they are ill conditioned."""
+    values, vectors = np.linalg.eig(A)
+    columns = [part for i, value in enumerate(values) if value.imag >= 0
+               for part in ((vectors[:, i].real,) if value.imag == 0 else (vectors[:, i].real, vectors[:, i].imag))]
+    T = np.stack(columns, axis=1)
+    return T if np.linalg.cond(T) < WELL_CONDITIONED else np.eye(A.shape[0])
+
+
+_SPACES: dict[int, TaylorSpace] = {}
+
+
+def _space(nu: int) -> TaylorSpace:
+    if nu not in _SPACES:
+        _SPACES[nu] = TaylorSpace(nu, DEGREES.get(nu, 2))
+    return _SPACES[nu]
+
+
+def _blocks(space: TaylorSpace, coefficients: Array, rows: bool) -> Array:
+    size, d = space.size, coefficients.shape[1]
+    lifted = np.zeros((size, size, d, d))
+    left, right, target = space.products
+    lifted[(right, target) if rows else (target, right)] = coefficients[left]
+    return lifted.swapaxes(1, 2).reshape(size * d, size * d)

@@ -1,0 +1,77 @@
+"""Local maxima of sampled functions, and the vertex of a parabola between the samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import product
+
+import numpy as np
+
+from sparserob_core.sip.convex_set import Array
+
+
+def local_maxima(values: Array, lattice: tuple[int, ...], kept: int) -> np.ndarray:
+    """Positions ``(k, 3)`` in ``values (v, r, times)`` of the largest local maxima, at most ``kept`` per row.
+
+    ``v`` runs over a tensor lattice of shape ``lattice``; neighbours are those along its axes and in time.
+    """
+    v, r, times = values.shape
+    tensor = values.reshape(*lattice, r, times)
+    peak = np.ones(tensor.shape, dtype=bool)
+    for axis in (*range(len(lattice)), tensor.ndim - 1):
+        ahead = np.diff(tensor, axis=axis)
+        first = [slice(None)] * tensor.ndim
+        last = [slice(None)] * tensor.ndim
+        first[axis], last[axis] = slice(None, -1), slice(1, None)
+        peak[tuple(first)] &= ahead <= 0
+        peak[tuple(last)] &= ahead >= 0
+    positions = np.argwhere(peak.reshape(v, r, times))
+    heights = values[tuple(positions.T)]
+    best: list[np.ndarray] = []
+    for row in range(r):  # every row keeps its own maxima, so that none starves another
+        mine = positions[:, 1] == row
+        best.append(positions[mine][np.argsort(-heights[mine], kind="stable")][:kept])
+    return np.concatenate(best)
+
+
+def vertex_times(values: Array, positions: np.ndarray, times: Array) -> Array:
+    """The times ``(k,)`` of the positions, each moved to the vertex of the parabola through its sample and the two beside it."""
+    v, r, t = positions.T
+    moved = times[t].copy()
+    inner = (t > 0) & (t < times.size - 1)
+    ti, vi, ri = t[inner], v[inner], r[inner]
+    h1, h2 = times[ti] - times[ti - 1], times[ti + 1] - times[ti]
+    d1 = (values[vi, ri, ti] - values[vi, ri, ti - 1]) / h1
+    d2 = (values[vi, ri, ti + 1] - values[vi, ri, ti]) / h2
+    curvature, slope = (d2 - d1) / (h1 + h2), (d1 * h2 + d2 * h1) / (h1 + h2)
+    bent = curvature < 0
+    shift = np.zeros(ti.size)
+    shift[bent] = np.clip(-slope[bent] / (2 * curvature[bent]), -h1[bent], h2[bent])
+    moved[inner] += shift
+    return moved
+
+
+def climb(evaluate: Callable[[Array, np.ndarray], Array], points: Array, radius: Array, project: Callable[[Array], Array],
+          halvings: int) -> tuple[Array, Array]:
+    """Climb from points ``(k, D)`` on stencils that shrink from ``radius (D,)``, all points at once.
+
+    ``evaluate(points (j, D), which (j,))`` gives the values of points that started as number ``which``; ``project`` maps any point back
+    into the domain. Returns the best points ``(k, D)`` and their values ``(k,)``.
+    """
+    dimension = points.shape[1]
+    stencil = np.vstack([np.eye(dimension), -np.eye(dimension)])
+    if dimension <= 3:
+        stencil = np.array([step for step in product((-1.0, 0.0, 1.0), repeat=dimension) if any(step)])
+    which = np.arange(points.shape[0])
+    size = np.tile(radius, (points.shape[0], 1))
+    best = evaluate(points, which)
+    for _ in range(halvings):
+        around = project((points[:, None] + size[:, None] * stencil).reshape(-1, dimension)).reshape(-1, stencil.shape[0], dimension)
+        found = evaluate(around.reshape(-1, dimension), np.repeat(which, stencil.shape[0])).reshape(around.shape[:2])
+        top = found.argmax(axis=1)
+        value = found[which, top]
+        better = value > best
+        points = np.where(better[:, None], around[which, top], points)
+        best = np.where(better, value, best)
+        size = np.where(better[:, None], size, size / 3)
+    return points, best

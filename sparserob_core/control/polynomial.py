@@ -1,0 +1,77 @@
+"""Upper bounds of polynomials in several variables on the box ``[-1, 1]^nu``."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sparserob_core.control.taylor import TaylorSpace
+from sparserob_core.sip.convex_set import Array
+
+DEFINITE = 1e-12    # relative to its largest entry, the smallest eigenvalue of a Hessian that counts as definite
+
+
+def polynomial_bound(space: TaylorSpace, coefficients: Array) -> tuple[Array, Array]:
+    """Upper bounds of polynomials ``(..., M)`` on ``[-1, 1]^nu``, and how much each variable adds to their range, ``(..., nu)``.
+
+    Variables in which the polynomial is monotone are set to their better end; in the others the quadratic part is maximised, exactly
+    where it is concave, variable by variable otherwise. Terms of degree three and more are bounded by their modulus.
+    """
+    nu = space.nu
+    shape = coefficients.shape[:-1]
+    if nu == 0 or space.degree == 0:
+        return coefficients[..., 0].copy(), np.zeros((*shape, nu))
+    flat = coefficients.reshape(-1, space.size)
+    gradient, hessian = _quadratic(space, flat)
+    tail, steepness = _tail(space, flat)
+    bound = flat[:, 0] + tail
+    slope = np.abs(hessian).sum(axis=2)
+    ends = np.where(np.abs(gradient) >= slope + steepness, np.sign(gradient), 0.0)
+    bound += (gradient * ends).sum(axis=1) + 0.5 * np.einsum("ki,kij,kj->k", ends, hessian, ends)
+    inner = ends == 0
+    gradient = np.where(inner, gradient + np.einsum("kij,kj->ki", hessian, ends), 0.0)
+    hessian = np.where(inner[:, :, None] & inner[:, None, :], hessian, 0.0)
+    bound += np.minimum(_separable(gradient, hessian), _concave(gradient, hessian, inner))
+    spread = np.abs(gradient) + steepness + slope
+    return bound.reshape(shape), spread.reshape(*shape, nu)
+
+
+def _quadratic(space: TaylorSpace, flat: Array) -> tuple[Array, Array]:
+    """Gradient ``(k, nu)`` and Hessian ``(k, nu, nu)`` at the centre."""
+    nu = space.nu
+    unit = np.eye(nu, dtype=int)
+    gradient = flat[:, [space.index[tuple(unit[i])] for i in range(nu)]]
+    hessian = np.zeros((flat.shape[0], nu, nu))
+    if space.degree >= 2:
+        for i in range(nu):
+            for j in range(i + 1):
+                entry = flat[:, space.index[tuple(unit[i] + unit[j])]]
+                hessian[:, i, j] = hessian[:, j, i] = 2 * entry if i == j else entry
+    return gradient, hessian
+
+
+def _tail(space: TaylorSpace, flat: Array) -> tuple[Array, Array]:
+    """Bounds of the terms of degree three and more, ``(k,)``, and of their partial derivatives, ``(k, nu)``."""
+    high = space.degrees >= 3
+    terms = flat[:, high]
+    value = np.where(space.even[high], np.maximum(terms, 0.0), np.abs(terms)).sum(axis=1)
+    return value, np.abs(terms) @ space.exponents[high]
+
+
+def _separable(gradient: Array, hessian: Array) -> Array:
+    """``sum_i max_s g_i s + h_ii s^2 / 2`` plus the modulus of the mixed terms."""
+    square = np.einsum("kii->ki", hessian) / 2
+    inside = (square < 0) & (np.abs(gradient) < -2 * square)
+    top = np.where(inside, -(gradient**2) / np.where(inside, 4 * square, 1.0), np.abs(gradient) + square)
+    mixed = (np.abs(hessian).sum(axis=(1, 2)) - 2 * np.abs(square).sum(axis=1)) / 2
+    return np.asarray(top.sum(axis=1) + mixed)
+
+
+def _concave(gradient: Array, hessian: Array, inner: np.ndarray) -> Array:
+    """``-g' H^-1 g / 2``, the maximum over the whole space, where ``H`` is negative definite in the inner variables; ``inf`` elsewhere."""
+    filled = np.where(inner[:, :, None] & inner[:, None, :], hessian, -np.eye(hessian.shape[1]))
+    values, vectors = np.linalg.eigh(filled)
+    along = np.einsum("kij,ki->kj", vectors, gradient)
+    definite = values[:, -1] < -DEFINITE * np.abs(values).max(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        top = -0.5 * (along**2 / values).sum(axis=1)
+    return np.where(definite, top, np.inf)

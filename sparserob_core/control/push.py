@@ -1,0 +1,146 @@
+"""How far the worst disturbance pushes a functional of the state, enclosed over a cell of parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from sparserob_core.control.combination import Combination
+from sparserob_core.control.disturbance import DisturbanceModel
+from sparserob_core.control.lifted import KNOWN, LiftedSystem
+from sparserob_core.sip.convex_set import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Push:
+    """The push ``sigma(t) = sum_b h_D(y_b(t))`` of functionals ``rows (r, d)`` (in the lifted system's coordinates) over one cell.
+
+    ``y_b`` is a polynomial in the parameters; ``h_D(y_b)`` is its value at the worst disturbance of the cell's centre, plus an excess that
+    is zero wherever that disturbance stays the worst on the whole cell.
+    """
+
+    lifted: LiftedSystem
+    disturbance: DisturbanceModel
+    rows: Array
+    combination: Combination | None = None
+
+    def at(self, times: Array) -> tuple[Array, Array]:
+        """Taylor coefficients ``(k, r, M)`` of the push under the centre's worst disturbance, and its excess ``(k, r)``."""
+        if self._repeats:
+            return self._by_age(times)
+        blocks = self._blocks(times, self._lifted_rows)
+        coefficients, excess = self._summed(blocks)
+        return coefficients.sum(axis=2), excess.sum(axis=2)
+
+    @cached_property
+    def curvature(self) -> Array:
+        """A bound ``(L, r)``, per piece, of the second time derivative of the blocks, summed over blocks and Taylor coefficients."""
+        grid, matrix = self.lifted.grid, self.lifted.row_matrix
+        bent = self._lifted_rows @ matrix @ matrix
+        norm = self.lifted.norm
+        growth = np.expm1(norm * grid.lengths)[:, None]
+        along = np.linalg.norm(bent, axis=1) * self._total_gain[:-1, None] * growth
+        fresh = np.linalg.norm(self._lifted_rows @ matrix, axis=1) * np.exp(norm * grid.lengths)[:, None]
+        return np.asarray(self._sizes(bent) + np.sqrt(self.lifted.space.size) * self._reach * (along + fresh))
+
+    @cached_property
+    def neglected(self) -> Array:
+        """What the Taylor models neglect, at most, on every piece: ``(r, L)``."""
+        lengths = self.lifted.grid.lengths
+        total = np.zeros((self.rows.shape[0], lengths.size))
+        if self.lifted.space.nu == 0:
+            return total
+        for row, direction in enumerate(self.rows):
+            truncated = self.lifted.row_remainder(direction) * self._reach
+            sizes = np.linalg.norm(self.lifted.row_nodes(direction), axis=2).sum(axis=1)
+            loose = np.maximum(sizes[:-1], sizes[1:]) * self.lifted.slack_W * self._radius
+            total[row] = np.cumsum((truncated + loose) * lengths)
+        return total
+
+    @property
+    def _repeats(self) -> bool:
+        """Whether the blocks are the pieces of a uniform grid: what they receive then depends on their age ``t - s`` only."""
+        return self.lifted.backward.uniform and self.disturbance.by_piece
+
+    def _by_age(self, times: Array) -> tuple[Array, Array]:
+        backward, grid, horizon = self.lifted.backward, self.lifted.grid, self.lifted.grid.breakpoints[-1]
+        pieces = grid.locate(times)
+        within, which = np.unique(np.round((times - grid.breakpoints[pieces]) / horizon, 15), return_inverse=True)
+        flow, partial = backward.flows(within * horizon)
+        oldest = int(pieces.max(initial=0))
+        young = self._weights(self._lifted_rows @ partial)
+        old = self._weights(np.einsum("rd,qde,aef->qraf", self._lifted_rows, flow, backward.ages[:oldest]))
+        young_parts, old_parts = self._summed(young[..., None, :]), self._summed(np.moveaxis(old, -2, -3))
+        result = []
+        for fresh, aged in zip(young_parts, old_parts, strict=True):
+            total = np.cumsum(np.concatenate([fresh, aged], axis=2), axis=2)
+            result.append(total[which.reshape(-1), :, pieces])
+        return result[0], result[1]
+
+    def _summed(self, blocks: Array) -> tuple[Array, Array]:
+        """Per block: the polynomial under the centre's worst disturbance, and the excess; from ``(k, r, M, nb, q)``."""
+        bound = self.disturbance.set
+        blocks = blocks if self.combination is None else self.combination.apply(blocks)
+        point = bound.support_point(blocks[:, :, 0])
+        coefficients = np.einsum("krbq,krabq->krba", point, blocks, optimize=True)
+        if blocks.shape[2] == 1:
+            return coefficients, np.zeros(coefficients.shape[:3])
+        return coefficients, bound.linearisation_excess(blocks[:, :, 0], np.moveaxis(blocks[:, :, 1:], 2, 3))
+
+    def _blocks(self, times: Array, rows: Array) -> Array:
+        """Taylor coefficients ``(k, r, M, nb, q)`` of what functionals that start as lifted ``rows (r, M d)`` give to every block."""
+        k, r = times.size, rows.shape[0]
+        _, gains, _, _ = self.lifted.backward.adjoint(np.repeat(times, r), np.tile(rows, (k, 1)), np.zeros((k * r, 0)))
+        weights = self._weights(gains.reshape(k, r, gains.shape[1], -1))
+        return self.disturbance.blocks(np.moveaxis(weights, 3, 2))
+
+    def _weights(self, gains: Array) -> Array:
+        """Gains ``(..., M d)`` on the state's drive, as Taylor coefficients ``(..., M, mw)`` of the weights on the disturbance."""
+        space = self.lifted.space
+        parts = gains.reshape(*gains.shape[:-1], space.size, -1)
+        weights = np.zeros((*parts.shape[:-1], self.lifted.W.shape[2]))
+        used = [part.any() for part in self.lifted.W]
+        for left, right, target in zip(*space.products, strict=True):
+            if used[left]:
+                weights[..., target, :] += parts[..., right, :] @ self.lifted.W[left]
+        return weights
+
+    def _sizes(self, rows: Array) -> Array:
+        """``sum_b`` and sum over Taylor coefficients of ``max(h(y_b), h(-y_b))`` at the start of every piece, ``(L, r)``."""
+        grid, bound = self.lifted.grid, self.disturbance.set
+        if self._repeats:
+            blocks = self._weights(np.einsum("rd,ade->rae", rows, self.lifted.backward.ages))
+            sizes = np.maximum(bound.support(blocks), bound.support(-blocks)).sum(axis=2)
+            return np.concatenate([np.zeros((rows.shape[0], 1)), np.cumsum(sizes, axis=1)[:, :-1]], axis=1).T
+        every = self._blocks(grid.breakpoints[:-1], rows)
+        return np.asarray(np.maximum(bound.support(every), bound.support(-every)).sum(axis=(2, 3)))
+
+    @cached_property
+    def _lifted_rows(self) -> Array:
+        rows = np.zeros((self.rows.shape[0], self.lifted.row_matrix.shape[0]))
+        rows[:, :self.lifted.states] = self.rows
+        return rows
+
+    @cached_property
+    def _radius(self) -> float:
+        """The largest disturbance in the 2-norm, from its bounding box."""
+        axes = np.eye(self.disturbance.channels)
+        return float(np.linalg.norm(np.maximum(self.disturbance.bound.support(axes), self.disturbance.bound.support(-axes))))
+
+    @cached_property
+    def _reach(self) -> float:
+        return self._radius * float(np.linalg.norm(self.lifted.W, axis=(1, 2)).sum())
+
+    @cached_property
+    def _total_gain(self) -> Array:
+        """``int_0^t |e^{R s}| ds`` at the breakpoints, bounded from above, ``(L+1,)``."""
+        grid, matrix = self.lifted.grid, self.lifted.row_matrix
+        steps = self.lifted.backward.steps(KNOWN)
+        powers = np.empty((grid.pieces, *matrix.shape))
+        powers[0] = np.eye(matrix.shape[0])
+        for piece in range(1, grid.pieces):
+            powers[piece] = powers[piece - 1] @ steps.E[0, self.lifted.backward.length_of(piece - 1)]
+        norms = np.linalg.norm(powers, axis=(1, 2))
+        return np.concatenate([[0.0], np.cumsum(norms * np.exp(self.lifted.norm * grid.lengths) * grid.lengths)])

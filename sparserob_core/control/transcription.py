@@ -1,0 +1,158 @@
+"""From an optimal control problem and two dictionaries to a convex semi-infinite program, exactly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sparserob_core.control.constraint import FlatConstraint
+from sparserob_core.control.dictionary import Dictionary
+from sparserob_core.control.disturbance import DisturbanceModel, disturbance_model
+from sparserob_core.control.functional import WorstCase
+from sparserob_core.control.parameters import ParameterIndex
+from sparserob_core.control.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.response import Response, merge_grids
+from sparserob_core.control.sampling import sample_disturbances, sample_parameters
+from sparserob_core.control.scenario import ScenarioConstraint
+from sparserob_core.control.sets import Equality
+from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import Array, Box, ConvexSet
+from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_array
+
+PROBES = 7  # parameters at which the right-hand side of a terminal equality must agree
+
+
+@dataclass(frozen=True, eq=False)
+class Transcription:
+    """A problem on its dictionaries: what every family, simulation and figure is built from."""
+
+    problem: OptimalControlProblem
+    control: Dictionary
+    functionals: WorstCase
+    parameters: ParameterIndex
+
+    @property
+    def response(self) -> Response:
+        return self.functionals.response
+
+    def pieces(self, theta: Array) -> Array:
+        """The control ``(m, K)`` on the pieces of its dictionary."""
+        return theta.reshape(-1, self.control.functions) @ self.control.values
+
+
+def transcribe(problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary | None = None) -> SemiInfiniteProgram:
+    """The convex semi-infinite program of a problem (the paper's (7)), with the disturbance eliminated exactly.
+
+    The decision is ``theta (m, N)`` raveled; its image ``S theta`` is the control on every piece, channel-major ``(m K,)``. ``disturbance``
+    defaults to the control's dictionary. Raises `InputError` when a dictionary does not span the horizon.
+    """
+    return program_of(prepare(problem, control, disturbance or control))
+
+
+def prepare(problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary) -> Transcription:
+    """The responses and disturbance model of a problem on its dictionaries."""
+    for name, dictionary in (("control", control), ("disturbance", disturbance)):
+        if abs(dictionary.horizon - problem.horizon) > 1e-12 * problem.horizon:
+            raise InputError(f"{name} dictionary: ends at {dictionary.horizon:g}, expected the horizon {problem.horizon:g}")
+    grid = merge_grids(control.breakpoints, disturbance.breakpoints)
+    model: DisturbanceModel | None = None
+    if problem.disturbance is not None:
+        model = disturbance_model(problem.disturbance_class, problem.disturbance, disturbance, grid)
+    response = Response(problem.system, grid, problem.initial_state)
+    return Transcription(problem, control, WorstCase(response, control, model), ParameterIndex(problem.system.parameters))
+
+
+def program_of(model: Transcription) -> SemiInfiniteProgram:
+    """The program of a prepared problem."""
+    S, lower, upper, weights = _image(model)
+    A, b = _equalities(model)
+    lengths = np.tile(model.control.lengths, model.problem.system.controls)
+    return SemiInfiniteProgram(
+        n=model.functionals.variables, families=_families(model), weights=weights, S=S, lower=lower, upper=upper,
+        A=A if b.size else None, b=b if b.size else None, channels=model.problem.system.controls, lengths=lengths)
+
+
+def _image(model: Transcription) -> tuple[csc_array | None, Array, Array, Array]:
+    """The control on every piece, its bounds and weights, and one more image per piece and side of a polytope."""
+    from scipy.sparse import csc_array, eye_array, kron, vstack
+
+    bound, dictionary, channels = model.problem.control, model.control, model.problem.system.controls
+    axes = np.eye(channels)
+    pieces = np.ones(dictionary.pieces)
+    lower, upper = np.kron(-bound.support(-axes), pieces), np.kron(bound.support(axes), pieces)
+    weights = np.kron(model.problem.weights, dictionary.lengths)
+    flat = None if isinstance(bound, Box) else bound.halfspaces()
+    values = csc_array(dictionary.values.T)
+    identity = dictionary.values.shape[0] == dictionary.pieces and np.array_equal(dictionary.values, np.eye(dictionary.pieces))
+    if flat is None:
+        return (None if identity else csc_array(kron(eye_array(channels), values))), lower, upper, weights
+    H, h = flat
+    several = np.count_nonzero(H, axis=1) > 1
+    S = csc_array(vstack([kron(eye_array(channels), values), kron(csc_array(H[several]), values)]))
+    extra = np.kron(h[several], pieces)
+    return (S, np.concatenate([lower, np.full(extra.size, -np.inf)]), np.concatenate([upper, extra]),
+            np.concatenate([weights, np.zeros(extra.size)]))
+
+
+def _equalities(model: Transcription) -> tuple[Array, Array]:
+    """Terminal equalities as rows; refused where the uncertainty reaches the state, since nothing could then satisfy them."""
+    horizon, functionals = model.problem.horizon, model.functionals
+    A, b = [np.zeros((0, functionals.variables))], [np.zeros(0)]
+    for terminal in model.problem.terminal:
+        if not isinstance(terminal, Equality):
+            continue
+        for state in terminal.fixed:
+            direction = np.eye(terminal.dimension)[[state]]
+            probes = _probes(model.parameters)
+            count = probes.shape[0]
+            time, up = np.full(count, horizon), np.repeat(direction, count, axis=0)
+            G, offset = functionals.rows(time, up, probes)
+            sigma = functionals.offsets(time, up, probes) + functionals.offsets(time, -up, probes)
+            if np.abs(sigma).max() > 1e-12 or np.abs(G - G[0]).max() > 1e-12 or np.abs(offset - offset[0]).max() > 1e-12:
+                raise InputError(f"terminal: equals: state {state + 1} depends on the uncertainty, so no control can fix its final value "
+                                 f"to {terminal.values[state]:g}; expected a set with interior")
+            A.append(G[:1])
+            b.append(np.array([terminal.values[state] - offset[0]]))
+    return np.vstack(A), np.concatenate(b)
+
+
+def _probes(parameters: ParameterIndex) -> Array:
+    points, _ = parameters.lattice()
+    return points[np.unique(np.linspace(0, points.shape[0] - 1, PROBES).astype(int))]
+
+
+def _families(model: Transcription) -> list[ConstraintFamily]:
+    problem = model.problem
+    windows = [(f"path[{i}]" if len(problem.path) > 1 else "path", entry) for i, entry in enumerate(problem.path)]
+    ends = [terminal for terminal in problem.terminal if not isinstance(terminal, Equality)]
+    windows += [(f"terminal[{i}]" if len(ends) > 1 else "terminal", PathConstraint(end, problem.horizon, problem.horizon))
+                for i, end in enumerate(ends)]
+    return [family for name, entry in windows for family in _family(model, entry.name or name, entry)]
+
+
+def _family(model: Transcription, name: str, entry: PathConstraint) -> list[ConstraintFamily]:
+    stop = model.problem.horizon if entry.stop is None else entry.stop
+    flat = entry.set.halfspaces()
+    if flat is None:
+        raise NotImplementedError
+    if not flat[1].size:
+        return []
+    return [_flat_family(FlatConstraint(name, model.functionals, *flat, entry.start, stop, model.parameters))]
+
+
+def _flat_family(constraint: FlatConstraint, simple: bool = False) -> ConstraintFamily:
+    """The family of a constraint, with its simpler versions unless it is one of them."""
+    def sample(count: int, rng: np.random.Generator) -> ConstraintFamily:
+        model = constraint.functionals.disturbance
+        disturbances = None if model is None else sample_disturbances(model, count, rng)
+        return ScenarioConstraint(constraint, disturbances, sample_parameters(constraint.parameters.set, count, rng)).family()
+
+    return ConstraintFamily(
+        name=constraint.name, index_set=constraint.index_set, rows=constraint.rows, worst=constraint.worst, enclosure=constraint.enclosure,
+        cells=constraint.cells, explain=constraint.explain, sample=None if simple else sample,
+        nominal=None if simple else _flat_family(constraint.nominal(), simple=True))

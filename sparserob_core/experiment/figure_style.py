@@ -1,0 +1,81 @@
+"""How the figures look: one palette that every eye can tell apart, one typeface, one way to a file."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sparserob_core.errors import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Okabe and Ito (2008), "Color universal design".
+BLUE, SKY, VERMILLION, ORANGE, GREEN, PURPLE = "#0072B2", "#56B4E9", "#D55E00", "#E69F00", "#009E73", "#CC79A7"
+INK, GREY, MIST = "#222222", "#7A7A7A", "#E9E9E9"
+WIDTH = 6.2
+"""Width of every figure in inches: a text column at full size."""
+
+_STYLE: dict[str, Any] = {
+    "font.family": "STIXGeneral",
+    "mathtext.fontset": "stix",
+    "font.size": 10.5,
+    "axes.titlesize": 11.5,
+    "axes.titlelocation": "left",
+    "axes.titlepad": 8,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": GREY,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "xtick.color": GREY,
+    "ytick.color": GREY,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "xtick.major.width": 0.7,
+    "ytick.major.width": 0.7,
+    "text.color": INK,
+    "legend.frameon": False,
+    "legend.fontsize": 9.5,
+    "lines.solid_capstyle": "butt",
+    "hatch.linewidth": 0.4,
+    "pdf.fonttype": 42,
+}
+
+
+def style() -> AbstractContextManager[None]:
+    """The settings of every figure, for the time of a ``with`` block; the user's own settings stay as they are."""
+    from matplotlib.style import context
+
+    return context(_STYLE)
+
+
+def panels(rows: int, height: float, *, right: float = 0.0) -> tuple[Figure, list[Axes]]:
+    """A figure of ``rows`` panels of ``height`` inches above one another on a common axis."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(WIDTH, rows * height + 0.75 + right), layout="constrained")
+    axes = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
+    return figure, list(axes)
+
+
+def save(figure: Figure, directory: Path, name: str) -> list[Path]:
+    """Write ``name.pdf`` (vector) and ``name.png`` (200 dots per inch); the same figure gives the same bytes."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    FigureCanvasAgg(figure)
+    directory.mkdir(parents=True, exist_ok=True)
+    files = [directory / f"{name}.pdf", directory / f"{name}.png"]
+    figure.savefig(files[0], metadata={"CreationDate": None, "Creator": None, "Producer": None})
+    figure.savefig(files[1], dpi=200, metadata={"Software": None})
+    return files
+
+
+def require_matplotlib() -> None:
+    """Raise `InputError` with the way to install it when matplotlib is missing."""
+    from importlib.util import find_spec
+
+    if find_spec("matplotlib") is None:
+        raise InputError("figures: matplotlib is not installed; `pip install sparserob[figures]` brings it")

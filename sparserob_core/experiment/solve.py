@@ -1,0 +1,152 @@
+"""The two things a Python user does without a config: solve a problem, maximise a function."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+
+from sparserob_core.control.dictionary import Dictionary, DictionaryFactory
+from sparserob_core.control.problem import OptimalControlProblem
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.components import Registry
+from sparserob_core.experiment.registry import load_registry
+from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.events import Event, silence
+from sparserob_core.sip.maximiser import Maximiser, Report
+from sparserob_core.sip.method import Continuation, Method, Tools
+from sparserob_core.sip.program import SemiInfiniteProgram
+from sparserob_core.sip.regulariser import Regulariser
+from sparserob_core.sip.result import Result
+from sparserob_core.sip.solver import Solver
+
+if TYPE_CHECKING:
+    from sparserob_core.sip.events import Notify
+
+Choice: TypeAlias = str | Mapping[str, Any]
+PIECES = {"name": "piecewise_constant", "pieces": 100}
+
+
+def solve(
+    problem: OptimalControlProblem | SemiInfiniteProgram,
+    method: Choice | Method = "exchange",
+    solver: Choice | Solver = "piqp",
+    maximiser: Choice | Maximiser = "direct",
+    regulariser: Choice | Regulariser | None = "ridge",
+    *,
+    tolerance: float | None = 1e-7,
+    seed: int = 0,
+    control: Choice | DictionaryFactory | Dictionary | None = None,
+    disturbance: Choice | DictionaryFactory | Dictionary | None = None,
+    continuation: Continuation | Mapping[str, float] | None = None,
+    budget: int = 2000,
+    notify: Notify = silence,
+) -> Result:
+    """Solve a semi-infinite program, or an optimal control problem on dictionaries, as ``sparserob run`` does, without files.
+
+    A component is a name, a mapping such as ``{"name": "exchange", "tolerance": 1e-9}``, or the component itself. ``tolerance`` is the
+    relative gap, for a method that has such an option. ``control`` is by default 100 equal pieces, and ``disturbance`` one indicator
+    function on each piece of the control; both are for control problems only. ``budget``: evaluations per search of the maximiser.
+    Raises `InputError` when an argument is at fault.
+    """
+    registry = load_registry()
+    program = _program(registry, problem, control, disturbance)
+    steps = continuation if isinstance(continuation, Continuation) else _continuation(continuation or {})
+    tools = Tools(
+        solver=component(registry, "solver", solver, Solver),
+        maximiser=component(registry, "maximiser", maximiser, Maximiser),
+        regulariser=None if regulariser is None else component(registry, "regulariser", regulariser, Regulariser),
+        continuation=steps, budget=_whole("budget", budget, 1), rng=np.random.default_rng(_whole("seed", seed, 0)), notify=_heard(notify))
+    chosen: Method = component(registry, "method", _with_tolerance(registry, method, tolerance), Method)
+    return chosen.solve(program, tools)
+
+
+def maximise(f: Callable[[Array], object], box: Box, name: Choice | Maximiser = "direct", budget: int = 1000, seed: int = 0,
+             **options: object) -> Report:
+    """Search for the maximum of ``f`` (points ``(k, d)`` to values ``(k,)``) over a box with the maximiser of that name.
+
+    Keywords are the maximiser's options. Raises `InputError` when an argument is at fault, and `EvaluationError` when ``f`` fails.
+    """
+    from sparserob_core.sip.maximiser import maximise as search
+
+    if not isinstance(box, Box):
+        raise InputError(f"box: expected a sparserob_core.Box, got {type(box).__name__}")
+    if options and not isinstance(name, str):
+        raise InputError(f"{', '.join(options)}: options as keywords need the maximiser's name, got {name!r}")
+    chosen = component(load_registry(), "maximiser", {"name": name, **options} if isinstance(name, str) else name, Maximiser)
+    return search(f, box, chosen, _whole("budget", budget, 1), np.random.default_rng(_whole("seed", seed, 0)))
+
+
+def component(registry: Registry, kind: str, choice: object, expected: type[Any]) -> Any:
+    """The component that a name, a mapping with a name, or the component itself stands for."""
+    if isinstance(choice, expected):
+        return choice
+    if isinstance(choice, str):
+        return registry.build(kind, choice)
+    if isinstance(choice, Mapping) and isinstance(choice.get("name"), str):
+        return registry.build(kind, choice["name"], {key: value for key, value in choice.items() if key != "name"})
+    raise InputError(f"{kind}: expected a name, a mapping with a name, or a {expected.__name__}, got {choice!r}")
+
+
+def dictionary(registry: Registry, choice: object, horizon: float) -> Dictionary:
+    """The dictionary that a choice stands for, on ``[0, horizon]``."""
+    if isinstance(choice, Dictionary):
+        return choice
+    factory: DictionaryFactory = component(registry, "dictionary", choice, DictionaryFactory)
+    return factory.build(horizon)
+
+
+def indicators(on: Dictionary) -> Dictionary:
+    """One indicator function on each piece of another dictionary."""
+    return Dictionary(on.breakpoints, np.eye(on.pieces))
+
+
+def _program(registry: Registry, problem: object, control: object, disturbance: object) -> SemiInfiniteProgram:
+    if isinstance(problem, SemiInfiniteProgram):
+        if control is not None or disturbance is not None:
+            raise InputError("control, disturbance: dictionaries are for an OptimalControlProblem, got a SemiInfiniteProgram")
+        return problem
+    if not isinstance(problem, OptimalControlProblem):
+        raise InputError(f"problem: expected an OptimalControlProblem or a SemiInfiniteProgram, got {type(problem).__name__}")
+    from sparserob_core.control.transcription import transcribe
+
+    controls = dictionary(registry, PIECES if control is None else control, problem.horizon)
+    disturbances = indicators(controls) if disturbance is None else dictionary(registry, disturbance, problem.horizon)
+    return transcribe(problem, control=controls, disturbance=disturbances)
+
+
+def _continuation(given: Mapping[str, float]) -> Continuation:
+    from pydantic import ValidationError
+
+    from sparserob_core.experiment.messages import complaints
+    from sparserob_core.experiment.run_config import ContinuationKeys
+
+    try:
+        return Continuation(**ContinuationKeys.model_validate(dict(given)).model_dump())
+    except ValidationError as error:
+        raise InputError("\n".join(f"continuation.{item}" for item in complaints(error, ContinuationKeys, given))) from None
+
+
+def _with_tolerance(registry: Registry, method: object, tolerance: float | None) -> object:
+    if isinstance(method, Method) or tolerance is None:
+        return method
+    entry = {"name": method} if isinstance(method, str) else method
+    if not isinstance(entry, Mapping) or not isinstance(entry.get("name"), str):
+        return entry
+    takes_it = "tolerance" in registry.get("method", entry["name"]).options_type().model_fields
+    return {"tolerance": tolerance, **entry} if takes_it else entry
+
+
+def _heard(notify: Notify) -> Callable[[object], None]:
+    def pass_on(event: object) -> None:
+        if isinstance(event, Event):
+            notify(event)
+
+    return pass_on
+
+
+def _whole(name: str, value: object, least: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise InputError(f"{name}: expected a whole number of at least {least}, got {value!r}")
+    return int(value)

@@ -1,0 +1,66 @@
+"""The two usual ways to deal with uncertainty, kept honest: their decisions are judged against every uncertainty, like any other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sparserob_core.errors import InputError
+from sparserob_core.sip.certificate import prove
+from sparserob_core.sip.exchange import Exchange
+from sparserob_core.sip.method import Method, Tools
+from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
+from sparserob_core.sip.result import Result
+from sparserob_core.sip.verdict import verdict, witness
+
+
+@dataclass(frozen=True)
+class Nominal(Method):
+    """Solve as if nothing were uncertain, to the relative gap ``tolerance``; then judge the decision against the uncertainty."""
+
+    tolerance: float = 1e-7
+    rounds: int = 200
+
+    def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
+        return _judged(program, _simplified(program, "nominal", lambda family: family.nominal), tools, self.tolerance, self.rounds)
+
+
+@dataclass(frozen=True)
+class Scenario(Method):
+    """Impose the constraints for ``scenarios`` sampled uncertainties (Calafiore and Campi 2006); then judge the decision against all of them."""
+
+    scenarios: int = 1000
+    tolerance: float = 1e-7
+    rounds: int = 200
+
+    def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
+        seed = int(tools.rng.integers(2**63))  # every family sees the same scenarios
+
+        def sampled(family: ConstraintFamily) -> ConstraintFamily | None:
+            return None if family.sample is None else family.sample(self.scenarios, np.random.default_rng(seed))
+
+        return _judged(program, _simplified(program, "scenario", sampled), tools, self.tolerance, self.rounds)
+
+
+def _simplified(program: SemiInfiniteProgram, method: str,
+                simpler: Callable[[ConstraintFamily], ConstraintFamily | None]) -> SemiInfiniteProgram:
+    families = [simpler(family) for family in program.families]
+    missing = [family.name for family, simple in zip(program.families, families, strict=True) if simple is None]
+    if missing:
+        raise InputError(f"method: {method} needs families that tell their uncertainty apart, which {', '.join(missing)} does not; "
+                         "expected the method exchange")
+    return replace(program, families=[family for family in families if family is not None])
+
+
+def _judged(program: SemiInfiniteProgram, simple: SemiInfiniteProgram, tools: Tools, tolerance: float, rounds: int) -> Result:
+    """Solve the simpler program, whose lower bound holds for the full one too, and say what its decision is worth in the full one."""
+    result = Exchange(tolerance, rounds).close(simple, tools, lambda x: ())
+    if result.decision is None:
+        return result
+    proofs = prove(program, result.decision, tools.notify)
+    status, message = verdict(proofs, result.gap, tolerance)
+    proven = status in ("certified", "verified")
+    worst = witness(program, result.worst, proofs) if result.worst is not None else None
+    return replace(result, status=status, message=message, worst=worst, upper_bound=result.cost if proven else np.inf)

@@ -1,0 +1,111 @@
+"""Proof over the continuum: branch and bound on the violation of every constraint family."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.events import Notify, ProofProgress, silence
+from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
+
+TOLERANCE = 1e-9        # a violation of at most this counts as none: the size of what rounding can hide
+CELLS = 400_000         # cells examined per family before the proof is given up
+BATCH = 4096            # cells bounded at a time, worst first
+PROBED = 16             # centres of the worst cells at which a witness is looked for, per batch
+
+
+@dataclass(frozen=True, eq=False)
+class Proof:
+    """What is known of one family at one decision: ``proven`` (no index violates it by more than ``bound <= TOLERANCE``),
+    ``refuted`` (``index``, ``row`` violate it by ``violation``) or ``undecided`` (``reason``)."""
+
+    family: str
+    verdict: Literal["proven", "refuted", "undecided"]
+    bound: float
+    violation: float = -np.inf
+    index: Array | None = None
+    row: int = 0
+    cells: int = 0
+    reason: str = ""
+
+
+def prove(program: SemiInfiniteProgram, x: Array, notify: Notify = silence,
+          cells: int = CELLS) -> tuple[Proof, ...]:
+    """Prove or refute every family at ``x (n,)``, one `Proof` each."""
+    return tuple(prove_family(family, x, notify, cells) for family in program.families)
+
+
+def prove_family(family: ConstraintFamily, x: Array, notify: Notify = silence,
+                 cells: int = CELLS) -> Proof:
+    """Bound the violation of one family over its whole index set.
+
+    Cells whose enclosure is at most `TOLERANCE` are closed, the others halved; the centres of the worst are probed for a witness.
+    """
+    if family.enclosure is None:
+        return _by_separation(family, x)
+    start = time.perf_counter()
+    lower, upper = family.cells if family.cells is not None else (family.index_set.lower[None], family.index_set.upper[None])
+    closed, examined, best = -np.inf, 0, (-np.inf, lower[0], 0)
+    bounds, split = _bounded(family, x, lower, upper)
+    while True:
+        examined += bounds.size
+        open_ = bounds > TOLERANCE
+        closed = max(closed, float(bounds[~open_].max(initial=-np.inf)))
+        best = max(best, _probe(family, x, lower, upper, bounds), key=lambda found: found[0])
+        if best[0] > TOLERANCE:
+            return Proof(family.name, "refuted", np.inf, best[0], best[1], best[2], examined)
+        if not open_.any():
+            return Proof(family.name, "proven", closed, best[0], best[1], best[2], examined)
+        worst = float(bounds.max())
+        notify(ProofProgress(family=family.name, cells=int(open_.sum()), bound=worst, seconds=time.perf_counter() - start))
+        halves = _halved(lower[open_], upper[open_], split[open_])
+        if halves is None or examined + halves[0].shape[0] > cells:
+            reason = f"{int(open_.sum())} of {examined} cells were left, where a violation of {worst:.1e} is not excluded"
+            return Proof(family.name, "undecided", worst, best[0], best[1], best[2], examined, reason)
+        lower, upper = halves
+        bounds, split = _bounded(family, x, lower, upper)
+
+
+def _bounded(family: ConstraintFamily, x: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+    assert family.enclosure is not None
+    parts = [family.enclosure(x, lower[i:i + BATCH], upper[i:i + BATCH]) for i in range(0, lower.shape[0], BATCH)]
+    return np.concatenate([p.bounds for p in parts]), np.concatenate([p.split for p in parts])
+
+
+def _probe(family: ConstraintFamily, x: Array, lower: Array, upper: Array, bounds: Array) -> tuple[float, Array, int]:
+    worst = np.argsort(-bounds, kind="stable")[:PROBED]
+    centres = (lower[worst] + upper[worst]) / 2
+    values = family.violations(x, centres)
+    position, row = np.unravel_index(int(values.argmax()), values.shape)
+    return float(values[position, row]), centres[position], int(row)
+
+
+def _halved(lower: Array, upper: Array, split: Array) -> tuple[Array, Array] | None:
+    """Both halves of every cell along its coordinate ``split``; ``None`` when a cell is too narrow to be halved in floating point."""
+    rows = np.arange(split.size)
+    middle = (lower[rows, split] + upper[rows, split]) / 2
+    if ((middle <= lower[rows, split]) | (middle >= upper[rows, split])).any():
+        return None
+    left_upper, right_lower = upper.copy(), lower.copy()
+    left_upper[rows, split] = middle
+    right_lower[rows, split] = middle
+    return np.vstack([lower, right_lower]), np.vstack([left_upper, upper])
+
+
+def _by_separation(family: ConstraintFamily, x: Array) -> Proof:
+    """For families without an enclosure: believe a proven bound of their separation, otherwise leave it open."""
+    if family.worst is None:
+        return Proof(family.name, "undecided", np.inf, reason=f"family {family.name} offers no enclosure, so nothing can be excluded")
+    found = family.worst(x)
+    violation = float(found.violations[0]) if found.violations.size else -np.inf
+    index, row = (found.indices[0], int(found.rows[0])) if found.violations.size else (None, 0)
+    if violation > TOLERANCE:
+        return Proof(family.name, "refuted", np.inf, violation, index, row)
+    if found.bound <= TOLERANCE:
+        return Proof(family.name, "proven", found.bound, violation, index, row)
+    return Proof(family.name, "undecided", found.bound, violation, index, row,
+                 reason=f"family {family.name} offers no enclosure, so nothing can be excluded")

@@ -1,0 +1,209 @@
+"""The exchange method: solve with few constraints, add those that the optimiser violates most, until the bounds meet.
+
+Blankenship and Falk (1976) with three additions: the rows are tightened by a tiny margin, so that the optimiser is feasible for
+the whole continuum and its cost is an upper bound; the lower bound comes from multipliers and untightened rows by weak duality;
+and the weight of the regulariser decreases only until the cost stops changing (exact regularisation: Friedlander and Tseng 2007).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TypeAlias
+
+import numpy as np
+
+from sparserob_core.sip.certificate import TOLERANCE, Proof, prove
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.events import RoundFinished
+from sparserob_core.sip.finite import FiniteSolution
+from sparserob_core.sip.method import Method, Tools
+from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation
+from sparserob_core.sip.relaxed import RelaxedProgram, Rows, rows_at
+from sparserob_core.sip.result import Result, Status, Witness, relative_gap
+from sparserob_core.sip.verdict import clash, verdict, witness
+from sparserob_core.sip.separation import search_worst
+
+IDLE_ROUNDS = 3         # rounds that a row may stay without a multiplier before it is dropped
+DROPPING_ROUNDS = 40    # rounds after which rows are only added, so that nothing can cycle
+MARGINS = (1e-10, 1e-6)
+ALLOWED = TOLERANCE / 2  # a violation that the search may leave to the proof
+BUDGET = 2000           # evaluations of the maximiser per family and round, where a family offers no separation
+
+Prover: TypeAlias = Callable[[Array], Sequence[Proof]]
+
+
+@dataclass(frozen=True)
+class Exchange(Method):
+    """Exchange of indices until the relative gap is at most ``tolerance``, in at most ``rounds`` rounds."""
+
+    tolerance: float = 1e-7
+    rounds: int = 200
+
+    def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
+        """`certified` when the gap is closed and every family is proven; infeasible, refuted or undecided otherwise, with the reason."""
+        return self.close(program, tools, lambda x: prove(program, x, tools.notify))
+
+    def close(self, program: SemiInfiniteProgram, tools: Tools, prover: Prover) -> Result:
+        """Close the gap of ``program``; what is claimed of the decision is what ``prover`` proves of it."""
+        return _Run(self, program, tools, prover).solve()
+
+
+@dataclass(eq=False)
+class _Run:
+    """One run: the working rows, the two bounds, the weight of the regulariser and the margin."""
+
+    method: Exchange
+    program: SemiInfiniteProgram
+    tools: Tools
+    prover: Prover
+    started: float = field(default_factory=time.perf_counter)
+    lower: float = -np.inf
+    margin: float = 0.0
+    slater: bool = True
+    history: list[RoundFinished] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.relaxed = RelaxedProgram(self.program, self.tools.solver, self.tools.regulariser)
+        self.rows = Rows.none(self.program.n)
+        self.idle = np.zeros(0, dtype=int)
+        self.epsilon = 0.0 if self.tools.regulariser is None else self.tools.continuation.start
+        self.guess: FiniteSolution | None = None
+
+    def solve(self) -> Result:
+        proofs: Sequence[Proof] = ()
+        for number in range(1, self.method.rounds + 1):
+            solution = self._relax()
+            if solution.status != "optimal":
+                return self._without_answer(solution)
+            separations = self._separate(solution.x)
+            worst = _worst(separations)
+            self._tell(number, solution, worst, separations)
+            if worst.violation > ALLOWED:
+                self._exchange(solution, [(s.indices[s.violations > ALLOWED], s.rows[s.violations > ALLOWED], f.name) for f, s in separations])
+                continue
+            if self._open(solution) and self._sharpen(solution):
+                continue
+            proofs = self.prover(solution.x)
+            refuted = [proof for proof in proofs if proof.verdict == "refuted"]
+            if not refuted:
+                return self._finished(solution, worst, proofs)
+            self._exchange(solution, [(p.index[None], np.array([p.row]), p.family) for p in refuted if p.index is not None])
+        return self._finished(solution, worst, proofs or self.prover(solution.x))
+
+    def _relax(self) -> FiniteSolution:
+        """Solve the relaxed program, with the regulariser as light as it must be for the cost to be exact."""
+        solution = self._solved(self.epsilon)
+        regu = self.tools.continuation
+        while solution.status == "optimal" and self.epsilon > regu.stop and self._open(solution):
+            lighter = max(regu.stop, self.epsilon * regu.factor)
+            candidate = self._solved(lighter)
+            if candidate.status != "optimal":
+                break
+            changed = abs(self.program.cost(candidate.x) - self.program.cost(solution.x)) > regu.tolerance * max(1.0, abs(self.lower))
+            self.epsilon, solution = lighter, candidate
+            if not changed and self._open(solution):
+                self._plain_bound()
+        return solution
+
+    def _solved(self, epsilon: float) -> FiniteSolution:
+        solution = self.relaxed.solve(self.rows, epsilon, self.margin, self.guess)
+        if solution.status == "infeasible" and self.margin > 0.0:  # the margin, not the program, may be at fault: no Slater point
+            self.margin, self.slater = 0.0, False
+            solution = self.relaxed.solve(self.rows, epsilon, 0.0, None)
+        if solution.status == "optimal":
+            self.guess = solution
+            self.lower = max(self.lower, self.relaxed.lower_bound(self.rows, solution))
+            self._set_margin(solution)
+        return solution
+
+    def _plain_bound(self) -> FiniteSolution:
+        """The unregularised relaxed program: only its multipliers are wanted, for the lower bound."""
+        plain = self.relaxed.solve(self.rows, 0.0, self.margin)
+        if plain.status == "optimal":
+            self.lower = max(self.lower, self.relaxed.lower_bound(self.rows, plain))
+        return plain
+
+    def _open(self, solution: FiniteSolution) -> bool:
+        return relative_gap(self.lower, self.program.cost(solution.x)) > self.method.tolerance
+
+    def _sharpen(self, solution: FiniteSolution) -> bool:
+        """The decision is feasible but its gap is open: try what else can close it; ``False`` when nothing is left."""
+        if self.epsilon == 0.0:
+            return False
+        plain = self._plain_bound()
+        if not self._open(solution) or plain.status != "optimal":
+            return False
+        self.epsilon, self.guess = 0.0, None  # the regulariser is not exact at its lightest: go on without it
+        return True
+
+    def _set_margin(self, solution: FiniteSolution) -> None:
+        """Tighten the rows as much as a tenth of the tolerated gap pays for."""
+        if not self.slater or not self.rows.h.size:
+            return
+        price = float(self._multipliers(solution) @ np.linalg.norm(self.rows.G, axis=1))
+        budget = 0.1 * self.method.tolerance * max(1.0, abs(solution.value))
+        margin = float(np.clip(budget / max(price, 1e-12), *MARGINS))
+        if self.margin == 0.0 or margin < 0.5 * self.margin:
+            self.margin = margin
+
+    def _multipliers(self, solution: FiniteSolution) -> Array:
+        return solution.y[solution.y.size - self.rows.h.size:]
+
+    def _separate(self, x: Array) -> list[tuple[ConstraintFamily, Separation]]:
+        return [(family, family.worst(x) if family.worst is not None
+                 else search_worst(family, x, self.tools.maximiser, BUDGET, self.tools.rng)) for family in self.program.families]
+
+    def _exchange(self, solution: FiniteSolution, violated: Sequence[tuple[Array, np.ndarray, str]]) -> None:
+        """Drop the rows that have been slack for a while, add the violated ones."""
+        y = self._multipliers(solution)
+        self.idle = np.where(y > 0.0, 0, self.idle + 1)
+        keep = (self.idle < IDLE_ROUNDS) | (len(self.history) > DROPPING_ROUNDS)
+        self.rows, self.idle = self.rows.take(keep), self.idle[keep]
+        known = {(cut.family, cut.row, cut.index.tobytes()) for cut in self.rows.cuts}
+        for indices, rows, family in violated:
+            new = np.array([(family, int(r), i.tobytes()) not in known for i, r in zip(indices, rows, strict=True)], dtype=bool)
+            if new.any():
+                self.rows = self.rows.joined(rows_at(self.program, family, indices[new], rows[new]))
+        added = self.rows.h.size - self.idle.size
+        self.idle = np.concatenate([self.idle, np.zeros(added, dtype=int)])
+        fixed = solution.y[:solution.y.size - y.size]
+        self.guess = replace(solution, y=np.concatenate([fixed, y[keep], np.zeros(added)]))
+
+    def _tell(self, number: int, solution: FiniteSolution, worst: Witness, separations: Sequence[tuple[ConstraintFamily, Separation]]) -> None:
+        feasible = worst.violation <= ALLOWED
+        event = RoundFinished(
+            round=number, epsilon=self.epsilon, lower_bound=self.lower, violation=worst.violation, worst_family=worst.constraint,
+            upper_bound=self.program.cost(solution.x) if feasible else np.inf, active_indices=self.rows.h.size,
+            cuts_added=sum(int((s.violations > ALLOWED).sum()) for _, s in separations),
+            relaxed_programs=self.relaxed.solves, seconds=time.perf_counter() - self.started)
+        self.history.append(event)
+        self.tools.notify(event)
+
+    def _finished(self, solution: FiniteSolution, worst: Witness, proofs: Sequence[Proof]) -> Result:
+        cost = self.program.cost(solution.x)
+        gap = relative_gap(self.lower, cost)
+        status, message = verdict(proofs, gap, self.method.tolerance)
+        return self._result(status, message, solution, cost, witness(self.program, worst, proofs))
+
+    def _without_answer(self, solution: FiniteSolution) -> Result:
+        if solution.status != "infeasible":
+            return self._result("failed", "; ".join(solution.attempts) or solution.message, solution, np.nan, None)
+        message, worst = clash(self.program, self.rows, self._multipliers(solution), solution.infeasibility)
+        return self._result("infeasible", message, solution, np.nan, worst)
+
+    def _result(self, status: Status, message: str, solution: FiniteSolution, cost: float, worst: Witness | None) -> Result:
+        y = self._multipliers(solution) if solution.y.size >= self.rows.h.size else np.zeros(self.rows.h.size)
+        cuts = tuple(replace(cut, multiplier=float(m)) for cut, m in zip(self.rows.cuts, y, strict=True) if m > 0.0)
+        return Result(
+            status=status, message=message, decision=solution.x if status not in ("infeasible", "failed") else None,
+            cost=cost, value=solution.value, epsilon=self.epsilon, lower_bound=np.inf if status == "infeasible" else self.lower,
+            upper_bound=cost if status in ("certified", "verified") else np.inf, worst=worst, indices=cuts,
+            counts={"relaxed_programs": self.relaxed.solves, "rounds": len(self.history), "active_indices": len(cuts)},
+            history=tuple(self.history), seconds=time.perf_counter() - self.started)
+
+
+def _worst(separations: Sequence[tuple[ConstraintFamily, Separation]]) -> Witness:
+    found = [Witness(float(s.violations[0]), family.name, s.indices[0], int(s.rows[0])) for family, s in separations if s.violations.size]
+    return max(found, key=lambda one: one.violation, default=Witness(-np.inf, "", np.zeros(0)))

@@ -1,0 +1,116 @@
+"""The finite program that is left when finitely many indices are imposed, and a checked answer to it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_array
+
+
+@dataclass(frozen=True, eq=False)
+class FiniteProgram:
+    """minimise ``sum_k weights_k |(S x)_k| + 1/2 x'P x + q'x``
+    subject to ``lower <= S x <= upper``, ``G x <= h``, ``A x = b``.
+
+    Shapes: ``q (n,)``, ``P (n, n)`` symmetric positive semidefinite or ``None``, ``S (k, n)`` or ``None`` for the
+    identity, ``weights, lower, upper (k,)`` with ``weights >= 0``, ``G (r, n)``, ``h (r,)``, ``A (e, n)``, ``b (e,)``.
+    Entries of ``lower`` may be ``-inf``, entries of ``upper`` and ``h`` may be ``inf``. Arrays must not be written to
+    after the program is built: what depends on ``S``, ``weights`` and the bounds alone is remembered between programs.
+    """
+
+    q: Array
+    weights: Array
+    lower: Array
+    upper: Array
+    G: Array
+    h: Array
+    A: Array
+    b: Array
+    P: csc_array | None = None
+    S: csc_array | None = None
+
+    @property
+    def n(self) -> int:
+        """Number of decision variables."""
+        return int(self.q.size)
+
+    def image(self, x: Array) -> Array:
+        """``S x`` ``(k,)``."""
+        return x if self.S is None else np.asarray(self.S @ x, dtype=float)
+
+    def objective(self, x: Array) -> float:
+        """The cost at ``x``."""
+        quadratic = 0.0 if self.P is None else 0.5 * float(x @ (self.P @ x))
+        return float(self.weights @ np.abs(self.image(x)) + self.q @ x) + quadratic
+
+    def residual(self, x: Array) -> float:
+        """The largest violation of bounds, rows and equalities at ``x``, each divided by its own scale (see `scaled_violation`)."""
+        size = np.abs(x)
+        worst = 0.0
+        if self.G.shape[0]:
+            worst = scaled_violation(self.G @ x - self.h, self.G, self.h, size)
+        if self.A.shape[0]:
+            worst = max(worst, scaled_violation(np.abs(self.A @ x - self.b), self.A, self.b, size))
+        image = self.image(x)
+        outside = np.maximum(self.lower - image, image - self.upper) / np.maximum(1.0, np.abs(image))
+        return max(worst, float(outside.max(initial=0.0)))
+
+    def validate(self) -> None:
+        """Raise `InputError` when shapes disagree or a number is not one."""
+        k = self.n if self.S is None else int(self.S.shape[0])
+        shapes = {"weights": (k,), "lower": (k,), "upper": (k,), "G": (self.h.size, self.n), "A": (self.b.size, self.n)}
+        for name, shape in shapes.items():
+            if getattr(self, name).shape != shape:
+                raise InputError(f"finite program: {name} has shape {getattr(self, name).shape}, expected {shape}")
+        for name in ("q", "weights", "G", "A", "b"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise InputError(f"finite program: {name} has an entry that is not a finite number")
+        if np.isnan(self.lower).any() or np.isnan(self.upper).any() or np.isnan(self.h).any():
+            raise InputError("finite program: a bound or right-hand side is NaN")
+        if np.isneginf(self.h).any() or (self.weights < 0).any():
+            raise InputError("finite program: expected weights >= 0 and right-hand sides above -inf")
+
+
+def scaled_violation(violations: Array, rows: Array, rhs: Array, size: Array) -> float:
+    """``max_i violations_i / max(min(1, |rows_i|), |rhs_i| + |rows_i| size)``.
+
+    A row of ordinary size is judged by its absolute violation, a short row by the distance to its half-space, and any
+    row leniently only where the numbers that cancel in it are themselves large.
+    """
+    magnitude = np.where(np.isfinite(rhs), np.abs(rhs), 0.0) + np.abs(rows) @ size
+    length = np.minimum(1.0, np.sqrt(np.einsum("ij,ij->i", rows, rows)))
+    scale = np.maximum(np.maximum(length, magnitude), np.finfo(float).tiny)
+    return max(0.0, float((violations / scale).max(initial=0.0)))
+
+
+@dataclass(frozen=True, eq=False)
+class FiniteSolution:
+    """What was *checked* about a finite program; no number here was taken from a solver unread.
+
+    ``status``: ``optimal`` (``residual`` and ``gap`` are below the tolerance), ``infeasible`` (``infeasibility`` is proven) or ``failed``.
+    ``value`` is the cost at ``x (n,)``; ``lower_bound`` is proven by weak duality from ``y (r,) >= 0`` (of ``G x <= h``),
+    ``mu (e,)`` (of ``A x = b``) and ``z (k,)`` (of ``s = S x``), with ``P x + q + G'y + A'mu + S'z = 0`` at an optimum.
+    ``residual``: see `FiniteProgram.residual`; ``gap = value - lower_bound``. ``infeasibility``: a proven lower bound of the
+    smallest ``t`` for which ``G_i x <= h_i + t |G_i|`` and ``|A_i x - b_i| <= t |A_i|`` can be met within the bounds.
+    ``attempts``: what was tried and why it was not believed.
+    """
+
+    status: Literal["optimal", "infeasible", "failed"]
+    x: Array
+    value: float
+    lower_bound: float
+    y: Array
+    mu: Array
+    z: Array
+    residual: float
+    gap: float
+    message: str = ""
+    attempts: tuple[str, ...] = ()
+    infeasibility: float = 0.0

@@ -1,0 +1,174 @@
+"""Semi-infinite programs: one decision, finitely many terms in the cost, families of uncountably many constraints."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import Array, Box, as_bound
+from sparserob_core.sip.finite import FiniteProgram
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_array
+
+
+@dataclass(frozen=True, eq=False)
+class Separation:
+    """The most violated constraints of one family at a decision, worst first.
+
+    ``indices (k, d)``, ``rows (k,)`` the row of the family at that index, ``violations (k,)`` (``rows x - rhs``, negative when
+    satisfied), and ``bound``: a proven upper bound on the family's violation over its whole index set, ``inf`` if none is known.
+    """
+
+    indices: Array
+    rows: Array
+    violations: Array
+    bound: float = np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Enclosure:
+    """Proven upper bounds ``(k,)`` of the violation on index cells, and the coordinate ``(k,)`` whose halving would help most."""
+
+    bounds: Array
+    split: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """One constraint in words (``text``), and its time, parameter ``(nu,)`` and worst disturbance ``(mw, pieces)`` where it has them."""
+
+    text: str
+    time: float | None = None
+    parameter: Array | None = None
+    disturbance: Array | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ConstraintFamily:
+    """``rows(xi) x <= rhs(xi)`` for every index ``xi`` in a compact box.
+
+    ``rows`` maps indices ``(k, d)`` to ``(G (k, r, n), h (k, r))``. The rest is optional, and used when offered:
+
+    ``worst(x)``      exact separation (a `Separation`);
+    ``enclosure(x, lower (k, d), upper (k, d))``  an `Enclosure` of the violation on cells, for proofs;
+    ``cells``         ``(lower, upper)``, a partition of the index set on whose cells the enclosure converges;
+    ``gradient(x, indices (k, d), rows (k,))``  derivative ``(k, d)`` of ``row x - rhs`` in the index;
+    ``nominal``       the same constraints without the uncertainty;
+    ``sample(count, rng)``  the same constraints for ``count`` sampled uncertainties only;
+    ``explain(index (d,), row)``  the constraint in words and, for control problems, where it is (an `Explanation`).
+    """
+
+    name: str
+    index_set: Box
+    rows: Callable[[Array], tuple[Array, Array]]
+    worst: Callable[[Array], Separation] | None = None
+    enclosure: Callable[[Array, Array, Array], Enclosure] | None = None
+    cells: tuple[Array, Array] | None = None
+    gradient: Callable[[Array, Array, Array], Array] | None = None
+    nominal: ConstraintFamily | None = None
+    sample: Callable[[int, np.random.Generator], ConstraintFamily] | None = None
+    explain: Callable[[Array, int], Explanation] | None = None
+
+    def violations(self, x: Array, indices: Array) -> Array:
+        """``rows(xi) x - rhs(xi)`` at indices ``(k, d)``, as ``(k, r)``; positive where violated."""
+        G, h = self.rows(indices)
+        return np.asarray(G @ x - h, dtype=float)
+
+
+@dataclass(frozen=True, eq=False)
+class SemiInfiniteProgram:
+    """minimise ``sum_k weights_k |(S x)_k| + 1/2 x'P x + q'x`` subject to ``lower <= S x <= upper``, ``G x <= h``, ``A x = b``
+    and every constraint family at every index.
+
+    ``n`` is the number of decision variables; ``S (k, n)`` is the identity when ``None``; ``lower``, ``upper`` and ``weights``
+    are numbers or ``(k,)``. ``lengths``: how much each entry of ``S x`` counts in a weighted regulariser (piece lengths), ``(k,)``.
+    """
+
+    n: int
+    families: Sequence[ConstraintFamily] = ()
+    q: Array | None = None
+    P: object | None = None
+    weights: Array | float | None = None
+    S: object | None = None
+    lower: Array | float = -np.inf
+    upper: Array | float = np.inf
+    G: Array | None = None
+    h: Array | None = None
+    A: Array | None = None
+    b: Array | None = None
+    channels: int = 1
+    lengths: Array | None = None
+    finite: FiniteProgram = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if isinstance(self.n, bool) or not isinstance(self.n, int) or self.n < 1:
+            raise InputError(f"n: expected the number of decision variables, at least 1, got {self.n!r}")
+        S, P = _sparse("S", self.S, None), _sparse("P", self.P, self.n)
+        if S is not None and S.shape[1] != self.n:
+            raise InputError(f"S: expected {self.n} columns, got shape {S.shape}")
+        images = self.n if S is None else int(S.shape[0])
+        G, h = self._rows("G", self.G, "h", self.h)
+        A, b = self._rows("A", self.A, "b", self.b)
+        weights = _vector("weights", 0.0 if self.weights is None else self.weights, images)
+        if (weights < 0).any():
+            raise InputError(f"weights: expected numbers that are not negative, got {weights.min()}")
+        lower, upper = as_bound("lower", self.lower, images), as_bound("upper", self.upper, images)
+        if (lower > upper).any():
+            raise InputError("lower: is above upper, so nothing is feasible")
+        q = _vector("q", 0.0 if self.q is None else self.q, self.n)
+        names = [family.name for family in self.families]
+        if len(set(names)) < len(names):
+            raise InputError(f"families: names must differ, got {names}")
+        object.__setattr__(self, "families", tuple(self.families))
+        object.__setattr__(self, "finite", FiniteProgram(q=q, weights=weights, lower=lower, upper=upper, G=G, h=h, A=A, b=b, P=P, S=S))
+
+    def _rows(self, left: str, matrix: object, right: str, bounds: object) -> tuple[Array, Array]:
+        if (matrix is None) != (bounds is None):
+            raise InputError(f"{left}, {right}: give both or neither")
+        if matrix is None:
+            return np.zeros((0, self.n)), np.zeros(0)
+        rows = np.atleast_2d(np.asarray(matrix, dtype=float))
+        if rows.ndim != 2 or rows.shape[1] != self.n or not np.isfinite(rows).all():
+            raise InputError(f"{left}: expected finite numbers of shape (rows, {self.n}), got shape {rows.shape}")
+        return rows, _vector(right, bounds, rows.shape[0])
+
+    @property
+    def image_size(self) -> int:
+        """Entries of ``S x`` that the regulariser is about: those with a length, or all of them."""
+        return self.finite.weights.size if self.lengths is None else int(np.size(self.lengths))
+
+    def family(self, name: str) -> ConstraintFamily:
+        """The family of that name."""
+        return next(family for family in self.families if family.name == name)
+
+    def cost(self, x: Array) -> float:
+        """``J(x)``, recomputed from the data."""
+        return self.finite.objective(x)
+
+
+def _vector(name: str, value: object, size: int) -> Array:
+    vector = as_bound(name, value, size)
+    if not np.isfinite(vector).all():
+        raise InputError(f"{name}: expected finite numbers, got {vector.tolist()}")
+    return vector
+
+
+def _sparse(name: str, matrix: object, square: int | None) -> csc_array | None:
+    if matrix is None:
+        return None
+    from scipy.sparse import csc_array as sparse
+
+    try:
+        array = sparse(matrix)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: expected a matrix of numbers, got {matrix!r}") from error
+    if array.ndim != 2 or not np.isfinite(array.data).all():
+        raise InputError(f"{name}: expected a matrix of finite numbers, got shape {array.shape}")
+    if square is not None and array.shape != (square, square):
+        raise InputError(f"{name}: expected shape ({square}, {square}), got {array.shape}")
+    return array

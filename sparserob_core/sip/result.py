@@ -1,0 +1,86 @@
+"""What a method returns: a decision, two bounds that are meant to meet, and what was proven of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+import numpy as np
+
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from sparserob_core.sip.events import RoundFinished
+
+Status: TypeAlias = Literal["certified", "verified", "infeasible", "refuted", "undecided", "failed"]
+
+MEANING: Mapping[Status, str] = {
+    "certified": "the constraints are proven for the whole continuum and the gap is closed",
+    "verified": "the constraints are proven for the whole continuum, but the gap is not closed",
+    "infeasible": "no decision satisfies the constraints; the multipliers prove it",
+    "refuted": "a witness violates the constraints",
+    "undecided": "no violation was found, but none was excluded",
+    "failed": "no checked answer was reached",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Cut:
+    """One imposed constraint: row ``row`` of family ``family`` at ``index (d,)``, with its multiplier in the last relaxed program."""
+
+    family: str
+    index: Array
+    row: int
+    multiplier: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Witness:
+    """The worst constraint found: by how much it is violated (negative: satisfied with that margin), which one, and where.
+
+    ``time``, ``parameter`` and ``disturbance`` are filled for control problems; ``disturbance`` is ``(mw, pieces)``.
+    """
+
+    violation: float
+    constraint: str
+    index: Array
+    row: int = 0
+    time: float | None = None
+    parameter: Array | None = None
+    disturbance: Array | None = field(default=None, repr=False)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Result:
+    """The outcome of a method.
+
+    ``cost`` is ``J`` of ``decision`` (no regulariser), ``value`` is ``J + epsilon rho``; ``lower_bound`` and ``upper_bound`` enclose the
+    value of the *unregularised* semi-infinite program (``upper_bound`` only when ``status`` is certified or verified), and
+    ``gap = (upper_bound - lower_bound) / max(1, |upper_bound|)``.
+    """
+
+    status: Status
+    message: str
+    decision: Array | None = None
+    cost: float = np.nan
+    value: float = np.nan
+    epsilon: float = 0.0
+    lower_bound: float = -np.inf
+    upper_bound: float = np.inf
+    worst: Witness | None = None
+    indices: Sequence[Cut] = ()
+    counts: Mapping[str, int] = field(default_factory=dict)
+    history: Sequence[RoundFinished] = ()
+    seconds: float = 0.0
+
+    @property
+    def gap(self) -> float:
+        return relative_gap(self.lower_bound, self.upper_bound)
+
+
+def relative_gap(lower: float, upper: float) -> float:
+    """``(upper - lower) / max(1, |upper|)``, infinite when either bound is."""
+    if not (np.isfinite(lower) and np.isfinite(upper)):
+        return float("inf")
+    return float((upper - lower) / max(1.0, abs(upper)))

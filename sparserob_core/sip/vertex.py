@@ -1,0 +1,33 @@
+"""Multipliers of the unregularised program from a decision of the regularised one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.finite import FiniteProgram
+
+FREE = 1e-7     # an entry further than this from 0 and from both bounds, relative to their distance, is free
+ACTIVE = 1e-9   # a row with a multiplier above this, relative to the largest, is active
+
+
+def vertex_multipliers(program: FiniteProgram, x: Array, y: Array, mu: Array) -> tuple[Array, Array]:
+    """``(y, mu)`` that make the linearised cost stationary in the free entries of ``x (n,)``, in the least-squares sense.
+
+    The multipliers ``y (r,)``, ``mu (e,)`` of a regularised program differ from those of the plain one by the slope of the regulariser; at
+    an exactly regularised optimiser these are the plain ones (Friedlander and Tseng 2007, section 2). Any answer is safe: weak duality
+    decides what it is worth. ``S`` must be the identity and ``P`` absent, otherwise the multipliers come back unchanged.
+    """
+    active = np.flatnonzero(y > ACTIVE * y.max(initial=0.0))
+    if program.S is not None or program.P is not None or not active.size + mu.size:
+        return y, mu
+    width = np.where(np.isfinite(program.upper - program.lower), program.upper - program.lower, 1.0)
+    away = np.minimum(np.abs(x), np.minimum(x - program.lower, program.upper - x))
+    free = away > FREE * width
+    rows = np.vstack([program.G[active], program.A])[:, free]
+    slope = -program.q[free] - program.weights[free] * np.sign(x[free])
+    start = np.concatenate([y[active], mu])
+    moved = start + np.linalg.lstsq(rows.T, slope - rows.T @ start, rcond=1e-10)[0]
+    plain = np.zeros_like(y)
+    plain[active] = np.maximum(moved[:active.size], 0.0)
+    return plain, moved[active.size:]

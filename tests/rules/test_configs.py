@@ -1,0 +1,79 @@
+"""Every config is complete, commented, valid, and comes back with the answer that is expected of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+import sparserob_core as sr
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+
+# status, and the cost J where a closed form or an independent linear program knows it (relative tolerance beside it)
+EXPECTED: dict[str, tuple[str, float | None, float]] = {
+    "breakpoints": ("certified", None, 0.0),
+    "coupled_masses": ("certified", None, 0.0),
+    "double_integrator": ("certified", 1.6, 1e-6),
+    "ellipsoidal": ("certified", None, 0.0),
+    "experiment1_nominal": ("refuted", 0.175769, 5e-6),
+    "experiment1_printed": ("infeasible", None, 0.0),
+    "experiment1_repaired": ("certified", 0.63212, 2e-5),
+    "experiment1_scenario": ("refuted", None, 0.0),
+    "experiment2_printed": ("infeasible", None, 0.0),
+    "experiment2_repaired": ("certified", 1.02007, 2e-5),
+    "experiment3_printed": ("infeasible", None, 0.0),
+    "experiment3_repaired": ("certified", 1.11230, 2e-5),
+    "haar": ("certified", None, 0.0),
+    "parameters_and_disturbance": ("certified", None, 0.0),
+    "walsh": ("certified", None, 0.0),
+}
+
+
+def test_the_table_of_expectations_is_complete() -> None:
+    assert {path.stem for path in CONFIGS.glob("*.yaml")} == set(EXPECTED)
+
+
+@pytest.mark.parametrize("name", sorted(EXPECTED))
+def test_a_config_says_what_it_shows(name: str) -> None:
+    first, second, *_ = (CONFIGS / f"{name}.yaml").read_text().splitlines()
+    assert first == "# yaml-language-server: $schema=./schema.json"
+    assert second.startswith("# ")
+
+
+@pytest.mark.parametrize("name", sorted(EXPECTED))
+def test_a_config_comes_back_with_the_expected_answer(name: str, tmp_path: Path) -> None:
+    status, cost, tolerance = EXPECTED[name]
+    outcome = sr.run(CONFIGS / f"{name}.yaml", {"observers": []}, out=tmp_path / "run")
+    assert outcome.result.status == status, outcome.result.message
+    if cost is not None:
+        assert outcome.result.cost == pytest.approx(cost, rel=tolerance)
+    if status == "certified":
+        assert outcome.result.gap <= 1e-6
+    written = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert written["status"] == status
+
+
+@pytest.mark.parametrize("name", sorted(name for name, (status, *_) in EXPECTED.items() if status == "infeasible"))
+def test_an_infeasible_config_says_which_constraint_is_at_fault_and_when(name: str, tmp_path: Path) -> None:
+    message = sr.run(CONFIGS / f"{name}.yaml", {"observers": []}, out=tmp_path / "run").result.message
+    assert "path" in message or "terminal" in message
+    assert "t = " in message
+
+
+def test_the_schema_in_the_folder_is_the_schema_of_the_program() -> None:
+    import jsonschema
+    from ruamel.yaml import YAML
+
+    schema = json.loads((CONFIGS / "schema.json").read_text())
+    jsonschema.Draft202012Validator.check_schema(schema)
+    validator = jsonschema.Draft202012Validator(schema)
+    for path in sorted(CONFIGS.glob("*.yaml")):
+        validator.validate(YAML(typ="safe", pure=True).load(path))
+
+
+def test_certified_costs_are_ordered_as_the_uncertainty_grows(tmp_path: Path) -> None:
+    costs = [sr.run(CONFIGS / "double_integrator.yaml", {"problem.disturbance.box": [w, w], "observers": []}, out=tmp_path / str(w)).result.cost
+             for w in (0.0, 0.01, 0.02)]
+    assert costs == sorted(costs)

@@ -1,0 +1,88 @@
+"""Documentation is executed: every command and every snippet of README.md and docs/, in the order in which a reader meets them.
+
+A fence may carry ``title=name`` (it is saved under that name), ``status=n`` (the command must exit with that status) and nothing else.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "docs" / "decisions").glob("*.md"))]
+FENCE = re.compile(r"^```(\w*)([^\n]*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+LINK = re.compile(r"\[[^\]]*\]\(([^)#\s]+)(?:#[^)]*)?\)")
+
+
+@dataclass(frozen=True)
+class Fence:
+    """One block of a page: its language, its attributes, its text."""
+
+    language: str
+    attributes: dict[str, str]
+    text: str
+
+
+def fences(page: Path) -> Iterator[Fence]:
+    for language, attributes, text in FENCE.findall(page.read_text()):
+        yield Fence(language, dict(item.split("=", 1) for item in attributes.split()), text)
+
+
+def relative(path: Path) -> str:
+    return str(path.relative_to(ROOT))
+
+
+def environment(place: Path) -> dict[str, str]:
+    """The tests' own interpreter first on the path, and a ``sparserob`` even where the scripts are not installed."""
+    script = place / ".bin" / "sparserob"
+    script.parent.mkdir()
+    script.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m sparserob_core "$@"\n')
+    script.chmod(0o755)
+    return {**os.environ, "PATH": os.pathsep.join([str(script.parent), str(Path(sys.executable).parent), os.environ["PATH"]])}
+
+
+def execute(fence: Fence, place: Path, variables: dict[str, str]) -> None:
+    if "title" in fence.attributes:
+        (place / fence.attributes["title"]).write_text(fence.text)
+        return
+    command = {"bash": ["bash", "-e", "-c"], "python": [sys.executable, "-W", "error", "-c"]}.get(fence.language)
+    if command is None:
+        return
+    done = subprocess.run([*command, fence.text], cwd=place, env=variables, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == int(fence.attributes.get("status", "0")), f"{fence.text}\n{done.stdout}\n{done.stderr}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=relative)
+def test_every_command_and_snippet_of_a_page_runs(page: Path, tmp_path: Path) -> None:
+    blocks = list(fences(page))
+    if not any(block.language in {"bash", "python"} for block in blocks):
+        return
+    shutil.copytree(ROOT / "configs", tmp_path / "configs")
+    variables = environment(tmp_path)
+    for block in blocks:
+        execute(block, tmp_path, variables)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=relative)
+def test_links_between_pages_lead_somewhere(page: Path) -> None:
+    targets = [link for link in LINK.findall(page.read_text()) if not link.startswith(("http://", "https://"))]
+    assert not [target for target in targets if not (page.parent / target).exists()]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=relative)
+def test_make_targets_that_a_page_names_exist(page: Path) -> None:
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    assert set(re.findall(r"\bmake ([a-z-]+)(?=`|\s{2,}#)", page.read_text())) <= targets
+
+
+@pytest.mark.parametrize("page", PAGES, ids=relative)
+def test_fences_carry_known_attributes_only(page: Path) -> None:
+    assert all(set(block.attributes) <= {"title", "status"} for block in fences(page))
