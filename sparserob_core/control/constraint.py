@@ -8,13 +8,16 @@ from typing import TypeVar
 
 import numpy as np
 
+from sparserob_core.control.combination import Combination
 from sparserob_core.control.enclosure import CellEnclosure
 from sparserob_core.control.functional import WorstCase
 from sparserob_core.control.lifted import LiftedSystem, lift
+from sparserob_core.control.measurable import MeasurablePush
 from sparserob_core.control.parameters import ParameterIndex
 from sparserob_core.control.peaks import climb, local_maxima, vertex_times
 from sparserob_core.control.push import Push
 from sparserob_core.control.response import distinct_times, transitions
+from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.program import Enclosure, Explanation, Separation
 
@@ -49,9 +52,16 @@ class FlatConstraint:
 
     def rows(self, indices: Array) -> tuple[Array, Array]:
         """``G (k, r, n)``, ``rhs (k, r)`` at indices ``(k, 1 + nu)``."""
-        count, r = indices.shape[0], self.h.size
-        G, offset = self.functionals.rows(*self._expand(indices))
-        return G.reshape(count, r, -1), self.h - offset.reshape(count, r)
+        times, directions, parameters, rhs = self.functionals_at(indices)
+        G, offset = self.functionals.rows(times, directions, parameters)
+        shape = (indices.shape[0], self.h.size)
+        return G.reshape(*shape, -1), (rhs - offset).reshape(shape)
+
+    def functionals_at(self, indices: Array) -> tuple[Array, Array, Array, Array]:
+        """Times, directions, parameters and right-hand sides of all ``r`` constraints of every index, index by index: ``(k r, ...)``."""
+        parameters = np.repeat(self.parameters.clamp(indices[:, 1:]), self.h.size, axis=0)
+        count = indices.shape[0]
+        return np.repeat(indices[:, 0], self.h.size), np.tile(self.H, (count, 1)), parameters, np.tile(self.h, count)
 
     def violations(self, x: Array, indices: Array, rows: np.ndarray) -> Array:
         """``row x - rhs`` for one row per index, ``(k,)``, without building rows."""
@@ -60,9 +70,9 @@ class FlatConstraint:
 
     def worst(self, x: Array) -> Separation:
         """The largest local maxima of the violation over the index set, times refined between the nodes, parameters between lattice points."""
-        values = self._on_lattice(x)
-        positions = local_maxima(values, self._lattice[1], KEPT)
-        indices = np.hstack([vertex_times(values, positions, self.times)[:, None], self._lattice[0][positions[:, 0]]])
+        values = self.on_lattice(x)
+        positions = local_maxima(values, self.lattice[1], KEPT)
+        indices = np.hstack([vertex_times(values, positions, self.times)[:, None], self.lattice[0][positions[:, 0]]])
         rows = positions[:, 1]
         if self.parameters.count:
             indices, found = self._zoomed(x, indices, rows)
@@ -108,24 +118,32 @@ class FlatConstraint:
             members = touched[which.reshape(-1) == group]
             cell = self._cell(x, lower[members[0], 1:], upper[members[0], 1:])
             bounds[members], drift, spread = cell.bounds(lower[members, 0], upper[members, 0])
-            split[members] = self._advice(drift, spread, bounds[members])
+            split[members] = where_to_halve(drift, spread, bounds[members])
         return Enclosure(bounds, split)
+
+    def lifted(self, low: Array, high: Array) -> LiftedSystem:
+        """The lifted system over a cell of parameters, remembered."""
+        key = low.tobytes() + high.tobytes()
+        if key not in self._lifted:
+            response = self.functionals.response
+            remember(self._lifted, key, lift(response.system, response.grid, response.initial_state, (low + high) / 2, (high - low) / 2))
+        return self._lifted[key]
 
     def _cell(self, x: Array, low: Array, high: Array) -> CellEnclosure:
         key = x.tobytes() + low.tobytes() + high.tobytes()
         if key not in self._cells:
-            lifted, push = self._lifted(low, high)
+            lifted = self.lifted(low, high)
             control = x.reshape(-1, self.functionals.dictionary.functions) @ self.functionals.dictionary.values
-            _remember(self._cells, key, CellEnclosure(lifted, push, self.H, self.h, control))
+            rhs = np.zeros((self.h.size, lifted.space.size))
+            rhs[:, 0] = self.h
+            remember(self._cells, key, CellEnclosure(lifted, self._push(low, high), self.H, rhs, control))
         return self._cells[key]
 
-    def _lifted(self, low: Array, high: Array) -> tuple[LiftedSystem, Push | None]:
+    def _push(self, low: Array, high: Array) -> Push | MeasurablePush | None:
+        lifted = self.lifted(low, high)
         key = low.tobytes() + high.tobytes()
         if key not in self._pushes:
-            response, model = self.functionals.response, self.functionals.disturbance
-            lifted = lift(response.system, response.grid, response.initial_state, (low + high) / 2, (high - low) / 2)
-            push = None if model is None else Push(lifted, model, self.H @ lifted.transform)
-            _remember(self._pushes, key, (lifted, push))
+            remember(self._pushes, key, push_of(self.functionals, lifted, self.H))
         return self._pushes[key]
 
     @cached_property
@@ -133,18 +151,12 @@ class FlatConstraint:
         return {}
 
     @cached_property
-    def _pushes(self) -> dict[bytes, tuple[LiftedSystem, Push | None]]:
+    def _lifted(self) -> dict[bytes, LiftedSystem]:
         return {}
 
-    @staticmethod
-    def _advice(drift: Array, spread: Array, bounds: Array) -> np.ndarray:
-        """Halve the times where they matter most, else one parameter, the same for the whole group so that its cells stay shared."""
-        if not spread.shape[1]:
-            return np.zeros(drift.size, dtype=int)
-        open_ = bounds > 0
-        total = spread[open_].sum(axis=0) if open_.any() else spread.sum(axis=0)
-        widest = int(total.argmax())
-        return np.where(drift > spread.max(axis=1), 0, 1 + widest)
+    @cached_property
+    def _pushes(self) -> dict[bytes, Push | MeasurablePush | None]:
+        return {}
 
     @cached_property
     def times(self) -> Array:
@@ -156,20 +168,21 @@ class FlatConstraint:
         return distinct_times(np.concatenate([[self.start], inside, [self.stop]]), float(grid.breakpoints[-1]))
 
     @cached_property
-    def _lattice(self) -> tuple[Array, tuple[int, ...]]:
+    def lattice(self) -> tuple[Array, tuple[int, ...]]:
+        """Sampled parameters ``(v, nu)`` and the shape of their lattice."""
         return self.parameters.lattice()
 
     @cached_property
     def _margins(self) -> Array:
         """``h - sigma`` on the lattice, ``(v, r, times)``: what the worst disturbance leaves of every side."""
-        points, _ = self._lattice
+        points, _ = self.lattice
         if self.functionals.disturbance is None:
             return np.broadcast_to(self.h[None, :, None], (points.shape[0], self.h.size, self.times.size))
         return self.h[None, :, None] - np.stack([self.functionals.profile(self.times, self.H, p).T for p in points])
 
-    def _on_lattice(self, x: Array) -> Array:
+    def on_lattice(self, x: Array) -> Array:
         """Violations ``(v, r, times)`` at every lattice point and sampled time."""
-        response, points = self.functionals.response, self._lattice[0]
+        response, points = self.functionals.response, self.lattice[0]
         control = x.reshape(-1, self.functionals.dictionary.functions) @ self.functionals.dictionary.values
         nodes = response.states(control, points)
         pieces, flow, driven = self._sampling
@@ -184,7 +197,7 @@ class FlatConstraint:
         pieces = response.grid.locate(self.times)
         within = np.round((self.times - response.grid.breakpoints[pieces]) / response.grid.breakpoints[-1], 15)
         distinct, which = np.unique(within, return_inverse=True)
-        A = response.steps(self._lattice[0]).A
+        A = response.steps(self.lattice[0]).A
         flow, driven = transitions(A[:, None], distinct[None] * response.grid.breakpoints[-1])
         return pieces, flow[:, which], driven[:, which]
 
@@ -199,10 +212,6 @@ class FlatConstraint:
 
         return climb(lambda points, which: self.violations(x, points, rows[which]), indices, radius, project, ZOOMS)
 
-    def _expand(self, indices: Array) -> tuple[Array, Array, Array]:
-        parameters = np.repeat(self.parameters.clamp(indices[:, 1:]), self.h.size, axis=0)
-        return np.repeat(indices[:, 0], self.h.size), np.tile(self.H, (indices.shape[0], 1)), parameters
-
 
 def _combination(direction: Array, time: float) -> str:
     """``c'x(t)`` in words, such as ``x1(5)`` or ``x1(5) - 0.5 x2(5)``."""
@@ -214,8 +223,33 @@ def _combination(direction: Array, time: float) -> str:
     return " ".join(parts) or "0"
 
 
-def _remember(cache: dict[bytes, T], key: bytes, value: T) -> None:
+def remember(cache: dict[bytes, T], key: bytes, value: T) -> None:
     """Keep the last `REMEMBERED` cells."""
     while len(cache) >= REMEMBERED:
         cache.pop(next(iter(cache)))
     cache[key] = value
+
+
+def where_to_halve(drift: Array, spread: Array, bounds: Array) -> np.ndarray:
+    """Halve the times where they matter most, else one other coordinate, the same for the whole group so that its cells stay shared.
+
+    ``drift (k,)``: what halving the times of a cell would gain; ``spread (k, j)``: what halving each other coordinate would.
+    """
+    if not spread.shape[1]:
+        return np.zeros(drift.size, dtype=int)
+    open_ = bounds > 0
+    total = spread[open_].sum(axis=0) if open_.any() else spread.sum(axis=0)
+    return np.where(drift > spread.max(axis=1), 0, 1 + int(total.argmax()))
+
+
+def push_of(functionals: WorstCase, lifted: LiftedSystem, H: Array, joined: Combination | None = None) -> Push | MeasurablePush | None:
+    """The push of the disturbance on functionals ``H (r, d)`` over a cell; raises `NotEnclosable` where there is no proven bound of it."""
+    model = functionals.disturbance
+    if model is None:
+        return None
+    if model.kind != "measurable":
+        return Push(lifted, model, H @ lifted.transform, joined)
+    if lifted.space.nu or joined is not None:
+        raise NotEnclosable("measurable disturbances are proven only for known systems and sets with flat sides; "
+                            "expected disturbance_class piecewise_constant")
+    return MeasurablePush(functionals.response, model.bound, H)

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.errors import InputError
-from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound
+from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound, vertex_excess
 
 _SIGN_DIMENSIONS = 10
 _BISECTIONS = 60
@@ -61,6 +61,10 @@ class Ellipsoid(ConvexSet):
 
     def linearisation_excess(self, centre: Array, spread: Array) -> Array:
         return _round_excess(np.asarray(centre, dtype=float) @ self.factor, np.asarray(spread, dtype=float) @ self.factor)
+
+    def support_minorant(self, centre: Array, spread: Array) -> tuple[float, Array, Array]:
+        value, gradient, _ = super().support_minorant(centre, spread)
+        return value, gradient, norm_curvature(centre @ self.factor, spread @ self.factor)
 
     def violation(self, points: Array) -> Array:
         """Distance to the ellipsoid outside; inside, ``(gauge - 1) * shortest half-axis``, which is at least minus the depth."""
@@ -135,6 +139,9 @@ class NormBall(ConvexSet):
         return point
 
     def linearisation_excess(self, centre: Array, spread: Array) -> Array:
+        if self.p == 1.0:
+            corners = self.radius * np.vstack([np.eye(self.dimension), -np.eye(self.dimension)])
+            return vertex_excess(self.centre + corners, np.asarray(centre, dtype=float), np.asarray(spread, dtype=float))
         if self.p != 2.0:
             return super().linearisation_excess(centre, spread)
         return self.radius * _round_excess(np.asarray(centre, dtype=float), np.asarray(spread, dtype=float))
@@ -205,3 +212,19 @@ def _finite(name: str, value: object, size: int | None) -> Array:
     if not np.isfinite(numbers).all():
         raise InputError(f"{name}: expected finite numbers, got {numbers.tolist()}")
     return numbers
+
+
+def norm_curvature(centre: Array, spread: Array) -> Array:
+    """``H (J, J)`` with ``|a + B's| >= |a| + a'B's / |a| + s'H s / 2`` for ``|s_j| <= 1``; ``centre`` is ``a (b,)``, ``spread`` is ``B (J, b)``.
+
+    With the part of ``B's`` along ``a`` at most ``p`` and the part across at most ``q``: ``sqrt(u^2 + v^2) >= u + v^2 / (2 u) - v^4 / (8 u^3)``
+    for ``|a| - p <= u <= |a| + p`` and ``v <= q``. Zero where that is not positive.
+    """
+    size = float(np.linalg.norm(centre))
+    if size == 0.0:
+        return np.zeros((spread.shape[0], spread.shape[0]))
+    along = spread @ centre / size
+    across = spread - np.outer(along, centre / size)
+    p, q = float(np.abs(along).sum()), float(np.linalg.norm(across, axis=1).sum())
+    factor = 0.0 if p >= size else 1.0 / (size + p) - q**2 / (4.0 * (size - p) ** 3)
+    return max(0.0, factor) * (across @ across.T)

@@ -12,7 +12,9 @@ from functools import cached_property
 
 import numpy as np
 
+from sparserob_core.control.combination import Combination
 from sparserob_core.control.lifted import LiftedSystem
+from sparserob_core.control.measurable import MeasurablePush
 from sparserob_core.control.polynomial import polynomial_bound
 from sparserob_core.control.push import Push
 from sparserob_core.sip.convex_set import Array
@@ -22,16 +24,18 @@ TAYLOR_TERMS = 1e-17    # relative size below which further terms of the exponen
 
 @dataclass(frozen=True, eq=False)
 class CellEnclosure:
-    """Bounds of ``H x(t) - h`` for one decision over one cell of parameters.
+    """Bounds of ``H x(t) - rhs`` for one decision over one cell of parameters, and of directions where there is a ``combination``.
 
-    ``H (r, d)``, ``h (r,)``; ``control (m, K)`` on the pieces of the control's dictionary.
+    ``H (r, d)``; ``rhs (r', M')``, polynomials over the cell; ``control (m, K)`` on the pieces of the control's dictionary. Without a
+    combination every row of ``H`` is a constraint (``r' = r``, ``M' = M``); with one they are the parts of a single constraint.
     """
 
     lifted: LiftedSystem
-    push: Push | None
+    push: Push | MeasurablePush | None
     H: Array
-    h: Array
+    rhs: Array
     control: Array
+    combination: Combination | None = None
 
     def bounds(self, start: Array, stop: Array) -> tuple[Array, Array, Array]:
         """For time cells ``[start, stop]`` (``(k,)``, each inside one piece): upper bounds ``(k,)``, the part of them that halving the
@@ -42,6 +46,8 @@ class CellEnclosure:
         left, right = bounds[which[:start.size]], bounds[which[start.size:]]
         bend = self._curvature(start, stop, pieces)
         neglected = self._neglected[:, pieces].T
+        if self.combination is not None:  # the parts of one constraint, each with a factor of at most 1
+            bend, neglected = bend.sum(axis=1, keepdims=True), neglected.sum(axis=1, keepdims=True)
         total = np.maximum(left, right) + bend + neglected
         worst = total.argmax(axis=1)
         pick = (np.arange(worst.size), worst)
@@ -53,13 +59,16 @@ class CellEnclosure:
         """Bounds ``(k, r)`` at single times, and how much of them each parameter accounts for, ``(k, r, nu)``."""
         states = self._states(times, pieces)
         coefficients = np.einsum("ri,kai->kra", self._rows, states)
-        coefficients[:, :, 0] -= self.h
+        space = self.lifted.space
+        if self.combination is not None:
+            coefficients, space = self.combination.apply(coefficients), self.combination.space
+        coefficients = coefficients - self.rhs
         excess: Array | float = 0.0
         if self.push is not None:
             pushed, excess = self.push.at(times)
             coefficients = coefficients + pushed
-        bound, spread = polynomial_bound(self.lifted.space, coefficients)
-        return bound + excess, spread + (self._shares * np.asarray(excess)[..., None] if self.lifted.space.nu else 0.0)
+        bound, spread = polynomial_bound(space, coefficients)
+        return bound + excess, spread + self._shares * np.broadcast_to(excess, bound.shape)[..., None]
 
     def _states(self, times: Array, pieces: np.ndarray) -> Array:
         """Taylor coefficients ``(k, M, d)`` of the state under the control alone: the exponential series from the last breakpoint."""
@@ -109,7 +118,7 @@ class CellEnclosure:
 
     @cached_property
     def _shares(self) -> Array:
-        nu = self.lifted.space.nu
+        nu = (self.combination or self.lifted).space.nu
         return np.full(nu, 1.0 / max(1, nu))
 
     @cached_property

@@ -55,6 +55,23 @@ class WorstCase:
             offset[part] = free @ self.response.initial_state + self._support(gains, W, times[part], directions[part], parameters[part])
         return G, offset
 
+    def rows_under(self, times: Array, directions: Array, parameters: Array, disturbances: Array | None) -> tuple[Array, Array]:
+        """``G (k, n)`` and ``offset (k,)`` with ``c'x(t) = G theta + offset`` under given disturbances ``(k, mw, L)`` on the grid's pieces."""
+        G, offset = np.empty((times.size, self.variables)), np.empty(times.size)
+        for part in self._chunks(times.size):
+            free, gains, B, W = self.response.adjoint(times[part], directions[part], parameters[part])
+            G[part] = self.on_decision(gains @ B)
+            offset[part] = free @ self.response.initial_state
+            if disturbances is not None:
+                offset[part] += np.einsum("kli,kil->k", gains @ W, disturbances[part])
+        return G, offset
+
+    def worst_blocks(self, times: Array, directions: Array, parameters: Array) -> Array:
+        """The coefficients ``(k, nb, q)`` of a worst disturbance at every index."""
+        assert self.disturbance is not None
+        _, gains, _, W = self.response.adjoint(times, directions, parameters)
+        return self.disturbance.set.support_point(self.disturbance.blocks(gains @ W))
+
     def values(self, theta: Array, times: Array, directions: Array, parameters: Array) -> Array:
         """``max_w c'x(t)`` at a decision, ``(k,)``, without building the rows."""
         control = self.on_grid(theta)

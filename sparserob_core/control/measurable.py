@@ -6,6 +6,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
+
 import numpy as np
 
 from sparserob_core.control.response import Response, transitions
@@ -95,3 +98,40 @@ def _value(A: Array, w: Array, starts: Array, durations: Array) -> Array:
     if not starts.shape[0]:
         return np.zeros(0)
     return np.einsum("li,lij,j->l", starts, transitions(A[None], durations)[0], w)
+
+
+@dataclass(frozen=True, eq=False)
+class MeasurablePush:
+    """The push of measurable disturbances on functionals ``rows (r, d)`` of a *known* system, in the form of `Push`.
+
+    ``sigma`` is an integral with a Lipschitz integrand, so its second derivative is bounded by that of the integrand's argument.
+    """
+
+    response: Response
+    bound: ConvexSet
+    rows: Array
+
+    def at(self, times: Array) -> tuple[Array, Array]:
+        """The push ``(k, r, 1)`` and an excess of zero ``(k, r)``."""
+        k, r = times.size, self.rows.shape[0]
+        sigma = measurable_support(self.response, self.bound, np.repeat(times, r), np.tile(self.rows, (k, 1)), np.zeros((k * r, 0)))
+        return sigma.reshape(k, r, 1), np.zeros((k, r))
+
+    @cached_property
+    def curvature(self) -> Array:
+        """Bounds ``(L, r)`` of the integrand's slope ``h(E' A' e^{A' s} c)`` on every piece."""
+        grid = self.response.grid
+        A, _, W = self.response.system.matrices(np.zeros((1, 0)))
+        slopes = self.rows @ (transitions(A[0][None], grid.breakpoints)[0] @ A[0])
+        ends = slopes @ W[0]
+        size = np.maximum(self.bound.support(ends), self.bound.support(-ends))
+        norm = float(np.linalg.norm(A[0], 2))
+        axes = np.eye(self.bound.dimension)
+        reach = float(np.linalg.norm(np.maximum(self.bound.support(axes), self.bound.support(-axes)))) * float(np.linalg.norm(W[0], 2))
+        grown = np.linalg.norm(slopes[:-1], axis=2) * np.expm1(norm * grid.lengths)[:, None] * reach
+        return np.asarray(size[:-1] + grown)
+
+    @property
+    def neglected(self) -> Array:
+        """Nothing: ``(r, L)`` of zeros."""
+        return np.zeros((self.rows.shape[0], self.response.grid.pieces))

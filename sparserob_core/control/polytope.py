@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from sparserob_core.errors import InputError
-from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound
+from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound, vertex_excess
 
 _VERTEX_DIMENSIONS = 6
 _VERTEX_ROWS = 200
@@ -107,6 +107,11 @@ class Polytope(ConvexSet):
             return highest
         flat = directions.reshape(-1, self.dimension)
         return np.array([self._maximise(c)[0] for c in flat]).reshape(directions.shape[:-1])
+
+    def linearisation_excess(self, centre: Array, spread: Array) -> Array:
+        if self.vertices is None:
+            return super().linearisation_excess(centre, spread)
+        return vertex_excess(self.vertices, np.asarray(centre, dtype=float), np.asarray(spread, dtype=float))
 
     def support_point(self, directions: Array) -> Array:
         directions = np.asarray(directions, dtype=float)

@@ -38,14 +38,9 @@ class ScenarioConstraint:
         """``G (k, r, n)``, ``rhs (k, r)`` at indices ``(k, 2)``."""
         k, r = indices.shape[0], self.base.h.size
         which = np.repeat(np.rint(indices[:, 1]).astype(int), r)
-        functionals = self.base.functionals
-        G, offset = np.empty((k * r, functionals.variables)), np.empty(k * r)
-        times, directions, parameters = np.repeat(indices[:, 0], r), np.tile(self.base.H, (k, 1)), self.parameters[which]
-        free, gains, B, W = functionals.response.adjoint(times, directions, parameters)
-        G[:] = functionals.on_decision(gains @ B)
-        offset[:] = free @ functionals.response.initial_state
-        if self.disturbances is not None:
-            offset += np.einsum("kli,kil->k", gains @ W, self.disturbances[which])
+        times, directions = np.repeat(indices[:, 0], r), np.tile(self.base.H, (k, 1))
+        signals = None if self.disturbances is None else self.disturbances[which]
+        G, offset = self.base.functionals.rows_under(times, directions, self.parameters[which], signals)
         return G.reshape(k, r, -1), self.base.h - offset.reshape(k, r)
 
     def worst(self, x: Array) -> Separation:

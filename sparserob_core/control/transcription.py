@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from sparserob_core.control.constraint import FlatConstraint
+from sparserob_core.control.control_constraint import ControlConstraint
+from sparserob_core.control.curved_constraint import CurvedConstraint
 from sparserob_core.control.dictionary import Dictionary
 from sparserob_core.control.disturbance import DisturbanceModel, disturbance_model
 from sparserob_core.control.functional import WorstCase
+from sparserob_core.control.literal import LiteralConstraint
 from sparserob_core.control.parameters import ParameterIndex
 from sparserob_core.control.problem import OptimalControlProblem, PathConstraint
 from sparserob_core.control.response import Response, merge_grids
@@ -45,13 +48,20 @@ class Transcription:
         return theta.reshape(-1, self.control.functions) @ self.control.values
 
 
-def transcribe(problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary | None = None) -> SemiInfiniteProgram:
-    """The convex semi-infinite program of a problem (the paper's (7)), with the disturbance eliminated exactly.
+def transcribe(problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary | None = None,
+               formulation: Literal["reduced", "literal"] = "reduced") -> SemiInfiniteProgram:
+    """The convex semi-infinite program of a problem (the paper's (7)).
 
     The decision is ``theta (m, N)`` raveled; its image ``S theta`` is the control on every piece, channel-major ``(m K,)``. ``disturbance``
-    defaults to the control's dictionary. Raises `InputError` when a dictionary does not span the horizon.
+    defaults to the control's dictionary. ``formulation``: ``reduced`` eliminates the disturbance exactly, by support functions;
+    ``literal`` keeps its coefficients as part of the index. Raises `InputError` when a dictionary does not span the horizon.
     """
-    return program_of(prepare(problem, control, disturbance or control))
+    if formulation not in ("reduced", "literal"):
+        raise InputError(f"formulation: expected reduced or literal, got {formulation!r}")
+    program = program_of(prepare(problem, control, disturbance or control))
+    if formulation == "reduced":
+        return program
+    return replace(program, families=[family.literal or family for family in program.families])
 
 
 def prepare(problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary) -> Transcription:
@@ -132,27 +142,33 @@ def _families(model: Transcription) -> list[ConstraintFamily]:
     ends = [terminal for terminal in problem.terminal if not isinstance(terminal, Equality)]
     windows += [(f"terminal[{i}]" if len(ends) > 1 else "terminal", PathConstraint(end, problem.horizon, problem.horizon))
                 for i, end in enumerate(ends)]
-    return [family for name, entry in windows for family in _family(model, entry.name or name, entry)]
+    families = [family for name, entry in windows for family in _family(model, entry.name or name, entry)]
+    curved = problem.control.halfspaces() is None
+    return [*families, ControlConstraint(problem.control, model.control).family()] if curved else families
 
 
 def _family(model: Transcription, name: str, entry: PathConstraint) -> list[ConstraintFamily]:
     stop = model.problem.horizon if entry.stop is None else entry.stop
     flat = entry.set.halfspaces()
     if flat is None:
-        raise NotImplementedError
-    if not flat[1].size:
-        return []
-    return [_flat_family(FlatConstraint(name, model.functionals, *flat, entry.start, stop, model.parameters))]
+        return [_complete(CurvedConstraint(name, model.functionals, entry.set, entry.start, stop, model.parameters))]
+    return [_complete(FlatConstraint(name, model.functionals, *flat, entry.start, stop, model.parameters))] if flat[1].size else []
 
 
-def _flat_family(constraint: FlatConstraint, simple: bool = False) -> ConstraintFamily:
-    """The family of a constraint, with its simpler versions unless it is one of them."""
+def _complete(constraint: FlatConstraint | CurvedConstraint) -> ConstraintFamily:
+    """The family of a constraint with its other forms: without the uncertainty, for sampled ones, and with the disturbance as an index."""
     def sample(count: int, rng: np.random.Generator) -> ConstraintFamily:
-        model = constraint.functionals.disturbance
+        if isinstance(constraint, CurvedConstraint):
+            raise InputError(f"method: scenario: the constraint {constraint.name} has a curved set; expected sets with flat sides")
         disturbances = None if model is None else sample_disturbances(model, count, rng)
         return ScenarioConstraint(constraint, disturbances, sample_parameters(constraint.parameters.set, count, rng)).family()
 
-    return ConstraintFamily(
-        name=constraint.name, index_set=constraint.index_set, rows=constraint.rows, worst=constraint.worst, enclosure=constraint.enclosure,
-        cells=constraint.cells, explain=constraint.explain, sample=None if simple else sample,
-        nominal=None if simple else _flat_family(constraint.nominal(), simple=True))
+    model = constraint.functionals.disturbance
+    bare = _bare(constraint)
+    literal = bare if model is None else LiteralConstraint(constraint, model).family(bare)
+    return replace(bare, nominal=_bare(constraint.nominal()), sample=sample, literal=literal)
+
+
+def _bare(constraint: FlatConstraint | CurvedConstraint) -> ConstraintFamily:
+    return ConstraintFamily(name=constraint.name, index_set=constraint.index_set, rows=constraint.rows, worst=constraint.worst,
+                            enclosure=constraint.enclosure, cells=constraint.cells, explain=constraint.explain)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
+from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ProofProgress, silence
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
@@ -36,7 +37,7 @@ class Proof:
 def prove(program: SemiInfiniteProgram, x: Array, notify: Notify = silence,
           cells: int = CELLS) -> tuple[Proof, ...]:
     """Prove or refute every family at ``x (n,)``, one `Proof` each."""
-    return tuple(prove_family(family, x, notify, cells) for family in program.families)
+    return tuple(prove_family(family.reduced or family, x, notify, cells) for family in program.families)
 
 
 def prove_family(family: ConstraintFamily, x: Array, notify: Notify = silence,
@@ -47,6 +48,13 @@ def prove_family(family: ConstraintFamily, x: Array, notify: Notify = silence,
     """
     if family.enclosure is None:
         return _by_separation(family, x)
+    try:
+        return _branch_and_bound(family, x, notify, cells)
+    except NotEnclosable as error:
+        return replace(_by_separation(family, x), reason=f"{family.name}: {error}")
+
+
+def _branch_and_bound(family: ConstraintFamily, x: Array, notify: Notify, cells: int) -> Proof:
     start = time.perf_counter()
     lower, upper = family.cells if family.cells is not None else (family.index_set.lower[None], family.index_set.upper[None])
     closed, examined, best = -np.inf, 0, (-np.inf, lower[0], 0)

@@ -49,6 +49,14 @@ class ConvexSet(ABC):
         excess: Array = np.maximum(self.support(spread) - along, self.support(-spread) + along).sum(axis=-1)
         return excess
 
+    def support_minorant(self, centre: Array, spread: Array) -> tuple[float, Array, Array]:
+        """A quadratic below ``h(centre + sum_j s_j spread_j)`` for ``|s_j| <= 1``: value, gradient ``(J,)`` and Hessian ``(J, J)`` in ``s``.
+
+        ``centre (d,)``, ``spread (J, d)``. The support function is convex, so its linearisation will do; curved sets add what they are sure of.
+        """
+        point = self.support_point(centre[None])[0]
+        return float(self.support(centre[None])[0]), spread @ point, np.zeros((spread.shape[0], spread.shape[0]))
+
     def violation(self, points: Array) -> Array:
         """``max {c'x - h(c) : |c| = 1}`` of points ``(..., d)``: how far outside (positive) or inside (negative) they are.
 
@@ -166,3 +174,18 @@ class Box(ConvexSet):
     @property
     def is_bounded(self) -> bool:
         return bool(np.isfinite(self.lower).all() and np.isfinite(self.upper).all())
+
+
+def vertex_excess(vertices: Array, centre: Array, spread: Array, blocks: int = 4096) -> Array:
+    """`ConvexSet.linearisation_excess` of a polytope with ``vertices (v, d)``: how much any other vertex can gain on the centre's best one."""
+    flat_centre, flat_spread = centre.reshape(-1, centre.shape[-1]), spread.reshape(-1, *spread.shape[-2:])
+    excess = np.empty(flat_centre.shape[0])
+    for start in range(0, excess.size, blocks):
+        part = slice(start, start + blocks)
+        heights = flat_centre[part] @ vertices.T
+        best = heights.argmax(axis=1)
+        swing = flat_spread[part] @ vertices.T
+        swing = np.abs(swing - np.take_along_axis(swing, best[:, None, None], axis=2)).sum(axis=1)
+        gain = heights - np.take_along_axis(heights, best[:, None], axis=1) + swing
+        excess[part] = np.maximum(gain.max(axis=1), 0.0)
+    return excess.reshape(centre.shape[:-1])

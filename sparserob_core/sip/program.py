@@ -60,6 +60,7 @@ class ConstraintFamily:
     ``gradient(x, indices (k, d), rows (k,))``  derivative ``(k, d)`` of ``row x - rhs`` in the index;
     ``nominal``       the same constraints without the uncertainty;
     ``sample(count, rng)``  the same constraints for ``count`` sampled uncertainties only;
+    ``literal``       the same constraints with an inner maximisation left to the index, and ``reduced``, from such a family, the way back;
     ``explain(index (d,), row)``  the constraint in words and, for control problems, where it is (an `Explanation`).
     """
 
@@ -72,6 +73,8 @@ class ConstraintFamily:
     gradient: Callable[[Array, Array, Array], Array] | None = None
     nominal: ConstraintFamily | None = None
     sample: Callable[[int, np.random.Generator], ConstraintFamily] | None = None
+    literal: ConstraintFamily | None = None
+    reduced: ConstraintFamily | None = None
     explain: Callable[[Array, int], Explanation] | None = None
 
     def violations(self, x: Array, indices: Array) -> Array:

@@ -1,0 +1,68 @@
+"""The paper's own index: the disturbance stays in it, beside the time and the parameter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sparserob_core.control.constraint import FlatConstraint
+from sparserob_core.control.curved_constraint import CurvedConstraint
+from sparserob_core.control.disturbance import DisturbanceModel
+from sparserob_core.control.parameters import ParameterIndex
+from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.program import ConstraintFamily, Separation
+
+
+@dataclass(frozen=True, eq=False)
+class LiteralConstraint:
+    """A state constraint whose index is ``(t, Beta, p)``, and a direction where the set is curved.
+
+    ``Beta`` are the coefficients of the disturbance's blocks, block by block, in the bounding box of their set; coefficients outside the set
+    are drawn to it along the ray from an interior point. Maximised over ``Beta`` it is the reduced constraint, exactly.
+    """
+
+    base: FlatConstraint | CurvedConstraint
+    disturbance: DisturbanceModel
+
+    def family(self, reduced: ConstraintFamily) -> ConstraintFamily:
+        """The constraint as a family; proofs go through ``reduced``."""
+        lower, upper = self.base.index_set.lower, self.base.index_set.upper
+        block, count = self._blocks.box, self.disturbance.block_count
+        index_set = Box(np.concatenate([lower[:1], np.tile(block.lower, count), lower[1:]]),
+                        np.concatenate([upper[:1], np.tile(block.upper, count), upper[1:]]))
+        return ConstraintFamily(name=self.base.name, index_set=index_set, rows=self.rows, worst=self.worst, reduced=reduced,
+                                explain=lambda index, row: self.base.explain(self._split(index[None])[0][0], row))
+
+    def rows(self, indices: Array) -> tuple[Array, Array]:
+        """``G (k, r, n)``, ``rhs (k, r)`` at indices ``(k, 1 + beta + ...)``."""
+        reduced, beta = self._split(indices)
+        times, directions, parameters, rhs = self.base.functionals_at(reduced)
+        per_index = times.size // indices.shape[0]
+        signals = np.repeat(self._signals(beta), per_index, axis=0)
+        G, offset = self.base.functionals.rows_under(times, directions, parameters, signals)
+        shape = (indices.shape[0], per_index)
+        return G.reshape(*shape, -1), (rhs - offset).reshape(shape)
+
+    def worst(self, x: Array) -> Separation:
+        """The separation of the reduced constraint, with the worst disturbance of each index written out."""
+        found = self.base.worst(x)
+        times, directions, parameters, _ = self.base.functionals_at(found.indices)
+        per_index = times.size // found.rows.size
+        pick = np.arange(found.rows.size) * per_index + found.rows
+        blocks = self.base.functionals.worst_blocks(times[pick], directions[pick], parameters[pick]).reshape(found.rows.size, -1)
+        indices = np.hstack([found.indices[:, :1], blocks, found.indices[:, 1:]])
+        return Separation(indices, found.rows, found.violations, found.bound)
+
+    @property
+    def _blocks(self) -> ParameterIndex:
+        return ParameterIndex(self.disturbance.set)
+
+    def _split(self, indices: Array) -> tuple[Array, Array]:
+        """The reduced index, and the coefficients of the disturbance."""
+        beta = self.disturbance.block_count * self.disturbance.set.dimension
+        return np.hstack([indices[:, :1], indices[:, 1 + beta:]]), indices[:, 1:1 + beta]
+
+    def _signals(self, beta: Array) -> Array:
+        blocks = self._blocks.clamp(beta.reshape(-1, self.disturbance.set.dimension))
+        return self.disturbance.signals(blocks.reshape(beta.shape[0], self.disturbance.block_count, -1))
