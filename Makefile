@@ -29,7 +29,7 @@ $(INSTALLED): pyproject.toml
 	done; \
 	if [ -z "$$python" ]; then echo "SparseRob needs Python 3.11 or later with venv; set PYTHON=/path/to/python" >&2; exit 1; fi; \
 	if [ ! -x $(BIN)/python ]; then echo "setting up $(VENV) with $$($$python --version)"; $$python -m venv $(VENV); fi
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[all]'
+	@$(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check --editable '.[all]'
 	@touch $@
 
 demo: $(INSTALLED)

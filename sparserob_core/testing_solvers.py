@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -53,7 +54,7 @@ def regularised(program: FiniteProgram, epsilon: float) -> FiniteProgram:
 
 
 def robust_terminal(spread: float = 1.0) -> FiniteProgram:
-    """Double integrator from (4, 0), ``|w| <= 0.02 spread``, ``|x(5)| <= (0.5, 0.3)``: 1.6 exactly at spread 1, infeasible from about 1.43."""
+    """Double integrator from (4, 0), ``|w| <= 0.02 spread``, ``|x(5)| <= (0.5, 0.3)``: 1.6 at spread 1, infeasible beyond 1.43."""
     weights, rows = double_integrator()
     slack = np.array([0.5, 0.3]) - 0.02 * spread * np.array([17.5, 5.0])
     start = np.array([4.0, 0.0])
@@ -113,8 +114,9 @@ def linear_instances() -> Iterator[Instance]:
     yield Instance("many optimisers", to_origin(10, -3), 3.0, 3.0)
     yield by_linear_programming("equalities", to_origin(1, 1))
     yield Instance("no row", replace(robust, G=rows[:0], h=h[:0]), 0.0, 0.0)
-    yield by_linear_programming("one-sided and fixed", replace(robust, lower=np.where(np.arange(50) % 7 == 0, -0.25, -1.0),
-                                                               upper=np.where(np.arange(50) % 7 == 0, -0.25, np.where(np.arange(50) > 30, 0.4, 2.0))))
+    seventh, late = np.arange(50) % 7 == 0, np.arange(50) > 30
+    yield by_linear_programming("one-sided and fixed", replace(robust, lower=np.where(seventh, -0.25, np.where(late, 0.0, -1.0)),
+                                                               upper=np.where(seventh, -0.25, np.where(late, 0.4, 2.0))))
     yield by_linear_programming("some weights zero", replace(robust, weights=np.where(np.arange(50) % 5 == 0, 0.0, robust.weights)))
     turn = csc_array(np.linalg.qr(np.random.default_rng(1).standard_normal((50, 50)))[0])
     yield Instance("rotated", replace(robust, S=turn, G=rows @ turn), 1.6, 1.6)
@@ -145,7 +147,8 @@ def regularised_instances() -> Iterator[Instance]:
         yield Instance(f"robust terminal, epsilon {epsilon:g}", regularised(robust_terminal(), epsilon), 1.6, 1.6 + 0.8 * epsilon)
         # int u^2 = 3 - 1/sqrt 3 is the least of all optimisers, and piecewise constant ones are not better.
         least = 3 + epsilon / 2 * (3 - 1 / np.sqrt(3))
-        yield Instance(f"many optimisers, epsilon {epsilon:g}", regularised(to_origin(10, -3), epsilon), least - 0.01 * epsilon, least + 0.01 * epsilon)
+        around = least - 0.01 * epsilon, least + 0.01 * epsilon
+        yield Instance(f"many optimisers, epsilon {epsilon:g}", regularised(to_origin(10, -3), epsilon), *around)
 
 
 def infeasible_instances() -> Iterator[Instance]:
@@ -211,7 +214,7 @@ class SolverContract(ABC):
         solver = self.create()
         solutions = [solve_finite(regularised(robust_terminal(), epsilon), solver) for epsilon in EPSILONS]
         values = [solution.value for solution in solutions if solution.status == "optimal"]
-        assert all(after <= before + 1e-8 for before, after in zip(values, values[1:], strict=False))
+        assert all(after <= before + 1e-8 for before, after in pairwise(values))
 
 
 def compare(instance: Instance, solution: FiniteSolution) -> None:
@@ -224,7 +227,7 @@ def compare(instance: Instance, solution: FiniteSolution) -> None:
     program, x = instance.program, solution.x
     slack = 1e-6 * max(min(1.0, float(program.weights.max())), abs(instance.highest))
     assert instance.lowest - slack <= solution.value <= instance.highest + slack, f"{instance.name}: {solution.value}, {solution.message}"
-    assert solution.lower_bound <= instance.highest + 1e-3 * slack, f"{instance.name}: the lower bound {solution.lower_bound} is above the value"
+    assert solution.lower_bound <= instance.highest + 1e-3 * slack, f"{instance.name}: the lower bound {solution.lower_bound} is too high"
     for violations, right in ((program.G @ x - program.h, program.h), (np.abs(program.A @ x - program.b), program.b)):
         allowed = 1e-7 * np.maximum(1.0, np.where(np.isfinite(right), np.abs(right), 1.0))
         assert (violations <= allowed).all(), f"{instance.name}: a row is violated by {violations.max():.1e}"

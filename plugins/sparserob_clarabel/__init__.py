@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -35,7 +35,7 @@ class Clarabel(sr.Solver, sr.Options):
         dual, z_box = np.array(solution.z), np.zeros(n)
         z_box[above] = dual[e + r: e + r + above.size]
         z_box[below] -= dual[e + r + above.size:]
-        kinds = {"Solved": "solved", "PrimalInfeasible": "infeasible"}
+        kinds: dict[Any, Literal["solved", "infeasible"]] = {"Solved": "solved", "PrimalInfeasible": "infeasible"}
         return sr.Claim(kinds.get(str(solution.status), "failed"), np.array(solution.x), dual[e: e + r], dual[:e], z_box,
                         f"{solution.status} after {solution.iterations} iterations")
 
@@ -53,4 +53,5 @@ class Clarabel(sr.Solver, sr.Options):
 
 @sr.hookimpl
 def sparserob_solvers() -> Iterator[sr.SolverPlugin]:
+    """Offer the solver."""
     yield sr.SolverPlugin(name="clarabel", factory=Clarabel, summary="interior point on the homogeneous embedding, conic; robust")

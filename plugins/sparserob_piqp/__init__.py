@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import ClassVar
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -29,10 +29,12 @@ class Piqp(sr.Solver, sr.Options):
         solver.setup(program.P, program.q, program.A, program.b, program.G, None, program.h, program.lower, program.upper)
         status = solver.solve()
         result = solver.result
-        claim = {piqp.PIQP_SOLVED: "solved", piqp.PIQP_PRIMAL_INFEASIBLE: "infeasible"}.get(status, "failed")
-        return sr.Claim(claim, result.x, result.z_u, result.y, result.z_bu - result.z_bl, f"{status.name} after {result.info.iter} iterations")
+        kinds: dict[Any, Literal["solved", "infeasible"]] = {piqp.PIQP_SOLVED: "solved", piqp.PIQP_PRIMAL_INFEASIBLE: "infeasible"}
+        return sr.Claim(kinds.get(status, "failed"), result.x, result.z_u, result.y, result.z_bu - result.z_bl,
+                        f"{status.name} after {result.info.iter} iterations")
 
 
 @sr.hookimpl
 def sparserob_solvers() -> Iterator[sr.SolverPlugin]:
+    """Offer the solver."""
     yield sr.SolverPlugin(name="piqp", factory=Piqp, summary="proximal interior point, sparse; fast and precise (default)")

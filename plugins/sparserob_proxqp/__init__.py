@@ -42,7 +42,7 @@ class ProxQp(sr.Solver, sr.Options):
                         np.concatenate([no_floor, program.lower]), np.concatenate([program.h, program.upper]))
         solver.solve()
         result, status = solver.results, solver.results.info.status
-        kinds = {proxqp.PROXQP_SOLVED: "solved", proxqp.PROXQP_PRIMAL_INFEASIBLE: "infeasible"}
+        kinds: dict[Any, Literal["solved", "infeasible"]] = {proxqp.PROXQP_SOLVED: "solved", proxqp.PROXQP_PRIMAL_INFEASIBLE: "infeasible"}
         return sr.Claim(kinds.get(status, "failed"), np.array(result.x), np.array(result.z[:r]), np.array(result.y), np.array(result.z[r:]),
                         f"{status.name} after {result.info.iter_ext} outer iterations")
 
@@ -55,4 +55,5 @@ class ProxQp(sr.Solver, sr.Options):
 
 @sr.hookimpl
 def sparserob_solvers() -> Iterator[sr.SolverPlugin]:
-    yield sr.SolverPlugin(name="proxqp", factory=ProxQp, summary="primal-dual augmented Lagrangian; precise where the curvature is not small")
+    """Offer the solver."""
+    yield sr.SolverPlugin(name="proxqp", factory=ProxQp, summary="primal-dual augmented Lagrangian; slow on nearly linear programs")

@@ -99,7 +99,7 @@ class Push:
     def _weights(self, gains: Array) -> Array:
         """Gains ``(..., M d)`` on the state's drive, as Taylor coefficients ``(..., M, mw)`` of the weights on the disturbance."""
         space = self.lifted.space
-        parts = gains.reshape(*gains.shape[:-1], space.size, -1)
+        parts = gains.reshape(*gains.shape[:-1], space.size, self.lifted.states)
         weights = np.zeros((*parts.shape[:-1], self.lifted.W.shape[2]))
         used = [part.any() for part in self.lifted.W]
         for left, right, target in zip(*space.products, strict=True):

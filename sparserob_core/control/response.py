@@ -80,8 +80,8 @@ class Response:
     _steps: dict[bytes, Steps] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
-        lengths, which = np.unique(np.round(self.grid.lengths / self.grid.breakpoints[-1], 13), return_inverse=True)
-        object.__setattr__(self, "_lengths", lengths * self.grid.breakpoints[-1])
+        _, which = np.unique(np.round(self.grid.lengths / self.grid.breakpoints[-1], 13), return_inverse=True)
+        object.__setattr__(self, "_lengths", np.bincount(which, self.grid.lengths) / np.bincount(which))  # means: the rounding must not add up
         object.__setattr__(self, "_which", which)
 
     _lengths: Array = field(init=False, repr=False)

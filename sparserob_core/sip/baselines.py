@@ -61,6 +61,5 @@ def _judged(program: SemiInfiniteProgram, simple: SemiInfiniteProgram, tools: To
         return result
     proofs = prove(program, result.decision, tools.notify)
     status, message = verdict(proofs, result.gap, tolerance)
-    proven = status in ("certified", "verified")
     worst = witness(program, result.worst, proofs) if result.worst is not None else None
-    return replace(result, status=status, message=message, worst=worst, upper_bound=result.cost if proven else np.inf)
+    return replace(result, status=status, message=message, worst=worst, upper_bound=np.inf if status == "refuted" else result.cost)

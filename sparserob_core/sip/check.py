@@ -7,11 +7,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.duality import diagonal, farkas_margin, measure, minimisers
 from sparserob_core.sip.elastic import elastic_program, unrelaxed
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
-from sparserob_core.sip.newton import polish
+from sparserob_core.sip.proximal import polish
 from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
 from sparserob_core.sip.standard_form import Form, Recovered, standard_form
 
@@ -102,11 +101,11 @@ def _ask(case: _Case, program: FiniteProgram, form: Form, accuracy: float) -> tu
     qp, recover = standard_form(program, form)
     try:
         claim = case.solver.solve(qp, accuracy)
-    except Exception as error:  # a foreign solver may raise anything; its failure must not be ours
+    except Exception as error:  # noqa: BLE001  a foreign solver may raise anything; its failure must not be ours
         case.attempts.append(f"{form} form: the solver raised {type(error).__name__}: {error}")
         return None, None
     if not _well_formed(claim, qp):
-        case.attempts.append(f"{form} form: {claim.status}, {claim.message}; the arrays it returned are not finite or not of the right size")
+        case.attempts.append(f"{form} form: {claim.status}, {claim.message}; its arrays are not finite, or not of the right size")
         return claim, None
     return claim, recover(claim)
 
@@ -165,10 +164,12 @@ def _contradiction(program: FiniteProgram, tolerance: float) -> FiniteSolution |
         k = int(np.argmax(crossed))
         reason, amount = f"the bounds of image entry {k} cross: {program.lower[k]} > {program.upper[k]}", float(crossed[k])
     elif (short := ~program.G.any(axis=1) & (program.h < -tolerance)).any():
-        y[i := int(np.argmax(short))] = 1.0
+        i = int(np.argmax(short))
+        y[i] = 1.0
         reason, amount = f"row {i} has no entries and asks for 0 <= {program.h[i]}", np.inf
     elif (short := ~program.A.any(axis=1) & (np.abs(program.b) > tolerance)).any():
-        mu[i := int(np.argmax(short))] = -np.sign(program.b[i])
+        i = int(np.argmax(short))
+        mu[i] = -np.sign(program.b[i])
         reason, amount = f"equality {i} has no entries and asks for 0 = {program.b[i]}", np.inf
     else:
         return None

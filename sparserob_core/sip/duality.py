@@ -20,7 +20,7 @@ ROUND_OFF = 1e-14
 
 @dataclass(frozen=True)
 class _Terms:
-    """``bound = constant + sum_k min over [lower_k, upper_k] of weights_k |s| + 1/2 curvature_k s^2 + slope_k s``; ``noise (k,)`` of slope."""
+    """``bound = constant + sum_k min weights_k |s| + 1/2 curvature_k s^2 + slope_k s`` over the bounds; ``noise (k,)`` of the slope."""
 
     constant: float
     slope: Array
@@ -90,7 +90,7 @@ def diagonal(P: csc_array | None, n: int) -> Array | None:
     columns = np.repeat(np.arange(n), np.diff(P.indptr))
     if not np.array_equal(columns, P.indices):
         return None
-    return np.bincount(columns, P.data, n) if columns.size else np.zeros(n)
+    return np.bincount(columns, P.data, n).astype(float)
 
 
 def measure(program: FiniteProgram, x: Array, y: Array, mu: Array, z: Array | None = None, message: str = "") -> FiniteSolution:

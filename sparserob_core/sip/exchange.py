@@ -199,7 +199,7 @@ class _Run:
         return Result(
             status=status, message=message, decision=solution.x if status not in ("infeasible", "failed") else None,
             cost=cost, value=solution.value, epsilon=self.epsilon, lower_bound=np.inf if status == "infeasible" else self.lower,
-            upper_bound=cost if status in ("certified", "verified") else np.inf, worst=worst, indices=cuts,
+            upper_bound=cost if status in ("certified", "verified", "undecided") else np.inf, worst=worst, indices=cuts,
             counts={"relaxed_programs": self.relaxed.solves, "rounds": len(self.history), "active_indices": len(cuts)},
             history=tuple(self.history), seconds=time.perf_counter() - self.started)
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +16,6 @@ ITERATIONS = 60
 PATIENCE = 10
 SEARCH = 25
 TARGET = 1e-12
-STILL = 1e-9
 
 
 class _Point(NamedTuple):
@@ -56,7 +54,7 @@ class _Dual:
         """Minus the generalised Hessian, damped so that duplicated and flat directions stay solvable."""
         free = (point.x != 0) & (point.x > self.program.lower) & (point.x < self.program.upper)
         rows = self.M[:, free]
-        hessian = (rows / self.curvature[free]) @ rows.T
+        hessian: Array = (rows / self.curvature[free]) @ rows.T
         flat = hessian.diagonal() <= 1e-14 / self.curvature.max()
         damping = 1e-13 * float(hessian.trace()) + np.where(flat, np.linalg.norm(point.gradient), 0.0) + np.finfo(float).tiny
         hessian[np.diag_indices_from(hessian)] += damping
@@ -114,7 +112,7 @@ def _ascend(dual: _Dual, start: Array) -> _Point | None:
 
 
 def _non_negative(hessian: Array, linear: Array, signed: npt.NDArray[np.bool_], support: npt.NDArray[np.bool_]) -> Array:
-    """argmin ``1/2 v'Hv - linear'v`` with ``v >= 0`` where signed, by active sets from a first support (Lawson and Hanson 1974, chapter 23)."""
+    """argmin ``1/2 v'Hv - linear'v``, ``v >= 0`` where signed, by active sets from a first support (Lawson and Hanson 1974, chapter 23)."""
     passive = support | ~signed
     v = np.zeros(signed.size)
     floor = 1e-13 * float(np.abs(linear).max(initial=0.0))
@@ -166,60 +164,3 @@ def _line_maximum(dual: _Dual, point: _Point, step: Array) -> float:
         length = low + (high - low) * min(max(share, 0.1), 0.9)
         derivative = float(change @ dual.decision(slope + length * change)) - constant
     return low
-
-
-def polish(program: FiniteProgram, x: Array, y: Array, mu: Array) -> FiniteSolution | None:
-    """The optimum to round-off from a nearby claim, by `newton_solve` or, where the curvature is too small for it, `proximal_polish`."""
-    curvature = diagonal(program.P, program.n) if program.S is None else None
-    if curvature is None or x.shape != program.q.shape or y.shape != program.h.shape or mu.shape != program.b.shape:
-        return None
-    bent = float(curvature.min(initial=np.inf)) >= 1e-4 * _cost(program)
-    found = newton_solve(program, y, mu) if bent else None
-    return proximal_polish(program, x, y, mu) if found is None else found
-
-
-def _cost(program: FiniteProgram) -> float:
-    return float(max(program.weights.max(initial=0.0), np.abs(program.q).max(initial=0.0)))
-
-
-def proximal_polish(program: FiniteProgram, x: Array, y: Array, mu: Array) -> FiniteSolution | None:
-    """Proximal points ``min cost + 1/2 weight |x - centre|^2`` (Rockafellar 1976) from a near-optimal ``x``, each by `newton_solve`.
-
-    A polyhedral program ends after finitely many rounds at an exact optimum. A strictly convex one needs weights as small as its
-    curvature to bring ``x`` itself, not only the value, to the optimiser. The best round is returned.
-    """
-    curvature = diagonal(program.P, program.n)
-    if program.S is not None or curvature is None:
-        return None
-    from scipy.sparse import dia_array
-
-    best: FiniteSolution | None = None
-    for weight in _weights(_cost(program) or 1.0, float(curvature.min(initial=np.inf))):
-        P = dia_array(((curvature + weight)[None], [0]), shape=(program.n, program.n)).tocsc()
-        near = newton_solve(replace(program, P=P, q=program.q - weight * x), y, mu)
-        if near is None:
-            break
-        found = measure(program, near.x, near.y, near.mu, message="proximal Newton")
-        still = float(np.abs(found.x - x).max(initial=0.0)) <= STILL * (1.0 + float(np.abs(x).max(initial=0.0)))
-        x, y, mu = found.x, found.y, found.mu
-        if best is None or _better(found, best):
-            best = found
-        elif curvature.min() == 0:
-            break
-        if still and weight <= 2 * curvature.min():
-            break
-    return best
-
-
-def _weights(cost: float, curvature: float) -> Iterator[float]:
-    """Constant for a polyhedral program; otherwise down to the curvature, where each round halves the distance to the optimiser."""
-    weight = 0.1 * cost
-    for _ in range(30):
-        yield weight
-        if curvature > 0:
-            weight = max(0.1 * weight, curvature, 1e-6 * cost)
-
-
-def _better(one: FiniteSolution, other: FiniteSolution) -> bool:
-    noise = 1e-13 * (1.0 + abs(other.value))
-    return one.gap <= other.gap + noise and one.residual <= max(other.residual, 1e-10) and (one.gap < 0.9 * other.gap or one.gap <= noise)

@@ -56,7 +56,8 @@ class Result:
     """The outcome of a method.
 
     ``cost`` is ``J`` of ``decision`` (no regulariser), ``value`` is ``J + epsilon rho``; ``lower_bound`` and ``upper_bound`` enclose the
-    value of the *unregularised* semi-infinite program (``upper_bound`` only when ``status`` is certified or verified), and
+    value of the *unregularised* semi-infinite program; ``lower_bound`` is proven in any case, ``upper_bound`` (the cost) only when ``status``
+    is certified or verified: it is what the search suggests when undecided, and infinite when refuted.
     ``gap = (upper_bound - lower_bound) / max(1, |upper_bound|)``.
     """
 

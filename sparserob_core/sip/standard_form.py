@@ -121,7 +121,7 @@ def _substituted(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticPr
 
 def _lifted(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticProgram, Callable[[Claim], Recovered]]:
     """Variables ``(x, v)``; equality rows ``S x - T v = offset`` for every image that has a weight or a bound."""
-    from scipy.sparse import csc_array, hstack, vstack
+    from scipy.sparse import block_diag, csc_array, hstack, vstack
 
     n, size, k = program.n, model.entry.size, program.weights.size
     held = np.flatnonzero((program.weights > 0) | np.isfinite(program.lower) | np.isfinite(program.upper))
@@ -132,15 +132,16 @@ def _lifted(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticProgram
     equal, b, keep_equal, norms_equal = _unit_rows(program.A, program.b, whole)
     cost = np.concatenate([program.q, model.cost])
     kappa = _largest(cost) or _largest(None if program.P is None else program.P.data) or 1.0
-    P = csc_array((n + size, n + size)) if program.P is None else csc_array((program.P.data / kappa, program.P.indices, np.concatenate(
-        [program.P.indptr, np.full(size, program.P.indptr[-1])])), shape=(n + size, n + size))
+    P = csc_array((n, n)) if program.P is None else program.P / kappa
+    P = block_diag([P, csc_array((size, size))], format="csc")
     pad = csc_array((rows.shape[0], size))
     G = hstack([csc_array(rows), pad], format="csc")
     if model.R is not None:
         G = vstack([G, hstack([csc_array((model.R.shape[0], n)), model.R])], format="csc")
     A = vstack([hstack([csc_array(equal), csc_array((equal.shape[0], size))]), link], format="csc")
     free = np.full(n, np.inf)
-    qp = QuadraticProgram(P, cost / kappa, G, np.concatenate([h, np.zeros(G.shape[0] - h.size)]), A, np.concatenate([b, model.offset[held]]),
+    right = np.concatenate([h, np.zeros(G.shape[0] - h.size)])
+    qp = QuadraticProgram(P, cost / kappa, G, right, A, np.concatenate([b, model.offset[held]]),
                           np.concatenate([-free, model.lower]), np.concatenate([free, model.upper]))
 
     def recover(claim: Claim) -> Recovered:

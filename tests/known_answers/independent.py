@@ -85,7 +85,8 @@ def gridded(problem: Problem, sampled: Sampled, spare: float) -> tuple[np.ndarra
     """Rows ``G u <= h`` of the path constraints ``(r, m K)`` with ``spare`` times the sag to spare, and the time ``(r,)`` of each."""
     rows, bounds, times = [], [], []
     for width, start, stop in problem.path:
-        inside = (sampled.times >= start - 1e-12) & (sampled.times <= stop + 1e-12)
+        beyond = 1e-12 + spare * sampled.times[1]  # with one more time on either side, the chords cover the whole window
+        inside = (sampled.times >= start - beyond) & (sampled.times <= stop + beyond)
         for i in np.flatnonzero(np.isfinite(width)):
             room = width[i] - sampled.deviation[inside, i] - spare * sampled.sag[i]
             rows += [sampled.response[inside, i], -sampled.response[inside, i]]
