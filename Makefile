@@ -17,7 +17,7 @@ help:
 	@echo "make test        lint, types, import rules, tests"
 	@echo "make test-slow   the long tests"
 	@echo "make bench       time the certified solve against gridded programs"
-	@echo "make docs        execute every command and snippet of README.md and docs/"
+	@echo "make docs        write the reference and the schema anew, execute README.md and docs/"
 	@echo "make install     set up $(VENV) only"
 	@echo "make clean       remove $(VENV) and every cache"
 
@@ -50,6 +50,7 @@ bench: $(INSTALLED)
 	$(BIN)/python -m pytest -m benchmark tests/benchmarks
 
 docs: $(INSTALLED)
+	$(BIN)/python docs/build_reference.py
 	$(BIN)/python -m pytest tests/rules/test_docs.py
 
 clean:

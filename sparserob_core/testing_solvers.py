@@ -228,6 +228,6 @@ def compare(instance: Instance, solution: FiniteSolution) -> None:
     slack = 1e-6 * max(min(1.0, float(program.weights.max())), abs(instance.highest))
     assert instance.lowest - slack <= solution.value <= instance.highest + slack, f"{instance.name}: {solution.value}, {solution.message}"
     assert solution.lower_bound <= instance.highest + 1e-3 * slack, f"{instance.name}: the lower bound {solution.lower_bound} is too high"
-    for violations, right in ((program.G @ x - program.h, program.h), (np.abs(program.A @ x - program.b), program.b)):
-        allowed = 1e-7 * np.maximum(1.0, np.where(np.isfinite(right), np.abs(right), 1.0))
+    for violations, rows in ((program.G @ x - program.h, program.G), (np.abs(program.A @ x - program.b), program.A)):
+        allowed = 1e-8 * np.maximum(1.0, np.abs(rows) @ np.abs(x))
         assert (violations <= allowed).all(), f"{instance.name}: a row is violated by {violations.max():.1e}"

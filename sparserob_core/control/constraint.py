@@ -24,8 +24,8 @@ from sparserob_core.sip.program import Enclosure, Explanation, Separation
 T = TypeVar("T")
 REMEMBERED = 256    # cells of parameters whose matrices are kept
 INSIDE = 3         # times sampled inside every piece, beside its ends
+CLIMBED = 10        # of them, those that parameters are climbed for
 KEPT = 12          # separated constraints per row and round
-ZOOMS = 26         # halvings of the zoom around a candidate (t, p)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,8 @@ class FlatConstraint:
     def violations(self, x: Array, indices: Array, rows: np.ndarray) -> Array:
         """``row x - rhs`` for one row per index, ``(k,)``, without building rows."""
         parameters = self.parameters.clamp(indices[:, 1:])
-        return self.functionals.values(x, indices[:, 0], self.H[rows], parameters) - self.h[rows]
+        answer: Array = self.functionals.values(x, indices[:, 0], self.H[rows], parameters) - self.h[rows]
+        return answer
 
     def worst(self, x: Array) -> Separation:
         """The largest local maxima of the violation over the index set, times refined between the nodes, parameters between lattice points."""
@@ -75,6 +76,8 @@ class FlatConstraint:
         indices = np.hstack([vertex_times(values, positions, self.times)[:, None], self.lattice[0][positions[:, 0]]])
         rows = positions[:, 1]
         if self.parameters.count:
+            likely = np.argsort(-values[tuple(positions.T)], kind="stable")[:CLIMBED]
+            indices, rows = indices[likely], rows[likely]
             indices, found = self._zoomed(x, indices, rows)
         else:
             found = self.violations(x, indices, rows)
@@ -189,7 +192,8 @@ class FlatConstraint:
         steps = response.steps(points)
         drive = np.einsum("vdm,ml->vld", steps.B, self.functionals.on_grid(x))
         states = np.einsum("vtij,vtj->vti", flow, nodes[:, pieces]) + np.einsum("vtij,vtj->vti", driven, drive[:, pieces])
-        return np.einsum("ri,vti->vrt", self.H, states) - self._margins
+        answer: Array = np.einsum("ri,vti->vrt", self.H, states) - self._margins
+        return answer
 
     @cached_property
     def _sampling(self) -> tuple[np.ndarray, Array, Array]:
@@ -210,12 +214,12 @@ class FlatConstraint:
             inside = np.clip(points, box.lower, box.upper)
             return np.hstack([inside[:, :1], self.parameters.clamp(inside[:, 1:])])
 
-        return climb(lambda points, which: self.violations(x, points, rows[which]), indices, radius, project, ZOOMS)
+        return climb(lambda points, which: self.violations(x, points, rows[which]), indices, radius, project)
 
 
 def _combination(direction: Array, time: float) -> str:
     """``c'x(t)`` in words, such as ``x1(5)`` or ``x1(5) - 0.5 x2(5)``."""
-    parts = []
+    parts: list[str] = []
     for state in np.flatnonzero(direction):
         size = abs(direction[state])
         sign = "-" if direction[state] < 0 else "+" if parts else ""

@@ -13,7 +13,6 @@ from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.program import ConstraintFamily, Explanation, Separation
 
 CLIMBED = 16    # pieces, those furthest outside, whose direction is refined per round
-ZOOMS = 26
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +48,10 @@ class ControlConstraint:
 
         def excess(points: Array, which: np.ndarray) -> Array:
             directions = unit(self.set, points)
-            return np.einsum("kc,kc->k", directions, control[pieces[which]]) - self.set.support(directions)
+            answer: Array = np.einsum("kc,kc->k", directions, control[pieces[which]]) - self.set.support(directions)
+            return answer
 
-        z, found = climb(excess, start, np.full(self.set.dimension, 0.1), lambda points: on_surface(np.clip(points, -1.0, 1.0)), ZOOMS)
+        z, found = climb(excess, start, np.full(self.set.dimension, 0.1), lambda points: on_surface(np.clip(points, -1.0, 1.0)))
         order = np.argsort(-found, kind="stable")
         middles = (self.dictionary.breakpoints[:-1] + self.dictionary.breakpoints[1:]) / 2
         indices = np.hstack([middles[pieces[order], None], z[order]])

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from sparserob_core.control.combination import Combination, combination
-from sparserob_core.control.constraint import ZOOMS, FlatConstraint, push_of, remember, where_to_halve
+from sparserob_core.control.constraint import FlatConstraint, push_of, remember, where_to_halve
 from sparserob_core.control.directions import faces, on_surface, sampled, unit
 from sparserob_core.control.enclosure import CellEnclosure
 from sparserob_core.control.functional import WorstCase
@@ -74,7 +74,7 @@ class CurvedConstraint:
             inside = np.clip(inside, box.lower, box.upper)
             return np.hstack([inside[:, :1], self.parameters.clamp(inside[:, 1:1 + count]), on_surface(inside[:, 1 + count:])])
 
-        indices, found = climb(lambda at, which: self.violations(x, at), points, step, project, ZOOMS)
+        indices, found = climb(lambda at, which: self.violations(x, at), points, step, project)
         order = _distinct(indices, found)[:KEPT]
         return Separation(indices[order], np.zeros(order.size, dtype=int), found[order])
 

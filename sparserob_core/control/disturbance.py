@@ -51,13 +51,14 @@ class DisturbanceModel:
             return np.add.reduceat(weights, self.starts, axis=-2)
         assert self.functions is not None
         coefficients = np.einsum("...li,jl->...ij", weights, self.functions)
-        if self.scale is not None:
-            return coefficients * self.scale[:, None]
-        return coefficients.reshape(*coefficients.shape[:-2], 1, -1)
+        blocks: Array = (coefficients.reshape(*coefficients.shape[:-2], 1, -1) if self.scale is None
+                         else coefficients * self.scale[:, None])
+        return blocks
 
     def support(self, weights: Array) -> Array:
         """``sigma (...,)``, the largest value of the functional over the admissible disturbances."""
-        return self.set.support(self.blocks(weights)).sum(axis=-1)
+        answer: Array = self.set.support(self.blocks(weights)).sum(axis=-1)
+        return answer
 
     def worst(self, weights: Array) -> Array:
         """A disturbance ``(..., mw, L)`` on the grid's pieces that attains `support`."""
@@ -78,7 +79,8 @@ class DisturbanceModel:
         assert self.functions is not None
         coefficients = points if self.scale is not None else points.reshape(*points.shape[:-2], self.channels, -1)
         signal = np.einsum("...ij,jl->...il", coefficients, self.functions)
-        return signal if self.scale is None else signal * self.scale[:, None]
+        answer: Array = signal if self.scale is None else signal * self.scale[:, None]
+        return answer
 
 
 def disturbance_model(kind: str, bound: ConvexSet, dictionary: Dictionary, grid: TimeGrid) -> DisturbanceModel:

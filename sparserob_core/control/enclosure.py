@@ -15,10 +15,12 @@ import numpy as np
 from sparserob_core.control.combination import Combination
 from sparserob_core.control.lifted import LiftedSystem
 from sparserob_core.control.measurable import MeasurablePush
-from sparserob_core.control.polynomial import polynomial_bound
+from sparserob_core.control.polynomial import distinct_patterns, face_matrix, monotone_ends, polynomial_bound
 from sparserob_core.control.push import Push
+from sparserob_core.control.taylor import TaylorSpace
 from sparserob_core.sip.convex_set import Array
 
+SMALL_SHARE = 1e-6      # so that no coordinate is ever entirely blameless
 TAYLOR_TERMS = 1e-17    # relative size below which further terms of the exponential series are left out
 
 
@@ -63,12 +65,21 @@ class CellEnclosure:
         if self.combination is not None:
             coefficients, space = self.combination.apply(coefficients), self.combination.space
         coefficients = coefficients - self.rhs
-        excess: Array | float = 0.0
+        ends = self._ends(times, space, coefficients)
+        coefficients, excess = _on_faces(space, coefficients, ends), np.zeros(coefficients.shape[:2])
         if self.push is not None:
-            pushed, excess = self.push.at(times)
+            pushed, excess = self.push.at(times, ends)
             coefficients = coefficients + pushed
         bound, spread = polynomial_bound(space, coefficients)
-        return bound + excess, spread + self._shares * np.broadcast_to(excess, bound.shape)[..., None]
+        return bound + excess, spread + self._shares * excess[..., None]
+
+    def _ends(self, times: Array, space: TaylorSpace, coefficients: Array) -> Array:
+        """Parameters in which the violation is monotone over the cell, whatever the disturbance: their better ends, ``(k, r, nu)``."""
+        shape = coefficients.shape[:2]
+        if space.nu == 0:
+            return np.zeros((*shape, 0))
+        swing = np.zeros((*shape, space.nu)) if self.push is None else self.push.swing(times)
+        return monotone_ends(space, coefficients.reshape(-1, space.size), swing.reshape(-1, space.nu)).reshape(*shape, space.nu)
 
     def _states(self, times: Array, pieces: np.ndarray) -> Array:
         """Taylor coefficients ``(k, M, d)`` of the state under the control alone: the exponential series from the last breakpoint."""
@@ -83,7 +94,8 @@ class CellEnclosure:
             term = term @ matrix.T * (within / order)
             total = total + within * term
             bound = bound * size / order
-        return total.reshape(times.size, self.lifted.space.size, -1)
+        answer: Array = total.reshape(times.size, self.lifted.space.size, -1)
+        return answer
 
     def _curvature(self, start: Array, stop: Array, pieces: np.ndarray) -> Array:
         """``(b - a)^2 / 8`` times the largest second time derivative, summed over the Taylor coefficients, ``(k, r)``."""
@@ -96,7 +108,8 @@ class CellEnclosure:
         total = by_row + np.linalg.norm(self._rows, axis=1) * loose[:, None]
         if self.push is not None:
             total = total + self.push.curvature[pieces]
-        return total * (width**2 / 8)[:, None]
+        answer: Array = total * (width**2 / 8)[:, None]
+        return answer
 
     @property
     def _rows(self) -> Array:
@@ -118,8 +131,13 @@ class CellEnclosure:
 
     @cached_property
     def _shares(self) -> Array:
-        nu = (self.combination or self.lifted).space.nu
-        return np.full(nu, 1.0 / max(1, nu))
+        """How what the models neglect is blamed on the parameters (and directions): by their first-order part in the system, ``(nu,)``."""
+        space, lifted = self.lifted.space, self.lifted
+        sizes = [sum(float(np.linalg.norm(part[space.index[tuple(unit)]])) for part in (lifted.A, lifted.B, lifted.W))
+                 for unit in np.eye(space.nu, dtype=int).tolist()] if space.degree else [1.0] * space.nu
+        directions = (self.combination.space.nu - space.nu) if self.combination is not None else 0
+        total = np.array(sizes + [0.0] * directions) + SMALL_SHARE
+        return np.asarray(total / total.sum())
 
     @cached_property
     def _neglected(self) -> Array:
@@ -127,6 +145,15 @@ class CellEnclosure:
         state = self.lifted.state_remainder(self._nodes, self.control)
         total = np.outer(np.linalg.norm(self._rows, axis=1), state)
         return total if self.push is None else total + self.push.neglected
+
+
+def _on_faces(space: TaylorSpace, coefficients: Array, ends: Array) -> Array:
+    """Polynomials ``(k, r, M)`` with the variables that have an end in ``ends (k, r, nu)`` set to it."""
+    if not ends.any():
+        return coefficients
+    patterns, which = distinct_patterns(ends)
+    matrices = np.stack([face_matrix(space, pattern) for pattern in patterns])
+    return np.asarray(np.einsum("krab,krb->kra", matrices[which], coefficients))
 
 
 def _ends(start: Array, stop: Array, pieces: np.ndarray) -> tuple[tuple[Array, np.ndarray], np.ndarray]:

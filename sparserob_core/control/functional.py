@@ -91,7 +91,7 @@ class WorstCase:
             every = np.broadcast_to(parameter, (k * r, parameter.size))
             return self.offsets(np.repeat(times, r), np.tile(directions, (k, 1)), every).reshape(k, r)
         known = frozen(self.response.system, self.response.grid, self.response.initial_state, parameter)
-        return Push(known, model, directions).at(times)[0][:, :, 0]
+        return Push(known, model, directions).at(times, np.zeros((times.size, directions.shape[0], 0)))[0][:, :, 0]
 
     def offsets(self, times: Array, directions: Array, parameters: Array) -> Array:
         """``sigma (k,)``: how far the worst disturbance alone pushes ``c'x(t)``."""
@@ -108,7 +108,8 @@ class WorstCase:
         if self.disturbance is None:
             return None
         _, gains, _, W = self.response.adjoint(np.array([time]), direction[None], parameter[None])
-        return self.disturbance.worst(gains @ W)[0]
+        answer: Array | None = self.disturbance.worst(gains @ W)[0]
+        return answer
 
     def on_decision(self, weights: Array) -> Array:
         """Weights ``(k, L, m)`` on the control of every grid piece, as rows ``(k, n)`` of the decision."""

@@ -84,7 +84,8 @@ class LiftedSystem:
 
     def nodes(self, control: Array) -> Array:
         """Taylor coefficients ``(L+1, M, d)`` of the state at the breakpoints, under ``control (m, K)``."""
-        return self.forward.states(control, KNOWN)[0].reshape(self.grid.pieces + 1, self.space.size, self.states)
+        answer: Array = self.forward.states(control, KNOWN)[0].reshape(self.grid.pieces + 1, self.space.size, self.states)
+        return answer
 
     def state_remainder(self, nodes: Array, control: Array) -> Array:
         """Norm bounds ``(L,)``, per piece, of the neglected part of the state."""
@@ -105,27 +106,41 @@ class LiftedSystem:
         row = np.zeros(self.row_matrix.shape[0])
         row[:self.states] = direction
         path = Response(LinearSystem(self.row_matrix.T, np.zeros((row.size, 1))), self.grid, row).states(np.zeros((1, self.grid.control_piece.max() + 1)), KNOWN)
-        return path[0].reshape(self.grid.pieces + 1, self.space.size, self.states)
+        answer: Array = path[0].reshape(self.grid.pieces + 1, self.space.size, self.states)
+        return answer
 
     def _neglected(self, nodes: Array, driven: Array, matrix: Array, extra: Array) -> Array:
         """Gronwall: ``|e|' <= growth |e| + residual``, with the residual of the truncation bounded on every piece."""
         lengths = self.grid.lengths
         start = nodes[:-1].reshape(lengths.size, -1)
-        bend = np.linalg.norm((start @ matrix.T + driven) @ matrix.T, axis=1) * np.exp(self.norm * lengths)
+        second = ((start @ matrix.T + driven) @ matrix.T).reshape(lengths.size, self.space.size, -1)
+        bend = np.linalg.norm(second, axis=2) @ self._growths.T
         norms = np.linalg.norm(nodes, axis=2)
-        norms = np.maximum(norms[:-1], norms[1:]) + (lengths**2 / 8 * bend)[:, None]
+        norms = np.maximum(norms[:-1], norms[1:]) + (lengths**2 / 8)[:, None] * bend
         residual = norms @ self._overflow + norms.sum(axis=1) * self.slack_A + extra
         factor = np.exp(self.growth * lengths)
         added = residual * (np.expm1(self.growth * lengths) / self.growth if abs(self.growth) > 1e-12 else lengths)
         bound = np.array(list(accumulate(zip(factor.tolist(), added.tolist(), strict=True), lambda b, step: b * step[0] + step[1], initial=0.0)))
-        return bound[:-1] * np.maximum(factor, 1.0) + np.maximum(added, residual * lengths)
+        answer: Array = bound[:-1] * np.maximum(factor, 1.0) + np.maximum(added, residual * lengths)
+        return answer
+
+    @cached_property
+    def _growths(self) -> Array:
+        """``G (M, M)``: the norm of coefficient ``a`` of ``e^{lifted r} z`` is at most ``sum_b G_ab |z_b|``, for ``r`` up to the longest piece."""
+        from scipy.linalg import expm
+
+        left, right, target = self.space.products
+        sizes = np.zeros((self.space.size, self.space.size))
+        sizes[target, right] = np.linalg.norm(self.A, axis=(1, 2))[left]
+        return np.asarray(expm(sizes * self.grid.lengths.max()))
 
     @cached_property
     def _overflow(self) -> Array:
         """For every monomial of the state, the norms of the coefficients of ``A`` that push it out of the space, ``(M,)``."""
         size = np.linalg.norm(self.A, axis=(1, 2))
         leaves = self.space.degrees[:, None] + self.space.degrees[None, :] > self.space.degree
-        return leaves @ size
+        answer: Array = leaves @ size
+        return answer
 
 
 def lift(system: LinearSystem, grid: TimeGrid, initial_state: Array, centre: Array, radius: Array) -> LiftedSystem:

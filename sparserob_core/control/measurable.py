@@ -80,7 +80,8 @@ def _between(A: Array, w: Array, starts: Array, left: Array, right: Array, at_le
         moved = np.einsum("li,lij->lj", starts[cross], transitions(A[None], left[cross])[0])
         root[cross] = left[cross] + _root(A, w, moved, (right - left)[cross])
     cumulative = np.einsum("li,qlij,j->ql", starts, transitions(A[None, None], np.stack([left, root, right]))[1], w)
-    return np.abs(cumulative[1] - cumulative[0]) + np.abs(cumulative[2] - cumulative[1])
+    answer: Array = np.abs(cumulative[1] - cumulative[0]) + np.abs(cumulative[2] - cumulative[1])
+    return answer
 
 
 def _root(A: Array, w: Array, starts: Array, lengths: Array) -> Array:
@@ -97,7 +98,8 @@ def _root(A: Array, w: Array, starts: Array, lengths: Array) -> Array:
 def _value(A: Array, w: Array, starts: Array, durations: Array) -> Array:
     if not starts.shape[0]:
         return np.zeros(0)
-    return np.einsum("li,lij,j->l", starts, transitions(A[None], durations)[0], w)
+    answer: Array = np.einsum("li,lij,j->l", starts, transitions(A[None], durations)[0], w)
+    return answer
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,8 +113,12 @@ class MeasurablePush:
     bound: ConvexSet
     rows: Array
 
-    def at(self, times: Array) -> tuple[Array, Array]:
-        """The push ``(k, r, 1)`` and an excess of zero ``(k, r)``."""
+    def swing(self, times: Array) -> Array:
+        """No parameters, no swing: ``(k, r, 0)``."""
+        return np.zeros((times.size, self.rows.shape[0], 0))
+
+    def at(self, times: Array, ends: Array) -> tuple[Array, Array]:
+        """The push ``(k, r, 1)`` and an excess of zero ``(k, r)``; ``ends (k, r, 0)``."""
         k, r = times.size, self.rows.shape[0]
         sigma = measurable_support(self.response, self.bound, np.repeat(times, r), np.tile(self.rows, (k, 1)), np.zeros((k * r, 0)))
         return sigma.reshape(k, r, 1), np.zeros((k, r))

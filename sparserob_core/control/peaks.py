@@ -10,6 +10,11 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array
 
 
+SMALLEST = 1e-6     # of the first step: a step that is not made smaller any more
+MOVES = 60          # steps at most
+ENOUGH = 0.03       # a step that gains less than this share of the value is followed by a smaller one
+
+
 def local_maxima(values: Array, lattice: tuple[int, ...], kept: int) -> np.ndarray:
     """Positions ``(k, 3)`` in ``values (v, r, times)`` of the largest local maxima, at most ``kept`` per row.
 
@@ -48,30 +53,35 @@ def vertex_times(values: Array, positions: np.ndarray, times: Array) -> Array:
     shift = np.zeros(ti.size)
     shift[bent] = np.clip(-slope[bent] / (2 * curvature[bent]), -h1[bent], h2[bent])
     moved[inner] += shift
-    return moved
+    answer: Array = moved
+    return answer
 
 
-def climb(evaluate: Callable[[Array, np.ndarray], Array], points: Array, radius: Array, project: Callable[[Array], Array],
-          halvings: int) -> tuple[Array, Array]:
+def climb(evaluate: Callable[[Array, np.ndarray], Array], points: Array, radius: Array,
+          project: Callable[[Array], Array]) -> tuple[Array, Array]:
     """Climb from points ``(k, D)`` on stencils that shrink from ``radius (D,)``, all points at once.
 
     ``evaluate(points (j, D), which (j,))`` gives the values of points that started as number ``which``; ``project`` maps any point back
     into the domain. Returns the best points ``(k, D)`` and their values ``(k,)``.
     """
     dimension = points.shape[1]
-    stencil = np.vstack([np.eye(dimension), -np.eye(dimension)])
+    points, stencil = points.copy(), np.vstack([np.eye(dimension), -np.eye(dimension)])
     if dimension <= 3:
         stencil = np.array([step for step in product((-1.0, 0.0, 1.0), repeat=dimension) if any(step)])
     which = np.arange(points.shape[0])
-    size = np.tile(radius, (points.shape[0], 1))
+    size, smallest = np.tile(radius, (points.shape[0], 1)), SMALLEST * radius
     best = evaluate(points, which)
-    for _ in range(halvings):
-        around = project((points[:, None] + size[:, None] * stencil).reshape(-1, dimension)).reshape(-1, stencil.shape[0], dimension)
-        found = evaluate(around.reshape(-1, dimension), np.repeat(which, stencil.shape[0])).reshape(around.shape[:2])
+    for _ in range(MOVES):
+        live = np.flatnonzero((size > smallest).any(axis=1))
+        if not live.size:
+            break
+        around = project((points[live, None] + size[live, None] * stencil).reshape(-1, dimension)).reshape(-1, stencil.shape[0], dimension)
+        found = evaluate(around.reshape(-1, dimension), np.repeat(live, stencil.shape[0])).reshape(around.shape[:2])
         top = found.argmax(axis=1)
-        value = found[which, top]
-        better = value > best
-        points = np.where(better[:, None], around[which, top], points)
-        best = np.where(better, value, best)
-        size = np.where(better[:, None], size, size / 3)
+        value = found[np.arange(live.size), top]
+        gain = value - best[live]
+        better = gain > 0
+        points[live[better]] = around[np.arange(live.size), top][better]
+        best[live[better]] = value[better]
+        size[live[gain <= ENOUGH * np.abs(best[live])]] /= 3
     return points, best

@@ -35,6 +35,34 @@ def polynomial_bound(space: TaylorSpace, coefficients: Array) -> tuple[Array, Ar
     return bound.reshape(shape), spread.reshape(*shape, nu)
 
 
+def monotone_ends(space: TaylorSpace, coefficients: Array, swing: Array) -> Array:
+    """The end, -1 or 1, of every variable in which polynomials ``(k, M)`` are monotone, whatever is added whose partial derivatives are
+    at most ``swing (k, nu)``; 0 for the other variables. ``(k, nu)``."""
+    if space.nu == 0 or space.degree == 0:
+        return np.zeros((coefficients.shape[0], space.nu))
+    gradient, hessian = _quadratic(space, coefficients)
+    certain = np.abs(gradient) > np.abs(hessian).sum(axis=2) + _tail(space, coefficients)[1] + swing
+    return np.where(certain, np.sign(gradient), 0.0)
+
+
+def distinct_patterns(ends: Array) -> tuple[Array, np.ndarray]:
+    """The distinct rows of ``ends (k, r, nu)``, and which of them stands at every ``(k, r)``."""
+    if not ends.shape[2]:
+        return np.zeros((1, 0)), np.zeros(ends.shape[:2], dtype=int)
+    patterns, which = np.unique(ends.reshape(-1, ends.shape[2]), axis=0, return_inverse=True)
+    return patterns, which.reshape(ends.shape[:2])
+
+
+def face_matrix(space: TaylorSpace, ends: Array) -> Array:
+    """The matrix ``(M, M)`` that sets the variables with ``ends (nu,)`` not 0 to them, in coefficient vectors on its right."""
+    fixed = ends != 0
+    sign = np.prod(np.where(fixed, ends, 1.0) ** space.exponents, axis=1)
+    target = [space.index[tuple(int(e) for e in exponents)] for exponents in np.where(fixed, 0, space.exponents)]
+    matrix = np.zeros((space.size, space.size))
+    matrix[target, np.arange(space.size)] = sign
+    return matrix
+
+
 def _quadratic(space: TaylorSpace, flat: Array) -> tuple[Array, Array]:
     """Gradient ``(k, nu)`` and Hessian ``(k, nu, nu)`` at the centre."""
     nu = space.nu

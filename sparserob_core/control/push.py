@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,6 +11,8 @@ import numpy as np
 from sparserob_core.control.combination import Combination
 from sparserob_core.control.disturbance import DisturbanceModel
 from sparserob_core.control.lifted import KNOWN, LiftedSystem
+from sparserob_core.control.polynomial import distinct_patterns, face_matrix
+from sparserob_core.control.taylor import TaylorSpace
 from sparserob_core.sip.convex_set import Array
 
 
@@ -26,13 +29,26 @@ class Push:
     rows: Array
     combination: Combination | None = None
 
-    def at(self, times: Array) -> tuple[Array, Array]:
-        """Taylor coefficients ``(k, r, M)`` of the push under the centre's worst disturbance, and its excess ``(k, r)``."""
-        if self._repeats:
-            return self._by_age(times)
-        blocks = self._blocks(times, self._lifted_rows)
-        coefficients, excess = self._summed(blocks)
-        return coefficients.sum(axis=2), excess.sum(axis=2)
+    def swing(self, times: Array) -> Array:
+        """How steep the push of *any* one disturbance can be in each parameter over the cell: ``(k, r, nu)``."""
+        bound, exponents = self.disturbance.set, self._space.exponents
+        return self._gathered(times, lambda blocks: np.maximum(bound.support(blocks), bound.support(-blocks)).swapaxes(2, 3)) @ exponents
+
+    def at(self, times: Array, ends: Array) -> tuple[Array, Array]:
+        """Taylor coefficients ``(k, r, M)`` of the push under the worst disturbance of a centre, and its excess ``(k, r)``.
+
+        ``ends (k, r, nu)``: parameters that are known to be at an end of the cell (-1 or 1); the centre is that of the face they leave.
+        """
+        k, r, _ = ends.shape
+        patterns, which = distinct_patterns(ends)
+        coefficients, excess = np.empty((k, r, self._space.size)), np.empty((k, r))
+        for position, pattern in enumerate(patterns):
+            face = face_matrix(self._space, pattern) if pattern.any() else None
+            here = (which == position).any(axis=1)
+            parts = self._gathered(times[here], lambda blocks, face=face: self._summed(blocks, face))
+            mine = which[here] == position
+            coefficients[which == position], excess[which == position] = parts[mine][:, :-1], parts[mine][:, -1]
+        return coefficients, excess
 
     @cached_property
     def curvature(self) -> Array:
@@ -60,34 +76,41 @@ class Push:
         return total
 
     @property
+    def _space(self) -> TaylorSpace:
+        return (self.combination or self.lifted).space
+
+    @property
     def _repeats(self) -> bool:
         """Whether the blocks are the pieces of a uniform grid: what they receive then depends on their age ``t - s`` only."""
         return self.lifted.backward.uniform and self.disturbance.by_piece
 
-    def _by_age(self, times: Array) -> tuple[Array, Array]:
+    def _gathered(self, times: Array, of_blocks: Callable[[Array], Array]) -> Array:
+        """Sums over the blocks of a function of them: from blocks ``(k, r, M, nb, q)`` to parts ``(k, r, nb, j)``; returns ``(k, r, j)``."""
+        if not self._repeats:
+            return np.asarray(of_blocks(self._combined(self._blocks(times, self._lifted_rows))).sum(axis=2))
         backward, grid, horizon = self.lifted.backward, self.lifted.grid, self.lifted.grid.breakpoints[-1]
         pieces = grid.locate(times)
         within, which = np.unique(np.round((times - grid.breakpoints[pieces]) / horizon, 15), return_inverse=True)
         flow, partial = backward.flows(within * horizon)
-        oldest = int(pieces.max(initial=0))
-        young = self._weights(self._lifted_rows @ partial)
-        old = self._weights(np.einsum("rd,qde,aef->qraf", self._lifted_rows, flow, backward.ages[:oldest]))
-        young_parts, old_parts = self._summed(young[..., None, :]), self._summed(np.moveaxis(old, -2, -3))
-        result = []
-        for fresh, aged in zip(young_parts, old_parts, strict=True):
-            total = np.cumsum(np.concatenate([fresh, aged], axis=2), axis=2)
-            result.append(total[which.reshape(-1), :, pieces])
-        return result[0], result[1]
+        young = self._weights(self._lifted_rows @ partial)[..., None, :]
+        rows = np.einsum("rd,qde->qre", self._lifted_rows, flow)
+        old = np.moveaxis(self._weights(np.einsum("qre,aef->qraf", rows, backward.ages[:int(pieces.max(initial=0))])), -2, -3)
+        parts = np.concatenate([of_blocks(self._combined(young)), of_blocks(self._combined(old))], axis=2)
+        return np.asarray(np.cumsum(parts, axis=2)[which.reshape(-1), :, pieces])
 
-    def _summed(self, blocks: Array) -> tuple[Array, Array]:
-        """Per block: the polynomial under the centre's worst disturbance, and the excess; from ``(k, r, M, nb, q)``."""
+    def _combined(self, blocks: Array) -> Array:
+        return blocks if self.combination is None else self.combination.apply(blocks)
+
+    def _summed(self, blocks: Array, face: Array | None) -> Array:
+        """Per block: the polynomial under the centre's worst disturbance, and the excess as one more entry; from ``(k, r, M, nb, q)``."""
         bound = self.disturbance.set
-        blocks = blocks if self.combination is None else self.combination.apply(blocks)
+        blocks = blocks if face is None else np.einsum("ab,krbnq->kranq", face, blocks, optimize=True)
         point = bound.support_point(blocks[:, :, 0])
         coefficients = np.einsum("krbq,krabq->krba", point, blocks, optimize=True)
-        if blocks.shape[2] == 1:
-            return coefficients, np.zeros(coefficients.shape[:3])
-        return coefficients, bound.linearisation_excess(blocks[:, :, 0], np.moveaxis(blocks[:, :, 1:], 2, 3))
+        excess = np.zeros(coefficients.shape[:3])
+        if blocks.shape[2] > 1:
+            excess = bound.linearisation_excess(blocks[:, :, 0], np.moveaxis(blocks[:, :, 1:], 2, 3))
+        return np.concatenate([coefficients, excess[..., None]], axis=3)
 
     def _blocks(self, times: Array, rows: Array) -> Array:
         """Taylor coefficients ``(k, r, M, nb, q)`` of what functionals that start as lifted ``rows (r, M d)`` give to every block."""

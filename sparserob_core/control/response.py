@@ -47,7 +47,8 @@ def distinct_times(times: Array, horizon: float) -> Array:
     points = np.unique(times)
     kept = points[np.concatenate([[True], np.diff(points) > SAME_TIME * horizon])]
     kept[-1] = points[-1]
-    return kept
+    answer: Array = kept
+    return answer
 
 
 def merge_grids(control: Array, disturbance: Array) -> TimeGrid:

@@ -109,4 +109,5 @@ class ScenarioConstraint:
 
     @cached_property
     def _times(self) -> Array:
-        return np.clip(self._fine.grid.breakpoints[self._kept], self.base.start, self.base.stop)
+        answer: Array = np.clip(self._fine.grid.breakpoints[self._kept], self.base.start, self.base.stop)
+        return answer

@@ -73,7 +73,7 @@ def prepare(problem: OptimalControlProblem, control: Dictionary, disturbance: Di
     model: DisturbanceModel | None = None
     if problem.disturbance is not None:
         model = disturbance_model(problem.disturbance_class, problem.disturbance, disturbance, grid)
-    response = Response(problem.system, grid, problem.initial_state)
+    response = Response(problem.system, grid, np.asarray(problem.initial_state, dtype=float))
     return Transcription(problem, control, WorstCase(response, control, model), ParameterIndex(problem.system.parameters))
 
 
@@ -95,7 +95,7 @@ def _image(model: Transcription) -> tuple[csc_array | None, Array, Array, Array]
     axes = np.eye(channels)
     pieces = np.ones(dictionary.pieces)
     lower, upper = np.kron(-bound.support(-axes), pieces), np.kron(bound.support(axes), pieces)
-    weights = np.kron(model.problem.weights, dictionary.lengths)
+    weights: Array = np.kron(np.asarray(model.problem.weights, dtype=float), dictionary.lengths)
     flat = None if isinstance(bound, Box) else bound.halfspaces()
     values = csc_array(dictionary.values.T)
     identity = dictionary.values.shape[0] == dictionary.pieces and np.array_equal(dictionary.values, np.eye(dictionary.pieces))
@@ -133,12 +133,14 @@ def _equalities(model: Transcription) -> tuple[Array, Array]:
 
 def _probes(parameters: ParameterIndex) -> Array:
     points, _ = parameters.lattice()
-    return points[np.unique(np.linspace(0, points.shape[0] - 1, PROBES).astype(int))]
+    answer: Array = points[np.unique(np.linspace(0, points.shape[0] - 1, PROBES).astype(int))]
+    return answer
 
 
 def _families(model: Transcription) -> list[ConstraintFamily]:
     problem = model.problem
-    windows = [(f"path[{i}]" if len(problem.path) > 1 else "path", entry) for i, entry in enumerate(problem.path)]
+    path = [entry for entry in problem.path if isinstance(entry, PathConstraint)]  # all of them, after the problem's own checks
+    windows = [(f"path[{i}]" if len(path) > 1 else "path", entry) for i, entry in enumerate(path)]
     ends = [terminal for terminal in problem.terminal if not isinstance(terminal, Equality)]
     windows += [(f"terminal[{i}]" if len(ends) > 1 else "terminal", PathConstraint(end, problem.horizon, problem.horizon))
                 for i, end in enumerate(ends)]

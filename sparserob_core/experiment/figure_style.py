@@ -52,11 +52,11 @@ def style() -> AbstractContextManager[None]:
     return context(_STYLE)
 
 
-def panels(rows: int, height: float, *, right: float = 0.0) -> tuple[Figure, list[Axes]]:
-    """A figure of ``rows`` panels of ``height`` inches above one another on a common axis."""
+def panels(rows: int, height: float, *, extra: float = 0.0) -> tuple[Figure, list[Axes]]:
+    """A figure of ``rows`` panels of ``height`` inches above one another on a common axis; ``extra`` inches are for legends."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(WIDTH, rows * height + 0.75 + right), layout="constrained")
+    figure = Figure(figsize=(WIDTH, rows * height + 0.75 + extra), layout="constrained")
     axes = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
     return figure, list(axes)
 

@@ -10,6 +10,7 @@ import numpy as np
 from sparserob_core.experiment import figure_style as look
 from sparserob_core.experiment.figure_data import FigureData, Wall
 from sparserob_core.experiment.figure_style import panels, require_matplotlib, save, style
+from sparserob_core.sip.result import relative_gap
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,7 +34,7 @@ def write_figures(directory: Path, data: FigureData) -> list[Path]:
 
 def draw_control(data: FigureData) -> Figure:
     """Every channel as steps between its bounds; ticks below the axis mark the times of the active constraints."""
-    figure, axes = panels(len(data.control), 1.9)
+    figure, axes = panels(len(data.control), 1.9, extra=0.5)
     for channel, ax in enumerate(axes):
         steps = data.control[channel]
         ax.axhline(0.0, color=look.GREY, linewidth=0.6, zorder=1)
@@ -50,7 +51,7 @@ def draw_control(data: FigureData) -> Figure:
 
 def draw_states(data: FigureData) -> Figure:
     """Every state with its worst-case tube; what the constraints forbid is hatched, the terminal set is a bracket."""
-    figure, axes = panels(len(data.state), 1.9, right=0.2)
+    figure, axes = panels(len(data.state), 1.9, extra=0.2)
     for component, ax in enumerate(axes):
         ax.fill_between(data.times, data.tube_lower[component], data.tube_upper[component], color=look.SKY, alpha=0.45, linewidth=0,
                         zorder=2, label="worst case")
@@ -70,35 +71,45 @@ def draw_states(data: FigureData) -> Figure:
 
 
 def draw_convergence(data: FigureData) -> Figure:
-    """Lower and upper bound against the rounds, and below them the gap and the violation on a logarithmic axis."""
+    """Both bounds against the rounds, and below them the violation and the gap of each lower bound to the best upper bound, on a
+    logarithmic axis."""
     from matplotlib.ticker import MaxNLocator
 
-    figure, (bounds, gaps) = panels(2, 1.9, right=0.2)
+    figure, (bounds, gaps) = panels(2, 1.9, extra=0.2)
     rounds = np.arange(1.0, len(data.history) + 1)
     lower = np.array([entry.lower_bound for entry in data.history])
     upper = np.array([entry.upper_bound for entry in data.history])
-    _series(bounds, rounds, upper, look.VERMILLION, "v", "upper bound")
-    _series(bounds, rounds, lower, look.BLUE, "^", "lower bound")
-    both = np.isfinite(upper) & np.isfinite(lower)
-    bounds.fill_between(rounds[both], lower[both], upper[both], color=look.MIST, linewidth=0, zorder=1)
-    bounds.set_ylabel("cost $J$")
+    best = float(upper.min())
+    _draw_bounds(bounds, rounds, lower, upper, best)
+    _draw_gaps(gaps, rounds, np.array([relative_gap(bound, best) for bound in lower]), data)
     bounds.set_title(data.title)
-    with np.errstate(invalid="ignore"):
-        gap = (upper - lower) / np.maximum(1.0, np.abs(upper))
-    violation = np.array([entry.violation for entry in data.history])
-    gaps.set_yscale("log")
-    gaps.set_ylim(*_decades(np.concatenate([violation, gap, [data.tolerance or np.nan]])))
-    _series(gaps, rounds, _positive(violation), look.ORANGE, "s", "worst violation")
-    _series(gaps, rounds, _positive(gap), look.GREEN, "o", "relative gap")
-    if data.tolerance is not None:
-        gaps.axhline(data.tolerance, color=look.PURPLE, linewidth=0.9, linestyle=(0, (5, 3)), label="tolerance")
-    gaps.set_xlabel("round")
     gaps.set_xlim(0.6, len(data.history) + 0.4)
     gaps.xaxis.set_major_locator(MaxNLocator(integer=True))
     _stages(bounds, gaps, [entry.epsilon for entry in data.history])
     for ax in (bounds, gaps):
         ax.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
     return figure
+
+
+def _draw_bounds(ax: Axes, rounds: Array, lower: Array, upper: Array, best: float) -> None:
+    shown = np.isfinite(lower)
+    if np.isfinite(best):
+        ax.fill_between(rounds[shown], lower[shown], best, color=look.MIST, linewidth=0, zorder=1)
+        ax.axhline(best, color=look.VERMILLION, linewidth=0.9, zorder=2)
+    _series(ax, rounds, upper, look.VERMILLION, "v", "upper bound")
+    _series(ax, rounds, lower, look.BLUE, "^", "lower bound")
+    ax.set_ylabel("cost $J$")
+
+
+def _draw_gaps(ax: Axes, rounds: Array, gap: Array, data: FigureData) -> None:
+    violation = np.array([entry.violation for entry in data.history])
+    ax.set_yscale("log")
+    ax.set_ylim(*_decades(np.concatenate([violation, gap, [data.tolerance or np.nan]])))
+    _series(ax, rounds, _positive(violation), look.ORANGE, "s", "worst violation")
+    _series(ax, rounds, _positive(gap), look.GREEN, "o", "relative gap")
+    if data.tolerance is not None:
+        ax.axhline(data.tolerance, color=look.PURPLE, linewidth=0.9, linestyle=(0, (5, 3)), label="tolerance")
+    ax.set_xlabel("round")
 
 
 def _title(ax: Axes, title: str, summary: str) -> None:

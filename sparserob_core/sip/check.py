@@ -7,12 +7,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sparserob_core.sip.duality import diagonal, farkas_margin, measure, minimisers
+from sparserob_core.sip.duality import farkas_margin, measure, minimisers
 from sparserob_core.sip.elastic import elastic_program, unrelaxed
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
 from sparserob_core.sip.proximal import polish
+from sparserob_core.sip.repair import diagonal
 from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
 from sparserob_core.sip.standard_form import Form, Recovered, standard_form
+from sparserob_core.sip.straighten import straightened, unstraightened
 
 # The accuracy that a solver is asked for, in multiples of the tolerance, in each form, until it is believed.
 ATTEMPTS: tuple[tuple[Form, float], ...] = (("split", 0.1), ("epigraph", 0.1), ("split", 1e-3), ("split", 10.0))
@@ -60,8 +62,16 @@ def solve_finite(program: FiniteProgram, solver: Solver, *, tolerance: float = 1
         if believed is not None:
             return believed
     case.attempts.clear()
+    easier = straightened(program)
+    answer = None if easier is None else _through(case, easier, guess)
+    return _tried(case) if answer is None else answer
+
+
+def _tried(case: _Case) -> FiniteSolution:
+    """Form after form, accuracy after accuracy."""
+    program = case.program
     for form, factor in ATTEMPTS:
-        claim, answer = _ask(case, program, form, factor * tolerance)
+        claim, answer = _ask(case, program, form, factor * case.tolerance)
         proof = _proof(case, answer, "the solver's ray") if claim is not None and claim.status == "infeasible" else None
         for solution in _candidates(case, answer) if proof is None else ():
             believed = case.judge(solution, f"{form} form")
@@ -74,12 +84,23 @@ def solve_finite(program: FiniteProgram, solver: Solver, *, tolerance: float = 1
     return _failed(case)
 
 
+def _through(case: _Case, easier: FiniteProgram, guess: FiniteSolution | None) -> FiniteSolution | None:
+    """The answer found in the coordinates of the image, checked in those of the program."""
+    program = case.program
+    start = guess if guess is None or guess.x.size != program.n else replace(guess, x=program.image(guess.x))
+    found = solve_finite(easier, case.solver, tolerance=case.tolerance, guess=start)
+    x = unstraightened(program, found.x)
+    if found.status == "infeasible":
+        return _proof(case, (x, found.y, found.mu, None), "the program in the coordinates of its image")
+    return case.judge(measure(program, x, found.y, found.mu, found.z, found.message), "straightened")
+
+
 def cost_scale(program: FiniteProgram, value: float) -> float:
     """What a gap is relative to: the value, but no less than the largest cost coefficient, or 1 if that is larger."""
     largest = max(float(program.weights.max(initial=0.0)), float(np.abs(program.q).max(initial=0.0)))
     if program.P is not None:
         largest = max(largest, float(np.abs(program.P.data).max(initial=0.0)))
-    return max(abs(value), min(1.0, largest))
+    return max(abs(value), min(1.0, largest or 1.0))
 
 
 def _cheap(case: _Case, guess: FiniteSolution | None) -> Iterator[FiniteSolution]:

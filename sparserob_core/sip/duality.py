@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
 from sparserob_core.sip.image import onto_stationary
-
-if TYPE_CHECKING:
-    from scipy.sparse import csc_array
+from sparserob_core.sip.repair import diagonal, repaired
 
 # Entries of a sum are evaluated with a relative error of at most this (Higham 2002, section 3.1, for sums of up to ~1e2 terms).
 ROUND_OFF = 1e-14
@@ -43,9 +40,9 @@ def dual_bound(program: FiniteProgram, y: Array, mu: Array, z: Array | None = No
     bound = _bound(_terms(program, y, mu, z, at), program)
     if bound > -np.inf:
         return bound
-    repaired = _repair(program, y, mu, at)
-    if repaired is not None:
-        bound = _bound(_terms(program, repaired[0], repaired[1], z, at), program)
+    better = repaired(program, y, mu, z, at)
+    if better is not None:
+        bound = _bound(_terms(program, *better), program)
     if bound == -np.inf and not program.q.any():
         return _shrunk_bound(program, y, mu, z, at)
     return bound
@@ -71,8 +68,8 @@ def farkas_margin(program: FiniteProgram, y: Array, mu: Array, z: Array | None =
     flat = homogeneous(program)
     terms = _terms(flat, y, mu, z, None)
     bound = _bound(terms, flat)
-    if bound == -np.inf and (repaired := _repair(flat, y, mu, None)) is not None:
-        terms = _terms(flat, *repaired, z, None)
+    if bound == -np.inf and (better := repaired(flat, y, mu, z, None)) is not None:
+        terms = _terms(flat, *better)
         bound = _bound(terms, flat)
     return bound, terms.magnitude
 
@@ -81,16 +78,6 @@ def homogeneous(program: FiniteProgram) -> FiniteProgram:
     """The same constraints without a cost."""
     q, weights = np.zeros_like(program.q), np.zeros_like(program.weights)
     return FiniteProgram(q, weights, program.lower, program.upper, program.G, program.h, program.A, program.b, S=program.S)
-
-
-def diagonal(P: csc_array | None, n: int) -> Array | None:
-    """The diagonal ``(n,)`` of a diagonal ``P`` (zeros for ``None``), or ``None`` when ``P`` has other entries."""
-    if P is None:
-        return np.zeros(n)
-    columns = np.repeat(np.arange(n), np.diff(P.indptr))
-    if not np.array_equal(columns, P.indices):
-        return None
-    return np.bincount(columns, P.data, n).astype(float)
 
 
 def measure(program: FiniteProgram, x: Array, y: Array, mu: Array, z: Array | None = None, message: str = "") -> FiniteSolution:
@@ -132,14 +119,13 @@ def _terms(program: FiniteProgram, y: Array, mu: Array, z: Array | None, at: Arr
     magnitude = float(y @ np.abs(finite) + np.abs(mu) @ np.abs(program.b))
     noise = np.abs(program.q) + y @ np.abs(program.G) + np.abs(mu) @ np.abs(program.A)
     curvature = diagonal(program.P, program.n) if program.S is None else None
-    if curvature is None:
+    slope = program.q + y @ program.G + mu @ program.A
+    if curvature is None and program.P is not None:
         at = np.zeros(program.n) if at is None else at
-        bent = np.zeros(program.n) if program.P is None else np.asarray(program.P @ at)
+        bent = np.asarray(program.P @ at)
         constant -= 0.5 * float(at @ bent)
         magnitude += 0.5 * abs(float(at @ bent))
-        slope, noise = program.q + y @ program.G + mu @ program.A + bent, noise + np.abs(bent)
-    else:
-        slope = program.q + y @ program.G + mu @ program.A
+        slope, noise = slope + bent, noise + abs(program.P) @ np.abs(at)
     if program.P is None:
         curvature = None
     if program.S is None:
@@ -172,25 +158,6 @@ def _shrunk_bound(program: FiniteProgram, y: Array, mu: Array, z: Array | None, 
     unbounded = np.isinf(program.lower) & (slope > program.weights) | np.isinf(program.upper) & (slope < -program.weights)
     with np.errstate(invalid="ignore"):
         factor = float((program.weights[unbounded] / np.abs(slope[unbounded])).min(initial=1.0)) * (1 - ROUND_OFF)
-    factor = factor if np.isfinite(factor) else 0.0
+    factor = factor if np.isfinite(factor) and np.isfinite(slope).all() else 0.0
     scaled = [None if v is None else factor * v for v in (z, at)]
     return _bound(_terms(program, factor * y, factor * mu, *scaled), program)
-
-
-def _repair(program: FiniteProgram, y: Array, mu: Array, at: Array | None) -> tuple[Array, Array] | None:
-    """Least-norm correction of the positive multipliers that gives unbounded variables the slope they need; identity image only."""
-    if program.S is not None or not (np.isfinite(y).all() and np.isfinite(mu).all()):
-        return None
-    slope = _terms(program, y, mu, None, at).slope
-    near = np.abs(slope) > program.weights - 1e-6 * (1.0 + np.abs(program.q))
-    open_side = np.isinf(program.lower) & (slope >= 0) | np.isinf(program.upper) & (slope <= 0)
-    tight = near & open_side
-    used = y > 0
-    columns = np.vstack([program.G[used][:, tight], program.A[:, tight]]).T
-    if not columns.size:
-        return None
-    target = np.sign(slope[tight]) * program.weights[tight] - slope[tight]
-    change = np.linalg.lstsq(columns, target, rcond=1e-12)[0]
-    fixed = y.copy()
-    fixed[used] += change[: int(used.sum())]
-    return np.maximum(fixed, 0.0), mu + change[int(used.sum()):]

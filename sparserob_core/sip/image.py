@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
-from typing import TYPE_CHECKING, TypeVar
+from functools import partial
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -30,7 +31,7 @@ class Memory:
         identity = (key, *map(id, sources))
         if identity in self._made:
             self._made.move_to_end(identity)
-            return self._made[identity][1]  # type: ignore[return-value]
+            return cast(Made, self._made[identity][1])
         made = make()
         self._made[identity] = (sources, made)
         if len(self._made) > self.size:
@@ -38,23 +39,40 @@ class Memory:
         return made
 
 
-_factors = Memory(8)
+HOLDS = 5
+CANCELLED = 1e-13
+_factors = Memory(12)
 
 
 def onto_stationary(program: FiniteProgram, z: Array, slope: Array) -> Array:
-    """The ``z (k,)`` nearest to the given one with ``S'z + slope = 0``, ``slope (n,)``; NaN where ``S`` has not full column rank.
+    """A ``z (k,)`` near the given one with ``S'z + slope = 0`` to round-off, ``slope (n,)``; NaN where there is none.
 
-    Images without weight and bounds cannot carry a multiplier and keep 0.
+    Where an image is unbounded its multiplier may not exceed its weight: it is held there, and the others make up for it.
     """
     S = program.S
     if S is None:
         return -slope
-    idle = (program.weights == 0) & np.isneginf(program.lower) & np.isposinf(program.upper)
-    project = _factors.recall((S,), idle.tobytes() if idle.any() else None, lambda: _projection(S, ~idle))
-    z = np.where(idle, 0.0, z)
-    for _ in range(2):
-        z = z - project(S.T @ z + slope)
-    return z
+    unbounded_above, unbounded_below = np.isposinf(program.upper), np.isneginf(program.lower)
+    held = (program.weights == 0) & unbounded_below & unbounded_above
+    moved = z
+    for _ in range(HOLDS):
+        if _stationary(S, moved, slope):
+            break
+        z = np.where(held, np.clip(z, -program.weights, program.weights), z)
+        project = _factors.recall((S,), held.tobytes(), partial(_projection, S, ~held))
+        moved = z - project(S.T @ z + slope)
+        moved = moved - project(S.T @ moved + slope)
+        limit = program.weights + CANCELLED * float(np.abs(moved).max(initial=0.0))
+        beyond = ~held & (unbounded_above & (moved > limit) | unbounded_below & (moved < -limit))
+        if not beyond.any():
+            break
+        z, held = moved, held | beyond
+    return moved if _stationary(S, moved, slope) else np.full_like(moved, np.nan)
+
+
+def _stationary(S: csc_array, z: Array, slope: Array) -> bool:
+    left, size = np.abs(S.T @ z + slope), np.abs(S).T @ np.abs(z) + np.abs(slope)
+    return bool((left <= CANCELLED * size.max(initial=0.0)).all())
 
 
 def _projection(S: csc_array, used: npt.NDArray[np.bool_]) -> Callable[[Array], Array]:

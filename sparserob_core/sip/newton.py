@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.duality import diagonal, measure, minimisers
+from sparserob_core.sip.duality import measure, minimisers
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
+from sparserob_core.sip.repair import diagonal
 
 ITERATIONS = 60
 PATIENCE = 10

@@ -109,7 +109,7 @@ class SemiInfiniteProgram:
     finite: FiniteProgram = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        if isinstance(self.n, bool) or not isinstance(self.n, int) or self.n < 1:
+        if not hasattr(self.n, "__index__") or self.n < 1:
             raise InputError(f"n: expected the number of decision variables, at least 1, got {self.n!r}")
         S, P = _sparse("S", self.S, None), _sparse("P", self.P, self.n)
         if S is not None and S.shape[1] != self.n:

@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.duality import diagonal, measure
+from sparserob_core.sip.duality import measure
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
 from sparserob_core.sip.newton import newton_solve
+from sparserob_core.sip.repair import diagonal
 
 FLAT = 1e-4     # below this, relative to the linear cost, the curvature amplifies round-off too much for Newton's method alone
 STILL = 1e-9    # a proximal point that moves by less, relative to the decision, has arrived
@@ -41,6 +42,7 @@ def proximal_polish(program: FiniteProgram, x: Array, y: Array, mu: Array) -> Fi
         return None
     from scipy.sparse import dia_array
 
+    flat = not curvature.min(initial=np.inf) > 0
     best: FiniteSolution | None = None
     for weight in _weights(_cost(program) or 1.0, float(curvature.min(initial=np.inf))):
         P = dia_array(((curvature + weight)[None], [0]), shape=(program.n, program.n)).tocsc()
@@ -48,13 +50,13 @@ def proximal_polish(program: FiniteProgram, x: Array, y: Array, mu: Array) -> Fi
         if near is None:
             break
         found = measure(program, near.x, near.y, near.mu, message="proximal Newton")
-        still = float(np.abs(found.x - x).max(initial=0.0)) <= STILL * (1.0 + float(np.abs(x).max(initial=0.0)))
+        moved = float(np.abs(found.x - x).max(initial=0.0))
         x, y, mu = found.x, found.y, found.mu
-        if best is None or _better(found, best):
-            best = found
-        elif curvature.min() == 0:
+        improved = best is None or _better(found, best)
+        best = found if improved or best is None else best
+        if flat and not (improved and found.gap > _noise(found)):
             break
-        if still and weight <= 2 * curvature.min():
+        if not flat and moved <= STILL * (1.0 + float(np.abs(x).max(initial=0.0))) and weight <= 2 * curvature.min():
             break
     return best
 
@@ -69,5 +71,8 @@ def _weights(cost: float, curvature: float) -> Iterator[float]:
 
 
 def _better(one: FiniteSolution, other: FiniteSolution) -> bool:
-    noise = 1e-13 * (1.0 + abs(other.value))
-    return one.gap <= other.gap + noise and one.residual <= max(other.residual, 1e-10) and (one.gap < 0.9 * other.gap or one.gap <= noise)
+    return one.gap <= max(0.9 * other.gap, _noise(other)) and one.residual <= max(other.residual, 1e-10)
+
+
+def _noise(solution: FiniteSolution) -> float:
+    return 1e-13 * (1.0 + abs(solution.value))

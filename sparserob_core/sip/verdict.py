@@ -48,14 +48,14 @@ def explained(program: SemiInfiniteProgram, bare: Witness) -> Witness:
 def clash(program: SemiInfiniteProgram, rows: Rows, multipliers: Array, amount: float) -> tuple[str, Witness | None]:
     """Why nothing is feasible, from Farkas multipliers ``(r,)`` of ``rows``: one impossible constraint if there is one, else those that clash."""
     active = np.flatnonzero(multipliers > 0)
-    alone = [_least_violation(program.finite, rows, i) for i in active]
+    alone = [_least_violation(program.finite, rows, int(i)) for i in active]
     if alone and max(alone) > 0:
-        worst = active[int(np.argmax(alone))]
+        worst = int(active[int(np.argmax(alone))])
         text = f"{_words(program, rows, worst)} is violated by at least {max(alone):.4g}, whatever the decision"
         cut = rows.cuts[worst]
         return text, explained(program, Witness(max(alone), cut.family, cut.index, cut.row))
     order = active[np.argsort(-multipliers[active], kind="stable")][:NAMED]
-    named = " and ".join(_words(program, rows, i) for i in order)
+    named = " and ".join(_words(program, rows, int(i)) for i in order)
     others = f" and {active.size - order.size} more" if active.size > order.size else ""
     if not active.size:
         return "the equalities and bounds alone cannot be met", None

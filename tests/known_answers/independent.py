@@ -156,3 +156,21 @@ def random_problem(seed: int) -> Problem:
         control=np.round(rng.uniform(0.9, 1.6, m), 2), weights=np.round(rng.uniform(0.5, 2, m), 2),
         disturbance=np.round(rng.uniform(0.0, 0.04, d), 3), terminal=np.round(rng.uniform(0.3, 0.6, d), 2),
         path=[(np.round(width, 2), start, horizon)])
+
+
+def worst_violation(problem: Problem, control: np.ndarray, per_piece: int = 32) -> float:
+    """By how much the control ``(m, K)`` violates a path or terminal constraint at a fine time, under the worst disturbance."""
+    A, d, m, K = problem.A, len(problem.A), problem.B.shape[1], problem.pieces
+    step = problem.horizon / (K * per_piece)
+    big = expm(step * np.block([[A, problem.B, np.eye(d)], [np.zeros((m + d, d + m + d))]]))
+    Ad, Bd, Ed = big[:d, :d], big[:d, d:d + m], big[:d, d + m:]
+    state, noise, bounds, worst = problem.initial_state.copy(), np.zeros((d, d * K)), np.repeat(problem.disturbance, K), -np.inf
+    for j in range(K * per_piece):
+        state = Ad @ state + Bd @ control[:, j // per_piece]
+        noise = Ad @ noise
+        noise[:, j // per_piece::K] += Ed
+        extent = np.abs(state) + np.abs(noise) @ bounds
+        for width, start, stop in problem.path:
+            if start - 1e-12 <= (j + 1) * step <= stop + 1e-12:
+                worst = max(worst, float((extent - width).max()))
+    return max(worst, float((extent - problem.terminal).max()))

@@ -17,7 +17,7 @@ EXPECTED: dict[str, tuple[str, float | None, float]] = {
     "coupled_masses": ("certified", None, 0.0),
     "double_integrator": ("certified", 1.6, 1e-6),
     "ellipsoidal": ("certified", None, 0.0),
-    "experiment1_nominal": ("refuted", 0.175769, 5e-6),
+    "experiment1_nominal": ("refuted", 0.1757928, 1e-6),
     "experiment1_printed": ("infeasible", None, 0.0),
     "experiment1_repaired": ("certified", 0.63212, 2e-5),
     "experiment1_scenario": ("refuted", None, 0.0),
@@ -45,7 +45,7 @@ def test_a_config_says_what_it_shows(name: str) -> None:
 @pytest.mark.parametrize("name", sorted(EXPECTED))
 def test_a_config_comes_back_with_the_expected_answer(name: str, tmp_path: Path) -> None:
     status, cost, tolerance = EXPECTED[name]
-    outcome = sr.run(CONFIGS / f"{name}.yaml", {"observers": []}, out=tmp_path / "run")
+    outcome = sr.run(CONFIGS / f"{name}.yaml", {"observers": []}, out=tmp_path / "run", figures=False)
     assert outcome.result.status == status, outcome.result.message
     if cost is not None:
         assert outcome.result.cost == pytest.approx(cost, rel=tolerance)
@@ -57,7 +57,7 @@ def test_a_config_comes_back_with_the_expected_answer(name: str, tmp_path: Path)
 
 @pytest.mark.parametrize("name", sorted(name for name, (status, *_) in EXPECTED.items() if status == "infeasible"))
 def test_an_infeasible_config_says_which_constraint_is_at_fault_and_when(name: str, tmp_path: Path) -> None:
-    message = sr.run(CONFIGS / f"{name}.yaml", {"observers": []}, out=tmp_path / "run").result.message
+    message = sr.run(CONFIGS / f"{name}.yaml", {"observers": []}, out=tmp_path / "run", figures=False).result.message
     assert "path" in message or "terminal" in message
     assert "t = " in message
 
@@ -73,7 +73,9 @@ def test_the_schema_in_the_folder_is_the_schema_of_the_program() -> None:
         validator.validate(YAML(typ="safe", pure=True).load(path))
 
 
-def test_certified_costs_are_ordered_as_the_uncertainty_grows(tmp_path: Path) -> None:
-    costs = [sr.run(CONFIGS / "double_integrator.yaml", {"problem.disturbance.box": [w, w], "observers": []}, out=tmp_path / str(w)).result.cost
-             for w in (0.0, 0.01, 0.02)]
+def test_the_cost_grows_with_the_uncertainty(tmp_path: Path) -> None:
+    config, costs = CONFIGS / "double_integrator.yaml", []
+    for bound in (0.0, 0.01, 0.02):
+        outcome = sr.run(config, {"problem.disturbance.box": [bound, bound], "observers": []}, out=tmp_path / str(bound), figures=False)
+        costs.append(outcome.result.cost)
     assert costs == sorted(costs)

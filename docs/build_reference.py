@@ -1,0 +1,109 @@
+"""Writes docs/reference.md and configs/schema.json from what the program says of itself: ``make docs``."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+
+import sparserob_core as sr
+from sparserob_core.experiment.cli import EXIT, commands
+from sparserob_core.experiment.option_rows import option_rows
+from sparserob_core.experiment.registry import Hooks
+from sparserob_core.experiment.run_config import RunConfig
+from sparserob_core.experiment.schema import config_schema
+
+ROOT = Path(__file__).resolve().parents[1]
+MEANING = {0: "certified or verified", 2: "the input is at fault", 3: "infeasible", 4: "refuted or undecided", 5: "failed",
+           130: "interrupted"}
+FILES = {
+    "config.yaml": "the complete, resolved config; `sparserob run` takes it",
+    "result.json": "status, message, cost, value, epsilon, bounds, gap, worst constraint, sparsity, counts, seconds, seed, versions",
+    "solution.npz": "`breakpoints (K+1,)`, `control (m, K)`, `theta (m, N)`; of the imposed constraints `times`, `indices`, `rows`, "
+                    "`families`, `multipliers`",
+    "trace.npz": "one array per column, one entry per round: bounds, violation, epsilon, indices, seconds",
+    "figures/": "`control`, `states`, `convergence`, each as PDF and PNG",
+}
+
+
+def reference() -> str:
+    """The whole page."""
+    head = ["# Reference", "", "Written by `make docs` from what the program says of itself; the tests compare."]
+    parts = [head, _commands(), _config(), _components(), _hooks(), _files(), _names()]
+    return "\n\n".join("\n".join(part) for part in parts) + "\n"
+
+
+def schema() -> str:
+    """The JSON schema of a config."""
+    return json.dumps(config_schema(sr.load_registry()), indent=2) + "\n"
+
+
+def table(columns: tuple[str, ...], rows: list[tuple[str, ...]]) -> list[str]:
+    """A Markdown table."""
+    lines = [columns, tuple("---" for _ in columns), *rows]
+    return ["| " + " | ".join(" ".join(cell.replace("|", "\\|").split()) for cell in line) + " |" for line in lines]
+
+
+def _commands() -> list[str]:
+    lines = ["## Commands", ""]
+    for name, command in commands.commands.items():
+        context = click.Context(command, info_name=f"sparserob {name}")
+        usage = [parameter.make_metavar(context) for parameter in command.params if isinstance(parameter, click.Argument)]
+        lines += [f"### `sparserob {name}`", "", f"`{' '.join(['sparserob', name, *usage])}`", "", inspect.cleandoc(command.help or ""), ""]
+        options = [(f"`{'`, `'.join([*option.opts, *option.secondary_opts])}`", option.help or "") for option in command.params
+                   if isinstance(option, click.Option)]
+        lines += [*table(("option", "meaning"), options), ""] if options else []
+    ends = sorted({*EXIT.values(), *MEANING})
+    return [*lines, "### Exit status", "", *table(("status", "meaning"), [(str(end), MEANING[end]) for end in ends])]
+
+
+def _config() -> list[str]:
+    rows, defaults = [], RunConfig.model_construct(problem=None).model_dump(mode="json")
+    for name, field in RunConfig.model_fields.items():
+        default = "required" if field.is_required() else f"`{json.dumps(defaults[name])}`"
+        rows.append((f"`{name}`", default, field.description or ""))
+    return ["## Keys of a config", "", *table(("key", "default", "meaning"), rows), "",
+            "A component is written as a mapping with its `name` and its options, or as its bare name. `maximiser` also takes `budget`."]
+
+
+def _components() -> list[str]:
+    lines = ["## Components"]
+    for record in sr.load_registry().records():
+        rows = [(f"`{row.name}`", row.type, row.default and f"`{row.default}`", row.range, row.meaning) for row in option_rows(record)]
+        lines += ["", f"### {record.kind} `{record.name}`", "", record.summary, ""]
+        lines += table(("option", "type", "default", "range", "meaning"), rows) if rows else ["It has no options."]
+    return lines
+
+
+def _hooks() -> list[str]:
+    hooks = [(f"`{name}`", inspect.getdoc(function) or "") for name, function in inspect.getmembers(Hooks, inspect.isfunction)]
+    return ["## Hooks", "", "[extending.md](extending.md) shows how to implement them.", "", *table(("hook", "yields"), hooks)]
+
+
+def _files() -> list[str]:
+    return ["## Files of a run", "", *table(("file", "contents"), [(f"`{name}`", text) for name, text in FILES.items()])]
+
+
+def _names() -> list[str]:
+    rows = [(f"`{name}`", _first_sentence(getattr(sr, name))) for name in sr.__all__]
+    return ["## Names of `sparserob_core`", "", *table(("name", "what it is"), rows)]
+
+
+def _first_sentence(thing: object) -> str:
+    if not (inspect.isclass(thing) or inspect.isfunction(thing)):
+        return "A type: an array of doubles."
+    return (inspect.getdoc(thing) or "").split("\n\n")[0]
+
+
+def pages() -> Iterator[tuple[Path, str]]:
+    """Every generated file with its text."""
+    yield ROOT / "docs" / "reference.md", reference()
+    yield ROOT / "configs" / "schema.json", schema()
+
+
+if __name__ == "__main__":
+    for path, text in pages():
+        path.write_text(text, encoding="utf-8")
