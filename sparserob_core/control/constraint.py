@@ -23,6 +23,7 @@ from sparserob_core.sip.program import Enclosure, Explanation, Separation
 
 T = TypeVar("T")
 REMEMBERED = 256    # cells of parameters whose matrices are kept
+TIME_FIRST = 0.25   # times are halved before anything else unless that gains less than this share: their cells share all work
 INSIDE = 3         # times sampled inside every piece, beside its ends
 CLIMBED = 10        # of them, those that parameters are climbed for
 KEPT = 12          # separated constraints per row and round
@@ -120,8 +121,8 @@ class FlatConstraint:
         for group in range(int(which.max(initial=-1)) + 1):
             members = touched[which.reshape(-1) == group]
             cell = self._cell(x, lower[members[0], 1:], upper[members[0], 1:])
-            bounds[members], drift, spread = cell.bounds(lower[members, 0], upper[members, 0])
-            split[members] = where_to_halve(drift, spread, bounds[members])
+            bounds[members], bend, spread = cell.bounds(lower[members, 0], upper[members, 0])
+            split[members] = where_to_halve(bend, spread, bounds[members])
         return Enclosure(bounds, split)
 
     def lifted(self, low: Array, high: Array) -> LiftedSystem:
@@ -136,7 +137,7 @@ class FlatConstraint:
         key = x.tobytes() + low.tobytes() + high.tobytes()
         if key not in self._cells:
             lifted = self.lifted(low, high)
-            control = x.reshape(-1, self.functionals.dictionary.functions) @ self.functionals.dictionary.values
+            control = self.functionals.dictionary.control(x)
             rhs = np.zeros((self.h.size, lifted.space.size))
             rhs[:, 0] = self.h
             remember(self._cells, key, CellEnclosure(lifted, self._push(low, high), self.H, rhs, control))
@@ -186,7 +187,7 @@ class FlatConstraint:
     def on_lattice(self, x: Array) -> Array:
         """Violations ``(v, r, times)`` at every lattice point and sampled time."""
         response, points = self.functionals.response, self.lattice[0]
-        control = x.reshape(-1, self.functionals.dictionary.functions) @ self.functionals.dictionary.values
+        control = self.functionals.dictionary.control(x)
         nodes = response.states(control, points)
         pieces, flow, driven = self._sampling
         steps = response.steps(points)
@@ -234,16 +235,16 @@ def remember(cache: dict[bytes, T], key: bytes, value: T) -> None:
     cache[key] = value
 
 
-def where_to_halve(drift: Array, spread: Array, bounds: Array) -> np.ndarray:
+def where_to_halve(bend: Array, spread: Array, bounds: Array) -> np.ndarray:
     """Halve the times where they matter most, else one other coordinate, the same for the whole group so that its cells stay shared.
 
-    ``drift (k,)``: what halving the times of a cell would gain; ``spread (k, j)``: what halving each other coordinate would.
+    ``bend (k,)``: what halving the times of a cell would gain; ``spread (k, j)``: what halving each other coordinate would.
     """
     if not spread.shape[1]:
-        return np.zeros(drift.size, dtype=int)
+        return np.zeros(bend.size, dtype=int)
     open_ = bounds > 0
     total = spread[open_].sum(axis=0) if open_.any() else spread.sum(axis=0)
-    return np.where(drift > spread.max(axis=1), 0, 1 + int(total.argmax()))
+    return np.where(bend > TIME_FIRST * spread.max(axis=1), 0, 1 + int(total.argmax()))
 
 
 def push_of(functionals: WorstCase, lifted: LiftedSystem, H: Array, joined: Combination | None = None) -> Push | MeasurablePush | None:

@@ -39,7 +39,7 @@ class ControlConstraint:
 
     def worst(self, x: Array) -> Separation:
         """The pieces furthest outside, each with its worst direction; the bound is exact, since the pieces are finitely many."""
-        control = (x.reshape(-1, self.dictionary.functions) @ self.dictionary.values).T
+        control = self.dictionary.control(x).T
         outside = self.set.violation(control)
         pieces = np.argsort(-outside, kind="stable")[:CLIMBED]
         z = sampled(self.set.dimension)

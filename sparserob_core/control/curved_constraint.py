@@ -97,8 +97,8 @@ class CurvedConstraint:
             first = members[0]
             free = np.flatnonzero(upper[first, 1 + nu:] > lower[first, 1 + nu:])
             cell = self._cell(x, lower[first, 1:], upper[first, 1:], free)
-            bounds[members], drift, spread = cell.bounds(lower[members, 0], upper[members, 0])
-            advice = where_to_halve(drift, spread, bounds[members])
+            bounds[members], bend, spread = cell.bounds(lower[members, 0], upper[members, 0])
+            advice = where_to_halve(bend, spread, bounds[members])
             coordinates = np.concatenate([np.arange(1 + nu), 1 + nu + free])
             split[members] = coordinates[advice]
         return Enclosure(bounds, split)
@@ -123,12 +123,13 @@ class CurvedConstraint:
             lifted = self._flat.lifted(low[:nu], high[:nu])
             joined = self._combination(lifted, free.size)
             push = push_of(self.functionals, lifted, H, joined)
-            control = x.reshape(-1, self.functionals.dictionary.functions) @ self.functionals.dictionary.values
-            remember(self._cells, key, CellEnclosure(lifted, push, H, self._minorant(H, joined, nu), control, joined))
+            rhs, looseness = self._minorant(H, joined, nu)
+            control = self.functionals.dictionary.control(x)
+            remember(self._cells, key, CellEnclosure(lifted, push, H, rhs, control, joined, looseness))
         return self._cells[key]
 
-    def _minorant(self, H: Array, joined: Combination, nu: int) -> Array:
-        """A quadratic polynomial below ``h(c_0 + sum_j eta_j c_j)``, ``(1, M')``."""
+    def _minorant(self, H: Array, joined: Combination, nu: int) -> tuple[Array, Array]:
+        """A quadratic polynomial below ``h(c_0 + sum_j eta_j c_j)``, ``(1, M')``, and how far below at the ends of every coordinate."""
         value, gradient, hessian = self.set.support_minorant(H[0], H[1:])
         rhs = np.zeros((1, joined.space.size))
         rhs[0, 0] = value
@@ -137,7 +138,8 @@ class CurvedConstraint:
             rhs[0, joined.space.index[tuple(first.tolist())]] = gradient[i]
             for j, second in enumerate(unit_exponents):
                 rhs[0, joined.space.index[tuple((first + second).tolist())]] += hessian[i, j] / 2
-        return rhs
+        ends = [self.set.support(H[0] + sign * H[1:]) - value - sign * gradient - np.diag(hessian) / 2 for sign in (-1.0, 1.0)]
+        return rhs, np.concatenate([np.zeros(nu), np.maximum(*ends)])
 
     def _combination(self, lifted: LiftedSystem, free: int) -> Combination:
         if free not in self._combinations:

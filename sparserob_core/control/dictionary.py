@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -56,6 +57,16 @@ class Dictionary:
     def lengths(self) -> Array:
         """Length of every piece ``(K,)``."""
         return np.diff(self.breakpoints)
+
+    @cached_property
+    def is_indicators(self) -> bool:
+        """Whether function ``k`` is the indicator of piece ``k``."""
+        return self.functions == self.pieces and np.array_equal(self.values, np.eye(self.pieces))
+
+    def control(self, theta: Array) -> Array:
+        """The control ``(m, K)`` on the pieces, from coefficients ``(m N,)``, raveled channel by channel."""
+        coefficients = theta.reshape(-1, self.functions)
+        return coefficients if self.is_indicators else coefficients @ self.values
 
     def merged(self) -> Dictionary:
         """The same functions on the fewest pieces: adjacent pieces on which all of them agree become one."""

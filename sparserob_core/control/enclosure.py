@@ -16,10 +16,11 @@ from sparserob_core.control.combination import Combination
 from sparserob_core.control.lifted import LiftedSystem
 from sparserob_core.control.measurable import MeasurablePush
 from sparserob_core.control.polynomial import distinct_patterns, face_matrix, monotone_ends, polynomial_bound
-from sparserob_core.control.push import Push
+from sparserob_core.control.push import HUGE, Push
 from sparserob_core.control.taylor import TaylorSpace
 from sparserob_core.sip.convex_set import Array
 
+LONG_STEP = 1.0         # in norm times duration: longer steps are taken by matrix exponentials
 SMALL_SHARE = 1e-6      # so that no coordinate is ever entirely blameless
 TAYLOR_TERMS = 1e-17    # relative size below which further terms of the exponential series are left out
 
@@ -30,6 +31,7 @@ class CellEnclosure:
 
     ``H (r, d)``; ``rhs (r', M')``, polynomials over the cell; ``control (m, K)`` on the pieces of the control's dictionary. Without a
     combination every row of ``H`` is a constraint (``r' = r``, ``M' = M``); with one they are the parts of a single constraint.
+    ``looseness (nu',)``: how far ``rhs`` may be below the truth at the ends of every coordinate; it only guides the halving.
     """
 
     lifted: LiftedSystem
@@ -38,6 +40,7 @@ class CellEnclosure:
     rhs: Array
     control: Array
     combination: Combination | None = None
+    looseness: Array | float = 0.0
 
     def bounds(self, start: Array, stop: Array) -> tuple[Array, Array, Array]:
         """For time cells ``[start, stop]`` (``(k,)``, each inside one piece): upper bounds ``(k,)``, the part of them that halving the
@@ -54,8 +57,7 @@ class CellEnclosure:
         worst = total.argmax(axis=1)
         pick = (np.arange(worst.size), worst)
         spread = np.maximum(spreads[which[:start.size]][pick], spreads[which[start.size:]][pick]) + self._shares * neglected[pick][:, None]
-        drift = np.abs(right - left)[pick] + bend[pick]
-        return total[pick], drift, spread
+        return total[pick], bend[pick], spread + self.looseness
 
     def _at(self, times: Array, pieces: np.ndarray) -> tuple[Array, Array]:
         """Bounds ``(k, r)`` at single times, and how much of them each parameter accounts for, ``(k, r, nu)``."""
@@ -82,27 +84,35 @@ class CellEnclosure:
         return monotone_ends(space, coefficients.reshape(-1, space.size), swing.reshape(-1, space.nu)).reshape(*shape, space.nu)
 
     def _states(self, times: Array, pieces: np.ndarray) -> Array:
-        """Taylor coefficients ``(k, M, d)`` of the state under the control alone: the exponential series from the last breakpoint."""
-        within = (times - self.lifted.grid.breakpoints[pieces])[:, None]
-        matrix = self.lifted.matrix
-        term = self._slopes[pieces]
-        total = self._nodes.reshape(self._nodes.shape[0], -1)[pieces] + within * term
-        order, size = 1, self.lifted.norm * float(within.max(initial=0.0))
-        bound = size
+        """Taylor coefficients ``(k, M, d)`` of the state under the control alone, from the last breakpoint."""
+        within = times - self.lifted.grid.breakpoints[pieces]
+        start = self._nodes.reshape(self._nodes.shape[0], -1)[pieces]
+        size = self.lifted.norm * float(within.max(initial=0.0))
+        moved = self._by_series(start, self._slopes[pieces], within[:, None], size) if size < LONG_STEP else self._by_exponential(start, pieces, within)
+        return moved.reshape(times.size, self.lifted.space.size, -1)
+
+    def _by_series(self, start: Array, slopes: Array, within: Array, size: float) -> Array:
+        """The exponential series, for short steps: no matrix is built."""
+        total, term, order, bound = start + within * slopes, slopes, 1, size
         while bound > TAYLOR_TERMS:
             order += 1
-            term = term @ matrix.T * (within / order)
+            term = term @ self.lifted.matrix.T * (within / order)
             total = total + within * term
-            bound = bound * size / order
-        answer: Array = total.reshape(times.size, self.lifted.space.size, -1)
-        return answer
+            bound *= size / order
+        return total
+
+    def _by_exponential(self, start: Array, pieces: np.ndarray, within: Array) -> Array:
+        distinct, which = np.unique(np.round(within / self.lifted.grid.breakpoints[-1], 15), return_inverse=True)
+        flow, driven = self.lifted.forward.flows(distinct * self.lifted.grid.breakpoints[-1])
+        which = which.reshape(-1)
+        return np.asarray(np.einsum("kij,kj->ki", flow[which], start) + np.einsum("kij,kj->ki", driven[which], self._drive[pieces]))
 
     def _curvature(self, start: Array, stop: Array, pieces: np.ndarray) -> Array:
         """``(b - a)^2 / 8`` times the largest second time derivative, summed over the Taylor coefficients, ``(k, r)``."""
         space, matrix, width = self.lifted.space, self.lifted.matrix, stop - start
         states = self._states(start, pieces).reshape(start.size, -1)
         second = (states @ matrix.T + self._drive[pieces]) @ matrix.T
-        growth = np.expm1(self.lifted.norm * width)
+        growth = np.expm1(np.minimum(self.lifted.norm * width, HUGE))
         by_row = np.abs(np.einsum("ri,kai->kra", self._rows, second.reshape(start.size, space.size, -1))).sum(axis=2)
         loose = np.sqrt(space.size) * np.linalg.norm(second, axis=1) * growth
         total = by_row + np.linalg.norm(self._rows, axis=1) * loose[:, None]

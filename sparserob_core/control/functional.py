@@ -114,12 +114,12 @@ class WorstCase:
     def on_decision(self, weights: Array) -> Array:
         """Weights ``(k, L, m)`` on the control of every grid piece, as rows ``(k, n)`` of the decision."""
         on_pieces = np.add.reduceat(weights, self._control_starts(), axis=1)
-        return (self.dictionary.values @ on_pieces).swapaxes(1, 2).reshape(-1, self.variables)
+        coefficients = on_pieces if self.dictionary.is_indicators else self.dictionary.values @ on_pieces
+        return coefficients.swapaxes(1, 2).reshape(-1, self.variables)
 
     def on_grid(self, theta: Array) -> Array:
         """The control ``(m, L)`` on the pieces of the merged grid."""
-        control = theta.reshape(-1, self.dictionary.functions) @ self.dictionary.values
-        return control[:, self.response.grid.control_piece]
+        return self.dictionary.control(theta)[:, self.response.grid.control_piece]
 
     def _support(self, gains: Array, W: Array, times: Array, directions: Array, parameters: Array) -> Array:
         if self.disturbance is None:

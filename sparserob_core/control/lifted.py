@@ -14,6 +14,7 @@ from itertools import accumulate
 
 import numpy as np
 
+from sparserob_core.control.exponential import exponential
 from sparserob_core.control.response import Response, TimeGrid
 from sparserob_core.control.system import LinearSystem
 from sparserob_core.control.taylor import TaylorSpace
@@ -127,12 +128,10 @@ class LiftedSystem:
     @cached_property
     def _growths(self) -> Array:
         """``G (M, M)``: the norm of coefficient ``a`` of ``e^{lifted r} z`` is at most ``sum_b G_ab |z_b|``, for ``r`` up to the longest piece."""
-        from scipy.linalg import expm
-
         left, right, target = self.space.products
         sizes = np.zeros((self.space.size, self.space.size))
         sizes[target, right] = np.linalg.norm(self.A, axis=(1, 2))[left]
-        return np.asarray(expm(sizes * self.grid.lengths.max()))
+        return exponential(sizes * self.grid.lengths.max())
 
     @cached_property
     def _overflow(self) -> Array:

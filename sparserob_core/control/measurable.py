@@ -134,7 +134,7 @@ class MeasurablePush:
         norm = float(np.linalg.norm(A[0], 2))
         axes = np.eye(self.bound.dimension)
         reach = float(np.linalg.norm(np.maximum(self.bound.support(axes), self.bound.support(-axes)))) * float(np.linalg.norm(W[0], 2))
-        grown = np.linalg.norm(slopes[:-1], axis=2) * np.expm1(norm * grid.lengths)[:, None] * reach
+        grown = np.linalg.norm(slopes[:-1], axis=2) * np.expm1(np.minimum(norm * grid.lengths, 300.0))[:, None] * reach
         return np.asarray(size[:-1] + grown)
 
     @property

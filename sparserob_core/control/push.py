@@ -15,6 +15,8 @@ from sparserob_core.control.polynomial import distinct_patterns, face_matrix
 from sparserob_core.control.taylor import TaylorSpace
 from sparserob_core.sip.convex_set import Array
 
+HUGE = 300.0    # a logarithm of a growth that is as good as infinite
+
 
 @dataclass(frozen=True, eq=False)
 class Push:
@@ -56,9 +58,9 @@ class Push:
         grid, matrix = self.lifted.grid, self.lifted.row_matrix
         bent = self._lifted_rows @ matrix @ matrix
         norm = self.lifted.norm
-        growth = np.expm1(norm * grid.lengths)[:, None]
+        growth = np.expm1(np.minimum(norm * grid.lengths, HUGE))[:, None]
         along = np.linalg.norm(bent, axis=1) * self._total_gain[:-1, None] * growth
-        fresh = np.linalg.norm(self._lifted_rows @ matrix, axis=1) * np.exp(norm * grid.lengths)[:, None]
+        fresh = np.linalg.norm(self._lifted_rows @ matrix, axis=1) * np.exp(np.minimum(norm * grid.lengths, HUGE))[:, None]
         return np.asarray(self._sizes(bent) + np.sqrt(self.lifted.space.size) * self._reach * (along + fresh))
 
     @cached_property
@@ -166,4 +168,4 @@ class Push:
         for piece in range(1, grid.pieces):
             powers[piece] = powers[piece - 1] @ steps.E[0, self.lifted.backward.length_of(piece - 1)]
         norms = np.linalg.norm(powers, axis=(1, 2))
-        return np.concatenate([[0.0], np.cumsum(norms * np.exp(self.lifted.norm * grid.lengths) * grid.lengths)])
+        return np.concatenate([[0.0], np.cumsum(norms * np.exp(np.minimum(self.lifted.norm * grid.lengths, HUGE)) * grid.lengths)])

@@ -12,6 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
+from sparserob_core.control.exponential import exponential
 from sparserob_core.control.system import LinearSystem
 from sparserob_core.sip.convex_set import Array
 
@@ -190,15 +191,13 @@ class Response:
 
 def transitions(A: Array, durations: Array) -> tuple[Array, Array]:
     """``e^{A r}`` and ``int_0^r e^{A s} ds`` for matrices ``(..., d, d)`` and durations ``(...,)``, broadcast together."""
-    from scipy.linalg import expm
-
     size = A.shape[-1]
     shape = np.broadcast_shapes(A.shape[:-2], durations.shape)
     block = np.zeros((*shape, 2 * size, 2 * size))
     block[..., :size, :size] = A * durations[..., None, None]
     block[..., :size, size:] = np.eye(size) * durations[..., None, None]
-    exponential = expm(block.reshape(-1, 2 * size, 2 * size)).reshape(block.shape)
-    return exponential[..., :size, :size], exponential[..., :size, size:]
+    both = exponential(block)
+    return both[..., :size, :size], both[..., :size, size:]
 
 
 def _unique_rows(parameters: Array) -> tuple[Array, np.ndarray]:

@@ -45,7 +45,7 @@ class Transcription:
 
     def pieces(self, theta: Array) -> Array:
         """The control ``(m, K)`` on the pieces of its dictionary."""
-        return theta.reshape(-1, self.control.functions) @ self.control.values
+        return self.control.control(theta)
 
 
 def transcribe(problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary | None = None,
@@ -98,9 +98,8 @@ def _image(model: Transcription) -> tuple[csc_array | None, Array, Array, Array]
     weights: Array = np.kron(np.asarray(model.problem.weights, dtype=float), dictionary.lengths)
     flat = None if isinstance(bound, Box) else bound.halfspaces()
     values = csc_array(dictionary.values.T)
-    identity = dictionary.values.shape[0] == dictionary.pieces and np.array_equal(dictionary.values, np.eye(dictionary.pieces))
     if flat is None:
-        return (None if identity else csc_array(kron(eye_array(channels), values))), lower, upper, weights
+        return (None if dictionary.is_indicators else csc_array(kron(eye_array(channels), values))), lower, upper, weights
     H, h = flat
     several = np.count_nonzero(H, axis=1) > 1
     S = csc_array(vstack([kron(eye_array(channels), values), kron(csc_array(H[several]), values)]))

@@ -29,7 +29,6 @@ IDLE_ROUNDS = 3         # rounds that a row may stay without a multiplier before
 DROPPING_ROUNDS = 40    # rounds after which rows are only added, so that nothing can cycle
 MARGINS = (1e-10, 1e-6)
 ALLOWED = TOLERANCE / 2  # a violation that the search may leave to the proof
-BUDGET = 2000           # evaluations of the maximiser per family and round, where a family offers no separation
 
 Prover: TypeAlias = Callable[[Array], Sequence[Proof]]
 
@@ -153,7 +152,7 @@ class _Run:
 
     def _separate(self, x: Array) -> list[tuple[ConstraintFamily, Separation]]:
         return [(family, family.worst(x) if family.worst is not None
-                 else search_worst(family, x, self.tools.maximiser, BUDGET, self.tools.rng)) for family in self.program.families]
+                 else search_worst(family, x, self.tools.maximiser, self.tools.budget, self.tools.rng, ALLOWED)) for family in self.program.families]
 
     def _exchange(self, solution: FiniteSolution, violated: Sequence[tuple[Array, np.ndarray, str]]) -> None:
         """Drop the rows that have been slack for a while, add the violated ones."""

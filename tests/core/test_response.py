@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from unittest.mock import patch
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,6 +12,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from sparserob_core.control.dictionary import Dictionary
+from sparserob_core.control.exponential import exponential
 from sparserob_core.control.lifted import lift
 from sparserob_core.control.push import Push
 from sparserob_core.control.response import Response, merge_grids, transitions
@@ -109,13 +112,18 @@ def test_the_push_by_age_equals_the_push_by_adjoints(seed, pieces, nu):
     system = LinearSystem(lambda p: A0 + p[0] * A1, np.ones((2, 1)), E, parameters=Box([-0.1], [0.1])) if nu else known
     functionals = worst_case(system, uniform(pieces, HORIZON), bound=Box([-0.1, -0.2], [0.3, 0.1]))
     lifted = lift(system, functionals.response.grid, np.zeros(2), np.zeros(nu), np.full(nu, 0.1))
-    push = Push(lifted, functionals.disturbance, rng.normal(size=(3, 2)))
-    assert push._repeats
+    rows = rng.normal(size=(3, 2))
     times = np.concatenate([functionals.response.grid.breakpoints, rng.uniform(0, HORIZON, 5)])
-    fast = push._by_age(times)
-    coefficients, excess = push._summed(push._blocks(times, push._lifted_rows))
-    assert np.allclose(fast[0], coefficients.sum(axis=2), rtol=1e-9, atol=1e-11)
-    assert np.allclose(fast[1], excess.sum(axis=2), rtol=1e-9, atol=1e-11)
+    ends = rng.integers(-1, 2, (times.size, 3, nu)).astype(float)
+    push = Push(lifted, functionals.disturbance, rows)
+    fast, steep, bent = push.at(times, ends), push.swing(times), push.curvature
+    with patch.object(Push, "_repeats", new=False):
+        push = Push(lifted, functionals.disturbance, rows)
+        slow = push.at(times, ends)
+        assert np.allclose(fast[0], slow[0], rtol=1e-9, atol=1e-11)
+        assert np.allclose(fast[1], slow[1], rtol=1e-9, atol=1e-11)
+        assert np.allclose(steep, push.swing(times), rtol=1e-9, atol=1e-11)
+        assert np.allclose(bent, push.curvature, rtol=1e-9, atol=1e-11)
 
 
 @settings(max_examples=20, deadline=None)
@@ -170,3 +178,20 @@ def test_a_stiff_system_keeps_its_accuracy(rate):
         truth = simulated(A, [(B, np.linspace(0, HORIZON, 4), control)], [1.0, 1.0], time, np.array([0.0]))
         G, offset = functionals.rows(np.full(2, time), np.eye(2), np.zeros((2, 0)))
         assert np.allclose(G @ control[0] + offset, truth, rtol=1e-11, atol=1e-12)
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 10**6), size=st.integers(1, 8), magnitude=st.sampled_from([0.0, 1e-8, 0.3, 1.0, 5.0, 30.0]))
+def test_the_exponential_of_many_matrices_agrees_with_scipy(seed, size, magnitude):
+    rng = np.random.default_rng(seed)
+    matrices = magnitude * rng.normal(size=(4, 3, size, size)) / size
+    matrices[0] *= 1e-3
+    matrices[1] = np.triu(matrices[1])
+    found, truth = exponential(matrices), expm(matrices)
+    assert (np.abs(found - truth).max(axis=(-2, -1)) <= 1e-11 * np.abs(truth).max(axis=(-2, -1))).all()
+
+
+def test_the_exponential_of_a_stiff_matrix_keeps_its_slow_part():
+    A = np.array([[-2000.0, 1.0, 0.0], [0.0, -0.3, 1.0], [0.0, 0.0, 0.0]])
+    assert np.allclose(exponential(A[None])[0], expm(A), rtol=1e-10, atol=1e-13)
+    assert np.array_equal(exponential(np.zeros((2, 3, 3))), np.tile(np.eye(3), (2, 1, 1)))

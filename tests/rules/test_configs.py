@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 # status, and the cost J where a closed form or an independent linear program knows it (relative tolerance beside it)
 EXPECTED: dict[str, tuple[str, float | None, float]] = {
     "breakpoints": ("certified", None, 0.0),
-    "coupled_masses": ("certified", None, 0.0),
+    "coupled_masses": ("certified", 1.057952, 5e-6),
     "double_integrator": ("certified", 1.6, 1e-6),
     "ellipsoidal": ("certified", None, 0.0),
     "experiment1_nominal": ("refuted", 0.1757928, 1e-6),
@@ -25,9 +26,9 @@ EXPECTED: dict[str, tuple[str, float | None, float]] = {
     "experiment2_repaired": ("certified", 1.02007, 2e-5),
     "experiment3_printed": ("infeasible", None, 0.0),
     "experiment3_repaired": ("certified", 1.11230, 2e-5),
-    "haar": ("certified", None, 0.0),
+    "haar": ("certified", 0.537592, 5e-6),
     "parameters_and_disturbance": ("certified", None, 0.0),
-    "walsh": ("certified", None, 0.0),
+    "walsh": ("certified", 0.537065, 5e-6),
 }
 
 
@@ -59,7 +60,7 @@ def test_a_config_comes_back_with_the_expected_answer(name: str, tmp_path: Path)
 def test_an_infeasible_config_says_which_constraint_is_at_fault_and_when(name: str, tmp_path: Path) -> None:
     message = sr.run(CONFIGS / f"{name}.yaml", {"observers": []}, out=tmp_path / "run", figures=False).result.message
     assert "path" in message or "terminal" in message
-    assert "t = " in message
+    assert re.search(r"x\d\(\d", message), message
 
 
 def test_the_schema_in_the_folder_is_the_schema_of_the_program() -> None:
