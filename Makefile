@@ -28,12 +28,15 @@ $(INSTALLED): pyproject.toml
 	  if $$candidate -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then python=$$candidate; break; fi; \
 	done; \
 	if [ -z "$$python" ]; then echo "SparseRob needs Python 3.11 or later with venv; set PYTHON=/path/to/python" >&2; exit 1; fi; \
-	if [ ! -x $(BIN)/python ]; then echo "setting up $(VENV) with $$($$python --version)"; $$python -m venv $(VENV); fi
+	if ! $(BIN)/python -m pip --version >/dev/null 2>&1; then \
+	  echo "setting up $(VENV) with $$($$python --version), which takes a minute, once"; $$python -m venv --clear $(VENV); \
+	fi
 	@$(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check --editable '.[all]'
 	@touch $@
 
 demo: $(INSTALLED)
 	@$(BIN)/sparserob run $(DEMO)
+	@echo "figures in $$(ls -dt runs/$(basename $(notdir $(DEMO)))/*/figures | head -n 1)"
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

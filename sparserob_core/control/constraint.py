@@ -14,7 +14,7 @@ from sparserob_core.control.functional import WorstCase
 from sparserob_core.control.lifted import LiftedSystem, lift
 from sparserob_core.control.measurable import MeasurablePush
 from sparserob_core.control.parameters import ParameterIndex
-from sparserob_core.control.peaks import climb, local_maxima, vertex_times
+from sparserob_core.control.peaks import climb, local_maxima, vertices
 from sparserob_core.control.push import Push
 from sparserob_core.control.response import distinct_times, transitions
 from sparserob_core.errors import NotEnclosable
@@ -23,6 +23,8 @@ from sparserob_core.sip.program import Enclosure, Explanation, Separation
 
 T = TypeVar("T")
 REMEMBERED = 256    # cells of parameters whose matrices are kept
+TINY = 1e-4         # of a cell of parameters: a cell on which a system that can be enclosed at all will be
+SURE = 1e-8         # a vertex that is predicted to this accuracy is one
 TIME_FIRST = 0.25   # times are halved before anything else unless that gains less than this share: their cells share all work
 INSIDE = 3         # times sampled inside every piece, beside its ends
 CLIMBED = 10        # of them, those that parameters are climbed for
@@ -74,14 +76,21 @@ class FlatConstraint:
         """The largest local maxima of the violation over the index set, times refined between the nodes, parameters between lattice points."""
         values = self.on_lattice(x)
         positions = local_maxima(values, self.lattice[1], KEPT)
-        indices = np.hstack([vertex_times(values, positions, self.times)[:, None], self.lattice[0][positions[:, 0]]])
-        rows = positions[:, 1]
+        heights, rows = values[tuple(positions.T)], positions[:, 1]
+        times, predicted = vertices(values, positions, self.times)
+        indices = np.hstack([times[:, None], self.lattice[0][positions[:, 0]]])
         if self.parameters.count:
-            likely = np.argsort(-values[tuple(positions.T)], kind="stable")[:CLIMBED]
-            indices, rows = indices[likely], rows[likely]
-            indices, found = self._zoomed(x, indices, rows)
+            likely = np.argsort(-heights, kind="stable")[:CLIMBED]
+            indices, found = self._climbed(x, indices[likely], rows[likely])
+            rows = rows[likely]
         else:
             found = self.violations(x, indices, rows)
+            lost = heights > found  # a kink, where a parabola is no guide
+            indices[lost, 0], found[lost] = self.times[positions[lost, 2]], heights[lost]
+            unsure = np.flatnonzero(lost | (np.abs(predicted - found) > SURE * np.maximum(1.0, np.abs(found))))
+            unsure = unsure[np.argsort(-found[unsure], kind="stable")][:CLIMBED]
+            if unsure.size:
+                indices[unsure], found[unsure] = self._climbed(x, indices[unsure], rows[unsure])
         order = np.argsort(-found, kind="stable")
         return Separation(indices[order], rows[order], found[order])
 
@@ -120,7 +129,13 @@ class FlatConstraint:
         _, which = np.unique(keys, axis=0, return_inverse=True) if keys.shape[1] else (keys, np.zeros(touched.size, dtype=int))
         for group in range(int(which.max(initial=-1)) + 1):
             members = touched[which.reshape(-1) == group]
-            cell = self._cell(x, lower[members[0], 1:], upper[members[0], 1:])
+            low, high = lower[members[0], 1:], upper[members[0], 1:]
+            try:
+                cell = self._cell(x, low, high)
+            except NotEnclosable:
+                self.lifted((low + high) / 2 - TINY * (high - low), (low + high) / 2 + TINY * (high - low))  # raises if no cell will do
+                bounds[members], split[members] = np.inf, 1 + int(np.argmax(high - low))
+                continue
             bounds[members], bend, spread = cell.bounds(lower[members, 0], upper[members, 0])
             split[members] = where_to_halve(bend, spread, bounds[members])
         return Enclosure(bounds, split)
@@ -206,7 +221,7 @@ class FlatConstraint:
         flow, driven = transitions(A[:, None], distinct[None] * response.grid.breakpoints[-1])
         return pieces, flow[:, which], driven[:, which]
 
-    def _zoomed(self, x: Array, indices: Array, rows: np.ndarray) -> tuple[Array, Array]:
+    def _climbed(self, x: Array, indices: Array, rows: np.ndarray) -> tuple[Array, Array]:
         """Climb from every candidate ``(t, p)``; the set of parameters is never left."""
         box = self.index_set
         radius = np.concatenate([[np.max(np.diff(self.times), initial=0.0)], (box.upper - box.lower)[1:] / 4])
@@ -257,4 +272,4 @@ def push_of(functionals: WorstCase, lifted: LiftedSystem, H: Array, joined: Comb
     if lifted.space.nu or joined is not None:
         raise NotEnclosable("measurable disturbances are proven only for known systems and sets with flat sides; "
                             "expected disturbance_class piecewise_constant")
-    return MeasurablePush(functionals.response, model.bound, H)
+    return MeasurablePush(functionals.measurable, H)

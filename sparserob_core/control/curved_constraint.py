@@ -14,7 +14,7 @@ from sparserob_core.control.enclosure import CellEnclosure
 from sparserob_core.control.functional import WorstCase
 from sparserob_core.control.lifted import LiftedSystem
 from sparserob_core.control.parameters import ParameterIndex
-from sparserob_core.control.peaks import climb, local_maxima, vertex_times
+from sparserob_core.control.peaks import climb, local_maxima, vertices
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.program import Enclosure, Explanation, Separation
 
@@ -65,7 +65,7 @@ class CurvedConstraint:
         positions = local_maxima(values, flat.lattice[1], CANDIDATES)
         heights = values[tuple(positions.T)]
         positions = positions[np.argsort(-heights, kind="stable")][:CANDIDATES]
-        times = vertex_times(values, positions, flat.times)
+        times = vertices(values, positions, flat.times)[0]
         points = np.hstack([times[:, None], flat.lattice[0][positions[:, 0]], sampled(self._b)[positions[:, 1]]])
         box = self.index_set
         step = np.concatenate([[np.max(np.diff(flat.times), initial=0.0)], (box.upper - box.lower)[1:1 + count] / 4, np.full(self._b, 0.1)])

@@ -41,6 +41,14 @@ class DisturbanceModel:
         return self.bound.dimension
 
     @property
+    def radius(self) -> float:
+        """An upper bound of the 2-norm of any admissible disturbance at any time."""
+        if self.scale is not None and self.functions is not None:
+            return float(np.linalg.norm(self.scale) * np.abs(self.functions).max())
+        axes = np.eye(self.channels)
+        return float(np.linalg.norm(np.maximum(self.bound.support(axes), self.bound.support(-axes))))
+
+    @property
     def by_piece(self) -> bool:
         """Whether the blocks are the pieces of the grid, one each."""
         return self.starts is not None and self.starts.size == self.grid.pieces

@@ -13,10 +13,10 @@ from functools import cached_property
 import numpy as np
 
 from sparserob_core.control.combination import Combination
-from sparserob_core.control.lifted import LiftedSystem
+from sparserob_core.control.lifted import HUGE, LiftedSystem
 from sparserob_core.control.measurable import MeasurablePush
 from sparserob_core.control.polynomial import distinct_patterns, face_matrix, monotone_ends, polynomial_bound
-from sparserob_core.control.push import HUGE, Push
+from sparserob_core.control.push import Push
 from sparserob_core.control.taylor import TaylorSpace
 from sparserob_core.sip.convex_set import Array
 
@@ -45,6 +45,10 @@ class CellEnclosure:
     def bounds(self, start: Array, stop: Array) -> tuple[Array, Array, Array]:
         """For time cells ``[start, stop]`` (``(k,)``, each inside one piece): upper bounds ``(k,)``, the part of them that halving the
         times would reduce, and the parts ``(k, nu)`` that halving each parameter would."""
+        with np.errstate(over="ignore", invalid="ignore"):  # a bound that overflows is no bound, and is told as such
+            return self._bounds(start, stop)
+
+    def _bounds(self, start: Array, stop: Array) -> tuple[Array, Array, Array]:
         pieces = self.lifted.grid.locate(stop)
         ends, which = _ends(start, stop, pieces)
         bounds, spreads = self._at(*ends)
@@ -88,7 +92,8 @@ class CellEnclosure:
         within = times - self.lifted.grid.breakpoints[pieces]
         start = self._nodes.reshape(self._nodes.shape[0], -1)[pieces]
         size = self.lifted.norm * float(within.max(initial=0.0))
-        moved = self._by_series(start, self._slopes[pieces], within[:, None], size) if size < LONG_STEP else self._by_exponential(start, pieces, within)
+        moved = (self._by_series(start, self._slopes[pieces], within[:, None], size) if size < LONG_STEP
+                 else self._by_exponential(start, pieces, within))
         return moved.reshape(times.size, self.lifted.space.size, -1)
 
     def _by_series(self, start: Array, slopes: Array, within: Array, size: float) -> Array:
@@ -117,7 +122,7 @@ class CellEnclosure:
         loose = np.sqrt(space.size) * np.linalg.norm(second, axis=1) * growth
         total = by_row + np.linalg.norm(self._rows, axis=1) * loose[:, None]
         if self.push is not None:
-            total = total + self.push.curvature[pieces]
+            total = total + self.push.curvature(start, width)
         answer: Array = total * (width**2 / 8)[:, None]
         return answer
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from sparserob_core.control.dictionary import Dictionary
 from sparserob_core.control.disturbance import DisturbanceModel
 from sparserob_core.control.lifted import frozen
-from sparserob_core.control.measurable import measurable_support
+from sparserob_core.control.measurable import MeasurableSupport
 from sparserob_core.control.push import Push
 from sparserob_core.control.response import Response
 from sparserob_core.control.system import LinearSystem
@@ -43,7 +44,8 @@ class WorstCase:
             zero = np.zeros(model.channels)
             point = zero if model.bound.contains(zero) else model.bound.interior_point()
             single = Box(point, point)
-            model = None if not point.any() else DisturbanceModel("piecewise_constant", single, single, model.grid, starts=np.arange(model.grid.pieces))
+            fixed = DisturbanceModel("piecewise_constant", single, single, model.grid, starts=np.arange(model.grid.pieces))
+            model = fixed if point.any() else None
         return WorstCase(Response(known, self.response.grid, self.response.initial_state), self.dictionary, model)
 
     def rows(self, times: Array, directions: Array, parameters: Array) -> tuple[Array, Array]:
@@ -111,6 +113,12 @@ class WorstCase:
         answer: Array | None = self.disturbance.worst(gains @ W)[0]
         return answer
 
+    @cached_property
+    def measurable(self) -> MeasurableSupport:
+        """The support of measurable disturbances."""
+        assert self.disturbance is not None
+        return MeasurableSupport(self.response, self.disturbance.bound)
+
     def on_decision(self, weights: Array) -> Array:
         """Weights ``(k, L, m)`` on the control of every grid piece, as rows ``(k, n)`` of the decision."""
         on_pieces = np.add.reduceat(weights, self._control_starts(), axis=1)
@@ -125,7 +133,7 @@ class WorstCase:
         if self.disturbance is None:
             return np.zeros(times.size)
         if self.disturbance.kind == "measurable":
-            return measurable_support(self.response, self.disturbance.set, times, directions, parameters)
+            return self.measurable(times, directions, parameters)
         return self.disturbance.support(gains @ W)
 
     def _control_starts(self) -> np.ndarray:

@@ -21,6 +21,7 @@ from sparserob_core.control.taylor import TaylorSpace
 from sparserob_core.sip.convex_set import Array
 
 DEGREES = {0: 0, 1: 6, 2: 4, 3: 3}   # of the Taylor models, by the number of parameters; 2 beyond
+HUGE = 300.0    # a logarithm of a growth that is as good as infinite
 KNOWN = np.zeros((1, 0))
 WELL_CONDITIONED = 1e3
 
@@ -106,21 +107,28 @@ class LiftedSystem:
         """Taylor coefficients ``(L+1, M, d)`` of ``c'e^{A(p) s}`` at the breakpoints ``s``."""
         row = np.zeros(self.row_matrix.shape[0])
         row[:self.states] = direction
-        path = Response(LinearSystem(self.row_matrix.T, np.zeros((row.size, 1))), self.grid, row).states(np.zeros((1, self.grid.control_piece.max() + 1)), KNOWN)
+        still = np.zeros((1, int(self.grid.control_piece.max()) + 1))
+        path = Response(LinearSystem(self.row_matrix.T, np.zeros((row.size, 1))), self.grid, row).states(still, KNOWN)
         answer: Array = path[0].reshape(self.grid.pieces + 1, self.space.size, self.states)
         return answer
 
+    def row_sizes(self, direction: Array) -> Array:
+        """Norms ``(L, M)`` of the Taylor coefficients of ``c'e^{A(p) s}``, the largest on every piece."""
+        return self._sizes(self.row_nodes(direction), np.zeros(1), self.row_matrix.T)
+
+    def _sizes(self, nodes: Array, driven: Array, matrix: Array) -> Array:
+        """Norms ``(L, M)`` of Taylor coefficients, the largest on every piece: at its ends, or between them, where they are near their chord."""
+        lengths = self.grid.lengths
+        second = ((nodes[:-1].reshape(lengths.size, -1) @ matrix.T + driven) @ matrix.T).reshape(lengths.size, self.space.size, -1)
+        norms = np.linalg.norm(nodes, axis=2)
+        return np.asarray(np.maximum(norms[:-1], norms[1:]) + (lengths**2 / 8)[:, None] * (np.linalg.norm(second, axis=2) @ self._growths.T))
+
     def _neglected(self, nodes: Array, driven: Array, matrix: Array, extra: Array) -> Array:
         """Gronwall: ``|e|' <= growth |e| + residual``, with the residual of the truncation bounded on every piece."""
-        lengths = self.grid.lengths
-        start = nodes[:-1].reshape(lengths.size, -1)
-        second = ((start @ matrix.T + driven) @ matrix.T).reshape(lengths.size, self.space.size, -1)
-        bend = np.linalg.norm(second, axis=2) @ self._growths.T
-        norms = np.linalg.norm(nodes, axis=2)
-        norms = np.maximum(norms[:-1], norms[1:]) + (lengths**2 / 8)[:, None] * bend
+        lengths, norms = self.grid.lengths, self._sizes(nodes, driven, matrix)
         residual = norms @ self._overflow + norms.sum(axis=1) * self.slack_A + extra
-        factor = np.exp(self.growth * lengths)
-        added = residual * (np.expm1(self.growth * lengths) / self.growth if abs(self.growth) > 1e-12 else lengths)
+        factor = np.exp(np.minimum(self.growth * lengths, HUGE))
+        added = residual * (np.expm1(np.minimum(self.growth * lengths, HUGE)) / self.growth if abs(self.growth) > 1e-12 else lengths)
         bound = np.array(list(accumulate(zip(factor.tolist(), added.tolist(), strict=True), lambda b, step: b * step[0] + step[1], initial=0.0)))
         answer: Array = bound[:-1] * np.maximum(factor, 1.0) + np.maximum(added, residual * lengths)
         return answer
@@ -131,7 +139,7 @@ class LiftedSystem:
         left, right, target = self.space.products
         sizes = np.zeros((self.space.size, self.space.size))
         sizes[target, right] = np.linalg.norm(self.A, axis=(1, 2))[left]
-        return exponential(sizes * self.grid.lengths.max())
+        return exponential(np.minimum(sizes * self.grid.lengths.max(), HUGE))
 
     @cached_property
     def _overflow(self) -> Array:

@@ -1,105 +1,86 @@
 """Support of the reachable set when the disturbance may be any measurable function with values in a set.
 
-``sigma(t) = int_0^t h_W(E' e^{A' s} c) ds`` (the integral and the maximum commute: Aumann 1965). For boxes the integrand is a sum of
-``|exponential polynomial|``, integrated exactly between its roots; for other sets by Gauss-Legendre quadrature on the pieces.
+``sigma(t) = int_0^t h_W(E' e^{A' s} c) ds``: the integral and the maximum commute (Aumann 1965).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
+from sparserob_core.control.push import HUGE
 from sparserob_core.control.response import Response, transitions
-from sparserob_core.sip.convex_set import Array, Box, ConvexSet
+from sparserob_core.sip.convex_set import Array, ConvexSet
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(6)
-BISECTIONS = 60
+ACCURACY = 1e-14    # of an integral over one interval, relative to the largest integrand times the horizon
+HALVINGS = 48       # of an interval across a kink of the integrand: what is left of it is below rounding
 
 
-def measurable_support(response: Response, bound: ConvexSet, times: Array, directions: Array, parameters: Array) -> Array:
-    """``sigma (k,)`` at ``times (k,)``, ``directions (k, d)``, ``parameters (k, nu)``."""
-    result = np.empty(times.size)
-    key = np.hstack([directions, parameters])
-    unique, which = np.unique(key, axis=0, return_inverse=True)
-    for position, row in enumerate(unique):
-        members = np.flatnonzero(which.reshape(-1) == position)
-        direction, parameter = row[: directions.shape[1]], row[directions.shape[1]:]
-        result[members] = _cumulative(response, bound, times[members], direction, parameter)
-    return result
+@dataclass(frozen=True, eq=False)
+class MeasurableSupport:
+    """The support ``sigma`` for one set ``bound``; integrals up to the grid's breakpoints are remembered per direction and parameter."""
 
+    response: Response
+    bound: ConvexSet
+    _tables: dict[bytes, tuple[Array, Array, Array]] = field(default_factory=dict, repr=False)
 
-def _cumulative(response: Response, bound: ConvexSet, times: Array, direction: Array, parameter: Array) -> Array:
-    """Integrate over the grid's pieces (as a partition of ``[0, t]`` in ``s``), refined by the asked times."""
-    points = np.unique(np.concatenate([response.grid.breakpoints, times]))
-    A, _, W = response.system.matrices(parameter[None])
-    lengths = np.diff(points)
-    starts = np.einsum("i,lij->lj", direction, transitions(A[0][None], points[:-1])[0])
-    integrals = (_box_integrals(A[0], W[0], starts, lengths, bound) if isinstance(bound, Box)
-                 else _smooth_integrals(A[0], W[0], starts, lengths, bound))
-    total = np.concatenate([[0.0], np.cumsum(integrals)])
-    return total[np.searchsorted(points, times)]
+    def __call__(self, times: Array, directions: Array, parameters: Array) -> Array:
+        """``sigma (k,)`` at ``times (k,)``, ``directions (k, d)``, ``parameters (k, nu)``."""
+        unique, which = np.unique(np.hstack([directions, parameters]), axis=0, return_inverse=True)
+        which = which.reshape(-1)
+        result = np.empty(times.size)
+        for position, row in enumerate(unique):
+            here = which == position
+            starts, total, A = self._table(row[:directions.shape[1]], row[directions.shape[1]:])
+            breakpoints = self.response.grid.breakpoints
+            pieces = self.response.grid.locate(times[here])
+            within = np.clip(times[here] - breakpoints[pieces], 0.0, None)
+            result[here] = total[pieces] + self._integrals(A, starts[pieces], within)
+        return result
 
+    def _table(self, direction: Array, parameter: Array) -> tuple[Array, Array, Array]:
+        """Rows ``c'e^{A s}`` at the breakpoints, the integral up to them, and ``[A, E]`` at the parameter."""
+        key = direction.tobytes() + parameter.tobytes()
+        if key not in self._tables:
+            A, _, W = self.response.system.matrices(parameter[None])
+            both = np.hstack([A[0], W[0]])
+            breakpoints = self.response.grid.breakpoints
+            starts = np.einsum("i,lij->lj", direction, transitions(A[0][None], breakpoints)[0])
+            integrals = self._integrals(both, starts[:-1], np.diff(breakpoints))
+            while len(self._tables) >= 64:
+                self._tables.pop(next(iter(self._tables)))
+            self._tables[key] = (starts, np.concatenate([[0.0], np.cumsum(integrals)]), both)
+        return self._tables[key]
 
-def _smooth_integrals(A: Array, W: Array, starts: Array, lengths: Array, bound: ConvexSet) -> Array:
-    within = lengths[:, None] * (NODES + 1) / 2
-    flow, _ = transitions(A[None, None], within)
-    values = bound.support(np.einsum("li,lqij,jw->lqw", starts, flow, W))
-    return np.asarray((values * WEIGHTS).sum(axis=1) * lengths / 2, dtype=float)
+    def _integrals(self, both: Array, starts: Array, lengths: Array) -> Array:
+        """``int_0^length h(E' y(s)) ds`` from rows ``y(0) = starts (l, d)``: Gauss-Legendre, halving what has not converged (kinks)."""
+        A, W = both[:, :both.shape[0]], both[:, both.shape[0]:]
+        total, count = np.zeros(lengths.size), max(1, int(np.ceil(float(np.linalg.norm(A, 2)) * lengths.max(initial=0.0))))
+        owner = np.repeat(np.arange(lengths.size), count)  # short intervals, on which the quadrature is at home
+        offsets = np.outer(lengths, np.arange(count) / count)
+        starts = np.einsum("li,lqij->lqj", starts, transitions(A[None, None], offsets)[0]).reshape(-1, A.shape[0])
+        lengths = lengths[owner] / count
+        whole, size = self._quadrature(A, W, starts, lengths)
+        accuracy = ACCURACY * max(float(size.max(initial=0.0)) * float(self.response.grid.breakpoints[-1]), np.finfo(float).tiny)
+        for _ in range(HALVINGS):
+            middles = np.einsum("li,lij->lj", starts, transitions(A[None], lengths / 2)[0])
+            left, right = self._quadrature(A, W, starts, lengths / 2)[0], self._quadrature(A, W, middles, lengths / 2)[0]
+            open_ = np.abs(left + right - whole) > accuracy
+            np.add.at(total, owner[~open_], (left + right)[~open_])
+            starts, lengths = np.vstack([starts[open_], middles[open_]]), np.tile(lengths[open_] / 2, 2)
+            whole, owner = np.concatenate([left[open_], right[open_]]), np.tile(owner[open_], 2)
+            if not owner.size:
+                return total
+        np.add.at(total, owner, whole)
+        return total
 
-
-def _box_integrals(A: Array, W: Array, starts: Array, lengths: Array, bound: Box) -> Array:
-    """``int max(u y, l y) = c int y + r int |y|`` per channel, with centre ``c`` and half-width ``r`` of the box."""
-    centre, radius = (bound.upper + bound.lower) / 2, (bound.upper - bound.lower) / 2
-    _, whole = transitions(A[None], lengths)
-    integral = np.einsum("li,lij,jw->lw", starts, whole, W)
-    total = np.asarray(integral @ centre, dtype=float)
-    for channel in np.flatnonzero(radius > 0):
-        total = total + radius[channel] * _absolute(A, W[:, channel], starts, lengths)
-    return total
-
-
-def _absolute(A: Array, w: Array, starts: Array, lengths: Array) -> Array:
-    """``int_0^h |y(s)| ds`` with ``y(s) = start' e^{A s} w`` on each piece, split at the extremum of ``y`` and then at its roots."""
-    ends = _value(A, w, starts, lengths)
-    slope_start, slope_end = starts @ (A @ w), _value(A, A @ w, starts, lengths)
-    turning = slope_start * slope_end < 0
-    middle = lengths.copy()
-    middle[turning] = _root(A, A @ w, starts[turning], lengths[turning])
-    at_middle = np.where(turning, _value(A, w, starts, middle), ends)
-    first = _between(A, w, starts, np.zeros_like(lengths), middle, starts @ w, at_middle)
-    return first + np.where(turning, _between(A, w, starts, middle, lengths, at_middle, ends), 0.0)
-
-
-def _between(A: Array, w: Array, starts: Array, left: Array, right: Array, at_left: Array, at_right: Array) -> Array:
-    """``|int|`` over ``[left, right]``, where ``y`` is monotone: split at its root when the ends differ in sign."""
-    cross = at_left * at_right < 0
-    root = right.copy()
-    if cross.any():
-        moved = np.einsum("li,lij->lj", starts[cross], transitions(A[None], left[cross])[0])
-        root[cross] = left[cross] + _root(A, w, moved, (right - left)[cross])
-    cumulative = np.einsum("li,qlij,j->ql", starts, transitions(A[None, None], np.stack([left, root, right]))[1], w)
-    answer: Array = np.abs(cumulative[1] - cumulative[0]) + np.abs(cumulative[2] - cumulative[1])
-    return answer
-
-
-def _root(A: Array, w: Array, starts: Array, lengths: Array) -> Array:
-    """The root in ``[0, length]`` of ``start' e^{A s} w``, which changes sign there: bisection, all pieces at once."""
-    low, high = np.zeros_like(lengths), lengths.copy()
-    sign = np.sign(starts @ w)
-    for _ in range(BISECTIONS):
-        middle = (low + high) / 2
-        left = np.sign(_value(A, w, starts, middle)) == sign
-        low, high = np.where(left, middle, low), np.where(left, high, middle)
-    return (low + high) / 2
-
-
-def _value(A: Array, w: Array, starts: Array, durations: Array) -> Array:
-    if not starts.shape[0]:
-        return np.zeros(0)
-    answer: Array = np.einsum("li,lij,j->l", starts, transitions(A[None], durations)[0], w)
-    return answer
+    def _quadrature(self, A: Array, W: Array, starts: Array, lengths: Array) -> tuple[Array, Array]:
+        flow, _ = transitions(A[None, None], lengths[:, None] * (NODES + 1) / 2)
+        values = self.bound.support(np.einsum("li,lqij,jw->lqw", starts, flow, W, optimize=True))
+        return (values * WEIGHTS).sum(axis=1) * lengths / 2, np.abs(values).max(axis=1, initial=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,8 +90,7 @@ class MeasurablePush:
     ``sigma`` is an integral with a Lipschitz integrand, so its second derivative is bounded by that of the integrand's argument.
     """
 
-    response: Response
-    bound: ConvexSet
+    support: MeasurableSupport
     rows: Array
 
     def swing(self, times: Array) -> Array:
@@ -120,24 +100,26 @@ class MeasurablePush:
     def at(self, times: Array, ends: Array) -> tuple[Array, Array]:
         """The push ``(k, r, 1)`` and an excess of zero ``(k, r)``; ``ends (k, r, 0)``."""
         k, r = times.size, self.rows.shape[0]
-        sigma = measurable_support(self.response, self.bound, np.repeat(times, r), np.tile(self.rows, (k, 1)), np.zeros((k * r, 0)))
+        sigma = self.support(np.repeat(times, r), np.tile(self.rows, (k, 1)), np.zeros((k * r, 0)))
         return sigma.reshape(k, r, 1), np.zeros((k, r))
 
-    @cached_property
-    def curvature(self) -> Array:
-        """Bounds ``(L, r)`` of the integrand's slope ``h(E' A' e^{A' s} c)`` on every piece."""
-        grid = self.response.grid
-        A, _, W = self.response.system.matrices(np.zeros((1, 0)))
-        slopes = self.rows @ (transitions(A[0][None], grid.breakpoints)[0] @ A[0])
+    def curvature(self, start: Array, widths: Array) -> Array:
+        """Bounds ``(k, r)`` of the integrand's slope ``h(E' A' e^{A' s} c)`` on ``[start, start + width]``."""
+        bound = self.support.bound
+        A, _, W = self.support.response.system.matrices(np.zeros((1, 0)))
+        slopes = np.einsum("ri,kij->krj", self.rows, transitions(A[0][None], start)[0] @ A[0])
         ends = slopes @ W[0]
-        size = np.maximum(self.bound.support(ends), self.bound.support(-ends))
-        norm = float(np.linalg.norm(A[0], 2))
-        axes = np.eye(self.bound.dimension)
-        reach = float(np.linalg.norm(np.maximum(self.bound.support(axes), self.bound.support(-axes)))) * float(np.linalg.norm(W[0], 2))
-        grown = np.linalg.norm(slopes[:-1], axis=2) * np.expm1(np.minimum(norm * grid.lengths, 300.0))[:, None] * reach
-        return np.asarray(size[:-1] + grown)
+        size = np.maximum(bound.support(ends), bound.support(-ends))
+        growth = np.expm1(np.minimum(float(np.linalg.norm(A[0], 2)) * widths, HUGE))[:, None]
+        return np.asarray(size + np.linalg.norm(slopes, axis=2) * growth * self._reach)
+
+    @cached_property
+    def _reach(self) -> float:
+        bound, axes = self.support.bound, np.eye(self.support.bound.dimension)
+        radius = float(np.linalg.norm(np.maximum(bound.support(axes), bound.support(-axes))))
+        return radius * float(np.linalg.norm(self.support.response.system.matrices(np.zeros((1, 0)))[2][0], 2))
 
     @property
     def neglected(self) -> Array:
         """Nothing: ``(r, L)`` of zeros."""
-        return np.zeros((self.rows.shape[0], self.response.grid.pieces))
+        return np.zeros((self.rows.shape[0], self.support.response.grid.pieces))

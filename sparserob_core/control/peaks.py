@@ -9,7 +9,6 @@ import numpy as np
 
 from sparserob_core.sip.convex_set import Array
 
-
 SMALLEST = 1e-6     # of the first step: a step that is not made smaller any more
 MOVES = 60          # steps at most
 ENOUGH = 0.03       # a step that gains less than this share of the value is followed by a smaller one
@@ -39,10 +38,10 @@ def local_maxima(values: Array, lattice: tuple[int, ...], kept: int) -> np.ndarr
     return np.concatenate(best)
 
 
-def vertex_times(values: Array, positions: np.ndarray, times: Array) -> Array:
-    """The times ``(k,)`` of the positions, each moved to the vertex of the parabola through its sample and the two beside it."""
+def vertices(values: Array, positions: np.ndarray, times: Array) -> tuple[Array, Array]:
+    """The vertex of the parabola through every position's sample and the two beside it: its time ``(k,)`` and height ``(k,)``."""
     v, r, t = positions.T
-    moved = times[t].copy()
+    moved, height = times[t].copy(), values[v, r, t].copy()
     inner = (t > 0) & (t < times.size - 1)
     ti, vi, ri = t[inner], v[inner], r[inner]
     h1, h2 = times[ti] - times[ti - 1], times[ti + 1] - times[ti]
@@ -53,8 +52,8 @@ def vertex_times(values: Array, positions: np.ndarray, times: Array) -> Array:
     shift = np.zeros(ti.size)
     shift[bent] = np.clip(-slope[bent] / (2 * curvature[bent]), -h1[bent], h2[bent])
     moved[inner] += shift
-    answer: Array = moved
-    return answer
+    height[inner] += slope * shift + curvature * shift**2
+    return moved, height
 
 
 def climb(evaluate: Callable[[Array, np.ndarray], Array], points: Array, radius: Array,

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
 from sparserob_core.control.combination import Combination
 from sparserob_core.control.disturbance import DisturbanceModel
-from sparserob_core.control.lifted import KNOWN, LiftedSystem
+from sparserob_core.control.lifted import HUGE, KNOWN, LiftedSystem
 from sparserob_core.control.polynomial import distinct_patterns, face_matrix
 from sparserob_core.control.taylor import TaylorSpace
 from sparserob_core.sip.convex_set import Array
-
-HUGE = 300.0    # a logarithm of a growth that is as good as infinite
-
 
 @dataclass(frozen=True, eq=False)
 class Push:
@@ -47,34 +44,36 @@ class Push:
         for position, pattern in enumerate(patterns):
             face = face_matrix(self._space, pattern) if pattern.any() else None
             here = (which == position).any(axis=1)
-            parts = self._gathered(times[here], lambda blocks, face=face: self._summed(blocks, face))
+            parts = self._gathered(times[here], partial(self._summed, face=face))
             mine = which[here] == position
             coefficients[which == position], excess[which == position] = parts[mine][:, :-1], parts[mine][:, -1]
         return coefficients, excess
 
-    @cached_property
-    def curvature(self) -> Array:
-        """A bound ``(L, r)``, per piece, of the second time derivative of the blocks, summed over blocks and Taylor coefficients."""
-        grid, matrix = self.lifted.grid, self.lifted.row_matrix
+    def curvature(self, start: Array, widths: Array) -> Array:
+        """Bounds ``(k, r)``, for times in ``[start, start + width]`` inside one piece, of the second time derivative of what the blocks
+        receive, summed over blocks and Taylor coefficients."""
+        matrix, norm, bound = self.lifted.row_matrix, self.lifted.norm, self.disturbance.set
         bent = self._lifted_rows @ matrix @ matrix
-        norm = self.lifted.norm
-        growth = np.expm1(np.minimum(norm * grid.lengths, HUGE))[:, None]
-        along = np.linalg.norm(bent, axis=1) * self._total_gain[:-1, None] * growth
-        fresh = np.linalg.norm(self._lifted_rows @ matrix, axis=1) * np.exp(np.minimum(norm * grid.lengths, HUGE))[:, None]
-        return np.asarray(self._sizes(bent) + np.sqrt(self.lifted.space.size) * self._reach * (along + fresh))
+        sizes = self._gathered(start, lambda blocks: np.maximum(bound.support(blocks), bound.support(-blocks)).swapaxes(2, 3), bent, plain=True)
+        pieces = np.clip(np.searchsorted(self.lifted.grid.breakpoints, start, side="right") - 1, 0, self.lifted.grid.pieces - 1)
+        distinct, which = np.unique(np.round(start - self.lifted.grid.breakpoints[pieces], 15), return_inverse=True)
+        fresh = np.linalg.norm(self._lifted_rows @ matrix @ self.lifted.backward.flows(distinct)[0], axis=2)[which.reshape(-1)]
+        growth = np.minimum(norm * widths, HUGE)[:, None]
+        along = np.linalg.norm(bent, axis=1) * self._total_gain[pieces + 1][:, None] * np.expm1(growth)
+        return np.asarray(sizes.sum(axis=2) + np.sqrt(self.lifted.space.size) * self._reach * (along + fresh * np.exp(growth)))
 
     @cached_property
     def neglected(self) -> Array:
         """What the Taylor models neglect, at most, on every piece: ``(r, L)``."""
-        lengths = self.lifted.grid.lengths
+        lengths, space = self.lifted.grid.lengths, self.lifted.space
         total = np.zeros((self.rows.shape[0], lengths.size))
-        if self.lifted.space.nu == 0:
+        if space.nu == 0:
             return total
+        leaves = space.degrees[:, None] + space.degrees[None, :] > space.degree
+        spilt = leaves @ np.linalg.norm(self.lifted.W, axis=(1, 2)) + self.lifted.slack_W
         for row, direction in enumerate(self.rows):
-            truncated = self.lifted.row_remainder(direction) * self._reach
-            sizes = np.linalg.norm(self.lifted.row_nodes(direction), axis=2).sum(axis=1)
-            loose = np.maximum(sizes[:-1], sizes[1:]) * self.lifted.slack_W * self._radius
-            total[row] = np.cumsum((truncated + loose) * lengths)
+            loose = self.lifted.row_sizes(direction) @ spilt * self.disturbance.radius
+            total[row] = np.cumsum((self.lifted.row_remainder(direction) * (self._reach + self.lifted.slack_W * self.disturbance.radius) + loose) * lengths)
         return total
 
     @property
@@ -86,18 +85,23 @@ class Push:
         """Whether the blocks are the pieces of a uniform grid: what they receive then depends on their age ``t - s`` only."""
         return self.lifted.backward.uniform and self.disturbance.by_piece
 
-    def _gathered(self, times: Array, of_blocks: Callable[[Array], Array]) -> Array:
-        """Sums over the blocks of a function of them: from blocks ``(k, r, M, nb, q)`` to parts ``(k, r, nb, j)``; returns ``(k, r, j)``."""
+    def _gathered(self, times: Array, of_blocks: Callable[[Array], Array], rows: Array | None = None, plain: bool = False) -> Array:
+        """Sums over the blocks of a function of them: from blocks ``(k, r, M, nb, q)`` to parts ``(k, r, nb, j)``; returns ``(k, r, j)``.
+
+        ``rows (r, M d)``: the lifted functionals, the push's own unless given; ``plain``: leave them uncombined.
+        """
+        start = self._lifted_rows if rows is None else rows
+        combined = (lambda blocks: blocks) if plain else self._combined
         if not self._repeats:
-            return np.asarray(of_blocks(self._combined(self._blocks(times, self._lifted_rows))).sum(axis=2))
+            return np.asarray(of_blocks(combined(self._blocks(times, start))).sum(axis=2))
         backward, grid, horizon = self.lifted.backward, self.lifted.grid, self.lifted.grid.breakpoints[-1]
         pieces = grid.locate(times)
         within, which = np.unique(np.round((times - grid.breakpoints[pieces]) / horizon, 15), return_inverse=True)
         flow, partial = backward.flows(within * horizon)
-        young = self._weights(self._lifted_rows @ partial)[..., None, :]
-        rows = np.einsum("rd,qde->qre", self._lifted_rows, flow)
-        old = np.moveaxis(self._weights(np.einsum("qre,aef->qraf", rows, backward.ages[:int(pieces.max(initial=0))])), -2, -3)
-        parts = np.concatenate([of_blocks(self._combined(young)), of_blocks(self._combined(old))], axis=2)
+        young = self._weights(start @ partial)[..., None, :]
+        moved = np.einsum("rd,qde->qre", start, flow)
+        old = np.moveaxis(self._weights(np.einsum("qre,aef->qraf", moved, backward.ages[:int(pieces.max(initial=0))])), -2, -3)
+        parts = np.concatenate([of_blocks(combined(young)), of_blocks(combined(old))], axis=2)
         return np.asarray(np.cumsum(parts, axis=2)[which.reshape(-1), :, pieces])
 
     def _combined(self, blocks: Array) -> Array:
@@ -132,16 +136,6 @@ class Push:
                 weights[..., target, :] += parts[..., right, :] @ self.lifted.W[left]
         return weights
 
-    def _sizes(self, rows: Array) -> Array:
-        """``sum_b`` and sum over Taylor coefficients of ``max(h(y_b), h(-y_b))`` at the start of every piece, ``(L, r)``."""
-        grid, bound = self.lifted.grid, self.disturbance.set
-        if self._repeats:
-            blocks = self._weights(np.einsum("rd,ade->rae", rows, self.lifted.backward.ages))
-            sizes = np.maximum(bound.support(blocks), bound.support(-blocks)).sum(axis=2)
-            return np.concatenate([np.zeros((rows.shape[0], 1)), np.cumsum(sizes, axis=1)[:, :-1]], axis=1).T
-        every = self._blocks(grid.breakpoints[:-1], rows)
-        return np.asarray(np.maximum(bound.support(every), bound.support(-every)).sum(axis=(2, 3)))
-
     @cached_property
     def _lifted_rows(self) -> Array:
         rows = np.zeros((self.rows.shape[0], self.lifted.row_matrix.shape[0]))
@@ -149,14 +143,8 @@ class Push:
         return rows
 
     @cached_property
-    def _radius(self) -> float:
-        """The largest disturbance in the 2-norm, from its bounding box."""
-        axes = np.eye(self.disturbance.channels)
-        return float(np.linalg.norm(np.maximum(self.disturbance.bound.support(axes), self.disturbance.bound.support(-axes))))
-
-    @cached_property
     def _reach(self) -> float:
-        return self._radius * float(np.linalg.norm(self.lifted.W, axis=(1, 2)).sum())
+        return self.disturbance.radius * float(np.linalg.norm(self.lifted.W, axis=(1, 2)).sum())
 
     @cached_property
     def _total_gain(self) -> Array:
@@ -168,4 +156,5 @@ class Push:
         for piece in range(1, grid.pieces):
             powers[piece] = powers[piece - 1] @ steps.E[0, self.lifted.backward.length_of(piece - 1)]
         norms = np.linalg.norm(powers, axis=(1, 2))
-        return np.concatenate([[0.0], np.cumsum(norms * np.exp(np.minimum(self.lifted.norm * grid.lengths, HUGE)) * grid.lengths)])
+        rising = float(np.linalg.eigvalsh((matrix + matrix.T) / 2)[-1])
+        return np.concatenate([[0.0], np.cumsum(norms * np.exp(np.clip(rising * grid.lengths, 0.0, HUGE)) * grid.lengths)])

@@ -143,7 +143,7 @@ class Response:
 
     @cached_property
     def ages(self) -> Array:
-        """``e^{A i h} F(h)`` for ``i = 0, 1, ..., L - 1``, ``(L, d, d)``: what a piece of age ``i`` still gives; for a known system and a uniform grid."""
+        """``e^{A i h} F(h)`` for ``i = 0, ..., L - 1``, ``(L, d, d)``: what a piece of age ``i`` still gives; for a known system and equal pieces."""
         steps = self.steps(np.zeros((1, 0)))
         powers = np.empty((self.grid.pieces, *steps.A.shape[1:]))
         powers[0] = steps.F[0, 0]

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from sparserob_core.control.constraint import KEPT, FlatConstraint
-from sparserob_core.control.peaks import local_maxima, vertex_times
+from sparserob_core.control.peaks import local_maxima, vertices
 from sparserob_core.control.response import SAME_TIME, Response, TimeGrid, distinct_times
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.program import ConstraintFamily, Separation
@@ -47,7 +47,7 @@ class ScenarioConstraint:
         """Local maxima in time of the worst sample's violation, at the breakpoints and between them."""
         values, sample = self._worst_samples(x)
         positions = local_maxima(values[None], (1,), KEPT)
-        times = vertex_times(values[None], positions, self._times)
+        times = vertices(values[None], positions, self._times)[0]
         rows = positions[:, 1]
         indices = np.stack([times, sample[rows, positions[:, 2]].astype(float)], axis=1)
         G, h = self.rows(indices)

@@ -21,7 +21,7 @@ from sparserob_core.control.sampling import sample_disturbances, sample_paramete
 from sparserob_core.control.scenario import ScenarioConstraint
 from sparserob_core.control.sets import Equality
 from sparserob_core.errors import InputError
-from sparserob_core.sip.convex_set import Array, Box, ConvexSet
+from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
 
 if TYPE_CHECKING:
@@ -93,8 +93,7 @@ def _image(model: Transcription) -> tuple[csc_array | None, Array, Array, Array]
 
     bound, dictionary, channels = model.problem.control, model.control, model.problem.system.controls
     axes = np.eye(channels)
-    pieces = np.ones(dictionary.pieces)
-    lower, upper = np.kron(-bound.support(-axes), pieces), np.kron(bound.support(axes), pieces)
+    lower, upper = np.repeat(-bound.support(-axes), dictionary.pieces), np.repeat(bound.support(axes), dictionary.pieces)
     weights: Array = np.kron(np.asarray(model.problem.weights, dtype=float), dictionary.lengths)
     flat = None if isinstance(bound, Box) else bound.halfspaces()
     values = csc_array(dictionary.values.T)
@@ -103,7 +102,7 @@ def _image(model: Transcription) -> tuple[csc_array | None, Array, Array, Array]
     H, h = flat
     several = np.count_nonzero(H, axis=1) > 1
     S = csc_array(vstack([kron(eye_array(channels), values), kron(csc_array(H[several]), values)]))
-    extra = np.kron(h[several], pieces)
+    extra = np.repeat(h[several], dictionary.pieces)
     return (S, np.concatenate([lower, np.full(extra.size, -np.inf)]), np.concatenate([upper, extra]),
             np.concatenate([weights, np.zeros(extra.size)]))
 

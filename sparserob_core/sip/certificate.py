@@ -81,7 +81,8 @@ def _branch_and_bound(family: ConstraintFamily, x: Array, notify: Notify, cells:
 def _bounded(family: ConstraintFamily, x: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
     assert family.enclosure is not None
     parts = [family.enclosure(x, lower[i:i + BATCH], upper[i:i + BATCH]) for i in range(0, lower.shape[0], BATCH)]
-    return np.concatenate([p.bounds for p in parts]), np.concatenate([p.split for p in parts])
+    bounds = np.concatenate([p.bounds for p in parts])
+    return np.where(np.isnan(bounds), np.inf, bounds), np.concatenate([p.split for p in parts])
 
 
 def _probe(family: ConstraintFamily, x: Array, lower: Array, upper: Array, bounds: Array) -> tuple[float, Array, int]:

@@ -22,8 +22,8 @@ from sparserob_core.sip.method import Method, Tools
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation
 from sparserob_core.sip.relaxed import RelaxedProgram, Rows, rows_at
 from sparserob_core.sip.result import Result, Status, Witness, relative_gap
-from sparserob_core.sip.verdict import clash, verdict, witness
 from sparserob_core.sip.separation import search_worst
+from sparserob_core.sip.verdict import clash, verdict, witness
 
 IDLE_ROUNDS = 3         # rounds that a row may stay without a multiplier before it is dropped
 DROPPING_ROUNDS = 40    # rounds after which rows are only added, so that nothing can cycle

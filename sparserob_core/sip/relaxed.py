@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sparserob_core.sip.check import solve_finite
-from sparserob_core.sip.duality import dual_bound
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.duality import dual_bound
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.regulariser import ControlImage, Regulariser

@@ -67,7 +67,6 @@ def test_the_worst_violation_of_a_smooth_path_is_found_between_the_nodes(seed, g
     assert np.allclose(at, found.violations, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.xfail(strict=True, reason="constraint.py, worst: the vertex of a parabola replaces the sample, also at kinks and where it is worse")
 @settings(max_examples=12, deadline=None, phases=[Phase.generate])
 @given(seed=st.integers(0, 10**6), grid=st.sampled_from(sorted(GRIDS)), bound=st.sampled_from(sorted(BOUNDS)))
 def test_the_worst_violation_of_any_path_is_found_within_a_millionth(seed, grid, bound):
@@ -78,7 +77,6 @@ def test_the_worst_violation_of_any_path_is_found_within_a_millionth(seed, grid,
     assert constraint.worst(x).violations[0] >= polished(constraint, x) - 1e-6
 
 
-@pytest.mark.xfail(strict=True, reason="constraint.py, worst: the vertex of a parabola replaces the sample, also at kinks and where it is worse")
 def test_a_path_that_peaks_at_a_kink_is_separated_at_the_kink():
     """``x' = u`` with u = 1 and then -1/3: the largest state is at the breakpoint."""
     functionals = worst_case(LinearSystem([[0.0]], [[1.0]]), uniform(2, 2.0), initial_state=[0.0])

@@ -135,7 +135,8 @@ def test_a_stiff_bound_is_the_violation_at_a_single_time(rate, side):
     assert np.allclose(bounds, (G @ x - rhs)[:, 0], rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize(("nu", "bound"), [(0, "none"), (0, "box"), (0, "ellipsoid"), (1, "none"), (1, "box"), (1, "ellipsoid"), (2, "box"), (3, "none")])
+@pytest.mark.parametrize(("nu", "bound"), [(0, "none"), (0, "box"), (0, "ellipsoid"), (1, "none"), (1, "box"), (1, "ellipsoid"), (1, "triangle"), (1, "1-norm"),
+                                              (2, "box"), (3, "none")])
 def test_the_bound_converges_quadratically_as_the_cell_shrinks(nu, bound):
     """Up to where the Taylor model of the parameters and the sign of a disturbance flip; measured over the median of several cells."""
     rng = np.random.default_rng(3)
