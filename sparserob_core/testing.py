@@ -9,7 +9,9 @@ import numpy as np
 
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.maximiser import EvaluationError, Maximiser, Report, maximise
-from sparserob_core.testing_solvers import SolverContract as SolverContract
+from sparserob_core.testing_solvers import SolverContract
+
+__all__ = ["MaximiserContract", "SolverContract"]
 
 PLANE = Box(np.array([-3.0, -2.0]), np.array([2.0, 4.0]))
 ODD_BOXES = (

@@ -10,11 +10,13 @@ from functools import cached_property
 
 import numpy as np
 
-from sparserob_core.control.push import HUGE
+from sparserob_core.control.lifted import HUGE
 from sparserob_core.control.response import Response, transitions
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
-NODES, WEIGHTS = np.polynomial.legendre.leggauss(6)
+LEGENDRE = np.polynomial.legendre.Legendre.basis(5)
+NODES = np.concatenate([[-1.0], LEGENDRE.deriv().roots(), [1.0]])   # Gauss-Lobatto: the ends are nodes, so that no kink hides beside them
+WEIGHTS = 1.0 / (15.0 * LEGENDRE(NODES) ** 2)
 ACCURACY = 1e-14    # of an integral over one interval, relative to the largest integrand times the horizon
 HALVINGS = 48       # of an interval across a kink of the integrand: what is left of it is below rounding
 
@@ -56,7 +58,7 @@ class MeasurableSupport:
         return self._tables[key]
 
     def _integrals(self, both: Array, starts: Array, lengths: Array) -> Array:
-        """``int_0^length h(E' y(s)) ds`` from rows ``y(0) = starts (l, d)``: Gauss-Legendre, halving what has not converged (kinks)."""
+        """``int_0^length h(E' y(s)) ds`` from rows ``y(0) = starts (l, d)``: Gauss-Lobatto, halving what has not converged (kinks)."""
         A, W = both[:, :both.shape[0]], both[:, both.shape[0]:]
         total, count = np.zeros(lengths.size), max(1, int(np.ceil(float(np.linalg.norm(A, 2)) * lengths.max(initial=0.0))))
         owner = np.repeat(np.arange(lengths.size), count)  # short intervals, on which the quadrature is at home

@@ -15,6 +15,7 @@ from sparserob_core.control.polynomial import distinct_patterns, face_matrix
 from sparserob_core.control.taylor import TaylorSpace
 from sparserob_core.sip.convex_set import Array
 
+
 @dataclass(frozen=True, eq=False)
 class Push:
     """The push ``sigma(t) = sum_b h_D(y_b(t))`` of functionals ``rows (r, d)`` (in the lifted system's coordinates) over one cell.
@@ -73,7 +74,8 @@ class Push:
         spilt = leaves @ np.linalg.norm(self.lifted.W, axis=(1, 2)) + self.lifted.slack_W
         for row, direction in enumerate(self.rows):
             loose = self.lifted.row_sizes(direction) @ spilt * self.disturbance.radius
-            total[row] = np.cumsum((self.lifted.row_remainder(direction) * (self._reach + self.lifted.slack_W * self.disturbance.radius) + loose) * lengths)
+            reach = self._reach + self.lifted.slack_W * self.disturbance.radius
+            total[row] = np.cumsum((self.lifted.row_remainder(direction) * reach + loose) * lengths)
         return total
 
     @property

@@ -33,7 +33,7 @@ def solve(
     method: Choice | Method = "exchange",
     solver: Choice | Solver = "piqp",
     maximiser: Choice | Maximiser = "direct",
-    regulariser: Choice | Regulariser | None = "ridge",
+    regulariser: Choice | Regulariser | None = "default",
     *,
     tolerance: float | None = 1e-7,
     seed: int = 0,
@@ -47,11 +47,14 @@ def solve(
 
     A component is a name, a mapping such as ``{"name": "exchange", "tolerance": 1e-9}``, or the component itself. ``tolerance`` is the
     relative gap, for a method that has such an option. ``control`` is by default 100 equal pieces, and ``disturbance`` one indicator
-    function on each piece of the control; both are for control problems only. ``budget``: evaluations per search of the maximiser.
+    function on each piece of the control; both are for control problems only. ``regulariser`` is by default the ridge for control problems, whose
+    optimisers are to be unique, and none for other programs, so that ``value`` is the cost. ``budget``: evaluations per search of the maximiser.
     Raises `InputError` when an argument is at fault.
     """
     registry = load_registry()
     program = _program(registry, problem, control, disturbance)
+    if regulariser == "default":
+        regulariser = None if program.lengths is None else "ridge"
     steps = continuation if isinstance(continuation, Continuation) else _continuation(continuation or {})
     tools = Tools(
         solver=component(registry, "solver", solver, Solver),

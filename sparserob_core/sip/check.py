@@ -15,6 +15,7 @@ from sparserob_core.sip.repair import diagonal
 from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
 from sparserob_core.sip.standard_form import Form, Recovered, standard_form
 from sparserob_core.sip.straighten import straightened, unstraightened
+from sparserob_core.sip.vertex import vertex_multipliers
 
 # The accuracy that a solver is asked for, in multiples of the tolerance, in each form, until it is believed.
 ATTEMPTS: tuple[tuple[Form, float], ...] = (("split", 0.1), ("epigraph", 0.1), ("split", 1e-3), ("split", 10.0))
@@ -144,6 +145,7 @@ def _candidates(case: _Case, answer: Recovered | None) -> Iterator[FiniteSolutio
     polished = polish(program, x, y, mu)
     if polished is not None:
         yield polished
+        yield measure(program, polished.x, *vertex_multipliers(program, polished.x, polished.y, polished.mu), message="its vertex")
     yield measure(program, x, y, mu, z, message="claimed")
 
 

@@ -28,6 +28,7 @@ from sparserob_core.sip.verdict import clash, verdict, witness
 IDLE_ROUNDS = 3         # rounds that a row may stay without a multiplier before it is dropped
 DROPPING_ROUNDS = 40    # rounds after which rows are only added, so that nothing can cycle
 MARGINS = (1e-10, 1e-6)
+CRUDE = 1e-4            # residual and relative gap of a relaxed solution that a round can do with
 ALLOWED = TOLERANCE / 2  # a violation that the search may leave to the proof
 
 Prover: TypeAlias = Callable[[Array], Sequence[Proof]]
@@ -74,7 +75,7 @@ class _Run:
         proofs: Sequence[Proof] = ()
         for number in range(1, self.method.rounds + 1):
             solution = self._relax()
-            if solution.status != "optimal":
+            if not _usable(solution):
                 return self._without_answer(solution)
             separations = self._separate(solution.x)
             worst = _worst(separations)
@@ -95,10 +96,10 @@ class _Run:
         """Solve the relaxed program, with the regulariser as light as it must be for the cost to be exact."""
         solution = self._solved(self.epsilon)
         regu = self.tools.continuation
-        while solution.status == "optimal" and self.epsilon > regu.stop and self._open(solution):
+        while _usable(solution) and self.epsilon > regu.stop and self._open(solution):
             lighter = max(regu.stop, self.epsilon * regu.factor)
             candidate = self._solved(lighter)
-            if candidate.status != "optimal":
+            if not _usable(candidate):
                 break
             changed = abs(self.program.cost(candidate.x) - self.program.cost(solution.x)) > regu.tolerance * max(1.0, abs(self.lower))
             self.epsilon, solution = lighter, candidate
@@ -111,7 +112,7 @@ class _Run:
         if solution.status == "infeasible" and self.margin > 0.0:  # the margin, not the program, may be at fault: no Slater point
             self.margin, self.slater = 0.0, False
             solution = self.relaxed.solve(self.rows, epsilon, 0.0, None)
-        if solution.status == "optimal":
+        if _usable(solution):
             self.guess = solution
             self.lower = max(self.lower, self.relaxed.lower_bound(self.rows, solution))
             self._set_margin(solution)
@@ -120,7 +121,7 @@ class _Run:
     def _plain_bound(self) -> FiniteSolution:
         """The unregularised relaxed program: only its multipliers are wanted, for the lower bound."""
         plain = self.relaxed.solve(self.rows, 0.0, self.margin)
-        if plain.status == "optimal":
+        if _usable(plain):
             self.lower = max(self.lower, self.relaxed.lower_bound(self.rows, plain))
         return plain
 
@@ -132,7 +133,7 @@ class _Run:
         if self.epsilon == 0.0:
             return False
         plain = self._plain_bound()
-        if not self._open(solution) or plain.status != "optimal":
+        if not self._open(solution) or not _usable(plain):
             return False
         self.epsilon, self.guess = 0.0, None  # the regulariser is not exact at its lightest: go on without it
         return True
@@ -201,6 +202,12 @@ class _Run:
             upper_bound=cost if status in ("certified", "verified", "undecided") else np.inf, worst=worst, indices=cuts,
             counts={"relaxed_programs": self.relaxed.solves, "rounds": len(self.history), "active_indices": len(cuts)},
             history=tuple(self.history), seconds=time.perf_counter() - self.started)
+
+
+def _usable(solution: FiniteSolution) -> bool:
+    """Whether a relaxed solution is good for a round: a crude optimiser costs rounds, but no claim rests on its accuracy."""
+    scale = max(1.0, abs(solution.value))
+    return solution.status == "optimal" or (solution.status == "failed" and solution.residual <= CRUDE and solution.gap <= CRUDE * scale)
 
 
 def _worst(separations: Sequence[tuple[ConstraintFamily, Separation]]) -> Witness:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from scipy.linalg import expm
 
@@ -47,7 +49,7 @@ def simulated(A, drives, start, time, breakpoints):
     """``x(time)`` of ``x' = A x + sum_j M_j f_j``, ``drives`` a list of ``(M, breakpoints, values)``: one augmented exponential per piece."""
     cuts = np.unique(np.concatenate([[0.0, time], *[b[(b > 0) & (b < time)] for _, b, _ in drives], breakpoints[breakpoints < time]]))
     state = np.asarray(start, dtype=float)
-    for left, right in zip(cuts[:-1], cuts[1:], strict=True):
+    for left, right in itertools.pairwise(cuts):
         force = sum((M @ held(b, v, (left + right) / 2) for M, b, v in drives), np.zeros(state.size))
         block = np.zeros((state.size + 1, state.size + 1))
         block[:-1, :-1], block[:-1, -1] = A, force

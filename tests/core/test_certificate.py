@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -37,7 +38,7 @@ def raised(constraint, amount):
 def dense_maximum(constraint, x, per_piece=400):
     """The largest violation of a known system on a fine grid that contains the breakpoints."""
     breaks = constraint.functionals.response.grid.breakpoints
-    times = np.unique(np.concatenate([np.linspace(a, b, per_piece) for a, b in zip(breaks[:-1], breaks[1:], strict=True)]))
+    times = np.unique(np.concatenate([np.linspace(a, b, per_piece) for a, b in itertools.pairwise(breaks)]))
     G, rhs = constraint.rows(times[(times >= constraint.start) & (times <= constraint.stop)][:, None])
     return (G @ x - rhs).max()
 

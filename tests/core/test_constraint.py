@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import Phase, given, settings
@@ -23,7 +25,9 @@ BOUNDS = {"none": None, "box": Box([-0.1, -0.3], [0.2, 0.1]), "ellipsoid": Ellip
 
 def constraint_of(rng, system, dictionary, bound=None, rows=2, start=0.0, stop=HORIZON):
     functionals = worst_case(system, dictionary, None, bound, initial_state=rng.normal(size=system.states))
-    return FlatConstraint("path", functionals, rng.normal(size=(rows, system.states)), rng.normal(size=rows), start, stop, ParameterIndex(system.parameters))
+    return FlatConstraint(
+        "path", functionals, rng.normal(size=(rows, system.states)), rng.normal(size=rows), start, stop, ParameterIndex(system.parameters)
+    )
 
 
 def violations(constraint, x, indices):
@@ -37,20 +41,29 @@ def polished(constraint, x, per_piece=40):
     inside = breaks[(breaks > constraint.start) & (breaks < constraint.stop)]
     ends = np.unique(np.concatenate([[constraint.start], inside, [constraint.stop]]))
     best = -np.inf
-    for left, right in zip(ends[:-1], ends[1:], strict=True):
+    for left, right in itertools.pairwise(ends):
         times = np.linspace(left, right, per_piece)
         found = violations(constraint, x, times[:, None])
         best = max(best, found.max())
         for row in range(found.shape[1]):
             k = int(found[:, row].argmax())
-            answer = minimize_scalar(lambda t, row=row: -violations(constraint, x, np.array([[t]]))[0, row], method="bounded",
-                                     bounds=(times[max(k - 1, 0)], times[min(k + 1, per_piece - 1)]), options={"xatol": 1e-10})
+            answer = minimize_scalar(
+                lambda t, row=row: -violations(constraint, x, np.array([[t]]))[0, row],
+                method="bounded",
+                bounds=(times[max(k - 1, 0)], times[min(k + 1, per_piece - 1)]),
+                options={"xatol": 1e-10},
+            )
             best = max(best, -answer.fun)
     return best
 
 
 @settings(max_examples=8, deadline=None)
-@given(seed=st.integers(0, 10**6), grid=st.sampled_from(sorted(GRIDS)), bound=st.sampled_from(sorted(BOUNDS)), window=st.sampled_from([(0.0, 3.0), (0.35, 2.9)]))
+@given(
+    seed=st.integers(0, 10**6),
+    grid=st.sampled_from(sorted(GRIDS)),
+    bound=st.sampled_from(sorted(BOUNDS)),
+    window=st.sampled_from([(0.0, 3.0), (0.35, 2.9)]),
+)
 def test_the_worst_violation_of_a_smooth_path_is_found_between_the_nodes(seed, grid, bound, window):
     rng = np.random.default_rng(seed)
     A = np.array([[0.0, 1.0], [-rng.uniform(0.5, 4), -rng.uniform(-0.2, 1)]])
@@ -95,7 +108,7 @@ def test_a_window_that_starts_just_before_a_sample_is_searched():
 
 
 def oscillator(damping=0.0):
-    return lambda p: np.array([[0 * p[0], 1 + 0 * p[0]], [-p[0] ** 2, -damping + 0 * p[0]]])
+    return lambda p: np.array([[0 * p[0], 1 + 0 * p[0]], [-(p[0] ** 2), -damping + 0 * p[0]]])
 
 
 @pytest.mark.parametrize("horizon", [2.0, 2 * np.pi])
@@ -114,8 +127,11 @@ def test_the_worst_frequency_may_be_inside_the_box(horizon):
 def test_the_worst_violation_over_parameters_is_no_less_than_any_sampled_one(seed, nu, bound):
     rng = np.random.default_rng(seed)
     A, B = rng.normal(size=(nu + 1, 2, 2)), rng.normal(size=(nu + 1, 2, 1))
-    system = LinearSystem(lambda p: A[0] + 0.4 * sum(np.sin(p[i]) * A[i + 1] for i in range(nu)),
-                          lambda p: B[0] + 0.4 * sum(p[i] * p[0] * B[i + 1] for i in range(nu)), parameters=Box([-1.0] * nu, [1.0] * nu))
+    system = LinearSystem(
+        lambda p: A[0] + 0.4 * sum(np.sin(p[i]) * A[i + 1] for i in range(nu)),
+        lambda p: B[0] + 0.4 * sum(p[i] * p[0] * B[i + 1] for i in range(nu)),
+        parameters=Box([-1.0] * nu, [1.0] * nu),
+    )
     constraint = constraint_of(rng, system, uniform(6, HORIZON), BOUNDS[bound])
     x = rng.normal(size=6)
     found = constraint.worst(x)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -56,7 +58,7 @@ def test_the_support_is_that_of_a_linear_program_over_all_coefficients(seed, nam
     direction = rng.normal(size=2)
     A, _, E = (matrix[0] for matrix in system.matrices(np.zeros((1, 0))))
     ends = dictionary.breakpoints
-    weights = np.array([weight_on_piece(A, E, direction, time, a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)])
+    weights = np.array([weight_on_piece(A, E, direction, time, a, b) for a, b in itertools.pairwise(ends)])
     truth = by_linear_program(bound, dictionary, weights)
     found = functionals.offsets(np.array([time]), direction[None], np.zeros((1, 0)))[0]
     assert abs(found - truth) <= 1e-9 * max(1.0, abs(truth))
@@ -90,7 +92,7 @@ def test_the_l1_ball_is_attained_at_one_of_its_vertices(seed, functions):
     functionals = worst_case(system, COARSE, dictionary, Box(-half, half), kind="l1_ball")
     A, _, E = (matrix[0] for matrix in system.matrices(np.zeros((1, 0))))
     ends = dictionary.breakpoints
-    weights = np.array([weight_on_piece(A, E, direction, time, a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)])
+    weights = np.array([weight_on_piece(A, E, direction, time, a, b) for a, b in itertools.pairwise(ends)])
     truth = sum(half[i] * np.abs(dictionary.values @ weights[:, i]).max() for i in range(2))
     assert abs(functionals.offsets(np.array([time]), direction[None], np.zeros((1, 0)))[0] - truth) <= 1e-10 * max(1.0, truth)
 
@@ -109,7 +111,7 @@ def test_finer_pieces_never_help_the_control():
     system = random_system(rng, speed=3.0)
     times, directions = rng.uniform(0, HORIZON, 20), rng.normal(size=(20, 2))
     pushes = [worst_case(system, COARSE, uniform(3 * 2**k, HORIZON), BOUNDS["box"]).offsets(times, directions, np.zeros((20, 0))) for k in range(6)]
-    for coarser, finer in zip(pushes[:-1], pushes[1:], strict=True):
+    for coarser, finer in itertools.pairwise(pushes):
         assert (finer >= coarser - 1e-12).all()
 
 

@@ -18,8 +18,13 @@ from .plants import indicators, uniform, walsh, worst_case
 
 HORIZON = 3.0
 GRIDS = {"uniform": uniform(6, HORIZON), "uneven": indicators([0.0, 0.4, 0.5, 1.6, HORIZON])}
-BOUNDS = {"none": None, "box": Box([-0.1, -0.3], [0.2, 0.1]), "ellipsoid": Ellipsoid([0.0, 0.1], [[0.04, 0.01], [0.01, 0.02]]),
-          "1-norm": NormBall(p=1.0, radius=0.2, dimension=2), "triangle": Polytope([[1.0, 1.0], [-1.0, 0.2], [0.0, -1.0]], [0.3, 0.2, 0.1])}
+BOUNDS = {
+    "none": None,
+    "box": Box([-0.1, -0.3], [0.2, 0.1]),
+    "ellipsoid": Ellipsoid([0.0, 0.1], [[0.04, 0.01], [0.01, 0.02]]),
+    "1-norm": NormBall(p=1.0, radius=0.2, dimension=2),
+    "triangle": Polytope([[1.0, 1.0], [-1.0, 0.2], [0.0, -1.0]], [0.3, 0.2, 0.1]),
+}
 
 
 def system_of(rng, nu, speed=1.0, spread=0.3):
@@ -28,21 +33,26 @@ def system_of(rng, nu, speed=1.0, spread=0.3):
         return LinearSystem(A[0], B[0], E[0])
 
     def affine(matrices):
-        return lambda p: matrices[0] + sum(spread * np.sin(p[i]) * matrices[i + 1] if i == 0 else spread * p[i] * p[0] * matrices[i + 1]
-                                           for i in range(nu))
+        return lambda p: (
+            matrices[0] + sum(spread * np.sin(p[i]) * matrices[i + 1] if i == 0 else spread * p[i] * p[0] * matrices[i + 1] for i in range(nu))
+        )
 
     return LinearSystem(affine(A), affine(B), affine(E), parameters=Box([-1.0] * nu, [1.0] * nu))
 
 
 def constraint_of(rng, system, dictionary, bound, disturbance=None, kind="piecewise_constant", rows=3, start=0.0, stop=HORIZON):
     functionals = worst_case(system, dictionary, disturbance, bound, kind, rng.normal(size=system.states))
-    return FlatConstraint("path", functionals, rng.normal(size=(rows, system.states)), rng.normal(size=rows), start, stop, ParameterIndex(system.parameters))
+    return FlatConstraint(
+        "path", functionals, rng.normal(size=(rows, system.states)), rng.normal(size=rows), start, stop, ParameterIndex(system.parameters)
+    )
 
 
 def sampled_maximum(constraint, x, lower, upper, rng, count=300):
     """The largest violation at random indices of a cell, its corners and its ends in time included."""
     d = lower.size
-    unit = np.vstack([rng.uniform(size=(count, d)), rng.integers(0, 2, size=(count // 8, d)), np.clip(1.5 * rng.uniform(size=(count // 5, d)) - 0.25, 0, 1)])
+    unit = np.vstack(
+        [rng.uniform(size=(count, d)), rng.integers(0, 2, size=(count // 8, d)), np.clip(1.5 * rng.uniform(size=(count // 5, d)) - 0.25, 0, 1)]
+    )
     indices = lower + unit * (upper - lower)
     G, rhs = constraint.rows(indices)
     return float((G @ x - rhs).max())
@@ -112,7 +122,10 @@ def test_a_stiff_system_on_long_pieces_is_enclosed(rate, bound):
     x = rng.normal(size=3)
     lower, upper = constraint.cells
     halves = np.linspace(0, 1, 9)
-    lower, upper = (np.concatenate([lower + f * (upper - lower) for f in halves[:-1]]), np.concatenate([lower + f * (upper - lower) for f in halves[1:]]))
+    lower, upper = (
+        np.concatenate([lower + f * (upper - lower) for f in halves[:-1]]),
+        np.concatenate([lower + f * (upper - lower) for f in halves[1:]]),
+    )
     with np.errstate(over="ignore", invalid="ignore"):
         bounds = constraint.enclosure(x, lower, upper).bounds
     assert not np.isnan(bounds).any()
@@ -135,8 +148,10 @@ def test_a_stiff_bound_is_the_violation_at_a_single_time(rate, side):
     assert np.allclose(bounds, (G @ x - rhs)[:, 0], rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize(("nu", "bound"), [(0, "none"), (0, "box"), (0, "ellipsoid"), (1, "none"), (1, "box"), (1, "ellipsoid"), (1, "triangle"), (1, "1-norm"),
-                                              (2, "box"), (3, "none")])
+@pytest.mark.parametrize(
+    ("nu", "bound"),
+    [(0, "none"), (0, "box"), (0, "ellipsoid"), (1, "none"), (1, "box"), (1, "ellipsoid"), (1, "triangle"), (1, "1-norm"), (2, "box"), (3, "none")],
+)
 def test_the_bound_converges_quadratically_as_the_cell_shrinks(nu, bound):
     """Up to where the Taylor model of the parameters and the sign of a disturbance flip; measured over the median of several cells."""
     rng = np.random.default_rng(3)

@@ -17,6 +17,7 @@ STATUSES = {"certified", "verified", "undecided"}
 def options():
     from sparserob_direct import Direct
     from sparserob_piqp import Piqp
+
     return {"solver": Piqp(), "maximiser": Direct(), "tolerance": 1e-7, "seed": 0}
 
 
@@ -29,12 +30,21 @@ def random_program(rng, n=6, families=2, equality=False, q=True):
         def of(t):
             G = np.cos(t * data[which, 0] + data[which, 1])[:, None, :]
             return G, G @ inside + 0.1 + 0.3 * np.sin(3 * t + which) ** 2
+
         return of
 
     made = [sr.ConstraintFamily(name=f"f{i}", index_set=sr.Box([0.0], [2.0]), rows=rows(i)) for i in range(families)]
     A = rng.normal(size=(2, n)) if equality else None
-    return sr.SemiInfiniteProgram(n=n, q=rng.normal(size=n) if q else None, weights=rng.uniform(0.1, 1, n), lower=-1.0, upper=1.0, families=made,
-                                  A=A, b=None if A is None else A @ inside)
+    return sr.SemiInfiniteProgram(
+        n=n,
+        q=rng.normal(size=n) if q else None,
+        weights=rng.uniform(0.1, 1, n),
+        lower=-1.0,
+        upper=1.0,
+        families=made,
+        A=A,
+        b=None if A is None else A @ inside,
+    )
 
 
 def gridded(program, count=2001, slack=0.0):
@@ -50,8 +60,15 @@ def gridded(program, count=2001, slack=0.0):
     G, h, identity = np.concatenate(rows), np.concatenate(rhs), np.eye(n)
     table = np.vstack([np.hstack([G, np.zeros_like(G)]), np.hstack([identity, -identity]), np.hstack([-identity, -identity])])
     equal = np.hstack([base.A, np.zeros_like(base.A)]) if base.b.size else None
-    answer = linprog(np.concatenate([base.q, base.weights]), table, np.concatenate([h, np.zeros(2 * n)]), equal, base.b if base.b.size else None,
-                     bounds=[*zip(base.lower, base.upper, strict=True), *[(0, None)] * n], method="highs")
+    answer = linprog(
+        np.concatenate([base.q, base.weights]),
+        table,
+        np.concatenate([h, np.zeros(2 * n)]),
+        equal,
+        base.b if base.b.size else None,
+        bounds=[*zip(base.lower, base.upper, strict=True), *[(0, None)] * n],
+        method="highs",
+    )
     return answer.fun if answer.status == 0 else np.inf
 
 
@@ -99,7 +116,9 @@ def test_a_family_given_twice_changes_nothing(options):
 def test_a_family_that_is_never_active_adds_no_index(options):
     program = random_program(np.random.default_rng(4))
     base = program.finite
-    idle = sr.ConstraintFamily(name="idle", index_set=sr.Box([0.0], [1.0]), rows=lambda t: (np.ones((t.shape[0], 1, 6)), np.full((t.shape[0], 1), 100.0)))
+    idle = sr.ConstraintFamily(
+        name="idle", index_set=sr.Box([0.0], [1.0]), rows=lambda t: (np.ones((t.shape[0], 1, 6)), np.full((t.shape[0], 1), 100.0))
+    )
     other = sr.SemiInfiniteProgram(n=program.n, q=base.q, weights=base.weights, lower=-1.0, upper=1.0, families=[*program.families, idle])
     first, second = sr.solve(program, **options), sr.solve(other, **options)
     assert abs(first.cost - second.cost) <= 2e-7 * max(1.0, abs(first.cost))
@@ -124,10 +143,12 @@ def test_without_a_regulariser_the_same_value_is_found(options):
 
 def shifted(program, amount):
     """The same program with every right-hand side lowered."""
+
     def lowered(family):
         def of(t):
             G, h = family.rows(t)
             return G, h - amount
+
         return sr.ConstraintFamily(name=family.name, index_set=family.index_set, rows=of)
 
     base = program.finite
@@ -177,8 +198,13 @@ def solved(problem, count, options, **more):
 
 def test_a_corridor_of_an_integrator_is_certified_although_its_path_has_kinks(options):
     """From 0 up to at least 1 and back to 0.2, never above 1.2: the cheapest control is known."""
-    problem = control_problem(INTEGRATOR, 4.0, [0.0], path=[sr.PathConstraint(sr.Box([-0.1], [1.2])), sr.PathConstraint(sr.Box([1.0], [np.inf]), 1.9, 2.1)],
-                              terminal=[sr.Box([0.0], [0.2])])
+    problem = control_problem(
+        INTEGRATOR,
+        4.0,
+        [0.0],
+        path=[sr.PathConstraint(sr.Box([-0.1], [1.2])), sr.PathConstraint(sr.Box([1.0], [np.inf]), 1.9, 2.1)],
+        terminal=[sr.Box([0.0], [0.2])],
+    )
     for count in (7, 20):
         result = solved(problem, count, options)
         assert result.status == "certified", result.message
@@ -190,8 +216,9 @@ def test_a_corridor_of_an_integrator_is_certified_although_its_path_has_kinks(op
 @pytest.mark.parametrize("count", [5, 40])
 def test_an_initial_state_on_the_boundary_of_its_path_set_ends_with_an_answer(options, start, push, count):
     """No Slater point: the constraint at t = 0 holds with equality, whatever the control."""
-    problem = control_problem(INTEGRATOR, 1.0, start, path=[sr.Box([-1.0], [1.0])], terminal=[sr.Box([-0.5], [0.5])],
-                              disturbance=sr.Box([-push], [push]) if push else None)
+    problem = control_problem(
+        INTEGRATOR, 1.0, start, path=[sr.Box([-1.0], [1.0])], terminal=[sr.Box([-0.5], [0.5])], disturbance=sr.Box([-push], [push]) if push else None
+    )
     result = solved(problem, count, options)
     assert result.status in STATUSES, result.message
     assert result.message
@@ -202,8 +229,13 @@ def test_an_initial_state_on_the_boundary_of_its_path_set_ends_with_an_answer(op
 
 def test_an_oscillator_that_starts_on_the_boundary_and_must_be_held_inside(options):
     """``x'' = -x + u`` from rest at the bound: free motion goes inside; from the velocity 0 at -1 too."""
-    problem = control_problem({"A": [[0, 1], [-1, 0]], "B": [[0.0], [1.0]]}, 3.0, [1.0, 0.0], path=[sr.Box([-1.0, -np.inf], [1.0, np.inf])],
-                              terminal=[sr.Box([-0.3, -0.3], [0.3, 0.3])])
+    problem = control_problem(
+        {"A": [[0, 1], [-1, 0]], "B": [[0.0], [1.0]]},
+        3.0,
+        [1.0, 0.0],
+        path=[sr.Box([-1.0, -np.inf], [1.0, np.inf])],
+        terminal=[sr.Box([-0.3, -0.3], [0.3, 0.3])],
+    )
     result = solved(problem, 30, options)
     assert result.status in STATUSES, result.message
 
@@ -230,8 +262,11 @@ def test_a_thin_terminal_set_is_reached_and_certified(options, width):
     """An almost-equality: the margin of the rows must shrink with the set."""
     problem = control_problem({"A": [[0, 1], [0, 0]], "B": [[0.0], [1.0]]}, 5.0, [1.0, 1.0], terminal=[sr.Box([-width, -width], [width, width])])
     result = solved(problem, 50, options)
-    truth = sr.solve(control_problem({"A": [[0, 1], [0, 0]], "B": [[0.0], [1.0]]}, 5.0, [1.0, 1.0], terminal=[sr.Equality([0.0, 0.0])]),
-                     control=pieces(50), solver=options["solver"])
+    truth = sr.solve(
+        control_problem({"A": [[0, 1], [0, 0]], "B": [[0.0], [1.0]]}, 5.0, [1.0, 1.0], terminal=[sr.Equality([0.0, 0.0])]),
+        control=pieces(50),
+        solver=options["solver"],
+    )
     assert result.status in STATUSES, result.message
     assert result.status == "certified", f"{result.message} (gap {result.gap:.1e})"
     assert abs(result.cost - truth.cost) <= 3 * width + 1e-6
@@ -246,8 +281,13 @@ def test_a_terminal_point_without_interior_ends_with_an_answer(options):
 
 
 def test_a_run_of_one_round_claims_nothing_of_an_earlier_decision(options):
-    problem = control_problem({"A": [[0, 1], [-4, 0]], "B": [[0.0], [1.0]]}, 5.0, [1.0, 0.0], path=[sr.PathConstraint(sr.Box([-0.9, -9], [0.7, 9]), 2.0)],
-                              terminal=[sr.Box([-0.2, -0.2], [0.2, 0.2])])
+    problem = control_problem(
+        {"A": [[0, 1], [-4, 0]], "B": [[0.0], [1.0]]},
+        5.0,
+        [1.0, 0.0],
+        path=[sr.PathConstraint(sr.Box([-0.9, -9], [0.7, 9]), 2.0)],
+        terminal=[sr.Box([-0.2, -0.2], [0.2, 0.2])],
+    )
     for rounds in (1, 2, 3):
         result = solved(problem, 25, options, method={"name": "exchange", "rounds": rounds})
         assert result.counts["rounds"] == len(result.history) <= rounds

@@ -17,8 +17,12 @@ from .plants import indicators, random_system, uniform, worst_case
 
 HORIZON = 2.0
 UNEVEN = indicators([0.0, 0.3, 1.4, HORIZON])
-BOUNDS = {"box": Box([-0.1, 0.05], [0.3, 0.2]), "ellipsoid": Ellipsoid([0.1, 0.0], [[0.04, 0.01], [0.01, 0.09]]),
-          "triangle": Polytope([[1.0, 1.0], [-1.0, 0.2], [0.0, -1.0]], [0.3, 0.2, 0.1]), "1-norm": NormBall(p=1.0, radius=0.3, dimension=2)}
+BOUNDS = {
+    "box": Box([-0.1, 0.05], [0.3, 0.2]),
+    "ellipsoid": Ellipsoid([0.1, 0.0], [[0.04, 0.01], [0.01, 0.09]]),
+    "triangle": Polytope([[1.0, 1.0], [-1.0, 0.2], [0.0, -1.0]], [0.3, 0.2, 0.1]),
+    "1-norm": NormBall(p=1.0, radius=0.3, dimension=2),
+}
 
 
 def by_quadrature(system, bound, direction, time, parameter=None):
@@ -39,7 +43,9 @@ def by_quadrature(system, bound, direction, time, parameter=None):
 def test_the_support_of_a_box_is_an_integral_of_moduli(seed, speed):
     rng = np.random.default_rng(seed)
     system, direction, time = random_system(rng, speed=speed), rng.normal(size=2), rng.uniform(0.1, HORIZON)
-    found = worst_case(system, uniform(40, HORIZON), bound=BOUNDS["box"], kind="measurable").offsets(np.array([time]), direction[None], np.zeros((1, 0)))
+    found = worst_case(system, uniform(40, HORIZON), bound=BOUNDS["box"], kind="measurable").offsets(
+        np.array([time]), direction[None], np.zeros((1, 0))
+    )
     truth = by_quadrature(system, BOUNDS["box"], direction, time)
     assert abs(found[0] - truth) <= 1e-6 * max(1.0, truth)
 
@@ -64,12 +70,11 @@ def test_one_channel_that_changes_sign_inside_a_piece_is_integrated_across_its_k
     assert abs(functionals.offsets(np.array([5.0]), np.array([[1.0, 0.0]]), np.zeros((1, 0)))[0] - truth) <= 1e-8
 
 
-
 @pytest.mark.parametrize("pieces", [1, 2, 3, 5, 50])
 def test_a_fast_oscillator_on_coarse_pieces_is_integrated_across_every_root(pieces):
     """``int_0^t |sin(omega s)| / omega ds``, with many roots and extrema inside one piece."""
     omega = 7.0
-    system = LinearSystem([[0, 1], [-omega**2, 0]], [[0.0], [1.0]], [[0.0], [1.0]])
+    system = LinearSystem([[0, 1], [-(omega**2), 0]], [[0.0], [1.0]], [[0.0], [1.0]])
     functionals = worst_case(system, uniform(pieces, 4.0), bound=Box([-1.0], [1.0]), kind="measurable")
     times = np.array([0.3, 1.0, 2.9, 4.0])
     found = functionals.offsets(times, np.tile([1.0, 0.0], (4, 1)), np.zeros((4, 0)))

@@ -19,9 +19,13 @@ from .plants import held, indicators, simulated, uniform, walsh
 
 HORIZON = 3.0
 UNEVEN = indicators([0.0, 0.2, 0.25, 1.1, HORIZON])
-CONTROLS = {"box": Box([-1.0, -0.5], [2.0, 0.5]), "triangle": Polytope([[1.0, 1.0], [-1.0, 0.2], [0.0, -1.0]], [1.0, 0.7, 0.4]),
-            "1-norm": NormBall(p=1.0, radius=0.8, centre=[0.1, 0.0]), "disc": NormBall(p=2.0, radius=0.7, dimension=2),
-            "ellipse": Ellipsoid([0.2, 0.0], [[0.5, 0.2], [0.2, 0.3]])}
+CONTROLS = {
+    "box": Box([-1.0, -0.5], [2.0, 0.5]),
+    "triangle": Polytope([[1.0, 1.0], [-1.0, 0.2], [0.0, -1.0]], [1.0, 0.7, 0.4]),
+    "1-norm": NormBall(p=1.0, radius=0.8, centre=[0.1, 0.0]),
+    "disc": NormBall(p=2.0, radius=0.7, dimension=2),
+    "ellipse": Ellipsoid([0.2, 0.0], [[0.5, 0.2], [0.2, 0.3]]),
+}
 
 
 def problem_of(rng, control=CONTROLS["box"], **more):
@@ -79,23 +83,45 @@ def test_an_equality_of_a_state_that_uncertainty_reaches_is_refused():
         transcribe(problem_of(rng, **disturbed), UNEVEN)
     system = LinearSystem(lambda p: np.array([[p[0]]]), [[1.0]], parameters=Box([-1.0], [1.0]))
     with pytest.raises(InputError, match="state 1 depends on the uncertainty"):
-        transcribe(OptimalControlProblem(system=system, horizon=1.0, initial_state=[1.0], control=Box([-1.0], [1.0]), terminal=[Equality([0.0])]), uniform(3, 1.0))
+        transcribe(
+            OptimalControlProblem(system=system, horizon=1.0, initial_state=[1.0], control=Box([-1.0], [1.0]), terminal=[Equality([0.0])]),
+            uniform(3, 1.0),
+        )
 
 
-@pytest.mark.parametrize("size", [1.0, pytest.param(1e4, marks=pytest.mark.xfail(
-    strict=True, raises=InputError, reason="transcription.py, _equalities: the tolerance 1e-12 is absolute, so rounding of large rows counts as uncertainty"))])
+@pytest.mark.parametrize(
+    "size",
+    [
+        1.0,
+        pytest.param(
+            1e4,
+            marks=pytest.mark.xfail(
+                strict=True,
+                raises=InputError,
+                reason="transcription.py, _equalities: the tolerance 1e-12 is absolute, so rounding of large rows counts as uncertainty",
+            ),
+        ),
+    ],
+)
 def test_an_equality_of_a_state_that_the_parameter_does_not_reach_is_kept_whatever_its_size(size):
     """The second state is driven by the control alone; the first, uncertain, does not reach it. Rounding grows with the numbers."""
-    system = LinearSystem(lambda p: np.array([[0.7 * p[0], p[0], 0.0], [0.0, 1.3, 0.8], [0.0, -0.7, 1.1]]), lambda p: size * np.array([[1.0], [0.3], [0.7]]),
-                          parameters=Box([-1.0], [1.0]))
-    problem = OptimalControlProblem(system=system, horizon=HORIZON, initial_state=[0.0, size, 0.0], control=Box([-1.0], [1.0]),
-                                    terminal=[Equality([np.nan, 0.0, 0.0])])
+    system = LinearSystem(
+        lambda p: np.array([[0.7 * p[0], p[0], 0.0], [0.0, 1.3, 0.8], [0.0, -0.7, 1.1]]),
+        lambda p: size * np.array([[1.0], [0.3], [0.7]]),
+        parameters=Box([-1.0], [1.0]),
+    )
+    problem = OptimalControlProblem(
+        system=system, horizon=HORIZON, initial_state=[0.0, size, 0.0], control=Box([-1.0], [1.0]), terminal=[Equality([np.nan, 0.0, 0.0])]
+    )
     assert transcribe(problem, UNEVEN).finite.A.shape == (2, 4)
 
 
 def test_families_are_named_and_windowed_as_the_problem_says():
     rng = np.random.default_rng(3)
-    path = [PathConstraint(Box([-1, -np.inf, -np.inf], [1, np.inf, np.inf]), 0.5, 2.0), PathConstraint(NormBall(p=1.0, radius=9, dimension=3), name="diamond")]
+    path = [
+        PathConstraint(Box([-1, -np.inf, -np.inf], [1, np.inf, np.inf]), 0.5, 2.0),
+        PathConstraint(NormBall(p=1.0, radius=9, dimension=3), name="diamond"),
+    ]
     program = transcribe(problem_of(rng, path=path, terminal=[Box([-1] * 3, [1] * 3), Equality([np.nan] * 2 + [0.0])]), UNEVEN)
     assert [family.name for family in program.families] == ["path[0]", "diamond", "terminal"]
     windows = {family.name: (family.index_set.lower[0], family.index_set.upper[0]) for family in program.families}
@@ -158,7 +184,9 @@ def test_a_dictionary_over_another_horizon_is_refused():
         transcribe(problem_of(np.random.default_rng(4)), uniform(3, HORIZON), uniform(3, 4.0))
 
 
-@pytest.mark.xfail(strict=True, raises=ValueError, reason="functional.py, _control_starts: a piece of the control that the merged grid swallows has no start")
+@pytest.mark.xfail(
+    strict=True, raises=ValueError, reason="functional.py, _control_starts: a piece of the control that the merged grid swallows has no start"
+)
 def test_pieces_shorter_than_rounding_are_transcribed_or_refused_with_a_sentence():
     tiny = Dictionary(np.array([0.0, 1.0, 1.0 + 1e-13, HORIZON]), np.eye(3))
     problem = problem_of(np.random.default_rng(5), path=[Box([-1] * 3, [1] * 3)])
