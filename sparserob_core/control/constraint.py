@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypeVar
 
 import numpy as np
 
-from sparserob_core.control.combination import Combination
-from sparserob_core.control.enclosure import CellEnclosure
+from sparserob_core.control.enclosure import CellEnclosure, remember, where_to_halve
 from sparserob_core.control.functional import WorstCase
 from sparserob_core.control.lifted import LiftedSystem, lift
 from sparserob_core.control.measurable import MeasurablePush
@@ -21,11 +19,8 @@ from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.program import Enclosure, Explanation, Separation
 
-T = TypeVar("T")
-REMEMBERED = 256    # cells of parameters whose matrices are kept
 TINY = 1e-4         # of a cell of parameters: a cell on which a system that can be enclosed at all will be
 SURE = 1e-8         # a vertex that is predicted to this accuracy is one
-TIME_FIRST = 0.25   # times are halved before anything else unless that gains less than this share: their cells share all work
 INSIDE = 3         # times sampled inside every piece, beside its ends
 CLIMBED = 10        # of them, those that parameters are climbed for
 KEPT = 12          # separated constraints per row and round
@@ -101,7 +96,7 @@ class FlatConstraint:
         sign = -1.0 if np.count_nonzero(direction) == 1 and direction.sum() < 0 else 1.0
         text = f"{self.name}: {_combination(sign * direction, time)} {'>=' if sign < 0 else '<='} {sign * bound:.6g}"
         push = float(self.functionals.offsets(np.array([time]), direction[None], parameter[None])[0])
-        remarks = [] if time > 0 else ["the initial state is given"]
+        remarks = [] if time > 0 else [f"the initial state gives {sign * float(direction @ self.functionals.response.initial_state):.6g}"]
         remarks += [f"the disturbance alone moves it by {push:.4g}"] if push > 0 else []
         remarks += [f"at {self.functionals.response.system.describe(parameter)}"] if parameter.size else []
         disturbance = self.functionals.worst_disturbance(time, direction, parameter)
@@ -162,7 +157,7 @@ class FlatConstraint:
         lifted = self.lifted(low, high)
         key = low.tobytes() + high.tobytes()
         if key not in self._pushes:
-            remember(self._pushes, key, push_of(self.functionals, lifted, self.H))
+            remember(self._pushes, key, self.functionals.push(lifted, self.H))
         return self._pushes[key]
 
     @cached_property
@@ -241,35 +236,3 @@ def _combination(direction: Array, time: float) -> str:
         sign = "-" if direction[state] < 0 else "+" if parts else ""
         parts.append(f"{sign}{' ' if parts else ''}{'' if size == 1 else f'{size:.4g} '}x{state + 1}({time:.6g})")
     return " ".join(parts) or "0"
-
-
-def remember(cache: dict[bytes, T], key: bytes, value: T) -> None:
-    """Keep the last `REMEMBERED` cells."""
-    while len(cache) >= REMEMBERED:
-        cache.pop(next(iter(cache)))
-    cache[key] = value
-
-
-def where_to_halve(bend: Array, spread: Array, bounds: Array) -> np.ndarray:
-    """Halve the times where they matter most, else one other coordinate, the same for the whole group so that its cells stay shared.
-
-    ``bend (k,)``: what halving the times of a cell would gain; ``spread (k, j)``: what halving each other coordinate would.
-    """
-    if not spread.shape[1]:
-        return np.zeros(bend.size, dtype=int)
-    open_ = bounds > 0
-    total = spread[open_].sum(axis=0) if open_.any() else spread.sum(axis=0)
-    return np.where(bend > TIME_FIRST * spread.max(axis=1), 0, 1 + int(total.argmax()))
-
-
-def push_of(functionals: WorstCase, lifted: LiftedSystem, H: Array, joined: Combination | None = None) -> Push | MeasurablePush | None:
-    """The push of the disturbance on functionals ``H (r, d)`` over a cell; raises `NotEnclosable` where there is no proven bound of it."""
-    model = functionals.disturbance
-    if model is None:
-        return None
-    if model.kind != "measurable":
-        return Push(lifted, model, H @ lifted.transform, joined)
-    if lifted.space.nu or joined is not None:
-        raise NotEnclosable("measurable disturbances are proven only for known systems and sets with flat sides; "
-                            "expected disturbance_class piecewise_constant")
-    return MeasurablePush(functionals.measurable, H)

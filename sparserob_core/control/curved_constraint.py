@@ -8,9 +8,9 @@ from functools import cached_property
 import numpy as np
 
 from sparserob_core.control.combination import Combination, combination
-from sparserob_core.control.constraint import FlatConstraint, push_of, remember, where_to_halve
+from sparserob_core.control.constraint import FlatConstraint
 from sparserob_core.control.directions import faces, on_surface, sampled, unit
-from sparserob_core.control.enclosure import CellEnclosure
+from sparserob_core.control.enclosure import CellEnclosure, remember, where_to_halve
 from sparserob_core.control.functional import WorstCase
 from sparserob_core.control.lifted import LiftedSystem
 from sparserob_core.control.parameters import ParameterIndex
@@ -122,7 +122,7 @@ class CurvedConstraint:
             H = np.vstack([centre, np.diag(radius)[free]]) @ self.set.normals
             lifted = self._flat.lifted(low[:nu], high[:nu])
             joined = self._combination(lifted, free.size)
-            push = push_of(self.functionals, lifted, H, joined)
+            push = self.functionals.push(lifted, H, joined)
             rhs, looseness = self._minorant(H, joined, nu)
             control = self.functionals.dictionary.control(x)
             remember(self._cells, key, CellEnclosure(lifted, push, H, rhs, control, joined, looseness))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 
@@ -20,8 +21,11 @@ from sparserob_core.control.push import Push
 from sparserob_core.control.taylor import TaylorSpace
 from sparserob_core.sip.convex_set import Array
 
+T = TypeVar("T")
 LONG_STEP = 1.0         # in norm times duration: longer steps are taken by matrix exponentials
 SMALL_SHARE = 1e-6      # so that no coordinate is ever entirely blameless
+REMEMBERED = 256        # cells of parameters whose matrices are kept
+TIME_FIRST = 0.25       # times are halved before anything else unless that gains less than this share: their cells share all work
 TAYLOR_TERMS = 1e-17    # relative size below which further terms of the exponential series are left out
 
 
@@ -176,3 +180,22 @@ def _ends(start: Array, stop: Array, pieces: np.ndarray) -> tuple[tuple[Array, n
     both = np.stack([np.concatenate([start, stop]), np.concatenate([pieces, pieces])])
     unique, which = np.unique(both, axis=1, return_inverse=True)
     return (unique[0], unique[1].astype(int)), which.reshape(-1)
+
+
+def remember(cache: dict[bytes, T], key: bytes, value: T) -> None:
+    """Keep the last `REMEMBERED` cells."""
+    while len(cache) >= REMEMBERED:
+        cache.pop(next(iter(cache)))
+    cache[key] = value
+
+
+def where_to_halve(bend: Array, spread: Array, bounds: Array) -> np.ndarray:
+    """Halve the times where they matter most, else one other coordinate, the same for the whole group so that its cells stay shared.
+
+    ``bend (k,)``: what halving the times of a cell would gain; ``spread (k, j)``: what halving each other coordinate would.
+    """
+    if not spread.shape[1]:
+        return np.zeros(bend.size, dtype=int)
+    open_ = bounds > 0
+    total = spread[open_].sum(axis=0) if open_.any() else spread.sum(axis=0)
+    return np.where(bend > TIME_FIRST * spread.max(axis=1), 0, 1 + int(total.argmax()))

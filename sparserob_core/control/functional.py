@@ -7,13 +7,15 @@ from functools import cached_property
 
 import numpy as np
 
+from sparserob_core.control.combination import Combination
 from sparserob_core.control.dictionary import Dictionary
 from sparserob_core.control.disturbance import DisturbanceModel
-from sparserob_core.control.lifted import frozen
-from sparserob_core.control.measurable import MeasurableSupport
+from sparserob_core.control.lifted import LiftedSystem, frozen
+from sparserob_core.control.measurable import MeasurablePush, MeasurableSupport
 from sparserob_core.control.push import Push
 from sparserob_core.control.response import Response
 from sparserob_core.control.system import LinearSystem
+from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array, Box
 
 CHUNK = 4_000_000  # entries of a gain array that are built at once (32 MB)
@@ -94,6 +96,18 @@ class WorstCase:
             return self.offsets(np.repeat(times, r), np.tile(directions, (k, 1)), every).reshape(k, r)
         known = frozen(self.response.system, self.response.grid, self.response.initial_state, parameter)
         return Push(known, model, directions).at(times, np.zeros((times.size, directions.shape[0], 0)))[0][:, :, 0]
+
+    def push(self, lifted: LiftedSystem, H: Array, joined: Combination | None = None) -> Push | MeasurablePush | None:
+        """The push of the disturbance on functionals ``H (r, d)`` over a cell; raises `NotEnclosable` where no bound of it is proven."""
+        model = self.disturbance
+        if model is None:
+            return None
+        if model.kind != "measurable":
+            return Push(lifted, model, H @ lifted.transform, joined)
+        if lifted.space.nu or joined is not None:
+            raise NotEnclosable("measurable disturbances are proven only for known systems and sets with flat sides; "
+                                "expected disturbance_class piecewise_constant")
+        return MeasurablePush(self.measurable, H)
 
     def offsets(self, times: Array, directions: Array, parameters: Array) -> Array:
         """``sigma (k,)``: how far the worst disturbance alone pushes ``c'x(t)``."""

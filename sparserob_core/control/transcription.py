@@ -16,7 +16,7 @@ from sparserob_core.control.functional import WorstCase
 from sparserob_core.control.literal import LiteralConstraint
 from sparserob_core.control.parameters import ParameterIndex
 from sparserob_core.control.problem import OptimalControlProblem, PathConstraint
-from sparserob_core.control.response import Response, merge_grids
+from sparserob_core.control.response import SAME_TIME, Response, merge_grids
 from sparserob_core.control.sampling import sample_disturbances, sample_parameters
 from sparserob_core.control.scenario import ScenarioConstraint
 from sparserob_core.control.sets import Equality
@@ -27,6 +27,7 @@ from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
+SAME = 1e-11  # relative to the largest entry of a row, a difference that is rounding
 PROBES = 7  # parameters at which the right-hand side of a terminal equality must agree
 
 
@@ -69,6 +70,9 @@ def prepare(problem: OptimalControlProblem, control: Dictionary, disturbance: Di
     for name, dictionary in (("control", control), ("disturbance", disturbance)):
         if abs(dictionary.horizon - problem.horizon) > 1e-12 * problem.horizon:
             raise InputError(f"{name} dictionary: ends at {dictionary.horizon:g}, expected the horizon {problem.horizon:g}")
+        if dictionary.lengths.min() <= SAME_TIME * problem.horizon:
+            raise InputError(f"{name} dictionary: a piece is {dictionary.lengths.min():.2g} long, "
+                             f"which is rounding for a horizon of {problem.horizon:g}")
     grid = merge_grids(control.breakpoints, disturbance.breakpoints)
     model: DisturbanceModel | None = None
     if problem.disturbance is not None:
@@ -121,7 +125,8 @@ def _equalities(model: Transcription) -> tuple[Array, Array]:
             time, up = np.full(count, horizon), np.repeat(direction, count, axis=0)
             G, offset = functionals.rows(time, up, probes)
             sigma = functionals.offsets(time, up, probes) + functionals.offsets(time, -up, probes)
-            if np.abs(sigma).max() > 1e-12 or np.abs(G - G[0]).max() > 1e-12 or np.abs(offset - offset[0]).max() > 1e-12:
+            rounding = SAME * max(1.0, float(np.abs(G).max()), float(np.abs(offset).max()))
+            if max(np.abs(sigma).max(), np.abs(G - G[0]).max(), np.abs(offset - offset[0]).max()) > rounding:
                 raise InputError(f"terminal: equals: state {state + 1} depends on the uncertainty, so no control can fix its final value "
                                  f"to {terminal.values[state]:g}; expected a set with interior")
             A.append(G[:1])

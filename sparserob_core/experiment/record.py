@@ -15,7 +15,7 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.result import Result, Witness
 
-PACKAGES = ("sparserob", "numpy", "scipy")
+PACKAGES = ("sparserob", "numpy", "scipy", "piqp", "proxsuite", "clarabel")
 
 
 def summary_of(result: Result, control: Array | None, dictionary: Dictionary | None) -> dict[str, Any]:

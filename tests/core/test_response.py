@@ -116,14 +116,15 @@ def test_the_push_by_age_equals_the_push_by_adjoints(seed, pieces, nu):
     times = np.concatenate([functionals.response.grid.breakpoints, rng.uniform(0, HORIZON, 5)])
     ends = rng.integers(-1, 2, (times.size, 3, nu)).astype(float)
     push = Push(lifted, functionals.disturbance, rows)
-    fast, steep, bent = push.at(times, ends), push.swing(times), push.curvature
+    widths = rng.uniform(0, 1, times.size) * HORIZON / pieces
+    fast, steep, bent = push.at(times, ends), push.swing(times), push.curvature(times, widths)
     with patch.object(Push, "_repeats", new=False):
         push = Push(lifted, functionals.disturbance, rows)
         slow = push.at(times, ends)
         assert np.allclose(fast[0], slow[0], rtol=1e-9, atol=1e-11)
         assert np.allclose(fast[1], slow[1], rtol=1e-9, atol=1e-11)
         assert np.allclose(steep, push.swing(times), rtol=1e-9, atol=1e-11)
-        assert np.allclose(bent, push.curvature, rtol=1e-9, atol=1e-11)
+        assert np.allclose(bent, push.curvature(times, widths), rtol=1e-9, atol=1e-11)
 
 
 @settings(max_examples=20, deadline=None)

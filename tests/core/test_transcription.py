@@ -93,14 +93,7 @@ def test_an_equality_of_a_state_that_uncertainty_reaches_is_refused():
     "size",
     [
         1.0,
-        pytest.param(
-            1e4,
-            marks=pytest.mark.xfail(
-                strict=True,
-                raises=InputError,
-                reason="transcription.py, _equalities: the tolerance 1e-12 is absolute, so rounding of large rows counts as uncertainty",
-            ),
-        ),
+        1e4,
     ],
 )
 def test_an_equality_of_a_state_that_the_parameter_does_not_reach_is_kept_whatever_its_size(size):
@@ -184,9 +177,6 @@ def test_a_dictionary_over_another_horizon_is_refused():
         transcribe(problem_of(np.random.default_rng(4)), uniform(3, HORIZON), uniform(3, 4.0))
 
 
-@pytest.mark.xfail(
-    strict=True, raises=ValueError, reason="functional.py, _control_starts: a piece of the control that the merged grid swallows has no start"
-)
 def test_pieces_shorter_than_rounding_are_transcribed_or_refused_with_a_sentence():
     tiny = Dictionary(np.array([0.0, 1.0, 1.0 + 1e-13, HORIZON]), np.eye(3))
     problem = problem_of(np.random.default_rng(5), path=[Box([-1] * 3, [1] * 3)])
