@@ -80,9 +80,10 @@ class FlatConstraint:
             rows = rows[likely]
         else:
             found = self.violations(x, indices, rows)
+            error = np.abs(predicted - found)
             lost = heights > found  # a kink, where a parabola is no guide
             indices[lost, 0], found[lost] = self.times[positions[lost, 2]], heights[lost]
-            unsure = np.flatnonzero(lost | (np.abs(predicted - found) > SURE * np.maximum(1.0, np.abs(found))))
+            unsure = np.flatnonzero((error > SURE * np.maximum(1.0, np.abs(found))) & (found + 4.0 * error >= found.max(initial=-np.inf)))
             unsure = unsure[np.argsort(-found[unsure], kind="stable")][:CLIMBED]
             if unsure.size:
                 indices[unsure], found[unsure] = self._climbed(x, indices[unsure], rows[unsure])

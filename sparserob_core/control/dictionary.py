@@ -70,6 +70,8 @@ class Dictionary:
 
     def merged(self) -> Dictionary:
         """The same functions on the fewest pieces: adjacent pieces on which all of them agree become one."""
+        if self.is_indicators:
+            return self
         changes = (np.diff(self.values, axis=1) != 0).any(axis=0)
         keep = np.concatenate([[True], changes])
         return Dictionary(self.breakpoints[np.concatenate([keep, [True]])], self.values[:, keep])
@@ -77,7 +79,7 @@ class Dictionary:
     @property
     def is_complete(self) -> bool:
         """Whether the functions span every piecewise constant function on the merged pieces."""
-        return self.functions == 1 + int((np.diff(self.values, axis=1) != 0).any(axis=0).sum())
+        return self.is_indicators or self.functions == 1 + int((np.diff(self.values, axis=1) != 0).any(axis=0).sum())
 
 
 class DictionaryFactory(ABC):

@@ -75,21 +75,22 @@ class CellEnclosure:
         if self.combination is not None:
             coefficients, space = self.combination.apply(coefficients), self.combination.space
         coefficients = coefficients - self.rhs
-        ends = self._ends(times, space, coefficients)
+        swing = np.zeros((*coefficients.shape[:2], space.nu)) if self.push is None or not space.nu else self.push.swing(times)
+        ends = self._better_ends(space, coefficients, swing)
         coefficients, excess = _on_faces(space, coefficients, ends), np.zeros(coefficients.shape[:2])
         if self.push is not None:
             pushed, excess = self.push.at(times, ends)
             coefficients = coefficients + pushed
         bound, spread = polynomial_bound(space, coefficients)
-        return bound + excess, spread + self._shares * excess[..., None]
+        blame = np.where(ends == 0, swing, 0.0) + np.finfo(float).tiny
+        return bound + excess, spread + excess[..., None] * blame / blame.sum(axis=2, keepdims=True)
 
-    def _ends(self, times: Array, space: TaylorSpace, coefficients: Array) -> Array:
+    @staticmethod
+    def _better_ends(space: TaylorSpace, coefficients: Array, swing: Array) -> Array:
         """Parameters in which the violation is monotone over the cell, whatever the disturbance: their better ends, ``(k, r, nu)``."""
-        shape = coefficients.shape[:2]
-        if space.nu == 0:
-            return np.zeros((*shape, 0))
-        swing = np.zeros((*shape, space.nu)) if self.push is None else self.push.swing(times)
-        return monotone_ends(space, coefficients.reshape(-1, space.size), swing.reshape(-1, space.nu)).reshape(*shape, space.nu)
+        if not space.nu:
+            return np.zeros(swing.shape)
+        return monotone_ends(space, coefficients.reshape(-1, space.size), swing.reshape(-1, space.nu)).reshape(swing.shape)
 
     def _states(self, times: Array, pieces: np.ndarray) -> Array:
         """Taylor coefficients ``(k, M, d)`` of the state under the control alone, from the last breakpoint."""

@@ -11,11 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
+import sparserob_core as sr
 from sparserob_core.control.constraint import FlatConstraint
 from sparserob_core.control.parameters import ParameterIndex
 from sparserob_core.control.system import LinearSystem
-from sparserob_core.sip.certificate import prove_family
+from sparserob_core.sip.certificate import Proof, prove_family
 from sparserob_core.sip.convex_set import Box
+from sparserob_core.sip.exchange import Exchange
+from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import ConstraintFamily, Enclosure
 
 from .plants import indicators, random_system, uniform, worst_case
@@ -222,3 +225,25 @@ def test_the_peak_of_a_long_smooth_piece_is_bounded_within_the_tolerance():
     top = at(constraint, brentq(lambda t: at(slope, t), 0.3, 0.8, xtol=1e-14))
     assert prove_family(family_of(raised(constraint, top + 1e-8)), np.zeros(1)).verdict == "proven"
     assert prove_family(family_of(raised(constraint, top - 1e-8)), np.zeros(1)).verdict == "refuted"
+
+
+def test_a_curved_set_under_a_parameter_and_a_disturbance_is_proven_with_few_cells():
+    """What the disturbance's flips cost comes from the direction: halving the parameter, which sits at its end, gains nothing."""
+    def affine(first, second):
+        return lambda p: np.array(first) + 0.05 * np.sin(p[0]) * np.array(second)
+
+    system = sr.LinearSystem(affine([[-0.3, 0.19], [-0.1, -0.06]], [[0.4, -0.22], [-0.43, -0.05]]), affine([[0.83], [-0.03]], [[-0.26], [-0.59]]),
+                             affine([[1.92, 1.41], [0.12, -0.42]], [[0.67, 0.27], [-2.16, -0.44]]), parameters=Box([-1.0], [1.0]))
+    problem = sr.OptimalControlProblem(system=system, horizon=3.0, initial_state=[0.53, -0.78], control=Box([-4.0], [4.0]),
+                                       disturbance=Box([-0.02, -0.01], [0.03, 0.02]), terminal=[sr.Ellipsoid([0, 0], [[0.3, 0.05], [0.05, 0.2]])])
+    program = sr.transcribe(problem, uniform(20, 3.0))
+    decisions = []
+
+    def undecided(x):
+        decisions.append(x)
+        return [Proof("terminal", "undecided", np.inf)]
+
+    from sparserob_piqp import Piqp
+    from sparserob_regularisers import Ridge
+    Exchange().close(program, Tools(solver=Piqp(), regulariser=Ridge()), undecided)
+    assert prove_family(program.families[0], decisions[-1], cells=400).verdict == "proven"
