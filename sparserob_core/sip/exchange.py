@@ -28,6 +28,7 @@ from sparserob_core.sip.verdict import clash, verdict, witness
 IDLE_ROUNDS = 3         # rounds that a row may stay without a multiplier before it is dropped
 DROPPING_ROUNDS = 40    # rounds after which rows are only added, so that nothing can cycle
 MARGINS = (1e-10, 1e-6)
+RESIDUAL = 1e-8         # of bounds, fixed rows and equalities, relative to their scale, at a decision that is returned
 CRUDE = 1e-4            # residual and relative gap of a relaxed solution that a round can do with
 ALLOWED = TOLERANCE / 2  # a violation that the search may leave to the proof
 
@@ -80,16 +81,15 @@ class _Run:
             separations = self._separate(solution.x)
             worst = _worst(separations)
             self._tell(number, solution, worst, separations)
-            if worst.violation > ALLOWED:
-                self._exchange(solution, [(s.indices[s.violations > ALLOWED], s.rows[s.violations > ALLOWED], f.name) for f, s in separations])
+            violated = [(s.indices[s.violations > ALLOWED], s.rows[s.violations > ALLOWED], f.name) for f, s in separations]
+            if worst.violation > ALLOWED and self._exchange(solution, violated):
                 continue
             if self._open(solution) and self._sharpen(solution):
                 continue
             proofs = self.prover(solution.x)
-            refuted = [proof for proof in proofs if proof.verdict == "refuted"]
-            if not refuted:
+            witnesses = [(p.index[None], np.array([p.row]), p.family) for p in proofs if p.verdict == "refuted" and p.index is not None]
+            if not witnesses or not self._exchange(solution, witnesses):
                 return self._finished(solution, worst, proofs)
-            self._exchange(solution, [(p.index[None], np.array([p.row]), p.family) for p in refuted if p.index is not None])
         return self._finished(solution, worst, proofs or self.prover(solution.x))
 
     def _relax(self) -> FiniteSolution:
@@ -155,8 +155,8 @@ class _Run:
         return [(family, family.worst(x) if family.worst is not None
                  else search_worst(family, x, self.tools.maximiser, self.tools.budget, self.tools.rng, ALLOWED)) for family in self.program.families]
 
-    def _exchange(self, solution: FiniteSolution, violated: Sequence[tuple[Array, np.ndarray, str]]) -> None:
-        """Drop the rows that have been slack for a while, add the violated ones."""
+    def _exchange(self, solution: FiniteSolution, violated: Sequence[tuple[Array, np.ndarray, str]]) -> int:
+        """Drop the rows that have been slack for a while, add the violated ones; returns how many were new."""
         y = self._multipliers(solution)
         self.idle = np.where(y > 0.0, 0, self.idle + 1)
         keep = (self.idle < IDLE_ROUNDS) | (len(self.history) > DROPPING_ROUNDS)
@@ -170,6 +170,7 @@ class _Run:
         self.idle = np.concatenate([self.idle, np.zeros(added, dtype=int)])
         fixed = solution.y[:solution.y.size - y.size]
         self.guess = replace(solution, y=np.concatenate([fixed, y[keep], np.zeros(added)]))
+        return added
 
     def _tell(self, number: int, solution: FiniteSolution, worst: Witness, separations: Sequence[tuple[ConstraintFamily, Separation]]) -> None:
         feasible = worst.violation <= ALLOWED
@@ -185,6 +186,9 @@ class _Run:
         cost = self.program.cost(solution.x)
         gap = relative_gap(self.lower, cost)
         status, message = verdict(proofs, gap, self.method.tolerance)
+        residual = self.program.finite.residual(solution.x)
+        if residual > RESIDUAL:
+            status, message = "failed", f"the decision misses its bounds or equalities by {residual:.1e}: {'; '.join(solution.attempts)}"
         return self._result(status, message, solution, cost, witness(self.program, worst, proofs))
 
     def _without_answer(self, solution: FiniteSolution) -> Result:
