@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.errors import InputError
-from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound, vertex_excess
+from sparserob_core.sip.convex_set import Array, Box, ConvexSet, as_bound, vertex_excess
 
 _SIGN_DIMENSIONS = 10
 _BISECTIONS = 60
@@ -142,6 +142,8 @@ class NormBall(ConvexSet):
         if self.p == 1.0:
             corners = self.radius * np.vstack([np.eye(self.dimension), -np.eye(self.dimension)])
             return vertex_excess(self.centre + corners, np.asarray(centre, dtype=float), np.asarray(spread, dtype=float))
+        if self.p == np.inf:
+            return Box(self.centre - self.radius, self.centre + self.radius).linearisation_excess(np.asarray(centre), np.asarray(spread))
         if self.p != 2.0:
             return super().linearisation_excess(centre, spread)
         return self.radius * _round_excess(np.asarray(centre, dtype=float), np.asarray(spread, dtype=float))

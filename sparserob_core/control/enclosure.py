@@ -14,7 +14,7 @@ from typing import TypeVar
 import numpy as np
 
 from sparserob_core.control.combination import Combination
-from sparserob_core.control.lifted import HUGE, LiftedSystem
+from sparserob_core.control.lifted import LiftedSystem, grown_less_one
 from sparserob_core.control.measurable import MeasurablePush
 from sparserob_core.control.polynomial import distinct_patterns, face_matrix, monotone_ends, polynomial_bound
 from sparserob_core.control.push import Push
@@ -122,7 +122,7 @@ class CellEnclosure:
         space, matrix, width = self.lifted.space, self.lifted.matrix, stop - start
         states = self._states(start, pieces).reshape(start.size, -1)
         second = (states @ matrix.T + self._drive[pieces]) @ matrix.T
-        growth = np.expm1(np.minimum(self.lifted.norm * width, HUGE))
+        growth = grown_less_one(self.lifted.norm * width)
         by_row = np.abs(np.einsum("ri,kai->kra", self._rows, second.reshape(start.size, space.size, -1))).sum(axis=2)
         loose = np.sqrt(space.size) * np.linalg.norm(second, axis=1) * growth
         total = by_row + np.linalg.norm(self._rows, axis=1) * loose[:, None]

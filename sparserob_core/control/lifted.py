@@ -127,8 +127,8 @@ class LiftedSystem:
         """Gronwall: ``|e|' <= growth |e| + residual``, with the residual of the truncation bounded on every piece."""
         lengths, norms = self.grid.lengths, self._sizes(nodes, driven, matrix)
         residual = norms @ self._overflow + norms.sum(axis=1) * self.slack_A + extra
-        factor = np.exp(np.minimum(self.growth * lengths, HUGE))
-        added = residual * (np.expm1(np.minimum(self.growth * lengths, HUGE)) / self.growth if abs(self.growth) > 1e-12 else lengths)
+        factor = grown(self.growth * lengths)
+        added = residual * (grown_less_one(self.growth * lengths) / self.growth if abs(self.growth) > 1e-12 else lengths)
         bound = np.array(list(accumulate(zip(factor.tolist(), added.tolist(), strict=True), lambda b, step: b * step[0] + step[1], initial=0.0)))
         answer: Array = bound[:-1] * np.maximum(factor, 1.0) + np.maximum(added, residual * lengths)
         return answer
@@ -139,7 +139,8 @@ class LiftedSystem:
         left, right, target = self.space.products
         sizes = np.zeros((self.space.size, self.space.size))
         sizes[target, right] = np.linalg.norm(self.A, axis=(1, 2))[left]
-        return exponential(np.minimum(sizes * self.grid.lengths.max(), HUGE))
+        exponent = sizes * self.grid.lengths.max()
+        return exponential(exponent) if exponent.max() < HUGE else np.full(sizes.shape, np.inf)
 
     @cached_property
     def _overflow(self) -> Array:
@@ -148,6 +149,16 @@ class LiftedSystem:
         leaves = self.space.degrees[:, None] + self.space.degrees[None, :] > self.space.degree
         answer: Array = leaves @ size
         return answer
+
+
+def grown(exponent: Array) -> Array:
+    """``e^x``, infinite where it is as good as that."""
+    return np.where(exponent > HUGE, np.inf, np.exp(np.minimum(exponent, HUGE)))
+
+
+def grown_less_one(exponent: Array) -> Array:
+    """``e^x - 1``, infinite where it is as good as that."""
+    return np.where(exponent > HUGE, np.inf, np.expm1(np.minimum(exponent, HUGE)))
 
 
 def lift(system: LinearSystem, grid: TimeGrid, initial_state: Array, centre: Array, radius: Array) -> LiftedSystem:

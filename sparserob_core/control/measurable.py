@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from sparserob_core.control.lifted import HUGE
+from sparserob_core.control.lifted import grown_less_one
 from sparserob_core.control.response import Response, transitions
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -112,7 +112,7 @@ class MeasurablePush:
         slopes = np.einsum("ri,kij->krj", self.rows, transitions(A[0][None], start)[0] @ A[0])
         ends = slopes @ W[0]
         size = np.maximum(bound.support(ends), bound.support(-ends))
-        growth = np.expm1(np.minimum(float(np.linalg.norm(A[0], 2)) * widths, HUGE))[:, None]
+        growth = grown_less_one(float(np.linalg.norm(A[0], 2)) * widths)[:, None]
         return np.asarray(size + np.linalg.norm(slopes, axis=2) * growth * self._reach)
 
     @cached_property

@@ -10,7 +10,7 @@ import numpy as np
 
 from sparserob_core.control.combination import Combination
 from sparserob_core.control.disturbance import DisturbanceModel
-from sparserob_core.control.lifted import HUGE, KNOWN, LiftedSystem
+from sparserob_core.control.lifted import KNOWN, LiftedSystem, grown, grown_less_one
 from sparserob_core.control.polynomial import distinct_patterns, face_matrix
 from sparserob_core.control.taylor import TaylorSpace
 from sparserob_core.sip.convex_set import Array
@@ -59,9 +59,9 @@ class Push:
         pieces = np.clip(np.searchsorted(self.lifted.grid.breakpoints, start, side="right") - 1, 0, self.lifted.grid.pieces - 1)
         distinct, which = np.unique(np.round(start - self.lifted.grid.breakpoints[pieces], 15), return_inverse=True)
         fresh = np.linalg.norm(self._lifted_rows @ matrix @ self.lifted.backward.flows(distinct)[0], axis=2)[which.reshape(-1)]
-        growth = np.minimum(norm * widths, HUGE)[:, None]
-        along = np.linalg.norm(bent, axis=1) * self._total_gain[pieces + 1][:, None] * np.expm1(growth)
-        return np.asarray(sizes.sum(axis=2) + np.sqrt(self.lifted.space.size) * self._reach * (along + fresh * np.exp(growth)))
+        growth = (norm * widths)[:, None]
+        along = np.linalg.norm(bent, axis=1) * self._total_gain[pieces + 1][:, None] * grown_less_one(growth)
+        return np.asarray(sizes.sum(axis=2) + np.sqrt(self.lifted.space.size) * self._reach * (along + fresh * grown(growth)))
 
     @cached_property
     def neglected(self) -> Array:
@@ -159,4 +159,4 @@ class Push:
             powers[piece] = powers[piece - 1] @ steps.E[0, self.lifted.backward.length_of(piece - 1)]
         norms = np.linalg.norm(powers, axis=(1, 2))
         rising = float(np.linalg.eigvalsh((matrix + matrix.T) / 2)[-1])
-        return np.concatenate([[0.0], np.cumsum(norms * np.exp(np.clip(rising * grid.lengths, 0.0, HUGE)) * grid.lengths)])
+        return np.concatenate([[0.0], np.cumsum(norms * grown(np.maximum(rising * grid.lengths, 0.0)) * grid.lengths)])

@@ -14,6 +14,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from sparserob_core.errors import InputError
 from sparserob_core.sip.certificate import TOLERANCE, Proof, prove
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import RoundFinished
@@ -41,6 +42,10 @@ class Exchange(Method):
 
     tolerance: float = 1e-7
     rounds: int = 200
+
+    def __post_init__(self) -> None:
+        if self.rounds < 1:
+            raise InputError(f"rounds: expected at least 1, got {self.rounds}")
 
     def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
         """`certified` when the gap is closed and every family is proven; infeasible, refuted or undecided otherwise, with the reason."""
@@ -73,7 +78,6 @@ class _Run:
         self.guess: FiniteSolution | None = None
 
     def solve(self) -> Result:
-        proofs: Sequence[Proof] = ()
         for number in range(1, self.method.rounds + 1):
             solution = self._relax()
             if not _usable(solution):
@@ -82,15 +86,16 @@ class _Run:
             worst = _worst(separations)
             self._tell(number, solution, worst, separations)
             violated = [(s.indices[s.violations > ALLOWED], s.rows[s.violations > ALLOWED], f.name) for f, s in separations]
-            if worst.violation > ALLOWED and self._exchange(solution, violated):
+            last = number == self.method.rounds
+            if worst.violation > ALLOWED and not last and self._exchange(solution, violated):
                 continue
-            if self._open(solution) and self._sharpen(solution):
+            if not last and self._open(solution) and self._sharpen(solution):
                 continue
             proofs = self.prover(solution.x)
             witnesses = [(p.index[None], np.array([p.row]), p.family) for p in proofs if p.verdict == "refuted" and p.index is not None]
-            if not witnesses or not self._exchange(solution, witnesses):
+            if last or not self._exchange(solution, witnesses):
                 return self._finished(solution, worst, proofs)
-        return self._finished(solution, worst, proofs or self.prover(solution.x))
+        raise AssertionError("the last round returns")
 
     def _relax(self) -> FiniteSolution:
         """Solve the relaxed program, with the regulariser as light as it must be for the cost to be exact."""
@@ -157,17 +162,18 @@ class _Run:
 
     def _exchange(self, solution: FiniteSolution, violated: Sequence[tuple[Array, np.ndarray, str]]) -> int:
         """Drop the rows that have been slack for a while, add the violated ones; returns how many were new."""
-        y = self._multipliers(solution)
-        self.idle = np.where(y > 0.0, 0, self.idle + 1)
-        keep = (self.idle < IDLE_ROUNDS) | (len(self.history) > DROPPING_ROUNDS)
-        self.rows, self.idle = self.rows.take(keep), self.idle[keep]
-        known = {(cut.family, cut.row, cut.index.tobytes()) for cut in self.rows.cuts}
+        known, fresh = {(cut.family, cut.row, cut.index.tobytes()) for cut in self.rows.cuts}, Rows.none(self.program.n)
         for indices, rows, family in violated:
             new = np.array([(family, int(r), i.tobytes()) not in known for i, r in zip(indices, rows, strict=True)], dtype=bool)
             if new.any():
-                self.rows = self.rows.joined(rows_at(self.program, family, indices[new], rows[new]))
-        added = self.rows.h.size - self.idle.size
-        self.idle = np.concatenate([self.idle, np.zeros(added, dtype=int)])
+                fresh = fresh.joined(rows_at(self.program, family, indices[new], rows[new]))
+        added = fresh.h.size
+        if not added:
+            return 0
+        y = self._multipliers(solution)
+        self.idle = np.where(y > 0.0, 0, self.idle + 1)
+        keep = (self.idle < IDLE_ROUNDS) | (len(self.history) > DROPPING_ROUNDS)
+        self.rows, self.idle = self.rows.take(keep).joined(fresh), np.concatenate([self.idle[keep], np.zeros(added, dtype=int)])
         fixed = solution.y[:solution.y.size - y.size]
         self.guess = replace(solution, y=np.concatenate([fixed, y[keep], np.zeros(added)]))
         return added
