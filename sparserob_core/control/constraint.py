@@ -48,6 +48,11 @@ class FlatConstraint:
         box = self.parameters.box
         return Box(np.concatenate([[self.start], box.lower]), np.concatenate([[self.stop], box.upper]))
 
+    @property
+    def scale(self) -> float:
+        """The size of the states that the constraint is about: its bounds, and the initial state."""
+        return float(max(np.abs(self.h).max(), np.abs(self.H @ self.functionals.response.initial_state).max())) or 1.0
+
     def rows(self, indices: Array) -> tuple[Array, Array]:
         """``G (k, r, n)``, ``rhs (k, r)`` at indices ``(k, 1 + nu)``."""
         times, directions, parameters, rhs = self.functionals_at(indices)

@@ -145,7 +145,8 @@ class NormBall(ConvexSet):
         if self.p == np.inf:
             return Box(self.centre - self.radius, self.centre + self.radius).linearisation_excess(np.asarray(centre), np.asarray(spread))
         if self.p != 2.0:
-            return super().linearisation_excess(centre, spread)
+            smooth = self.radius * _power_excess(np.asarray(centre, dtype=float), np.abs(spread).sum(axis=-2), self.dual)
+            return np.minimum(super().linearisation_excess(centre, spread), smooth)
         return self.radius * _round_excess(np.asarray(centre, dtype=float), np.asarray(spread, dtype=float))
 
     def halfspaces(self) -> tuple[Array, Array] | None:
@@ -230,3 +231,16 @@ def norm_curvature(centre: Array, spread: Array) -> Array:
     p, q = float(np.abs(along).sum()), float(np.linalg.norm(across, axis=1).sum())
     factor = 0.0 if p >= size else 1.0 / (size + p) - q**2 / (4.0 * (size - p) ** 3)
     return max(0.0, factor) * (across @ across.T)
+
+
+def _power_excess(a: Array, b: Array, q: float) -> Array:
+    """A bound of ``|a + s|_q - |a|_q - gradient's`` for ``|s_i| <= b_i``: the root is concave in ``sum |a_i + s_i|^q``, whose terms are convex.
+
+    ``a, b (..., d)``; returns ``(...,)``, infinite where ``a`` vanishes.
+    """
+    slope = q * np.sign(a) * np.abs(a) ** (q - 1.0)
+    ends = [np.abs(a + sign * b) ** q - np.abs(a) ** q - sign * slope * b for sign in (-1.0, 1.0)]
+    norms = np.linalg.norm(a, ord=q, axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        excess = norms ** (1.0 - q) * np.maximum(*ends).sum(axis=-1) / q
+    return np.where(norms > 0.0, excess, np.inf)

@@ -41,6 +41,11 @@ class CurvedConstraint:
         return self._flat.index_set if not self._b else Box(
             np.concatenate([self._flat.index_set.lower, -np.ones(self._b)]), np.concatenate([self._flat.index_set.upper, np.ones(self._b)]))
 
+    @property
+    def scale(self) -> float:
+        """The size of the states that the constraint is about."""
+        return self._flat.scale
+
     def rows(self, indices: Array) -> tuple[Array, Array]:
         """``G (k, 1, n)``, ``rhs (k, 1)`` at indices ``(k, 1 + nu + b)``."""
         times, directions, parameters, rhs = self.functionals_at(indices)

@@ -20,7 +20,8 @@ from sparserob_core.control.response import SAME_TIME, Response, merge_grids
 from sparserob_core.control.sampling import sample_disturbances, sample_parameters
 from sparserob_core.control.scenario import ScenarioConstraint
 from sparserob_core.control.sets import Equality
-from sparserob_core.errors import InputError
+from sparserob_core.control.taylor import TaylorSpace
+from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
 
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
 SAME = 1e-11  # relative to the largest entry of a row, a difference that is rounding
-PROBES = 7  # parameters at which the right-hand side of a terminal equality must agree
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,29 +115,39 @@ def _equalities(model: Transcription) -> tuple[Array, Array]:
     """Terminal equalities as rows; refused where the uncertainty reaches the state, since nothing could then satisfy them."""
     horizon, functionals = model.problem.horizon, model.functionals
     A, b = [np.zeros((0, functionals.variables))], [np.zeros(0)]
+    middle = np.zeros((1, 0)) if model.parameters.set is None else model.parameters.set.interior_point()[None]
     for terminal in model.problem.terminal:
         if not isinstance(terminal, Equality):
             continue
         for state in terminal.fixed:
-            direction = np.eye(terminal.dimension)[[state]]
-            probes = _probes(model.parameters)
-            count = probes.shape[0]
-            time, up = np.full(count, horizon), np.repeat(direction, count, axis=0)
-            G, offset = functionals.rows(time, up, probes)
-            sigma = functionals.offsets(time, up, probes) + functionals.offsets(time, -up, probes)
+            time, up = np.array([horizon]), np.eye(terminal.dimension)[[state]]
+            G, offset = functionals.rows(time, up, middle)
+            sigma = functionals.offsets(time, up, middle) + functionals.offsets(time, -up, middle)
             rounding = SAME * max(1.0, float(np.abs(G).max()), float(np.abs(offset).max()))
-            if max(np.abs(sigma).max(), np.abs(G - G[0]).max(), np.abs(offset - offset[0]).max()) > rounding:
+            if sigma[0] > rounding or _reached(model, int(state)):
                 raise InputError(f"terminal: equals: state {state + 1} depends on the uncertainty, so no control can fix its final value "
                                  f"to {terminal.values[state]:g}; expected a set with interior")
-            A.append(G[:1])
+            A.append(G)
             b.append(np.array([terminal.values[state] - offset[0]]))
     return np.vstack(A), np.concatenate(b)
 
 
-def _probes(parameters: ParameterIndex) -> Array:
-    points, _ = parameters.lattice()
-    answer: Array = points[np.unique(np.linspace(0, points.shape[0] - 1, PROBES).astype(int))]
-    return answer
+def _reached(model: Transcription, state: int) -> bool:
+    """Whether an uncertain entry of the system may reach a state: follow the entries of ``A`` that are not exactly 0, over all parameters."""
+    if model.parameters.set is None:
+        return False
+    system, box = model.problem.system, model.parameters.box
+    try:
+        parts = system.taylor(TaylorSpace(model.parameters.count, 1), (box.lower + box.upper) / 2, (box.upper - box.lower) / 2)
+    except NotEnclosable:
+        return True
+    uncertain = [np.any(parts[k][1:] != 0, axis=(0, 2)) | np.any(parts[k + 1] != 0, axis=1) for k in (0, 2, 4)]
+    linked = np.any(parts[0] != 0, axis=0) | (parts[1] != 0)
+    reaching = np.arange(system.states) == state
+    for _ in range(system.states):
+        reaching = reaching | linked[reaching].any(axis=0)
+    rows = uncertain[0] | uncertain[1] | (uncertain[2] if model.problem.disturbance is not None else False)
+    return bool(rows[reaching].any())
 
 
 def _families(model: Transcription) -> list[ConstraintFamily]:
@@ -176,4 +186,4 @@ def _complete(constraint: FlatConstraint | CurvedConstraint) -> ConstraintFamily
 
 def _bare(constraint: FlatConstraint | CurvedConstraint) -> ConstraintFamily:
     return ConstraintFamily(name=constraint.name, index_set=constraint.index_set, rows=constraint.rows, worst=constraint.worst,
-                            enclosure=constraint.enclosure, cells=constraint.cells, explain=constraint.explain)
+                            enclosure=constraint.enclosure, cells=constraint.cells, explain=constraint.explain, scale=constraint.scale)

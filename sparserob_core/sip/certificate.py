@@ -13,7 +13,7 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ProofProgress, silence
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
 
-TOLERANCE = 1e-9        # a violation of at most this counts as none: the size of what rounding can hide
+TOLERANCE = 1e-9        # a violation of at most this counts as none (less where the numbers are tiny: `ConstraintFamily.tolerance`)
 CELLS = 400_000         # cells examined per family before the proof is given up
 BATCH = 4096            # cells bounded at a time, worst first
 PROBED = 16             # centres of the worst cells at which a witness is looked for, per batch
@@ -55,16 +55,16 @@ def prove_family(family: ConstraintFamily, x: Array, notify: Notify = silence,
 
 
 def _branch_and_bound(family: ConstraintFamily, x: Array, notify: Notify, cells: int) -> Proof:
-    start = time.perf_counter()
+    start, tolerance = time.perf_counter(), family.tolerance(TOLERANCE)
     lower, upper = family.cells if family.cells is not None else (family.index_set.lower[None], family.index_set.upper[None])
     closed, examined, best = -np.inf, 0, (-np.inf, lower[0], 0)
     bounds, split = _bounded(family, x, lower, upper)
     while True:
         examined += bounds.size
-        open_ = bounds > TOLERANCE
+        open_ = bounds > tolerance
         closed = max(closed, float(bounds[~open_].max(initial=-np.inf)))
         best = max(best, _probe(family, x, lower, upper, bounds), key=lambda found: found[0])
-        if best[0] > TOLERANCE:
+        if best[0] > tolerance:
             return Proof(family.name, "refuted", np.inf, best[0], best[1], best[2], examined)
         if not open_.any():
             return Proof(family.name, "proven", closed, best[0], best[1], best[2], examined)
@@ -112,9 +112,9 @@ def _by_separation(family: ConstraintFamily, x: Array) -> Proof:
     found = family.worst(x)
     violation = float(found.violations[0]) if found.violations.size else -np.inf
     index, row = (found.indices[0], int(found.rows[0])) if found.violations.size else (None, 0)
-    if violation > TOLERANCE:
+    if violation > family.tolerance(TOLERANCE):
         return Proof(family.name, "refuted", np.inf, violation, index, row)
-    if found.bound <= TOLERANCE:
+    if found.bound <= family.tolerance(TOLERANCE):
         return Proof(family.name, "proven", found.bound, violation, index, row)
     return Proof(family.name, "undecided", found.bound, violation, index, row,
                  reason=f"family {family.name} offers no enclosure, so nothing can be excluded")

@@ -28,7 +28,7 @@ from sparserob_core.sip.verdict import clash, verdict, witness
 
 IDLE_ROUNDS = 3         # rounds that a row may stay without a multiplier before it is dropped
 DROPPING_ROUNDS = 40    # rounds after which rows are only added, so that nothing can cycle
-MARGINS = (1e-10, 1e-6)
+SMALLEST_MARGIN, LARGEST_MARGIN = 1e-15, 1e-6   # in units of the decision's bounds, where those are below 1
 RESIDUAL = 1e-8         # of bounds, fixed rows and equalities, relative to their scale, at a decision that is returned
 CRUDE = 1e-4            # residual and relative gap of a relaxed solution that a round can do with
 ALLOWED = TOLERANCE / 2  # a violation that the search may leave to the proof
@@ -85,9 +85,9 @@ class _Run:
             separations = self._separate(solution.x)
             worst = _worst(separations)
             self._tell(number, solution, worst, separations)
-            violated = [(s.indices[s.violations > ALLOWED], s.rows[s.violations > ALLOWED], f.name) for f, s in separations]
+            violated = [_above(family, found) for family, found in separations]
             last = number == self.method.rounds
-            if worst.violation > ALLOWED and not last and self._exchange(solution, violated):
+            if not last and self._exchange(solution, violated):
                 continue
             if not last and self._open(solution) and self._sharpen(solution):
                 continue
@@ -131,7 +131,10 @@ class _Run:
         return plain
 
     def _open(self, solution: FiniteSolution) -> bool:
-        return relative_gap(self.lower, self.program.cost(solution.x)) > self.method.tolerance
+        return self._gap(self.program.cost(solution.x)) > self.method.tolerance
+
+    def _gap(self, upper: float) -> float:
+        return relative_gap(self.lower, upper, self.program.cost_scale)
 
     def _sharpen(self, solution: FiniteSolution) -> bool:
         """The decision is feasible but its gap is open: try what else can close it; ``False`` when nothing is left."""
@@ -148,8 +151,10 @@ class _Run:
         if not self.slater or not self.rows.h.size:
             return
         price = float(self._multipliers(solution) @ np.linalg.norm(self.rows.G, axis=1))
-        budget = 0.1 * self.method.tolerance * max(1.0, abs(solution.value))
-        margin = float(np.clip(budget / max(price, 1e-12), *MARGINS))
+        budget = 0.1 * self.method.tolerance * max(self.program.cost_scale, abs(solution.value))
+        reach = np.maximum(np.abs(self.program.finite.lower), np.abs(self.program.finite.upper))
+        unit = min(1.0, float(np.where(np.isfinite(reach), reach, 1.0).max()))
+        margin = float(np.clip(budget / max(price, np.finfo(float).tiny), SMALLEST_MARGIN * unit, LARGEST_MARGIN * unit))
         if self.margin == 0.0 or margin < 0.5 * self.margin:
             self.margin = margin
 
@@ -179,18 +184,18 @@ class _Run:
         return added
 
     def _tell(self, number: int, solution: FiniteSolution, worst: Witness, separations: Sequence[tuple[ConstraintFamily, Separation]]) -> None:
-        feasible = worst.violation <= ALLOWED
+        feasible = not any(_above(family, found)[1].size for family, found in separations)
         event = RoundFinished(
             round=number, epsilon=self.epsilon, lower_bound=self.lower, violation=worst.violation, worst_family=worst.constraint,
             upper_bound=self.program.cost(solution.x) if feasible else np.inf, active_indices=self.rows.h.size,
-            cuts_added=sum(int((s.violations > ALLOWED).sum()) for _, s in separations),
+            cuts_added=sum(_above(family, found)[1].size for family, found in separations),
             relaxed_programs=self.relaxed.solves, seconds=time.perf_counter() - self.started)
         self.history.append(event)
         self.tools.notify(event)
 
     def _finished(self, solution: FiniteSolution, worst: Witness, proofs: Sequence[Proof]) -> Result:
         cost = self.program.cost(solution.x)
-        gap = relative_gap(self.lower, cost)
+        gap = self._gap(cost)
         status, message = verdict(proofs, gap, self.method.tolerance)
         residual = self.program.finite.residual(solution.x)
         if residual > RESIDUAL:
@@ -210,8 +215,15 @@ class _Run:
             status=status, message=message, decision=solution.x if status not in ("infeasible", "failed") else None,
             cost=cost, value=solution.value, epsilon=self.epsilon, lower_bound=np.inf if status == "infeasible" else self.lower,
             upper_bound=cost if status in ("certified", "verified", "undecided") else np.inf, worst=worst, indices=cuts,
-            counts={"relaxed_programs": self.relaxed.solves, "rounds": len(self.history), "active_indices": len(cuts)},
+            counts={"relaxed_programs": self.relaxed.solves, "rounds": len(self.history), "active_indices": len(cuts),
+                    "solver_calls": self.relaxed.counted.calls},
             history=tuple(self.history), seconds=time.perf_counter() - self.started)
+
+
+def _above(family: ConstraintFamily, found: Separation) -> tuple[Array, np.ndarray, str]:
+    """The indices, rows and family of what is violated by more than the search may leave to the proof."""
+    violated = found.violations > family.tolerance(ALLOWED)
+    return found.indices[violated], found.rows[violated], family.name
 
 
 def _usable(solution: FiniteSolution) -> bool:

@@ -61,6 +61,7 @@ class ConstraintFamily:
     ``nominal``       the same constraints without the uncertainty;
     ``sample(count, rng)``  the same constraints for ``count`` sampled uncertainties only;
     ``literal``       the same constraints with an inner maximisation left to the index, and ``reduced``, from such a family, the way back;
+    ``scale``         the size of the numbers that the constraint compares; where it is tiny, a violation is judged relative to it;
     ``explain(index (d,), row)``  the constraint in words and, for control problems, where it is (an `Explanation`).
     """
 
@@ -76,6 +77,11 @@ class ConstraintFamily:
     literal: ConstraintFamily | None = None
     reduced: ConstraintFamily | None = None
     explain: Callable[[Array, int], Explanation] | None = None
+    scale: float = 1.0
+
+    def tolerance(self, level: float) -> float:
+        """``level``, or less where the numbers of this constraint are below a thousandth: a millionth of them, at the level 1e-9."""
+        return level * min(1.0, 1e3 * self.scale)
 
     def violations(self, x: Array, indices: Array) -> Array:
         """``rows(xi) x - rhs(xi)`` at indices ``(k, d)``, as ``(k, r)``; positive where violated."""
@@ -148,6 +154,15 @@ class SemiInfiniteProgram:
     def family(self, name: str) -> ConstraintFamily:
         """The family of that name."""
         return next(family for family in self.families if family.name == name)
+
+    @property
+    def cost_scale(self) -> float:
+        """The largest possible cost of the bounded entries, at most 1: what a gap is relative to where the cost itself is smaller."""
+        program = self.finite
+        reach = np.maximum(np.abs(program.lower), np.abs(program.upper))
+        if program.q.any() or program.P is not None or not np.isfinite(reach[program.weights > 0]).all():
+            return 1.0
+        return min(1.0, float(program.weights @ np.where(program.weights > 0, reach, 0.0))) or 1.0
 
     def cost(self, x: Array) -> float:
         """``J(x)``, recomputed from the data."""

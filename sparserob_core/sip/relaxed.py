@@ -15,7 +15,7 @@ from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.regulariser import ControlImage, Regulariser
 from sparserob_core.sip.result import Cut
-from sparserob_core.sip.solver import Solver
+from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
 from sparserob_core.sip.vertex import vertex_multipliers
 
 if TYPE_CHECKING:
@@ -70,6 +70,17 @@ class RelaxedSolution:
     finite: FiniteSolution
 
 
+class CountedSolver(Solver):
+    """A solver that counts its ``calls``: many relaxed programs are solved from the last one, without it."""
+
+    def __init__(self, solver: Solver) -> None:
+        self.solver, self.calls = solver, 0
+
+    def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
+        self.calls += 1
+        return self.solver.solve(program, accuracy)
+
+
 @dataclass(eq=False)
 class RelaxedProgram:
     """``g(epsilon; indices)``: minimise ``J + epsilon rho`` over the finite constraints and the imposed indices.
@@ -87,6 +98,7 @@ class RelaxedProgram:
     _programs: dict[float, FiniteProgram] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        self.counted = CountedSolver(self.solver)
         if self.regulariser is not None:
             from scipy.sparse import csc_array, eye_array
 
@@ -104,7 +116,7 @@ class RelaxedProgram:
     def solve(self, rows: Rows, epsilon: float, margin: float = 0.0, guess: FiniteSolution | None = None) -> FiniteSolution:
         """Solve with all of these rows at once; ``guess`` is a solution with the same rows."""
         self.solves += 1
-        return solve_finite(self.finite(rows, epsilon, margin), self.solver, tolerance=self.tolerance, guess=guess)
+        return solve_finite(self.finite(rows, epsilon, margin), self.counted, tolerance=self.tolerance, guess=guess)
 
     def lower_bound(self, rows: Rows, solution: FiniteSolution) -> float:
         """A lower bound of the *unregularised* semi-infinite program, from the multipliers of any solution with these rows (weak duality)."""

@@ -80,8 +80,8 @@ class Result:
         return relative_gap(self.lower_bound, self.upper_bound)
 
 
-def relative_gap(lower: float, upper: float) -> float:
-    """``(upper - lower) / max(1, |upper|)``, infinite when either bound is."""
+def relative_gap(lower: float, upper: float, scale: float = 1.0) -> float:
+    """``(upper - lower) / max(scale, |upper|)``, infinite when either bound is."""
     if not (np.isfinite(lower) and np.isfinite(upper)):
         return float("inf")
-    return float((upper - lower) / max(1.0, abs(upper)))
+    return float((upper - lower) / max(scale, abs(upper)))

@@ -27,7 +27,7 @@ def verdict(proofs: Sequence[Proof], gap: float, tolerance: float) -> tuple[Stat
     if undecided:
         return "undecided", "; ".join(undecided)
     status: Status = "certified" if gap <= tolerance else "verified"
-    return status, f"{MEANING[status]} (relative gap {max(gap, 0.0):.1e})"
+    return status, f"{MEANING[status]} (gap {max(gap, 0.0):.1e})"
 
 
 def witness(program: SemiInfiniteProgram, searched: Witness, proofs: Sequence[Proof]) -> Witness:
@@ -58,7 +58,7 @@ def clash(program: SemiInfiniteProgram, rows: Rows, multipliers: Array, amount: 
     named = " and ".join(_words(program, rows, int(i)) for i in order)
     others = f" and {active.size - order.size} more" if active.size > order.size else ""
     if not active.size:
-        return "the equalities and bounds alone cannot be met", None
+        return f"the equalities cannot be met within the bounds, whatever the decision: one is missed by at least {amount:.4g} times its norm", None
     cut = rows.cuts[order[0]]
     text = f"these cannot hold together, whatever the decision (one is violated by at least {amount:.4g} times its norm): {named}{others}"
     return text, explained(program, Witness(amount, cut.family, cut.index, cut.row))
