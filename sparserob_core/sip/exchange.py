@@ -30,6 +30,7 @@ IDLE_ROUNDS = 3         # rounds that a row may stay without a multiplier before
 DROPPING_ROUNDS = 40    # rounds after which rows are only added, so that nothing can cycle
 SMALLEST_MARGIN, LARGEST_MARGIN = 1e-15, 1e-6   # in units of the decision's bounds, where those are below 1
 RESIDUAL = 1e-8         # of bounds, fixed rows and equalities, relative to their scale, at a decision that is returned
+PRUNED = 40             # constraints at most that are dropped from an infeasible set for the sake of its explanation
 CRUDE = 1e-4            # residual and relative gap of a relaxed solution that a round can do with
 ALLOWED = TOLERANCE / 2  # a violation that the search may leave to the proof
 
@@ -205,8 +206,26 @@ class _Run:
     def _without_answer(self, solution: FiniteSolution) -> Result:
         if solution.status != "infeasible":
             return self._result("failed", "; ".join(solution.attempts) or solution.message, solution, np.nan, None)
+        solution = self._irreducible(solution)
         message, worst = clash(self.program, self.rows, self._multipliers(solution), solution.infeasibility)
         return self._result("infeasible", message, solution, np.nan, worst)
+
+    def _irreducible(self, solution: FiniteSolution) -> FiniteSolution:
+        """Drop the constraints without which nothing is feasible either, the least important first: what is left explains itself."""
+        for _ in range(PRUNED):
+            y = self._multipliers(solution)
+            support = np.flatnonzero(y > 0.0)
+            self.rows, y = self.rows.take(support), y[support]
+            for position in np.argsort(y, kind="stable") if y.size > 1 else ():
+                fewer = self.rows.take(np.arange(y.size) != position)
+                without = self.relaxed.solve(fewer, 0.0)
+                if without.status == "infeasible":
+                    self.rows, solution = fewer, without
+                    break
+            else:
+                fixed = solution.y[:self.program.finite.h.size]
+                return replace(solution, y=np.concatenate([fixed, y]))
+        return solution
 
     def _result(self, status: Status, message: str, solution: FiniteSolution, cost: float, worst: Witness | None) -> Result:
         y = self._multipliers(solution) if solution.y.size >= self.rows.h.size else np.zeros(self.rows.h.size)
