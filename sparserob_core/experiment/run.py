@@ -90,12 +90,12 @@ def run(config: str | Path | Mapping[str, Any], overrides: Mapping[str, object] 
     tools, observers = _tools(loaded), _observers(loaded)
     method = loaded.registry.build("method", loaded.config.method.name, loaded.config.method.options)
     directory = create_directory(out, name_of(loaded), loaded.config.digest())
-    directory.write_text("config.yaml", write_yaml(loaded.config.plain(), HEADING))
     journal = _Journal(directory, experiment)
-    journal.record(Result(status="failed", message=UNFINISHED))
     broadcast = Broadcast([*observers, ("journal", journal)])
     ending, started = RunFinished(status="failed", message=UNFINISHED, seconds=0.0), time.perf_counter()
     try:
+        directory.write_text("config.yaml", write_yaml(loaded.config.plain(), HEADING))
+        journal.record(Result(status="failed", message=UNFINISHED))
         broadcast(RunStarted(title=experiment.title, directory=directory.path, problem=experiment.problem, program=experiment.program,
                              quiet=quiet))
         result: Result = method.solve(experiment.program, _notifying(tools, broadcast))
