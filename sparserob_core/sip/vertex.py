@@ -19,6 +19,8 @@ def vertex_multipliers(program: FiniteProgram, x: Array, y: Array, mu: Array) ->
     an exactly regularised optimiser these are the plain ones (Friedlander and Tseng 2007, section 2). Any answer is safe: weak duality
     decides what it is worth. ``S`` must be the identity and ``P`` absent, otherwise the multipliers come back unchanged.
     """
+    from scipy.optimize import nnls
+
     tight = program.h - program.G @ x <= TIGHT * np.maximum(1.0, np.abs(program.h))
     active = np.flatnonzero((y > ACTIVE * y.max(initial=0.0)) | tight)
     if program.S is not None or program.P is not None or not active.size + mu.size:
@@ -29,8 +31,6 @@ def vertex_multipliers(program: FiniteProgram, x: Array, y: Array, mu: Array) ->
     free = away > FREE * width
     rows = np.vstack([program.G[active], program.A, -program.A])[:, free]
     slope = -program.q[free] - program.weights[free] * np.sign(x[free])
-    from scipy.optimize import nnls
-
     try:
         found, _ = nnls(rows.T, slope)
     except RuntimeError:  # its iteration limit: these multipliers were an offer only
