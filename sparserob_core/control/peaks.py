@@ -10,8 +10,9 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array
 
 SMALLEST = 1e-6     # of the first step: a step that is not made smaller any more
-MOVES = 60          # steps at most
-ENOUGH = 0.03       # a step that gains less than this share of the value is followed by a smaller one
+MOVES = 120         # steps at most
+ENOUGH = 0.002      # a step that gains less than this share of the value is followed by a smaller one
+AGAIN = np.array([[1.0], [3.0]])   # multiples of the last moves that are tried besides, to follow a ridge (Hooke and Jeeves 1961)
 
 
 def local_maxima(values: Array, lattice: tuple[int, ...], kept: int) -> np.ndarray:
@@ -69,18 +70,21 @@ def climb(evaluate: Callable[[Array, np.ndarray], Array], points: Array, radius:
         stencil = np.array([step for step in product((-1.0, 0.0, 1.0), repeat=dimension) if any(step)])
     which = np.arange(points.shape[0])
     size, smallest = np.tile(radius, (points.shape[0], 1)), SMALLEST * radius
-    best = evaluate(points, which)
+    best, last = evaluate(points, which), np.zeros_like(points)
     for _ in range(MOVES):
         live = np.flatnonzero((size > smallest).any(axis=1))
         if not live.size:
             break
-        around = project((points[live, None] + size[live, None] * stencil).reshape(-1, dimension)).reshape(-1, stencil.shape[0], dimension)
-        found = evaluate(around.reshape(-1, dimension), np.repeat(live, stencil.shape[0])).reshape(around.shape[:2])
+        steps = np.concatenate([size[live, None] * stencil, last[live, None] * AGAIN], axis=1)
+        around = project((points[live, None] + steps).reshape(-1, dimension)).reshape(steps.shape)
+        found = evaluate(around.reshape(-1, dimension), np.repeat(live, steps.shape[1])).reshape(around.shape[:2])
         top = found.argmax(axis=1)
         value = found[np.arange(live.size), top]
         gain = value - best[live]
         better = gain > 0
-        points[live[better]] = around[np.arange(live.size), top][better]
+        reached = around[np.arange(live.size), top]
+        last[live] = np.where(better[:, None], reached - points[live] + last[live] / 2, 0.0)
+        points[live[better]] = reached[better]
         best[live[better]] = value[better]
         size[live[gain <= ENOUGH * np.abs(best[live])]] /= 3
     return points, best
