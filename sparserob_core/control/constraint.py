@@ -7,10 +7,11 @@ from functools import cached_property
 
 import numpy as np
 
-from sparserob_core.control.enclosure import CellEnclosure, remember, where_to_halve
+from sparserob_core.control.enclosure import CELLS_KEPT, CellEnclosure, where_to_halve
 from sparserob_core.control.functional import WorstCase
 from sparserob_core.control.lifted import LiftedSystem, lift
 from sparserob_core.control.measurable import MeasurablePush
+from sparserob_core.control.memory import remember
 from sparserob_core.control.parameters import ParameterIndex
 from sparserob_core.control.peaks import climb, local_maxima, vertices
 from sparserob_core.control.push import Push
@@ -21,7 +22,8 @@ from sparserob_core.sip.program import Enclosure, Explanation, Separation
 
 TINY = 1e-4         # of a cell of parameters: a cell on which a system that can be enclosed at all will be
 SURE = 1e-8         # a vertex that is predicted to this accuracy is one
-INSIDE = 3         # times sampled inside every piece, beside its ends
+INSIDE, MOST_INSIDE = 3, 64    # times sampled inside every piece, beside its ends: more where the system moves on it
+SMOOTH = 0.1        # norm of A times the spacing of samples between which a parabola is a good guide
 CLIMBED = 10        # of them, those that parameters are climbed for
 KEPT = 12          # separated constraints per row and round
 
@@ -81,6 +83,7 @@ class FlatConstraint:
         indices = np.hstack([times[:, None], self.lattice[0][positions[:, 0]]])
         if self.parameters.count:
             likely = np.argsort(-heights, kind="stable")[:CLIMBED]
+            indices[:, 0] = self.times[positions[:, 2]]  # a maximum at a breakpoint is a kink: it is climbed along, not across
             indices, found = self._climbed(x, indices[likely], rows[likely])
             rows = rows[likely]
         else:
@@ -146,7 +149,8 @@ class FlatConstraint:
         key = low.tobytes() + high.tobytes()
         if key not in self._lifted:
             response = self.functionals.response
-            remember(self._lifted, key, lift(response.system, response.grid, response.initial_state, (low + high) / 2, (high - low) / 2))
+            remember(self._lifted, key, lift(response.system, response.grid, response.initial_state, (low + high) / 2, (high - low) / 2),
+                     CELLS_KEPT)
         return self._lifted[key]
 
     def _cell(self, x: Array, low: Array, high: Array) -> CellEnclosure:
@@ -156,14 +160,14 @@ class FlatConstraint:
             control = self.functionals.dictionary.control(x)
             rhs = np.zeros((self.h.size, lifted.space.size))
             rhs[:, 0] = self.h
-            remember(self._cells, key, CellEnclosure(lifted, self._push(low, high), self.H, rhs, control))
+            remember(self._cells, key, CellEnclosure(lifted, self._push(low, high), self.H, rhs, control), CELLS_KEPT)
         return self._cells[key]
 
     def _push(self, low: Array, high: Array) -> Push | MeasurablePush | None:
         lifted = self.lifted(low, high)
         key = low.tobytes() + high.tobytes()
         if key not in self._pushes:
-            remember(self._pushes, key, self.functionals.push(lifted, self.H))
+            remember(self._pushes, key, self.functionals.push(lifted, self.H), CELLS_KEPT)
         return self._pushes[key]
 
     @cached_property
@@ -180,10 +184,12 @@ class FlatConstraint:
 
     @cached_property
     def times(self) -> Array:
-        """Sampled times: the window's ends, the breakpoints in it, and `INSIDE` times in every piece, increasing."""
+        """Sampled times: the window's ends, the breakpoints in it, and a few times in every piece, increasing."""
         grid = self.functionals.response.grid
-        fractions = np.arange(INSIDE + 1) / (INSIDE + 1)
-        inside = (grid.breakpoints[:-1, None] + grid.lengths[:, None] * fractions).ravel()
+        pace = float(np.linalg.norm(self.functionals.response.steps(self.lattice[0]).A, axis=(1, 2)).max())
+        counts = np.clip(np.ceil(pace * grid.lengths / SMOOTH), INSIDE + 1, MOST_INSIDE).astype(int)
+        inside = np.concatenate([np.linspace(left, right, count, endpoint=False) for left, right, count in
+                                 zip(grid.breakpoints[:-1], grid.breakpoints[1:], counts, strict=True)])
         inside = inside[(inside > self.start) & (inside < self.stop)]
         return distinct_times(np.concatenate([[self.start], inside, [self.stop]]), float(grid.breakpoints[-1]))
 
@@ -216,10 +222,9 @@ class FlatConstraint:
     def _sampling(self) -> tuple[np.ndarray, Array, Array]:
         response = self.functionals.response
         pieces = response.grid.locate(self.times)
-        within = np.round((self.times - response.grid.breakpoints[pieces]) / response.grid.breakpoints[-1], 15)
-        distinct, which = np.unique(within, return_inverse=True)
+        distinct, which = response.grid.distinct(self.times - response.grid.breakpoints[pieces])
         A = response.steps(self.lattice[0]).A
-        flow, driven = transitions(A[:, None], distinct[None] * response.grid.breakpoints[-1])
+        flow, driven = transitions(A[:, None], distinct[None])
         return pieces, flow[:, which], driven[:, which]
 
     def _climbed(self, x: Array, indices: Array, rows: np.ndarray) -> tuple[Array, Array]:

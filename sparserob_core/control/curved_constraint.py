@@ -10,9 +10,10 @@ import numpy as np
 from sparserob_core.control.combination import Combination, combination
 from sparserob_core.control.constraint import FlatConstraint
 from sparserob_core.control.directions import faces, on_surface, sampled, unit
-from sparserob_core.control.enclosure import CellEnclosure, remember, where_to_halve
+from sparserob_core.control.enclosure import CELLS_KEPT, CellEnclosure, where_to_halve
 from sparserob_core.control.functional import WorstCase
 from sparserob_core.control.lifted import LiftedSystem
+from sparserob_core.control.memory import remember
 from sparserob_core.control.parameters import ParameterIndex
 from sparserob_core.control.peaks import climb, local_maxima, vertices
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
@@ -38,8 +39,8 @@ class CurvedConstraint:
 
     @property
     def index_set(self) -> Box:
-        return self._flat.index_set if not self._b else Box(
-            np.concatenate([self._flat.index_set.lower, -np.ones(self._b)]), np.concatenate([self._flat.index_set.upper, np.ones(self._b)]))
+        box, cube = self._flat.index_set, np.ones(self._b)
+        return Box(np.concatenate([box.lower, -cube]), np.concatenate([box.upper, cube]))
 
     @property
     def scale(self) -> float:
@@ -130,7 +131,7 @@ class CurvedConstraint:
             push = self.functionals.push(lifted, H, joined)
             rhs, looseness = self._minorant(H, joined, nu)
             control = self.functionals.dictionary.control(x)
-            remember(self._cells, key, CellEnclosure(lifted, push, H, rhs, control, joined, looseness))
+            remember(self._cells, key, CellEnclosure(lifted, push, H, rhs, control, joined, looseness), CELLS_KEPT)
         return self._cells[key]
 
     def _minorant(self, H: Array, joined: Combination, nu: int) -> tuple[Array, Array]:

@@ -45,8 +45,7 @@ class DisturbanceModel:
         """An upper bound of the 2-norm of any admissible disturbance at any time."""
         if self.scale is not None and self.functions is not None:
             return float(np.linalg.norm(self.scale) * np.abs(self.functions).max())
-        axes = np.eye(self.channels)
-        return float(np.linalg.norm(np.maximum(self.bound.support(axes), self.bound.support(-axes))))
+        return self.bound.radius_bound
 
     @property
     def by_piece(self) -> bool:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
 
 import numpy as np
 
@@ -21,10 +20,9 @@ from sparserob_core.control.push import Push
 from sparserob_core.control.taylor import TaylorSpace
 from sparserob_core.sip.convex_set import Array
 
-T = TypeVar("T")
 LONG_STEP = 1.0         # in norm times duration: longer steps are taken by matrix exponentials
 SMALL_SHARE = 1e-6      # so that no coordinate is ever entirely blameless
-REMEMBERED = 256        # cells of parameters whose matrices are kept
+CELLS_KEPT = 256        # cells of parameters whose matrices are kept
 TIME_FIRST = 0.25       # times are halved before anything else unless that gains less than this share: their cells share all work
 TAYLOR_TERMS = 1e-17    # relative size below which further terms of the exponential series are left out
 
@@ -112,9 +110,8 @@ class CellEnclosure:
         return total
 
     def _by_exponential(self, start: Array, pieces: np.ndarray, within: Array) -> Array:
-        distinct, which = np.unique(np.round(within / self.lifted.grid.breakpoints[-1], 15), return_inverse=True)
-        flow, driven = self.lifted.forward.flows(distinct * self.lifted.grid.breakpoints[-1])
-        which = which.reshape(-1)
+        distinct, which = self.lifted.grid.distinct(within)
+        flow, driven = self.lifted.forward.flows(distinct)
         return np.asarray(np.einsum("kij,kj->ki", flow[which], start) + np.einsum("kij,kj->ki", driven[which], self._drive[pieces]))
 
     def _curvature(self, start: Array, stop: Array, pieces: np.ndarray) -> Array:
@@ -181,13 +178,6 @@ def _ends(start: Array, stop: Array, pieces: np.ndarray) -> tuple[tuple[Array, n
     both = np.stack([np.concatenate([start, stop]), np.concatenate([pieces, pieces])])
     unique, which = np.unique(both, axis=1, return_inverse=True)
     return (unique[0], unique[1].astype(int)), which.reshape(-1)
-
-
-def remember(cache: dict[bytes, T], key: bytes, value: T) -> None:
-    """Keep the last `REMEMBERED` cells."""
-    while len(cache) >= REMEMBERED:
-        cache.pop(next(iter(cache)))
-    cache[key] = value
 
 
 def where_to_halve(bend: Array, spread: Array, bounds: Array) -> np.ndarray:

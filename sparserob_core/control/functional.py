@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -52,22 +53,22 @@ class WorstCase:
 
     def rows(self, times: Array, directions: Array, parameters: Array) -> tuple[Array, Array]:
         """``G (k, n)`` and ``offset (k,)`` with ``max_w c'x(t) = G theta + offset``."""
-        G, offset = np.empty((times.size, self.variables)), np.empty(times.size)
-        for part in self._chunks(times.size):
-            free, gains, B, W = self.response.adjoint(times[part], directions[part], parameters[part])
-            G[part] = self.on_decision(gains @ B)
-            offset[part] = free @ self.response.initial_state + self._support(gains, W, times[part], directions[part], parameters[part])
-        return G, offset
+        return self._rows(times, directions, parameters, lambda part, gains, W: self._support(
+            gains, W, times[part], directions[part], parameters[part]))
 
     def rows_under(self, times: Array, directions: Array, parameters: Array, disturbances: Array | None) -> tuple[Array, Array]:
         """``G (k, n)`` and ``offset (k,)`` with ``c'x(t) = G theta + offset`` under given disturbances ``(k, mw, L)`` on the grid's pieces."""
+        return self._rows(times, directions, parameters, lambda part, gains, W: (
+            0.0 if disturbances is None else np.einsum("kli,kil->k", gains @ W, disturbances[part])))
+
+    def _rows(self, times: Array, directions: Array, parameters: Array,
+              pushed: Callable[[slice, Array, Array], Array | float]) -> tuple[Array, Array]:
+        """Rows and offsets; ``pushed(part, gains, W)`` is what the disturbance adds to the offsets of a part of the indices."""
         G, offset = np.empty((times.size, self.variables)), np.empty(times.size)
         for part in self._chunks(times.size):
             free, gains, B, W = self.response.adjoint(times[part], directions[part], parameters[part])
             G[part] = self.on_decision(gains @ B)
-            offset[part] = free @ self.response.initial_state
-            if disturbances is not None:
-                offset[part] += np.einsum("kli,kil->k", gains @ W, disturbances[part])
+            offset[part] = free @ self.response.initial_state + pushed(part, gains, W)
         return G, offset
 
     def worst_blocks(self, times: Array, directions: Array, parameters: Array) -> Array:

@@ -8,7 +8,7 @@ With ``p = centre + radius delta`` and ``A(p) = sum_g A_g delta^g + remainder``,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate
 
@@ -95,26 +95,28 @@ class LiftedSystem:
             return np.zeros(self.grid.pieces)
         inputs = control[:, self.grid.control_piece]
         driven = inputs.T @ self.forward.system.matrices(KNOWN)[1][0].T
-        return self._neglected(nodes, driven, self.matrix, np.abs(inputs).sum(axis=0) * self.slack_B)
+        return self._neglected(self._sizes(nodes, driven, self.matrix), np.abs(inputs).sum(axis=0) * self.slack_B)
 
-    def row_remainder(self, direction: Array) -> Array:
-        """Norm bounds ``(L,)``, per piece of ``[0, t]`` read backwards, of the neglected part of ``c'e^{A(p) s}``."""
-        if self.space.nu == 0:
-            return np.zeros(self.grid.pieces)
-        return self._neglected(self.row_nodes(direction), np.zeros(1), self.row_matrix.T, np.zeros(self.grid.pieces))
+    def row_bounds(self, direction: Array) -> tuple[Array, Array]:
+        """For the Taylor model of ``c'e^{A(p) s}``, read backwards from ``t``: norms ``(L, M)`` of its coefficients, the largest on every
+        piece, and norm bounds ``(L,)`` of its neglected part."""
+        sizes = self._sizes(self.row_nodes(direction), np.zeros(1), self.row_matrix.T)
+        return sizes, self._neglected(sizes, np.zeros(self.grid.pieces))
 
     def row_nodes(self, direction: Array) -> Array:
         """Taylor coefficients ``(L+1, M, d)`` of ``c'e^{A(p) s}`` at the breakpoints ``s``."""
         row = np.zeros(self.row_matrix.shape[0])
         row[:self.states] = direction
         still = np.zeros((1, int(self.grid.control_piece.max()) + 1))
-        path = Response(LinearSystem(self.row_matrix.T, np.zeros((row.size, 1))), self.grid, row).states(still, KNOWN)
+        path = replace(self._transposed, initial_state=row).states(still, KNOWN)
         answer: Array = path[0].reshape(self.grid.pieces + 1, self.space.size, self.states)
         return answer
 
-    def row_sizes(self, direction: Array) -> Array:
-        """Norms ``(L, M)`` of the Taylor coefficients of ``c'e^{A(p) s}``, the largest on every piece."""
-        return self._sizes(self.row_nodes(direction), np.zeros(1), self.row_matrix.T)
+    @cached_property
+    def _transposed(self) -> Response:
+        """Rows as states; its transitions are shared by all of them."""
+        size = self.row_matrix.shape[0]
+        return Response(LinearSystem(self.row_matrix.T, np.zeros((size, 1))), self.grid, np.zeros(size))
 
     def _sizes(self, nodes: Array, driven: Array, matrix: Array) -> Array:
         """Norms ``(L, M)`` of Taylor coefficients, the largest on every piece: at its ends, or between them, where they are near their chord."""
@@ -123,10 +125,10 @@ class LiftedSystem:
         norms = np.linalg.norm(nodes, axis=2)
         return np.asarray(np.maximum(norms[:-1], norms[1:]) + (lengths**2 / 8)[:, None] * (np.linalg.norm(second, axis=2) @ self._growths.T))
 
-    def _neglected(self, nodes: Array, driven: Array, matrix: Array, extra: Array) -> Array:
+    def _neglected(self, norms: Array, extra: Array) -> Array:
         """Gronwall: ``|e|' <= growth |e| + residual``, with the residual of the truncation bounded on every piece."""
-        lengths, norms = self.grid.lengths, self._sizes(nodes, driven, matrix)
-        residual = norms @ self._overflow + norms.sum(axis=1) * self.slack_A + extra
+        lengths = self.grid.lengths
+        residual = norms @ self.spilt(self.A) + norms.sum(axis=1) * self.slack_A + extra
         factor = grown(self.growth * lengths)
         added = residual * (grown_less_one(self.growth * lengths) / self.growth if abs(self.growth) > 1e-12 else lengths)
         bound = np.array(list(accumulate(zip(factor.tolist(), added.tolist(), strict=True), lambda b, step: b * step[0] + step[1], initial=0.0)))
@@ -142,12 +144,10 @@ class LiftedSystem:
         exponent = sizes * self.grid.lengths.max()
         return exponential(exponent) if exponent.max() < HUGE else np.full(sizes.shape, np.inf)
 
-    @cached_property
-    def _overflow(self) -> Array:
-        """For every monomial of the state, the norms of the coefficients of ``A`` that push it out of the space, ``(M,)``."""
-        size = np.linalg.norm(self.A, axis=(1, 2))
+    def spilt(self, coefficients: Array) -> Array:
+        """For every monomial, the norms of those ``coefficients (M, ...)`` of a factor that push its product out of the space, ``(M,)``."""
         leaves = self.space.degrees[:, None] + self.space.degrees[None, :] > self.space.degree
-        answer: Array = leaves @ size
+        answer: Array = leaves @ np.linalg.norm(coefficients, axis=(1, 2))
         return answer
 
 

@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from sparserob_core.control.lifted import grown_less_one
+from sparserob_core.control.memory import remember
 from sparserob_core.control.response import Response, transitions
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -18,6 +19,7 @@ LEGENDRE = np.polynomial.legendre.Legendre.basis(5)
 NODES = np.concatenate([[-1.0], LEGENDRE.deriv().roots(), [1.0]])   # Gauss-Lobatto: the ends are nodes, so that no kink hides beside them
 WEIGHTS = 1.0 / (15.0 * LEGENDRE(NODES) ** 2)
 ACCURACY = 1e-14    # of an integral over one interval, relative to the largest integrand times the horizon
+TABLES_KEPT = 64    # directions and parameters whose integrals are remembered
 HALVINGS = 48       # of an interval across a kink of the integrand: what is left of it is below rounding
 
 
@@ -52,9 +54,7 @@ class MeasurableSupport:
             breakpoints = self.response.grid.breakpoints
             starts = np.einsum("i,lij->lj", direction, transitions(A[0][None], breakpoints)[0])
             integrals = self._integrals(both, starts[:-1], np.diff(breakpoints))
-            while len(self._tables) >= 64:
-                self._tables.pop(next(iter(self._tables)))
-            self._tables[key] = (starts, np.concatenate([[0.0], np.cumsum(integrals)]), both)
+            remember(self._tables, key, (starts, np.concatenate([[0.0], np.cumsum(integrals)]), both), TABLES_KEPT)
         return self._tables[key]
 
     def _integrals(self, both: Array, starts: Array, lengths: Array) -> Array:
@@ -111,15 +111,12 @@ class MeasurablePush:
         A, _, W = self.support.response.system.matrices(np.zeros((1, 0)))
         slopes = np.einsum("ri,kij->krj", self.rows, transitions(A[0][None], start)[0] @ A[0])
         ends = slopes @ W[0]
-        size = np.maximum(bound.support(ends), bound.support(-ends))
         growth = grown_less_one(float(np.linalg.norm(A[0], 2)) * widths)[:, None]
-        return np.asarray(size + np.linalg.norm(slopes, axis=2) * growth * self._reach)
+        return np.asarray(bound.reach(ends) + np.linalg.norm(slopes, axis=2) * growth * self._reach)
 
     @cached_property
     def _reach(self) -> float:
-        bound, axes = self.support.bound, np.eye(self.support.bound.dimension)
-        radius = float(np.linalg.norm(np.maximum(bound.support(axes), bound.support(-axes))))
-        return radius * float(np.linalg.norm(self.support.response.system.matrices(np.zeros((1, 0)))[2][0], 2))
+        return self.support.bound.radius_bound * float(np.linalg.norm(self.support.response.system.matrices(np.zeros((1, 0)))[2][0], 2))
 
     @property
     def neglected(self) -> Array:

@@ -31,8 +31,7 @@ class Push:
 
     def swing(self, times: Array) -> Array:
         """How steep the push of *any* one disturbance can be in each parameter over the cell: ``(k, r, nu)``."""
-        bound, exponents = self.disturbance.set, self._space.exponents
-        return self._gathered(times, lambda blocks: np.maximum(bound.support(blocks), bound.support(-blocks)).swapaxes(2, 3)) @ exponents
+        return self._gathered(times, self._reaches) @ self._space.exponents
 
     def at(self, times: Array, ends: Array) -> tuple[Array, Array]:
         """Taylor coefficients ``(k, r, M)`` of the push under the worst disturbance of a centre, and its excess ``(k, r)``.
@@ -53,12 +52,12 @@ class Push:
     def curvature(self, start: Array, widths: Array) -> Array:
         """Bounds ``(k, r)``, for times in ``[start, start + width]`` inside one piece, of the second time derivative of what the blocks
         receive, summed over blocks and Taylor coefficients."""
-        matrix, norm, bound = self.lifted.row_matrix, self.lifted.norm, self.disturbance.set
+        matrix, norm, grid = self.lifted.row_matrix, self.lifted.norm, self.lifted.grid
         bent = self._lifted_rows @ matrix @ matrix
-        sizes = self._gathered(start, lambda blocks: np.maximum(bound.support(blocks), bound.support(-blocks)).swapaxes(2, 3), bent, plain=True)
-        pieces = np.clip(np.searchsorted(self.lifted.grid.breakpoints, start, side="right") - 1, 0, self.lifted.grid.pieces - 1)
-        distinct, which = np.unique(np.round(start - self.lifted.grid.breakpoints[pieces], 15), return_inverse=True)
-        fresh = np.linalg.norm(self._lifted_rows @ matrix @ self.lifted.backward.flows(distinct)[0], axis=2)[which.reshape(-1)]
+        sizes = self._gathered(start, self._reaches, bent, plain=True)
+        pieces = np.clip(np.searchsorted(grid.breakpoints, start, side="right") - 1, 0, grid.pieces - 1)
+        distinct, which = grid.distinct(start - grid.breakpoints[pieces])
+        fresh = np.linalg.norm(self._lifted_rows @ matrix @ self.lifted.backward.flows(distinct)[0], axis=2)[which]
         growth = (norm * widths)[:, None]
         along = np.linalg.norm(bent, axis=1) * self._total_gain[pieces + 1][:, None] * grown_less_one(growth)
         return np.asarray(sizes.sum(axis=2) + np.sqrt(self.lifted.space.size) * self._reach * (along + fresh * grown(growth)))
@@ -70,12 +69,11 @@ class Push:
         total = np.zeros((self.rows.shape[0], lengths.size))
         if space.nu == 0:
             return total
-        leaves = space.degrees[:, None] + space.degrees[None, :] > space.degree
-        spilt = leaves @ np.linalg.norm(self.lifted.W, axis=(1, 2)) + self.lifted.slack_W
+        spilt = self.lifted.spilt(self.lifted.W) + self.lifted.slack_W
+        reach = self._reach + self.lifted.slack_W * self.disturbance.radius
         for row, direction in enumerate(self.rows):
-            loose = self.lifted.row_sizes(direction) @ spilt * self.disturbance.radius
-            reach = self._reach + self.lifted.slack_W * self.disturbance.radius
-            total[row] = np.cumsum((self.lifted.row_remainder(direction) * reach + loose) * lengths)
+            sizes, remainder = self.lifted.row_bounds(direction)
+            total[row] = np.cumsum((remainder * reach + sizes @ spilt * self.disturbance.radius) * lengths)
         return total
 
     @property
@@ -96,18 +94,22 @@ class Push:
         combined = (lambda blocks: blocks) if plain else self._combined
         if not self._repeats:
             return np.asarray(of_blocks(combined(self._blocks(times, start))).sum(axis=2))
-        backward, grid, horizon = self.lifted.backward, self.lifted.grid, self.lifted.grid.breakpoints[-1]
+        backward, grid = self.lifted.backward, self.lifted.grid
         pieces = grid.locate(times)
-        within, which = np.unique(np.round((times - grid.breakpoints[pieces]) / horizon, 15), return_inverse=True)
-        flow, partial = backward.flows(within * horizon)
-        young = self._weights(start @ partial)[..., None, :]
+        within, which = grid.distinct(times - grid.breakpoints[pieces])
+        flow, driven = backward.flows(within)
+        young = self._weights(start @ driven)[..., None, :]
         moved = np.einsum("rd,qde->qre", start, flow)
         old = np.moveaxis(self._weights(np.einsum("qre,aef->qraf", moved, backward.ages[:int(pieces.max(initial=0))])), -2, -3)
         parts = np.concatenate([of_blocks(combined(young)), of_blocks(combined(old))], axis=2)
-        return np.asarray(np.cumsum(parts, axis=2)[which.reshape(-1), :, pieces])
+        return np.asarray(np.cumsum(parts, axis=2)[which, :, pieces])
 
     def _combined(self, blocks: Array) -> Array:
         return blocks if self.combination is None else self.combination.apply(blocks)
+
+    def _reaches(self, blocks: Array) -> Array:
+        """How much any one disturbance can make of every Taylor coefficient of every block, ``(k, r, nb, M)``."""
+        return self.disturbance.set.reach(blocks).swapaxes(2, 3)
 
     def _summed(self, blocks: Array, face: Array | None) -> Array:
         """Per block: the polynomial under the centre's worst disturbance, and the excess as one more entry; from ``(k, r, M, nb, q)``."""

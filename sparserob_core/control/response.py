@@ -13,10 +13,12 @@ from functools import cached_property
 import numpy as np
 
 from sparserob_core.control.exponential import exponential
+from sparserob_core.control.memory import remember
 from sparserob_core.control.system import LinearSystem
 from sparserob_core.sip.convex_set import Array
 
 FEW = 64            # indices for which a table beats the loop over the pieces
+STEPS_KEPT = 16     # sets of parameters whose transitions are remembered
 SAME_TIME = 1e-12   # times closer than this share of the horizon are one
 
 
@@ -38,6 +40,12 @@ class TimeGrid:
     @property
     def lengths(self) -> Array:
         return np.diff(self.breakpoints)
+
+    def distinct(self, durations: Array) -> tuple[Array, np.ndarray]:
+        """The distinct durations ``(u,)`` among ``(k,)``, those that differ by rounding as one, and which of them each is."""
+        horizon = self.breakpoints[-1]
+        shares, which = np.unique(np.round(durations / horizon, 15), return_inverse=True)
+        return shares * horizon, which.reshape(-1)
 
     def locate(self, times: Array) -> np.ndarray:
         """Index of the piece that each time ``(k,)`` lies in; a breakpoint belongs to the piece that it ends."""
@@ -65,7 +73,6 @@ def merge_grids(control: Array, disturbance: Array) -> TimeGrid:
 class Steps:
     """Transition matrices over whole pieces: ``E (v, q, d, d)`` and ``F (v, q, d, d)`` for ``v`` parameters and ``q`` distinct lengths."""
 
-    parameters: Array
     A: Array
     B: Array
     W: Array
@@ -96,9 +103,7 @@ class Response:
         if key not in self._steps:
             A, B, W = self.system.matrices(parameters)
             E, F = transitions(A[:, None], self._lengths[None, :])
-            while len(self._steps) >= 16:
-                self._steps.pop(next(iter(self._steps)))
-            self._steps[key] = Steps(parameters, A, B, W, E, F)
+            remember(self._steps, key, Steps(A, B, W, E, F), STEPS_KEPT)
         return self._steps[key]
 
     def adjoint(self, times: Array, directions: Array, parameters: Array) -> tuple[Array, Array, Array, Array]:

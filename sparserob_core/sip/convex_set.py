@@ -37,6 +37,16 @@ class ConvexSet(ABC):
         """``(H (r, d), h (r,))`` with the set ``= {x : H x <= h}``, or ``None`` for a curved set."""
         return None
 
+    def reach(self, directions: Array) -> Array:
+        """``max {|c'x| : x in the set}`` of directions ``(..., d)``, as ``(...,)``."""
+        farthest: Array = np.maximum(self.support(directions), self.support(-directions))
+        return farthest
+
+    @property
+    def radius_bound(self) -> float:
+        """An upper bound of the 2-norm of any point: that of the corner of the bounding box."""
+        return float(np.linalg.norm(self.reach(np.eye(self.dimension))))
+
     def linearisation_excess(self, centre: Array, spread: Array) -> Array:
         """How much the support function can exceed its linearisation at ``centre (..., d)``, over ``centre + sum_j s_j spread_j``,
         ``|s_j| <= 1``.

@@ -85,8 +85,8 @@ class _Run:
                 return self._without_answer(solution)
             separations = self._separate(solution.x)
             worst = _worst(separations)
-            self._tell(number, solution, worst, separations)
             violated = [_above(family, found) for family, found in separations]
+            self._tell(number, solution, worst, sum(rows.size for _, rows, _ in violated))
             last = number == self.method.rounds
             if not last and self._exchange(solution, violated):
                 continue
@@ -184,12 +184,11 @@ class _Run:
         self.guess = replace(solution, y=np.concatenate([fixed, y[keep], np.zeros(added)]))
         return added
 
-    def _tell(self, number: int, solution: FiniteSolution, worst: Witness, separations: Sequence[tuple[ConstraintFamily, Separation]]) -> None:
-        feasible = not any(_above(family, found)[1].size for family, found in separations)
+    def _tell(self, number: int, solution: FiniteSolution, worst: Witness, violated: int) -> None:
         event = RoundFinished(
             round=number, epsilon=self.epsilon, lower_bound=self.lower, violation=worst.violation, worst_family=worst.constraint,
-            upper_bound=self.program.cost(solution.x) if feasible else np.inf, active_indices=self.rows.h.size,
-            cuts_added=sum(_above(family, found)[1].size for family, found in separations),
+            upper_bound=np.inf if violated else self.program.cost(solution.x), active_indices=self.rows.h.size,
+            cuts_added=violated,
             relaxed_programs=self.relaxed.solves, seconds=time.perf_counter() - self.started)
         self.history.append(event)
         self.tools.notify(event)

@@ -88,7 +88,7 @@ def test_the_taylor_model_of_a_functional_encloses_it_over_the_cell(name):
     functionals, lifted = made(name, "uneven")
     _, _, _, centre, radius = SYSTEMS[name]
     direction = rng.normal(size=lifted.states)
-    nodes, remainder = lifted.row_nodes(direction), lifted.row_remainder(direction)
+    nodes, remainder = lifted.row_nodes(direction), lifted.row_bounds(direction)[1]
     for delta in deltas(rng, lifted.space.nu):
         A = functionals.response.system.matrices((np.array(centre) + np.array(radius) * delta)[None])[0][0]
         T = lifted.transform

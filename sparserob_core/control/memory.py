@@ -1,0 +1,15 @@
+"""A memory of the last few results, by key."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+T = TypeVar("T")
+
+
+def remember(cache: dict[bytes, T], key: bytes, value: T, most: int) -> T:
+    """Keep ``value`` under ``key``, and at most ``most`` entries, the oldest forgotten first; returns the value."""
+    while len(cache) >= most:
+        cache.pop(next(iter(cache)))
+    cache[key] = value
+    return value
