@@ -24,6 +24,7 @@ FILES = {
     "result.json": "status, message, cost, value, epsilon, bounds, gap, worst constraint, sparsity, counts, seconds, seed, versions",
     "solution.npz": "`breakpoints (K+1,)`, `control (m, K)`, `theta (m, N)`; of the imposed constraints `times`, `indices`, `rows`, "
                     "`families`, `multipliers`",
+    "evaluations.npz": "for a method that searches, one entry per value of g: outer iteration, epsilon, value, proven lower bound, seconds",
     "trace.npz": "one array per column, one entry per round: bounds, violation, epsilon, indices, seconds",
     "figures/": "`control`, `states`, `convergence`, each as PDF and PNG",
 }

@@ -5,7 +5,8 @@ Every public name is an attribute of this module, and is imported when it is fir
 1. ``control/``     ``sets``, ``system``, ``problem``: what is to be controlled; ``dictionary``: how controls are written;
    ``response``, ``transcription``: the problem as a convex semi-infinite program.
 2. ``sip/``         ``program``: such a program in general; ``finite``, ``solver``: finitely many of its constraints, and who solves them;
-   ``method``, ``exchange``: from there to the whole continuum; ``result``: what was found and what of it was proven.
+   ``method``, ``exchange``: from there to the whole continuum; ``tuples``,
+   ``sparserob``: the paper's own way, a search over tuples of indices; ``result``: what was found and what of it was proven.
 3. ``experiment/``  ``config``: a file that names components; ``registry``: who offers them; ``run``: the whole walk; ``cli``: the commands.
 
 ``experiment`` imports ``control``, ``control`` imports ``sip``, never the other way; plugins import this module only.
@@ -26,11 +27,15 @@ if TYPE_CHECKING:
     from sparserob_core.experiment.events import Observer, RunFinished, RunStarted
     from sparserob_core.experiment.plugin import (
         DictionaryPlugin,
+        InnerStopPlugin,
         MaximiserPlugin,
         MethodPlugin,
         ObserverPlugin,
+        OuterStopPlugin,
         ProblemPlugin,
         RegulariserPlugin,
+        SchedulePlugin,
+        SelectionPlugin,
         SolverPlugin,
     )
     from sparserob_core.experiment.problems import LinearKeys, LinearProblem
@@ -45,18 +50,21 @@ if TYPE_CHECKING:
     from sparserob_core.sip.method import Continuation, Method, Tools
     from sparserob_core.sip.program import ConstraintFamily, Enclosure, SemiInfiniteProgram, Separation
     from sparserob_core.sip.regulariser import ControlImage, Regulariser
-    from sparserob_core.sip.result import Cut, Result, Witness
+    from sparserob_core.sip.result import Cut, Result, SearchTrace, Witness
+    from sparserob_core.sip.rules import InnerStop, OuterStep, OuterStop, Progress, Schedule, Selection
     from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
+    from sparserob_core.sip.trust_region import TrustRegion
 
 __all__ = [
     "Array", "Box", "Claim", "ConfigError", "ConstraintFamily", "Continuation", "ControlImage", "ConvexSet", "Cut", "Dictionary",
     "DictionaryFactory", "DictionaryPlugin", "Ellipsoid", "Enclosure", "Equality", "EvaluationError", "EvaluationsFinished", "Event",
-    "InputError", "LinearKeys", "LinearProblem", "LinearSystem", "Maximiser", "MaximiserPlugin", "Method", "MethodPlugin", "NormBall",
-    "Objective", "Observer", "ObserverPlugin", "OptimalControlProblem", "Options", "Outcome", "PathConstraint", "PluginError", "Polytope",
-    "ProblemFactory", "ProblemPlugin", "ProofProgress", "QuadraticProgram", "Regulariser", "RegulariserPlugin", "Report", "Result",
-    "RoundFinished", "RunFinished", "RunStarted", "SearchEnded", "SemiInfiniteProgram", "Separation", "SetOptions", "Solver",
-    "SolverError", "SolverPlugin", "SparseRobError", "Tools", "Trace", "Witness", "cylinder", "hookimpl", "intersection", "load_registry",
-    "maximise", "run", "solve", "transcribe",
+    "InnerStop", "InnerStopPlugin", "InputError", "LinearKeys", "LinearProblem", "LinearSystem", "Maximiser", "MaximiserPlugin", "Method",
+    "MethodPlugin", "NormBall", "Objective", "Observer", "ObserverPlugin", "OptimalControlProblem", "Options", "Outcome", "OuterStep",
+    "OuterStop", "OuterStopPlugin", "PathConstraint", "PluginError", "Polytope", "ProblemFactory", "ProblemPlugin", "Progress",
+    "ProofProgress", "QuadraticProgram", "Regulariser", "RegulariserPlugin", "Report", "Result", "RoundFinished", "RunFinished",
+    "RunStarted", "Schedule", "SchedulePlugin", "SearchEnded", "SearchTrace", "Selection", "SelectionPlugin", "SemiInfiniteProgram",
+    "Separation", "SetOptions", "Solver", "SolverError", "SolverPlugin", "SparseRobError", "Tools", "Trace", "TrustRegion", "Witness",
+    "cylinder", "hookimpl", "intersection", "load_registry", "maximise", "run", "solve", "transcribe",
 ]
 
 _MODULES = {
@@ -68,7 +76,9 @@ _MODULES = {
     "sip.regulariser": "ControlImage Regulariser",
     "sip.maximiser": "EvaluationError Maximiser Objective Report SearchEnded Trace",
     "sip.method": "Continuation Method Tools",
-    "sip.result": "Cut Result Witness",
+    "sip.result": "Cut Result SearchTrace Witness",
+    "sip.rules": "InnerStop OuterStep OuterStop Progress Schedule Selection",
+    "sip.trust_region": "TrustRegion",
     "sip.events": "EvaluationsFinished Event ProofProgress RoundFinished",
     "control.dictionary": "Dictionary DictionaryFactory",
     "control.sets": "Ellipsoid Equality NormBall Polytope cylinder intersection",
@@ -76,7 +86,8 @@ _MODULES = {
     "control.problem": "OptimalControlProblem PathConstraint ProblemFactory",
     "control.transcription": "transcribe",
     "experiment.events": "Observer RunFinished RunStarted",
-    "experiment.plugin": "DictionaryPlugin MaximiserPlugin MethodPlugin ObserverPlugin ProblemPlugin RegulariserPlugin SolverPlugin",
+    "experiment.plugin": "DictionaryPlugin InnerStopPlugin MaximiserPlugin MethodPlugin ObserverPlugin OuterStopPlugin ProblemPlugin "
+                         "RegulariserPlugin SchedulePlugin SelectionPlugin SolverPlugin",
     "experiment.problems": "LinearKeys LinearProblem",
     "experiment.registry": "hookimpl load_registry",
     "experiment.run": "Outcome run",

@@ -8,7 +8,8 @@ from collections.abc import Callable
 import numpy as np
 
 from sparserob_core.sip.convex_set import Array, Box
-from sparserob_core.sip.maximiser import EvaluationError, Maximiser, Report, maximise
+from sparserob_core.sip.maximiser import EvaluationError, Maximiser, Report
+from sparserob_core.sip.search import Target, maximise
 from sparserob_core.testing_solvers import SolverContract
 
 __all__ = ["MaximiserContract", "SolverContract"]
@@ -84,11 +85,11 @@ class MaximiserContract(ABC):
 
     def search(self, function: Callable[[Array], object], domain: Box = PLANE, budget: int = 60, seed: int = 0) -> Report:
         """Run a new maximiser."""
-        return maximise(function, domain, self.create(), budget, np.random.default_rng(seed))
+        return maximise(Target(function, domain), self.create(), budget, np.random.default_rng(seed))
 
     def test_the_same_seed_gives_the_same_points(self) -> None:
         maximiser = self.create()
-        first, second = (maximise(ripples, PLANE, maximiser, 60, np.random.default_rng(3)) for _ in range(2))
+        first, second = (maximise(Target(ripples, PLANE), maximiser, 60, np.random.default_rng(3)) for _ in range(2))
         assert first.trace.points.tolist() == second.trace.points.tolist(), "one maximiser used twice remembers its first search"
         assert first.trace.points.tolist() == self.search(ripples, seed=3).trace.points.tolist()
 
@@ -97,7 +98,7 @@ class MaximiserContract(ABC):
         from multiprocessing import get_context
 
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as fresh:
-            there = fresh.submit(maximise, ripples, PLANE, self.create(), 60, np.random.default_rng(3)).result()
+            there = fresh.submit(maximise, Target(ripples, PLANE), self.create(), 60, np.random.default_rng(3)).result()
         assert there.trace.points.tolist() == self.search(ripples, seed=3).trace.points.tolist()
 
     def test_every_point_lies_in_the_box_however_odd_the_box(self) -> None:
@@ -162,6 +163,20 @@ class MaximiserContract(ABC):
         together = self.search(ripples)
         np.testing.assert_array_equal(singly.trace.points, together.trace.points)
         np.testing.assert_array_equal(singly.trace.values, together.trace.values)
+
+    def test_a_gradient_may_be_used_and_costs_what_it_says(self) -> None:
+        counted = _Counted(bowl)
+        target = Target(counted, PLANE, gradient=lambda point: -2.0 * (point - 0.3))
+        report = maximise(target, self.create(), 60, np.random.default_rng(0))
+        assert report.evaluations == counted.calls <= 60
+        assert report.best_value >= -10.0
+
+    def test_a_tuple_of_many_indices_is_searched_within_the_budget(self) -> None:
+        count, width = 400, 3
+        domain = Box(np.tile(PLANE.lower[:1], count * width), np.tile(PLANE.upper[1:], count * width))
+        report = maximise(Target(bowl, domain, block=width), self.create(), 50, np.random.default_rng(0))
+        assert 1 <= report.evaluations <= 50
+        assert report.best_value > -np.inf
 
     def test_a_smooth_hill_is_climbed_at_least_part_of_the_way(self) -> None:
         assert self.search(bowl, budget=500).best_value >= -0.5

@@ -17,7 +17,9 @@ from sparserob_core.experiment.config import Source, read_source, read_value
 from sparserob_core.experiment.messages import Complaint, Path, complaints, malformed
 from sparserob_core.experiment.overrides import Override, apply_override, parse_overrides
 from sparserob_core.experiment.registry import load_registry
-from sparserob_core.experiment.run_config import SLOTS, RunConfig
+from sparserob_core.experiment.run_config import SLOTS, MaximiserEntry, RunConfig
+
+KEPT = {*MaximiserEntry.model_fields} - {"name"}   # keys of a maximiser that are the framework's own
 
 
 @final
@@ -106,7 +108,7 @@ def _checked(data: dict[str, Any], registry: Registry) -> tuple[RunConfig | None
         wrong += complaints(error, RunConfig, data)
     plain = checked.plain() if checked else data
     for path, kind, entry in _entries(plain):
-        options = {key: value for key, value in entry.items() if key != "name" and not (kind == "maximiser" and key == "budget")}
+        options = {key: value for key, value in entry.items() if key != "name" and not (kind == "maximiser" and key in KEPT)}
         try:
             typed, faults = registry.check(kind, entry["name"], options)
         except PluginError as error:

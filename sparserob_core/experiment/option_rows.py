@@ -78,6 +78,8 @@ class _Walk:
             return ", ".join(str(value) for value in member["enum"])
         if "const" in member:
             return str(member["const"])
+        if "component" in member:
+            return f"{str(member['component']).replace('_', ' ')} by name, or with its options"
         kind = member.get("type")
         if kind == "array":
             inside = " or ".join(dict.fromkeys(self._type(item) for _, item in self._members(member.get("items", {}))))

@@ -141,6 +141,42 @@ class ProblemPlugin(Plugin):
 
 
 @final
+class SchedulePlugin(Plugin):
+    """A `Schedule`: the next weight of the regulariser, the paper's ``Regu``."""
+
+    kind = "schedule"
+    hook = "sparserob_schedules"
+    component = "sparserob_core.sip.rules:Schedule"
+
+
+@final
+class OuterStopPlugin(Plugin):
+    """An `OuterStop`: when outer iterations end, the paper's ``SC1``."""
+
+    kind = "outer_stop"
+    hook = "sparserob_outer_stops"
+    component = "sparserob_core.sip.rules:OuterStop"
+
+
+@final
+class InnerStopPlugin(Plugin):
+    """An `InnerStop`: when one global maximisation ends, the paper's ``SC2``."""
+
+    kind = "inner_stop"
+    hook = "sparserob_inner_stops"
+    component = "sparserob_core.sip.rules:InnerStop"
+
+
+@final
+class SelectionPlugin(Plugin):
+    """A `Selection`: whether a walk accepts a candidate, the paper's ``SlCr``."""
+
+    kind = "selection"
+    hook = "sparserob_selections"
+    component = "sparserob_core.sip.rules:Selection"
+
+
+@final
 class ObserverPlugin(Plugin):
     """An `Observer`, told of every event."""
 
@@ -150,7 +186,8 @@ class ObserverPlugin(Plugin):
 
 
 RECORDS: Mapping[str, type[Plugin]] = {record.kind: record for record in (
-    ProblemPlugin, MethodPlugin, DictionaryPlugin, RegulariserPlugin, SolverPlugin, MaximiserPlugin, ObserverPlugin)}
+    ProblemPlugin, MethodPlugin, DictionaryPlugin, RegulariserPlugin, SolverPlugin, MaximiserPlugin, SchedulePlugin, OuterStopPlugin,
+    InnerStopPlugin, SelectionPlugin, ObserverPlugin)}
 
 
 def record_type(kind: str) -> type[Plugin]:

@@ -23,12 +23,16 @@ from sparserob_core.experiment.messages import nearest
 from sparserob_core.experiment.plugin import (
     RECORDS,
     DictionaryPlugin,
+    InnerStopPlugin,
     MaximiserPlugin,
     MethodPlugin,
     ObserverPlugin,
+    OuterStopPlugin,
     Plugin,
     ProblemPlugin,
     RegulariserPlugin,
+    SchedulePlugin,
+    SelectionPlugin,
     SolverPlugin,
 )
 
@@ -78,6 +82,26 @@ class Hooks:
     @_specification
     def sparserob_maximisers(self) -> Iterable[MaximiserPlugin]:
         """Global maximisers over a box."""
+        return ()
+
+    @_specification
+    def sparserob_schedules(self) -> Iterable[SchedulePlugin]:
+        """Schedules of the regulariser's weight (``Regu``)."""
+        return ()
+
+    @_specification
+    def sparserob_outer_stops(self) -> Iterable[OuterStopPlugin]:
+        """Stopping rules of the outer iteration (``SC1``)."""
+        return ()
+
+    @_specification
+    def sparserob_inner_stops(self) -> Iterable[InnerStopPlugin]:
+        """Stopping rules of one global maximisation (``SC2``)."""
+        return ()
+
+    @_specification
+    def sparserob_selections(self) -> Iterable[SelectionPlugin]:
+        """Rules by which a walk accepts a candidate (``SlCr``)."""
         return ()
 
     @_specification

@@ -154,7 +154,7 @@ def _tools(loaded: Loaded) -> Tools:
     return Tools(
         solver=_build(loaded, "solver", config.solver), maximiser=_build(loaded, "maximiser", config.maximiser),
         regulariser=None if config.regulariser is None else _build(loaded, "regulariser", config.regulariser),
-        continuation=Continuation(**config.continuation.model_dump()), budget=config.maximiser.budget,
+        continuation=Continuation(**config.continuation.model_dump()), budget=config.maximiser.budget, polish=config.maximiser.polish,
         rng=np.random.default_rng(config.seed))
 
 
@@ -206,6 +206,8 @@ class _Journal(Observer):
         control, summary = self.record(result)
         self.directory.write_arrays("solution.npz", arrays_of(result, experiment.program, experiment.control, control))
         self.directory.write_arrays("trace.npz", trace_columns(self.rounds or list(result.history)))
+        if result.trace is not None:
+            self.directory.write_arrays("evaluations.npz", vars(result.trace))
         remarks = _draw(experiment, result, self.directory.path) if figures and control is not None else ()
         return Outcome(result, self.directory.path, experiment, control, summary, remarks)
 

@@ -32,6 +32,9 @@ class MaximiserEntry(Entry):
     budget: int = Field(default=2000, ge=1)
     """Evaluations that one search may spend."""
 
+    polish: float = Field(default=0.0, ge=0.0, lt=1.0)
+    """Share of the budget that goes to a local method, from the best points, at the end."""
+
 
 @final
 class Dictionaries(Options):

@@ -8,6 +8,7 @@ from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import core_schema
 
 from sparserob_core.experiment.components import Registry
+from sparserob_core.experiment.components import parts as components
 from sparserob_core.experiment.plugin import Plugin
 from sparserob_core.experiment.run_config import SLOTS, MaximiserEntry, RunConfig
 
@@ -47,6 +48,10 @@ def _choice(registry: Registry, kind: str, default: str | None, parts: dict[str,
     entries = []
     for name in names:
         entry = options_schema(registry.get(kind, name))
+        for key, part in components(registry.get(kind, name).options_type()).items():
+            described = entry["properties"][key]
+            described.pop("component")
+            described["anyOf"] = [*_choice(registry, part, None, parts)["anyOf"], {"type": "null"}]
         parts.update({f"{kind}.{name}.{part}": value for part, value in entry.pop("$defs", {}).items()})
         entries.append(_named(entry, registry.get(kind, name), needs_name=name != default))
     return {"anyOf": [{"enum": names, "description": f"A {kind} with its default options."}, *entries]}
@@ -55,7 +60,8 @@ def _choice(registry: Registry, kind: str, default: str | None, parts: dict[str,
 def _named(entry: dict[str, Any], record: Plugin, needs_name: bool) -> dict[str, Any]:
     properties = {"name": {"const": record.name, "description": record.summary}, **entry.get("properties", {})}
     if record.kind == "maximiser":
-        properties["budget"] = MaximiserEntry.model_json_schema()["properties"]["budget"]
+        own = MaximiserEntry.model_json_schema()["properties"]
+        properties |= {key: own[key] for key in own if key != "name"}
     required = (["name"] if needs_name else []) + entry.get("required", [])
     return {"type": "object", "title": f"{record.kind} {record.name}", "description": record.summary,
             "properties": properties, "required": required, "additionalProperties": False}

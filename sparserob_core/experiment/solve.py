@@ -41,6 +41,7 @@ def solve(
     disturbance: Choice | DictionaryFactory | Dictionary | None = None,
     continuation: Continuation | Mapping[str, float] | None = None,
     budget: int = 2000,
+    polish: float = 0.0,
     notify: Notify = silence,
 ) -> Result:
     """Solve a semi-infinite program, or an optimal control problem on dictionaries, as ``sparserob run`` does, without files.
@@ -48,7 +49,8 @@ def solve(
     A component is a name, a mapping such as ``{"name": "exchange", "tolerance": 1e-9}``, or the component itself. ``tolerance`` is the
     relative gap, for a method that has such an option. ``control`` is by default 100 equal pieces, and ``disturbance`` one indicator
     function on each piece of the control; both are for control problems only. ``regulariser`` is by default the ridge for control problems, whose
-    optimisers are to be unique, and none for other programs, so that ``value`` is the cost. ``budget``: evaluations per search of the maximiser.
+    optimisers are to be unique, and none for other programs, so that ``value`` is the cost. ``budget``: evaluations per search of the
+    maximiser, of which the share ``polish`` goes to a local method at its end.
     Raises `InputError` when an argument is at fault.
     """
     registry = load_registry()
@@ -60,25 +62,30 @@ def solve(
         solver=component(registry, "solver", solver, Solver),
         maximiser=component(registry, "maximiser", maximiser, Maximiser),
         regulariser=None if regulariser is None else component(registry, "regulariser", regulariser, Regulariser),
-        continuation=steps, budget=_whole("budget", budget, 1), rng=np.random.default_rng(_whole("seed", seed, 0)), notify=_heard(notify))
+        continuation=steps, budget=_whole("budget", budget, 1), polish=_share(polish),
+        rng=np.random.default_rng(_whole("seed", seed, 0)), notify=_heard(notify))
     chosen: Method = component(registry, "method", _with_tolerance(registry, method, tolerance), Method)
     return chosen.solve(program, tools)
 
 
 def maximise(f: Callable[[Array], object], box: Box, name: Choice | Maximiser = "direct", budget: int = 1000, seed: int = 0,
-             **options: object) -> Report:
+             polish: float = 0.0, gradient: Callable[[Array], Array] | None = None, **options: object) -> Report:
     """Search for the maximum of ``f`` (points ``(k, d)`` to values ``(k,)``) over a box with the maximiser of that name.
 
-    Keywords are the maximiser's options. Raises `InputError` when an argument is at fault, and `EvaluationError` when ``f`` fails.
+    The last share ``polish`` of the budget goes to a local method, from the best points. ``gradient`` maps a point ``(d,)`` to the
+    gradient ``(d,)`` of ``f``, for maximisers and a polish that use it. Further keywords are the maximiser's options.
+    Raises `InputError` when an argument is at fault, and `EvaluationError` when ``f`` fails.
     """
-    from sparserob_core.sip.maximiser import maximise as search
+    from sparserob_core.sip.search import Rules, Target
+    from sparserob_core.sip.search import maximise as search
 
     if not isinstance(box, Box):
         raise InputError(f"box: expected a sparserob_core.Box, got {type(box).__name__}")
     if options and not isinstance(name, str):
         raise InputError(f"{', '.join(options)}: options as keywords need the maximiser's name, got {name!r}")
     chosen = component(load_registry(), "maximiser", {"name": name, **options} if isinstance(name, str) else name, Maximiser)
-    return search(f, box, chosen, _whole("budget", budget, 1), np.random.default_rng(_whole("seed", seed, 0)))
+    return search(Target(f, box, gradient), chosen, _whole("budget", budget, 1), np.random.default_rng(_whole("seed", seed, 0)),
+                  Rules(polish=_share(polish)))
 
 
 def component(registry: Registry, kind: str, choice: object, expected: type[Any]) -> Any:
@@ -147,6 +154,12 @@ def _heard(notify: Notify) -> Callable[[object], None]:
             notify(event)
 
     return pass_on
+
+
+def _share(polish: object) -> float:
+    if isinstance(polish, bool) or not isinstance(polish, int | float | np.integer | np.floating) or not 0.0 <= polish < 1.0:
+        raise InputError(f"polish: expected a share of the budget, at least 0 and below 1, got {polish!r}")
+    return float(polish)
 
 
 def _whole(name: str, value: object, least: int) -> int:

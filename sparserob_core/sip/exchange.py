@@ -19,18 +19,18 @@ from sparserob_core.sip.certificate import TOLERANCE, Proof, prove
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import RoundFinished
 from sparserob_core.sip.finite import FiniteSolution
+from sparserob_core.sip.infeasible import irreducible
 from sparserob_core.sip.method import Method, Tools
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation
 from sparserob_core.sip.relaxed import RelaxedProgram, Rows, rows_at
 from sparserob_core.sip.result import Result, Status, Witness, relative_gap
-from sparserob_core.sip.separation import search_worst
-from sparserob_core.sip.verdict import clash, verdict, witness
+from sparserob_core.sip.separation import separate
+from sparserob_core.sip.verdict import clash, verdict, witness, worst_of
 
 IDLE_ROUNDS = 3         # rounds that a row may stay without a multiplier before it is dropped
 DROPPING_ROUNDS = 40    # rounds after which rows are only added, so that nothing can cycle
 SMALLEST_MARGIN, LARGEST_MARGIN = 1e-15, 1e-6   # in units of the decision's bounds, where those are below 1
 RESIDUAL = 1e-8         # of bounds, fixed rows and equalities, relative to their scale, at a decision that is returned
-PRUNED = 40             # constraints at most that are dropped from an infeasible set for the sake of its explanation
 CRUDE = 1e-4            # residual and relative gap of a relaxed solution that a round can do with
 ALLOWED = TOLERANCE / 2  # a violation that the search may leave to the proof
 
@@ -83,8 +83,8 @@ class _Run:
             solution = self._relax()
             if not _usable(solution):
                 return self._without_answer(solution)
-            separations = self._separate(solution.x)
-            worst = _worst(separations)
+            separations = separate(self.program, solution.x, self.tools, ALLOWED)
+            worst = worst_of(separations)
             violated = [_above(family, found) for family, found in separations]
             self._tell(number, solution, worst, sum(rows.size for _, rows, _ in violated))
             last = number == self.method.rounds
@@ -162,10 +162,6 @@ class _Run:
     def _multipliers(self, solution: FiniteSolution) -> Array:
         return solution.y[solution.y.size - self.rows.h.size:]
 
-    def _separate(self, x: Array) -> list[tuple[ConstraintFamily, Separation]]:
-        return [(family, family.worst(x) if family.worst is not None
-                 else search_worst(family, x, self.tools.maximiser, self.tools.budget, self.tools.rng, ALLOWED)) for family in self.program.families]
-
     def _exchange(self, solution: FiniteSolution, violated: Sequence[tuple[Array, np.ndarray, str]]) -> int:
         """Drop the rows that have been slack for a while, add the violated ones; returns how many were new."""
         known, fresh = {(cut.family, cut.row, cut.index.tobytes()) for cut in self.rows.cuts}, Rows.none(self.program.n)
@@ -205,26 +201,9 @@ class _Run:
     def _without_answer(self, solution: FiniteSolution) -> Result:
         if solution.status != "infeasible":
             return self._result("failed", "; ".join(solution.attempts) or solution.message, solution, np.nan, None)
-        solution = self._irreducible(solution)
+        self.rows, solution = irreducible(self.relaxed, self.rows, solution)
         message, worst = clash(self.program, self.rows, self._multipliers(solution), solution.infeasibility)
         return self._result("infeasible", message, solution, np.nan, worst)
-
-    def _irreducible(self, solution: FiniteSolution) -> FiniteSolution:
-        """Drop the constraints without which nothing is feasible either, the least important first: what is left explains itself."""
-        for _ in range(PRUNED):
-            y = self._multipliers(solution)
-            support = np.flatnonzero(y > 0.0)
-            self.rows, y = self.rows.take(support), y[support]
-            for position in np.argsort(y, kind="stable") if y.size > 1 else ():
-                fewer = self.rows.take(np.arange(y.size) != position)
-                without = self.relaxed.solve(fewer, 0.0)
-                if without.status == "infeasible":
-                    self.rows, solution = fewer, without
-                    break
-            else:
-                fixed = solution.y[:self.program.finite.h.size]
-                return replace(solution, y=np.concatenate([fixed, y]))
-        return solution
 
     def _result(self, status: Status, message: str, solution: FiniteSolution, cost: float, worst: Witness | None) -> Result:
         y = self._multipliers(solution) if solution.y.size >= self.rows.h.size else np.zeros(self.rows.h.size)
@@ -248,8 +227,3 @@ def _usable(solution: FiniteSolution) -> bool:
     """Whether a relaxed solution is good for a round: a crude optimiser costs rounds, but no claim rests on its accuracy."""
     scale = max(1.0, abs(solution.value))
     return solution.status == "optimal" or (solution.status == "failed" and solution.residual <= CRUDE and solution.gap <= CRUDE * scale)
-
-
-def _worst(separations: Sequence[tuple[ConstraintFamily, Separation]]) -> Witness:
-    found = [Witness(float(s.violations[0]), family.name, s.indices[0], int(s.rows[0])) for family, s in separations if s.violations.size]
-    return max(found, key=lambda one: one.violation, default=Witness(-np.inf, "", np.zeros(0)))

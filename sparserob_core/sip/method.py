@@ -28,13 +28,17 @@ class Continuation:
 
 @dataclass(frozen=True, eq=False)
 class Tools:
-    """The components that a config has chosen. ``regulariser`` may be ``None``: the unregularised program is then solved."""
+    """The components that a config has chosen. ``regulariser`` may be ``None``: the unregularised program is then solved.
+
+    ``budget``: evaluations that one search of the maximiser may spend, of which the share ``polish`` goes to a local method at its end.
+    """
 
     solver: Solver
     maximiser: Maximiser | None = None
     regulariser: Regulariser | None = None
     continuation: Continuation = Continuation()
     budget: int = 2000
+    polish: float = 0.0
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
     notify: Notify = silence
 

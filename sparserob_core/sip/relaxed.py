@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
 LAZY = 1e-9     # rows violated by less than this, relative to their norm, are not added
-ROUNDS = 50     # lazy additions at most within one evaluation
+ROUNDS = 200    # lazy additions at most within one evaluation
+DROPPING = 20   # of them, those that also drop the rows without a multiplier; later rows are only added, so that nothing can cycle
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,12 +63,42 @@ def rows_at(program: SemiInfiniteProgram, family: str, indices: Array, rows: np.
 
 @dataclass(frozen=True, eq=False)
 class RelaxedSolution:
-    """``value`` of ``g`` (``+inf`` when infeasible), its optimiser, the rows that carry a multiplier, and the checked finite solution."""
+    """``value`` of ``g`` (see `value_of`), its optimiser, the rows that were imposed, and the checked finite solution with them."""
 
     value: float
     decision: Array
     rows: Rows
     finite: FiniteSolution
+
+    def multipliers(self) -> dict[tuple[str, bytes, int], float]:
+        """The multipliers of the imposed rows, by family, index and row."""
+        y = self.finite.y[self.finite.y.size - self.rows.h.size:]
+        return {_key(cut): float(m) for cut, m in zip(self.rows.cuts, y, strict=False)}
+
+
+@dataclass(frozen=True, eq=False)
+class Imposed:
+    """Which rows of a pool are imposed: their ``positions (k,)`` and ``multipliers (k,)``, and the solution these are from, if any."""
+
+    positions: np.ndarray
+    multipliers: Array
+    solution: FiniteSolution | None = None
+
+
+def value_of(solution: FiniteSolution) -> float:
+    """``g``: ``+inf`` where proven infeasible; where no optimum was believed the proven lower bound, so never more than the truth."""
+    return {"optimal": solution.value, "infeasible": np.inf}.get(solution.status, solution.lower_bound)
+
+
+def _key(cut: Cut) -> tuple[str, bytes, int]:
+    return cut.family, cut.index.tobytes(), cut.row
+
+
+def _most_violated(excess: Array, kinds: np.ndarray) -> np.ndarray:
+    """The position of the largest excess of every kind, where it is above `LAZY`."""
+    violated = np.flatnonzero(excess > LAZY)
+    order = violated[np.lexsort((-excess[violated], kinds[violated]))]
+    return np.asarray(order[np.flatnonzero(np.diff(kinds[order], prepend=-1))], dtype=int)
 
 
 class CountedSolver(Solver):
@@ -94,7 +125,7 @@ class RelaxedProgram:
     tolerance: float = 1e-9
     solves: int = 0
     _terms: tuple[csc_array, Array] | None = None
-    _last: tuple[Rows, FiniteSolution] | None = None
+    _last: RelaxedSolution | None = None
     _programs: dict[float, FiniteProgram] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -107,20 +138,14 @@ class RelaxedProgram:
             lengths = np.ones(images) if self.program.lengths is None else self.program.lengths
             self._terms = self.regulariser.quadratic(ControlImage(csc_array(S), self.program.channels, lengths))
 
-    def finite(self, rows: Rows, epsilon: float, margin: float = 0.0) -> FiniteProgram:
-        """The finite program with these rows, every one of them tightened by ``margin`` times its norm."""
-        base = self._regularised(epsilon)
-        norms = np.linalg.norm(rows.G, axis=1) if margin else 0.0
-        return replace(base, G=np.vstack([base.G, rows.G]), h=np.concatenate([base.h, rows.h - margin * norms]))
-
     def solve(self, rows: Rows, epsilon: float, margin: float = 0.0, guess: FiniteSolution | None = None) -> FiniteSolution:
-        """Solve with all of these rows at once; ``guess`` is a solution with the same rows."""
-        self.solves += 1
-        return solve_finite(self.finite(rows, epsilon, margin), self.counted, tolerance=self.tolerance, guess=guess)
+        """Solve with all of these rows at once, each tightened by ``margin`` times its norm; ``guess`` is a solution with the same rows."""
+        norms = np.linalg.norm(rows.G, axis=1) if margin else 0.0
+        return self._solved(rows.G, rows.h - margin * norms, epsilon, guess)
 
     def lower_bound(self, rows: Rows, solution: FiniteSolution) -> float:
         """A lower bound of the *unregularised* semi-infinite program, from the multipliers of any solution with these rows (weak duality)."""
-        plain = self.finite(rows, 0.0)
+        plain = self.finite(rows.G, rows.h, 0.0)
         bounds = [dual_bound(plain, solution.y, solution.mu, solution.z, at=solution.x)]
         if plain.P is None and np.isfinite(solution.x).all():
             y, mu = vertex_multipliers(plain, solution.x, solution.y, solution.mu)
@@ -132,30 +157,54 @@ class RelaxedProgram:
         pool = Rows.none(self.program.n)
         for family, points in indices.items():
             pool = pool.joined(rows_at(self.program, family, points))
-        norms = np.maximum(np.linalg.norm(pool.G, axis=1), np.finfo(float).tiny)
-        working = self._matching(pool)
-        for _ in range(ROUNDS):
-            rows = pool.take(working)
-            solution = self.solve(rows, epsilon)
-            self._last = (rows, solution)
-            if solution.status != "optimal":
-                break
-            violated = np.setdiff1d(np.flatnonzero((pool.G @ solution.x - pool.h) / norms > LAZY), working)
-            if not violated.size:
-                break
-            order = np.argsort(-((pool.G[violated] @ solution.x - pool.h[violated]) / norms[violated]))
-            working = np.concatenate([working, violated[order[: max(10, working.size)]]])
-        value = {"optimal": solution.value, "infeasible": np.inf}.get(solution.status, np.nan)
-        return RelaxedSolution(value, solution.x, rows, solution)
+        known = {} if self._last is None else self._last.multipliers()
+        start = [(i, y) for i, cut in enumerate(pool.cuts) if (y := known.get(_key(cut), 0.0)) > 0.0]
+        kinds = {kind: number for number, kind in enumerate(dict.fromkeys((cut.family, cut.row) for cut in pool.cuts))}
+        imposed = Imposed(np.array([i for i, _ in start], dtype=int), np.array([y for _, y in start]),
+                          None if self._last is None else self._last.finite)
+        imposed, solution = self.lazily(
+            pool.G, pool.h, np.array([kinds[cut.family, cut.row] for cut in pool.cuts], dtype=int), epsilon, imposed)
+        self._last = RelaxedSolution(value_of(solution), solution.x, pool.take(imposed.positions), solution)
+        return self._last
 
-    def _matching(self, pool: Rows) -> np.ndarray:
-        """Positions in the pool of the rows that were active in the last evaluation."""
-        if self._last is None or self._last[1].y.size < self._last[0].h.size:
-            return np.zeros(0, dtype=int)
-        rows, solution = self._last
-        active = solution.y[solution.y.size - rows.h.size:] > 0
-        keys = {(cut.family, cut.index.tobytes(), cut.row) for cut, on in zip(rows.cuts, active, strict=True) if on}
-        return np.array([i for i, cut in enumerate(pool.cuts) if (cut.family, cut.index.tobytes(), cut.row) in keys], dtype=int)
+    def lazily(self, G: Array, h: Array, kinds: np.ndarray, epsilon: float, start: Imposed,
+               norms: Array | None = None) -> tuple[Imposed, FiniteSolution]:
+        """Solve with all rows ``G x <= h`` by imposing few of them: those of ``start``, then the most violated of every kind ``(r,)``,
+        until no other is violated. Returns the rows imposed last, in terms of which the solution's multipliers are."""
+        norms = np.maximum(np.linalg.norm(G, axis=1), np.finfo(float).tiny) if norms is None else norms
+        positions, guess = start.positions, self._guess(start)
+        for number in range(ROUNDS):
+            solution = self._solved(G[positions], h[positions], epsilon, guess)
+            multipliers = solution.y[solution.y.size - positions.size:] if solution.y.size >= positions.size else np.zeros(positions.size)
+            imposed = Imposed(positions, multipliers, solution)
+            if solution.status == "infeasible" or not np.isfinite(solution.x).all():
+                break
+            excess = (G @ solution.x - h) / norms
+            excess[positions] = -np.inf
+            fresh = _most_violated(excess, kinds)
+            if not fresh.size:
+                break
+            needed = (multipliers > 0.0) | (number > DROPPING)
+            positions = np.concatenate([positions[needed], fresh])
+            guess = self._guess(Imposed(positions, np.concatenate([multipliers[needed], np.zeros(fresh.size)]), solution))
+        return imposed, solution
+
+    def _guess(self, start: Imposed) -> FiniteSolution | None:
+        """The solution that the imposed rows came with, with their multipliers."""
+        last = start.solution
+        if last is None or not np.isfinite(last.x).all():
+            return None
+        fixed = last.y[:self.program.finite.h.size]
+        return replace(last, y=np.concatenate([fixed, start.multipliers]))
+
+    def _solved(self, G: Array, h: Array, epsilon: float, guess: FiniteSolution | None) -> FiniteSolution:
+        self.solves += 1
+        return solve_finite(self.finite(G, h, epsilon), self.counted, tolerance=self.tolerance, guess=guess)
+
+    def finite(self, G: Array, h: Array, epsilon: float) -> FiniteProgram:
+        """The finite program with these rows."""
+        base = self._regularised(epsilon)
+        return replace(base, G=np.vstack([base.G, G]), h=np.concatenate([base.h, h]))
 
     def _regularised(self, epsilon: float) -> FiniteProgram:
         base = self.program.finite

@@ -51,6 +51,18 @@ class Witness:
     disturbance: Array | None = field(default=None, repr=False)
 
 
+@dataclass(frozen=True, eq=False)
+class SearchTrace:
+    """Every evaluation of ``g``, in order: the outer iteration ``outer (n,)`` and its ``epsilon (n,)``, the ``value (n,)`` of ``g``, the best
+    lower bound ``bound (n,)`` proven until then of the unregularised semi-infinite program, and ``seconds (n,)`` since the start."""
+
+    outer: Array
+    epsilon: Array
+    value: Array
+    bound: Array
+    seconds: Array
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Result:
     """The outcome of a method.
@@ -58,7 +70,7 @@ class Result:
     ``cost`` is ``J`` of ``decision`` (no regulariser), ``value`` is ``J + epsilon rho``; ``lower_bound`` and ``upper_bound`` enclose the
     value of the *unregularised* semi-infinite program; ``lower_bound`` is proven in any case, ``upper_bound`` (the cost) only when ``status``
     is certified or verified: it is what the search suggests when undecided, and infinite when refuted.
-    ``gap = (upper_bound - lower_bound) / max(1, |upper_bound|)``.
+    ``gap = (upper_bound - lower_bound) / max(1, |upper_bound|)``. ``trace``: for a method that searches, every value of ``g``.
     """
 
     status: Status
@@ -73,6 +85,7 @@ class Result:
     indices: Sequence[Cut] = ()
     counts: Mapping[str, int] = field(default_factory=dict)
     history: Sequence[RoundFinished] = ()
+    trace: SearchTrace | None = None
     seconds: float = 0.0
 
     @property

@@ -11,7 +11,7 @@ from sparserob_core.sip.certificate import Proof
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.duality import dual_bound
 from sparserob_core.sip.finite import FiniteProgram
-from sparserob_core.sip.program import SemiInfiniteProgram
+from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation
 from sparserob_core.sip.relaxed import Rows
 from sparserob_core.sip.result import MEANING, Status, Witness
 
@@ -28,6 +28,12 @@ def verdict(proofs: Sequence[Proof], gap: float, tolerance: float) -> tuple[Stat
         return "undecided", "; ".join(undecided)
     status: Status = "certified" if gap <= tolerance else "verified"
     return status, f"{MEANING[status]} (gap {max(gap, 0.0):.1e})"
+
+
+def worst_of(separations: Sequence[tuple[ConstraintFamily, Separation]]) -> Witness:
+    """The most violated constraint that the separations of all families have found."""
+    found = [Witness(float(s.violations[0]), family.name, s.indices[0], int(s.rows[0])) for family, s in separations if s.violations.size]
+    return max(found, key=lambda one: one.violation, default=Witness(-np.inf, "", np.zeros(0)))
 
 
 def witness(program: SemiInfiniteProgram, searched: Witness, proofs: Sequence[Proof]) -> Witness:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import sparserob_core as sr
-from sparserob_core.sip.maximiser import CountedObjective, maximise
+from sparserob_core.sip.search import CountedObjective, Target, maximise
 
 SQUARE = sr.Box([-1.0, -1.0], [1.0, 1.0])
 
@@ -31,7 +31,7 @@ class Asking(sr.Maximiser):
 
 
 def search(maximiser, function=hill, budget=100):
-    return maximise(function, SQUARE, maximiser, budget, np.random.default_rng(0))
+    return maximise(Target(function, SQUARE), maximiser, budget, np.random.default_rng(0))
 
 
 @given(budget=st.integers(1, 40), sizes=st.lists(st.integers(0, 30), min_size=1, max_size=6))
@@ -55,7 +55,7 @@ def test_notes_are_columns_against_the_number_of_evaluations():
 
 @pytest.mark.parametrize("point", [[1.0000001, 0.0], [np.nan, 0.0], [0.0, -np.inf]])
 def test_a_point_outside_the_domain_is_refused_and_not_counted(point):
-    objective = CountedObjective(hill, SQUARE, 10)
+    objective = CountedObjective(Target(hill, SQUARE), 10)
     with pytest.raises(sr.InputError, match="outside the domain"):
         objective.evaluate(np.array([[0.0, 0.0], point]))
     assert objective.evaluations == 0
@@ -64,11 +64,11 @@ def test_a_point_outside_the_domain_is_refused_and_not_counted(point):
 @pytest.mark.parametrize("points", [np.zeros(2), np.zeros((1, 3))])
 def test_points_of_the_wrong_shape_are_refused(points):
     with pytest.raises(sr.InputError, match=r"expected shape \(k, 2\)"):
-        CountedObjective(hill, SQUARE, 10).evaluate(points)
+        CountedObjective(Target(hill, SQUARE), 10).evaluate(points)
 
 
 def test_no_number_counts_as_minus_infinity():
-    objective = CountedObjective(lambda points: np.where(points[:, 0] < 0, np.nan, 1.0), SQUARE, 10)
+    objective = CountedObjective(Target(lambda points: np.where(points[:, 0] < 0, np.nan, 1.0), SQUARE), 10)
     np.testing.assert_array_equal(objective.evaluate(np.array([[-0.5, 0.0], [0.5, 0.0]])), [-np.inf, 1.0])
     assert objective.best_value == 1.0
 
@@ -128,11 +128,11 @@ def test_a_budget_that_is_no_positive_whole_number_is_refused(budget):
 
 def test_an_unbounded_domain_is_refused():
     with pytest.raises(sr.InputError, match="bounded box"):
-        CountedObjective(hill, sr.Box([0.0], [np.inf]), 10)
+        CountedObjective(Target(hill, sr.Box([0.0], [np.inf])), 10)
 
 
 def test_observers_hear_of_every_evaluation_once():
     events = []
-    maximise(hill, SQUARE, Asking(3, 4), 100, np.random.default_rng(0), events.append)
+    maximise(Target(hill, SQUARE), Asking(3, 4), 100, np.random.default_rng(0), notify=events.append)
     assert sum(event.count for event in events) == events[-1].total == 7
     assert events[-1].notes == {"size": 4.0}

@@ -43,7 +43,7 @@ def load(*files: Path) -> Registry:
 
 def test_the_framework_registers_its_own_components_like_anybody_else() -> None:
     registry = load()
-    assert registry.names("method") == ["exchange", "nominal", "scenario"]
+    assert registry.names("method") == ["exchange", "nominal", "scenario", "sparserob"]
     assert registry.get("problem", "linear").plugin == "core"
     assert registry.names("solver") == []
 

@@ -39,7 +39,7 @@ def experiment_one(dictionary: sr.DictionaryFactory) -> FiniteProgram:
         times = np.linspace(family.index_set.lower, family.index_set.upper, 8)
         found = rows_at(program, family.name, np.unique(times, axis=0))
         rows = found if rows is None else rows.joined(found)
-    return RelaxedProgram(program, SOLVERS[0]).finite(rows, 0.0)
+    return RelaxedProgram(program, SOLVERS[0]).finite(rows.G, rows.h, 0.0)
 
 
 @pytest.mark.parametrize("pieces", [50, 250])

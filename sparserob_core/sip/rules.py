@@ -1,0 +1,199 @@
+"""The four pieces of the paper's algorithm that a user may replace: ``Regu``, ``SC1``, ``SC2`` and ``SlCr``.
+
+Each is an object that is called; a plain function with the same arguments serves as well.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from bisect import bisect_right
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import exp
+from typing import final
+
+import numpy as np
+
+from sparserob_core.sip.convex_set import Array
+
+
+@dataclass(frozen=True, eq=False)
+class OuterStep:
+    """What one outer iteration ``j`` ended with: ``epsilon``, the best ``value`` of ``g``, the ``cost`` J of its optimiser ``decision (n,)``,
+    and the lower bound of the semi-infinite program that its multipliers prove."""
+
+    j: int
+    epsilon: float
+    value: float
+    cost: float
+    lower_bound: float
+    decision: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Progress:
+    """How a search stands: ``evaluations`` so far, ``best_value``, the last scalars that the maximiser noted (``temperature``, ...), and
+    ``improvements``, the pairs (evaluations so far, best value) at which the best value rose."""
+
+    evaluations: int
+    best_value: float
+    notes: Mapping[str, float]
+    improvements: Sequence[tuple[int, float]]
+
+    def gain(self, window: int) -> float:
+        """By how much the best value rose within the last ``window`` evaluations; ``inf`` where there were not so many."""
+        earlier = bisect_right(self.improvements, (self.evaluations - window, np.inf)) - 1
+        return np.inf if earlier < 0 or window >= self.evaluations else self.best_value - self.improvements[earlier][1]
+
+
+class Schedule(ABC):
+    """``Regu``: the weight of the regulariser in the next outer iteration."""
+
+    @abstractmethod
+    def __call__(self, epsilon: float, j: int) -> float:
+        """The weight in iteration ``j = 1, 2, ...`` where iteration ``j - 1`` had ``epsilon``; smaller, and positive."""
+
+
+class OuterStop(ABC):
+    """``SC1``: when the optimisers of successive outer iterations are near enough to one another."""
+
+    @abstractmethod
+    def __call__(self, steps: Sequence[OuterStep]) -> bool:
+        """Whether to stop after these outer iterations, of which there is at least one."""
+
+
+class InnerStop(ABC):
+    """``SC2``: when one global maximisation has gone on for long enough; its budget bounds it in any case."""
+
+    @abstractmethod
+    def __call__(self, progress: Progress) -> bool:
+        """Whether to stop the search; asked after every batch of evaluations."""
+
+
+class Selection(ABC):
+    """``SlCr``: whether a walk goes on from a candidate."""
+
+    @abstractmethod
+    def __call__(self, current: float, candidate: float, temperature: float, rng: np.random.Generator) -> bool:
+        """Whether the candidate's value replaces the current one, at a temperature that is not negative."""
+
+
+@final
+@dataclass(frozen=True)
+class Geometric(Schedule):
+    """``factor`` times the weight before: the paper's ``2^-j`` times the first, for the factor 1/2."""
+
+    factor: float = 0.5
+
+    def __call__(self, epsilon: float, j: int) -> float:
+        return self.factor * epsilon
+
+
+@final
+@dataclass(frozen=True)
+class Accelerating(Schedule):
+    """``factor^j`` times the weight before: the paper's ``Regu(epsilon, j) = 2^-j epsilon`` applied again and again."""
+
+    factor: float = 0.5
+
+    def __call__(self, epsilon: float, j: int) -> float:
+        return self.factor**j * epsilon
+
+
+@final
+@dataclass(frozen=True)
+class OptimisersSettle(OuterStop):
+    """The norm of the difference of successive optimisers is at most ``tolerance``, relative to the norm of the last one or 1."""
+
+    tolerance: float = 1e-3
+
+    def __call__(self, steps: Sequence[OuterStep]) -> bool:
+        if len(steps) < 2:
+            return False
+        last, before = steps[-1].decision, steps[-2].decision
+        return bool(np.linalg.norm(last - before) <= self.tolerance * max(1.0, float(np.linalg.norm(last))))
+
+
+@final
+@dataclass(frozen=True)
+class CostsSettle(OuterStop):
+    """The cost ``J`` of successive optimisers changes by at most ``tolerance``, relative to it or 1."""
+
+    tolerance: float = 1e-6
+
+    def __call__(self, steps: Sequence[OuterStep]) -> bool:
+        return len(steps) >= 2 and abs(steps[-1].cost - steps[-2].cost) <= self.tolerance * max(1.0, abs(steps[-1].cost))
+
+
+@final
+@dataclass(frozen=True)
+class Iterations(OuterStop):
+    """After ``count`` outer iterations."""
+
+    count: int = 10
+
+    def __call__(self, steps: Sequence[OuterStep]) -> bool:
+        return len(steps) >= self.count
+
+
+@final
+@dataclass(frozen=True)
+class Evaluations(InnerStop):
+    """After ``count`` evaluations; ``None``: when the budget is spent."""
+
+    count: int | None = None
+
+    def __call__(self, progress: Progress) -> bool:
+        return self.count is not None and progress.evaluations >= self.count
+
+
+@final
+@dataclass(frozen=True)
+class TemperatureFloor(InnerStop):
+    """When the temperature that an annealing maximiser notes is at most ``floor``; other maximisers note none, and are not stopped."""
+
+    floor: float = 1e-6
+
+    def __call__(self, progress: Progress) -> bool:
+        return progress.notes.get("temperature", np.inf) <= self.floor
+
+
+@final
+@dataclass(frozen=True)
+class Stalled(InnerStop):
+    """When the best value rose by no more than ``tolerance`` within the last ``window`` evaluations."""
+
+    window: int = 200
+    tolerance: float = 1e-9
+
+    def __call__(self, progress: Progress) -> bool:
+        return progress.gain(self.window) <= self.tolerance
+
+
+@final
+@dataclass(frozen=True)
+class Metropolis(Selection):
+    """Accept what is not worse, and what is worse by ``delta`` with probability ``exp(-delta / temperature)`` (Metropolis et al. 1953)."""
+
+    def __call__(self, current: float, candidate: float, temperature: float, rng: np.random.Generator) -> bool:
+        if candidate >= current:
+            return True
+        return temperature > 0.0 and rng.random() < exp(max(-700.0, (candidate - current) / temperature))
+
+
+@final
+@dataclass(frozen=True)
+class Threshold(Selection):
+    """Accept what is worse by no more than the temperature (threshold accepting: Dueck and Scheuer 1990)."""
+
+    def __call__(self, current: float, candidate: float, temperature: float, rng: np.random.Generator) -> bool:
+        return candidate >= current - temperature
+
+
+@final
+@dataclass(frozen=True)
+class Improvement(Selection):
+    """Accept only what is not worse."""
+
+    def __call__(self, current: float, candidate: float, temperature: float, rng: np.random.Generator) -> bool:
+        return candidate >= current

@@ -1,0 +1,213 @@
+"""The paper's algorithm SparseRob(x0, epsilon): the value ``g`` of the relaxed program, maximised over tuples of indices.
+
+Its theorem (the paper's, after Das, Aravind, Cherukuri and Chatterjee 2022, theorem 1): with as many indices as decision variables the
+maximum of ``g`` over tuples is the value of the semi-infinite program, and its optimiser there an optimiser. A search that has not met the
+maximum leaves constraints violated; so every decision is proven or refuted like any other, and the lower bound comes from multipliers.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from sparserob_core.errors import InputError
+from sparserob_core.sip.certificate import Proof, prove
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.events import RoundFinished
+from sparserob_core.sip.infeasible import irreducible
+from sparserob_core.sip.maximiser import Maximiser, Objective, Report
+from sparserob_core.sip.method import Method, Tools
+from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
+from sparserob_core.sip.relaxed import RelaxedProgram, Rows
+from sparserob_core.sip.result import Result, SearchTrace, Status, Witness, relative_gap
+from sparserob_core.sip.rules import Geometric, Metropolis, OptimisersSettle, OuterStep, Progress
+from sparserob_core.sip.search import Rules, Target, maximise
+from sparserob_core.sip.separation import separate
+from sparserob_core.sip.tuples import TupleValue
+from sparserob_core.sip.verdict import clash, verdict, witness, worst_of
+
+
+@dataclass(frozen=True)
+class SparseRob(Method):
+    """Maximise ``g(epsilon; xi^1, ..., xi^D)`` for smaller and smaller ``epsilon``.
+
+    ``formulation``: ``literal`` indices ``(t, Beta, p)`` as in the paper, or ``reduced`` ones ``(t, p)``, at which the worst ``Beta`` is in
+    closed form. ``indices``: D, by default the number of decision variables. The four rules are the paper's user-defined pieces: ``regu``
+    gives the next weight, ``sc1`` ends the outer iteration, ``sc2`` a search, ``slcr`` is what a maximiser that walks accepts; each is a rule of
+    `sparserob_core.sip.rules` or a function with the same arguments. ``tolerance``: relative gap at which the bounds have met.
+    Raises `InputError` for a formulation that a family does not have, for a missing maximiser, and for weights that do not decrease.
+    """
+
+    formulation: Literal["reduced", "literal"] = "reduced"
+    indices: int | None = None
+    regu: Callable[[float, int], float] | None = None
+    sc1: Callable[[Sequence[OuterStep]], bool] | None = None
+    sc2: Callable[[Progress], bool] | None = None
+    slcr: Callable[[float, float, float, np.random.Generator], bool] | None = None
+    tolerance: float = 1e-7
+
+    def __post_init__(self) -> None:
+        if self.formulation not in ("reduced", "literal"):
+            raise InputError(f"formulation: expected reduced or literal, got {self.formulation!r}")
+        if self.indices is not None and (self.indices != int(self.indices) or self.indices < 1):
+            raise InputError(f"indices: expected a whole number of at least 1, got {self.indices!r}")
+        for name in ("regu", "sc1", "sc2", "slcr"):
+            if getattr(self, name) is not None and not callable(getattr(self, name)):
+                raise InputError(f"{name}: expected the name of a rule, a mapping with a name, or a function, got {getattr(self, name)!r}")
+
+    def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
+        """`certified`, `verified` or, as a rule, `refuted` with the uncertainty that breaks the decision; `infeasible` where ``g`` is infinite."""
+        if tools.maximiser is None:
+            raise InputError("maximiser: expected one, got none; the method sparserob is a search")
+        if not program.families:
+            raise InputError("families: the method sparserob searches their indices, but the program has none; expected the method exchange")
+        return _Run(self, program, tools).solve()
+
+
+@dataclass(eq=False)
+class _Run:
+    """One run: ``g``, the best tuple so far, the lower bound."""
+
+    method: SparseRob
+    program: SemiInfiniteProgram
+    tools: Tools
+    started: float = field(default_factory=time.perf_counter)
+    lower: float = -np.inf
+    history: list[RoundFinished] = field(default_factory=list)
+    steps: list[OuterStep] = field(default_factory=list)
+    parts: list[SearchTrace] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        literal = self.method.formulation == "literal"
+        self.imposed = replace(self.program, families=[_literal(family) for family in self.program.families]) if literal else self.program
+        self.relaxed = RelaxedProgram(self.imposed, self.tools.solver, self.tools.regulariser)
+        self.g = TupleValue(self.imposed, self.relaxed, self.method.indices or self.program.n)
+
+    def solve(self) -> Result:
+        regu = self.method.regu or Geometric(self.tools.continuation.factor)
+        sc1 = self.method.sc1 or OptimisersSettle()
+        epsilon = 0.0 if self.tools.regulariser is None else self.tools.continuation.start
+        point = self.tools.rng.uniform(self.g.domain.lower, self.g.domain.upper)  # (t_0, Beta_0)
+        j = 0
+        while True:
+            point = self._search(point, epsilon, j)
+            if self.g.solution.status == "infeasible" or not np.isfinite(self.g.solution.x).all():
+                return self._without_answer(epsilon)
+            if epsilon <= self.tools.continuation.stop or sc1(self.steps):
+                return self._finished(epsilon)
+            j += 1
+            epsilon = max(self.tools.continuation.stop, _smaller(regu(epsilon, j), epsilon))
+
+    def _search(self, point: Array, epsilon: float, j: int) -> Array:
+        """Maximise ``g`` from the best tuple so far; ``g`` is left at the tuple that is returned."""
+        g, began = self.g, time.perf_counter() - self.started
+        g.epsilon, bounds = epsilon, _Bounds(self)
+        rules = Rules(self.method.sc2, self.method.slcr or Metropolis(), self.tools.polish)
+        target = Target(bounds, g.domain, g.gradient, g.block)
+        assert self.tools.maximiser is not None
+        report = maximise(target, _From(point, self.tools.maximiser), self.tools.budget, self.tools.rng, rules, self.tools.notify)
+        self._record(report, bounds, epsilon, j, began)
+        if report.interrupted:
+            raise KeyboardInterrupt
+        value = g.at(report.best_point)
+        cost = self.program.cost(g.solution.x)
+        self.steps.append(OuterStep(j, epsilon, value, cost, self.lower, g.solution.x))
+        if np.isfinite(value):
+            self._tell(j, epsilon)
+        return report.best_point
+
+    def _record(self, report: Report, bounds: _Bounds, epsilon: float, j: int, began: float) -> None:
+        count = report.evaluations
+        self.parts.append(SearchTrace(np.full(count, j), np.full(count, epsilon), report.trace.values,
+                                      np.array(bounds.proven[:count]), began + report.trace.seconds))
+
+    def _tell(self, j: int, epsilon: float) -> None:
+        worst = self._worst()
+        event = RoundFinished(
+            round=j + 1, epsilon=epsilon, lower_bound=self.lower, upper_bound=np.inf, violation=worst.violation, worst_family=worst.constraint,
+            active_indices=int((self.g.imposed.multipliers > 0).sum()), relaxed_programs=self.relaxed.solves,
+            seconds=time.perf_counter() - self.started)
+        self.history.append(event)
+        self.tools.notify(event)
+
+    def _worst(self) -> Witness:
+        """The most violated constraint of the whole family, whatever the tuple."""
+        return worst_of(separate(self.program, self.g.solution.x, self.tools))
+
+    def _finished(self, epsilon: float) -> Result:
+        rows, x = self.g.rows(), self.g.solution.x
+        plain = self.relaxed.solve(rows, 0.0)
+        if plain.status == "optimal":
+            self.lower = max(self.lower, self.relaxed.lower_bound(rows, plain))
+        cost = self.program.cost(x)
+        proofs: tuple[Proof, ...] = prove(self.program, x, self.tools.notify)
+        status, message = verdict(proofs, relative_gap(self.lower, cost, self.program.cost_scale), self.method.tolerance)
+        return self._result(status, message, rows, cost, epsilon, witness(self.program, self._worst(), proofs))
+
+    def _without_answer(self, epsilon: float) -> Result:
+        rows, solution = self.g.rows(), self.g.solution
+        if solution.status != "infeasible":
+            return self._result("failed", "; ".join(solution.attempts) or solution.message, rows, np.nan, epsilon, None)
+        rows, solution = irreducible(self.relaxed, rows, solution)
+        y = solution.y[solution.y.size - rows.h.size:]
+        message, worst = clash(self.imposed, rows, y, solution.infeasibility)
+        rows = replace(rows, cuts=tuple(replace(cut, multiplier=float(m)) for cut, m in zip(rows.cuts, y, strict=True)))
+        return self._result("infeasible", message, rows, np.nan, epsilon, worst)
+
+    def _result(self, status: Status, message: str, rows: Rows, cost: float, epsilon: float, worst: Witness | None) -> Result:
+        cuts = tuple(cut for cut in rows.cuts if cut.multiplier > 0.0)
+        columns = {name: np.concatenate([getattr(part, name) for part in self.parts]) for name in SearchTrace.__dataclass_fields__}
+        return Result(
+            status=status, message=message, decision=self.g.solution.x if status not in ("infeasible", "failed") else None, cost=cost,
+            value=self.steps[-1].value, epsilon=epsilon, lower_bound=np.inf if status == "infeasible" else self.lower,
+            upper_bound=cost if status in ("certified", "verified", "undecided") else np.inf, worst=worst, indices=cuts,
+            counts={"relaxed_programs": self.relaxed.solves, "rounds": len(self.steps), "active_indices": len(cuts),
+                    "solver_calls": self.relaxed.counted.calls, "evaluations": int(columns["value"].size)},
+            history=tuple(self.history), trace=SearchTrace(**columns), seconds=time.perf_counter() - self.started)
+
+
+class _Bounds:
+    """``g`` for the maximiser; of every value that is the best so far the multipliers are turned into a lower bound."""
+
+    def __init__(self, run: _Run) -> None:
+        self.run, self.best = run, -np.inf
+        self.proven: list[float] = []
+
+    def __call__(self, points: Array) -> Array:
+        return np.array([self._value(point) for point in points])
+
+    def _value(self, point: Array) -> float:
+        run = self.run
+        value = run.g.at(point)
+        if np.isfinite(value) and value > self.best:
+            self.best = value
+            run.lower = max(run.lower, run.relaxed.lower_bound(run.g.rows(), run.g.solution))
+        self.proven.append(run.lower)
+        return value
+
+
+class _From(Maximiser):
+    """A maximiser that finds one point evaluated already: the first tuple, or the best of the iteration before."""
+
+    def __init__(self, point: Array, maximiser: Maximiser) -> None:
+        self.point, self.maximiser = point, maximiser
+
+    def search(self, objective: Objective, rng: np.random.Generator) -> float:
+        objective.evaluate(self.point[np.newaxis])
+        return self.maximiser.search(objective, rng)
+
+
+def _literal(family: ConstraintFamily) -> ConstraintFamily:
+    if family.literal is None:
+        raise InputError(f"formulation: literal needs families with a disturbance in their index, which {family.name} is not; expected reduced")
+    return family.literal
+
+
+def _smaller(weight: object, before: float) -> float:
+    if isinstance(weight, int | float | np.floating) and 0.0 < weight < before:
+        return float(weight)
+    raise InputError(f"regu: expected a positive weight below {before!r}, got {weight!r}")
