@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sparserob_core.control.dictionary import Dictionary
-from sparserob_core.control.directions import on_surface, sampled, unit
+from sparserob_core.control.directions import across, on_surface, sampled, unit
 from sparserob_core.control.peaks import climb
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.program import ConstraintFamily, Explanation, Separation
@@ -26,9 +26,9 @@ class ControlConstraint:
         """The constraint as a family; it does not depend on any uncertainty."""
         m = self.set.dimension
         index_set = Box(np.concatenate([[0.0], -np.ones(m)]), np.concatenate([[self.dictionary.horizon], np.ones(m)]))
-        family = ConstraintFamily(name="control", index_set=index_set, rows=self.rows, worst=self.worst, explain=self.explain)
-        return ConstraintFamily(name="control", index_set=index_set, rows=self.rows, worst=self.worst, explain=self.explain,
-                                nominal=family, sample=lambda count, rng: family, literal=family)
+        family = ConstraintFamily(name="control", index_set=index_set, rows=self.rows, worst=self.worst, gradient=self.gradient,
+                                  explain=self.explain)
+        return replace(family, nominal=family, sample=lambda count, rng: family, literal=family)
 
     def rows(self, indices: Array) -> tuple[Array, Array]:
         """``G (k, 1, n)``, ``rhs (k, 1)`` at indices ``(k, 1 + m)``."""
@@ -36,6 +36,13 @@ class ControlConstraint:
         values = self.dictionary.values[:, self._piece(indices[:, 0])].T
         G = np.einsum("kc,kn->kcn", directions, values).reshape(indices.shape[0], 1, -1)
         return G, self.set.support(directions)[:, None]
+
+    def gradient(self, x: Array, indices: Array, rows: Array) -> Array:
+        """The derivative ``(k, 1 + m)`` of ``row x - rhs`` in the index: 0 in time, since the control is constant on every piece."""
+        z = np.asarray(indices, dtype=float)[:, 1:]
+        control = self.dictionary.control(x)[:, self._piece(indices[:, 0])].T
+        turned = across(z, (control - self.set.support_point(unit(self.set, z))) @ self.set.normals.T)
+        return np.hstack([np.zeros((z.shape[0], 1)), turned])
 
     def worst(self, x: Array) -> Separation:
         """The pieces furthest outside, each with its worst direction; the bound is exact, since the pieces are finitely many."""

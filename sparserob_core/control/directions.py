@@ -18,6 +18,14 @@ def unit(convex_set: ConvexSet, z: Array) -> Array:
     return np.asarray(directions / np.where(norms > 0, norms, 1.0))
 
 
+def across(z: Array, slopes: Array) -> Array:
+    """Derivatives ``(k, b)`` in cube points, from derivatives ``slopes (k, b)`` in the coordinates of their unit directions; 0 at the point 0."""
+    lengths = np.linalg.norm(z, axis=1, keepdims=True)
+    shares = z / np.where(lengths > 0, lengths, 1.0)
+    sideways = slopes - (slopes * shares).sum(axis=1, keepdims=True) * shares
+    return np.asarray(np.where(lengths > 0, sideways / np.where(lengths > 0, lengths, 1.0), 0.0))
+
+
 def on_surface(z: Array) -> Array:
     """Cube points scaled to the surface of the cube."""
     size = np.abs(z).max(axis=-1, keepdims=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from sparserob_core.control.constraint import FlatConstraint
 from sparserob_core.control.curved_constraint import CurvedConstraint
 from sparserob_core.control.disturbance import DisturbanceModel
 from sparserob_core.control.parameters import ParameterIndex
+from sparserob_core.control.sensitivity import Sensitivity
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.program import ConstraintFamily, Separation
 
@@ -31,8 +33,8 @@ class LiteralConstraint:
         block, count = self._blocks.box, self.disturbance.block_count
         index_set = Box(np.concatenate([lower[:1], np.tile(block.lower, count), lower[1:]]),
                         np.concatenate([upper[:1], np.tile(block.upper, count), upper[1:]]))
-        return ConstraintFamily(name=self.base.name, index_set=index_set, rows=self.rows, worst=self.worst, reduced=reduced,
-                                explain=lambda index, row: self.base.explain(self._split(index[None])[0][0], row))
+        return ConstraintFamily(name=self.base.name, index_set=index_set, rows=self.rows, worst=self.worst, gradient=self.gradient,
+                                reduced=reduced, explain=lambda index, row: self.base.explain(self._split(index[None])[0][0], row))
 
     def rows(self, indices: Array) -> tuple[Array, Array]:
         """``G (k, r, n)``, ``rhs (k, r)`` at indices ``(k, 1 + beta + ...)``."""
@@ -54,7 +56,25 @@ class LiteralConstraint:
         indices = np.hstack([found.indices[:, :1], blocks, found.indices[:, 1:]])
         return Separation(indices, found.rows, found.violations, found.bound)
 
-    @property
+    def gradient(self, x: Array, indices: Array, rows: Array) -> Array:
+        """The derivative ``(k, d)`` of ``row x - rhs`` in the index (`Sensitivity`); in ``Beta``: the functional on every block."""
+        reduced, beta = self._split(np.asarray(indices, dtype=float))
+        slopes, weights = self._sensitivity.slopes(x, reduced, rows, self._signals(beta))
+        size, moves = self.disturbance.set.dimension, np.tile(self._movable, self.disturbance.block_count)
+        in_beta = self._blocks.pulled_back(beta.reshape(-1, size), self.disturbance.blocks(weights).reshape(-1, size)).reshape(beta.shape)
+        return np.hstack([slopes[:, :1], in_beta * moves, slopes[:, 1:]])
+
+    @cached_property
+    def _sensitivity(self) -> Sensitivity:
+        return Sensitivity(self.base)
+
+    @cached_property
+    def _movable(self) -> np.ndarray:
+        """Which coefficients of a block have more than one value."""
+        box = self._blocks.box
+        return np.asarray(box.upper > box.lower)
+
+    @cached_property
     def _blocks(self) -> ParameterIndex:
         return ParameterIndex(self.disturbance.set)
 
@@ -65,4 +85,4 @@ class LiteralConstraint:
 
     def _signals(self, beta: Array) -> Array:
         blocks = self._blocks.clamp(beta.reshape(-1, self.disturbance.set.dimension))
-        return self.disturbance.signals(blocks.reshape(beta.shape[0], self.disturbance.block_count, -1))
+        return self.disturbance.signals(blocks.reshape(beta.shape[0], self.disturbance.block_count, self.disturbance.set.dimension))

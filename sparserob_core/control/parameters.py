@@ -7,6 +7,7 @@ from itertools import product
 
 import numpy as np
 
+from sparserob_core.control.ray import outward, shares
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
 LATTICE = 4096  # points at most in the lattice over the parameters
@@ -35,14 +36,24 @@ class ParameterIndex:
         """Points ``(k, nu)`` of the box mapped onto the set: kept where inside, else drawn along the ray to an interior point."""
         if self.set is None or isinstance(self.set, Box):
             return parameters
-        middle = self.set.interior_point()
-        inside = self.set.contains(parameters, 0.0)
-        low, high = np.zeros(parameters.shape[0]), np.ones(parameters.shape[0])
-        for _ in range(50):
-            half = (low + high) / 2
-            ok = self.set.contains(middle + half[:, None] * (parameters - middle), 0.0)
-            low, high = np.where(ok, half, low), np.where(ok, high, half)
-        return np.where(inside[:, None], parameters, middle + low[:, None] * (parameters - middle))
+        share, middle = shares(self.set, parameters)[:, None], self.set.interior_point()
+        return np.where(share == 1.0, parameters, middle + share * (parameters - middle))
+
+    def pulled_back(self, parameters: Array, slopes: Array) -> Array:
+        """Derivatives ``(k, nu)`` in the points of the box, from derivatives ``slopes (k, nu)`` in what `clamp` makes of them.
+
+        A point ``p`` outside the set is drawn to ``middle + s (p - middle)`` on the boundary. With an outward normal ``v`` there, the derivative of
+        ``s`` is ``-s v / v'(p - middle)``. Points of the set stay where they are; at a corner of the set one of its normals is taken.
+        """
+        if self.set is None or isinstance(self.set, Box):
+            return slopes
+        share, middle, result = shares(self.set, parameters), self.set.interior_point(), slopes.astype(float)
+        outside = np.flatnonzero(share < 1.0)
+        ray, before, kept = parameters[outside] - middle, result[outside], share[outside, None]
+        normals = outward(self.set, middle + kept * ray)
+        across, along = (normals * ray).sum(axis=1, keepdims=True), (before * ray).sum(axis=1, keepdims=True)
+        result[outside] = kept * (before - np.where(across > 0, along / np.where(across > 0, across, 1.0), 0.0) * normals)
+        return result
 
     def touches(self, lower: Array, upper: Array) -> np.ndarray:
         """Whether cells ``[lower, upper]`` (``(k, nu)``) may meet the set; ``False`` only when they provably do not."""

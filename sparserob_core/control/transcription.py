@@ -19,6 +19,7 @@ from sparserob_core.control.problem import OptimalControlProblem, PathConstraint
 from sparserob_core.control.response import SAME_TIME, Response, merge_grids
 from sparserob_core.control.sampling import sample_disturbances, sample_parameters
 from sparserob_core.control.scenario import ScenarioConstraint
+from sparserob_core.control.sensitivity import Sensitivity
 from sparserob_core.control.sets import Equality
 from sparserob_core.control.taylor import TaylorSpace
 from sparserob_core.errors import InputError, NotEnclosable
@@ -186,4 +187,5 @@ def _complete(constraint: FlatConstraint | CurvedConstraint) -> ConstraintFamily
 
 def _bare(constraint: FlatConstraint | CurvedConstraint) -> ConstraintFamily:
     return ConstraintFamily(name=constraint.name, index_set=constraint.index_set, rows=constraint.rows, worst=constraint.worst,
-                            enclosure=constraint.enclosure, cells=constraint.cells, explain=constraint.explain, scale=constraint.scale)
+                            enclosure=constraint.enclosure, cells=constraint.cells, gradient=Sensitivity(constraint).gradient,
+                            explain=constraint.explain, scale=constraint.scale)
