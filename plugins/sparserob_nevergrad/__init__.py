@@ -1,0 +1,129 @@
+"""The optimisers of nevergrad, by name, through ask and tell."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from difflib import get_close_matches
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+import sparserob_core as sr
+from sparserob_nevergrad.guarded import Failed, Guarded
+
+
+class Nevergrad(sr.Maximiser, sr.Options):
+    """Any optimiser of nevergrad's registry (Rapin and Teytaud 2018): evolution strategies, differential evolution, particle swarms, and
+    portfolios of them such as NGOpt, which chooses by dimension and budget.
+
+    An optional extra: ``pip install 'sparserob[nevergrad]'``. It works in the unit box, one point at a time, with its random numbers drawn
+    from the generator of the search and the global ones left as they were. Some of nevergrad's portfolios are not repeatable all the same:
+    NGOpt in three dimensions or more may run ``cma.fmin2``, which takes its seed from the clock. Where the function has no value the loss
+    1e20 is told. What an optimiser guarantees, and in how many dimensions it is of use, nevergrad's documentation says for each; in a space
+    of tuples nearly all of them change every block at each step. It proves no upper bound.
+
+    An optimiser that raises does not end the run. With numpy 2.4 or later NGOpt and its relatives do so for many pairs of dimension and
+    budget ("only 0-dimensional arrays can be converted to Python scalars"). The exception is reported in one warning, and the search goes on
+    with ``fallback``, which is told all that was evaluated, or else shown the best of it.
+
+    Its own time is 0.2 to 20 milliseconds for each evaluation, and importing it takes seconds. Notes ``spread``: the distance, root mean
+    square over the coordinates and in widths of the box, of each evaluated point from the best one.
+    """
+
+    optimiser: str = Field(default="TwoPointsDE", min_length=1)
+    """A name in nevergrad's registry: CMA, DE, NGOpt, OnePlusOne, PSO, TBPSA, TwoPointsDE, ..."""
+
+    fallback: str | None = Field(default="CMA", min_length=1)
+    """The optimiser that goes on when the first one raises; none: the search ends there, with what was found."""
+
+    def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
+        """See `sparserob_core.Maximiser`."""
+        import warnings
+
+        registry = _registry()
+        names = [_known(key, name, registry) for key, name in (("optimiser", self.optimiser), ("fallback", self.fallback)) if name]
+        domain = objective.domain
+        if not (domain.lower < domain.upper).any():
+            return float(objective.evaluate(domain.lower[np.newaxis])[0])
+        walk = _Walk(objective, rng)
+        for name, following in zip(names, [*names[1:], None], strict=True):
+            try:
+                walk.run(Guarded(registry[name], walk.free.size, objective.remaining, rng))
+            except Failed as failure:
+                reason = (f"nevergrad's {name} failed after {objective.evaluations} evaluations ({failure}); the search "
+                          + (f"goes on with {following}" if following else "ends here"))
+                warnings.warn(reason, stacklevel=2)
+                if following is None:
+                    raise _ended(objective, reason) from failure
+            else:
+                break
+        return float("inf")
+
+
+class _Walk:
+    """The points and losses so far, in the unit box of the coordinates that can move."""
+
+    def __init__(self, objective: sr.Objective, rng: np.random.Generator) -> None:
+        domain = objective.domain
+        self.objective, self.free = objective, np.flatnonzero(domain.lower < domain.upper)
+        self.lower, self.upper = domain.lower[self.free], domain.upper[self.free]
+        self.point = domain.lower.copy()
+        self.told: list[tuple[np.ndarray, float]] = []
+        if objective.evaluations:
+            self.told.append((self._unit(objective.best_point[self.free]), _loss(objective.best_value)))
+
+    def run(self, optimiser: Guarded) -> None:
+        """Ask, evaluate and tell until the budget is spent; raises `Failed` when the optimiser does."""
+        try:
+            optimiser.learn(self.told)
+            loss = None
+            while self.objective.remaining:
+                unit = optimiser.next(loss)
+                self.point[self.free] = np.clip(self.lower + unit * (self.upper - self.lower), self.lower, self.upper)
+                value = float(self.objective.evaluate(self.point[np.newaxis])[0])
+                loss = _loss(value)
+                self.told.append((unit, loss))
+                self.objective.note(spread=self._spread(unit))
+        finally:
+            optimiser.close()
+
+    def _unit(self, moved: np.ndarray) -> np.ndarray:
+        return np.asarray(np.clip((moved - self.lower) / (self.upper - self.lower), 0.0, 1.0))
+
+    def _spread(self, unit: np.ndarray) -> float:
+        return float(np.sqrt(np.mean((unit - self._unit(self.objective.best_point[self.free])) ** 2)))
+
+
+def _loss(value: float) -> float:
+    return float(np.clip(-value, -1e20, 1e20))
+
+
+def _ended(objective: sr.Objective, reason: str) -> Exception:
+    """With something found, the end of the search; with nothing, the fault of the plugin."""
+    return sr.SearchEnded(reason) if objective.evaluations else sr.PluginError(reason)
+
+
+def _known(key: str, name: str, registry: Any) -> str:
+    if name in registry:
+        return name
+    nearest = get_close_matches(name, list(registry), 1, 0.0)
+    raise sr.InputError(f"nevergrad: {key}: there is no optimiser {name!r}; the nearest name is {nearest[0]!r}")
+
+
+def _registry() -> Any:
+    import warnings
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            from nevergrad.optimization import registry
+    except ImportError as error:
+        raise sr.PluginError("nevergrad: the package is not installed; `pip install 'sparserob[nevergrad]'` brings it") from error
+    return registry
+
+
+@sr.hookimpl
+def sparserob_maximisers() -> Iterator[sr.MaximiserPlugin]:
+    """Offer ``nevergrad``."""
+    yield sr.MaximiserPlugin(name="nevergrad", factory=Nevergrad, summary="any optimiser of nevergrad (extra)")

@@ -1,0 +1,83 @@
+"""One of nevergrad's optimisers, kept from warning, from failing unnoticed, and from touching the global random numbers."""
+
+from __future__ import annotations
+
+import random
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+
+class Failed(Exception):
+    """The optimiser raised; the text says what."""
+
+
+class Guarded:
+    """An optimiser of the unit box ``[0, 1]^d``, seeded by the generator, one point at a time.
+
+    Its failures come out as `Failed`, its warnings not at all. It works with global random numbers of its own: some of its parts use them.
+    """
+
+    def __init__(self, create: Any, dimension: int, budget: int, rng: np.random.Generator) -> None:
+        seeds = [int(seed) for seed in rng.integers(2**31, size=3)]
+        self._numbers: tuple[Any, Any] = (random.Random(seeds[0]).getstate(), np.random.RandomState(seeds[1]).get_state())
+        self._create, self._shape, self._budget, self._seed = create, (dimension,), budget, seeds[2]
+        self._optimiser: Any = None
+        self._asked: Any = None
+
+    def learn(self, told: Sequence[tuple[np.ndarray, float]]) -> None:
+        """Create the optimiser, and tell it of points and losses from before; it is shown the best where it takes none that it has not asked."""
+        with self._guard():
+            import nevergrad as ng
+
+            box = ng.p.Array(shape=self._shape, lower=np.zeros(self._shape), upper=np.ones(self._shape))
+            box.random_state = np.random.RandomState(self._seed)
+            self._optimiser = self._create(parametrization=box, budget=self._budget, num_workers=1)
+            if not told:
+                return
+            try:
+                for unit, loss in told:
+                    self._optimiser.tell(box.spawn_child(new_value=unit), loss)
+            except ng.errors.TellNotAskedNotSupportedError:
+                self._optimiser.suggest(min(told, key=lambda pair: pair[1])[0])
+
+    def next(self, loss: float | None) -> np.ndarray:
+        """The next point ``(d,)`` after the loss at the one before; ``None`` at first.
+
+        Telling and asking are one step, so that an optimiser which thinks in a thread of its own rests while the function is evaluated.
+        """
+        with self._guard():
+            if loss is not None:
+                self._optimiser.tell(self._asked, loss)
+            self._asked = self._optimiser.ask()
+            unit = np.array(self._asked.value, dtype=float)
+            if unit.shape != self._shape or not np.isfinite(unit).all():
+                raise ValueError(f"it asked for {unit.tolist()}")
+            return np.asarray(np.clip(unit, 0.0, 1.0))
+
+    def close(self) -> None:
+        """Let go of the optimiser: some of them run in a thread, which ends with them."""
+        self._optimiser = self._asked = None
+
+    @contextmanager
+    def _guard(self) -> Iterator[None]:
+        outside = _exchanged(self._numbers)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                yield
+        except Exception as error:
+            raise Failed(f"{type(error).__name__}: {str(error).partition(chr(10))[0]}") from error
+        finally:
+            self._numbers = _exchanged(outside)
+
+
+def _exchanged(numbers: tuple[Any, Any]) -> tuple[Any, Any]:
+    """Set the states of the global generators, of Python and of numpy; what they were."""
+    before = random.getstate(), np.random.get_state()  # noqa: NPY002
+    random.setstate(numbers[0])
+    np.random.set_state(numbers[1])  # noqa: NPY002
+    return before

@@ -1,0 +1,144 @@
+"""Candidates of a walk in a box: reflected steps, of few coordinates at a time, at scales that adapt."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from math import exp, pi, sqrt, tan
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+import sparserob_core as sr
+
+if TYPE_CHECKING:
+    from sparserob_simulated_annealing import SimulatedAnnealing
+
+CHUNK = 256
+FEW = 3
+SMALLEST, LARGEST = 1e-13, 0.5
+VISITS = 20          # evaluations per scale that are needed to adapt it
+
+
+class Moves:
+    """Draws a candidate near a point, and learns from whether it was accepted.
+
+    A step is noise times a scale times the width of the box, so that the units of the coordinates do not matter. In a space of tuples
+    (``block > 1``) the scale of a coordinate is that of its place within its block. ``scale`` is that of the last candidate.
+    """
+
+    def __init__(self, options: SimulatedAnnealing, objective: sr.Objective, rng: np.random.Generator) -> None:
+        domain = objective.domain
+        self.options, self.rng, self.lower, self.upper = options, rng, domain.lower, domain.upper
+        self.dimension, self.widths = domain.dimension, domain.upper - domain.lower
+        self.block = objective.block if objective.block < self.dimension else 1
+        self.free = np.flatnonzero(self.widths > 0.0)
+        self.places = self.block if self.block > 1 else self.dimension
+        each = options.adapt == "coordinate" and self.places * VISITS <= objective.remaining
+        self.several = self.places if each else 1
+        self.uniforms = _stream(rng.random)
+        self.normals = _stream(rng.standard_normal)
+        kinds = (options.one, options.few, options.full)
+        self.until_one, self.until_few = kinds[0] / sum(kinds), (kinds[0] + kinds[1]) / sum(kinds)
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget what was learned."""
+        self.scales = [self.options.initial_scale] * self.several
+        self.factors = {"few": 1.0 / sqrt(2.0), "full": 1.0 / sqrt(self.places)}
+        self.scale, self._moved = self.options.initial_scale, ""
+        self._place = 0
+
+    def uniform(self, count: int) -> np.ndarray:
+        """``count`` points drawn uniformly from the box, ``(count, d)``."""
+        points = self.rng.random((count, self.dimension))
+        points *= self.widths
+        points += self.lower
+        return np.clip(points, self.lower, self.upper, out=points)
+
+    def candidate(self, current: np.ndarray) -> np.ndarray:
+        """A candidate ``(d,)`` for a walk that is at ``current (d,)``; only one array of this size is made."""
+        if next(self.uniforms) < self.options.exploration:
+            self._moved, self.scale = "", 1.0
+            return np.asarray(self.uniform(1)[0])
+        moved = current.copy()
+        kind = next(self.uniforms)
+        coarse = next(self.uniforms) < self.options.coarse
+        if kind < self.until_one or self.free.size == 1:
+            self._one(moved, coarse)
+        elif self.block > 1:
+            self._blocks(moved, "few" if kind < self.until_few else "full", coarse)
+        else:
+            self._coordinates(moved, "few" if kind < self.until_few and self.dimension > FEW else "full", coarse)
+        return moved
+
+    def learn(self, accepted: bool) -> None:
+        """Widen the steps of the kind that was taken last if it was accepted, narrow them if not."""
+        if self._moved and self.options.adapt != "none":
+            change = exp(self.options.adaptation * (float(accepted) - self.options.acceptance))
+            if self._moved == "one":
+                self.scales[self._place] = min(LARGEST, max(SMALLEST, self.scales[self._place] * change))
+            else:
+                self.factors[self._moved] = min(10.0, max(1e-6, self.factors[self._moved] * change))
+
+    def _one(self, moved: np.ndarray, coarse: bool) -> None:
+        at = self._random_coordinate()
+        self._place = at % self.places if self.several > 1 else 0
+        self.scale, self._moved = (self.options.initial_scale, "") if coarse else (self.scales[self._place], "one")
+        self._shift(moved, at, self.scale)
+
+    def _coordinates(self, moved: np.ndarray, kind: str, coarse: bool) -> None:
+        factor, self._moved = (1.0, "") if coarse else (self.factors[kind], kind)
+        if kind == "few":
+            for _ in range(2 + int(next(self.uniforms) * (FEW - 1))):
+                at = self._random_coordinate()
+                self.scale = factor * (self.options.initial_scale if coarse else self.scales[at if self.several > 1 else 0])
+                self._shift(moved, at, self.scale)
+        else:
+            self._shift_part(moved, slice(0, self.dimension), factor, coarse)
+
+    def _blocks(self, moved: np.ndarray, kind: str, coarse: bool) -> None:
+        count = 1 if kind == "full" else 2 + int(next(self.uniforms) * (FEW - 1))
+        self._moved = "" if coarse else kind
+        for _ in range(count):
+            first = self._random_coordinate() // self.block * self.block
+            part = slice(first, first + self.block)
+            if coarse:
+                self.scale = 1.0
+                drawn = self.lower[part] + self.rng.random(self.block) * self.widths[part]
+                moved[part] = np.clip(drawn, self.lower[part], self.upper[part])
+            else:
+                self._shift_part(moved, part, self.factors[kind], coarse)
+
+    def _random_coordinate(self) -> int:
+        drawn = int(next(self.uniforms) * self.free.size)
+        return drawn if self.free.size == self.dimension else int(self.free[drawn])
+
+    def _shift(self, moved: np.ndarray, at: int, scale: float) -> None:
+        """Move one coordinate, in place."""
+        lower, upper, width = float(self.lower[at]), float(self.upper[at]), float(self.widths[at])
+        noise = tan(pi * (next(self.uniforms) - 0.5)) if self.options.step == "cauchy" else next(self.normals)
+        shifted = float(moved[at]) + scale * width * noise
+        if not lower <= shifted <= upper:
+            folded = width - abs(width - (shifted - lower) % (2.0 * width))
+            shifted = min(max(lower + folded, lower), upper)
+        moved[at] = shifted
+
+    def _shift_part(self, moved: np.ndarray, part: slice, factor: float, coarse: bool) -> None:
+        """Move all coordinates of a part, in place."""
+        lower, upper, widths = self.lower[part], self.upper[part], self.widths[part]
+        scales = np.array(self.scales) if self.several > 1 and not coarse else self.options.initial_scale if coarse else self.scales[0]
+        self.scale = factor * float(np.mean(scales))
+        noise = np.tan(pi * (self.rng.random(widths.size) - 0.5)) if self.options.step == "cauchy" else self.rng.standard_normal(widths.size)
+        shifted = moved[part] + factor * scales * widths * noise
+        outside = (shifted < lower) | (shifted > upper)
+        if outside.any():
+            low, width = lower[outside], widths[outside]
+            period = np.where(width > 0.0, 2.0 * width, 1.0)
+            shifted[outside] = low + (width - np.abs(width - (shifted[outside] - low) % period))
+        moved[part] = np.clip(shifted, lower, upper)
+
+
+def _stream(draw: Callable[[int], np.ndarray]) -> Iterator[float]:
+    """Numbers one at a time, drawn many at a time: a tenth of the cost."""
+    while True:
+        yield from draw(CHUNK).tolist()

@@ -1,0 +1,216 @@
+"""nevergrad's optimisers behind the contract: names, budget, random numbers, and what happens when one of them raises."""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pytest
+
+import sparserob_core as sr
+from sparserob_core.sip.search import CountedObjective, Target, maximise
+from sparserob_nevergrad import Nevergrad
+
+pytest.importorskip("nevergrad")
+
+BOX = sr.Box(np.array([-5.0, -4.0]), np.array([5.0, 6.0]))
+NUMPY_TYPE_ERROR = "only 0-dimensional arrays can be converted to Python scalars"
+
+
+def bowl(points):
+    return -((points - 0.3) ** 2).sum(axis=1)
+
+
+def search(function=bowl, domain=BOX, budget=60, seed=0, **options):
+    return maximise(Target(function, domain), Nevergrad(**options), budget, np.random.default_rng(seed))
+
+
+@pytest.fixture
+def registry():
+    from nevergrad.optimization import registry
+
+    added = []
+
+    def add(name, optimiser):
+        registry[name] = optimiser
+        added.append(name)
+
+    yield add
+    for name in added:
+        registry.pop(name)
+
+
+class Crashing:
+    """An optimiser that asks for points on the diagonal, and raises when it is asked for the ``last`` time."""
+
+    last = 8
+
+    def __init__(self, parametrization, budget, num_workers):
+        self.parametrization, self.budget, self.asked = parametrization, budget, 0
+
+    def ask(self):
+        self.asked += 1
+        if self.asked == self.last:
+            raise TypeError(NUMPY_TYPE_ERROR)
+        return self.parametrization.spawn_child(new_value=np.full(2, 0.5 + 0.01 * (self.asked % 40)))
+
+    def tell(self, candidate, loss):
+        assert candidate.value.shape == (2,)
+        assert isinstance(loss, float)
+
+
+def recording(heard, refuses):
+    """An optimiser that writes down what it is told and shown; ``refuses`` what it has not asked for."""
+    from nevergrad.common.errors import TellNotAskedNotSupportedError
+
+    class Recording(Crashing):
+        last = 10**9
+
+        def tell(self, candidate, loss):
+            if refuses and not self.asked:
+                raise TellNotAskedNotSupportedError
+            heard.append(("told", candidate.value.tolist(), loss))
+
+        def suggest(self, unit):
+            heard.append(("shown", unit.tolist()))
+
+    return Recording
+
+
+@pytest.mark.parametrize("name", ["TwoPointsDE", "OnePlusOne", "CMA", "PSO", "Cobyla"])
+def test_an_optimiser_by_name_climbs_and_spends_the_budget_exactly(name):
+    report = search(budget=200, optimiser=name)
+    assert report.evaluations == 200
+    assert report.best_value > -0.1
+    assert (report.trace.notes["spread"][:, 1] <= 1.0).all()
+
+
+def test_a_misspelt_name_names_the_nearest_one():
+    with pytest.raises(sr.InputError, match="nevergrad: optimiser: there is no optimiser 'OnePlusTwo'; the nearest name is 'OnePlusOne'"):
+        search(optimiser="OnePlusTwo")
+    with pytest.raises(sr.InputError, match=r"nevergrad: fallback: .* the nearest name is 'NGOpt'"):
+        search(fallback="NGOpt!")
+
+
+def test_a_missing_package_is_one_sentence_that_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "nevergrad.optimization", None)
+    with pytest.raises(sr.PluginError, match=r"nevergrad: the package is not installed; `pip install 'sparserob\[nevergrad\]'` brings it"):
+        search()
+
+
+def test_listing_the_plugins_does_not_import_the_package():
+    code = ("import sys, sparserob_core as sr; registry = sr.load_registry(); assert 'nevergrad' in registry.names('maximiser'); "
+            "registry.build('maximiser', 'nevergrad'); assert 'nevergrad' not in sys.modules")
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_generator_alone_decides_the_search_and_the_global_random_numbers_are_left_alone():
+    random.seed(1)
+    np.random.seed(1)  # noqa: NPY002
+    before = random.getstate(), np.random.get_state()[1].tolist()  # noqa: NPY002
+    first = search(optimiser="CMA").trace.points
+    assert (random.getstate(), np.random.get_state()[1].tolist()) == before  # noqa: NPY002
+    np.random.seed(2)  # noqa: NPY002
+    assert first.tolist() == search(optimiser="CMA").trace.points.tolist()
+    assert first.tolist() != search(optimiser="CMA", seed=1).trace.points.tolist()
+
+
+def test_an_optimiser_that_raises_is_explained_and_the_fallback_is_told_all_that_was_evaluated(registry):
+    heard = []
+    registry("Crashing", Crashing)
+    registry("Recording", recording(heard, refuses=False))
+    with pytest.warns(UserWarning, match=f"nevergrad's Crashing failed after 7 evaluations .TypeError: {NUMPY_TYPE_ERROR}.; "
+                                         "the search goes on with Recording") as caught:
+        report = search(optimiser="Crashing", fallback="Recording")
+    assert len(caught) == 1
+    assert report.evaluations == 60
+    unit = (report.trace.points - BOX.lower) / (BOX.upper - BOX.lower)
+    np.testing.assert_allclose([at for _, at, _ in heard[:7]], unit[:7])
+    np.testing.assert_allclose([loss for *_, loss in heard[:7]], -report.trace.values[:7])
+
+
+def test_a_fallback_that_takes_only_what_it_asked_for_is_shown_the_best(registry):
+    heard = []
+    registry("Crashing", Crashing)
+    registry("Recording", recording(heard, refuses=True))
+    with pytest.warns(UserWarning, match="goes on with Recording"):
+        report = search(optimiser="Crashing", fallback="Recording")
+    best = report.trace.points[np.argmax(report.trace.values[:7])]
+    np.testing.assert_allclose(heard[0][1], (best - BOX.lower) / (BOX.upper - BOX.lower))
+    assert report.evaluations == 60
+
+
+@pytest.mark.parametrize("fallback", [None, "Crashing"])
+def test_without_a_fallback_that_works_the_search_ends_with_what_was_found(registry, fallback):
+    registry("Crashing", Crashing)
+    with pytest.warns(UserWarning, match="nevergrad's Crashing failed") as caught:
+        report = search(optimiser="Crashing", fallback=fallback)
+    assert len(caught) == (1 if fallback is None else 2)
+    assert str(caught[-1].message).endswith("the search ends here")
+    assert report.evaluations == (7 if fallback is None else 14)
+    assert report.best_value == report.trace.values.max()
+    assert "nevergrad's Crashing failed" in report.stopped
+
+
+def test_an_optimiser_that_raises_before_anything_is_found_is_an_error_of_the_plugin(registry):
+    class Stillborn(Crashing):
+        last = 1
+
+    registry("Stillborn", Stillborn)
+    with pytest.warns(UserWarning, match="failed after 0"), pytest.raises(sr.PluginError, match="Stillborn failed after 0 evaluations"):
+        search(optimiser="Stillborn", fallback=None)
+
+
+def test_what_the_function_raises_is_not_taken_for_a_fault_of_the_optimiser():
+    calls = []
+
+    def failing(points):
+        calls.append(1)
+        raise TypeError(NUMPY_TYPE_ERROR)
+
+    with pytest.raises(sr.EvaluationError, match="the function failed after 0 evaluations"):
+        search(failing)
+    assert len(calls) == 1
+
+
+@pytest.mark.filterwarnings("ignore:nevergrad's NGOpt failed")
+@pytest.mark.parametrize("dimension", [1, 2, 3, 5])
+def test_ngopt_never_ends_a_run_whatever_the_version_of_numpy(dimension):
+    box = sr.Box(np.full(dimension, -2.0), np.full(dimension, 3.0))
+    report = search(domain=box, budget=300, optimiser="NGOpt")
+    assert report.evaluations == 300
+    assert report.best_value > -1e-2
+
+
+def test_an_optimiser_with_a_thread_of_its_own_leaves_none_behind_and_warns_of_nothing():
+    before = threading.active_count()
+    for _ in range(3):
+        assert search(optimiser="Cobyla", budget=300).evaluations == 300
+    for thread in threading.enumerate()[before:]:
+        thread.join(10.0)
+    assert threading.active_count() == before
+
+
+def test_losses_that_are_no_numbers_are_told_as_large_ones(registry):
+    heard = []
+    registry("Recording", recording(heard, refuses=False))
+    search(lambda points: np.where(points[:, 0] < 0.6, -np.inf, np.nan), optimiser="Recording")
+    assert {loss for *_, loss in heard} == {1e20}
+
+
+def test_a_search_that_is_continued_is_told_of_the_best_point(registry):
+    heard = []
+    registry("Recording", recording(heard, refuses=False))
+    objective = CountedObjective(Target(bowl, BOX), 5)
+    objective.evaluate(np.array([[0.0, 1.0]]))
+    Nevergrad(optimiser="Recording").search(objective, np.random.default_rng(0))
+    assert heard[0] == ("told", [0.5, 0.5], pytest.approx(0.58))
+
+
+def test_sides_of_length_zero_stay_where_they_are():
+    report = search(domain=sr.Box(np.array([0.0, 0.7]), np.array([1.0, 0.7])))
+    assert (report.trace.points[:, 1] == 0.7).all()
+    assert search(domain=sr.Box(np.ones(2), np.ones(2))).evaluations == 1
