@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from sparserob_core.control.system import LinearSystem
     from sparserob_core.control.transcription import transcribe
     from sparserob_core.errors import ConfigError, InputError, PluginError, SolverError, SparseRobError
+    from sparserob_core.experiment.compare import Comparison, compare
     from sparserob_core.experiment.events import Observer, RunFinished, RunStarted
     from sparserob_core.experiment.plugin import (
         DictionaryPlugin,
@@ -56,15 +57,15 @@ if TYPE_CHECKING:
     from sparserob_core.sip.trust_region import TrustRegion
 
 __all__ = [
-    "Array", "Box", "Claim", "ConfigError", "ConstraintFamily", "Continuation", "ControlImage", "ConvexSet", "Cut", "Dictionary",
-    "DictionaryFactory", "DictionaryPlugin", "Ellipsoid", "Enclosure", "Equality", "EvaluationError", "EvaluationsFinished", "Event",
-    "InnerStop", "InnerStopPlugin", "InputError", "LinearKeys", "LinearProblem", "LinearSystem", "Maximiser", "MaximiserPlugin", "Method",
-    "MethodPlugin", "NormBall", "Objective", "Observer", "ObserverPlugin", "OptimalControlProblem", "Options", "Outcome", "OuterStep",
-    "OuterStop", "OuterStopPlugin", "PathConstraint", "PluginError", "Polytope", "ProblemFactory", "ProblemPlugin", "Progress",
+    "Array", "Box", "Claim", "Comparison", "ConfigError", "ConstraintFamily", "Continuation", "ControlImage", "ConvexSet", "Cut",
+    "Dictionary", "DictionaryFactory", "DictionaryPlugin", "Ellipsoid", "Enclosure", "Equality", "EvaluationError", "EvaluationsFinished",
+    "Event", "InnerStop", "InnerStopPlugin", "InputError", "LinearKeys", "LinearProblem", "LinearSystem", "Maximiser", "MaximiserPlugin",
+    "Method", "MethodPlugin", "NormBall", "Objective", "Observer", "ObserverPlugin", "OptimalControlProblem", "Options", "Outcome",
+    "OuterStep", "OuterStop", "OuterStopPlugin", "PathConstraint", "PluginError", "Polytope", "ProblemFactory", "ProblemPlugin", "Progress",
     "ProofProgress", "QuadraticProgram", "Regulariser", "RegulariserPlugin", "Report", "Result", "RoundFinished", "RunFinished",
     "RunStarted", "Schedule", "SchedulePlugin", "SearchEnded", "SearchTrace", "Selection", "SelectionPlugin", "SemiInfiniteProgram",
     "Separation", "SetOptions", "Solver", "SolverError", "SolverPlugin", "SparseRobError", "Tools", "Trace", "TrustRegion", "Witness",
-    "cylinder", "hookimpl", "intersection", "load_registry", "maximise", "run", "solve", "transcribe",
+    "compare", "cylinder", "hookimpl", "intersection", "load_registry", "maximise", "run", "solve", "transcribe",
 ]
 
 _MODULES = {
@@ -85,6 +86,7 @@ _MODULES = {
     "control.system": "LinearSystem",
     "control.problem": "OptimalControlProblem PathConstraint ProblemFactory",
     "control.transcription": "transcribe",
+    "experiment.compare": "Comparison compare",
     "experiment.events": "Observer RunFinished RunStarted",
     "experiment.plugin": "DictionaryPlugin InnerStopPlugin MaximiserPlugin MethodPlugin ObserverPlugin OuterStopPlugin ProblemPlugin "
                          "RegulariserPlugin SchedulePlugin SelectionPlugin SolverPlugin",

@@ -1,0 +1,76 @@
+"""The local half: one ascent after another, each from the best point that is not below an earlier one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+import sparserob_core as sr
+from sparserob_maxlipo.slopes import Slopes
+
+APART = 0.03
+"""A point that lies within this share of the box of a summit, and no higher, starts no further ascent."""
+
+
+class Ascents:
+    """Trust regions, one at a time; where one ended is a summit, and the next begins elsewhere."""
+
+    def __init__(self, seen: Slopes) -> None:
+        self.seen, self._region, self._progress = seen, sr.TrustRegion(), list[float]()
+        self._summits, self._heights = np.empty((0, seen.points.shape[1])), np.empty(0)
+        self._closed = np.zeros(0, dtype=bool)
+
+    @property
+    def secondary(self) -> bool:
+        """Whether the best point is a summit, so that the next ascent begins lower."""
+        return bool(self._heights.max(initial=-np.inf) >= self.seen.best)
+
+    def propose(self) -> np.ndarray | None:
+        """The next point ``(d,)`` of the ascent, or ``None`` when it has just ended or none can begin."""
+        points, values = self._open()
+        if len(points) <= points.shape[1] + 1 or not np.isfinite(values.max()):
+            return None
+        value = float(values.max())
+        point = None if self._futile(value) else self._region.propose(points, values)
+        if point is None or self._is_below_a_summit(point, value):
+            self._end(points[values.argmax()], value)
+            return None
+        return point
+
+    def tell(self, value: float) -> None:
+        """The value at the point that was proposed last."""
+        self._region.tell(value)
+
+    def hear(self, point: np.ndarray, value: float) -> None:
+        """A global step has added this point: if it is the better start, and far away, the ascent begins again from there."""
+        points, values = self._open()
+        if not len(points) or value < values.max() or self._closed[-1]:
+            return
+        others = values[:-1]
+        if len(others) and float(np.linalg.norm(point - points[others.argmax()])) > self._region.radius:
+            self._begin()
+
+    def _begin(self) -> None:
+        self._region, self._progress = sr.TrustRegion(), []
+
+    def _end(self, summit: np.ndarray, height: float) -> None:
+        seen = self.seen
+        self._summits, self._heights = np.vstack([self._summits, summit]), np.append(self._heights, height)
+        self._closed |= (np.abs(seen.points - summit).max(axis=1) < APART) & (seen.raw <= height)
+        self._begin()
+
+    def _is_below_a_summit(self, point: np.ndarray, value: float) -> bool:
+        return bool(((np.abs(self._summits - point).max(axis=1) < APART) & (value <= self._heights)).any())
+
+    def _open(self) -> tuple[np.ndarray, np.ndarray]:
+        """The points that lie below no summit, and their values."""
+        points, values = self.seen.points, self.seen.raw
+        known = self._closed.size
+        fresh = [self._is_below_a_summit(point, value) for point, value in zip(points[known:], values[known:], strict=True)]
+        self._closed = np.concatenate([self._closed, np.array(fresh, dtype=bool)])
+        return points[~self._closed], values[~self._closed]
+
+    def _futile(self, value: float) -> bool:
+        """Whether recent progress would not carry this ascent to the best value."""
+        self._progress.append(value)
+        window = 2 * self.seen.points.shape[1] + 4
+        return len(self._progress) > window and bool(self.seen.best - value > 4.0 * (value - self._progress[-1 - window]))
