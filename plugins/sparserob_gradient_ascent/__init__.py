@@ -86,7 +86,7 @@ class _Climb:
         value, slope = self.objective.value_and_gradient(point) if self.objective.differentiable else self.differences(point)
         if np.isfinite(value):
             self.worst = min(self.worst, value)
-        if value >= self.objective.best_value:
+        if np.array_equal(point, self.objective.best_point):
             self.slope, self.at = slope, point
         shown = value if np.isfinite(value) else (self.worst if np.isfinite(self.worst) else 0.0)
         return -shown, -slope[self.free] * self.width / SCALE

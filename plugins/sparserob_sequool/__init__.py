@@ -68,19 +68,24 @@ class _Tree:
         values = self._values(centres)
         opened, hmax = 0, len(schedule) - 1
         for depth, count in enumerate(schedule.tolist()):
-            best = np.argsort(-values, kind="stable")[:count]
+            best = np.array([values.argmax()]) if count == 1 else (-values).argsort(kind="stable")[:count]
             centres, values = self._open(centres[best], values[best], depth % self.period)
             opened += count
             self.objective.note(depth=depth, openings=opened, hmax=hmax)
 
     def _open(self, centres: np.ndarray, values: np.ndarray, across: int) -> tuple[np.ndarray, np.ndarray]:
-        children = np.repeat(centres[:, np.newaxis], CHILDREN, axis=1)
-        step, lower, upper = self.thirds[across], self.lower[across], self.upper[across]
-        children[:, 0, across] = np.maximum(centres[:, across] - step, lower)
-        children[:, 1, across] = np.minimum(centres[:, across] + step, upper)
+        step = self.thirds[across]
+        k, d = centres.shape
+        children = np.empty((k, CHILDREN, d))
+        children[:] = centres[:, np.newaxis]
+        line = centres[:, across]
+        children[:, 0, across] = np.maximum(line - step, self.lower[across])
+        children[:, 1, across] = np.minimum(line + step, self.upper[across])
         self.thirds[across] = step / CHILDREN
-        outer = self._values(children[:, :2].reshape(-1, centres.shape[1])).reshape(-1, 2)
-        return children.reshape(-1, centres.shape[1]), np.column_stack([outer, values]).ravel()
+        found = np.empty((k, CHILDREN))
+        found[:, :2] = self._values(children[:, :2].reshape(-1, d)).reshape(-1, 2)
+        found[:, 2] = values
+        return children.reshape(-1, d), found.ravel()
 
     def _values(self, centres: np.ndarray) -> np.ndarray:
         d = self.root.size

@@ -70,7 +70,7 @@ class CountedObjective:
         self._keeps = self.domain.dimension * self.budget <= KEPT_NUMBERS
         self._points: list[Array] = []
         self._values: list[Array] = []
-        self._seconds: list[Array] = []
+        self._seconds: list[tuple[int, float]] = []
         self._improvements: list[tuple[int, float]] = []
         self._notes: dict[str, list[tuple[float, float]]] = {}
         self._notify, self._told = notify, 0
@@ -96,7 +96,7 @@ class CountedObjective:
         if len(allowed):
             values = self._values_at(allowed)
             self._record(allowed, values)
-        if np.isposinf(self.best_value):
+        if self.best_value == np.inf:
             raise self._end(SearchEnded("a value of +inf was found, which nothing can exceed"))
         if self._stopped():
             raise self._end(SearchEnded("the stopping rule of the search says so"))
@@ -137,7 +137,7 @@ class CountedObjective:
         """What has been found so far."""
         points = self.seen()[0] if self._keeps else np.empty((0, self.domain.dimension))
         values = np.concatenate([np.empty(0), *self._values])
-        seconds = np.concatenate([np.empty(0), *self._seconds])
+        seconds = np.repeat([moment for _, moment in self._seconds], [count for count, _ in self._seconds])
         notes = {name: np.array(rows) for name, rows in self._notes.items()}
         trace = Trace(points, values, np.maximum.accumulate(values), seconds, notes)
         return Report(self.best_value, self.best_point, self.evaluations, upper_bound, trace, stopped)
@@ -161,8 +161,8 @@ class CountedObjective:
         asked = np.array(points, dtype=float)
         if asked.ndim != 2 or asked.shape[1] != self.domain.dimension:
             raise InputError(f"points: expected shape (k, {self.domain.dimension}), got {asked.shape}")
-        outside = ~((asked >= self.domain.lower) & (asked <= self.domain.upper)).all(axis=1)
-        if outside.any():
+        if not ((asked >= self.domain.lower).all() and (asked <= self.domain.upper).all()):
+            outside = ~((asked >= self.domain.lower) & (asked <= self.domain.upper)).all(axis=1)
             raise InputError(f"points: {asked[outside][0].tolist()} lies outside the domain, "
                              f"lower {self.domain.lower.tolist()}, upper {self.domain.upper.tolist()}")
         return asked
@@ -173,7 +173,9 @@ class CountedObjective:
 
     def _values_at(self, points: Array) -> Array:
         values = np.array(self._called(self.target.function, points.copy() if self._keeps else points, (len(points),)))
-        values[np.isnan(values)] = -np.inf
+        missing = np.isnan(values)
+        if missing.any():
+            values[missing] = -np.inf
         return values
 
     def _called(self, function: Function, argument: Array, shape: tuple[int, ...]) -> Array:
@@ -192,14 +194,15 @@ class CountedObjective:
         if self._keeps:
             self._points.append(points)
         self._values.append(values.copy())
-        self._seconds.append(np.full(values.size, time.monotonic() - self._started))
-        top = int(np.argmax(values))
+        now = time.monotonic()
+        self._seconds.append((values.size, now - self._started))
+        top = int(values.argmax())
         first = self.evaluations == 0
         self.evaluations += len(values)
         if values[top] > self.best_value or first:
             self.best_value, self.best_point = float(values[top]), points[top].copy()
             self._improvements.append((self.evaluations, self.best_value))
-        if time.monotonic() - self._told_at > SECONDS_BETWEEN_EVENTS:
+        if now - self._told_at > SECONDS_BETWEEN_EVENTS:
             self.tell()
 
 
