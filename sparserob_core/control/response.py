@@ -99,7 +99,7 @@ class Response:
 
     def steps(self, parameters: Array) -> Steps:
         """Matrices and whole-piece transitions at parameters ``(v, nu)``; remembered for the last few calls."""
-        key = parameters.tobytes()
+        key = bytes(str(parameters.shape), "ascii") + parameters.tobytes()  # no parameters: any number of rows has the same bytes
         if key not in self._steps:
             A, B, W = self.system.matrices(parameters)
             E, F = transitions(A[:, None], self._lengths[None, :])

@@ -196,3 +196,12 @@ def test_the_exponential_of_a_stiff_matrix_keeps_its_slow_part():
     A = np.array([[-2000.0, 1.0, 0.0], [0.0, -0.3, 1.0], [0.0, 0.0, 0.0]])
     assert np.allclose(exponential(A[None])[0], expm(A), rtol=1e-10, atol=1e-13)
     assert np.array_equal(exponential(np.zeros((2, 3, 3))), np.tile(np.eye(3), (2, 1, 1)))
+
+
+def test_a_known_system_takes_any_number_of_rows_without_parameters_one_after_the_other():
+    response = Response(LinearSystem([[0.0, 1.0], [-2.0, -0.5]], [[0.0], [1.0]]), merge_grids(np.linspace(0, 1, 4), np.linspace(0, 1, 4)),
+                        np.array([1.0, 0.0]))
+    control, disturbances = np.ones((1, 3)), np.ones((5, 2, 3))
+    many = response.states(control, np.zeros((5, 0)), disturbances)
+    one = response.states(control, np.zeros((1, 0)), disturbances[:1])
+    np.testing.assert_allclose(many, np.repeat(one, 5, axis=0), atol=1e-14)
