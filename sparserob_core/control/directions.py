@@ -36,7 +36,7 @@ def sampled(dimension: int) -> Array:
     """A lattice ``(k, b)`` on the surface of the cube."""
     points = np.linspace(-1.0, 1.0, PER_EDGE.get(dimension, 3)) if dimension > 1 else np.zeros(0)
     every = [np.insert(rest, axis, sign) for axis in range(dimension) for sign in (-1.0, 1.0)
-             for rest in np.array(list(product(points, repeat=dimension - 1))).reshape(-1, dimension - 1)]
+             for rest in np.array(list(product(points, repeat=dimension - 1))).reshape(len(points) ** (dimension - 1), dimension - 1)]
     return np.unique(np.array(every), axis=0)
 
 

@@ -77,3 +77,14 @@ def test_equalities_out_of_reach_are_infeasible_and_say_so():
     result = solved(problem, 40)
     assert result.status == "infeasible"
     assert "equalities cannot be met" in result.message
+
+
+def test_a_curved_set_with_one_coordinate_is_an_interval():
+    """x' = -x + u + w, x0 = 2, |u| <= 2, |w| <= 0.1, |x(1)| <= 1/2: as late as possible, J = -2 ln(1 - (2/e + 0.1 (1 - 1/e) - 1/2) / 2)."""
+    problem = sr.OptimalControlProblem(
+        system=sr.LinearSystem([[-1.0]], [[1.0]]), horizon=1.0, initial_state=[2.0], control=sr.Box([-2.0], [2.0]),
+        disturbance=sr.Ellipsoid([0.0], [[0.01]]), terminal=[sr.Ellipsoid([0.0], [[0.25]])])
+    result = sr.solve(problem)
+    assert result.status == "certified"
+    exact = -2 * np.log(1 - (2 / np.e + 0.1 * (1 - 1 / np.e) - 0.5) / 2)
+    assert exact <= result.cost <= exact * (1 + 1e-4)
