@@ -50,7 +50,7 @@ class SparseRobOptions(Options):
     formulation: Literal["reduced", "literal"] = "reduced"
     """What an index is: (t, p), the worst disturbance in closed form; or the paper's (t, Beta, p)."""
 
-    indices: int | None = Field(default=None, ge=1)
+    indices: int | None = Field(default=None, ge=1, strict=True)
     """How many indices a tuple has; null: as many as there are decision variables (m N), which the theorem asks for."""
 
     regu: Any = _part("schedule")

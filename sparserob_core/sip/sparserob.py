@@ -53,7 +53,7 @@ class SparseRob(Method):
     def __post_init__(self) -> None:
         if self.formulation not in ("reduced", "literal"):
             raise InputError(f"formulation: expected reduced or literal, got {self.formulation!r}")
-        if self.indices is not None and (self.indices != int(self.indices) or self.indices < 1):
+        if self.indices is not None and (isinstance(self.indices, bool) or self.indices != int(self.indices) or self.indices < 1):
             raise InputError(f"indices: expected a whole number of at least 1, got {self.indices!r}")
         for name in ("regu", "sc1", "sc2", "slcr"):
             if getattr(self, name) is not None and not callable(getattr(self, name)):

@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.finite import FiniteSolution
 from sparserob_core.sip.index_gradient import index_gradient
@@ -140,7 +141,12 @@ class TupleValue:
         return changed
 
     def _family_rows(self, family: ConstraintFamily, slots: Array) -> tuple[Array, Array]:
-        return family.rows(self.layout.indices(family, slots))
+        indices = self.layout.indices(family, slots)
+        G, h = family.rows(indices)
+        if np.ndim(G) != 3 or np.shape(G)[::2] != (len(indices), self.program.n) or np.shape(G)[:2] != np.shape(h):
+            raise InputError(f"family {family.name!r}: expected rows of shape ({len(indices)}, r, {self.program.n}) and right-hand sides "
+                             f"({len(indices)}, r), got {np.shape(G)} and {np.shape(h)}")
+        return G, h
 
 
 @dataclass(frozen=True, eq=False)

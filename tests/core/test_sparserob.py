@@ -150,6 +150,7 @@ class TestTheFourPieces:
         ({"regu": {"name": "geometric", "faktor": 0.5}}, r"method\.regu\.faktor: unknown key"),
         ({"sc2": {"window": 3}}, r"method\.sc2\.name: expected the name of one of evaluations, stalled"),
         ({"indices": 0}, r"method\.indices"),
+        ({"indices": True}, r"method\.indices"),
         ({"formulation": "lateral"}, r"method\.formulation"),
     ])
     def test_a_mistake_names_its_key(self, option, words, tmp_path):
@@ -179,3 +180,11 @@ def test_the_gain_of_a_search_looks_back_over_its_window():
     assert progress.gain(20) == 2.0
     assert progress.gain(70) == 4.0
     assert progress.gain(100) == np.inf
+
+
+@pytest.mark.parametrize("G", [np.ones((1, 1, 2)), np.ones((1, 1)), np.ones((2, 1, 1))])
+def test_rows_of_the_wrong_shape_name_their_family(G):
+    family = sr.ConstraintFamily(name="odd", index_set=sr.Box([0.0], [1.0]), rows=lambda t: (G, np.ones((len(t), 1))))
+    program = sr.SemiInfiniteProgram(n=1, q=[1.0], lower=-1.0, upper=1.0, families=[family])
+    with pytest.raises(sr.InputError, match=r"family 'odd': expected rows of shape \(1, r, 1\)"):
+        sr.solve(program, method="sparserob", maximiser="random_search", budget=5)
