@@ -10,7 +10,8 @@ from pathlib import Path
 import click
 
 import sparserob_core as sr
-from sparserob_core.experiment.cli import EXIT, commands
+from sparserob_core.experiment.cli import commands
+from sparserob_core.experiment.commands.printing import EXIT
 from sparserob_core.experiment.option_rows import option_rows
 from sparserob_core.experiment.registry import Hooks
 from sparserob_core.experiment.run_config import RunConfig

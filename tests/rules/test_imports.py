@@ -80,12 +80,18 @@ def test_the_core_imports_no_plugin(path: Path) -> None:
 
 
 @pytest.mark.parametrize(("package", "owner"), [
-    ("pluggy", "experiment/registry.py"), ("ruamel", "experiment/config.py"), ("click", "experiment/cli.py"),
+    ("pluggy", "experiment/registry.py"), ("ruamel", "experiment/config.py"),
 ])
 def test_one_module_knows_the_library(package: str, owner: str) -> None:
     users = {str(path.relative_to(ROOT / "sparserob_core")) for path in CORE
              for module, _ in imports(ast.parse(path.read_text())) if module.split(".")[0] == package}
     assert users == {owner}
+
+
+def test_only_the_command_line_knows_the_library_of_commands() -> None:
+    users = {str(path.relative_to(ROOT / "sparserob_core")) for path in CORE
+             for module, _ in imports(ast.parse(path.read_text())) if module.split(".")[0] == "click"}
+    assert all(user == "experiment/cli.py" or user.startswith("experiment/commands/") for user in users)
 
 
 @pytest.mark.parametrize("path", PLUGINS, ids=relative)
