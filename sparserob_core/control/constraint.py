@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from sparserob_core.control.enclosure import CELLS_KEPT, CellEnclosure, where_to_halve
+from sparserob_core.control.enclosure import CELLS_KEPT, CellEnclosure, enclose
 from sparserob_core.control.functional import WorstCase
 from sparserob_core.control.lifted import LiftedSystem, lift
 from sparserob_core.control.measurable import MeasurablePush
@@ -16,11 +16,10 @@ from sparserob_core.control.parameters import ParameterIndex
 from sparserob_core.control.peaks import climb, local_maxima, vertices
 from sparserob_core.control.push import Push
 from sparserob_core.control.response import distinct_times, transitions
-from sparserob_core.errors import NotEnclosable
+from sparserob_core.control.words import explanation
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.program import Enclosure, Explanation, Separation
 
-TINY = 1e-4         # of a cell of parameters: a cell on which a system that can be enclosed at all will be
 SURE = 1e-8         # a vertex that is predicted to this accuracy is one
 INSIDE, MOST_INSIDE = 3, 64    # times sampled inside every piece, beside its ends: more where the system moves on it
 SMOOTH = 0.1        # norm of A times the spacing of samples between which a parabola is a good guide
@@ -101,15 +100,7 @@ class FlatConstraint:
     def explain(self, index: Array, row: int) -> Explanation:
         """One constraint in words: what is bounded, when, and what the uncertainty does to it."""
         time, parameter = float(index[0]), self.parameters.clamp(index[None, 1:])[0]
-        direction, bound = self.H[row], float(self.h[row])
-        sign = -1.0 if np.count_nonzero(direction) == 1 and direction.sum() < 0 else 1.0
-        text = f"{self.name}: {_combination(sign * direction, time)} {'>=' if sign < 0 else '<='} {sign * bound:.6g}"
-        push = float(self.functionals.offsets(np.array([time]), direction[None], parameter[None])[0])
-        remarks = [] if time > 0 else [f"the initial state gives {sign * float(direction @ self.functionals.response.initial_state):.6g}"]
-        remarks += [f"the disturbance alone moves it by {push:.4g}"] if push > 0 else []
-        remarks += [f"at {self.functionals.response.system.describe(parameter)}"] if parameter.size else []
-        disturbance = self.functionals.worst_disturbance(time, direction, parameter)
-        return Explanation(f"{text} ({', '.join(remarks)})" if remarks else text, time, parameter, disturbance)
+        return explanation(self.name, self.functionals, self.H, self.h, row, time, parameter)
 
     def nominal(self) -> FlatConstraint:
         """The same constraint without uncertainty: a middle parameter, and no disturbance (or a middle one where none is not admissible)."""
@@ -127,22 +118,8 @@ class FlatConstraint:
 
     def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
         """Proven upper bounds of the violation on cells ``(k, 1 + nu)``, each within one piece; cells of parameters share their work."""
-        bounds, split = np.full(lower.shape[0], -np.inf), np.zeros(lower.shape[0], dtype=int)
-        touched = np.flatnonzero(self.parameters.touches(lower[:, 1:], upper[:, 1:]))
-        keys = np.hstack([lower[touched, 1:], upper[touched, 1:]])
-        _, which = np.unique(keys, axis=0, return_inverse=True) if keys.shape[1] else (keys, np.zeros(touched.size, dtype=int))
-        for group in range(int(which.max(initial=-1)) + 1):
-            members = touched[which.reshape(-1) == group]
-            low, high = lower[members[0], 1:], upper[members[0], 1:]
-            try:
-                cell = self._cell(x, low, high)
-            except NotEnclosable:
-                self.lifted((low + high) / 2 - TINY * (high - low), (low + high) / 2 + TINY * (high - low))  # raises if no cell will do
-                bounds[members], split[members] = np.inf, 1 + int(np.argmax(high - low))
-                continue
-            bounds[members], bend, spread = cell.bounds(lower[members, 0], upper[members, 0])
-            split[members] = where_to_halve(bend, spread, bounds[members])
-        return Enclosure(bounds, split)
+        touched = self.parameters.touches(lower[:, 1:], upper[:, 1:])
+        return enclose(lower, upper, touched, self.parameters.count, lambda low, high: self._cell(x, low, high))
 
     def lifted(self, low: Array, high: Array) -> LiftedSystem:
         """The lifted system over a cell of parameters, remembered."""
@@ -160,7 +137,8 @@ class FlatConstraint:
             control = self.functionals.dictionary.control(x)
             rhs = np.zeros((self.h.size, lifted.space.size))
             rhs[:, 0] = self.h
-            remember(self._cells, key, CellEnclosure(lifted, self._push(low, high), self.H, rhs, control), CELLS_KEPT)
+            remember(self._cells, key, CellEnclosure(lifted, self._push(low, high), self.H, rhs, control,
+                                                     cuts=self.parameters.cuts(low, high)), CELLS_KEPT)
         return self._cells[key]
 
     def _push(self, low: Array, high: Array) -> Push | MeasurablePush | None:
@@ -237,13 +215,3 @@ class FlatConstraint:
             return np.hstack([inside[:, :1], self.parameters.clamp(inside[:, 1:])])
 
         return climb(lambda points, which: self.violations(x, points, rows[which]), indices, radius, project)
-
-
-def _combination(direction: Array, time: float) -> str:
-    """``c'x(t)`` in words, such as ``x1(5)`` or ``x1(5) - 0.5 x2(5)``."""
-    parts: list[str] = []
-    for state in np.flatnonzero(direction):
-        size = abs(direction[state])
-        sign = "-" if direction[state] < 0 else "+" if parts else ""
-        parts.append(f"{sign}{' ' if parts else ''}{'' if size == 1 else f'{size:.4g} '}x{state + 1}({time:.6g})")
-    return " ".join(parts) or "0"

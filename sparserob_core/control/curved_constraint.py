@@ -10,7 +10,7 @@ import numpy as np
 from sparserob_core.control.combination import Combination, combination
 from sparserob_core.control.constraint import FlatConstraint
 from sparserob_core.control.directions import faces, on_surface, sampled, unit
-from sparserob_core.control.enclosure import CELLS_KEPT, CellEnclosure, where_to_halve
+from sparserob_core.control.enclosure import CELLS_KEPT, CellEnclosure, enclose
 from sparserob_core.control.functional import WorstCase
 from sparserob_core.control.lifted import LiftedSystem
 from sparserob_core.control.memory import remember
@@ -94,20 +94,9 @@ class CurvedConstraint:
 
     def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
         """Proven upper bounds of the violation (in the length of the cube's directions, at least 1) on cells ``(k, 1 + nu + b)``."""
-        bounds, split = np.full(lower.shape[0], -np.inf), np.zeros(lower.shape[0], dtype=int)
         nu = self.parameters.count
-        touched = np.flatnonzero(self.parameters.touches(lower[:, 1:1 + nu], upper[:, 1:1 + nu]))
-        _, which = np.unique(np.hstack([lower[touched, 1:], upper[touched, 1:]]), axis=0, return_inverse=True)
-        for group in range(int(which.max(initial=-1)) + 1):
-            members = touched[which.reshape(-1) == group]
-            first = members[0]
-            free = np.flatnonzero(upper[first, 1 + nu:] > lower[first, 1 + nu:])
-            cell = self._cell(x, lower[first, 1:], upper[first, 1:], free)
-            bounds[members], bend, spread = cell.bounds(lower[members, 0], upper[members, 0])
-            advice = where_to_halve(bend, spread, bounds[members])
-            coordinates = np.concatenate([np.arange(1 + nu), 1 + nu + free])
-            split[members] = coordinates[advice]
-        return Enclosure(bounds, split)
+        touched = self.parameters.touches(lower[:, 1:1 + nu], upper[:, 1:1 + nu])
+        return enclose(lower, upper, touched, nu, lambda low, high: self._cell(x, low, high))
 
     def explain(self, index: Array, row: int) -> Explanation:
         """One constraint in words."""
@@ -120,18 +109,20 @@ class CurvedConstraint:
         """The same constraint without uncertainty."""
         return replace(self, functionals=self.functionals.nominal(), parameters=ParameterIndex(None))
 
-    def _cell(self, x: Array, low: Array, high: Array, free: np.ndarray) -> CellEnclosure:
+    def _cell(self, x: Array, low: Array, high: Array) -> CellEnclosure:
         key = x.tobytes() + low.tobytes() + high.tobytes()
         if key not in self._cells:
             nu = self.parameters.count
             centre, radius = (low + high)[nu:] / 2, (high - low)[nu:] / 2
+            free = np.flatnonzero(radius > 0)
             H = np.vstack([centre, np.diag(radius)[free]]) @ self.set.normals
             lifted = self._flat.lifted(low[:nu], high[:nu])
             joined = self._combination(lifted, free.size)
             push = self.functionals.push(lifted, H, joined)
             rhs, looseness = self._minorant(H, joined, nu)
             control = self.functionals.dictionary.control(x)
-            remember(self._cells, key, CellEnclosure(lifted, push, H, rhs, control, joined, looseness), CELLS_KEPT)
+            cuts = self.parameters.cuts(low[:nu], high[:nu])
+            remember(self._cells, key, CellEnclosure(lifted, push, H, rhs, control, joined, looseness, cuts), CELLS_KEPT)
         return self._cells[key]
 
     def _minorant(self, H: Array, joined: Combination, nu: int) -> tuple[Array, Array]:

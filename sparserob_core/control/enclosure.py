@@ -7,23 +7,28 @@ the larger of its bounds at ``a`` and at ``b``, plus that curvature, plus what t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from sparserob_core.control.combination import Combination
+from sparserob_core.control.cut import cheapest_multipliers
 from sparserob_core.control.lifted import LiftedSystem, grown_less_one
 from sparserob_core.control.measurable import MeasurablePush
 from sparserob_core.control.polynomial import distinct_patterns, face_matrix, monotone_ends, polynomial_bound
 from sparserob_core.control.push import Push
 from sparserob_core.control.taylor import TaylorSpace
+from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.program import Enclosure
 
 LONG_STEP = 1.0         # in norm times duration: longer steps are taken by matrix exponentials
 SMALL_SHARE = 1e-6      # so that no coordinate is ever entirely blameless
 CELLS_KEPT = 256        # cells of parameters whose matrices are kept
 TIME_FIRST = 0.25       # times are halved before anything else unless that gains less than this share: their cells share all work
+TINY = 1e-4             # of a cell of parameters: a cell on which a system that can be enclosed at all will be
 TAYLOR_TERMS = 1e-17    # relative size below which further terms of the exponential series are left out
 
 
@@ -34,6 +39,7 @@ class CellEnclosure:
     ``H (r, d)``; ``rhs (r', M')``, polynomials over the cell; ``control (m, K)`` on the pieces of the control's dictionary. Without a
     combination every row of ``H`` is a constraint (``r' = r``, ``M' = M``); with one they are the parts of a single constraint.
     ``looseness (nu',)``: how far ``rhs`` may be below the truth at the ends of every coordinate; it only guides the halving.
+    ``cuts (q, nu), (q,)``: half-spaces ``a'delta <= s`` beyond which the cell holds no parameters.
     """
 
     lifted: LiftedSystem
@@ -43,6 +49,7 @@ class CellEnclosure:
     control: Array
     combination: Combination | None = None
     looseness: Array | float = 0.0
+    cuts: tuple[Array, Array] | None = None
 
     def bounds(self, start: Array, stop: Array) -> tuple[Array, Array, Array]:
         """For time cells ``[start, stop]`` (``(k,)``, each inside one piece): upper bounds ``(k,)``, the part of them that halving the
@@ -74,6 +81,7 @@ class CellEnclosure:
             coefficients, space = self.combination.apply(coefficients), self.combination.space
         coefficients = coefficients - self.rhs
         swing = np.zeros((*coefficients.shape[:2], space.nu)) if self.push is None or not space.nu else self.push.swing(times)
+        coefficients = self._cut_off(space, coefficients, times)
         ends = self._better_ends(space, coefficients, swing)
         coefficients, excess = _on_faces(space, coefficients, ends), np.zeros(coefficients.shape[:2])
         if self.push is not None:
@@ -82,6 +90,23 @@ class CellEnclosure:
         bound, spread = polynomial_bound(space, coefficients)
         blame = np.where(ends == 0, swing, 0.0) + np.finfo(float).tiny
         return bound + excess, spread + excess[..., None] * blame / blame.sum(axis=2, keepdims=True)
+
+    def _cut_off(self, space: TaylorSpace, coefficients: Array, times: Array) -> Array:
+        """Polynomials that are above ``coefficients (k, r, M)`` where the parameters are, and lower beyond: ``lambda (s - a'delta)`` is added,
+        with multipliers ``lambda >= 0`` that make the linear part (that of the push included) small."""
+        if self.cuts is None or not self.cuts[1].size:
+            return coefficients
+        count = self.cuts[0].shape[1]
+        linear = [space.index[tuple(unit)] for unit in np.eye(space.nu, dtype=int)[:count].tolist()]
+        gradient = coefficients[:, :, linear]
+        if self.push is not None:
+            gradient = gradient + self.push.at(times, np.zeros((*coefficients.shape[:2], space.nu)))[0][:, :, linear]
+        slopes, slack = self.cuts
+        multipliers = cheapest_multipliers(slopes, slack, gradient)
+        lowered = coefficients.copy()
+        lowered[:, :, 0] += multipliers @ slack
+        lowered[:, :, linear] -= multipliers @ slopes
+        return lowered
 
     @staticmethod
     def _better_ends(space: TaylorSpace, coefficients: Array, swing: Array) -> Array:
@@ -159,7 +184,7 @@ class CellEnclosure:
     @cached_property
     def _neglected(self) -> Array:
         """What the Taylor models neglect, ``(r, L)``."""
-        state = self.lifted.state_remainder(self._nodes, self.control)
+        state = self.lifted.state_remainder(self.control)
         total = np.outer(np.linalg.norm(self._rows, axis=1), state)
         return total if self.push is None else total + self.push.neglected
 
@@ -178,6 +203,38 @@ def _ends(start: Array, stop: Array, pieces: np.ndarray) -> tuple[tuple[Array, n
     both = np.stack([np.concatenate([start, stop]), np.concatenate([pieces, pieces])])
     unique, which = np.unique(both, axis=1, return_inverse=True)
     return (unique[0], unique[1].astype(int)), which.reshape(-1)
+
+
+def enclose(lower: Array, upper: Array, touched: np.ndarray, nu: int, cell_over: Callable[[Array, Array], CellEnclosure]) -> Enclosure:
+    """Bounds on cells ``(k, 1 + nu + b)`` of times, ``nu`` parameters and directions; those of one box ``(low, high)`` share its ``cell_over``.
+
+    Cells that are not ``touched (k,)`` are closed. A cell without an enclosure is halved; raises `NotEnclosable` when a tiny one has none either.
+    """
+    bounds, split = np.full(lower.shape[0], -np.inf), np.zeros(lower.shape[0], dtype=int)
+    for members in _groups(np.hstack([lower[:, 1:], upper[:, 1:]]), touched):
+        low, high = lower[members[0], 1:], upper[members[0], 1:]
+        try:
+            cell = cell_over(low, high)
+        except NotEnclosable:
+            middle, radius = (low + high) / 2, (high - low) / 2
+            radius[:nu] *= TINY
+            cell_over(middle - radius, middle + radius)
+            bounds[members], split[members] = np.inf, 1 + int(np.argmax((high - low)[:nu]))
+            continue
+        bounds[members], bend, spread = cell.bounds(lower[members, 0], upper[members, 0])
+        coordinates = np.concatenate([np.arange(1 + nu), 1 + nu + np.flatnonzero(high[nu:] > low[nu:])])
+        split[members] = coordinates[where_to_halve(bend, spread, bounds[members])]
+    return Enclosure(bounds, split)
+
+
+def _groups(keys: Array, touched: np.ndarray) -> list[np.ndarray]:
+    """Positions of the touched rows of ``keys``, those with the same row together."""
+    places = np.flatnonzero(touched)
+    if not places.size or not keys.shape[1]:
+        return [places] if places.size else []
+    _, which = np.unique(keys[places], axis=0, return_inverse=True)
+    order = np.argsort(which.reshape(-1), kind="stable")
+    return np.split(places[order], np.flatnonzero(np.diff(which.reshape(-1)[order])) + 1)
 
 
 def where_to_halve(bend: Array, spread: Array, bounds: Array) -> np.ndarray:

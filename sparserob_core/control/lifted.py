@@ -14,7 +14,9 @@ from itertools import accumulate
 
 import numpy as np
 
+from sparserob_core.control.algebra import lifted_matrix, lifted_transitions
 from sparserob_core.control.exponential import exponential
+from sparserob_core.control.memory import remember
 from sparserob_core.control.response import Response, TimeGrid
 from sparserob_core.control.system import LinearSystem
 from sparserob_core.control.taylor import TaylorSpace
@@ -24,6 +26,8 @@ DEGREES = {0: 0, 1: 6, 2: 4, 3: 3}   # of the Taylor models, by the number of pa
 HUGE = 300.0    # a logarithm of a growth that is as good as infinite
 KNOWN = np.zeros((1, 0))
 WELL_CONDITIONED = 1e3
+SHORT, MOST_CUTS = 0.5, 64      # norm times length of the parts that pieces are cut into for what is neglected, and how many of a piece at most
+PATHS_KEPT = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,71 +67,102 @@ class LiftedSystem:
     @cached_property
     def matrix(self) -> Array:
         """The lifted matrix ``(M d, M d)`` that acts on columns: block (target, source) is ``A_g`` with ``g + source = target``."""
-        return _blocks(self.space, self.A, rows=False)
+        return lifted_matrix(self.space, self.A, rows=False)
 
     @cached_property
     def row_matrix(self) -> Array:
         """The lifted matrix that acts on rows from the right."""
-        return _blocks(self.space, self.A, rows=True)
+        return lifted_matrix(self.space, self.A, rows=True)
+
+    @cached_property
+    def fine(self) -> TimeGrid:
+        """The grid with long pieces cut into equal parts: a norm bound over a part is only good if the system moves little on it."""
+        counts, breaks = np.clip(np.ceil(self.norm * self.grid.lengths / SHORT), 1, MOST_CUTS).astype(int), self.grid.breakpoints
+        if not self.space.nu or counts.max() == 1:
+            return self.grid
+        inner = [np.linspace(a, b, count, endpoint=False) for a, b, count in zip(breaks[:-1], breaks[1:], counts, strict=True)]
+        return TimeGrid(np.concatenate([*inner, breaks[-1:]]), np.repeat(self.grid.control_piece, counts),
+                        np.repeat(self.grid.disturbance_piece, counts))
+
+    @cached_property
+    def ends(self) -> np.ndarray:
+        """Where the breakpoints of the grid are among those of the fine one, ``(L+1,)``."""
+        return np.searchsorted(self.fine.breakpoints, self.grid.breakpoints)
 
     @cached_property
     def forward(self) -> Response:
-        """The lifted system as a response; its states are the Taylor coefficients of the state, ``(M d,)``."""
+        """The lifted system as a response on the fine grid; its states are the Taylor coefficients of the state, ``(M d,)``."""
         start = np.zeros(self.matrix.shape[0])
         start[:self.states] = self.initial_state
         drive = self.B.reshape(-1, self.B.shape[2])
-        return Response(LinearSystem(self.matrix, drive), self.grid, start)
+        return Response(LinearSystem(self.matrix, drive), self.fine, start, lifted_transitions(self.space, self.A, rows=False))
 
     @cached_property
     def backward(self) -> Response:
         """The adjoint of the lifted system; its functionals are Taylor coefficients of ``c'e^{A(p) t}``."""
         size = self.row_matrix.shape[0]
-        return Response(LinearSystem(self.row_matrix, np.zeros((size, 1))), self.grid, np.zeros(size))
+        propagate = lifted_transitions(self.space, self.A, rows=True)
+        return Response(LinearSystem(self.row_matrix, np.zeros((size, 1))), self.grid, np.zeros(size), propagate)
 
     def nodes(self, control: Array) -> Array:
         """Taylor coefficients ``(L+1, M, d)`` of the state at the breakpoints, under ``control (m, K)``."""
-        answer: Array = self.forward.states(control, KNOWN)[0].reshape(self.grid.pieces + 1, self.space.size, self.states)
+        answer: Array = self._path(control)[self.ends]
         return answer
 
-    def state_remainder(self, nodes: Array, control: Array) -> Array:
+    def state_remainder(self, control: Array) -> Array:
         """Norm bounds ``(L,)``, per piece, of the neglected part of the state."""
         if self.space.nu == 0:
             return np.zeros(self.grid.pieces)
-        inputs = control[:, self.grid.control_piece]
+        inputs = control[:, self.fine.control_piece]
         driven = inputs.T @ self.forward.system.matrices(KNOWN)[1][0].T
-        return self._neglected(self._sizes(nodes, driven, self.matrix), np.abs(inputs).sum(axis=0) * self.slack_B)
+        neglected = self._neglected(self._sizes(self._path(control), driven, self.matrix), np.abs(inputs).sum(axis=0) * self.slack_B)
+        answer: Array = np.maximum.reduceat(neglected, self.ends[:-1])
+        return answer
+
+    def _path(self, control: Array) -> Array:
+        """Taylor coefficients of the state at the breakpoints of the fine grid, remembered: all directions of a cell share them."""
+        key = control.tobytes()
+        if key not in self._paths:
+            states = self.forward.states(control, KNOWN)[0]
+            remember(self._paths, key, states.reshape(-1, self.space.size, self.states), PATHS_KEPT)
+        return self._paths[key]
+
+    @cached_property
+    def _paths(self) -> dict[bytes, Array]:
+        return {}
 
     def row_bounds(self, direction: Array) -> tuple[Array, Array]:
-        """For the Taylor model of ``c'e^{A(p) s}``, read backwards from ``t``: norms ``(L, M)`` of its coefficients, the largest on every
-        piece, and norm bounds ``(L,)`` of its neglected part."""
+        """For the Taylor model of ``c'e^{A(p) s}``, read backwards from ``t``: norms ``(L', M)`` of its coefficients, the largest on every
+        piece of the fine grid, and norm bounds ``(L',)`` of its neglected part."""
         sizes = self._sizes(self.row_nodes(direction), np.zeros(1), self.row_matrix.T)
-        return sizes, self._neglected(sizes, np.zeros(self.grid.pieces))
+        return sizes, self._neglected(sizes, np.zeros(self.fine.pieces))
 
     def row_nodes(self, direction: Array) -> Array:
-        """Taylor coefficients ``(L+1, M, d)`` of ``c'e^{A(p) s}`` at the breakpoints ``s``."""
+        """Taylor coefficients ``(L'+1, M, d)`` of ``c'e^{A(p) s}`` at the breakpoints ``s`` of the fine grid."""
         row = np.zeros(self.row_matrix.shape[0])
         row[:self.states] = direction
         still = np.zeros((1, int(self.grid.control_piece.max()) + 1))
         path = replace(self._transposed, initial_state=row).states(still, KNOWN)
-        answer: Array = path[0].reshape(self.grid.pieces + 1, self.space.size, self.states)
+        answer: Array = path[0].reshape(-1, self.space.size, self.states)
         return answer
 
     @cached_property
     def _transposed(self) -> Response:
         """Rows as states; its transitions are shared by all of them."""
         size = self.row_matrix.shape[0]
-        return Response(LinearSystem(self.row_matrix.T, np.zeros((size, 1))), self.grid, np.zeros(size))
+        propagate = lifted_transitions(self.space, self.A, rows=True, transposed=True)
+        return Response(LinearSystem(self.row_matrix.T, np.zeros((size, 1))), self.fine, np.zeros(size), propagate)
 
     def _sizes(self, nodes: Array, driven: Array, matrix: Array) -> Array:
-        """Norms ``(L, M)`` of Taylor coefficients, the largest on every piece: at its ends, or between them, where they are near their chord."""
-        lengths = self.grid.lengths
+        """Norms ``(L', M)`` of Taylor coefficients, the largest on every fine piece: at its ends, or between them, near their chord."""
+        lengths = self.fine.lengths
         second = ((nodes[:-1].reshape(lengths.size, -1) @ matrix.T + driven) @ matrix.T).reshape(lengths.size, self.space.size, -1)
         norms = np.linalg.norm(nodes, axis=2)
         return np.asarray(np.maximum(norms[:-1], norms[1:]) + (lengths**2 / 8)[:, None] * (np.linalg.norm(second, axis=2) @ self._growths.T))
 
     def _neglected(self, norms: Array, extra: Array) -> Array:
-        """Gronwall: ``|e|' <= growth |e| + residual``, with the residual of the truncation bounded on every piece."""
-        lengths = self.grid.lengths
+        """Gronwall: ``|e|' <= growth |e| + residual``, with the residual of the truncation bounded on every fine piece."""
+        lengths = self.fine.lengths
         residual = norms @ self.spilt(self.A) + norms.sum(axis=1) * self.slack_A + extra
         factor = grown(self.growth * lengths)
         added = residual * (grown_less_one(self.growth * lengths) / self.growth if abs(self.growth) > 1e-12 else lengths)
@@ -137,11 +172,11 @@ class LiftedSystem:
 
     @cached_property
     def _growths(self) -> Array:
-        """``G (M, M)``: the norm of coefficient ``a`` of ``e^{lifted r} z`` is at most ``sum_b G_ab |z_b|``, for ``r`` up to the longest piece."""
+        """``G (M, M)``: the norm of coefficient ``a`` of ``e^{lifted r} z`` is at most ``sum_b G_ab |z_b|``, ``r`` up to the longest fine piece."""
         left, right, target = self.space.products
         sizes = np.zeros((self.space.size, self.space.size))
         sizes[target, right] = np.linalg.norm(self.A, axis=(1, 2))[left]
-        exponent = sizes * self.grid.lengths.max()
+        exponent = sizes * self.fine.lengths.max()
         return exponential(exponent) if exponent.max() < HUGE else np.full(sizes.shape, np.inf)
 
     def spilt(self, coefficients: Array) -> Array:
@@ -195,11 +230,3 @@ def _space(nu: int) -> TaylorSpace:
     if nu not in _SPACES:
         _SPACES[nu] = TaylorSpace(nu, DEGREES.get(nu, 2))
     return _SPACES[nu]
-
-
-def _blocks(space: TaylorSpace, coefficients: Array, rows: bool) -> Array:
-    size, d = space.size, coefficients.shape[1]
-    lifted = np.zeros((size, size, d, d))
-    left, right, target = space.products
-    lifted[(right, target) if rows else (target, right)] = coefficients[left]
-    return lifted.swapaxes(1, 2).reshape(size * d, size * d)

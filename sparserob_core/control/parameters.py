@@ -10,6 +10,7 @@ import numpy as np
 from sparserob_core.control.ray import outward, shares
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
+TOUCHING = 1e-12    # relative: a cell this close to the set meets it
 LATTICE = 4096  # points at most in the lattice over the parameters
 
 
@@ -57,11 +58,33 @@ class ParameterIndex:
 
     def touches(self, lower: Array, upper: Array) -> np.ndarray:
         """Whether cells ``[lower, upper]`` (``(k, nu)``) may meet the set; ``False`` only when they provably do not."""
-        if self.set is None or isinstance(self.set, Box) or (flat := self.set.halfspaces()) is None:
+        if self.set is None or isinstance(self.set, Box):
             return np.ones(lower.shape[0], dtype=bool)
-        H, h = flat
-        smallest = np.minimum(H[None] * lower[:, None], H[None] * upper[:, None]).sum(axis=2)
-        return np.asarray((smallest <= h + 1e-12).all(axis=1))
+        H, h = self._halfspaces(self.set, (lower + upper) / 2)
+        smallest = np.minimum(H * lower[:, None], H * upper[:, None]).sum(axis=2)
+        return np.asarray((smallest <= h + TOUCHING * np.maximum(1.0, np.abs(h))).all(axis=1))
+
+    def cuts(self, low: Array, high: Array) -> tuple[Array, Array]:
+        """Half-spaces ``a'delta <= s`` that contain the set and cut the cell ``[low, high]``, in ``delta in [-1, 1]^nu``: ``(q, nu), (q,)``."""
+        centre, radius = (low + high) / 2, (high - low) / 2
+        if self.set is None or isinstance(self.set, Box):
+            return np.zeros((0, centre.size)), np.zeros(0)
+        H, h = self._halfspaces(self.set, centre[None])
+        slopes, slack = H[0] * radius, h[0] - H[0] @ centre
+        crossing = np.abs(slopes).sum(axis=1) > slack
+        return slopes[crossing], slack[crossing]
+
+    @staticmethod
+    def _halfspaces(convex_set: ConvexSet, points: Array) -> tuple[Array, Array]:
+        """Half-spaces ``H p <= h`` that contain the set: its own, or a tangent one on the ray to each of ``points``; ``(k, q, nu), (k, q)``."""
+        flat = convex_set.halfspaces()
+        if flat is not None:
+            return np.broadcast_to(flat[0], (points.shape[0], *flat[0].shape)), np.broadcast_to(flat[1], (points.shape[0], flat[1].size))
+        middle = convex_set.interior_point()
+        normals = outward(convex_set, middle + shares(convex_set, points)[:, None] * (points - middle))
+        sizes = np.linalg.norm(normals, axis=1, keepdims=True)
+        normals = normals / np.where(sizes > 0, sizes, 1.0)
+        return normals[:, None], convex_set.support(normals)[:, None]
 
     def lattice(self) -> tuple[Array, tuple[int, ...]]:
         """A tensor lattice ``(v, nu)`` over the box (ends and middle included), clamped onto the set, and its shape."""

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from sparserob_core.control.memory import remember
 from sparserob_core.control.taylor import TaylorSpace
 from sparserob_core.sip.convex_set import Array
 
 DEFINITE = 1e-12    # relative to its largest entry, the smallest eigenvalue of a Hessian that counts as definite
+FACES_KEPT = 256    # matrices of faces that a space remembers
 
 
 def polynomial_bound(space: TaylorSpace, coefficients: Array) -> tuple[Array, Array]:
@@ -54,7 +56,14 @@ def distinct_patterns(ends: Array) -> tuple[Array, np.ndarray]:
 
 
 def face_matrix(space: TaylorSpace, ends: Array) -> Array:
-    """The matrix ``(M, M)`` that sets the variables with ``ends (nu,)`` not 0 to them, in coefficient vectors on its right."""
+    """The matrix ``(M, M)`` that sets the variables with ``ends (nu,)`` not 0 to them, in coefficient vectors on its right; remembered."""
+    key = ends.tobytes()
+    if key not in space.faces:
+        remember(space.faces, key, _face_matrix(space, ends), FACES_KEPT)
+    return space.faces[key]
+
+
+def _face_matrix(space: TaylorSpace, ends: Array) -> Array:
     fixed = ends != 0
     sign = np.prod(np.where(fixed, ends, 1.0) ** space.exponents, axis=1)
     target = [space.index[tuple(int(e) for e in exponents)] for exponents in np.where(fixed, 0, space.exponents)]

@@ -65,15 +65,15 @@ class Push:
     @cached_property
     def neglected(self) -> Array:
         """What the Taylor models neglect, at most, on every piece: ``(r, L)``."""
-        lengths, space = self.lifted.grid.lengths, self.lifted.space
-        total = np.zeros((self.rows.shape[0], lengths.size))
-        if space.nu == 0:
+        total = np.zeros((self.rows.shape[0], self.lifted.grid.pieces))
+        if self.lifted.space.nu == 0:
             return total
+        lengths = self.lifted.fine.lengths
         spilt = self.lifted.spilt(self.lifted.W) + self.lifted.slack_W
         reach = self._reach + self.lifted.slack_W * self.disturbance.radius
         for row, direction in enumerate(self.rows):
             sizes, remainder = self.lifted.row_bounds(direction)
-            total[row] = np.cumsum((remainder * reach + sizes @ spilt * self.disturbance.radius) * lengths)
+            total[row] = np.cumsum((remainder * reach + sizes @ spilt * self.disturbance.radius) * lengths)[self.lifted.ends[1:] - 1]
         return total
 
     @property

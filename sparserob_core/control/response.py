@@ -7,6 +7,7 @@ exponential of ``[[A, I], [0, 0]]`` (Van Loan 1978, Theorem 1).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -82,11 +83,12 @@ class Steps:
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """The responses of one system on one time grid."""
+    """The responses of one system on one time grid; ``propagate`` takes the place of `transitions` for matrices with a structure."""
 
     system: LinearSystem
     grid: TimeGrid
     initial_state: Array
+    propagate: Callable[[Array, Array], tuple[Array, Array]] | None = None
     _steps: dict[bytes, Steps] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
@@ -102,7 +104,7 @@ class Response:
         key = bytes(str(parameters.shape), "ascii") + parameters.tobytes()  # no parameters: any number of rows has the same bytes
         if key not in self._steps:
             A, B, W = self.system.matrices(parameters)
-            E, F = transitions(A[:, None], self._lengths[None, :])
+            E, F = self._transitions(A[:, None], self._lengths[None, :])
             remember(self._steps, key, Steps(A, B, W, E, F), STEPS_KEPT)
         return self._steps[key]
 
@@ -149,7 +151,7 @@ class Response:
     def _partial(self, steps: Steps, which: np.ndarray, within: Array) -> tuple[Array, Array]:
         horizon = self.grid.breakpoints[-1]
         distinct, inverse = np.unique(np.stack([which, np.round(within / horizon, 15)]), axis=1, return_inverse=True)
-        E, F = transitions(steps.A[distinct[0].astype(int)], distinct[1] * horizon)
+        E, F = self._transitions(steps.A[distinct[0].astype(int)], distinct[1] * horizon)
         return E[inverse.reshape(-1)], F[inverse.reshape(-1)]
 
     @property
@@ -159,7 +161,10 @@ class Response:
 
     def flows(self, durations: Array) -> tuple[Array, Array]:
         """``e^{A r}`` and its integral ``(k, d, d)`` for durations ``(k,)``; for a known system."""
-        return transitions(self.steps(np.zeros((1, 0))).A[0], durations)
+        return self._transitions(self.steps(np.zeros((1, 0))).A[0], durations)
+
+    def _transitions(self, A: Array, durations: Array) -> tuple[Array, Array]:
+        return (self.propagate or transitions)(A, durations)
 
     @cached_property
     def _powers(self) -> Array:
@@ -175,7 +180,7 @@ class Response:
         done = 1
         while done < powers.shape[0]:  # doubling: e^{A (done + i) h} = e^{A done h} e^{A i h}
             count = min(done, powers.shape[0] - done)
-            leap = transitions(steps.A[0], np.array(done * self._lengths[0]))[0]
+            leap = self._transitions(steps.A[0], np.array(done * self._lengths[0]))[0]
             powers[done:done + count] = leap @ powers[:count]
             done += count
         return powers

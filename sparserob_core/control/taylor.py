@@ -25,7 +25,8 @@ class TaylorSpace:
     """Polynomials in ``delta in [-1, 1]^nu`` of total degree at most ``degree``, over one fixed list of ``M`` monomials.
 
     ``exponents (M, nu)`` in graded order, the constant first; ``degrees (M,)``; ``index`` from an exponent tuple to its place;
-    ``products``: three arrays ``(left, right, target)``, every pair of monomials whose product is in the space.
+    ``products``: three arrays ``(left, right, target)``, every pair of monomials whose product is in the space; ``faces``: what
+    `face_matrix` remembers.
     """
 
     def __init__(self, nu: int, degree: int) -> None:
@@ -43,6 +44,7 @@ class TaylorSpace:
         order = np.argsort(codes)
         target = order[np.searchsorted(codes[order], codes[left] + codes[right])]
         self.products = (left, right, target)
+        self.faces: dict[bytes, Array] = {}
 
     @property
     def size(self) -> int:

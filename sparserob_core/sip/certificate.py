@@ -17,12 +17,18 @@ TOLERANCE = 1e-9        # a violation of at most this counts as none (less where
 CELLS = 400_000         # cells examined per family before the proof is given up
 BATCH = 4096            # cells bounded at a time, worst first
 PROBED = 16             # centres of the worst cells at which a witness is looked for, per batch
+CLIMBED = (3, 6, 10, 15, 20, 30)    # halvings after which a witness is also climbed to: a cell's centre may be far from the worst corner of a set
+MOVES = 24              # steps of such a climb at most
 
 
 @dataclass(frozen=True, eq=False)
 class Proof:
     """What is known of one family at one decision: ``proven`` (no index violates it by more than ``bound <= TOLERANCE``),
-    ``refuted`` (``index``, ``row`` violate it by ``violation``) or ``undecided`` (``reason``)."""
+    ``refuted`` (``index``, ``row`` violate it by ``violation``) or ``undecided`` (``reason``).
+
+    ``leaves``: the lower and upper corners ``(k, d)`` of the closed cells that prove it, a subdivision of the family's ``cells``, in
+    lexicographic order; ``None`` unless proven by branch and bound.
+    """
 
     family: str
     verdict: Literal["proven", "refuted", "undecided"]
@@ -32,6 +38,7 @@ class Proof:
     row: int = 0
     cells: int = 0
     reason: str = ""
+    leaves: tuple[Array, Array] | None = None
 
 
 def prove(program: SemiInfiniteProgram, x: Array, notify: Notify = silence,
@@ -44,7 +51,8 @@ def prove_family(family: ConstraintFamily, x: Array, notify: Notify = silence,
                  cells: int = CELLS) -> Proof:
     """Bound the violation of one family over its whole index set.
 
-    Cells whose enclosure is at most `TOLERANCE` are closed, the others halved; the centres of the worst are probed for a witness.
+    Cells whose enclosure is at most `TOLERANCE` are closed, the others halved; the centres of the worst are probed for a witness,
+    and where that takes long one is climbed to.
     """
     if family.enclosure is None:
         return _by_separation(family, x)
@@ -58,16 +66,20 @@ def _branch_and_bound(family: ConstraintFamily, x: Array, notify: Notify, cells:
     start, tolerance = time.perf_counter(), family.tolerance(TOLERANCE)
     lower, upper = family.cells if family.cells is not None else (family.index_set.lower[None], family.index_set.upper[None])
     closed, examined, best = -np.inf, 0, (-np.inf, lower[0], 0)
+    leaves: list[tuple[Array, Array]] = []  # one entry per halving
     bounds, split = _bounded(family, x, lower, upper)
     while True:
         examined += bounds.size
         open_ = bounds > tolerance
+        leaves.append((lower[~open_], upper[~open_]))
         closed = max(closed, float(bounds[~open_].max(initial=-np.inf)))
         best = max(best, _probe(family, x, lower, upper, bounds), key=lambda found: found[0])
+        if open_.any() and best[0] <= tolerance and len(leaves) in CLIMBED:
+            best = max(best, _climb(family, x, *(corner[bounds.argmax()] for corner in (lower, upper))), key=lambda found: found[0])
         if best[0] > tolerance:
             return Proof(family.name, "refuted", np.inf, best[0], best[1], best[2], examined)
         if not open_.any():
-            return Proof(family.name, "proven", closed, best[0], best[1], best[2], examined)
+            return Proof(family.name, "proven", closed, best[0], best[1], best[2], examined, leaves=_in_order(leaves))
         worst = float(bounds.max())
         notify(ProofProgress(family=family.name, cells=int(open_.sum()), bound=worst, seconds=time.perf_counter() - start))
         halves = _halved(lower[open_], upper[open_], split[open_])
@@ -91,6 +103,32 @@ def _probe(family: ConstraintFamily, x: Array, lower: Array, upper: Array, bound
     values = family.violations(x, centres)
     position, row = np.unravel_index(int(values.argmax()), values.shape)
     return float(values[position, row]), centres[position], int(row)
+
+
+def _climb(family: ConstraintFamily, x: Array, lower: Array, upper: Array) -> tuple[float, Array, int]:
+    """The largest violation that a climb from the middle of one cell finds, its index and row: steps along every axis and along all of them."""
+    box, point, radius = family.index_set, (lower + upper) / 2, upper - lower
+    best = (-np.inf, point, 0)
+    for _ in range(MOVES):
+        star = np.clip(np.vstack([point, point + np.diag(radius), point - np.diag(radius)]), box.lower, box.upper)
+        values = family.violations(x, star)
+        ahead, behind = values[1:].max(axis=1).reshape(2, -1)
+        together = np.clip(point + np.sign(ahead - behind) * radius, box.lower, box.upper)[None]
+        star, values = np.vstack([star, together]), np.vstack([values, family.violations(x, together)])
+        position, row = (int(i) for i in np.unravel_index(int(values.argmax()), values.shape))
+        if values[position, row] > best[0]:
+            best = (float(values[position, row]), star[position], row)
+        else:
+            radius = radius / 2
+        point = best[1]
+    return best
+
+
+def _in_order(leaves: list[tuple[Array, Array]]) -> tuple[Array, Array]:
+    """All leaves, by their lower and then by their upper corners."""
+    lower, upper = (np.vstack(corners) for corners in zip(*leaves, strict=True))
+    order = np.lexsort(np.hstack([lower, upper]).T[::-1])
+    return lower[order], upper[order]
 
 
 def _halved(lower: Array, upper: Array, split: Array) -> tuple[Array, Array] | None:

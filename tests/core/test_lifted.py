@@ -70,7 +70,7 @@ def test_the_taylor_model_of_the_state_encloses_every_trajectory_of_the_cell(nam
     system, response = functionals.response.system, functionals.response
     control = rng.normal(size=(1, GRIDS[grid].pieces))
     nodes = lifted.nodes(control)
-    remainder = lifted.state_remainder(nodes, control)
+    remainder = lifted.state_remainder(control)
     _, _, _, centre, radius = SYSTEMS[name]
     for delta in deltas(rng, lifted.space.nu):
         p = np.array(centre) + scale * np.array(radius) * delta
@@ -92,7 +92,7 @@ def test_the_taylor_model_of_a_functional_encloses_it_over_the_cell(name):
     for delta in deltas(rng, lifted.space.nu):
         A = functionals.response.system.matrices((np.array(centre) + np.array(radius) * delta)[None])[0][0]
         T = lifted.transform
-        for piece, stop in enumerate(functionals.response.grid.breakpoints[1:]):
+        for piece, stop in enumerate(lifted.fine.breakpoints[1:]):
             truth = direction @ np.linalg.solve(T, expm(A * stop) @ T)
             polynomial = lifted.space.monomials(delta[None])[0] @ nodes[piece + 1]
             assert np.linalg.norm(truth - polynomial) <= remainder[piece] * (1 + 1e-9) + 1e-10 * max(1.0, np.linalg.norm(truth))
@@ -123,7 +123,7 @@ def test_the_remainder_vanishes_with_the_cell(name):
     sizes = []
     for scale in (0.25, 0.125, 0.0625):
         _, lifted = made(name, "uniform", scale)
-        sizes.append(lifted.state_remainder(lifted.nodes(control), control).max())
+        sizes.append(lifted.state_remainder(control).max())
     assert sizes[1] <= sizes[0] / 60
     assert sizes[2] <= sizes[1] / 60
 
@@ -160,10 +160,9 @@ def test_a_known_system_has_no_remainder():
     system = LinearSystem([[0, 1], [-1, 0]], [[0.0], [1.0]])
     functionals = worst_case(system, GRIDS["uniform"], bound=Box([-1, -1], [1, 1]), initial_state=[1.0, 0.0])
     lifted = lift(system, functionals.response.grid, np.array([1.0, 0.0]), np.zeros(0), np.zeros(0))
-    nodes = lifted.nodes(np.ones((1, 6)))
-    assert not lifted.state_remainder(nodes, np.ones((1, 6))).any()
+    assert not lifted.state_remainder(np.ones((1, 6))).any()
     assert not Push(lifted, functionals.disturbance, np.eye(2)).neglected.any()
-    assert np.allclose(nodes[:, 0], functionals.response.states(np.ones((1, 6)), np.zeros((1, 0)))[0])
+    assert np.allclose(lifted.nodes(np.ones((1, 6)))[:, 0], functionals.response.states(np.ones((1, 6)), np.zeros((1, 0)))[0])
 
 
 def test_a_frozen_system_is_the_system_at_that_parameter():

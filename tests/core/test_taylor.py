@@ -7,7 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sparserob_core.control.algebra import lifted_matrix, lifted_transitions
 from sparserob_core.control.expression import parse_expression
+from sparserob_core.control.response import transitions
 from sparserob_core.control.taylor import TaylorModel, TaylorSpace
 from sparserob_core.errors import NotEnclosable
 
@@ -83,3 +85,13 @@ def test_what_has_no_enclosure_says_so(broken) -> None:
     (p,) = TaylorSpace(1, 3).variables(np.array([0.0]), np.array([1.0]))
     with pytest.raises(NotEnclosable):
         broken(p)
+
+
+@pytest.mark.parametrize(("nu", "degree"), [(0, 0), (1, 4), (2, 3), (4, 2)])
+@pytest.mark.parametrize("rows", [False, True])
+def test_the_transitions_of_the_coefficients_are_those_of_the_lifted_matrix(nu, degree, rows):
+    space, rng = TaylorSpace(nu, degree), np.random.default_rng(nu)
+    A, durations = rng.normal(size=(space.size, 3, 3)), np.array([0.0, 0.3, 2.0])
+    matrix = lifted_matrix(space, A, rows)
+    for found, expected in zip(lifted_transitions(space, A, rows)(matrix, durations), transitions(matrix, durations), strict=True):
+        assert np.allclose(found, expected, rtol=1e-11, atol=1e-11 * np.abs(expected).max())
