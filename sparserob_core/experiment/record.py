@@ -27,6 +27,7 @@ def summary_of(result: Result, control: Array | None, dictionary: Dictionary | N
         "lower_bound": result.lower_bound, "upper_bound": result.upper_bound, "gap": result.gap,
         "worst": _witness(result.worst), "sparsity": acting or {"active_fraction": None, "switches": None},
         "counts": {"relaxed_programs": 0, "rounds": len(result.history), "active_indices": len(result.indices), **result.counts},
+        **({} if result.scenario_bound is None else {"scenario_bound": asdict(result.scenario_bound)}),
         "seconds": result.seconds,
     }
 

@@ -8,12 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sparserob_core.errors import InputError
-from sparserob_core.sip.certificate import prove
+from sparserob_core.sip.certificate import TOLERANCE, Proof, prove
 from sparserob_core.sip.exchange import Exchange
 from sparserob_core.sip.method import Method, Tools
-from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
+from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation
 from sparserob_core.sip.result import Result
-from sparserob_core.sip.verdict import verdict, witness
+from sparserob_core.sip.scenario_bound import scenario_bound
+from sparserob_core.sip.separation import separate
+from sparserob_core.sip.verdict import verdict, witness, worst_of
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,11 @@ class Nominal(Method):
 
 @dataclass(frozen=True)
 class Scenario(Method):
-    """Impose the constraints for ``scenarios`` sampled uncertainties (Calafiore and Campi 2006); then judge the decision against all of them."""
+    """Impose the constraints for ``scenarios`` sampled uncertainties (Calafiore and Campi 2006); then judge the decision against all of them.
+
+    Beside the worst violation stands what the scenario theory promises: the `ScenarioBound` of the result. A constraint belongs to one
+    scenario, so those that carry a multiplier are at least as many as the support constraints.
+    """
 
     scenarios: int = 1000
     tolerance: float = 1e-7
@@ -41,7 +47,12 @@ class Scenario(Method):
         def sampled(family: ConstraintFamily) -> ConstraintFamily | None:
             return None if family.sample is None else family.sample(self.scenarios, np.random.default_rng(seed))
 
-        return _judged(program, _simplified(program, "scenario", sampled), tools, self.tolerance, self.rounds)
+        result = _judged(program, _simplified(program, "scenario", sampled), tools, self.tolerance, self.rounds)
+        if result.decision is None:
+            return result
+        bound = scenario_bound(self.scenarios, program.n, len(result.indices))
+        message = f"{result.message}; {bound.sentence}" if result.status in ("refuted", "undecided") else result.message
+        return replace(result, message=message, scenario_bound=bound)
 
 
 def _simplified(program: SemiInfiniteProgram, method: str,
@@ -59,7 +70,16 @@ def _judged(program: SemiInfiniteProgram, simple: SemiInfiniteProgram, tools: To
     result = Exchange(tolerance, rounds).close(simple, tools, lambda x: ())
     if result.decision is None:
         return result
-    proofs = prove(program, result.decision, tools.notify)
+    found = separate(program, result.decision, tools, TOLERANCE)
+    proofs = [_worse(proof, family, separation) for proof, (family, separation) in zip(
+        prove(program, result.decision, tools.notify), found, strict=True)]
     status, message = verdict(proofs, result.gap, tolerance)
-    worst = witness(program, result.worst, proofs) if result.worst is not None else None
-    return replace(result, status=status, message=message, worst=worst, upper_bound=np.inf if status == "refuted" else result.cost)
+    return replace(result, status=status, message=message, proofs=tuple(proofs), worst=witness(program, worst_of(found), proofs),
+                   upper_bound=np.inf if status == "refuted" else result.cost)
+
+
+def _worse(proof: Proof, family: ConstraintFamily, found: Separation) -> Proof:
+    """A refutation ends at the first witness: of what is not proven, tell the worst that the separation finds."""
+    if proof.verdict == "proven" or not found.violations.size or found.violations[0] <= max(proof.violation, family.tolerance(TOLERANCE)):
+        return proof
+    return replace(proof, verdict="refuted", violation=float(found.violations[0]), index=found.indices[0], row=int(found.rows[0]))

@@ -11,7 +11,9 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
+    from sparserob_core.sip.certificate import Proof
     from sparserob_core.sip.events import RoundFinished
+    from sparserob_core.sip.scenario_bound import ScenarioBound
 
 Status: TypeAlias = Literal["certified", "verified", "infeasible", "refuted", "undecided", "failed"]
 
@@ -33,6 +35,20 @@ class Cut:
     index: Array
     row: int
     multiplier: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Dual:
+    """Multipliers that prove a lower ``bound`` of the semi-infinite program's value, or of its infeasibility: those of the imposed
+    constraints (in ``cuts``), ``mu (e,)`` of the equalities, and ``z (k,)`` of the image ``S x`` unless ``S`` is the identity."""
+
+    bound: float
+    cuts: Sequence[Cut]
+    mu: Array
+    z: Array | None = None
+
+
+NO_BOUND = Dual(-np.inf, (), np.zeros(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +86,9 @@ class Result:
     ``cost`` is ``J`` of ``decision`` (no regulariser), ``value`` is ``J + epsilon rho``; ``lower_bound`` and ``upper_bound`` enclose the
     value of the *unregularised* semi-infinite program; ``lower_bound`` is proven in any case, ``upper_bound`` (the cost) only when ``status``
     is certified or verified: it is what the search suggests when undecided, and infinite when refuted.
-    ``gap = (upper_bound - lower_bound) / max(1, |upper_bound|)``. ``trace``: for a method that searches, every value of ``g``.
+    ``gap = (upper_bound - lower_bound) / max(1, |upper_bound|)``. ``dual``: the multipliers behind ``lower_bound``, or behind
+    infeasibility; ``proofs``: what was shown of every constraint family at the decision. ``trace``: for a method that searches, every value of
+    ``g``; ``scenario_bound``: for the scenario approach, what its theory promises.
     """
 
     status: Status
@@ -86,6 +104,9 @@ class Result:
     counts: Mapping[str, int] = field(default_factory=dict)
     history: Sequence[RoundFinished] = ()
     trace: SearchTrace | None = None
+    dual: Dual = NO_BOUND
+    proofs: Sequence[Proof] = ()
+    scenario_bound: ScenarioBound | None = None
     seconds: float = 0.0
 
     @property
