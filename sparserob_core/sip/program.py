@@ -40,12 +40,26 @@ class Enclosure:
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """One constraint in words (``text``), and its time, parameter ``(nu,)`` and worst disturbance ``(mw, pieces)`` where it has them."""
+    """One constraint in words (``text``), and its time, parameter ``(nu,)``, worst disturbance ``(mw, pieces)`` and normal ``direction`` (of the
+    state, or of the control) where it has them.
+
+    Where it compares a quantity with a limit, also their words and numbers: ``quantity`` such as ``x1(5)``, what it may be (``bound``, such as
+    ``|x1| <= 0.3``), its value ``free`` without decision and disturbance, ``sign`` -1 for a lower limit, and how far the disturbance alone
+    moves it towards the ``limit`` (``push``). ``where``: the parameter in words.
+    """
 
     text: str
     time: float | None = None
     parameter: Array | None = None
     disturbance: Array | None = None
+    quantity: str = ""
+    bound: str = ""
+    limit: float = np.nan
+    free: float = np.nan
+    push: float = 0.0
+    sign: float = 1.0
+    where: str = ""
+    direction: Array | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

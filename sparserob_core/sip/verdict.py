@@ -9,13 +9,12 @@ import numpy as np
 
 from sparserob_core.sip.certificate import Proof
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.duality import dual_bound
-from sparserob_core.sip.finite import FiniteProgram
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation
+from sparserob_core.sip.reasons import least_of, reasons, sentence, told_apart
 from sparserob_core.sip.relaxed import Rows
-from sparserob_core.sip.result import MEANING, Status, Witness
+from sparserob_core.sip.result import MEANING, Cut, Status, Witness
 
-NAMED = 4   # constraints of a clash that the sentence names, those with the largest multipliers
+NAMED = 6   # reasons, or constraints of a clash, that are named; of the latter those with the largest multipliers
 
 
 def verdict(proofs: Sequence[Proof], gap: float, tolerance: float) -> tuple[Status, str]:
@@ -52,28 +51,51 @@ def explained(program: SemiInfiniteProgram, bare: Witness) -> Witness:
 
 
 def clash(program: SemiInfiniteProgram, rows: Rows, multipliers: Array, amount: float) -> tuple[str, Witness | None]:
-    """Why nothing is feasible, from Farkas multipliers ``(r,)`` of ``rows``: one impossible constraint if there is one, else those that clash."""
+    """Why nothing is feasible, from Farkas multipliers ``(r,)`` of ``rows``: every separate reason that needs no solver, one sentence each;
+    where there is none, the rows that cannot hold together, and what they ask of the decision against what it can give."""
+    found = reasons(program)
+    if found:
+        texts = [reason.text for reason in found[:NAMED]]
+        more = f"; and {len(found) - NAMED} more" if len(found) > NAMED else ""
+        cut, several = found[0].rows.cuts[0], f"{len(found)} separate reasons: "
+        return f"{several if len(found) > 1 else ''}{'; '.join(texts)}{more}", _witness_at(program, cut, found[0].amount)
     active = np.flatnonzero(multipliers > 0)
-    alone = [_least_violation(program.finite, rows, int(i)) for i in active]
-    if alone and max(alone) > 0:
-        worst = int(active[int(np.argmax(alone))])
-        text = f"{_words(program, rows, worst)} is violated by at least {max(alone):.4g}, whatever the decision"
-        cut = rows.cuts[worst]
-        return text, explained(program, Witness(max(alone), cut.family, cut.index, cut.row))
-    order = active[np.argsort(-multipliers[active], kind="stable")][:NAMED]
-    named = " and ".join(_words(program, rows, int(i)) for i in order)
-    others = f" and {active.size - order.size} more" if active.size > order.size else ""
     if not active.size:
         return f"the equalities cannot be met within the bounds, whatever the decision: one is missed by at least {amount:.4g} times its norm", None
-    cut = rows.cuts[order[0]]
-    text = f"these cannot hold together, whatever the decision (one is violated by at least {amount:.4g} times its norm): {named}{others}"
-    return text, explained(program, Witness(amount, cut.family, cut.index, cut.row))
+    order = active[np.argsort(-multipliers[active], kind="stable")]
+    witness = _witness_at(program, rows.cuts[order[0]], amount)
+    if active.size == 1 and not program.finite.b.size:
+        i = int(order[0])
+        family = program.family(rows.cuts[i].family)
+        alone = float(least_of(program.finite, rows.G[[i]], rows.h[[i]])[0])
+        if alone > 0:
+            return sentence("out of reach", family, rows.take(np.array([i])), alone), replace(witness, violation=alone)
+    return _together(program, rows, multipliers, order, amount), witness
 
 
-def _least_violation(base: FiniteProgram, rows: Rows, i: int) -> float:
-    """A lower bound of ``G_i x - h_i`` over the bounds and fixed rows."""
-    single = replace(base, q=rows.G[i], weights=np.zeros_like(base.weights), P=None)
-    return dual_bound(single, np.zeros(base.h.size), np.zeros(base.b.size)) - float(rows.h[i])
+def _together(program: SemiInfiniteProgram, rows: Rows, multipliers: Array, order: np.ndarray, amount: float) -> str:
+    """Several rows that clash: each by name, and the sum of them that proves it."""
+    named = "; ".join(_words(program, rows, int(i)) for i in order[:NAMED])
+    others = f"; and {order.size - NAMED} more" if order.size > NAMED else ""
+    head = "nothing meets this and the equalities" if order.size == 1 else "these cannot hold together, though all but any one of them can"
+    y = multipliers / multipliers.max()
+    asked = -float(y[order] @ rows.h[order])
+    missing = float(least_of(program.finite, (y[order] @ rows.G[order])[None], np.array([-asked]))[0])
+    noun = "decision" if program.lengths is None else "control"
+    more, less = told_apart(asked, asked - missing)
+    sums = (f"; weighted by {', '.join(f'{y[i]:.3g}' for i in order[:NAMED])}{', ...' if order.size > NAMED else ''} they ask the {noun} for "
+            f"{more}, and it can give at most {less}") if missing > 0 and asked > 0 else ""
+    return f"{head} (one is violated by at least {amount:.4g} times its norm, whatever the decision): {named}{others}{sums}"
+
+
+def _witness_at(program: SemiInfiniteProgram, cut: Cut, violation: float) -> Witness:
+    family = program.family(cut.family)
+    words = (family.reduced or family).explain
+    bare = Witness(violation, cut.family, cut.index, cut.row)
+    if words is None or cut.index.size != (family.reduced or family).index_set.dimension:
+        return explained(program, bare)
+    said = words(cut.index, cut.row)
+    return replace(bare, time=said.time, parameter=said.parameter, disturbance=said.disturbance)
 
 
 def _words(program: SemiInfiniteProgram, rows: Rows, i: int) -> str:
