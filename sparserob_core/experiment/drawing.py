@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,56 +12,56 @@ from sparserob_core.control.problem import OptimalControlProblem, PathConstraint
 from sparserob_core.control.sets import Equality
 from sparserob_core.control.transcription import Transcription, prepare
 from sparserob_core.errors import InputError
+from sparserob_core.experiment.adversary import adversaries
 from sparserob_core.experiment.figure_data import FigureData, Wall
+from sparserob_core.experiment.finished import read_arrays, read_finished
 from sparserob_core.experiment.sparsity import sparsity
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.events import RoundFinished
 
 if TYPE_CHECKING:
-    from sparserob_core.experiment.run import Experiment
+    from sparserob_core.experiment.assemble import Experiment
 
 TIMES = 400
 PARAMETERS = 27
 
 
 def draw_experiment(experiment: Experiment, theta: Array, active_times: Array, history: Sequence[RoundFinished], directory: Path,
-                    cost: float | None) -> list[Path]:
-    """Draw the figures of a decision ``theta (m, N)`` into ``directory/figures``; raises `InputError` when there is nothing to draw."""
-    from sparserob_core.experiment.figures import write_figures
+                    cost: float | None, worst: Mapping[str, Array]) -> list[Path]:
+    """Draw the figures of a decision ``theta (m, N)`` into ``directory/figures``; raises `InputError` when there is nothing to draw.
 
+    ``worst``: the arrays of `adversaries`, empty when there is no constraint to be driven against.
+    """
+    from sparserob_core.experiment.figures import write_figures
+    from sparserob_core.experiment.simulation_figure import write_adversary
+
+    data = figure_data(experiment, theta, active_times, history, cost)
+    files = write_figures(directory / "figures", data)
+    for kind in ("pdf", "png") if worst else ():
+        files.append(directory / "figures" / f"adversary.{kind}")
+        write_adversary(files[-1], worst, data)
+    return files
+
+
+def figure_data(experiment: Experiment, theta: Array, active_times: Array, history: Sequence[RoundFinished], cost: float | None) -> FigureData:
+    """What figures of a decision ``theta (m, N)`` show; raises `InputError` when the program is no control problem."""
     problem, control, disturbance = experiment.problem, experiment.control, experiment.disturbance
     if problem is None or control is None or disturbance is None:
         raise InputError("figures: they are for control problems; this is a semi-infinite program of another kind")
-    return write_figures(directory / "figures", _data(experiment, problem, prepare(problem, control, disturbance), theta,
-                                                      active_times, history, cost))
+    return _data(experiment, problem, prepare(problem, control, disturbance), theta, active_times, history, cost)
 
 
 def draw_run(directory: Path) -> list[Path]:
     """Draw the figures of a run directory again; raises `InputError` when it is none, or holds no control."""
-    from sparserob_core.experiment.load import load_config
-    from sparserob_core.experiment.run import assemble
-
-    for name in ("config.yaml", "result.json"):
-        if not (directory / name).is_file():
-            raise InputError(f"{directory}: expected the directory of a run, got one without {name}")
-    summary: dict[str, Any] = json.loads((directory / "result.json").read_text(encoding="utf-8"))
-    solution = _arrays(directory / "solution.npz")
-    if "theta" not in solution:
-        raise InputError(f"{directory}: there is no control to draw; the status is '{summary['status']}': {summary['message']}")
-    trace = _arrays(directory / "trace.npz")
+    finished = read_finished(directory)
+    trace = read_arrays(directory / "trace.npz")
     rounds = [RoundFinished(**{name: trace[name][row].item() for name in trace}) for row in range(len(trace.get("round", ())))]
-    return draw_experiment(assemble(load_config(directory / "config.yaml")), solution["theta"], _active(solution), rounds, directory,
-                           summary["cost"])
+    return draw_experiment(finished.experiment, finished.theta, active_times(finished.solution), rounds, directory, finished.summary["cost"],
+                           adversaries(finished.experiment, finished.theta))
 
 
-def _arrays(file: Path) -> dict[str, Array]:
-    if not file.is_file():
-        return {}
-    with np.load(file, allow_pickle=False) as stored:
-        return {name: stored[name] for name in stored.files}
-
-
-def _active(solution: dict[str, Array]) -> Array:
+def active_times(solution: Mapping[str, Array]) -> Array:
+    """The times of the imposed constraints that carry a multiplier, from ``solution.npz``."""
     return np.unique(solution["times"][solution["multipliers"] > 0])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -43,9 +44,9 @@ def draw_control(data: FigureData) -> Figure:
         _bounds(ax, float(data.control_lower[channel]), float(data.control_upper[channel]), steps)
         _rug(ax, data.active_times)
         ax.set_ylabel(data.control_label(channel))
-    _time_axis(axes[-1], data)
+    draw_time_axis(axes[-1], data)
     _title(axes[0], data.title, _summary(data))
-    _legend(figure, axes)
+    draw_legend(figure, axes)
     return figure
 
 
@@ -60,13 +61,12 @@ def draw_states(data: FigureData) -> Figure:
         ax.plot(data.times, data.state[component], color=look.BLUE, linewidth=1.5, zorder=3, label="nominal")
         walls = [wall for wall in data.walls if wall.state == component]
         ax.set_ylim(*_limits(data, component, walls))
-        for wall in walls:
-            _terminal(ax, wall) if wall.start == wall.end else _forbidden(ax, wall)
+        draw_walls(ax, walls)
         _rug(ax, data.active_times)
         ax.set_ylabel(data.state_label(component))
-    _time_axis(axes[-1], data)
+    draw_time_axis(axes[-1], data)
     axes[0].set_title(data.title)
-    _legend(figure, axes)
+    draw_legend(figure, axes)
     return figure
 
 
@@ -139,7 +139,8 @@ def _rug(ax: Axes, times: Array) -> None:
                 transform=ax.get_xaxis_transform(), label="active constraint")
 
 
-def _time_axis(ax: Axes, data: FigureData) -> None:
+def draw_time_axis(ax: Axes, data: FigureData) -> None:
+    """Limits and label of the time axis that the panels share."""
     start, end = float(data.breakpoints[0]), float(data.breakpoints[-1])
     ax.set_xlim(start, end + 0.012 * (end - start))
     ax.set_xlabel(data.time_label())
@@ -151,6 +152,12 @@ def _limits(data: FigureData, component: int, walls: list[Wall]) -> tuple[float,
     high = max([*edges, float(data.tube_upper[component].max())])
     margin = 0.12 * max(high - low, 1e-9)
     return low - margin, high + margin
+
+
+def draw_walls(ax: Axes, walls: Sequence[Wall]) -> None:
+    """Hatch what path constraints forbid within the axis' limits, and bracket terminal sets."""
+    for wall in walls:
+        _terminal(ax, wall) if wall.start == wall.end else _forbidden(ax, wall)
 
 
 def _forbidden(ax: Axes, wall: Wall) -> None:
@@ -172,9 +179,10 @@ def _terminal(ax: Axes, wall: Wall) -> None:
             ax.plot(wall.end, edge, marker=0, markersize=7, markeredgewidth=2.0, color=look.VERMILLION, clip_on=False, zorder=4)
 
 
-def _legend(figure: Figure, axes: list[Axes]) -> None:
+def draw_legend(figure: Figure, axes: list[Axes]) -> None:
+    """One legend below all panels."""
     entries = {label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=len(entries),
+    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=len(entries) if len("".join(entries)) <= 64 else 3,
                   columnspacing=1.6, handlelength=1.4, handletextpad=0.6)
 
 
