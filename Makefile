@@ -11,10 +11,11 @@ DEMO      := configs/experiment1_repaired.yaml
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help install demo test test-slow lint bench docs clean
+.PHONY: help install demo paper test test-slow lint bench docs clean
 
 help:
 	@echo "make demo        solve the repaired experiment 1, print the bounds, draw the figures"
+	@echo "make paper       every experiment and figure of the paper, and docs/paper.md (a few minutes)"
 	@echo "make test        lint, types, import rules, tests"
 	@echo "make test-slow   the long tests"
 	@echo "make bench       time the certified solve and the maximisers beside other people's"
@@ -42,6 +43,9 @@ $(PEERS): $(INSTALLED)
 demo: $(INSTALLED)
 	@$(BIN)/sparserob run $(DEMO)
 	@echo "figures in $$(ls -dt runs/$(basename $(notdir $(DEMO)))/*/figures | head -n 1)"
+
+paper: $(INSTALLED)
+	@$(BIN)/python docs/paper/build.py
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .
