@@ -66,7 +66,8 @@ class ControlConstraint:
 
     def explain(self, index: Array, row: int) -> Explanation:
         """One constraint in words."""
-        return Explanation(f"control: u({index[0]:.6g}) in the {type(self.set).__name__.lower()}", float(index[0]))
+        return Explanation(f"control: u({index[0]:.6g}) in the {type(self.set).__name__.lower()}", float(index[0]),
+                           direction=unit(self.set, index[None, 1:])[0])
 
     def _piece(self, times: Array) -> np.ndarray:
         return np.clip(np.searchsorted(self.dictionary.breakpoints, times, side="right") - 1, 0, self.dictionary.pieces - 1)

@@ -10,11 +10,15 @@ from collections.abc import Sequence
 import click
 
 from sparserob_core.errors import SparseRobError
+from sparserob_core.experiment.commands.check import check
 from sparserob_core.experiment.commands.compare import compare
 from sparserob_core.experiment.commands.figures import figures
+from sparserob_core.experiment.commands.initial_states import initial_states
+from sparserob_core.experiment.commands.margin import margin
 from sparserob_core.experiment.commands.plugins import plugins
 from sparserob_core.experiment.commands.run import run
 from sparserob_core.experiment.commands.schema import schema
+from sparserob_core.experiment.commands.simulate import simulate
 
 INTERRUPTED = 130
 DEBUG = "SPARSEROB_DEBUG"
@@ -56,5 +60,5 @@ def commands() -> None:
     """Sparse robust optimal control of uncertain linear systems, with the proof."""
 
 
-for command in (run, plugins, schema, figures, compare):
+for command in (run, check, simulate, margin, initial_states, compare, figures, plugins, schema):
     commands.add_command(command)

@@ -12,9 +12,10 @@ from sparserob_core.sip.check import solve_finite
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.duality import dual_bound
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
+from sparserob_core.sip.image import onto_stationary
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.regulariser import ControlImage, Regulariser
-from sparserob_core.sip.result import Cut
+from sparserob_core.sip.result import Cut, Dual
 from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
 from sparserob_core.sip.vertex import vertex_multipliers
 
@@ -143,14 +144,24 @@ class RelaxedProgram:
         norms = np.linalg.norm(rows.G, axis=1) if margin else 0.0
         return self._solved(rows.G, rows.h - margin * norms, epsilon, guess)
 
-    def lower_bound(self, rows: Rows, solution: FiniteSolution) -> float:
+    def lower_bound(self, rows: Rows, solution: FiniteSolution) -> Dual:
         """A lower bound of the *unregularised* semi-infinite program, from the multipliers of any solution with these rows (weak duality)."""
         plain = self.finite(rows.G, rows.h, 0.0)
-        bounds = [dual_bound(plain, solution.y, solution.mu, solution.z, at=solution.x)]
+        offers = [(solution.y, solution.mu)]
         if plain.P is None and np.isfinite(solution.x).all():
-            y, mu = vertex_multipliers(plain, solution.x, solution.y, solution.mu)
-            bounds.append(dual_bound(plain, y, mu, solution.z, at=solution.x))
-        return float(max(bounds))
+            offers.append(vertex_multipliers(plain, solution.x, solution.y, solution.mu))
+        bounds = [dual_bound(plain, y, mu, solution.z, at=solution.x) for y, mu in offers]
+        best = int(np.argmax(bounds))
+        return self.dual(rows, *offers[best], solution.z, bounds[best])
+
+    def dual(self, rows: Rows, y: Array, mu: Array, z: Array, bound: float) -> Dual:
+        """Multipliers of a program with these rows (and of its fixed rows, which come first in ``y``), as a record."""
+        own = y[y.size - rows.h.size:]
+        if self.program.finite.S is not None:
+            plain = self.finite(rows.G, rows.h, 0.0)
+            z = onto_stationary(plain, z, plain.q + y @ plain.G + mu @ plain.A)
+        cuts = tuple(replace(cut, multiplier=float(m)) for cut, m in zip(rows.cuts, own, strict=True) if m > 0.0)
+        return Dual(bound, cuts, mu, None if self.program.finite.S is None else z)
 
     def evaluate(self, indices: Mapping[str, Array], epsilon: float) -> RelaxedSolution:
         """``g`` at a tuple: per family the indices ``(k, d)``. Rows are imposed lazily: those active last time, then what is violated."""

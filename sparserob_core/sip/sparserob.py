@@ -23,7 +23,7 @@ from sparserob_core.sip.maximiser import Maximiser, Objective, Report
 from sparserob_core.sip.method import Method, Tools
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
 from sparserob_core.sip.relaxed import RelaxedProgram, Rows
-from sparserob_core.sip.result import Result, SearchTrace, Status, Witness, relative_gap
+from sparserob_core.sip.result import NO_BOUND, Dual, Result, SearchTrace, Status, Witness, relative_gap
 from sparserob_core.sip.rules import Geometric, Metropolis, OptimisersSettle, OuterStep, Progress
 from sparserob_core.sip.search import Rules, Target, maximise
 from sparserob_core.sip.separation import separate
@@ -76,7 +76,7 @@ class _Run:
     program: SemiInfiniteProgram
     tools: Tools
     started: float = field(default_factory=time.perf_counter)
-    lower: float = -np.inf
+    dual: Dual = NO_BOUND
     history: list[RoundFinished] = field(default_factory=list)
     steps: list[OuterStep] = field(default_factory=list)
     parts: list[SearchTrace] = field(default_factory=list)
@@ -101,6 +101,15 @@ class _Run:
                 return self._finished(epsilon)
             j += 1
             epsilon = max(self.tools.continuation.stop, _smaller(regu(epsilon, j), epsilon))
+
+    @property
+    def lower(self) -> float:
+        """The best lower bound proven so far."""
+        return self.dual.bound
+
+    def improve(self, dual: Dual) -> None:
+        """Keep the better of two bounds."""
+        self.dual = max(self.dual, dual, key=lambda one: one.bound)
 
     def _search(self, point: Array, epsilon: float, j: int) -> Array:
         """Maximise ``g`` from the best tuple so far; ``g`` is left at the tuple that is returned."""
@@ -142,11 +151,11 @@ class _Run:
         rows, x = self.g.rows(), self.g.solution.x
         plain = self.relaxed.solve(rows, 0.0)
         if plain.status == "optimal":
-            self.lower = max(self.lower, self.relaxed.lower_bound(rows, plain))
+            self.improve(self.relaxed.lower_bound(rows, plain))
         cost = self.program.cost(x)
         proofs: tuple[Proof, ...] = prove(self.program, x, self.tools.notify)
         status, message = verdict(proofs, relative_gap(self.lower, cost, self.program.cost_scale), self.method.tolerance)
-        return self._result(status, message, rows, cost, epsilon, witness(self.program, self._worst(), proofs))
+        return replace(self._result(status, message, rows, cost, epsilon, witness(self.program, self._worst(), proofs)), proofs=proofs)
 
     def _without_answer(self, epsilon: float) -> Result:
         rows, solution = self.g.rows(), self.g.solution
@@ -155,6 +164,7 @@ class _Run:
         rows, solution = irreducible(self.relaxed, rows, solution)
         y = solution.y[solution.y.size - rows.h.size:]
         message, worst = clash(self.imposed, rows, y, solution.infeasibility)
+        self.dual = self.relaxed.dual(rows, solution.y, solution.mu, solution.z, solution.infeasibility)
         rows = replace(rows, cuts=tuple(replace(cut, multiplier=float(m)) for cut, m in zip(rows.cuts, y, strict=True)))
         return self._result("infeasible", message, rows, np.nan, epsilon, worst)
 
@@ -167,7 +177,7 @@ class _Run:
             upper_bound=cost if status in ("certified", "verified", "undecided") else np.inf, worst=worst, indices=cuts,
             counts={"relaxed_programs": self.relaxed.solves, "rounds": len(self.steps), "active_indices": len(cuts),
                     "solver_calls": self.relaxed.counted.calls, "evaluations": int(columns["value"].size)},
-            history=tuple(self.history), trace=SearchTrace(**columns), seconds=time.perf_counter() - self.started)
+            history=tuple(self.history), trace=SearchTrace(**columns), dual=self.dual, seconds=time.perf_counter() - self.started)
 
 
 class _Bounds:
@@ -185,7 +195,7 @@ class _Bounds:
         value = run.g.at(point)
         if np.isfinite(value) and value > self.best:
             self.best = value
-            run.lower = max(run.lower, run.relaxed.lower_bound(run.g.rows(), run.g.solution))
+            run.improve(run.relaxed.lower_bound(run.g.rows(), run.g.solution))
         self.proven.append(run.lower)
         return value
 

@@ -15,8 +15,8 @@ import pytest
 from scipy import sparse
 
 import sparserob_core as sr
+from sparserob_core.experiment.assemble import assemble
 from sparserob_core.experiment.load import load_config
-from sparserob_core.experiment.run import assemble
 from sparserob_core.sip.relaxed import RelaxedProgram
 from sparserob_core.sip.tuples import TupleValue
 

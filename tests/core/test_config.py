@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.experiment.assemble import assemble
 from sparserob_core.experiment.config import read_value, write_yaml
 from sparserob_core.experiment.load import load_config
-from sparserob_core.experiment.run import assemble
 
 
 def refusal(config: object, *overrides: str) -> str:

@@ -1,0 +1,1 @@
+"""Verification of a finished run in ball arithmetic; shares no code with what solved it."""
