@@ -198,9 +198,8 @@ def _equalities(case: Case) -> str:
     """The fixed states at the end, at every parameter: their coefficients beside the constant one must vanish."""
     flow, worst = _whole(case), 0.0
     tube = Tube(flow, replace(case.scene, disturbance=None))
-    d = case.problem.system.states
     for state, value in case.equalities:
-        parts = [tube.nodes[-1][k * d + state, 0] for k in range(flow.monomials.size)]
+        parts = [part[state, 0] for part in tube.nodes[-1].parts]
         off = sum((abs(part) for part in parts[1:]), abs(parts[0] - balls([value])[0]))
         worst = max(worst, float(off.upper()))
     if worst > VIOLATION:

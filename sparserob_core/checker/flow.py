@@ -1,7 +1,7 @@
 """The response of an uncertain linear system over one box of parameters, as polynomials in the parameters with balls as coefficients.
 
-Vectors of Taylor coefficients obey a larger linear system, which is solved by exponentials of ball matrices; Lagrange's remainder is
-bounded by a comparison system for the norms of the first coefficients left out, with the logarithmic norm in modal coordinates.
+Power series of ball matrices solve for the coefficients; Lagrange's remainder is bounded by a comparison system for the norms of the first
+coefficients left out, with the logarithmic norm in modal coordinates.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.jets import Monomials, expanded
+from sparserob_core.checker.series import Series
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -31,8 +32,7 @@ ORDER = 6               # of the expansion in time
 class Flow:
     """The system over the box ``centre +- radius`` (``(nu,)`` exact numbers), expanded to ``degree`` in the parameters.
 
-    A *state* is a column of ``M d`` balls, the coefficients of one monomial after the other; a *row* is one of ``M (d + mw)``: the functional
-    ``c'e^{A s}`` and its integral times ``E``.
+    A *row* is the functional ``c'e^{A s}``, as a column, and below it its integral times ``E``.
     """
 
     system: LinearSystem
@@ -52,37 +52,24 @@ class Flow:
         return expanded(self.system, self.monomials, [arb(c) for c in self.centre], self.radius)
 
     @cached_property
-    def states(self) -> arb_mat:
-        """The matrix of the coefficients of the state."""
-        return self._blocks(self.parts["A"])
+    def states(self) -> Series:
+        """``A``."""
+        return Series(self.monomials, self.parts["A"])
 
     @cached_property
-    def inputs(self) -> arb_mat:
-        """How the control enters the coefficients of the state, ``(M d, m)``."""
-        return stacked([[part[i, j] for j in range(part.ncols())] for part in self.parts["B"] for i in range(part.nrows())])
+    def inputs(self) -> Series:
+        """``B``."""
+        return Series(self.monomials, self.parts["B"])
 
-    def rows(self, which: str = "E") -> arb_mat:
-        """The matrix of the coefficients of a row and of its integral times ``which``."""
+    @cached_property
+    def rows(self) -> Series:
+        """The matrix of a row and of its integral times ``E``."""
         from flint import arb, arb_mat
 
-        d, columns = self.parts["A"][0].nrows(), self.parts[which][0].ncols()
-        joined = []
-        for a, e in zip(self.parts["A"], self.parts[which], strict=True):
-            left, lower = a.transpose(), e.transpose()
-            joined.append(arb_mat([[left[i, j] for j in range(d)] + [arb(0)] * columns for i in range(d)]
-                                  + [[lower[i, j] for j in range(d)] + [arb(0)] * columns for i in range(columns)]))
-        return self._blocks(joined)
-
-    def _blocks(self, parts: Sequence[arb_mat]) -> arb_mat:
-        from flint import arb
-
-        size, M = parts[0].nrows(), self.monomials.size
-        table = [[arb(0)] * (M * size) for _ in range(M * size)]
-        for i, j, k in self.monomials.products:
-            for row in range(size):
-                for column in range(size):
-                    table[k * size + row][j * size + column] = parts[i][row, column]
-        return stacked(table)
+        mw = self.parts["E"][0].ncols()
+        table = [[row + [arb(0)] * mw for row in a.transpose().tolist() + e.transpose().tolist()]
+                 for a, e in zip(self.parts["A"], self.parts["E"], strict=True)]
+        return Series(self.monomials, [arb_mat(part) for part in table])
 
     @cached_property
     def remainder(self) -> Remainder | None:
@@ -184,16 +171,16 @@ def exponential(matrix: arb_mat, time: arb) -> arb_mat:
     return (matrix * time).exp()
 
 
-def in_time(matrix: arb_mat, derivative: arb_mat, length: arb, inside: arb_mat) -> list[arb_mat]:
+def in_time(matrix: Series, derivative: Series, length: arb, inside: Series) -> list[Series]:
     """The terms of order 1, 2, ... of a solution of ``y' = matrix y`` in the time over ``length``, from its derivative at the start.
 
     The last term is Lagrange's: with ``inside``, which holds ``e^{matrix s}`` for every ``s`` up to ``length``, it is right anywhere in between.
     """
     terms, v, factor = [], derivative, length
     for order in range(1, ORDER):
-        terms.append(v * factor)
+        terms.append(v.scaled(factor))
         v, factor = matrix * v, factor * length / (order + 1)
-    return [*terms, inside * v * factor]
+    return [*terms, (inside * v).scaled(factor)]
 
 
 def held(matrix: arb_mat, inputs: arb_mat, time: arb) -> tuple[arb_mat, arb_mat]:

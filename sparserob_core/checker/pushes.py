@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.bernstein import bernstein
-from sparserob_core.checker.flow import Flow, exponential, in_time, stacked, up_to
+from sparserob_core.checker.flow import Flow, in_time, stacked, up_to
 from sparserob_core.checker.polynomials import OUTWARD, ROUNDING, Enclosed, linear_bound
+from sparserob_core.checker.series import Series
 from sparserob_core.control.sets import ConvexSet
 from sparserob_core.sip.convex_set import Array
 
@@ -33,6 +34,40 @@ class Scene:
     disturbance: ConvexSet | None
     changes: list[float]
 
+    @property
+    def tick(self) -> float:
+        """The unit in which durations are told apart."""
+        return SAME * self.grid[-1]
+
+    def ticks(self, start: float, stop: float) -> int:
+        """A duration in ticks, rounded up; 0 only for none."""
+        return 0 if start == stop else round((stop - start) / self.tick) + 1
+
+    def duration(self, ticks: int) -> arb:
+        """That many ticks, exactly."""
+        from flint import arb
+
+        return arb(self.tick) * ticks
+
+
+@final
+class Table:
+    """Arrays by lag, in one array that grows."""
+
+    def __init__(self) -> None:
+        self.places: dict[int, int] = {}
+        self.mid = self.rad = np.zeros((0, 0, 0, 0))
+
+    def add(self, lag: int, entry: tuple[Array, Array]) -> None:
+        """One more lag."""
+        place = len(self.places)
+        if place == self.mid.shape[0] or not place:
+            size = max(16, 2 * place)
+            self.mid, self.rad = (np.concatenate([old.reshape(place, *new.shape), np.zeros((size - place, *new.shape))])
+                                  for old, new in zip((self.mid, self.rad), entry, strict=True))
+        self.mid[place], self.rad[place] = entry
+        self.places[lag] = place
+
 
 @final
 @dataclass(eq=False)
@@ -41,24 +76,16 @@ class Pushes:
 
     flow: Flow
     scene: Scene
-    _made: dict[object, object] = field(default_factory=dict)
-    _rows: dict[bytes, tuple[list[int], list[arb_mat]]] = field(default_factory=dict)
+    _tables: dict[tuple[int, bytes], Table] = field(default_factory=dict)
+    _steps: dict[int, Series] = field(default_factory=dict)
+    _inside: dict[int, Series] = field(default_factory=dict)
+    _rows: dict[bytes, tuple[list[int], list[Series]]] = field(default_factory=dict)
 
-    @cached_property
-    def _row_matrix(self) -> arb_mat:
-        return self.flow.rows()
-
-    def bound(self, start: float, length: arb, direction: Array) -> tuple[Array, float, float]:
-        """Coefficients of a bound of the disturbance's support, its error, and how much of that is due to switching."""
+    def bound(self, start: float, ticks: int, direction: Array) -> tuple[Array, float, float]:
+        """Coefficients of a bound of the disturbance's support from ``start`` on for that many ticks, its error, and how much of that is due to
+        switching."""
         assert self.scene.disturbance is not None
-        lags = [s for s in self.scene.changes if s <= start]
-        sign = 1.0 if direction[np.flatnonzero(direction)[0]] > 0 else -1.0   # opposite directions share their rows
-        parts = [self._integral(start, s, length, sign * direction) for s in reversed(lags)]  # short ones first: each starts from the one before
-        mids, rads = zip(*reversed(parts), strict=True)
-        mid, rad = sign * np.array(mids), np.array(rads)            # (lags, J + 1, M, mw)
-        mid, rad = np.concatenate([mid, np.zeros_like(mid[:1])]), np.concatenate([rad, np.zeros_like(rad[:1])])
-        rad = rad[:-1] + rad[1:] + ROUNDING * (np.abs(mid[:-1]) + np.abs(mid[1:]))
-        mid = mid[:-1] - mid[1:]
+        mid, rad = self._weights(start, ticks, direction)
         ends = bernstein(np.moveaxis(mid[:, :, 0], 1, 2).reshape(-1, mid.shape[1]), [False]).reshape(mid.shape[0], -1, mid.shape[1])
         value, spread = (ends.max(axis=2) + ends.min(axis=2)) / 2, (ends.max(axis=2) - ends.min(axis=2)) / 2
         spread = spread + np.abs(mid[:, :, 1:]).sum(axis=(1, 2)) + rad.sum(axis=(1, 2)) + ROUNDING * np.abs(mid[:, :, 0]).sum(axis=1)
@@ -68,58 +95,59 @@ class Pushes:
         off = float(np.einsum("lw,ljkw->", size, rad) + ROUNDING * np.einsum("lw,ljkw->", size, np.abs(mid)))
         return moved, off * OUTWARD, float(excess.sum()) * OUTWARD
 
-    def _integral(self, time: float, since: float, length: arb, direction: Array) -> tuple[Array, Array]:
-        """``int_0^{t - since} c'e^{A s} E ds`` for ``t`` from ``time`` on, as ``(J + 1, M, mw)`` with errors of the same shape."""
-        key = ("row", round((time - since) / self._tick), str(length), direction.tobytes())
-        if key not in self._made:
-            row = self._widened * self._row(key[1], direction)
-            terms = [row]
-            if not length.is_zero():
-                terms += in_time(self._row_matrix, self._row_matrix * row, length, self._inside(length))
-            M, d = self.flow.monomials.size, len(self.scene.initial_state)
-            block = row.nrows() // M
-            both = Enclosed.of(stacked([[term[k * block + i, 0] for k in range(M) for i in range(d, block)] for term in terms]))
-            shape = (len(terms), M, block - d)
-            self._made[key] = (both.mid.reshape(shape), both.rad.reshape(shape))
-        return self._made[key]  # type: ignore[return-value]
+    def _weights(self, start: float, ticks: int, direction: Array) -> tuple[Array, Array]:
+        """What every piece of the disturbance before the cell adds per unit, ``(pieces, J + 1, M, mw)``, with errors of the same shape."""
+        sign = 1.0 if direction[np.flatnonzero(direction)[0]] > 0 else -1.0   # opposite directions share their rows
+        table = self._tables.setdefault((ticks, (sign * direction).tobytes()), Table())
+        since = np.array([s for s in self.scene.changes if s <= start])
+        lags = np.rint((start - since) / self.scene.tick).astype(int).tolist()
+        for lag in reversed(lags):  # short ones first: each row starts from the one before
+            if lag not in table.places:
+                table.add(lag, self._integral(lag, ticks, sign * direction))
+        places = [table.places[lag] for lag in lags]
+        mid, rad = sign * table.mid[places], table.rad[places]
+        mid, rad = np.concatenate([mid, np.zeros_like(mid[:1])]), np.concatenate([rad, np.zeros_like(rad[:1])])
+        return mid[:-1] - mid[1:], rad[:-1] + rad[1:] + ROUNDING * (np.abs(mid[:-1]) + np.abs(mid[1:]))
 
-    def _inside(self, length: arb) -> arb_mat:
-        key = ("inside", str(length))
-        if key not in self._made:
-            self._made[key] = exponential(self._row_matrix, up_to(length))
-        return self._made[key]  # type: ignore[return-value]
-
-    @property
-    def _tick(self) -> float:
-        return SAME * self.scene.grid[-1]
+    def _integral(self, lag: int, ticks: int, direction: Array) -> tuple[Array, Array]:
+        """``int_0^s c'e^{A r} E dr`` for ``s`` from ``lag`` on, as ``(J + 1, M, mw)`` with errors of the same shape."""
+        row = self._widened * self._row(lag, direction)
+        terms = [row]
+        if ticks:
+            if ticks not in self._inside:
+                self._inside[ticks] = self.flow.rows.scaled(up_to(self.scene.duration(ticks))).exp()
+            terms += in_time(self.flow.rows, self.flow.rows * row, self.scene.duration(ticks), self._inside[ticks])
+        M, d = self.flow.monomials.size, len(self.scene.initial_state)
+        block = row.parts[0].nrows()
+        both = Enclosed.of(stacked([[term.parts[k][i, 0] for k in range(M) for i in range(d, block)] for term in terms]))
+        shape = (len(terms), M, block - d)
+        return both.mid.reshape(shape), both.rad.reshape(shape)
 
     @cached_property
-    def _widened(self) -> arb_mat:
+    def _widened(self) -> Series:
         """Whatever a row does within a tick to either side."""
         from flint import arb
 
-        return exponential(self._row_matrix, arb(0, self._tick))
+        return self.flow.rows.scaled(arb(0, self.scene.tick)).exp()
 
-    def _row(self, ticks: int, direction: Array) -> arb_mat:
+    def _row(self, ticks: int, direction: Array) -> Series:
         """The row after that many ticks, from the longest one before it that is known."""
-        from flint import arb
 
         known = self._rows.setdefault(direction.tobytes(), ([0], [self._first_row(direction)]))
         place = bisect_right(known[0], ticks)
         before = known[0][place - 1]
         if before == ticks:
             return known[1][place - 1]
-        name = ("row step", ticks - before)
-        if name not in self._made:
-            self._made[name] = exponential(self._row_matrix, arb(self._tick) * (ticks - before))
-        row: arb_mat = self._made[name] * known[1][place - 1]  # type: ignore[operator]
+        if ticks - before not in self._steps:
+            self._steps[ticks - before] = self.flow.rows.scaled(self.scene.duration(ticks - before)).exp()
+        row = self._steps[ticks - before] * known[1][place - 1]
         known[0].insert(place, ticks)
         known[1].insert(place, row)
         return row
 
-    def _first_row(self, direction: Array) -> arb_mat:
+    def _first_row(self, direction: Array) -> Series:
         from flint import arb
 
-        M, d = self.flow.monomials.size, direction.size
-        block = self._row_matrix.nrows() // M
-        return stacked([[arb(float(direction[i]) if k == 0 and i < d else 0.0)] for k in range(M) for i in range(block)])
+        size = self.flow.rows.parts[0].nrows()
+        column = [[arb(float(direction[i]) if i < direction.size else 0.0)] for i in range(size)]
+        return Series.constant(self.flow.monomials, stacked(column))

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.flow import Flow, exponential, held, in_time, norm, stacked, up_to, upper
+from sparserob_core.checker.flow import Flow, held, in_time, norm, stacked, up_to, upper
 from sparserob_core.checker.polynomials import OUTWARD, ROUNDING, Enclosed
-from sparserob_core.checker.pushes import SAME, Pushes, Scene
+from sparserob_core.checker.pushes import Pushes, Scene
+from sparserob_core.checker.series import Series
 from sparserob_core.checker.shapes import radius
 from sparserob_core.sip.convex_set import Array
 
@@ -38,19 +39,20 @@ class Tube:
     flow: Flow
     scene: Scene
     _lengths: dict[int, arb] = field(default_factory=dict)
-    _made: dict[object, object] = field(default_factory=dict)
+    _transitions: dict[int, tuple[Series, Series]] = field(default_factory=dict)
+    _growths: dict[int, tuple[arb_mat, arb_mat]] = field(default_factory=dict)
+    _inside: dict[int, Series] = field(default_factory=dict)
 
     @cached_property
-    def nodes(self) -> list[arb_mat]:
-        """The coefficients of the undisturbed state at the breakpoints of the grid."""
+    def nodes(self) -> list[Series]:
+        """The undisturbed state at the breakpoints of the grid."""
         from flint import arb
 
-        M, x0 = self.flow.monomials.size, self.scene.initial_state
-        x = stacked([[arb(v if k == 0 else 0.0)] for k in range(M) for v in x0])
+        x = Series.constant(self.flow.monomials, stacked([[arb(v)] for v in self.scene.initial_state]))
         found = [x]
         for k, u in enumerate(self.scene.control):
-            Phi, Gamma = self._held("state", self._span(self.scene.grid[k], self.scene.grid[k + 1]))
-            x = Phi * x + Gamma * u
+            Phi, Gamma = self._transition(self._span(self.scene.grid[k], self.scene.grid[k + 1]))
+            x = Phi * x + Gamma.applied(u)
             found.append(x)
         return found
 
@@ -64,7 +66,7 @@ class Tube:
         n = rest.start(upper(norm(rest.inverse * stacked([[arb(v)] for v in self.scene.initial_state]))))
         found = [n]
         for k, u in enumerate(self.scene.control):
-            growth, driven = self._held("norms", self._span(self.scene.grid[k], self.scene.grid[k + 1]))
+            growth, driven = self._growth(self._span(self.scene.grid[k], self.scene.grid[k + 1]))
             n = self._up(growth * n + driven * upper(norm(u)))
             found.append(n)
         return found
@@ -77,7 +79,7 @@ class Tube:
         from flint import arb
 
         length = arb(stop) - arb(start)
-        key = round((stop - start) / (SAME * self.scene.grid[-1]))
+        key = round((stop - start) / self.scene.tick)
         self._lengths[key] = self._lengths[key].union(length) if key in self._lengths else length
         return key
 
@@ -89,26 +91,27 @@ class Tube:
     def __post_init__(self) -> None:
         self._prepare()
 
-    def _held(self, what: str, key: int) -> tuple[arb_mat, arb_mat]:
-        length = self._lengths[key]
-        name = (what, "held", str(length))
-        if name not in self._made:
-            if what == "state":
-                self._made[name] = held(self.flow.states, self.flow.inputs, length)
-            else:
-                rest = self.flow.remainder
-                assert rest is not None
-                self._made[name] = held(rest.growth, stacked([[b] for b in rest.control]), length)
-        return self._made[name]  # type: ignore[return-value]
+    def _transition(self, key: int) -> tuple[Series, Series]:
+        if key not in self._transitions:
+            self._transitions[key] = self.flow.states.held(self.flow.inputs, self._lengths[key])
+        return self._transitions[key]
+
+    def _growth(self, key: int) -> tuple[arb_mat, arb_mat]:
+        if key not in self._growths:
+            rest = self.flow.remainder
+            assert rest is not None
+            self._growths[key] = held(rest.growth, stacked([[b] for b in rest.control]), self._lengths[key])
+        return self._growths[key]
 
     def cells(self, piece: int, start: float, stop: float, directions: Sequence[Array]) -> list[Polynomial]:
         """For every direction ``c (d,)`` the polynomial above ``c'x`` on ``[start, stop]``, a part of piece ``piece`` of the grid."""
         from flint import arb
 
-        offset, length = arb(start) - arb(self.scene.grid[piece]), arb(stop) - arb(start)
-        state, push = self._state_part(piece, offset, length, directions), None
+        ticks = self.scene.ticks(start, stop)  # never shorter than the cell: a bound on a little more is a bound
+        offset, length = arb(start) - arb(self.scene.grid[piece]), self.scene.duration(ticks)
+        state, push = self._state_part(piece, offset, ticks, directions), None
         if self.scene.disturbance is not None and stop > 0.0:
-            push = [self.pushes.bound(start, length, c) for c in directions]
+            push = [self.pushes.bound(start, ticks, c) for c in directions]
         rest = self._left_out(piece, offset, length, directions)
         answer = []
         for i in range(len(directions)):
@@ -120,30 +123,26 @@ class Tube:
             answer.append(Polynomial(mid, (rad + rest[i] + kinks) * OUTWARD, rest[i], kinks))
         return answer
 
-    def _state_part(self, piece: int, offset: arb, length: arb, directions: Sequence[Array]) -> list[Enclosed]:
+    def _state_part(self, piece: int, offset: arb, ticks: int, directions: Sequence[Array]) -> list[Enclosed]:
         from flint import arb
 
         x, u = self.nodes[piece], self.scene.control[min(piece, len(self.scene.control) - 1)]
         if not offset.is_zero():
-            Phi, Gamma = held(self.flow.states, self.flow.inputs, offset)
-            x = Phi * x + Gamma * u
+            Phi, Gamma = self.flow.states.held(self.flow.inputs, offset)
+            x = Phi * x + Gamma.applied(u)
         terms = [x]
-        if not length.is_zero():
-            derivative = self.flow.states * x + self.flow.inputs * u
-            terms += in_time(self.flow.states, derivative, length, self._inside(length))
+        if ticks:
+            length = self.scene.duration(ticks)
+            if ticks not in self._inside:
+                self._inside[ticks] = self.flow.states.scaled(up_to(length)).exp()
+            terms += in_time(self.flow.states, self.flow.states * x + self.flow.inputs.applied(u), length, self._inside[ticks])
         M, d = self.flow.monomials.size, len(self.scene.initial_state)
         answer = []
         for c in directions:
             exact = [arb(float(v)) for v in c]
-            table = [[sum((exact[i] * term[k * d + i, 0] for i in range(d) if c[i]), arb(0)) for k in range(M)] for term in terms]
+            table = [[sum((exact[i] * term.parts[k][i, 0] for i in range(d) if c[i]), arb(0)) for k in range(M)] for term in terms]
             answer.append(Enclosed.of(stacked(table)))
         return answer
-
-    def _inside(self, length: arb) -> arb_mat:
-        key = ("inside", str(length))
-        if key not in self._made:
-            self._made[key] = exponential(self.flow.states, up_to(length))
-        return self._made[key]  # type: ignore[return-value]
 
     @cached_property
     def pushes(self) -> Pushes:
@@ -171,12 +170,15 @@ class Tube:
         """The remainder of the disturbance's part up to the horizon, for a direction of that size."""
         from flint import arb
 
+        return arb(0) if self.scene.disturbance is None else size * self._pushed_per_size
+
+    @cached_property
+    def _pushed_per_size(self) -> arb:
+        from flint import arb
+
         rest = self.flow.remainder
-        if self.scene.disturbance is None or rest is None:
-            return arb(0)
-        if "pushed" not in self._made:
-            total = held(rest.growth, rest.start(arb(1)), arb(self.scene.grid[-1]))[1]
-            last = rest.growth.nrows() - 1
-            columns = zip(radius(self.scene.disturbance), rest.disturbance, strict=True)
-            self._made["pushed"] = sum((arb(w) * total[last - i, 0] * e for w, per in columns for i, e in enumerate(per)), arb(0))
-        return size * self._made["pushed"]  # type: ignore[operator]
+        assert rest is not None and self.scene.disturbance is not None
+        total = held(rest.growth, rest.start(arb(1)), arb(self.scene.grid[-1]))[1]
+        last = rest.growth.nrows() - 1
+        columns = zip(radius(self.scene.disturbance), rest.disturbance, strict=True)
+        return sum((arb(w) * total[last - i, 0] * e for w, per in columns for i, e in enumerate(per)), arb(0))

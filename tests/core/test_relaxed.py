@@ -142,7 +142,7 @@ def test_a_tightened_program_is_feasible_with_the_margin_to_spare(piqp):
     solution = relaxed.solve(rows, 0.0, margin=1e-4)
     norms = np.linalg.norm(rows.G, axis=1)
     assert ((rows.G @ solution.x - rows.h) / norms).max() <= -1e-4 + 1e-8
-    assert relaxed.lower_bound(rows, solution) <= relaxed.solve(rows, 0.0).value + 1e-10
+    assert relaxed.lower_bound(rows, solution).bound <= relaxed.solve(rows, 0.0).value + 1e-10
 
 
 def test_the_lower_bound_holds_for_any_multipliers():
@@ -155,10 +155,10 @@ def test_the_lower_bound_holds_for_any_multipliers():
     rows = rows_at(program, "a", points(rng, 10))
     solution = relaxed.solve(rows, 0.0)
     truth = by_linear_program(program, {"a": np.array([cut.index for cut in rows.cuts])}).fun
-    assert abs(relaxed.lower_bound(rows, solution) - truth) <= 1e-8
+    assert abs(relaxed.lower_bound(rows, solution).bound - truth) <= 1e-8
     for _ in range(20):
         wrong = replace(solution, y=solution.y + rng.normal(size=solution.y.size) * 10 ** rng.uniform(-8, 1), x=solution.x + rng.normal(size=5))
-        assert relaxed.lower_bound(rows, wrong) <= truth + 1e-9
+        assert relaxed.lower_bound(rows, wrong).bound <= truth + 1e-9
 
 
 def test_rows_remember_where_they_come_from():

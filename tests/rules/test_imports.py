@@ -13,9 +13,9 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 CORE = sorted((ROOT / "sparserob_core").rglob("*.py"))
 PLUGINS = sorted((ROOT / "plugins").glob("sparserob_*/**/*.py"))
-HEAVY = {"scipy", "matplotlib", "rich", "qpsolvers", "piqp", "proxsuite", "clarabel", "cvxpy", "rerun", "nevergrad", "dask"}
+HEAVY = {"scipy", "matplotlib", "rich", "qpsolvers", "piqp", "proxsuite", "clarabel", "cvxpy", "rerun", "nevergrad", "dask", "flint"}
 SOLVERS = HEAVY - {"rich"}
-RANK = {"errors": 0, "options": 0, "sip": 1, "control": 2, "experiment": 3}
+RANK = {"errors": 0, "options": 0, "sip": 1, "control": 2, "checker": 3, "experiment": 4}
 
 
 def imports(tree: ast.AST) -> Iterator[tuple[str, tuple[str, ...]]]:
