@@ -11,13 +11,14 @@ import numpy as np
 from sparserob_core.checker.case import Case, Window, number, numbers
 from sparserob_core.checker.flow import Flow
 from sparserob_core.checker.outcome import Broken, Unchecked
-from sparserob_core.checker.prove import Box, Interval, Work, prove
+from sparserob_core.checker.parameters import Corners, Parameters
+from sparserob_core.checker.prove import Interval, Work, prove
 from sparserob_core.checker.shapes import balls, facets, support
 from sparserob_core.checker.sides import Sides
 from sparserob_core.checker.subdivision import fill
 from sparserob_core.checker.tube import Tube
 from sparserob_core.control.sets import Box as BoxSet
-from sparserob_core.control.sets import ConvexSet, Cylinder
+from sparserob_core.control.sets import Cylinder
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ def bounded(case: Case, window: Window) -> str:
     if lower.shape == (0, 0):
         raise Unchecked("the certificate holds no cells for a constraint that was not proven on cells")
     _covered(case, window, lower, upper)
-    found = prove(_tubes(case, lower, upper), _work(case, window, lower, upper), tolerance)
+    found = prove(_tubes(case, lower, upper), Parameters(case.problem.system.parameters), _work(case, window, lower, upper), tolerance)
     size = f"{found.cells} cells" + (f" in {found.boxes} boxes" if found.boxes > 1 else "")
     return f"kept, with a margin of at least {-found.bound:.1e} ({size})" if found.bound < 0 else f"kept to {found.bound:.1e} ({size})"
 
@@ -93,8 +94,6 @@ def _work(case: Case, window: Window, lower: Array, upper: Array) -> list[Work]:
     order = sorted(range(len(keys)), key=lambda i: (keys[i], lower[i, 0]))
     work: list[Work] = []
     for (a, b), members in groupby(order, key=lambda i: keys[i]):
-        if not _may_meet(case.problem.system.parameters, np.array(a[:nu]), np.array(b[:nu])):
-            continue
         sides = flat or Sides.curved(window.shape, np.array(a[nu:]), np.array(b[nu:]))
         intervals = [part for i in members for part in _cut(case, float(lower[i, 0]), float(upper[i, 0]))]
         work.append(((a[:nu], b[:nu]), sides, intervals))
@@ -111,21 +110,13 @@ def _cut(case: Case, start: float, stop: float) -> list[Interval]:
     return [(first + i, a, b) for i, (a, b) in enumerate(pairwise(points))]
 
 
-def _may_meet(bound: ConvexSet | None, low: Array, high: Array) -> bool:
-    """Whether a box may hold parameters; ``False`` only where a facet provably excludes it."""
-    flat = None if bound is None or isinstance(bound, BoxSet) else facets(bound)
-    return all(not sum((x.min(y) for x, y in ((balls([c])[0] * balls([a])[0], balls([c])[0] * balls([b])[0])
-                                              for c, a, b in zip(normal, low, high, strict=True))), balls([0.0])[0]) > limit
-               for normal, limit in flat or [])
-
-
-def _tubes(case: Case, lower: Array, upper: Array) -> Callable[[Box], Tube]:
+def _tubes(case: Case, lower: Array, upper: Array) -> Callable[[Corners], Tube]:
     nu = case.problem.system.parameter_count
     widened = nu and not isinstance(case.problem.system.parameters, BoxSet)
     extra = WIDER * (upper[:, 1:1 + nu].max(axis=0) - lower[:, 1:1 + nu].min(axis=0)) if widened else np.zeros(nu)
-    made: dict[Box, Tube] = {}
+    made: dict[Corners, Tube] = {}
 
-    def tube(box: Box) -> Tube:
+    def tube(box: Corners) -> Tube:
         if box not in made:
             low, high = np.array(box[0]), np.array(box[1])
             centre = (low + high) / 2

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, TypeAlias, final
 
 import numpy as np
 
 from sparserob_core.checker.bernstein import highest
 from sparserob_core.checker.outcome import Broken, Unchecked
-from sparserob_core.checker.polynomials import OUTWARD
+from sparserob_core.checker.parameters import Corners, Parameters
+from sparserob_core.checker.polynomials import OUTWARD, ROUNDING
 from sparserob_core.checker.sides import Bounded, Sides
 from sparserob_core.checker.tube import Polynomial, Tube
 from sparserob_core.sip.convex_set import Array
@@ -36,57 +37,87 @@ class Proven:
     boxes: int
 
 
-Box: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
-"""Lower and upper corners of a box of parameters."""
-
-
-Work: TypeAlias = tuple[Box, Sides, list[Interval]]
+Work: TypeAlias = tuple[Corners, Sides, list[Interval]]
 """A box of parameters, what is to be bounded, and when."""
 
 
-def prove(tubes: Callable[[Box], Tube], work: Sequence[Work], tolerance: float) -> Proven:
+def prove(tubes: Callable[[Corners], Tube], parameters: Parameters, work: Sequence[Work], tolerance: float) -> Proven:
     """Show that no row is exceeded by more than ``tolerance`` on the cells ``work``; raises `Broken` where one is, or nothing can be shown."""
     stack = list(reversed(work))
     bound, cells, items = -np.inf, 0, 0
     while stack:
         box, sides, todo = stack.pop()
+        if not parameters.meets(box):
+            continue
         items += 1
-        tube, wide, turned, axes = tubes(box), list[Interval](), list[Interval](), np.zeros(len(box[0]))
+        left = _Left(np.zeros(len(box[0])))
         while todo:
             cells += len(todo)
             if cells > MOST_CELLS or items > MOST_BOXES:
                 raise Broken(f"a violation of more than {tolerance:.1e} is not excluded after {cells} cells of time")
-            again: list[Interval] = []
-            for interval, found, tops in _batch(tube, sides.rows, todo, tolerance):
-                bound = max(bound, *(top for top in tops if top <= tolerance), -np.inf)
-                failed = [(row, poly) for row, poly, top in zip(sides.rows, found, tops, strict=True) if top > tolerance]
-                if not failed:
-                    continue
-                if _turn(tube, sides, interval, tolerance):
-                    turned.append(interval)
-                elif box[0] and any(_to_blame(poly, interval) for _, poly in failed):
-                    wide.append(interval)
-                    axes += sum(_influence(tube, poly) for _, poly in failed)
-                else:
-                    again += _halves(interval)
-            todo = again
-        if turned:
-            stack += [(box, half, turned) for half in reversed(sides.halves())]
-        if wide:
-            stack += [(half, sides, wide) for half in reversed(_split(box, int(axes.argmax())))]
+            bound, todo = max(bound, _examine(Place(tubes(box), parameters, box, tolerance), sides, todo, left)), left.halves
+            left.halves = []
+        if left.turned:
+            stack += [(box, half, left.turned) for half in reversed(sides.halves())]
+        if left.wide:
+            stack += [(half, sides, left.wide) for half in reversed(_split(box, int(left.influence.argmax())))]
     return Proven(bound, cells, items)
 
 
-def _turn(tube: Tube, sides: Sides, interval: Interval, tolerance: float) -> bool:
+@final
+@dataclass(frozen=True, eq=False)
+class Place:
+    """One box of parameters, and what counts as a violation there."""
+
+    tube: Tube
+    parameters: Parameters
+    box: Corners
+    tolerance: float
+
+
+@final
+@dataclass(eq=False)
+class _Left:
+    """What a box leaves open: cells to be halved in time, those for smaller cells of directions, those for smaller boxes."""
+
+    influence: Array
+    halves: list[Interval] = field(default_factory=list)
+    turned: list[Interval] = field(default_factory=list)
+    wide: list[Interval] = field(default_factory=list)
+
+
+def _examine(place: Place, sides: Sides, todo: Sequence[Interval], left: _Left) -> float:
+    """Bound every cell of time; returns the largest bound that will do, and sorts what will not."""
+    bound = -np.inf
+    for interval, found, tops in _batch(place.tube, sides.rows, todo, place.tolerance):
+        tops = [top if top <= place.tolerance else _cut(place, row, poly) for top, row, poly in zip(tops, sides.rows, found, strict=True)]
+        bound = max(bound, *(top for top in tops if top <= place.tolerance), -np.inf)
+        failed = [poly for poly, top in zip(found, tops, strict=True) if top > place.tolerance]
+        if not failed:
+            continue
+        if _turn(place, sides, interval):
+            left.turned.append(interval)
+        elif place.box[0] and any(_to_blame(poly, interval) for poly in failed):
+            left.wide.append(interval)
+            left.influence += sum(_influence(place.tube, poly) for poly in failed)
+        else:
+            left.halves += _halves(interval)
+    return bound
+
+
+def _turn(place: Place, sides: Sides, interval: Interval) -> bool:
     """Whether a cell fails because its directions differ too much. Stops at a violation that is certain: at the cell's start."""
     middle = sides.centre
     rows = sides.rows if middle is None else [middle]
-    (_, found, tops), = _batch(tube, rows, [interval], tolerance)
+    (_, found, tops), = _batch(place.tube, rows, [interval], place.tolerance)
     for row, poly in zip(rows, found, strict=True):
         least = float(poly.coefficients[0, 0]) - row.limit - poly.error - poly.kinks
-        if least > tolerance and (middle is not None or sides.shape is None):
+        certain = middle is not None or sides.shape is None
+        if least > place.tolerance and certain and place.parameters.holds(np.array(place.tube.flow.centre)):
             raise Broken(f"it is exceeded by {least:.3g} at t = {interval[1]:.6g}")
-    return middle is not None and tops[0] <= tolerance
+    if middle is None:
+        return False
+    return tops[0] <= place.tolerance or _cut(place, middle, found[0]) <= place.tolerance
 
 
 def _batch(tube: Tube, rows: Sequence[Bounded], todo: Sequence[Interval],
@@ -94,9 +125,14 @@ def _batch(tube: Tube, rows: Sequence[Bounded], todo: Sequence[Interval],
     """Every interval with its polynomials, one per row, and their proven upper bounds."""
     directions = [row.direction for row in rows]
     every = [tube.cells(*interval, directions) for interval in todo]
-    flat = [(poly, row.limit) for found in every for poly, row in zip(found, rows, strict=True)]
-    tops = np.empty(len(flat))
-    monomials = tube.flow.monomials
+    tops = _tops(tube, [(poly, row.limit) for found in every for poly, row in zip(found, rows, strict=True)], tolerance)
+    for number, (interval, found) in enumerate(zip(todo, every, strict=True)):
+        yield interval, found, tops[number * len(rows):(number + 1) * len(rows)].tolist()
+
+
+def _tops(tube: Tube, flat: Sequence[tuple[Polynomial, float]], tolerance: float) -> Array:
+    """Upper bounds of polynomials less their limits."""
+    tops, monomials = np.empty(len(flat)), tube.flow.monomials
     for orders in {poly.coefficients.shape[0] for poly, _ in flat}:
         which = [i for i, (poly, _) in enumerate(flat) if poly.coefficients.shape[0] == orders]
         dense = np.zeros((len(which), orders, *(monomials.degree + 1,) * monomials.count))
@@ -107,8 +143,25 @@ def _batch(tube: Tube, rows: Sequence[Bounded], todo: Sequence[Interval],
         together[:, 0, 0] -= np.array([flat[i][1] for i in which])
         errors = np.array([flat[i][0].error + 1e-15 * abs(flat[i][1]) for i in which]) * OUTWARD
         tops[which] = highest(dense, [False] + [True] * monomials.count, errors, tolerance)
-    for number, (interval, found) in enumerate(zip(todo, every, strict=True)):
-        yield interval, found, tops[number * len(rows):(number + 1) * len(rows)].tolist()
+    return tops
+
+
+def _cut(place: Place, row: Bounded, poly: Polynomial) -> float:
+    """The bound with the help of the set of parameters: where ``a'p <= s`` on the set, ``v <= v + weight (s - a'p)`` there."""
+    tube, top = place.tube, np.inf
+    centre, radius = np.array(tube.flow.centre), np.array(tube.flow.radius)
+    if place.parameters.is_box:
+        return top
+    linear = [tube.flow.monomials.number[tuple(int(i == j) for j in range(centre.size))] for i in range(centre.size)]
+    slope = poly.coefficients[:, linear].sum(axis=0) / np.where(radius > 0, radius, 1.0)
+    for normals, limits, weights in place.parameters.bounds(place.box, slope):
+        coefficients = poly.coefficients.copy()
+        coefficients[0, linear] -= (weights @ normals) * radius
+        coefficients[0, 0] += float(weights @ (limits - normals @ centre))
+        size = float(weights @ (np.abs(limits) + np.abs(normals) @ (np.abs(centre) + radius)))
+        changed = replace(poly, coefficients=coefficients, error=poly.error + ROUNDING * size)
+        top = min(top, float(_tops(tube, [(changed, row.limit)], place.tolerance)[0]))
+    return top
 
 
 def _to_blame(poly: Polynomial, interval: Interval) -> bool:
@@ -131,7 +184,7 @@ def _halves(interval: Interval) -> list[Interval]:
     return [(piece, start, middle), (piece, middle, stop)]
 
 
-def _split(box: Box, axis: int) -> list[Box]:
+def _split(box: Corners, axis: int) -> list[Corners]:
     lower, upper = list(box[0]), list(box[1])
     middle = (lower[axis] + upper[axis]) / 2
     if not lower[axis] < middle < upper[axis]:
