@@ -22,12 +22,16 @@ MEANING = {0: "certified or verified", 2: "the input is at fault", 3: "infeasibl
            130: "interrupted"}
 FILES = {
     "config.yaml": "the complete, resolved config; `sparserob run` takes it",
-    "result.json": "status, message, cost, value, epsilon, bounds, gap, worst constraint, sparsity, counts, seconds, seed, versions",
+    "result.json": "status, message, cost, value, epsilon, bounds, gap, worst constraint, sparsity, counts, seconds, seed, versions; "
+                   "for the scenario approach `scenario_bound`",
+    "certificate.json": "what is claimed and what proves it; `sparserob check` takes it, [certificate.md](certificate.md) explains it",
     "solution.npz": "`breakpoints (K+1,)`, `control (m, K)`, `theta (m, N)`; of the imposed constraints `times`, `indices`, `rows`, "
                     "`families`, `multipliers`",
     "evaluations.npz": "for a method that searches, one entry per value of g: outer iteration, epsilon, value, proven lower bound, seconds",
     "trace.npz": "one array per column, one entry per round: bounds, violation, epsilon, indices, seconds",
-    "figures/": "`control`, `states`, `convergence`, each as PDF and PNG",
+    "adversary.npz": "per constraint its worst time, parameter, disturbance and the states that these cause",
+    "simulation-LAW.json": "written by `sparserob simulate`: how often trajectories under a law break each constraint",
+    "figures/": "`control`, `states`, `convergence`, `adversary`, each as PDF and PNG; `clash` when infeasible",
 }
 
 
