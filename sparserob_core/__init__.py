@@ -24,8 +24,13 @@ if TYPE_CHECKING:
     from sparserob_core.control.system import LinearSystem
     from sparserob_core.control.transcription import transcribe
     from sparserob_core.errors import ConfigError, InputError, PluginError, SolverError, SparseRobError
+    from sparserob_core.experiment.check import Check, check
     from sparserob_core.experiment.compare import Comparison, compare
     from sparserob_core.experiment.events import Observer, RunFinished, RunStarted
+    from sparserob_core.experiment.figure_data import FigureData, Wall
+    from sparserob_core.experiment.initial_states import InitialStates, initial_states
+    from sparserob_core.experiment.inspection import Inspection, RelaxedValue
+    from sparserob_core.experiment.margin import Margin, margin
     from sparserob_core.experiment.plugin import (
         DictionaryPlugin,
         InnerStopPlugin,
@@ -43,8 +48,11 @@ if TYPE_CHECKING:
     from sparserob_core.experiment.registry import hookimpl, load_registry
     from sparserob_core.experiment.run import Outcome, run
     from sparserob_core.experiment.set_options import SetOptions
+    from sparserob_core.experiment.simulate import simulate
+    from sparserob_core.experiment.simulation import ConstraintShare, Simulation
     from sparserob_core.experiment.solve import maximise, solve
     from sparserob_core.options import Options
+    from sparserob_core.sip.batch import Batch
     from sparserob_core.sip.convex_set import Array, Box, ConvexSet
     from sparserob_core.sip.events import EvaluationsFinished, Event, ProofProgress, RoundFinished
     from sparserob_core.sip.maximiser import EvaluationError, Maximiser, Objective, Report, SearchEnded, Trace
@@ -57,15 +65,16 @@ if TYPE_CHECKING:
     from sparserob_core.sip.trust_region import TrustRegion
 
 __all__ = [
-    "Array", "Box", "Claim", "Comparison", "ConfigError", "ConstraintFamily", "Continuation", "ControlImage", "ConvexSet", "Cut",
-    "Dictionary", "DictionaryFactory", "DictionaryPlugin", "Ellipsoid", "Enclosure", "Equality", "EvaluationError", "EvaluationsFinished",
-    "Event", "InnerStop", "InnerStopPlugin", "InputError", "LinearKeys", "LinearProblem", "LinearSystem", "Maximiser", "MaximiserPlugin",
-    "Method", "MethodPlugin", "NormBall", "Objective", "Observer", "ObserverPlugin", "OptimalControlProblem", "Options", "Outcome",
-    "OuterStep", "OuterStop", "OuterStopPlugin", "PathConstraint", "PluginError", "Polytope", "ProblemFactory", "ProblemPlugin", "Progress",
-    "ProofProgress", "QuadraticProgram", "Regulariser", "RegulariserPlugin", "Report", "Result", "RoundFinished", "RunFinished",
-    "RunStarted", "Schedule", "SchedulePlugin", "SearchEnded", "SearchTrace", "Selection", "SelectionPlugin", "SemiInfiniteProgram",
-    "Separation", "SetOptions", "Solver", "SolverError", "SolverPlugin", "SparseRobError", "Tools", "Trace", "TrustRegion", "Witness",
-    "compare", "cylinder", "hookimpl", "intersection", "load_registry", "maximise", "run", "solve", "transcribe",
+    "Array", "Batch", "Box", "Check", "Claim", "Comparison", "ConfigError", "ConstraintFamily", "ConstraintShare", "Continuation", "ControlImage",
+    "ConvexSet", "Cut", "Dictionary", "DictionaryFactory", "DictionaryPlugin", "Ellipsoid", "Enclosure", "Equality", "EvaluationError",
+    "EvaluationsFinished", "Event", "FigureData", "InitialStates", "InnerStop", "InnerStopPlugin", "InputError", "Inspection", "LinearKeys",
+    "LinearProblem", "LinearSystem", "Margin", "Maximiser", "MaximiserPlugin", "Method", "MethodPlugin", "NormBall", "Objective", "Observer",
+    "ObserverPlugin", "OptimalControlProblem", "Options", "Outcome", "OuterStep", "OuterStop", "OuterStopPlugin", "PathConstraint",
+    "PluginError", "Polytope", "ProblemFactory", "ProblemPlugin", "Progress", "ProofProgress", "QuadraticProgram", "Regulariser",
+    "RegulariserPlugin", "RelaxedValue", "Report", "Result", "RoundFinished", "RunFinished", "RunStarted", "Schedule", "SchedulePlugin",
+    "SearchEnded", "SearchTrace", "Selection", "SelectionPlugin", "SemiInfiniteProgram", "Separation", "SetOptions", "Simulation", "Solver",
+    "SolverError", "SolverPlugin", "SparseRobError", "Tools", "Trace", "TrustRegion", "Wall", "Witness", "check", "compare", "cylinder", "hookimpl",
+    "initial_states", "intersection", "load_registry", "margin", "maximise", "run", "simulate", "solve", "transcribe",
 ]
 
 _MODULES = {
@@ -80,20 +89,28 @@ _MODULES = {
     "sip.result": "Cut Result SearchTrace Witness",
     "sip.rules": "InnerStop OuterStep OuterStop Progress Schedule Selection",
     "sip.trust_region": "TrustRegion",
+    "sip.batch": "Batch",
     "sip.events": "EvaluationsFinished Event ProofProgress RoundFinished",
     "control.dictionary": "Dictionary DictionaryFactory",
     "control.sets": "Ellipsoid Equality NormBall Polytope cylinder intersection",
     "control.system": "LinearSystem",
     "control.problem": "OptimalControlProblem PathConstraint ProblemFactory",
     "control.transcription": "transcribe",
+    "experiment.check": "Check check",
     "experiment.compare": "Comparison compare",
     "experiment.events": "Observer RunFinished RunStarted",
+    "experiment.figure_data": "FigureData Wall",
+    "experiment.initial_states": "InitialStates initial_states",
+    "experiment.inspection": "Inspection RelaxedValue",
+    "experiment.margin": "Margin margin",
     "experiment.plugin": "DictionaryPlugin InnerStopPlugin MaximiserPlugin MethodPlugin ObserverPlugin OuterStopPlugin ProblemPlugin "
                          "RegulariserPlugin SchedulePlugin SelectionPlugin SolverPlugin",
     "experiment.problems": "LinearKeys LinearProblem",
     "experiment.registry": "hookimpl load_registry",
     "experiment.run": "Outcome run",
     "experiment.set_options": "SetOptions",
+    "experiment.simulate": "simulate",
+    "experiment.simulation": "ConstraintShare Simulation",
     "experiment.solve": "maximise solve",
 }
 _HOME = {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names.split()}

@@ -79,35 +79,48 @@ class Pushes:
     _tables: dict[tuple[int, bytes], Table] = field(default_factory=dict)
     _steps: dict[int, Series] = field(default_factory=dict)
     _inside: dict[int, Series] = field(default_factory=dict)
+    _latest: tuple[tuple[float, int, bytes], Array, Array, Array, Array] | None = None
     _rows: dict[bytes, tuple[list[int], list[Series]]] = field(default_factory=dict)
 
     def bound(self, start: float, ticks: int, direction: Array) -> tuple[Array, float, float]:
         """Coefficients of a bound of the disturbance's support from ``start`` on for that many ticks, its error, and how much of that is due to
         switching."""
         assert self.scene.disturbance is not None
+        sign = 1.0 if direction[np.flatnonzero(direction)[0]] > 0 else -1.0   # opposite directions share everything but the sign
+        key = (start, ticks, (sign * direction).tobytes())
+        if self._latest is None or self._latest[0] != key:
+            self._latest = (key, *self._ranged(start, ticks, sign * direction))
+        _, mid, rad, value, spread = self._latest
+        w, excess = linear_bound(self.scene.disturbance, sign * value, spread)
+        size = np.abs(w)
+        moved = sign * np.einsum("lw,ljkw->jk", w, mid)
+        off = float(np.einsum("lw,lw->", size, rad.sum(axis=(1, 2)) + ROUNDING * np.abs(mid).sum(axis=(1, 2))))
+        return moved, off * OUTWARD, float(excess.sum()) * OUTWARD
+
+    def _ranged(self, start: float, ticks: int, direction: Array) -> tuple[Array, Array, Array, Array]:
+        """`_weights`, and the ranges that they stay in on the cell: middles and half-widths, ``(pieces, mw)``."""
         mid, rad = self._weights(start, ticks, direction)
         ends = bernstein(np.moveaxis(mid[:, :, 0], 1, 2).reshape(-1, mid.shape[1]), [False]).reshape(mid.shape[0], -1, mid.shape[1])
-        value, spread = (ends.max(axis=2) + ends.min(axis=2)) / 2, (ends.max(axis=2) - ends.min(axis=2)) / 2
-        spread = spread + np.abs(mid[:, :, 1:]).sum(axis=(1, 2)) + rad.sum(axis=(1, 2)) + ROUNDING * np.abs(mid[:, :, 0]).sum(axis=1)
-        w, excess = linear_bound(self.scene.disturbance, value, spread * OUTWARD)
-        size = np.abs(w)
-        moved = np.einsum("lw,ljkw->jk", w, mid)
-        off = float(np.einsum("lw,ljkw->", size, rad) + ROUNDING * np.einsum("lw,ljkw->", size, np.abs(mid)))
-        return moved, off * OUTWARD, float(excess.sum()) * OUTWARD
+        highest, lowest = ends.max(axis=2), ends.min(axis=2)
+        spread = (highest - lowest) / 2 + np.abs(mid[:, :, 1:]).sum(axis=(1, 2)) + rad.sum(axis=(1, 2)) + ROUNDING * np.abs(mid[:, :, 0]).sum(axis=1)
+        return mid, rad, (highest + lowest) / 2, spread * OUTWARD
 
     def _weights(self, start: float, ticks: int, direction: Array) -> tuple[Array, Array]:
         """What every piece of the disturbance before the cell adds per unit, ``(pieces, J + 1, M, mw)``, with errors of the same shape."""
-        sign = 1.0 if direction[np.flatnonzero(direction)[0]] > 0 else -1.0   # opposite directions share their rows
-        table = self._tables.setdefault((ticks, (sign * direction).tobytes()), Table())
-        since = np.array([s for s in self.scene.changes if s <= start])
-        lags = np.rint((start - since) / self.scene.tick).astype(int).tolist()
+        table = self._tables.setdefault((ticks, direction.tobytes()), Table())
+        lags = np.rint((start - self._jumps[:np.searchsorted(self._jumps, start, side="right")]) / self.scene.tick).astype(int).tolist()
         for lag in reversed(lags):  # short ones first: each row starts from the one before
             if lag not in table.places:
-                table.add(lag, self._integral(lag, ticks, sign * direction))
+                table.add(lag, self._integral(lag, ticks, direction))
         places = [table.places[lag] for lag in lags]
-        mid, rad = sign * table.mid[places], table.rad[places]
-        mid, rad = np.concatenate([mid, np.zeros_like(mid[:1])]), np.concatenate([rad, np.zeros_like(rad[:1])])
-        return mid[:-1] - mid[1:], rad[:-1] + rad[1:] + ROUNDING * (np.abs(mid[:-1]) + np.abs(mid[1:]))
+        mid, rad = table.mid[places], table.rad[places]
+        rad[:-1] += rad[1:] + ROUNDING * (np.abs(mid[:-1]) + np.abs(mid[1:]))
+        mid[:-1] -= mid[1:]
+        return mid, rad
+
+    @cached_property
+    def _jumps(self) -> Array:
+        return np.array(self.scene.changes)
 
     def _integral(self, lag: int, ticks: int, direction: Array) -> tuple[Array, Array]:
         """``int_0^s c'e^{A r} E dr`` for ``s`` from ``lag`` on, as ``(J + 1, M, mw)`` with errors of the same shape."""

@@ -15,13 +15,14 @@ from sparserob_core.control.disturbance import DisturbanceModel, disturbance_mod
 from sparserob_core.control.functional import WorstCase
 from sparserob_core.control.literal import LiteralConstraint
 from sparserob_core.control.parameters import ParameterIndex
-from sparserob_core.control.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem import OptimalControlProblem
 from sparserob_core.control.response import SAME_TIME, Response, merge_grids
 from sparserob_core.control.sampling import sample_disturbances, sample_parameters
 from sparserob_core.control.scenario import ScenarioConstraint
 from sparserob_core.control.sensitivity import Sensitivity
 from sparserob_core.control.sets import Equality
 from sparserob_core.control.taylor import TaylorSpace
+from sparserob_core.control.windows import state_constraints
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
@@ -152,23 +153,8 @@ def _reached(model: Transcription, state: int) -> bool:
 
 
 def _families(model: Transcription) -> list[ConstraintFamily]:
-    problem = model.problem
-    path = [entry for entry in problem.path if isinstance(entry, PathConstraint)]  # all of them, after the problem's own checks
-    windows = [(f"path[{i}]" if len(path) > 1 else "path", entry) for i, entry in enumerate(path)]
-    ends = [terminal for terminal in problem.terminal if not isinstance(terminal, Equality)]
-    windows += [(f"terminal[{i}]" if len(ends) > 1 else "terminal", PathConstraint(end, problem.horizon, problem.horizon))
-                for i, end in enumerate(ends)]
-    families = [family for name, entry in windows for family in _family(model, entry.name or name, entry)]
-    curved = problem.control.halfspaces() is None
-    return [*families, ControlConstraint(problem.control, model.control).family()] if curved else families
-
-
-def _family(model: Transcription, name: str, entry: PathConstraint) -> list[ConstraintFamily]:
-    stop = model.problem.horizon if entry.stop is None else entry.stop
-    flat = entry.set.halfspaces()
-    if flat is None:
-        return [_complete(CurvedConstraint(name, model.functionals, entry.set, entry.start, stop, model.parameters))]
-    return [_complete(FlatConstraint(name, model.functionals, *flat, entry.start, stop, model.parameters))] if flat[1].size else []
+    families, bound = [_complete(constraint) for constraint in state_constraints(model)], model.problem.control
+    return [*families, ControlConstraint(bound, model.control).family()] if bound.halfspaces() is None else families
 
 
 def _complete(constraint: FlatConstraint | CurvedConstraint) -> ConstraintFamily:

@@ -1,4 +1,4 @@
-"""The state constraints of a problem, one object per family: for whoever follows single trajectories instead of a program."""
+"""The state constraints of a problem, one object per family: for the program, and for whoever follows single trajectories."""
 
 from __future__ import annotations
 

@@ -74,14 +74,15 @@ def _branch_and_bound(family: ConstraintFamily, x: Array, notify: Notify, cells:
         leaves.append((lower[~open_], upper[~open_]))
         closed = max(closed, float(bounds[~open_].max(initial=-np.inf)))
         best = max(best, _probe(family, x, lower, upper, bounds), key=lambda found: found[0])
-        if open_.any() and best[0] <= tolerance and len(leaves) in CLIMBED:
+        if open_.any() and best[0] <= tolerance and len(leaves) in CLIMBED and family.index_set.dimension > 1:
             best = max(best, _climb(family, x, *(corner[bounds.argmax()] for corner in (lower, upper))), key=lambda found: found[0])
         if best[0] > tolerance:
             return Proof(family.name, "refuted", np.inf, best[0], best[1], best[2], examined)
         if not open_.any():
             return Proof(family.name, "proven", closed, best[0], best[1], best[2], examined, leaves=_in_order(leaves))
         worst = float(bounds.max())
-        notify(ProofProgress(family=family.name, cells=int(open_.sum()), bound=worst, seconds=time.perf_counter() - start))
+        notify(ProofProgress(family=family.name, cells=int(open_.sum()), bound=worst, seconds=time.perf_counter() - start,
+                             examined=examined, budget=cells))
         halves = _halved(lower[open_], upper[open_], split[open_])
         if halves is None or examined + halves[0].shape[0] > cells:
             reason = f"{int(open_.sum())} of {examined} cells were left, where a violation of {worst:.1e} is not excluded"
