@@ -124,7 +124,7 @@ def numbers(data: object, name: str) -> Array:
     """Finite numbers from the certificate; raises `Broken` where they are none."""
     try:
         array = np.array(data, dtype=float)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise Broken(f"{name}: expected numbers") from error
     if not np.isfinite(array).all():
         raise Broken(f"{name}: expected finite numbers")

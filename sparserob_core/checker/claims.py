@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,11 +10,10 @@ import numpy as np
 from sparserob_core.checker.case import Case, listed, number, numbers
 from sparserob_core.checker.constraints import bounded
 from sparserob_core.checker.duality import Row
-from sparserob_core.checker.flow import Flow
-from sparserob_core.checker.outcome import Broken, Claim, Unchecked
+from sparserob_core.checker.equalities import equalities
+from sparserob_core.checker.outcome import VIOLATION, Broken, Claim, Unchecked
 from sparserob_core.checker.replay import reached
 from sparserob_core.checker.shapes import balls, excess, limit, member, support
-from sparserob_core.checker.tube import Tube
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -23,7 +21,6 @@ if TYPE_CHECKING:
 
 PRECISION = 96          # bits
 FIGURES = 1e-11         # relative to the larger of it and 1: how closely a written figure must agree with the one derived
-VIOLATION = 1e-9        # a constraint that is exceeded by at most this counts as kept
 MOST_MULTIPLIERS = 100_000
 
 
@@ -44,7 +41,7 @@ def check(case: Case, gap_tolerance: float | None) -> list[Claim]:
         if status == "refuted":
             return [*claims, judged("violation", lambda: _witness(case))]
         if case.equalities:
-            claims.append(judged("equalities", lambda: _equalities(case)))
+            claims.append(judged("equalities", lambda: equalities(case)))
         claims += [judged(window.name, lambda window=window: bounded(case, window)) for window in case.windows]  # type: ignore[misc]
         return [*claims, judged("status", lambda: _status(case, str(status), gap_tolerance, claims))]
 
@@ -192,27 +189,6 @@ def _scale(case: Case) -> float:
     axes = np.eye(case.problem.system.controls)
     reach = [max(abs(float(support(case.problem.control, balls(s * axis)).mid())) for s in (1.0, -1.0)) for axis in axes]
     return min(1.0, float(np.dot(np.asarray(case.problem.weights), reach)) * case.problem.horizon) or 1.0
-
-
-def _equalities(case: Case) -> str:
-    """The fixed states at the end, at every parameter: their coefficients beside the constant one must vanish."""
-    flow, worst = _whole(case), 0.0
-    tube = Tube(flow, replace(case.scene, disturbance=None))
-    for state, value in case.equalities:
-        parts = [part[state, 0] for part in tube.nodes[-1].parts]
-        off = sum((abs(part) for part in parts[1:]), abs(parts[0] - balls([value])[0]))
-        worst = max(worst, float(off.upper()))
-    if worst > VIOLATION:
-        raise Broken(f"one is missed by up to {worst:.3g}")
-    return f"kept to {worst:.1e}"
-
-
-def _whole(case: Case) -> Flow:
-    bound = case.problem.system.parameters
-    if bound is None:
-        return Flow(case.problem.system, (), (), 0)
-    reach = [(float(-support(bound, balls(-e)).mid()), float(support(bound, balls(e)).mid())) for e in np.eye(bound.dimension)]
-    return Flow(case.problem.system, tuple((a + b) / 2 for a, b in reach), tuple((b - a) / 2 for a, b in reach), 2)
 
 
 def _witness(case: Case) -> str:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, TypeAlias, final
 
+VIOLATION = 1e-9        # a constraint that is exceeded by at most this counts as kept
+
 Verdict: TypeAlias = Literal["holds", "fails", "not checked"]
 
 

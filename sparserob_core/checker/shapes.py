@@ -206,7 +206,7 @@ def balls(vector: Sequence[float] | Array) -> list[arb]:
 def limit(shape: ConvexSet, direction: Array) -> arb:
     """The largest ``c'x`` over a set, or a bound of it; for a facet's own normal simply what the facet says."""
     flat = facets(shape)
-    if flat is None or isinstance(shape, Box):
+    if flat is None or isinstance(shape, Box | NormBall):
         return support(shape, balls(direction))
     said = [b for c, b in flat if np.array_equal(c, direction)]
     if not said:

@@ -6,8 +6,10 @@ from fractions import Fraction
 
 import numpy as np
 
-from sparserob_core.checker.outcome import Broken
+from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.sip.convex_set import Array
+
+MOST_CELLS = 100_000
 
 
 def fill(lower: Array, upper: Array, low: Array, high: Array) -> None:
@@ -21,6 +23,8 @@ def fill(lower: Array, upper: Array, low: Array, high: Array) -> None:
     if (lower < low).any() or (upper > high).any() or (lower > upper).any():
         raise Broken("a cell lies outside what is to be covered")
     thick = high > low
+    if lower.shape[0] > MOST_CELLS:
+        raise Unchecked(f"{lower.shape[0]} cells are too many to be told apart one by one")
     if not thick.any():
         if lower.shape[0] != 1:
             raise Broken(f"{lower.shape[0]} cells stand for a single point, expected one")
