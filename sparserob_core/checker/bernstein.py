@@ -47,11 +47,13 @@ def bernstein(coefficients: Array, symmetric: Sequence[bool], absolute: bool = F
 
 def highest(coefficients: Array, symmetric: Sequence[bool], errors: Array, limit: float) -> Array:
     """Upper bounds ``(k,)`` of each polynomial plus its ``errors (k,)``: at most ``limit`` where halving boxes shows that, else not sharp."""
-    slack = errors + ROUNDING * bernstein(coefficients, symmetric, absolute=True).reshape(coefficients.shape[0], -1).max(axis=1)
-    b = bernstein(coefficients, symmetric)
-    owner = np.arange(b.shape[0])
-    bounds = np.full(b.shape[0], -np.inf)
-    for step in range(HALVINGS):
+    with np.errstate(over="ignore", invalid="ignore"):
+        slack = errors + ROUNDING * bernstein(coefficients, symmetric, absolute=True).reshape(coefficients.shape[0], -1).max(axis=1)
+        b = bernstein(coefficients, symmetric)
+    tame = np.isfinite(b).reshape(b.shape[0], -1).all(axis=1) & np.isfinite(slack)  # of the others nothing is proven
+    owner, b = np.flatnonzero(tame), b[tame]
+    bounds = np.where(tame, -np.inf, np.inf)
+    for step in range(HALVINGS if owner.size else 0):
         top = b.reshape(b.shape[0], -1).max(axis=1)
         done = top + slack[owner] <= limit
         reached = _corners(b).max(axis=1)

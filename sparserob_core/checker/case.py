@@ -122,6 +122,8 @@ class Case:
 
 def numbers(data: object, name: str) -> Array:
     """Finite numbers from the certificate; raises `Broken` where they are none."""
+    if not _numeric(data):
+        raise Broken(f"{name}: expected numbers")
     try:
         array = np.array(data, dtype=float)
     except (TypeError, ValueError, OverflowError) as error:
@@ -129,6 +131,13 @@ def numbers(data: object, name: str) -> Array:
     if not np.isfinite(array).all():
         raise Broken(f"{name}: expected finite numbers")
     return array
+
+
+def _numeric(data: object) -> bool:
+    """Whether that is a number, or lists of them: text and truth values are none."""
+    if isinstance(data, list):
+        return all(_numeric(value) for value in data)
+    return isinstance(data, int | float) and not isinstance(data, bool)
 
 
 def number(data: Mapping[str, Any], name: str) -> float:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sparserob_core.checker.case import Case, listed, number, numbers
-from sparserob_core.checker.constraints import bounded
+from sparserob_core.checker.constraints import bounded, kept
 from sparserob_core.checker.duality import Row
 from sparserob_core.checker.equalities import equalities
 from sparserob_core.checker.outcome import VIOLATION, Broken, Claim, Unchecked
@@ -30,7 +30,7 @@ def check(case: Case, gap_tolerance: float | None) -> list[Claim]:
 
     status = case.certificate.get("status")
     with ctx.workprec(PRECISION):
-        if case.certificate.get("format") != 1:
+        if type(case.certificate.get("format")) is not int or case.certificate["format"] != 1:
             return [Claim("certificate", "fails", f"its format is {case.certificate.get('format')!r}, expected 1")]
         if status == "infeasible":
             return [judged("infeasibility", lambda: _infeasible(case))]
@@ -79,15 +79,15 @@ def cost_of(case: Case) -> arb:
 
 def _cost(case: Case) -> str:
     derived = cost_of(case)
-    _agrees("cost", number(case.certificate, "cost"), derived)
+    _agrees("cost", number(case.certificate, "cost"), derived, _scale(case))
     return f"J = {float(derived.mid()):.12g}"
 
 
-def _agrees(name: str, written: float, derived: arb) -> None:
+def _agrees(name: str, written: float, derived: arb, scale: float) -> None:
     from flint import arb
 
     off = abs(arb(written) - derived)
-    if not off <= arb(FIGURES) * arb(1).max(abs(derived)):
+    if not off <= arb(FIGURES) * arb(scale).max(abs(derived)):
         raise Broken(f"{name}: {written!r} is written, {float(derived.mid())!r} is derived")
 
 
@@ -114,9 +114,9 @@ def _multiplied(case: Case, priced: bool) -> arb:
         rows.append((multiplier, row))
     images = data.get("images")
     if case.control.functions < case.control.pieces:
-        images = numbers(images, "images").tolist()
-        if len(images) % case.control.pieces or len(images) < case.problem.system.controls * case.control.pieces:
-            raise Broken(f"{len(images)} multipliers of the control's pieces, expected {case.problem.system.controls * case.control.pieces}")
+        images, expected = numbers(images, "images"), case.duality.images
+        if images.shape != (expected,):
+            raise Broken(f"{images.size} multipliers of the control's pieces, expected {expected}")
     return case.duality.bound(rows, images, priced)
 
 
@@ -199,13 +199,14 @@ def _witness(case: Case) -> str:
     window, time = case.window(str(data.get("constraint"))), number(data, "time")
     direction, parameter = (numbers(data.get(key), key) for key in ("direction", "parameter"))
     _sized(direction, case.problem.system.states, window.name)
+    _sized(parameter, case.problem.system.parameter_count, window.name)
     if not window.start <= time <= window.stop:
         raise Broken(f"t = {time!r} is not within {window.start:g} to {window.stop:g}")
     if case.problem.system.parameters is not None and not member(case.problem.system.parameters, parameter):
         raise Broken(f"the parameter {parameter.tolist()} is not shown to be in its set")
     state = reached(case, time, parameter, data.get("disturbance"))
     over = sum((balls([c])[0] * x for c, x in zip(direction, state, strict=True)), balls([0.0])[0]) - limit(window.shape, direction)
-    if not over > VIOLATION * min(1.0, float(np.linalg.norm(direction))):
+    if not over > kept(case, window) * float(np.linalg.norm(direction)):
         raise Broken(f"it leads to a violation of {float(over.mid()):.3g}, which is none")
     if abs(float(over.mid()) - number(data, "violation")) > 1e-6 * max(1.0, abs(float(over.mid()))):
         raise Broken(f"a violation of {data.get('violation')!r} is written, {float(over.mid())!r} is derived")

@@ -39,8 +39,9 @@ def bounded(case: Case, window: Window) -> str:
             raise Unchecked("the certificate does not claim it")
         raise Broken("the certificate holds no proof of it")
     tolerance = number(entry, "tolerance")
-    if not 0 < tolerance <= MOST_TOLERANCE:
-        raise Broken(f"a violation of {tolerance:g} is to count as none, at most {MOST_TOLERANCE:g} may")
+    most = kept(case, window)
+    if not 0 < tolerance <= most * (1.0 + 1e-12):
+        raise Broken(f"a violation of {tolerance:g} is to count as none, at most {most:g} may")
     lower, upper = numbers(entry.get("lower"), "lower"), numbers(entry.get("upper"), "upper")
     if lower.shape == (0, 0):
         raise Unchecked("the certificate holds no cells for a constraint that was not proven on cells")
@@ -48,6 +49,19 @@ def bounded(case: Case, window: Window) -> str:
     found = prove(_tubes(case, lower, upper), Parameters(case.problem.system.parameters), _work(case, window, lower, upper), tolerance)
     size = f"{found.cells} cells" + (f" in {found.boxes} boxes" if found.boxes > 1 else "")
     return f"kept, with a margin of at least {-found.bound:.1e} ({size})" if found.bound < 0 else f"kept to {found.bound:.1e} ({size})"
+
+
+def kept(case: Case, window: Window) -> float:
+    """A violation of at most this counts as none: less where the numbers of the constraint are below a thousandth."""
+    start = np.asarray(case.problem.initial_state)
+    flat = facets(window.shape)
+    if flat is not None:
+        size = max((max(abs(float(b.mid())), abs(float(c @ start))) for c, b in flat), default=1.0)
+    else:
+        base = window.shape.base if isinstance(window.shape, Cylinder) else window.shape
+        axes = np.eye(base.dimension)
+        size = max(float(np.abs(base.support(np.vstack([axes, -axes]))).max()), float(np.abs(start[:base.dimension]).max()))
+    return MOST_TOLERANCE * min(1.0, 1e3 * (size or 1.0))
 
 
 def _spanned(window: Window) -> int:

@@ -86,6 +86,12 @@ class Duality:
         lengths = [_exact(b) - _exact(a) for a, b in zip(self.control.breakpoints[:-1], self.control.breakpoints[1:], strict=True)]
         return sum((self._least([_exact(w) * length for w in weights], slope) for length, slope in zip(lengths, slopes, strict=True)), constant)
 
+    @property
+    def images(self) -> int:
+        """How many multipliers the control's pieces have: one per channel and per facet that several channels share."""
+        flat = facets(self.problem.control) if not isinstance(self.problem.control, Box) else None
+        return (self.problem.system.controls + sum(bool(np.count_nonzero(c) > 1) for c, _ in flat or [])) * self.control.pieces
+
     def _moved(self, slopes: list[list[arb]], images: Sequence[float]) -> tuple[list[list[arb]], arb]:
         """With fewer functions than pieces, slopes that act alike on every control of the dictionary are as good: those of the certificate.
 

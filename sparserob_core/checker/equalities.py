@@ -26,9 +26,10 @@ def equalities(case: Case) -> str:
     for state, value in case.equalities:
         if _reached(case, state):
             raise Unchecked(f"the uncertainty may reach x{state + 1}, which is to be fixed")
-        worst = max(worst, float(abs(tube.nodes[-1].parts[0][state, 0] - balls([value])[0]).upper()))
-    if worst > VIOLATION:
-        raise Broken(f"one is missed by up to {worst:.3g}")
+        missed = abs(tube.nodes[-1].parts[0][state, 0] - balls([value])[0])
+        if not missed <= VIOLATION:
+            raise Broken(f"x{state + 1} is missed by up to {float(missed.upper()):.3g}")
+        worst = max(worst, float(missed.upper()))
     return f"kept to {worst:.1e}"
 
 

@@ -67,13 +67,16 @@ def linear_bound(shape: ConvexSet, value: Array, spread: Array) -> tuple[Array, 
 
 
 def _round_bound(centre: Array, S: Array, value: Array, spread: Array) -> tuple[Array, Array]:
-    size = np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", value, S, value), 0.0))
+    square = np.maximum(np.einsum("ki,ij,kj->k", value, S, value), 0.0)
+    lost = ROUNDING * np.einsum("ki,ij,kj->k", np.abs(value), np.abs(S), np.abs(value))   # by cancellation
+    size = np.sqrt(square)
     safe = np.where(size > 0, size, 1.0)
     w = centre + np.where(size[:, None] > 0, value @ S / safe[:, None], 0.0)
     off = spread @ np.sqrt(np.diag(S)) * OUTWARD
     with np.errstate(divide="ignore", invalid="ignore"):
         excess = np.where(off < 0.5 * size, off**2 / (2.0 * (size - off)), 2.0 * off + np.where(size > 0, 0.0, off))
-    return w, excess * OUTWARD + 1e-14 * (size + off + np.abs(value) @ np.abs(centre))
+    short = np.sqrt(square + lost) - size + lost / safe
+    return w, (excess + short) * OUTWARD + 1e-14 * (size + off + np.abs(value) @ np.abs(centre))
 
 
 def _octahedron(shape: NormBall) -> Array:

@@ -92,7 +92,7 @@ def _examine(place: Place, sides: Sides, todo: Sequence[Interval], left: _Left) 
     for interval, found, tops in _batch(place.tube, sides.rows, todo, place.tolerance):
         tops = [top if top <= place.tolerance else _cut(place, row, poly) for top, row, poly in zip(tops, sides.rows, found, strict=True)]
         bound = max(bound, *(top for top in tops if top <= place.tolerance), -np.inf)
-        failed = [poly for poly, top in zip(found, tops, strict=True) if top > place.tolerance]
+        failed = [poly for poly, top in zip(found, tops, strict=True) if not top <= place.tolerance]
         if not failed:
             continue
         if _turn(place, sides, interval):
@@ -142,6 +142,8 @@ def _tops(tube: Tube, flat: Sequence[tuple[Polynomial, float]], tolerance: float
         together[:, :, places] = np.array([flat[i][0].coefficients for i in which])
         together[:, 0, 0] -= np.array([flat[i][1] for i in which])
         errors = np.array([flat[i][0].error + 1e-15 * abs(flat[i][1]) for i in which]) * OUTWARD
+        if not (np.isfinite(dense).all() and np.isfinite(errors).all()):
+            raise Unchecked("the response grows beyond what numbers can hold")
         tops[which] = highest(dense, [False] + [True] * monomials.count, errors, tolerance)
     return tops
 

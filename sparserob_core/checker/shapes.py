@@ -111,8 +111,16 @@ def _dual_norm(shape: NormBall, d: Sequence[arb]) -> arb:
     if shape.p == 2.0:
         return sum((c * c for c in d), arb(0)).nonnegative_part().sqrt()
     q = arb(shape.p) / (arb(shape.p) - 1)
-    total = sum((size ** q for size in sizes if not size.is_zero()), arb(0))
-    return arb(0) if total.is_zero() else total ** (1 / q)
+    total = sum((_power(size, q) for size in sizes if not size.is_zero()), arb(0))
+    return arb(0) if total.is_zero() else _power(total, 1 / q)
+
+
+def _power(value: arb, exponent: arb) -> arb:
+    """``|value|^exponent``, ``exponent > 0``, also of a ball that holds 0, for which Arb gives none."""
+    from flint import arb
+
+    size = abs(value)
+    return size ** exponent if size > 0 else arb(0).union(arb(size.upper()) ** exponent)
 
 
 def radius(shape: ConvexSet) -> list[float]:
@@ -227,8 +235,10 @@ def excess(shape: ConvexSet, point: Sequence[arb]) -> float:
         z = arb_mat([[arb(float(v)) for v in row] for row in shape.shape]).solve(arb_mat([[v] for v in offsets]))
         gauge = sum((v * z[i, 0] for i, v in enumerate(offsets)), arb(0)).nonnegative_part().sqrt()
     elif isinstance(shape, NormBall):
-        total = sum((abs(v) ** arb(shape.p) for v in offsets if not v.is_zero()), arb(0))
-        gauge = (arb(0) if total.is_zero() else total ** (1 / arb(shape.p))) / arb(shape.radius)
+        total = sum((_power(v, arb(shape.p)) for v in offsets if not v.is_zero()), arb(0))
+        gauge = (arb(0) if total.is_zero() else _power(total, 1 / arb(shape.p))) / arb(shape.radius)
     else:
         raise Unchecked(f"the checker cannot tell who is in a {type(shape).__name__}")
+    if not gauge.is_finite():
+        raise Unchecked("the size of a point cannot be bounded")
     return max(0.0, float((gauge - 1).upper()))

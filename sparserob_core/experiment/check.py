@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import json
 import time
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any, final
+from zipfile import BadZipFile
 
 import numpy as np
 
 from sparserob_core.checker.outcome import Claim
+from sparserob_core.control.dictionary import Dictionary
 from sparserob_core.errors import InputError
 
 STATUS = {"holds": 0, "not checked": 1, "fails": 2}
@@ -50,7 +54,7 @@ def check(directory: str | Path) -> Check:
         raise InputError(f"{path}: expected the run of a control problem; certificates of other programs cannot be checked")
     case = Case(experiment.problem, experiment.control, experiment.disturbance, data)
     claims = [_config(experiment.loaded.config.digest(), data, summary), *derive(case, gap_tolerance(experiment.loaded)),
-              _result(data, summary), _solution(path, data, experiment.control.values)]
+              _result(data, summary), _solution(path, data, experiment.control)]
     return Check(experiment.loaded.config.title or path.name, tuple(claims), time.perf_counter() - started)
 
 
@@ -77,7 +81,9 @@ def _result(data: Mapping[str, Any], summary: Mapping[str, Any]) -> Claim:
     """``result.json`` must say what the certificate says."""
     status = data.get("status")
     wanted: dict[str, object] = {"status": status, "lower_bound": data.get("lower_bound")}
-    if status != "infeasible":
+    if status == "infeasible":
+        wanted |= {"cost": None, "upper_bound": None}
+    else:
         wanted |= {"cost": data.get("cost"), "upper_bound": None if status == "refuted" else data.get("cost")}
     different = [f"{name} is {summary.get(name)!r}, not {value!r}" for name, value in wanted.items() if summary.get(name) != value]
     different += _gap(summary) if status in ("certified", "verified") else []
@@ -92,16 +98,17 @@ def _gap(summary: Mapping[str, Any]) -> list[str]:
     return [] if abs(gap - derived) <= 1e-12 else [f"gap is {gap!r}, not {derived!r}"]
 
 
-def _solution(path: Path, data: Mapping[str, Any], values: np.ndarray) -> Claim:
+def _solution(path: Path, data: Mapping[str, Any], dictionary: Dictionary) -> Claim:
     """``solution.npz`` must hold the certificate's decision."""
     if data.get("decision") is None:
         return Claim("solution.npz", "holds", "there is no decision")
     try:
-        with np.load(path / "solution.npz", allow_pickle=False) as stored:
-            theta, control = stored["theta"], stored["control"]
+        with np.load(BytesIO((path / "solution.npz").read_bytes()), allow_pickle=False) as stored:
+            theta, control, breakpoints = stored["theta"], stored["control"], stored["breakpoints"]
         decision = np.array(data["decision"], dtype=float)
-        same = np.array_equal(theta, decision) and np.allclose(control, decision @ values, rtol=0.0, atol=1e-12)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        same = (np.array_equal(theta, decision) and np.array_equal(breakpoints, dictionary.breakpoints)
+                and np.allclose(control, decision @ dictionary.values, rtol=0.0, atol=1e-12))
+    except (OSError, EOFError, ValueError, KeyError, TypeError, OverflowError, BadZipFile, zlib.error) as error:
         return Claim("solution.npz", "fails", f"it cannot be read: {error}")
     if not same:
         return Claim("solution.npz", "fails", "its control is not the certificate's")
