@@ -27,8 +27,10 @@ FILES = {
     "certificate.json": "what is claimed and what proves it; `sparserob check` takes it, [certificate.md](certificate.md) explains it",
     "solution.npz": "`breakpoints (K+1,)`, `control (m, K)`, `theta (m, N)`; of the imposed constraints `times`, `indices`, `rows`, "
                     "`families`, `multipliers`",
-    "evaluations.npz": "for a method that searches, one entry per value of g: outer iteration, epsilon, value, proven lower bound, seconds",
+    "evaluations.npz": "for a method that searches, one entry per value of g: outer iteration, epsilon, value, proven lower bound, seconds, "
+                       "`points (n, d)` unless they are too many, and `note_...` for what the maximiser noted",
     "trace.npz": "one array per column, one entry per round: bounds, violation, epsilon, indices, seconds",
+    "rounds.npz": "the decision of every round and the constraints that it imposed, with their multipliers, unless they are too many",
     "adversary.npz": "per constraint its worst time, parameter, disturbance and the states that these cause",
     "simulation-LAW.json": "written by `sparserob simulate`: how often trajectories under a law break each constraint",
     "figures/": "`control`, `states`, `convergence`, `adversary`, each as PDF and PNG; `clash` when infeasible",

@@ -10,9 +10,10 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.maximiser import EvaluationError, Maximiser, Report
 from sparserob_core.sip.search import Target, maximise
+from sparserob_core.testing_observers import ObserverContract
 from sparserob_core.testing_solvers import SolverContract
 
-__all__ = ["MaximiserContract", "SolverContract"]
+__all__ = ["MaximiserContract", "ObserverContract", "SolverContract"]
 
 PLANE = Box(np.array([-3.0, -2.0]), np.array([2.0, 4.0]))
 ODD_BOXES = (

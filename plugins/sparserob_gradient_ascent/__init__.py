@@ -22,6 +22,8 @@ class GradientAscent(sr.Maximiser, sr.Options):
     evaluation is one step in any dimension; without, each gradient is taken from differences and costs an evaluation per coordinate, so
     that in high dimension little is left. Where the function has kinks, as ``g`` does, a local method may stop at one: the restarts are what
     it relies on. Proves no upper bound.
+
+    Notes ``ascent`` (its number, from 1) and ``slope`` (the largest entry of the gradient, per width of the box) at every step.
     """
 
     redraw: float = Field(default=0.5, ge=0.0, le=1.0)
@@ -50,7 +52,7 @@ class _Climb:
     def __init__(self, objective: sr.Objective, free: np.ndarray) -> None:
         self.objective, self.free, self.domain = objective, np.flatnonzero(free), objective.domain
         self.width = (objective.domain.upper - objective.domain.lower)[free]
-        self.slope, self.at, self.worst = np.zeros(objective.domain.dimension), np.zeros(0), np.inf
+        self.slope, self.at, self.worst, self.ascent = np.zeros(objective.domain.dimension), np.zeros(0), np.inf, 0
 
     def uniform(self, rng: np.random.Generator) -> sr.Array:
         """A uniform point of the box."""
@@ -76,6 +78,7 @@ class _Climb:
         """One ascent; a value of ``-inf`` is shown to the local method as the worst that was seen."""
         from scipy.optimize import minimize
 
+        self.ascent += 1
         scaled = np.clip((start - self.domain.lower)[self.free] / self.width, 0.0, 1.0) * SCALE
         minimize(self.descent, scaled, jac=True, method="L-BFGS-B", bounds=[(0.0, SCALE)] * scaled.size,
                  options={"maxfun": steps, "maxiter": steps, "ftol": 1e-15, "gtol": 1e-14})
@@ -88,6 +91,7 @@ class _Climb:
             self.worst = min(self.worst, value)
         if np.array_equal(point, self.objective.best_point):
             self.slope, self.at = slope, point
+        self.objective.note(ascent=self.ascent, slope=float(np.abs(slope[self.free] * self.width).max()))
         shown = value if np.isfinite(value) else (self.worst if np.isfinite(self.worst) else 0.0)
         return -shown, -slope[self.free] * self.width / SCALE
 

@@ -30,6 +30,8 @@ class MaxLIPO(sr.Maximiser, sr.Options):
     coordinates; as their number grows the highest candidate becomes just another uniform point. Beyond 30 coordinates that move,
     quadratics are not fitted either: the local step is then the best candidate, under ``U``, of those that change one or few blocks of the
     best point. The time per evaluation grows in proportion to their number: use it for functions that take a millisecond or more.
+
+    Notes ``local`` (0 or 1, of the last step) and, while quadratics are fitted, the ``radius`` of the trust region in widths of the box.
     """
 
     candidates: int = Field(default=1000, ge=10, le=100_000)
@@ -56,6 +58,7 @@ class MaxLIPO(sr.Maximiser, sr.Options):
             else:
                 walk.step_globally(self.candidates, self.uniform)
                 waited += 1
+            walk.note(local=waited == 0)
         return float("inf")
 
 
@@ -87,6 +90,11 @@ class _Walk:
         value = float(self.objective.evaluate(np.clip(point, domain.lower, domain.upper)[np.newaxis])[0])
         self.slopes.add(unit, value)
         return value
+
+    def note(self, local: bool) -> None:
+        """Tell what the last step was."""
+        fitted = {"radius": self.ascents.radius} if self.dimension <= MODELLED else {}
+        self.objective.note(local=float(local), **fitted)
 
     def step_locally(self) -> bool:
         """Whether there was a local step to make."""

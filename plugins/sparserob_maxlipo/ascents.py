@@ -24,6 +24,11 @@ class Ascents:
         """Whether the best point is a summit, so that the next ascent begins lower."""
         return bool(self._heights.max(initial=-np.inf) >= self.seen.best)
 
+    @property
+    def radius(self) -> float:
+        """Of the present trust region."""
+        return self._region.radius
+
     def propose(self) -> np.ndarray | None:
         """The next point ``(d,)`` of the ascent, or ``None`` when it has just ended or none can begin."""
         points, values = self._open()

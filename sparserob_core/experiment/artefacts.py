@@ -7,7 +7,6 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict
 from datetime import UTC, datetime
 from io import BytesIO
 from pathlib import Path
@@ -79,9 +78,9 @@ def _stamped(name: str, digest: str) -> Path:
 
 
 def trace_columns(history: Sequence[RoundFinished]) -> dict[str, Any]:
-    """One array per field of `RoundFinished`, one entry per round."""
-    rows = [asdict(entry) for entry in history]
-    return {name: np.array([row[name] for row in rows]) for name in RoundFinished.__dataclass_fields__}
+    """One array per field of `RoundFinished` that is a number or a text, one entry per round."""
+    plain = [name for name, kind in RoundFinished.__annotations__.items() if kind in ("int", "float", "str", "bool")]
+    return {name: np.array([getattr(entry, name) for entry in history]) for name in plain}
 
 
 def finite(data: Any) -> Any:

@@ -17,6 +17,7 @@ from sparserob_core.experiment.assemble import Experiment
 from sparserob_core.experiment.certificate import certificate
 from sparserob_core.experiment.events import Event, Observer, RoundFinished
 from sparserob_core.experiment.record import arrays_of, control_of, summary_of, versions
+from sparserob_core.experiment.rounds import round_arrays
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.result import Result
 
@@ -60,12 +61,16 @@ class Journal(Observer):
         experiment, write = self.experiment, self.directory
         control, summary = self.record(result)
         write.write_arrays("solution.npz", arrays_of(result, experiment.program, experiment.control, control))
-        write.write_arrays("trace.npz", trace_columns(self.rounds or list(result.history)))
+        rounds = self.rounds or list(result.history)
+        write.write_arrays("trace.npz", trace_columns(rounds))
+        kept = round_arrays(rounds)
+        if kept:
+            write.write_arrays("rounds.npz", kept)
         proof = certificate(experiment, result)
         if proof is not None:
             write.write_json("certificate.json", proof)
         if result.trace is not None:
-            write.write_arrays("evaluations.npz", vars(result.trace))
+            write.write_arrays("evaluations.npz", result.trace.arrays())
         worst = adversaries(experiment, np.asarray(result.decision)) if control is not None else {}
         if worst:
             write.write_arrays(ADVERSARY, worst)

@@ -69,11 +69,12 @@ def solve(
 
 
 def maximise(f: Callable[[Array], object], box: Box, name: Choice | Maximiser = "direct", budget: int = 1000, seed: int = 0,
-             polish: float = 0.0, gradient: Callable[[Array], Array] | None = None, **options: object) -> Report:
+             polish: float = 0.0, gradient: Callable[[Array], Array] | None = None, notify: Notify = silence, **options: object) -> Report:
     """Search for the maximum of ``f`` (points ``(k, d)`` to values ``(k,)``) over a box with the maximiser of that name.
 
     The last share ``polish`` of the budget goes to a local method, from the best points. ``gradient`` maps a point ``(d,)`` to the
-    gradient ``(d,)`` of ``f``, for maximisers and a polish that use it. Further keywords are the maximiser's options.
+    gradient ``(d,)`` of ``f``, for maximisers and a polish that use it. ``notify`` is called with `EvaluationsFinished` now and then.
+    Further keywords are the maximiser's options.
     Raises `InputError` when an argument is at fault, and `EvaluationError` when ``f`` fails.
     """
     from sparserob_core.sip.search import Rules, Target
@@ -85,7 +86,7 @@ def maximise(f: Callable[[Array], object], box: Box, name: Choice | Maximiser = 
         raise InputError(f"{', '.join(options)}: options as keywords need the maximiser's name, got {name!r}")
     chosen = component(load_registry(), "maximiser", {"name": name, **options} if isinstance(name, str) else name, Maximiser)
     return search(Target(f, box, gradient), chosen, _whole("budget", budget, 1), np.random.default_rng(_whole("seed", seed, 0)),
-                  Rules(polish=_share(polish)))
+                  Rules(polish=_share(polish)), notify)
 
 
 def component(registry: Registry, kind: str, choice: object, expected: type[Any]) -> Any:
@@ -148,7 +149,10 @@ def _with_tolerance(registry: Registry, method: object, tolerance: float | None)
     return {"tolerance": tolerance, **entry} if takes_it else entry
 
 
-def _heard(notify: Notify) -> Callable[[object], None]:
+def _heard(notify: Notify) -> Callable[[Any], None]:
+    if notify is silence:
+        return silence
+
     def pass_on(event: object) -> None:
         if isinstance(event, Event):
             notify(event)

@@ -9,6 +9,7 @@ import numpy as np
 
 from sparserob_core.errors import InputError
 from sparserob_core.sip.certificate import TOLERANCE, Proof, prove
+from sparserob_core.sip.events import RoundFinished, retold
 from sparserob_core.sip.exchange import Exchange
 from sparserob_core.sip.method import Method, Tools
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation
@@ -67,7 +68,8 @@ def _simplified(program: SemiInfiniteProgram, method: str,
 
 def _judged(program: SemiInfiniteProgram, simple: SemiInfiniteProgram, tools: Tools, tolerance: float, rounds: int) -> Result:
     """Solve the simpler program, whose lower bound holds for the full one too, and say what its decision is worth in the full one."""
-    result = Exchange(tolerance, rounds).close(simple, tools, lambda x: ())
+    notify = retold(tools.notify, RoundFinished, lambda event: replace(event, simplified=True))
+    result = Exchange(tolerance, rounds).close(simple, replace(tools, notify=notify), lambda x: ())
     if result.decision is None:
         return result
     found = separate(program, result.decision, tools, TOLERANCE)

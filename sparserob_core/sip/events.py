@@ -1,31 +1,64 @@
-"""What the optimisation wing tells while it works; whoever listens cannot disturb it."""
+"""What the optimisation wing tells while it works; whoever listens cannot disturb it.
+
+Arrays in events cannot be written to. What takes time to put together is put together by whoever looks at it (`Batch`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
+
+import numpy as np
+
+from sparserob_core.sip.batch import Batch
+from sparserob_core.sip.convex_set import Array, Box
+
+if TYPE_CHECKING:
+    from sparserob_core.sip.program import Separation
+    from sparserob_core.sip.result import Cut
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Event:
     """Something that happened in a run."""
 
 
 Notify: TypeAlias = Callable[[Event], None]
+T = TypeVar("T", bound=Event)
 
 
 def silence(event: Event) -> None:
     """The listener that hears nothing."""
 
 
-@dataclass(frozen=True, kw_only=True)
+def retold(notify: Notify, kind: type[T], tell: Callable[[T], Event]) -> Notify:
+    """A listener that passes on what it hears, events of one kind as ``tell`` completes them; silence remains silence."""
+    if notify is silence:
+        return silence
+    return lambda event: notify(tell(event) if isinstance(event, kind) else event)
+
+
+def frozen(array: Array) -> Array:
+    """A view of an array that cannot be written to."""
+    view = np.asarray(array).view()
+    view.flags.writeable = False
+    return view
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class RoundFinished(Event):
-    """One round of a method is over.
+    """One round of a method is over: a round of the exchange, or an outer iteration of the method ``sparserob``.
 
     ``lower_bound`` and ``upper_bound`` enclose the value of the unregularised program (``-inf``, ``inf`` while unknown);
     ``violation`` is the worst constraint violation of this round's decision over the continuum, reached in ``worst_family``;
-    ``active_indices`` are the rows kept, ``cuts_added`` and ``cuts_dropped`` the change; ``seconds`` since the start.
+    ``active_indices`` are the rows kept, ``cuts_added`` and ``cuts_dropped`` the change since the round before; ``seconds`` since the start.
+
+    ``decision (n,)`` has the ``cost`` J. ``separations``: per family what was found most violated at it, worst first. ``imposed``: the
+    constraints of this round's relaxed program, with their ``multipliers (r,)`` (the multiplier within each `Cut` is not filled); ``added`` and
+    ``dropped``: how they differ from those of the round before. ``simplified``: it is a round on a program with some of the uncertainty
+    only (methods ``nominal``, ``scenario``), whose ``upper_bound`` and ``violation`` say nothing of the program itself; its lower bound holds
+    for both.
     """
 
     round: int
@@ -39,24 +72,54 @@ class RoundFinished(Event):
     cuts_dropped: int = 0
     relaxed_programs: int = 0
     seconds: float = 0.0
+    cost: float = np.nan
+    decision: Array | None = field(default=None, repr=False)
+    separations: Mapping[str, Separation] = field(default_factory=dict, repr=False)
+    imposed: Sequence[Cut] = field(default=(), repr=False)
+    multipliers: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+    added: Sequence[Cut] = field(default=(), repr=False)
+    dropped: Sequence[Cut] = field(default=(), repr=False)
+    simplified: bool = False
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ProofProgress(Event):
-    """A proof over the continuum goes on: ``cells`` of ``family`` are still open, ``bound`` is the violation not yet excluded."""
+    """A proof over the continuum goes on: ``cells`` of ``family`` are still open, ``bound`` is the violation not yet excluded.
+
+    ``examined`` cells were bounded so far, of a ``budget`` after which the proof is given up (0: unknown).
+    """
 
     family: str
     cells: int
     bound: float
     seconds: float = 0.0
+    examined: int = 0
+    budget: int = 0
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class EvaluationsFinished(Event):
-    """A maximiser has evaluated ``count`` more points, ``total`` so far; ``notes`` are its own scalars (temperature, ...)."""
+    """A maximiser has evaluated ``count`` more points, ``total`` so far in this search, of ``budget`` (0: unknown).
+
+    ``best_value`` was found at ``best_point (d,)``; ``seconds`` since the search began; ``notes`` are the maximiser's own scalars (temperature,
+    ...), the last of each. A new search begins where ``total == count``. ``batch``: every one of these evaluations.
+
+    What is searched: the tuples of the method ``sparserob`` in the outer iteration ``round`` (from 1) with the weight ``epsilon``, where
+    ``lower_bound`` is proven so far; or, where ``family`` is named, its indices for the most violated one. ``block`` consecutive
+    coordinates of the ``domain`` are one index.
+    """
 
     count: int
     total: int
     best_value: float
     seconds: float = 0.0
     notes: Mapping[str, float] = field(default_factory=dict)
+    budget: int = 0
+    best_point: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+    domain: Box | None = field(default=None, repr=False)
+    block: int = 1
+    family: str = ""
+    round: int = 0
+    epsilon: float = np.nan
+    lower_bound: float = -np.inf
+    batch: Batch = field(default_factory=Batch, repr=False)

@@ -17,13 +17,13 @@ import numpy as np
 from sparserob_core.errors import InputError
 from sparserob_core.sip.certificate import TOLERANCE, Proof, prove
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.events import RoundFinished
+from sparserob_core.sip.events import RoundFinished, frozen
 from sparserob_core.sip.finite import FiniteSolution
 from sparserob_core.sip.infeasible import irreducible
 from sparserob_core.sip.method import Method, Tools
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation
 from sparserob_core.sip.relaxed import RelaxedProgram, Rows, rows_at
-from sparserob_core.sip.result import Result, Status, Witness, relative_gap
+from sparserob_core.sip.result import NO_BOUND, Cut, Dual, Result, Status, Witness, relative_gap
 from sparserob_core.sip.separation import separate
 from sparserob_core.sip.verdict import clash, verdict, witness, worst_of
 
@@ -59,15 +59,16 @@ class Exchange(Method):
 
 @dataclass(eq=False)
 class _Run:
-    """One run: the working rows, the two bounds, the weight of the regulariser and the margin."""
+    """One run: the working rows, the two bounds, the weight of the regulariser, and the margin with the least it may be."""
 
     method: Exchange
     program: SemiInfiniteProgram
     tools: Tools
     prover: Prover
     started: float = field(default_factory=time.perf_counter)
-    lower: float = -np.inf
+    dual: Dual = NO_BOUND
     margin: float = 0.0
+    floor: float = 0.0
     slater: bool = True
     history: list[RoundFinished] = field(default_factory=list)
 
@@ -77,18 +78,20 @@ class _Run:
         self.idle = np.zeros(0, dtype=int)
         self.epsilon = 0.0 if self.tools.regulariser is None else self.tools.continuation.start
         self.guess: FiniteSolution | None = None
+        self.added: tuple[Cut, ...] = ()
+        self.dropped: tuple[Cut, ...] = ()
 
     def solve(self) -> Result:
         for number in range(1, self.method.rounds + 1):
             solution = self._relax()
             if not _usable(solution):
                 return self._without_answer(solution)
-            separations = separate(self.program, solution.x, self.tools, ALLOWED)
+            separations = separate(self.program, solution.x, self.tools, ALLOWED, number)
             worst = worst_of(separations)
             violated = [_above(family, found) for family, found in separations]
-            self._tell(number, solution, worst, sum(rows.size for _, rows, _ in violated))
+            self._tell(number, solution, worst, separations)
             last = number == self.method.rounds
-            if not last and self._exchange(solution, violated):
+            if not last and (self._exchange(solution, violated) or self._tighten(violated)):
                 continue
             if not last and self._open(solution) and self._sharpen(solution):
                 continue
@@ -120,7 +123,7 @@ class _Run:
             solution = self.relaxed.solve(self.rows, epsilon, 0.0, None)
         if _usable(solution):
             self.guess = solution
-            self.lower = max(self.lower, self.relaxed.lower_bound(self.rows, solution))
+            self._improve(self.relaxed.lower_bound(self.rows, solution))
             self._set_margin(solution)
         return solution
 
@@ -128,8 +131,15 @@ class _Run:
         """The unregularised relaxed program: only its multipliers are wanted, for the lower bound."""
         plain = self.relaxed.solve(self.rows, 0.0, self.margin)
         if _usable(plain):
-            self.lower = max(self.lower, self.relaxed.lower_bound(self.rows, plain))
+            self._improve(self.relaxed.lower_bound(self.rows, plain))
         return plain
+
+    @property
+    def lower(self) -> float:
+        return self.dual.bound
+
+    def _improve(self, dual: Dual) -> None:
+        self.dual = max(self.dual, dual, key=lambda one: one.bound)
 
     def _open(self, solution: FiniteSolution) -> bool:
         return self._gap(self.program.cost(solution.x)) > self.method.tolerance
@@ -157,7 +167,20 @@ class _Run:
         unit = min(1.0, float(np.where(np.isfinite(reach), reach, 1.0).max()))
         margin = float(np.clip(budget / max(price, np.finfo(float).tiny), SMALLEST_MARGIN * unit, LARGEST_MARGIN * unit))
         if self.margin == 0.0 or margin < 0.5 * self.margin:
-            self.margin = margin
+            self.margin = max(margin, self.floor)
+
+    def _tighten(self, violated: Sequence[tuple[Array, np.ndarray, str]]) -> bool:
+        """Imposed rows that are violated nonetheless, by the solver's accuracy: tighten by twice as much; ``False`` when that does not help."""
+        known = {(cut.family, cut.row, cut.index.tobytes()): i for i, cut in enumerate(self.rows.cuts)}
+        places = [known[key] for indices, rows, family in violated for i, r in zip(indices, rows, strict=True)
+                  if (key := (family, int(r), i.tobytes())) in known]
+        if not places or not self.slater or self.guess is None or self.floor >= LARGEST_MARGIN:
+            return False
+        norms = np.maximum(np.linalg.norm(self.rows.G[places], axis=1), np.finfo(float).tiny)
+        missed = float(((self.rows.G[places] @ self.guess.x - self.rows.h[places]) / norms).max())
+        self.floor = float(np.clip(2.0 * max(missed, self.margin), SMALLEST_MARGIN, LARGEST_MARGIN))
+        self.margin = max(self.margin, self.floor)
+        return True
 
     def _multipliers(self, solution: FiniteSolution) -> Array:
         return solution.y[solution.y.size - self.rows.h.size:]
@@ -175,17 +198,22 @@ class _Run:
         y = self._multipliers(solution)
         self.idle = np.where(y > 0.0, 0, self.idle + 1)
         keep = (self.idle < IDLE_ROUNDS) | (len(self.history) > DROPPING_ROUNDS)
+        self.added, self.dropped = fresh.cuts, tuple(cut for cut, kept in zip(self.rows.cuts, keep, strict=True) if not kept)
         self.rows, self.idle = self.rows.take(keep).joined(fresh), np.concatenate([self.idle[keep], np.zeros(added, dtype=int)])
         fixed = solution.y[:solution.y.size - y.size]
         self.guess = replace(solution, y=np.concatenate([fixed, y[keep], np.zeros(added)]))
         return added
 
-    def _tell(self, number: int, solution: FiniteSolution, worst: Witness, violated: int) -> None:
+    def _tell(self, number: int, solution: FiniteSolution, worst: Witness, found: Sequence[tuple[ConstraintFamily, Separation]]) -> None:
+        cost, violated = self.program.cost(solution.x), any(_above(family, one)[1].size for family, one in found)
         event = RoundFinished(
             round=number, epsilon=self.epsilon, lower_bound=self.lower, violation=worst.violation, worst_family=worst.constraint,
-            upper_bound=np.inf if violated else self.program.cost(solution.x), active_indices=self.rows.h.size,
-            cuts_added=violated,
-            relaxed_programs=self.relaxed.solves, seconds=time.perf_counter() - self.started)
+            upper_bound=np.inf if violated else cost, active_indices=self.rows.h.size,
+            cuts_added=len(self.added), cuts_dropped=len(self.dropped),
+            relaxed_programs=self.relaxed.solves, seconds=time.perf_counter() - self.started,
+            cost=cost, decision=frozen(solution.x), separations={family.name: one for family, one in found},
+            imposed=self.rows.cuts, multipliers=frozen(self._multipliers(solution)), added=self.added, dropped=self.dropped)
+        self.added, self.dropped = (), ()
         self.history.append(event)
         self.tools.notify(event)
 
@@ -196,13 +224,14 @@ class _Run:
         residual = self.program.finite.residual(solution.x)
         if residual > RESIDUAL:
             status, message = "failed", f"the decision misses its bounds or equalities by {residual:.1e}: {'; '.join(solution.attempts)}"
-        return self._result(status, message, solution, cost, witness(self.program, worst, proofs))
+        return replace(self._result(status, message, solution, cost, witness(self.program, worst, proofs)), proofs=tuple(proofs))
 
     def _without_answer(self, solution: FiniteSolution) -> Result:
         if solution.status != "infeasible":
             return self._result("failed", "; ".join(solution.attempts) or solution.message, solution, np.nan, None)
         self.rows, solution = irreducible(self.relaxed, self.rows, solution)
         message, worst = clash(self.program, self.rows, self._multipliers(solution), solution.infeasibility)
+        self.dual = self.relaxed.dual(self.rows, solution.y, solution.mu, solution.z, solution.infeasibility)
         return self._result("infeasible", message, solution, np.nan, worst)
 
     def _result(self, status: Status, message: str, solution: FiniteSolution, cost: float, worst: Witness | None) -> Result:
@@ -214,7 +243,7 @@ class _Run:
             upper_bound=cost if status in ("certified", "verified", "undecided") else np.inf, worst=worst, indices=cuts,
             counts={"relaxed_programs": self.relaxed.solves, "rounds": len(self.history), "active_indices": len(cuts),
                     "solver_calls": self.relaxed.counted.calls},
-            history=tuple(self.history), seconds=time.perf_counter() - self.started)
+            history=tuple(self.history), dual=self.dual, seconds=time.perf_counter() - self.started)
 
 
 def _above(family: ConstraintFamily, found: Separation) -> tuple[Array, np.ndarray, str]:

@@ -13,6 +13,7 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from sparserob_core.sip.certificate import Proof
     from sparserob_core.sip.events import RoundFinished
+    from sparserob_core.sip.maximiser import Trace
     from sparserob_core.sip.scenario_bound import ScenarioBound
 
 Status: TypeAlias = Literal["certified", "verified", "infeasible", "refuted", "undecided", "failed"]
@@ -67,16 +68,61 @@ class Witness:
     disturbance: Array | None = field(default=None, repr=False)
 
 
+COLUMNS = ("outer", "epsilon", "value", "bound", "seconds")
+NOTE = "note_"
+POINTS = 500_000   # coordinates of tuples that a run keeps
+
+
 @dataclass(frozen=True, eq=False)
 class SearchTrace:
     """Every evaluation of ``g``, in order: the outer iteration ``outer (n,)`` and its ``epsilon (n,)``, the ``value (n,)`` of ``g``, the best
-    lower bound ``bound (n,)`` proven until then of the unregularised semi-infinite program, and ``seconds (n,)`` since the start."""
+    lower bound ``bound (n,)`` proven until then of the unregularised semi-infinite program, and ``seconds (n,)`` since the start.
+
+    ``points (n, d)``: the tuples, ``(n, 0)`` where all of them would be more than `POINTS` numbers. ``notes``: what the maximiser noted, one
+    column ``(n,)`` for each name, NaN where it noted nothing.
+    """
 
     outer: Array
     epsilon: Array
     value: Array
     bound: Array
     seconds: Array
+    points: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
+    notes: Mapping[str, Array] = field(default_factory=dict, repr=False)
+
+    @staticmethod
+    def of(outer: int, epsilon: float, trace: Trace, bounds: Array, began: float) -> SearchTrace:
+        """One outer iteration, whose search began ``began`` seconds after the start."""
+        count = trace.values.size
+        notes = {}
+        for name, rows in trace.notes.items():
+            last = rows[rows[:, 0] >= 1]
+            notes[name] = np.full(count, np.nan)
+            notes[name][last[:, 0].astype(int) - 1] = last[:, 1]
+        points = trace.points if 0 < trace.points.size <= POINTS else np.zeros((count, 0))
+        return SearchTrace(np.full(count, outer), np.full(count, epsilon), trace.values, bounds, began + trace.seconds, points, notes)
+
+    @staticmethod
+    def joined(parts: Sequence[SearchTrace]) -> SearchTrace:
+        """All outer iterations."""
+        outer, epsilon, value, bound, seconds = (np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS)
+        kept = len({part.points.shape[1] for part in parts}) == 1 and sum(part.points.size for part in parts) <= POINTS
+        points = np.concatenate([part.points for part in parts]) if kept else np.zeros((value.size, 0))
+        names = dict.fromkeys(name for part in parts for name in part.notes)
+        notes = {name: np.concatenate([part.notes.get(name, np.full(part.value.size, np.nan)) for part in parts]) for name in names}
+        return SearchTrace(outer, epsilon, value, bound, seconds, points, notes)
+
+    def arrays(self) -> dict[str, Array]:
+        """``evaluations.npz``: the columns, ``points``, and ``note_...`` for each name that was noted."""
+        notes = {f"{NOTE}{name}": column for name, column in self.notes.items()}
+        return {**{name: getattr(self, name) for name in COLUMNS}, **({"points": self.points} if self.points.size else {}), **notes}
+
+    @staticmethod
+    def stored(arrays: Mapping[str, Array]) -> SearchTrace:
+        """The same from `arrays`; raises `KeyError` for a column that is missing."""
+        notes = {name.removeprefix(NOTE): column for name, column in arrays.items() if name.startswith(NOTE)}
+        outer, epsilon, value, bound, seconds = (arrays[name] for name in COLUMNS)
+        return SearchTrace(outer, epsilon, value, bound, seconds, arrays.get("points", np.zeros((value.size, 0))), notes)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

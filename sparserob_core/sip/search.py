@@ -11,13 +11,13 @@ import numpy as np
 
 from sparserob_core.errors import InputError, PluginError
 from sparserob_core.sip.convex_set import Array, Box
-from sparserob_core.sip.events import EvaluationsFinished, Notify, silence
+from sparserob_core.sip.events import Notify, silence
 from sparserob_core.sip.maximiser import EvaluationError, Maximiser, Report, SearchEnded, Trace
 from sparserob_core.sip.rules import Metropolis, Progress
+from sparserob_core.sip.telling import Telling
 
 Function: TypeAlias = Callable[[Array], object]
 
-SECONDS_BETWEEN_EVENTS = 0.05
 KEPT_NUMBERS = 20_000_000   # coordinates in a trace; searches with more keep their values only
 
 
@@ -73,8 +73,8 @@ class CountedObjective:
         self._seconds: list[tuple[int, float]] = []
         self._improvements: list[tuple[int, float]] = []
         self._notes: dict[str, list[tuple[float, float]]] = {}
-        self._notify, self._told = notify, 0
-        self._started = self._told_at = time.monotonic()
+        self._telling = None if notify is silence else Telling(notify, target.domain)
+        self._started = time.monotonic()
 
     @property
     def remaining(self) -> int:
@@ -90,6 +90,8 @@ class CountedObjective:
         """See `Objective.evaluate`."""
         if self.ended is not None:
             raise self.ended
+        if self._telling is not None and self._telling.due:
+            self.tell()
         asked = self._checked(points)
         allowed = asked[: self.remaining]
         values = np.empty(0)
@@ -122,6 +124,8 @@ class CountedObjective:
         """See `Objective.note`."""
         for name, value in scalars.items():
             self._notes.setdefault(name, []).append((self.evaluations, float(value)))
+        if self._telling is not None:
+            self._telling.note(scalars)
 
     def go_on(self, budget: int) -> None:
         """Open the search again, for its last part: up to ``budget`` evaluations in all, without a rule that stops it."""
@@ -144,11 +148,8 @@ class CountedObjective:
 
     def tell(self) -> None:
         """Tell the observers of what was evaluated since they were told last."""
-        if self.evaluations > self._told and self._notify is not silence:
-            now = time.monotonic()
-            count, self._told, self._told_at = self.evaluations - self._told, self.evaluations, now
-            self._notify(EvaluationsFinished(count=count, total=self.evaluations, best_value=self.best_value,
-                                             seconds=now - self._started, notes=self._last_notes()))
+        if self._telling is not None and self.evaluations > self._telling.told:
+            self._telling.tell(self, self._notes)
 
     def _last_notes(self) -> dict[str, float]:
         return {name: rows[-1][1] for name, rows in self._notes.items()}
@@ -194,16 +195,16 @@ class CountedObjective:
         if self._keeps:
             self._points.append(points)
         self._values.append(values.copy())
-        now = time.monotonic()
-        self._seconds.append((values.size, now - self._started))
+        moment = time.monotonic() - self._started
+        self._seconds.append((values.size, moment))
+        if self._telling is not None:
+            self._telling.add(points, self._values[-1], moment)
         top = int(values.argmax())
         first = self.evaluations == 0
         self.evaluations += len(values)
         if values[top] > self.best_value or first:
             self.best_value, self.best_point = float(values[top]), points[top].copy()
             self._improvements.append((self.evaluations, self.best_value))
-        if now - self._told_at > SECONDS_BETWEEN_EVENTS:
-            self.tell()
 
 
 def _shown(point: Array) -> str:

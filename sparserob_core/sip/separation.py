@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.events import EvaluationsFinished, Notify, retold, silence
 from sparserob_core.sip.maximiser import Maximiser
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation
@@ -21,14 +24,18 @@ SAME = 1e-6
 LARGEST_ARRAY = 2_000_000
 
 
-def separate(program: SemiInfiniteProgram, x: Array, tools: Tools, threshold: float = 1e-9) -> list[tuple[ConstraintFamily, Separation]]:
-    """The most violated indices of every family at ``x (n,)``: in the family's own way, or as the maximiser finds them."""
-    return [(family, family.worst(x) if family.worst is not None
-             else search_worst(family, x, tools.maximiser, tools.budget, tools.rng, threshold, tools.polish)) for family in program.families]
+def separate(program: SemiInfiniteProgram, x: Array, tools: Tools, threshold: float = 1e-9,
+             number: int = 0) -> list[tuple[ConstraintFamily, Separation]]:
+    """The most violated indices of every family at ``x (n,)``: in the family's own way, or as the maximiser finds them (in round ``number``)."""
+    def searched(family: ConstraintFamily) -> Separation:
+        notify = retold(tools.notify, EvaluationsFinished, lambda event: replace(event, family=family.name, round=number))
+        return search_worst(family, x, tools.maximiser, tools.budget, tools.rng, threshold, tools.polish, notify)
+
+    return [(family, searched(family) if family.worst is None else family.worst(x)) for family in program.families]
 
 
 def search_worst(family: ConstraintFamily, x: Array, maximiser: Maximiser | None, budget: int, rng: np.random.Generator,
-                 threshold: float = 1e-9, polish: float = 0.0) -> Separation:
+                 threshold: float = 1e-9, polish: float = 0.0, notify: Notify = silence) -> Separation:
     """The largest local maxima of the violation of every row of ``family`` at the decision ``x (n,)``, at most 8 per row, worst first.
 
     A grid of the index box (257 points for one coordinate that moves, 33 x 33, 13^3, 7^4; 2048 random points beyond) brackets the local
@@ -45,7 +52,7 @@ def search_worst(family: ConstraintFamily, x: Array, maximiser: Maximiser | None
     if field.dimension == 0:
         bound = float(found.values.max())
     elif maximiser is not None and budget > 0 and found.values.max() <= threshold:
-        asked, bound = _ask(field, maximiser, budget, rng, polish)
+        asked, bound = _ask(field, maximiser, budget, rng, polish, notify)
         found = found.join(refine(field, asked))
     kept = _distinct(found)
     return Separation(field.indices(kept.points), kept.rows, kept.values, bound)
@@ -145,9 +152,11 @@ def _promising(unit: Array, values: Array, promise: Array, radius: float) -> Can
     return Candidates(unit[which], row, values[which, row], np.full(which.size, radius))
 
 
-def _ask(field: _Violation, maximiser: Maximiser, budget: int, rng: np.random.Generator, polish: float) -> tuple[Candidates, float]:
+def _ask(field: _Violation, maximiser: Maximiser, budget: int, rng: np.random.Generator, polish: float,
+         notify: Notify) -> tuple[Candidates, float]:
     """The best index that a maximiser finds, as a candidate of every row."""
-    report = maximise(Target(lambda indices: field.at(indices).max(axis=1), field.box), maximiser, budget, rng, Rules(polish=polish))
+    target = Target(lambda indices: field.at(indices).max(axis=1), field.box)
+    report = maximise(target, maximiser, budget, rng, Rules(polish=polish), notify)
     if report.interrupted:
         raise KeyboardInterrupt
     values = field.at(report.best_point[np.newaxis])[0]

@@ -17,17 +17,17 @@ import numpy as np
 from sparserob_core.errors import InputError
 from sparserob_core.sip.certificate import Proof, prove
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.events import RoundFinished
+from sparserob_core.sip.events import EvaluationsFinished, RoundFinished, frozen, retold
 from sparserob_core.sip.infeasible import irreducible
 from sparserob_core.sip.maximiser import Maximiser, Objective, Report
 from sparserob_core.sip.method import Method, Tools
-from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
+from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.relaxed import RelaxedProgram, Rows
-from sparserob_core.sip.result import NO_BOUND, Dual, Result, SearchTrace, Status, Witness, relative_gap
+from sparserob_core.sip.result import NO_BOUND, Cut, Dual, Result, SearchTrace, Status, Witness, relative_gap
 from sparserob_core.sip.rules import Geometric, Metropolis, OptimisersSettle, OuterStep, Progress
 from sparserob_core.sip.search import Rules, Target, maximise
 from sparserob_core.sip.separation import separate
-from sparserob_core.sip.tuples import TupleValue
+from sparserob_core.sip.tuples import TupleValue, imposed_program
 from sparserob_core.sip.verdict import clash, verdict, witness, worst_of
 
 
@@ -82,8 +82,7 @@ class _Run:
     parts: list[SearchTrace] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        literal = self.method.formulation == "literal"
-        self.imposed = replace(self.program, families=[_literal(family) for family in self.program.families]) if literal else self.program
+        self.imposed = imposed_program(self.program, self.method.formulation)
         self.relaxed = RelaxedProgram(self.imposed, self.tools.solver, self.tools.regulariser)
         self.g = TupleValue(self.imposed, self.relaxed, self.method.indices or self.program.n)
 
@@ -118,7 +117,8 @@ class _Run:
         rules = Rules(self.method.sc2, self.method.slcr or Metropolis(), self.tools.polish)
         target = Target(bounds, g.domain, g.gradient, g.block)
         assert self.tools.maximiser is not None
-        report = maximise(target, _From(point, self.tools.maximiser), self.tools.budget, self.tools.rng, rules, self.tools.notify)
+        notify = retold(self.tools.notify, EvaluationsFinished, lambda event: self._completed(event, j, epsilon))
+        report = maximise(target, _From(point, self.tools.maximiser), self.tools.budget, self.tools.rng, rules, notify)
         self._record(report, bounds, epsilon, j, began)
         if report.interrupted:
             raise KeyboardInterrupt
@@ -130,16 +130,22 @@ class _Run:
         return report.best_point
 
     def _record(self, report: Report, bounds: _Bounds, epsilon: float, j: int, began: float) -> None:
-        count = report.evaluations
-        self.parts.append(SearchTrace(np.full(count, j), np.full(count, epsilon), report.trace.values,
-                                      np.array(bounds.proven[:count]), began + report.trace.seconds))
+        self.parts.append(SearchTrace.of(j, epsilon, report.trace, np.array(bounds.proven[:report.evaluations]), began))
+
+    def _completed(self, event: EvaluationsFinished, j: int, epsilon: float) -> EvaluationsFinished:
+        return replace(event, round=j + 1, epsilon=epsilon, lower_bound=self.lower)
 
     def _tell(self, j: int, epsilon: float) -> None:
-        worst = self._worst()
+        found, rows = separate(self.program, self.g.solution.x, self.tools, number=j + 1), self.g.rows()
+        worst = worst_of(found)
+        added, dropped = _change(self.history[-1].imposed if self.history else (), rows.cuts)
         event = RoundFinished(
             round=j + 1, epsilon=epsilon, lower_bound=self.lower, upper_bound=np.inf, violation=worst.violation, worst_family=worst.constraint,
             active_indices=int((self.g.imposed.multipliers > 0).sum()), relaxed_programs=self.relaxed.solves,
-            seconds=time.perf_counter() - self.started)
+            seconds=time.perf_counter() - self.started, cuts_added=len(added), cuts_dropped=len(dropped),
+            cost=self.program.cost(self.g.solution.x), decision=frozen(self.g.solution.x),
+            separations={family.name: one for family, one in found}, imposed=rows.cuts, multipliers=frozen(self.g.imposed.multipliers),
+            added=added, dropped=dropped)
         self.history.append(event)
         self.tools.notify(event)
 
@@ -170,14 +176,14 @@ class _Run:
 
     def _result(self, status: Status, message: str, rows: Rows, cost: float, epsilon: float, worst: Witness | None) -> Result:
         cuts = tuple(cut for cut in rows.cuts if cut.multiplier > 0.0)
-        columns = {name: np.concatenate([getattr(part, name) for part in self.parts]) for name in SearchTrace.__dataclass_fields__}
+        trace = SearchTrace.joined(self.parts)
         return Result(
             status=status, message=message, decision=self.g.solution.x if status not in ("infeasible", "failed") else None, cost=cost,
             value=self.steps[-1].value, epsilon=epsilon, lower_bound=np.inf if status == "infeasible" else self.lower,
             upper_bound=cost if status in ("certified", "verified", "undecided") else np.inf, worst=worst, indices=cuts,
             counts={"relaxed_programs": self.relaxed.solves, "rounds": len(self.steps), "active_indices": len(cuts),
-                    "solver_calls": self.relaxed.counted.calls, "evaluations": int(columns["value"].size)},
-            history=tuple(self.history), trace=SearchTrace(**columns), dual=self.dual, seconds=time.perf_counter() - self.started)
+                    "solver_calls": self.relaxed.counted.calls, "evaluations": int(trace.value.size)},
+            history=tuple(self.history), trace=trace, dual=self.dual, seconds=time.perf_counter() - self.started)
 
 
 class _Bounds:
@@ -211,10 +217,10 @@ class _From(Maximiser):
         return self.maximiser.search(objective, rng)
 
 
-def _literal(family: ConstraintFamily) -> ConstraintFamily:
-    if family.literal is None:
-        raise InputError(f"formulation: literal needs families with a disturbance in their index, which {family.name} is not; expected reduced")
-    return family.literal
+def _change(before: Sequence[Cut], now: Sequence[Cut]) -> tuple[tuple[Cut, ...], tuple[Cut, ...]]:
+    """The constraints that were added and those that were dropped."""
+    old, new = ({(cut.family, cut.index.tobytes(), cut.row): cut for cut in cuts} for cuts in (before, now))
+    return tuple(cut for key, cut in new.items() if key not in old), tuple(cut for key, cut in old.items() if key not in new)
 
 
 def _smaller(weight: object, before: float) -> float:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 
@@ -49,6 +50,17 @@ class TupleLayout:
         """The indices ``(k, d)`` at which a family is imposed by the indices ``(k, width)`` of a tuple."""
         box = family.index_set
         return np.clip(slots[:, :box.dimension], box.lower, box.upper)
+
+
+def imposed_program(program: SemiInfiniteProgram, formulation: Literal["reduced", "literal"]) -> SemiInfiniteProgram:
+    """The program whose families are indexed as the formulation says; raises `InputError` for a family that has no literal one."""
+    return program if formulation == "reduced" else replace(program, families=[_literal(family) for family in program.families])
+
+
+def _literal(family: ConstraintFamily) -> ConstraintFamily:
+    if family.literal is None:
+        raise InputError(f"formulation: literal needs families with a disturbance in their index, which {family.name} is not; expected reduced")
+    return family.literal
 
 
 class TupleValue:

@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 import io
+import json
+import os
+import re
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.testing_observers import CONFIG, METHODS
+
+CODES = re.compile(r"\x1b\[[0-9;?]*[a-zA-Z]|\r")
 
 
 class Terminal(io.StringIO):
@@ -18,53 +29,173 @@ class Terminal(io.StringIO):
         return True
 
 
+class Broken(io.StringIO):
+    """A stream that nobody reads any more."""
+
+    def write(self, text: str) -> int:
+        raise BrokenPipeError("nobody reads this")
+
+
 def started(quiet: bool = False) -> sr.RunStarted:
     program = sr.SemiInfiniteProgram(n=1, q=np.ones(1), lower=-1.0, upper=1.0)
     return sr.RunStarted(title="a title", directory=Path(), problem=None, program=program, quiet=quiet)
 
 
-def finished_round(number: int) -> sr.RoundFinished:
-    return sr.RoundFinished(round=number, epsilon=0.5, lower_bound=0.25, upper_bound=np.inf, violation=1e-3, worst_family="path")
+def finished_round(number: int, **fields: object) -> sr.RoundFinished:
+    return sr.RoundFinished(round=number, epsilon=0.5, lower_bound=0.25, upper_bound=np.inf, violation=1e-3, worst_family="path",
+                            **fields)  # type: ignore[arg-type]
+
+
+ROUND = finished_round(2, cost=0.75, active_indices=7, relaxed_programs=30, seconds=2.0)
+PROOF = sr.ProofProgress(family="path", cells=12, bound=1e-4, examined=100, budget=1000, seconds=0.5)
+SEARCH = sr.EvaluationsFinished(
+    count=4, total=20, best_value=-0.5, seconds=2.0, budget=50, round=3, lower_bound=0.5,
+    batch=sr.Batch(notes={"accepted": [(17, 1.0), (18, 0.0), (19, 0.0), (20, 0.0)], "temperature": [(20, 0.125)]}))
+ENDING = sr.RunFinished(status="certified", message="done", seconds=1.0)
+
+
+def observer(stream: io.StringIO, monkeypatch: pytest.MonkeyPatch, **options: object) -> sr.Observer:
+    monkeypatch.setattr("sys.stderr", stream)
+    monkeypatch.setenv("TERM", "xterm")
+    made: sr.Observer = sr.load_registry().build("observer", "progress", options)
+    return made
+
+
+def until(said: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 20.0
+    while not said():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.01)
 
 
 def watch(stream: io.StringIO, monkeypatch: pytest.MonkeyPatch, events: list[sr.Event], **options: object) -> str:
-    monkeypatch.setattr("sys.stderr", stream)
-    observer = sr.load_registry().build("observer", "progress", options)
+    watching = observer(stream, monkeypatch, **options)
     for event in events:
-        observer.receive(event)
+        watching.receive(event)
+    watching.close()
     return stream.getvalue()
 
 
-EVENTS: list[sr.Event] = [finished_round(1), sr.ProofProgress(family="path", cells=12, bound=1e-4), finished_round(2),
-                          sr.EvaluationsFinished(count=10, total=20, best_value=-0.5),
-                          sr.RunFinished(status="certified", message="done", seconds=1.0)]
-
-
-def test_a_verbose_run_has_one_plain_line_for_every_round(monkeypatch: pytest.MonkeyPatch) -> None:
-    lines = watch(io.StringIO(), monkeypatch, [started(), *EVENTS], verbose=True).splitlines()
-    assert len(lines) == 4
-    assert lines[0].startswith("round 1  eps 5.0e-01  lower 0.25  upper inf  violation 1.0e-03")
-    assert "12 cells open" in lines[1]
-    assert "20 evaluations, best -0.5" in lines[3]
+def test_a_verbose_run_has_one_plain_line_for_every_event(monkeypatch: pytest.MonkeyPatch) -> None:
+    lines = watch(io.StringIO(), monkeypatch, [started(), ROUND, PROOF, SEARCH, sr.Event(), ENDING], verbose=True).splitlines()
+    assert [line.partition("s  ")[2] for line in lines] == [
+        "round 2  J 0.75  violation 1.0e-03 in path  eps 5.0e-01  lower 0.25  upper unknown  7 cuts  30 relaxed programs at 15/s",
+        "proof of path  cells open 12  100 examined at 200/s  violation not excluded 1.0e-04",
+        "search 3  best g -0.5  20 of 50 evaluations  10/s  3.0 s left  accepted 25%  temperature 0.125",
+    ]
 
 
 def test_a_short_run_and_a_quiet_run_show_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert watch(io.StringIO(), monkeypatch, [started(), *EVENTS]) == ""
-    assert watch(io.StringIO(), monkeypatch, [started(quiet=True), *EVENTS], verbose=True) == ""
+    for stream in (io.StringIO(), Terminal()):
+        assert watch(stream, monkeypatch, [started(), ROUND, SEARCH, ENDING]) == ""
+        assert watch(stream, monkeypatch, [started(quiet=True), ROUND, SEARCH, ENDING], verbose=True) == ""
+        assert watch(stream, monkeypatch, [started(quiet=True), ROUND, SEARCH, ENDING], patience=0.0) == ""
 
 
-def test_plain_lines_come_at_most_once_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
-    lines = watch(io.StringIO(), monkeypatch, [started(), *(finished_round(k) for k in range(100))], patience=0.0).splitlines()
-    assert len(lines) == 1
+def test_without_a_terminal_there_is_one_plain_line_in_five_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = io.StringIO()
+    watching = observer(stream, monkeypatch, patience=0.0)
+    watching.receive(started())
+    for number in range(100):
+        watching.receive(finished_round(number))
+        time.sleep(1e-3)
+    watching.close()
+    assert len(stream.getvalue().splitlines()) <= 1
+
+
+def test_plain_lines_say_everything_that_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sparserob_progress.screen.PLAIN_EVERY", 0.01)
+    stream = io.StringIO()
+    watching = observer(stream, monkeypatch, patience=0.0)
+    for event in (started(), ROUND, SEARCH):
+        watching.receive(event)
+    until(lambda: "best g" in stream.getvalue())
+    watching.receive(finished_round(4, simplified=True))
+    until(lambda: "simplified" in stream.getvalue())
+    watching.receive(ENDING)
+    lines = stream.getvalue().splitlines()
+    both = next(line for line in lines if "best g" in line)
+    for said in ("lower 0.5", "upper unknown", "round 2", "J 0.75", "best g -0.5", "20 of 50 evaluations", "10/s", "3.0 s left"):
+        assert said in both
+    assert "\x1b" not in stream.getvalue()
 
 
 def test_on_a_terminal_the_bounds_are_live_and_disappear(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TERM", "xterm")
-    shown = watch(Terminal(), monkeypatch, [started(), *EVENTS], patience=0.0)
+    stream = Terminal()
+    watching = observer(stream, monkeypatch, patience=0.0)
+    for event in (started(), finished_round(1, relaxed_programs=3, seconds=1.0), SEARCH):
+        watching.receive(event)
+    until(lambda: "best g" in stream.getvalue())
+    watching.receive(PROOF)
+    until(lambda: "cells open" in stream.getvalue())
+    watching.receive(ENDING)
+    shown = stream.getvalue()
     assert "a title" in shown
-    assert "0.25" in shown
-    assert shown.count("\x1b[?25l") == shown.count("\x1b[?25h") == 1
+    assert shown.count("\x1b[?25l") == shown.count("\x1b[?25h") == 1, "the cursor is shown again"
+    before, _, after = shown.rpartition("\x1b[?25h")
+    assert "cells open" in before
+    assert not CODES.sub("", after).strip()
+
+
+def test_time_goes_on_while_nothing_is_heard(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sparserob_progress.screen.DRAWN_EVERY", 0.05)
+    stream = Terminal()
+    watching = observer(stream, monkeypatch, patience=0.0)
+    watching.receive(started())
+    until(lambda: len(set(re.findall(r"a title[^0-9]*([0-9.]+) s", CODES.sub("", stream.getvalue())))) >= 3)
+    watching.close()
+
+
+def test_a_stream_that_nobody_reads_is_told_as_the_observers_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    watching = observer(Broken(), monkeypatch, patience=0.0)
+    watching.receive(started())
+    until(lambda: not any(thread.name == "sparserob progress" for thread in threading.enumerate()))
+    with pytest.raises(BrokenPipeError, match="nobody reads this"):
+        watching.receive(ROUND)
 
 
 def test_events_before_a_start_and_after_the_end_are_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert watch(io.StringIO(), monkeypatch, [finished_round(1), EVENTS[-1], finished_round(2)], verbose=True) == ""
+    assert watch(io.StringIO(), monkeypatch, [ROUND, ENDING, SEARCH], verbose=True) == ""
+
+
+@pytest.mark.parametrize(("seconds", "said"), [(0.04, "0.0 s"), (12.34, "12.3 s"), (245.2, "4 min 05 s"), (7384.0, "2 h 03 min")])
+def test_a_duration_is_written_in_few_figures(seconds: float, said: str) -> None:
+    from sparserob_progress.status import duration
+
+    assert duration(seconds) == said
+
+
+def command(tmp_path: Path, terminal: int | None, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """``sparserob run`` of a small search, with its standard error stream on a terminal if one is given."""
+    (tmp_path / "small.yaml").write_text(json.dumps({**CONFIG, **METHODS["sparserob"], "observers": [{"name": "progress", "patience": 0.0}]}))
+    return subprocess.run([sys.executable, "-m", "sparserob_core", "run", "small.yaml", "--no-figures", *arguments], cwd=tmp_path, text=True,
+                          stdout=subprocess.PIPE, stderr=terminal or subprocess.PIPE, timeout=120, check=False, env={**os.environ, "TERM": "xterm"})
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a pseudo-terminal")
+def test_on_a_real_terminal_it_shows_and_clears_its_lines_and_quiet_and_json_silence_it(tmp_path: Path) -> None:
+    shown = {}
+    for arguments in ((), ("--quiet",), ("--json",)):
+        reading, terminal = os.openpty()
+        done = command(tmp_path, terminal, *arguments)
+        os.set_blocking(reading, False)
+        try:
+            shown[arguments] = os.read(reading, 1 << 20).decode()
+        except BlockingIOError:
+            shown[arguments] = ""
+        os.close(terminal)
+        os.close(reading)
+        assert done.returncode in (0, 4)
+        assert (arguments == ("--quiet",)) == (done.stdout == "")
+        if arguments == ("--json",):
+            assert json.loads(done.stdout)["title"] == "A double integrator"
+    assert "A double integrator" in shown[()]
+    assert shown[()].count("\x1b[?25l") == shown[()].count("\x1b[?25h") == 1
+    assert (shown["--quiet",], shown["--json",]) == ("", "")
+
+
+def test_without_a_terminal_quiet_and_json_leave_the_error_stream_empty(tmp_path: Path) -> None:
+    plain = command(tmp_path, None).stderr
+    assert plain
+    assert "\x1b" not in plain
+    assert command(tmp_path, None, "--quiet").stderr == command(tmp_path, None, "--json").stderr == ""

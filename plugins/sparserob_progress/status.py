@@ -1,0 +1,129 @@
+"""How a run stands, gathered from its events, and what is said of it."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Final
+
+import sparserob_core as sr
+
+LABEL: Final = 9    # characters
+
+
+class Status:
+    """The last of what was heard. To hear an event costs microseconds; the words are put together when they are shown."""
+
+    def __init__(self, title: str) -> None:
+        self.title, self.started = title, time.monotonic()
+        self.round: sr.RoundFinished | None = None
+        self.searched: sr.EvaluationsFinished | None = None
+        self.proving: sr.ProofProgress | None = None
+        self.lower, self.upper = -math.inf, math.inf
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the run began."""
+        return time.monotonic() - self.started
+
+    def hear(self, event: sr.Event) -> None:
+        """Take note of an event."""
+        match event:
+            case sr.RoundFinished():
+                self.round, self.proving = event, None
+                self.lower = max(self.lower, event.lower_bound)
+                self.upper = min(self.upper, math.inf if event.simplified else event.upper_bound)
+            case sr.EvaluationsFinished():
+                self.searched, self.proving = event, None
+                self.lower = max(self.lower, event.lower_bound)
+            case sr.ProofProgress():
+                self.searched, self.proving = None, event
+
+    def parts(self) -> list[tuple[str, str]]:
+        """What is known, as labels and texts of less than 70 characters."""
+        parts = [("bounds", _bounds(self.lower, self.upper))] if self.round or self.searched else []
+        if self.round is not None:
+            parts += [("round", _round(self.round)), ("", _work(self.round))]
+        if self.searched is not None:
+            parts.append(("search", _search(self.searched)))
+            notes = _notes(self.searched)
+            parts += [("", notes)] if notes else []
+        if self.proving is not None:
+            parts.append(("proof", _proof(self.proving)))
+        return parts
+
+    def last(self, event: sr.Event) -> str:
+        """One event in one line."""
+        match event:
+            case sr.RoundFinished():
+                return f"round {_round(event)}  {_bounds(event.lower_bound, event.upper_bound)}  {_work(event)}"
+            case sr.EvaluationsFinished():
+                return "  ".join(["search " + _search(event), _notes(event)]).strip()
+            case sr.ProofProgress():
+                return f"proof {_proof(event)}"
+            case _:
+                return type(event).__name__
+
+    def line(self) -> str:
+        """All of it in one line."""
+        said = "; ".join(f"{label} {text}".strip() for label, text in self.parts())
+        return f"{duration(self.elapsed)}  {said or 'no event yet'}"
+
+
+def duration(seconds: float) -> str:
+    """A time in three figures or so: 12.3 s, 4 min 05 s, 2 h 03 min."""
+    if seconds < 60.0:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def _bounds(lower: float, upper: float) -> str:
+    if not (math.isfinite(lower) and math.isfinite(upper)):
+        return f"lower {_number(lower)}  upper {_number(upper)}"
+    return f"lower {_number(lower)}  upper {_number(upper)} (to be proven)  gap {(upper - lower) / max(1.0, abs(upper)):.1e}"
+
+
+def _round(event: sr.RoundFinished) -> str:
+    where = f" in {event.worst_family}" if event.worst_family else ""
+    cost = "" if math.isnan(event.cost) else f"  J {_number(event.cost)}"
+    return f"{event.round}{cost}  violation {event.violation:.1e}{where}  eps {event.epsilon:.1e}"
+
+
+def _work(event: sr.RoundFinished) -> str:
+    of = "  of the simplified program" if event.simplified else ""
+    rate = f" at {_rate(event.relaxed_programs, event.seconds)}/s" if event.seconds > 0.0 else ""
+    return f"{event.active_indices} cuts  {event.relaxed_programs} relaxed programs{rate}{of}"
+
+
+def _search(event: sr.EvaluationsFinished) -> str:
+    what = f"of {event.family}  largest violation" if event.family else f"{event.round or ''}  best g" if event.round else "  best"
+    of = f" of {event.budget}" if event.budget else ""
+    said = f"{what} {_number(event.best_value)}  {event.total}{of} evaluations  {_rate(event.total, event.seconds)}/s"
+    if event.budget and event.total and event.seconds > 0.0:
+        said += f"  {duration(max(0.0, event.budget / event.total - 1.0) * event.seconds)} left"
+    return said.strip()
+
+
+def _notes(event: sr.EvaluationsFinished) -> str:
+    """The scalars that the maximiser has noted since the last event; of 0 or 1 at every evaluation, the share."""
+    said = []
+    for name, rows in event.batch.notes.items():
+        share = name == "accepted"
+        value = sum(value for _, value in rows) / len(rows) if share else rows[-1][1]
+        said.append(f"{name} {value:.0%}" if share else f"{name} {value:.3g}")
+    return "  ".join(said)
+
+
+def _proof(event: sr.ProofProgress) -> str:
+    rate = f" at {_rate(event.examined, event.seconds)}/s" if event.examined and event.seconds > 0.0 else ""
+    seen = f"  {event.examined} examined{rate}" if event.examined else ""
+    return f"of {event.family}  cells open {event.cells}{seen}  violation not excluded {event.bound:.1e}"
+
+
+def _rate(count: int, seconds: float) -> str:
+    return f"{count / seconds:.3g}" if count < 1000 * seconds else f"{count / seconds:.0f}"
+
+
+def _number(value: float) -> str:
+    return "unknown" if math.isinf(value) else f"{value:.9g}"
