@@ -13,7 +13,7 @@ from sparserob_core.control.lifted import LiftedSystem, lift
 from sparserob_core.control.measurable import MeasurablePush
 from sparserob_core.control.memory import remember
 from sparserob_core.control.parameters import ParameterIndex
-from sparserob_core.control.peaks import climb, local_maxima, vertices
+from sparserob_core.control.peaks import climb, local_maxima, step_out, vertices
 from sparserob_core.control.push import Push
 from sparserob_core.control.response import distinct_times, transitions
 from sparserob_core.control.words import explanation
@@ -214,4 +214,14 @@ class FlatConstraint:
             inside = np.clip(points, box.lower, box.upper)
             return np.hstack([inside[:, :1], self.parameters.clamp(inside[:, 1:])])
 
-        return climb(lambda points, which: self.violations(x, points, rows[which]), indices, radius, project)
+        def evaluate(points: Array, which: np.ndarray) -> Array:
+            return self.violations(x, points, rows[which])
+
+        points, found = climb(evaluate, indices, radius, project)
+        bound = self.parameters.set
+        if bound is None or isinstance(bound, Box):
+            return points, found
+        stepped, higher = step_out(evaluate, points, found, bound)
+        moved = np.flatnonzero(higher > found)
+        points[moved], found[moved] = climb(lambda at, which: evaluate(at, moved[which]), stepped[moved], radius / 16, project)
+        return points, found

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from sparserob_core.control.combination import Combination
-from sparserob_core.control.cut import cheapest_multipliers
+from sparserob_core.control.cut import Cuts
 from sparserob_core.control.lifted import LiftedSystem, grown_less_one
 from sparserob_core.control.measurable import MeasurablePush
 from sparserob_core.control.polynomial import distinct_patterns, face_matrix, monotone_ends, polynomial_bound
@@ -39,7 +39,7 @@ class CellEnclosure:
     ``H (r, d)``; ``rhs (r', M')``, polynomials over the cell; ``control (m, K)`` on the pieces of the control's dictionary. Without a
     combination every row of ``H`` is a constraint (``r' = r``, ``M' = M``); with one they are the parts of a single constraint.
     ``looseness (nu',)``: how far ``rhs`` may be below the truth at the ends of every coordinate; it only guides the halving.
-    ``cuts (q, nu), (q,)``: half-spaces ``a'delta <= s`` beyond which the cell holds no parameters.
+    ``cuts``: beyond them the cell holds no parameters.
     """
 
     lifted: LiftedSystem
@@ -49,7 +49,7 @@ class CellEnclosure:
     control: Array
     combination: Combination | None = None
     looseness: Array | float = 0.0
-    cuts: tuple[Array, Array] | None = None
+    cuts: Cuts | None = None
 
     def bounds(self, start: Array, stop: Array) -> tuple[Array, Array, Array]:
         """For time cells ``[start, stop]`` (``(k,)``, each inside one piece): upper bounds ``(k,)``, the part of them that halving the
@@ -81,7 +81,7 @@ class CellEnclosure:
             coefficients, space = self.combination.apply(coefficients), self.combination.space
         coefficients = coefficients - self.rhs
         swing = np.zeros((*coefficients.shape[:2], space.nu)) if self.push is None or not space.nu else self.push.swing(times)
-        coefficients = self._cut_off(space, coefficients, times)
+        coefficients, gain = self._cut_off(space, coefficients, times)
         ends = self._better_ends(space, coefficients, swing)
         coefficients, excess = _on_faces(space, coefficients, ends), np.zeros(coefficients.shape[:2])
         if self.push is not None:
@@ -89,24 +89,15 @@ class CellEnclosure:
             coefficients = coefficients + pushed
         bound, spread = polynomial_bound(space, coefficients)
         blame = np.where(ends == 0, swing, 0.0) + np.finfo(float).tiny
+        spread = spread if gain is None else gain
         return bound + excess, spread + excess[..., None] * blame / blame.sum(axis=2, keepdims=True)
 
-    def _cut_off(self, space: TaylorSpace, coefficients: Array, times: Array) -> Array:
-        """Polynomials that are above ``coefficients (k, r, M)`` where the parameters are, and lower beyond: ``lambda (s - a'delta)`` is added,
-        with multipliers ``lambda >= 0`` that make the linear part (that of the push included) small."""
-        if self.cuts is None or not self.cuts[1].size:
-            return coefficients
-        count = self.cuts[0].shape[1]
-        linear = [space.index[tuple(unit)] for unit in np.eye(space.nu, dtype=int)[:count].tolist()]
-        gradient = coefficients[:, :, linear]
-        if self.push is not None:
-            gradient = gradient + self.push.at(times, np.zeros((*coefficients.shape[:2], space.nu)))[0][:, :, linear]
-        slopes, slack = self.cuts
-        multipliers = cheapest_multipliers(slopes, slack, gradient)
-        lowered = coefficients.copy()
-        lowered[:, :, 0] += multipliers @ slack
-        lowered[:, :, linear] -= multipliers @ slopes
-        return lowered
+    def _cut_off(self, space: TaylorSpace, coefficients: Array, times: Array) -> tuple[Array, Array | None]:
+        """Polynomials above ``coefficients (k, r, M)`` where the parameters are, and what halving the cell would gain with them."""
+        if self.cuts is None:
+            return coefficients, None
+        pushed = 0.0 if self.push is None else self.push.at(times, np.zeros((*coefficients.shape[:2], space.nu)))[0]
+        return self.cuts.lowered(space, coefficients, pushed)
 
     @staticmethod
     def _better_ends(space: TaylorSpace, coefficients: Array, swing: Array) -> Array:

@@ -7,6 +7,7 @@ from itertools import product
 
 import numpy as np
 
+from sparserob_core.control.cut import Cuts, ball_of
 from sparserob_core.control.ray import outward, shares
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
@@ -64,15 +65,23 @@ class ParameterIndex:
         smallest = np.minimum(H * lower[:, None], H * upper[:, None]).sum(axis=2)
         return np.asarray((smallest <= h + TOUCHING * np.maximum(1.0, np.abs(h))).all(axis=1))
 
-    def cuts(self, low: Array, high: Array) -> tuple[Array, Array]:
-        """Half-spaces ``a'delta <= s`` that contain the set and cut the cell ``[low, high]``, in ``delta in [-1, 1]^nu``: ``(q, nu), (q,)``."""
-        centre, radius = (low + high) / 2, (high - low) / 2
+    def cuts(self, low: Array, high: Array) -> Cuts | None:
+        """What the set says about the parameters of a cell ``[low, high]``; ``None`` where all of the cell is in it, as far as can be told."""
         if self.set is None or isinstance(self.set, Box):
-            return np.zeros((0, centre.size)), np.zeros(0)
-        H, h = self._halfspaces(self.set, centre[None])
-        slopes, slack = H[0] * radius, h[0] - H[0] @ centre
+            return None
+        centre, radius = (low + high) / 2, (high - low) / 2
+        ball, flat = ball_of(self.set, centre, radius), self.set.halfspaces() is not None
+        towards = centre[None] if flat or ball is not None else np.vstack([centre, *product(*zip(low, high, strict=True))])
+        H, h = (side.reshape(-1, *side.shape[2:]) for side in self._halfspaces(self.set, towards))
+        slopes, slack = H * radius, h - H @ centre
         crossing = np.abs(slopes).sum(axis=1) > slack
-        return slopes[crossing], slack[crossing]
+        if not crossing.any() and (ball is None or np.linalg.norm(np.abs(ball[0]) + np.abs(ball[1]).sum(axis=1)) <= 1.0):
+            return None
+        bent = np.zeros(centre.size)
+        if not flat:
+            box = self.box
+            bent = float((h - H @ self.set.interior_point()).max()) * ((high - low) / (box.upper - box.lower)) ** 2 / 2
+        return Cuts(slopes[crossing], slack[crossing], ball, bent)
 
     @staticmethod
     def _halfspaces(convex_set: ConvexSet, points: Array) -> tuple[Array, Array]:

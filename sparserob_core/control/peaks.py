@@ -7,12 +7,16 @@ from itertools import product
 
 import numpy as np
 
-from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.convex_set import Array, ConvexSet
 
 SMALLEST = 1e-6     # of the first step: a step that is not made smaller any more
 MOVES = 120         # steps at most
 ENOUGH = 0.002      # a step that gains less than this share of the value is followed by a smaller one
 AGAIN = np.array([[1.0], [3.0]])   # multiples of the last moves that are tried besides, to follow a ridge (Hooke and Jeeves 1961)
+STEPS = 6           # to points where a gradient is highest on a set, at most
+SHARES = np.array([1.0, 0.5, 0.2, 0.05])    # of such a step that are tried
+TINY = 1e-300       # instead of nothing to divide by
+INWARD, DIFFERENCE = 1e-3, 1e-7     # shares of the set: how far inside it differences are taken, and how large
 
 
 def local_maxima(values: Array, lattice: tuple[int, ...], kept: int) -> np.ndarray:
@@ -88,3 +92,28 @@ def climb(evaluate: Callable[[Array, np.ndarray], Array], points: Array, radius:
         best[live[better]] = value[better]
         size[live[gain <= ENOUGH * np.abs(best[live])]] /= 3
     return points, best
+
+
+def step_out(evaluate: Callable[[Array, np.ndarray], Array], points: Array, values: Array, convex: ConvexSet) -> tuple[Array, Array]:
+    """Steps to where the gradient is highest on a set (Frank and Wolfe 1956), from points ``(k, D)`` whose coordinates but the first are in it.
+
+    A climb that is drawn back to the set gets stuck short of its corners. ``evaluate`` as for `climb`; its differences are taken a little
+    inside the set. Returns the points and their ``values (k,)``, none of which gets lower.
+    """
+    points, values, middle = points.copy(), values.copy(), convex.interior_point()
+    axes = np.eye(middle.size)
+    every, moves = np.arange(values.size), DIFFERENCE * (convex.support(axes) + convex.support(-axes)) * axes
+    for _ in range(STEPS):
+        inner = np.repeat(points[:, None], 2 * middle.size, axis=1)
+        inner[:, :, 1:] += INWARD * (middle - inner[:, :, 1:]) + np.vstack([moves, -moves])
+        ahead, behind = np.split(evaluate(inner.reshape(-1, points.shape[1]), every.repeat(2 * middle.size)).reshape(values.size, -1), 2, axis=1)
+        gradient = (ahead - behind) / np.maximum(np.diag(moves), TINY)
+        trials = np.repeat(points[:, None], SHARES.size, axis=1)
+        trials[:, :, 1:] += SHARES[:, None] * (convex.support_point(gradient)[:, None] - trials[:, :, 1:])
+        found = evaluate(trials.reshape(-1, points.shape[1]), every.repeat(SHARES.size)).reshape(values.size, -1)
+        best = found.argmax(axis=1)
+        better = found[every, best] > values
+        if not better.any():
+            break
+        points[better], values[better] = trials[every, best][better], found[every, best][better]
+    return points, values

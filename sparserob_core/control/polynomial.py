@@ -8,7 +8,9 @@ from sparserob_core.control.memory import remember
 from sparserob_core.control.taylor import TaylorSpace
 from sparserob_core.sip.convex_set import Array
 
-DEFINITE = 1e-12    # relative to its largest entry, the smallest eigenvalue of a Hessian that counts as definite
+DEFINITE = 1e-12    # relative to the largest, how negative the eigenvalues of a Hessian are made
+SLOPE = 1e-9        # relative to the Hessian, that at which a side of the box is left again
+ROUNDS = 3          # of the active set method, per variable
 FACES_KEPT = 256    # matrices of faces that a space remembers
 
 
@@ -16,20 +18,21 @@ def polynomial_bound(space: TaylorSpace, coefficients: Array) -> tuple[Array, Ar
     """Upper bounds of polynomials ``(..., M)`` on ``[-1, 1]^nu``, and how much each variable adds to their range, ``(..., nu)``.
 
     Variables in which the polynomial is monotone are set to their better end; in the others the quadratic part is maximised, exactly
-    where it is concave, variable by variable otherwise. Terms of degree three and more are bounded by their modulus.
+    where it is concave, variable by variable or less a multiple of ``|delta|^2`` otherwise.
+    Terms of degree three and more are bounded by their modulus.
     """
     nu = space.nu
     shape = coefficients.shape[:-1]
     if nu == 0 or space.degree == 0:
         return coefficients[..., 0].copy(), np.zeros((*shape, nu))
     flat = coefficients.reshape(-1, space.size)
-    gradient, hessian = _quadratic(space, flat)
+    gradient, hessian = quadratic_part(space, flat)
     tail, steepness = _tail(space, flat)
     bound = flat[:, 0] + tail
     slope = np.abs(hessian).sum(axis=2)
     ends = np.where(np.abs(gradient) >= slope + steepness, np.sign(gradient), 0.0)
     bound += (gradient * ends).sum(axis=1) + 0.5 * np.einsum("ki,kij,kj->k", ends, hessian, ends)
-    inner = ends == 0
+    inner = (ends == 0) & ((gradient != 0) | (slope > 0))
     gradient = np.where(inner, gradient + np.einsum("kij,kj->ki", hessian, ends), 0.0)
     hessian = np.where(inner[:, :, None] & inner[:, None, :], hessian, 0.0)
     bound += np.minimum(_separable(gradient, hessian), _concave(gradient, hessian, inner))
@@ -42,7 +45,7 @@ def monotone_ends(space: TaylorSpace, coefficients: Array, swing: Array) -> Arra
     at most ``swing (k, nu)``; 0 for the other variables. ``(k, nu)``."""
     if space.nu == 0 or space.degree == 0:
         return np.zeros((coefficients.shape[0], space.nu))
-    gradient, hessian = _quadratic(space, coefficients)
+    gradient, hessian = quadratic_part(space, coefficients)
     certain = np.abs(gradient) > np.abs(hessian).sum(axis=2) + _tail(space, coefficients)[1] + swing
     return np.where(certain, np.sign(gradient), 0.0)
 
@@ -72,7 +75,7 @@ def _face_matrix(space: TaylorSpace, ends: Array) -> Array:
     return matrix
 
 
-def _quadratic(space: TaylorSpace, flat: Array) -> tuple[Array, Array]:
+def quadratic_part(space: TaylorSpace, flat: Array) -> tuple[Array, Array]:
     """Gradient ``(k, nu)`` and Hessian ``(k, nu, nu)`` at the centre."""
     nu = space.nu
     unit = np.eye(nu, dtype=int)
@@ -104,11 +107,44 @@ def _separable(gradient: Array, hessian: Array) -> Array:
 
 
 def _concave(gradient: Array, hessian: Array, inner: np.ndarray) -> Array:
-    """``-g' H^-1 g / 2``, the maximum over the whole space, where ``H`` is negative definite in the inner variables; ``inf`` elsewhere."""
-    filled = np.where(inner[:, :, None] & inner[:, None, :], hessian, -np.eye(hessian.shape[1]))
-    values, vectors = np.linalg.eigh(filled)
-    along = np.einsum("kij,ki->kj", vectors, gradient)
-    definite = values[:, -1] < -DEFINITE * np.abs(values).max(axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        top = -0.5 * (along**2 / values).sum(axis=1)
-    return np.where(definite, top, np.inf)
+    """An upper bound of ``g's + s'H s / 2`` over the box in the inner variables, exact where ``H`` is negative definite in them.
+
+    Elsewhere ``H`` is first lowered by a multiple of the identity, which costs half of that per variable. ``inf`` where fewer than two
+    variables are inner: there, the bound variable by variable is exact.
+    """
+    top = np.full(gradient.shape[0], np.inf)
+    several = np.flatnonzero(inner.sum(axis=1) > 1)
+    if not several.size:
+        return top
+    H, free = hessian[several], inner[several]
+    values = np.linalg.eigvalsh(H)  # the other variables add zeros only
+    size = np.abs(values).max(axis=1)
+    lowered = np.maximum(values[:, -1], 0.0) + DEFINITE * size
+    H = np.where(free[:, :, None] & free[:, None, :], H - lowered[:, None, None] * np.eye(H.shape[1]), 0.0)
+    top[several] = _highest(gradient[several], H, free, size) + lowered * free.sum(axis=1) / 2
+    return top
+
+
+def _highest(gradient: Array, hessian: Array, inner: np.ndarray, size: Array) -> Array:
+    """The maximum on the box of concave functions ``g's + s'H s / 2`` of the inner variables, from above, ``(k,)``: the least maximum of the
+    tangents at the points of an active set method, in which one variable at a time is held at a side or released from it."""
+    rows, free, held = np.arange(gradient.shape[0]), inner.copy(), np.zeros(gradient.shape)
+    filler = -np.where(size > 0, size, 1.0)[:, None, None] * np.eye(gradient.shape[1])
+    top = np.full(rows.size, np.inf)
+    for _ in range(ROUNDS * gradient.shape[1]):
+        pull = np.where(free, gradient + np.einsum("kij,kj->ki", hessian, held), 0.0)
+        reached = held - np.linalg.solve(np.where(free[:, :, None] & free[:, None, :], hessian, filler), pull[..., None])[..., 0]
+        point = np.clip(np.nan_to_num(reached), -1.0, 1.0)
+        bent = np.einsum("kij,kj->ki", hessian, point)
+        slope = np.where(inner, gradient + bent, 0.0)
+        top = np.minimum(top, ((gradient + bent / 2) * point).sum(axis=1) + (np.abs(slope) - slope * point).sum(axis=1))
+        beyond = np.where(free, np.abs(reached) - 1.0, 0.0)
+        inward = np.where(free, 0.0, -slope * held)
+        worst = np.where(beyond.max(axis=1) > 0.0, beyond.argmax(axis=1), inward.argmax(axis=1))
+        changed = (beyond.max(axis=1) > 0.0) | (inward.max(axis=1) > SLOPE * size)
+        if not changed.any():
+            break
+        which = (rows[changed], worst[changed])
+        held[which] = np.where(free[which], point[which], 0.0)
+        free[which] = ~free[which]
+    return top

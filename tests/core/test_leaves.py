@@ -28,12 +28,14 @@ def plant(parameters, disturbance=None):
 def flat(parameters, start):
     functionals, index = plant(parameters, Box([-0.1, -0.1], [0.1, 0.1]))
     constraint = FlatConstraint("path", functionals, np.array([[1.0, 0.4], [-0.3, 1.0]]), np.zeros(2), start, 2.0, index)
-    return FlatConstraint("path", functionals, constraint.H, np.full(2, top(constraint) + 0.4), start, 2.0, index)
+    slack = 0.4 if start < 2.0 or isinstance(parameters, Polytope) else 0.02
+    return FlatConstraint("path", functionals, constraint.H, np.full(2, top(constraint) + slack), start, 2.0, index)
 
 
 def curved(parameters, start):
     functionals, index = plant(parameters)
-    return CurvedConstraint("path", functionals, Ellipsoid([0.0, 0.0], (2.5 if start == 2.0 else 5.0) * np.eye(2)), start, 2.0, index)
+    size = 5.0 if start < 2.0 else 2.5 if isinstance(parameters, Polytope) else 1.9
+    return CurvedConstraint("path", functionals, Ellipsoid([0.0, 0.0], size * np.eye(2)), start, 2.0, index)
 
 
 def top(constraint):
