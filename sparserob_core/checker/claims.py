@@ -99,7 +99,7 @@ def _multiplied(case: Case, priced: bool) -> arb:
     if data is None:
         raise Unchecked("the certificate holds no multipliers, which this method does not offer")
     if not isinstance(data, Mapping):
-        raise Broken("multipliers: expected those of constraints, equalities and images")
+        raise Broken("multipliers: expected those of constraints, equalities and pieces")
     entries = listed(data, "constraints")
     if len(entries) > MOST_MULTIPLIERS:
         raise Broken(f"{len(entries)} multipliers are too many to be checked")
@@ -112,12 +112,12 @@ def _multiplied(case: Case, priced: bool) -> arb:
     for multiplier, (state, value) in zip(nu.tolist(), case.equalities, strict=True):
         row = case.duality.row(np.eye(case.problem.system.states)[state], case.problem.horizon, middle, arb(value), disturbed=False)
         rows.append((multiplier, row))
-    images = data.get("images")
+    pieces = data.get("pieces")
     if case.control.functions < case.control.pieces:
-        images, expected = numbers(images, "images"), case.duality.images
-        if images.shape != (expected,):
-            raise Broken(f"{images.size} multipliers of the control's pieces, expected {expected}")
-    return case.duality.bound(rows, images, priced)
+        pieces, expected = numbers(pieces, "pieces"), (case.problem.system.controls, case.control.pieces)
+        if pieces.shape != expected:
+            raise Broken(f"multipliers of the control's pieces have shape {pieces.shape}, expected {expected}")
+    return case.duality.bound(rows, pieces, priced)
 
 
 def _row(case: Case, entry: object) -> tuple[float, Row]:

@@ -73,39 +73,26 @@ class Duality:
         column: list[arb] = (exponential(matrix, _exact(time) - _exact(since)) * start).entries()
         return column
 
-    def bound(self, rows: Sequence[tuple[float, Row]], images: Sequence[float] | None, priced: bool) -> arb:
+    def bound(self, rows: Sequence[tuple[float, Row]], pieces: Sequence[Sequence[float]] | None, priced: bool) -> arb:
         """The bound that multipliers ``y`` of ``rows`` give; ``priced``: with the cost, otherwise as a proof of infeasibility."""
         constant = sum((_exact(y) * row.constant for y, row in rows), _exact(0.0))
         m, K = self.problem.system.controls, self.control.pieces
         slopes = [[sum((_exact(y) * row.slope[k][c] for y, row in rows if not row.slope[k][c].is_zero()), _exact(0.0)) for c in range(m)]
                   for k in range(K)]
-        if images is not None and self.control.functions < K:
-            slopes, slip = self._moved(slopes, images)
+        if pieces is not None and self.control.functions < K:
+            slopes, slip = self._moved(slopes, pieces)
             constant = constant - slip
         weights = np.asarray(self.problem.weights, dtype=float) if priced else np.zeros(m)
         lengths = [_exact(b) - _exact(a) for a, b in zip(self.control.breakpoints[:-1], self.control.breakpoints[1:], strict=True)]
         return sum((self._least([_exact(w) * length for w in weights], slope) for length, slope in zip(lengths, slopes, strict=True)), constant)
 
-    @property
-    def images(self) -> int:
-        """How many multipliers the control's pieces have: one per channel and per facet that several channels share."""
-        flat = facets(self.problem.control) if not isinstance(self.problem.control, Box) else None
-        return (self.problem.system.controls + sum(bool(np.count_nonzero(c) > 1) for c, _ in flat or [])) * self.control.pieces
-
-    def _moved(self, slopes: list[list[arb]], images: Sequence[float]) -> tuple[list[list[arb]], arb]:
+    def _moved(self, slopes: list[list[arb]], pieces: Sequence[Sequence[float]]) -> tuple[list[list[arb]], arb]:
         """With fewer functions than pieces, slopes that act alike on every control of the dictionary are as good: those of the certificate.
 
         What they act differently is bounded by the largest coefficients.
         """
         m, K, N = self.problem.system.controls, self.control.pieces, self.control.functions
-        z = np.asarray(images, dtype=float)
-        mine = [[-_exact(z[c * K + k]) for c in range(m)] for k in range(K)]
-        flat = facets(self.problem.control) if not isinstance(self.problem.control, Box) else None
-        several = [c for c, _ in flat or [] if np.count_nonzero(c) > 1]
-        for r, normal in enumerate(several):
-            for k in range(K):
-                for i in range(m):
-                    mine[k][i] = mine[k][i] - _exact(z[(m + r) * K + k]) * _exact(normal[i])
+        mine = [[-_exact(pieces[c][k]) for c in range(m)] for k in range(K)]
         slip = _exact(0.0)
         for c in range(m):
             largest = self._largest_coefficients(c)

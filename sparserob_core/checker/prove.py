@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 MOST_CELLS = 40_000     # cells of time examined per constraint
-MOST_BOXES = 4_000      # boxes of parameters
+MOST_BOXES = 20_000     # boxes of parameters and cells of directions
 BLAME = 0.2             # share of the error from which the box of parameters is to blame for it
 
 Interval: TypeAlias = tuple[int, float, float]

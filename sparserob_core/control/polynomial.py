@@ -125,6 +125,14 @@ def _concave(gradient: Array, hessian: Array, inner: np.ndarray) -> Array:
     return top
 
 
+def _solved(matrices: Array, right: Array) -> Array:
+    """``matrices^-1 right``, ``(k, d)``; in the least-squares sense for all where one is singular, since a tangent at any point will do."""
+    try:
+        return np.asarray(np.linalg.solve(matrices, right[..., None])[..., 0], dtype=float)
+    except np.linalg.LinAlgError:
+        return np.asarray(np.einsum("kij,kj->ki", np.linalg.pinv(matrices), right), dtype=float)
+
+
 def _highest(gradient: Array, hessian: Array, inner: np.ndarray, size: Array) -> Array:
     """The maximum on the box of concave functions ``g's + s'H s / 2`` of the inner variables, from above, ``(k,)``: the least maximum of the
     tangents at the points of an active set method, in which one variable at a time is held at a side or released from it."""
@@ -133,7 +141,7 @@ def _highest(gradient: Array, hessian: Array, inner: np.ndarray, size: Array) ->
     top = np.full(rows.size, np.inf)
     for _ in range(ROUNDS * gradient.shape[1]):
         pull = np.where(free, gradient + np.einsum("kij,kj->ki", hessian, held), 0.0)
-        reached = held - np.linalg.solve(np.where(free[:, :, None] & free[:, None, :], hessian, filler), pull[..., None])[..., 0]
+        reached = held - _solved(np.where(free[:, :, None] & free[:, None, :], hessian, filler), pull)
         point = np.clip(np.nan_to_num(reached), -1.0, 1.0)
         bent = np.einsum("kij,kj->ki", hessian, point)
         slope = np.where(inner, gradient + bent, 0.0)

@@ -25,7 +25,7 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
     """The certificate of a result, as plain data; ``None`` for a program that is no control problem, or when nothing was reached.
 
     ``cost`` and ``lower_bound`` are as in ``result.json``. ``multipliers``: of constraints at a time, a parameter and a normal direction, of
-    equalities, and of the control's images where the dictionary has fewer functions than pieces. ``proof``: per constraint the cells
+    equalities, and of the control's pieces where the dictionary is not that of their indicators. ``proof``: per constraint the cells
     ``[lower, upper]`` of (time, parameters, directions) on which it was shown. ``witness``: what refutes the decision.
     """
     problem, program = experiment.problem, experiment.program
@@ -49,8 +49,19 @@ def _multipliers(problem: OptimalControlProblem, program: SemiInfiniteProgram, r
     return {
         "constraints": [{"constraint": cut.family, "time": words.time, "parameter": _parameter(problem, words), "direction": _direction(words),
                          "multiplier": cut.multiplier} for cut, words in told],
-        "equalities": result.dual.mu, "images": result.dual.z,
+        "equalities": result.dual.mu, "pieces": _on_pieces(problem, result.dual.z),
     }
+
+
+def _on_pieces(problem: OptimalControlProblem, z: Array | None) -> Array | None:
+    """The multipliers of the control ``(m, K)`` on its pieces, those of its set's slanted sides folded in."""
+    if z is None:
+        return None
+    m, flat = problem.system.controls, None if isinstance(problem.control, Box) else problem.control.halfspaces()
+    slanted = np.zeros((0, m)) if flat is None else flat[0][np.count_nonzero(flat[0], axis=1) > 1]
+    rows = z.reshape(m + slanted.shape[0], -1)
+    answer: Array = rows[:m] + slanted.T @ rows[m:]
+    return answer
 
 
 def _explained(program: SemiInfiniteProgram, cut: Cut) -> Explanation | None:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 LAZY = 1e-9     # rows violated by less than this, relative to their norm, are not added
 ROUNDS = 200    # lazy additions at most within one evaluation
+ROUNDING = 1e-12   # of a row's numbers, from which its terms were computed; relative to the sum of their absolute values
 DROPPING = 20   # of them, those that also drop the rows without a multiplier; later rows are only added, so that nothing can cycle
 
 
@@ -145,14 +146,23 @@ class RelaxedProgram:
         return self._solved(rows.G, rows.h - margin * norms, epsilon, guess)
 
     def lower_bound(self, rows: Rows, solution: FiniteSolution) -> Dual:
-        """A lower bound of the *unregularised* semi-infinite program, from the multipliers of any solution with these rows (weak duality)."""
+        """A lower bound of the *unregularised* semi-infinite program, from the multipliers of any solution with these rows (weak duality).
+
+        Less an allowance for the rounding of the rows themselves; no multipliers at all are an offer too, and need none.
+        """
         plain = self.finite(rows.G, rows.h, 0.0)
-        offers = [(solution.y, solution.mu)]
+        offers = [(np.zeros_like(solution.y), np.zeros_like(solution.mu), np.zeros_like(solution.z)), (solution.y, solution.mu, solution.z)]
         if plain.P is None and np.isfinite(solution.x).all():
-            offers.append(vertex_multipliers(plain, solution.x, solution.y, solution.mu))
-        bounds = [dual_bound(plain, y, mu, solution.z, at=solution.x) for y, mu in offers]
+            offers.append((*vertex_multipliers(plain, solution.x, solution.y, solution.mu), solution.z))
+        bounds = [dual_bound(plain, y, mu, z, at=solution.x) - self._rounding(plain, y, mu, solution.x) for y, mu, z in offers]
         best = int(np.argmax(bounds))
-        return self.dual(rows, *offers[best], solution.z, bounds[best])
+        return self.dual(rows, *offers[best], bounds[best])
+
+    def _rounding(self, plain: FiniteProgram, y: Array, mu: Array, x: Array) -> float:
+        size = np.where(np.isfinite(x), np.abs(x), 0.0)
+        used = (y > 0) & np.isfinite(plain.h)
+        total = y[used] @ (np.abs(plain.h[used]) + np.abs(plain.G[used]) @ size) + np.abs(mu) @ (np.abs(plain.b) + np.abs(plain.A) @ size)
+        return ROUNDING * float(total)
 
     def dual(self, rows: Rows, y: Array, mu: Array, z: Array, bound: float) -> Dual:
         """Multipliers of a program with these rows (and of its fixed rows, which come first in ``y``), as a record."""

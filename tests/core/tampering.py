@@ -251,9 +251,9 @@ MULTIPLIERS: dict[str, tuple[str, Change]] = {
         "minimum attention", lambda files: files.multipliers.update(equalities=[1.1 * nu for nu in files.multipliers["equalities"]])),
     "the multiplier of an equality is missing": ("minimum attention", lambda files: files.multipliers.update(equalities=[])),
     "a multiplier of the control's pieces is larger": (
-        "walsh", lambda files: files.multipliers.update(images=[files.multipliers["images"][0] + 0.1, *files.multipliers["images"][1:]])),
+        "walsh", lambda files: files.multipliers["pieces"][0].__setitem__(0, files.multipliers["pieces"][0][0] + 0.1)),
     "the multipliers of the control's pieces are in another order": (
-        "walsh", lambda files: files.multipliers.update(images=files.multipliers["images"][::-1])),
+        "walsh", lambda files: files.multipliers.update(pieces=[row[::-1] for row in files.multipliers["pieces"]])),
     "there are no multipliers": ("known", entry(multipliers=None)),
 }
 
@@ -382,7 +382,7 @@ PLACES: dict[str, tuple[str, Callable[[Forgery], Any], str]] = {
     "multiplier's parameter": ("one parameter", lambda files: files.heaviest, "parameter"),
     "multipliers.constraints": ("known", lambda files: files.multipliers, "constraints"),
     "multipliers.equalities": ("minimum attention", lambda files: files.multipliers, "equalities"),
-    "multipliers.images": ("walsh", lambda files: files.multipliers, "images"),
+    "multipliers.pieces": ("walsh", lambda files: files.multipliers, "pieces"),
     "proof.path": ("known", lambda files: files.certificate["proof"], "path"),
     **{f"proof.{key}": ("known", lambda files: files.proof("path"), key) for key in ("tolerance", "lower", "upper")},
     "witness": ("refuted", lambda files: files.certificate, "witness"),
