@@ -16,9 +16,11 @@ from sparserob_core.experiment.commands.figures import figures
 from sparserob_core.experiment.commands.initial_states import initial_states
 from sparserob_core.experiment.commands.margin import margin
 from sparserob_core.experiment.commands.plugins import plugins
+from sparserob_core.experiment.commands.replay import replay
 from sparserob_core.experiment.commands.run import run
 from sparserob_core.experiment.commands.schema import schema
 from sparserob_core.experiment.commands.simulate import simulate
+from sparserob_core.experiment.commands.watch import watch
 
 INTERRUPTED = 130
 DEBUG = "SPARSEROB_DEBUG"
@@ -60,5 +62,5 @@ def commands() -> None:
     """Sparse robust optimal control of uncertain linear systems, with the proof."""
 
 
-for command in (run, check, simulate, margin, initial_states, compare, figures, plugins, schema):
+for command in (run, watch, replay, check, simulate, margin, initial_states, compare, figures, plugins, schema):
     commands.add_command(command)

@@ -105,7 +105,7 @@ class Inspection:
         per_index = sum(family.rows(family.index_set.lower[np.newaxis])[1].shape[1] for family in program.families)
 
         def weights() -> Array:
-            return np.bincount(value.imposed.positions // per_index, value.imposed.multipliers, count)
+            return np.bincount(value.imposed.positions // per_index, value.imposed.multipliers, count).astype(float)
 
         return RelaxedValue(lambda slots: value.at(np.asarray(slots, dtype=float).ravel()), weights, value.layout.slot,
                             self.names(value.layout.slot.dimension))

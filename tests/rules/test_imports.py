@@ -54,7 +54,7 @@ def first_part(path: Path) -> str:
 
 def in_a_wing(path: Path) -> bool:
     """The public face and the shipped contracts look at every wing; all other modules stand in one."""
-    return first_part(path) not in {"__init__", "__main__", "testing", "testing_solvers"}
+    return first_part(path) not in {"__init__", "__main__", "testing", "testing_observers", "testing_solvers"}
 
 
 def relative(path: Path) -> str:

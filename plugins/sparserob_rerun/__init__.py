@@ -1,0 +1,96 @@
+"""Streams a run into Rerun while it runs: the search, the landscape of g, the physics, the bounds, to a viewer, a browser or a file."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pydantic import Field, PrivateAttr, field_validator
+
+import sparserob_core as sr
+from sparserob_rerun.options import LandscapeOptions
+
+if TYPE_CHECKING:
+    from sparserob_rerun.outlet import Outlet
+
+logger = logging.getLogger("sparserob")
+
+
+class Rerun(sr.Observer, sr.Options):
+    """A recording for the viewer of Rerun (rerun.io), an optional extra: ``pip install 'sparserob[rerun]'``.
+
+    Destinations can be combined; with none of them, ``recording.rrd`` in the run's directory. A missing package, viewer or listener is one
+    warning, and the run goes on without. Everything happens in a process of its own, on one core and with low priority; the solver hands
+    over its events and goes on. When too many are waiting, the newest are dropped, and their number is told at the end.
+    """
+
+    spawn: bool = False
+    """Start a viewer, or use the one that runs already."""
+
+    connect: str | None = None
+    """Send to a viewer that listens at this address, such as 127.0.0.1:9876."""
+
+    serve: bool = False
+    """Show it in a browser, at port 9090 of this machine, as long as the run lasts and ``keep`` seconds more."""
+
+    keep: float = Field(default=0.0, ge=0.0)
+    """Seconds that a browser is served after the run."""
+
+    save: str | None = None
+    """Record into this file; a relative one is in the run's directory."""
+
+    landscape: LandscapeOptions | None = LandscapeOptions()
+    """The landscape of g that is evaluated in the background; null: none."""
+
+    _outlet: Outlet | None = PrivateAttr(default=None)
+
+    @field_validator("connect")
+    @classmethod
+    def _address(cls, text: str | None) -> str | None:
+        from sparserob_rerun.sinks import address_of
+
+        if text is not None:
+            address_of(text)
+        return text
+
+    def receive(self, event: sr.Event) -> None:
+        """See `sparserob_core.Observer`."""
+        if isinstance(event, sr.RunStarted):
+            self._begin(event)
+        elif self._outlet is not None:
+            self._outlet.send(event)
+            if isinstance(event, sr.RunFinished):
+                self.close()
+
+    def close(self) -> None:
+        """See `sparserob_core.Observer`: the recording is complete afterwards."""
+        outlet, self._outlet = self._outlet, None
+        if outlet is not None:
+            for line in outlet.close(self.keep):
+                logger.warning("rerun: %s", line)
+
+    def _begin(self, event: sr.RunStarted) -> None:
+        from sparserob_rerun.sinks import look
+
+        self.close()
+        nowhere = not (self.spawn or self.connect or self.serve or self.save)
+        file = "recording.rrd" if nowhere and event.directory is not None else self.save
+        chosen = look(None if file is None else (event.directory or Path()) / file, self.connect, self.spawn, self.serve)
+        if chosen.missing or not chosen.any:
+            logger.warning("rerun: %s", "; ".join(chosen.missing) or "there is no run directory to record into; give it a place with save")
+        if chosen.serve is not None:
+            logger.warning("rerun: to watch, open %s", chosen.page)
+        if chosen.any:
+            from sparserob_rerun.outlet import Outlet
+            from sparserob_rerun.recorder import Opening
+
+            opening = Opening(event.title, event.directory, event.inspection, self.landscape)
+            self._outlet = Outlet(opening, chosen, 0 if event.problem is None else event.problem.system.parameter_count)
+
+
+@sr.hookimpl
+def sparserob_observers() -> Iterator[sr.ObserverPlugin]:
+    """Offer ``rerun``."""
+    yield sr.ObserverPlugin(name="rerun", factory=Rerun, summary="Search, landscape, physics and bounds, live in the viewer of Rerun or in a file.")

@@ -1,0 +1,134 @@
+"""A plot as plain geometry: axes, ticks, curves and hatching in the pixels of a 2-D view.
+
+The viewer plots against its timelines only; the physics is a plot against the time of the system, which is another axis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+
+from sparserob_rerun.palette import FAINT, GREY, INK, Colour, Floats
+
+HATCHES = 60
+LIFT = 9.0          # the viewer writes labels this far below their points
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Axes:
+    """A plot ``width`` by ``height`` pixels with its upper left corner at ``(left, top)``; ``x`` and ``y`` are the limits of its axes."""
+
+    left: float
+    top: float
+    width: float
+    height: float
+    x: tuple[float, float]
+    y: tuple[float, float]
+
+    def at(self, x: Floats | float, y: Floats | float) -> Floats:
+        """Pixels ``(k, 2)`` of points; what lies outside the limits is drawn to the edge."""
+        across = self.left + self.width * (np.asarray(x, dtype=float) - self.x[0]) / (self.x[1] - self.x[0])
+        down = self.top + self.height * (self.y[1] - np.asarray(y, dtype=float)) / (self.y[1] - self.y[0])
+        points = np.stack(np.broadcast_arrays(across, down), axis=-1).reshape(-1, 2)
+        return np.asarray(np.clip(points, (self.left, self.top), (self.left + self.width, self.top + self.height)))
+
+
+@final
+class Drawing:
+    """Lines and labels in layers: collected first, then logged as few entities, because many of them slow the viewer down."""
+
+    def __init__(self) -> None:
+        self.strips: dict[str, list[tuple[Floats, Colour, float]]] = {}
+        self.labels: list[tuple[Floats, str, Colour]] = []
+        self.dots: list[tuple[Floats, Colour, float]] = []
+
+    def line(self, layer: str, points: Floats, colour: Colour, width: float = 1.5) -> None:
+        """A curve through pixels ``(k, 2)``."""
+        self.strips.setdefault(layer, []).append((points, colour, width))
+
+    def dashed(self, layer: str, points: Floats, colour: Colour, dash: float = 6.0) -> None:
+        """A straight line between two pixels ``(2, 2)``, interrupted."""
+        length = float(np.linalg.norm(points[1] - points[0]))
+        for start in np.arange(0.0, length, 2.0 * dash):
+            ends = np.array([[start], [min(start + dash, length)]]) / max(length, 1e-9)
+            self.line(layer, points[0] + ends * (points[1] - points[0]), colour, 1.0)
+
+    def dot(self, points: Floats, colour: Colour, size: float = 4.0) -> None:
+        """Dots at pixels ``(k, 2)``."""
+        self.dots.append((points, colour, size))
+
+    def text(self, x: float, y: float, words: str, colour: Colour = INK) -> None:
+        """Words centred at a pixel."""
+        self.labels.append((np.array([x, y - LIFT]), words, colour))
+
+    def frame(self, axes: Axes, title: str, x_label: str = "", ticks_below: bool = True) -> None:
+        """The box, ticks at round numbers, and the name of what is plotted above it."""
+        left, top, right, bottom = axes.left, axes.top, axes.left + axes.width, axes.top + axes.height
+        self.line("frame", np.array([[left, top], [left, bottom], [right, bottom]]), GREY, 1.0)
+        for value in ticks(*axes.y):
+            y = float(axes.at(axes.x[0], value)[0, 1])
+            self.line("frame", np.array([[left - 5, y], [left, y]]), GREY, 1.0)
+            self.text(left - 24, y, f"{value:g}", GREY)
+        for value in ticks(*axes.x):
+            x = float(axes.at(value, axes.y[0])[0, 0])
+            self.line("frame", np.array([[x, bottom], [x, bottom + 5]]), GREY, 1.0)
+            if ticks_below:
+                self.text(x, bottom + 15, f"{value:g}", GREY)
+        if axes.y[0] < 0.0 < axes.y[1]:
+            self.line("frame", axes.at(np.array(axes.x), np.zeros(2)), FAINT, 0.7)
+        self.text((left + right) / 2, top - 14, title)
+        if x_label:
+            self.text((left + right) / 2, bottom + 34, x_label, GREY)
+
+    def band(self, layer: str, axes: Axes, x: Floats, lower: Floats, upper: Floats, colour: Colour) -> None:
+        """The area between two curves, as upright strokes."""
+        grid = np.linspace(x[0], x[-1], 4 * HATCHES)
+        low, high = axes.at(grid, np.interp(grid, x, lower)), axes.at(grid, np.interp(grid, x, upper))
+        width = axes.width * (x[-1] - x[0]) / (axes.x[1] - axes.x[0]) / grid.size
+        for one, other in zip(low, high, strict=True):
+            self.line(layer, np.stack([one, other]), colour, width)
+
+    def hatched(self, layer: str, axes: Axes, x: tuple[float, float], y: tuple[float, float], colour: Colour) -> None:
+        """A forbidden box: strokes from lower left to upper right, and its outline on the side that can be reached."""
+        (left, bottom), (right, top) = axes.at(x[0], y[0])[0], axes.at(x[1], y[1])[0]
+        if right - left < 1.0 or bottom - top < 1.0:
+            return
+        step = axes.width / HATCHES
+        for start in np.arange(left - (bottom - top), right, step):
+            first, last = max(start, left), min(start + (bottom - top), right)
+            if last > first:
+                self.line(layer, np.array([[first, bottom - (first - start)], [last, bottom - (last - start)]]), colour, 1.0)
+
+    def log(self, rr: Any, stream: Any, path: str, static: bool = False, layers: Sequence[str] = ()) -> None:
+        """Log everything below ``path``, later ``layers`` above earlier ones."""
+        order = {layer: 10.0 * (place + 1) for place, layer in enumerate(layers)}
+        for layer, strips in self.strips.items():
+            stream.log(f"{path}/{layer}", rr.LineStrips2D(
+                [points for points, _, _ in strips], colors=[colour for _, colour, _ in strips],
+                radii=rr.Radius.ui_points([width / 2 for _, _, width in strips]) if layer != "tube" else [w / 2 for _, _, w in strips],
+                draw_order=order.get(layer, 5.0)), static=static)
+        if self.labels:
+            stream.log(f"{path}/labels", rr.Points2D(
+                np.array([place for place, _, _ in self.labels]), labels=[words for _, words, _ in self.labels],
+                colors=[colour for _, _, colour in self.labels], radii=rr.Radius.ui_points(0.0), show_labels=True, draw_order=90.0),
+                static=static)
+        if self.dots:
+            points = np.concatenate([places for places, _, _ in self.dots])
+            sizes = np.concatenate([np.full(len(places), size) for places, _, size in self.dots])
+            colours = np.concatenate([np.tile(colour, (len(places), 1)) for places, colour, _ in self.dots]).astype(np.uint8)
+            stream.log(f"{path}/dots", rr.Points2D(points, colors=colours, radii=rr.Radius.ui_points(sizes), draw_order=80.0), static=static)
+
+
+def ticks(low: float, high: float, most: int = 5) -> Floats:
+    """Round numbers within limits."""
+    span = high - low
+    raw = span / most
+    power = 10.0 ** np.floor(np.log10(raw))
+    step = next(power * factor for factor in (1.0, 2.0, 2.5, 5.0, 10.0) if power * factor >= raw * (1 - 1e-12))
+    first = np.ceil(low / step - 1e-9)
+    values = step * np.arange(first, np.floor(high / step + 1e-9) + 1)
+    return np.where(np.abs(values) < 1e-12 * span, 0.0, values)

@@ -1,0 +1,169 @@
+"""The process that records: it takes events from a queue, logs them, and works on the landscape while there are none."""
+
+from __future__ import annotations
+
+import os
+import queue
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from importlib.abc import MetaPathFinder
+from typing import Any, final
+
+import sparserob_core as sr
+from sparserob_rerun.layout import layout
+from sparserob_rerun.recorder import Opening, Recorder, shown_of
+from sparserob_rerun.sinks import Destinations, open_sinks
+
+IDLE = 0.5          # seconds between two looks at whether the run is still alive
+FLUSHING = 5.0
+NICE = 10
+
+
+@final
+@dataclass(frozen=True)
+class Ending:
+    """The last message: how many events were dropped before it, and for how many seconds a browser is served from then on."""
+
+    dropped: int = 0
+    keep: float = 0.0
+
+
+@final
+@dataclass(frozen=True)
+class Account:
+    """What the process says of itself at the end."""
+
+    wrong: list[str] = field(default_factory=list)
+    addresses: list[str] = field(default_factory=list)
+
+
+def record(messages: Any, report: Any, opening: Opening, chosen: Destinations, name: str) -> None:
+    """The whole life of the process. Nothing that it does can reach the run: neither its signals nor its failures."""
+    _settle()
+    parent, wrong = os.getppid(), []
+    try:
+        wrong = _record(messages, opening, chosen, name, parent)
+    except Exception as error:  # noqa: BLE001  told at the end, by the process that has a terminal
+        wrong = [f"the recording broke off: {type(error).__name__}: {error}"]
+    with suppress(OSError):
+        report.send(Account(wrong))
+        report.close()
+
+
+def _record(messages: Any, opening: Opening, chosen: Destinations, name: str, parent: int) -> list[str]:
+    sys.meta_path.insert(0, _WithoutPandas())
+    import rerun as rr
+
+    inspection = opening.answers()
+    shown = shown_of(inspection, opening.landscape)
+    stream = rr.RecordingStream("sparserob", recording_id=name)
+    wrong, servers = open_sinks(rr, stream, chosen, layout(shown))
+    ending = Ending()
+    try:
+        recorder = Recorder(rr, stream, opening, shown, inspection)
+        ending = _listen(messages, recorder, parent, wrong, 1.0 if opening.landscape is None else opening.landscape.share)
+        if ending.dropped:
+            recorder.say(f"{ending.dropped} events came faster than they could be recorded, and were dropped", "WARN")
+        _finish_landscape(recorder, opening)
+        if recorder.explorer.wrong:
+            recorder.say(recorder.explorer.wrong, "WARN")
+        stream.flush(timeout_sec=FLUSHING)
+    except RuntimeError as error:  # of the flush: a viewer that went away
+        wrong.append(f"not everything has arrived: {error}")
+    finally:
+        stream.disconnect()
+        _serve(servers, ending.keep, parent)
+    return wrong
+
+
+@final
+class Pause:
+    """Keeps the background work to a share of the time: after it, as much rest as the share asks for."""
+
+    def __init__(self, share: float) -> None:
+        self.share, self.until = share, 0.0
+
+    @property
+    def left(self) -> float:
+        """Seconds of rest that are left."""
+        return max(0.0, self.until - time.monotonic())
+
+    def work(self, task: Callable[[], None]) -> None:
+        """Do a piece of work, if the rest is over."""
+        if self.left == 0.0:
+            began = time.monotonic()
+            task()
+            now = time.monotonic()
+            self.until = now + (now - began) * (1.0 / self.share - 1.0)
+
+
+def _serve(servers: list[subprocess.Popen[bytes]], keep: float, parent: int) -> None:
+    """Let a browser look on for a while."""
+    end = time.monotonic() + keep
+    try:
+        while servers and time.monotonic() < end and os.getppid() == parent:
+            time.sleep(IDLE)
+    finally:
+        for server in servers:
+            server.terminate()
+
+
+def _listen(messages: Any, recorder: Recorder, parent: int, wrong: list[str], share: float) -> Ending:
+    """Log whatever comes until the run is over, or gone; an event that cannot be drawn is left out, and the first of them is told."""
+    pause = Pause(share)
+    while True:
+        try:
+            message = messages.get(timeout=pause.left if recorder.explorer.busy else IDLE)
+        except queue.Empty:
+            if os.getppid() != parent:
+                return Ending()
+            pause.work(recorder.idle)
+            continue
+        if isinstance(message, Ending):
+            return message
+        try:
+            recorder.receive(*message)
+        except Exception as error:  # noqa: BLE001  a picture less is better than no recording
+            if not wrong:
+                wrong.append(f"a {type(message[0]).__name__} could not be drawn: {type(error).__name__}: {error}")
+        if isinstance(message[0], sr.RunFinished):
+            recorder.over = message[0].seconds if message[0].result is not None else -1.0
+
+
+def _finish_landscape(recorder: Recorder, opening: Opening) -> None:
+    """A short run waits for its landscape; a long one had it meanwhile, and one that broke off does not wait."""
+    explorer = recorder.explorer
+    if opening.landscape is None or recorder.over < 0.0:
+        return
+    shown = recorder.terrain.known is not None
+    end = time.monotonic() + opening.landscape.patience - (0.5 * recorder.over if shown else 0.0)
+    if time.monotonic() < end:
+        explorer.hurry()
+    while explorer.busy and time.monotonic() < end:
+        recorder.idle()
+    recorder.mark()
+
+
+@final
+class _WithoutPandas(MetaPathFinder):
+    """pyarrow imports pandas where it is installed, for seconds and 50 MB; nothing here needs it."""
+
+    def find_spec(self, fullname: str, path: object = None, target: object = None) -> None:
+        """Nothing, but for pandas an error."""
+        if fullname == "pandas":
+            raise ModuleNotFoundError("pandas is left out", name=fullname)
+
+
+def _settle() -> None:
+    """Hear no signals of the terminal, take one core only, and step back for everybody else."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(0))  # through `finally`, to the servers
+    with suppress(OSError, AttributeError):
+        os.nice(NICE)
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    sys.stdin = None

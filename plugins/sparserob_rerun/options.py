@@ -1,0 +1,26 @@
+"""The options of the landscape."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+import sparserob_core as sr
+
+
+class LandscapeOptions(sr.Options):
+    """The landscape of ``g``, evaluated in the background."""
+
+    coordinates: tuple[str, str] | None = None
+    """Two coordinates of the tuple, such as [t, p1], or [t[1], t[4]] for the times of its first and fourth index; null: the most influential two."""
+
+    grid: int = Field(default=32, ge=8, le=256)
+    """Points along each of the two."""
+
+    evaluations: int = Field(default=4000, ge=64)
+    """Evaluations of g that all landscapes of a run may take."""
+
+    share: float = Field(default=0.04, gt=0.0, le=1.0)
+    """Share of one core that it may take during the run: two cores are often one, and what works beside the solver slows it down."""
+
+    patience: float = Field(default=3.0, ge=0.0, le=600.0)
+    """Seconds that a short run waits for its landscape at its end; half of the run's own time is taken off once something is drawn."""

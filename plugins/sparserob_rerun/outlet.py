@@ -1,0 +1,142 @@
+"""The run's end of a recording: a queue that takes an event in microseconds, and never makes the solver wait."""
+
+from __future__ import annotations
+
+import multiprocessing
+import queue
+import sys
+import time
+import uuid
+import warnings
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any, final
+
+import numpy as np
+
+import sparserob_core as sr
+from sparserob_rerun.desk import Account, Ending, record
+from sparserob_rerun.recorder import Opening
+from sparserob_rerun.sinks import Destinations
+
+CAPACITY = 512      # events that may wait
+COLLECTING = 0.4    # seconds for which evaluations are collected before they are sent
+LARGE = 64          # coordinates of one index from which on only times and parameters are sent
+CLOSING = 20.0      # seconds that the process may take to finish its files, beyond the patience of the landscape
+START = "fork" if sys.platform.startswith("linux") else "spawn"
+
+
+@final
+class Outlet:
+    """One process that records one run. Everything about it may fail, and the run does not notice."""
+
+    def __init__(self, opening: Opening, chosen: Destinations, parameters: int, capacity: int = CAPACITY) -> None:
+        context: Any = multiprocessing.get_context(START)
+        self.patience = 0.0 if opening.landscape is None else opening.landscape.patience
+        self.parameters, self.dropped, self.dead = parameters, 0, False
+        self.pending: list[sr.EvaluationsFinished] = []
+        self.since = 0.0
+        self.kept: np.ndarray | None = None
+        self.messages = context.Queue(capacity)
+        self.report, theirs = context.Pipe(duplex=False)
+        sent = opening if START == "fork" else replace(opening, inspection=None)
+        self.process = context.Process(target=record, args=(self.messages, theirs, sent, chosen, uuid.uuid4().hex), daemon=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # of a fork beside other threads: the child uses none of them
+            self.process.start()
+        theirs.close()
+
+    def send(self, event: sr.Event) -> None:
+        """Pass an event on, or drop it where too many are waiting already. Evaluations are collected for a moment."""
+        if isinstance(event, sr.EvaluationsFinished):
+            part = self._thin(event)
+            if self.pending and not follows(self.pending[-1], part):
+                self._flush()
+            if not self.pending:
+                self.since = time.monotonic()
+            self.pending.append(part)
+            if time.monotonic() - self.since < COLLECTING:
+                return
+            self._flush()
+        else:
+            self._flush()
+            self._put((event, None))
+
+    def _flush(self) -> None:
+        pending, self.pending = self.pending, []
+        if pending:
+            self._put((joined(pending), self.kept))
+
+    def _put(self, message: tuple[sr.Event, np.ndarray | None]) -> None:
+        if not self.dead:
+            try:
+                self.messages.put_nowait(message)
+                return
+            except queue.Full:
+                self.dead = not self.process.is_alive()
+        self.dropped += 1
+
+    def close(self, keep: float = 0.0) -> list[str]:
+        """End the recording; returns what there is to complain about. An interrupt ends the waiting, not more."""
+        wrong = []
+        self._flush()
+        try:
+            wrong = self._closed(keep)
+        except KeyboardInterrupt:
+            wrong = [] if keep else ["interrupted while the recording was being finished"]
+        finally:
+            if self.process.is_alive():
+                self.process.terminate()
+            self.process.join(3.0)
+            if self.process.is_alive():
+                self.process.kill()
+            self.messages.cancel_join_thread()
+            self.messages.close()
+        if self.dropped:
+            wrong.append(f"{self.dropped} events came faster than they could be recorded, and were dropped")
+        return wrong
+
+    def _closed(self, keep: float) -> list[str]:
+        end = time.monotonic() + self.patience + CLOSING
+        while self.process.is_alive() and time.monotonic() < end:
+            with suppress(queue.Full):
+                self.messages.put(Ending(self.dropped, keep), timeout=0.2)
+                break
+        while time.monotonic() < end + keep:
+            if self.report.poll(0.05):
+                with suppress(EOFError, OSError):
+                    account = self.report.recv()
+                    self.process.join(CLOSING)
+                    return list(account.wrong) if isinstance(account, Account) else []
+                break
+        return ["the process that records ended early" if not self.process.is_alive() else "the recording could not be finished in time"]
+
+    def _thin(self, event: sr.EvaluationsFinished) -> sr.EvaluationsFinished:
+        """The event without what is too much: of an index with many coordinates the time and the parameters are sent."""
+        if event.block < LARGE or not event.best_point.size:
+            self.kept = None
+            return replace(event, domain=None)
+        offsets = [0, *range(event.block - self.parameters, event.block)]
+        kept = self.kept = (np.arange(0, event.best_point.size, event.block)[:, np.newaxis] + offsets).ravel()
+        batch = event.batch
+        origin = None if batch.origin is None else batch.origin[kept]
+        return replace(event, domain=None, batch=replace(batch, points=[piece[:, kept] for piece in batch.points], origin=origin))
+
+
+def follows(before: sr.EvaluationsFinished, event: sr.EvaluationsFinished) -> bool:
+    """Whether an event goes on where another one of the same search ended."""
+    return event.family == before.family and event.round == before.round and event.total - event.count == before.total
+
+
+def joined(parts: list[sr.EvaluationsFinished]) -> sr.EvaluationsFinished:
+    """Successive events of one search as one."""
+    first, batches = parts[0].batch, [part.batch for part in parts]
+    notes: dict[str, list[tuple[float, float]]] = {}
+    for batch in batches:
+        for name, rows in batch.notes.items():
+            notes.setdefault(name, []).extend(rows)
+    points = [np.concatenate(list(batch.points)) for batch in batches if len(batch.points)]
+    values = [np.concatenate(list(batch.values)) for batch in batches if len(batch.values)]
+    moments = [moment for batch in batches for moment in batch.moments]
+    whole = replace(first, points=points, values=values, moments=moments, notes=notes)
+    return replace(parts[-1], count=sum(part.count for part in parts), batch=whole)

@@ -1,0 +1,114 @@
+"""The state space: a plane for two states, space for three; the first states of more."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import product
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sparserob_rerun import palette as ink
+from sparserob_rerun.canvas import Axes, Drawing
+
+if TYPE_CHECKING:
+    import sparserob_core as sr
+    from sparserob_rerun.palette import Floats
+
+SIDE = 420.0
+SLICES = 36
+
+
+def draw_phase(rr: Any, stream: Any, data: sr.FigureData, worst: Mapping[str, Any]) -> None:
+    """The nominal trajectory, the worst ones, slices of the tube and the terminal set below ``/physics/phase``; nothing for a single state."""
+    if len(data.state) == 2:
+        _plane(data, worst).log(rr, stream, "physics/phase", layers=("hatch", "slices", "frame", "worst", "curve", "wall"))
+    elif len(data.state) > 2:
+        _space(rr, stream, data, worst)
+
+
+def _slices(data: sr.FigureData) -> Floats:
+    """Boxes ``(k, d, 2)`` that hold every state at some times."""
+    which = np.unique(np.linspace(0, data.times.size - 1, SLICES).astype(int))
+    return np.stack([data.tube_lower[:, which].T, data.tube_upper[:, which].T], axis=-1)
+
+
+def _plane(data: sr.FigureData, worst: Mapping[str, Any]) -> Drawing:
+    axes = Axes(60.0, 0.0, SIDE, SIDE, _limits(data, 0), _limits(data, 1))
+    drawing = Drawing()
+    drawing.frame(axes, "x2 over x1: worst-case boxes along the way", "x1")
+    for box in _slices(data):
+        (a, b), (c, d) = box
+        drawing.line("slices", axes.at(np.array([a, b, b, a, a]), np.array([c, c, d, d, c])), ink.TUBE, 1.0)
+    _walls(drawing, axes, data)
+    for path in worst.get("states", ()):
+        drawing.line("worst", axes.at(path[0], path[1]), ink.ORANGE, 1.2)
+    drawing.line("curve", axes.at(data.state[0], data.state[1]), ink.SKY, 2.0)
+    drawing.dot(axes.at(data.state[0, 0], data.state[1, 0]), ink.INK, 5.0)
+    start = axes.at(data.state[0, 0], data.state[1, 0])[0]
+    drawing.text(float(start[0]), float(start[1]) - 14.0, "x(0)")
+    return drawing
+
+
+def _walls(drawing: Drawing, axes: Axes, data: sr.FigureData) -> None:
+    end = [wall for wall in data.walls if wall.start == wall.end]
+    if end:
+        limits = [axes.x, axes.y]
+        for wall in end:
+            limits[wall.state] = (max(wall.lower, limits[wall.state][0]), min(wall.upper, limits[wall.state][1]))
+        (a, b), (c, d) = limits
+        drawing.line("wall", axes.at(np.array([a, b, b, a, a]), np.array([c, c, d, d, c])), ink.VERMILLION, 2.0)
+        drawing.text(float(axes.at((a + b) / 2, d)[0, 0]), float(axes.at(a, d)[0, 1]) - 12.0, "terminal set", ink.VERMILLION)
+    for wall in data.walls:
+        if wall.start == wall.end:
+            continue
+        low, high = axes.x if wall.state == 0 else axes.y
+        for edge, outside in ((wall.lower, low), (wall.upper, high)):
+            if np.isfinite(edge):
+                span = (min(edge, outside), max(edge, outside))
+                across, up = (span, axes.y) if wall.state == 0 else (axes.x, span)
+                drawing.hatched("hatch", axes, across, up, ink.HATCH)
+
+
+def _limits(data: sr.FigureData, state: int) -> tuple[float, float]:
+    edges = [edge for wall in data.walls if wall.state == state for edge in (wall.lower, wall.upper) if np.isfinite(edge)]
+    low, high = min([*edges, float(data.tube_lower[state].min())]), max([*edges, float(data.tube_upper[state].max())])
+    margin = 0.1 * max(high - low, 1e-9)
+    return low - margin, high + margin
+
+
+def _space(rr: Any, stream: Any, data: sr.FigureData, worst: Mapping[str, Any]) -> None:
+    boxes = _slices(data)[:, :3]
+    stream.log("physics/phase/nominal", rr.LineStrips3D([data.state[:3].T], colors=[ink.SKY], radii=rr.Radius.ui_points(1.5)))
+    stream.log("physics/phase/tube", rr.Boxes3D(centers=boxes.mean(axis=2), half_sizes=(boxes[:, :, 1] - boxes[:, :, 0]) / 2,
+                                                colors=[ink.TUBE] * len(boxes), radii=rr.Radius.ui_points(0.7)))
+    if len(worst.get("states", ())):
+        stream.log("physics/phase/worst", rr.LineStrips3D([path[:3].T for path in worst["states"]], colors=[ink.ORANGE],
+                                                          radii=rr.Radius.ui_points(1.0)))
+    ends = [(float(data.tube_lower[k].min()), float(data.tube_upper[k].max())) for k in range(3)]
+    stream.log("physics/phase/axes", rr.LineStrips3D(_cage(ends), colors=[ink.FAINT], radii=rr.Radius.ui_points(0.5)))
+    start = data.state[:3, 0]
+    corners = [(tuple(ends[j][1 if j == k else 0] for j in range(3)), f"x{k + 1} = {ends[k][1]:.3g}") for k in range(3)]
+    stream.log("physics/phase/labels", rr.Points3D([start, *(place for place, _ in corners)], labels=["x(0)", *(words for _, words in corners)],
+                                                   colors=[ink.INK], radii=rr.Radius.ui_points(3.0), show_labels=True))
+    terminal = [list(limits) for limits in ends]
+    for wall in data.walls:
+        if wall.start == wall.end and wall.state < 3:
+            terminal[wall.state] = [max(wall.lower, terminal[wall.state][0]), min(wall.upper, terminal[wall.state][1])]
+    if any(wall.start == wall.end for wall in data.walls):
+        box = np.array(terminal)
+        stream.log("physics/phase/terminal", rr.Boxes3D(centers=[box.mean(axis=1)], half_sizes=[(box[:, 1] - box[:, 0]) / 2],
+                                                        colors=[ink.VERMILLION], radii=rr.Radius.ui_points(1.5)))
+
+
+def _cage(ends: list[tuple[float, float]]) -> list[Floats]:
+    """The twelve edges of a box."""
+    edges = []
+    for axis in range(3):
+        others = [k for k in range(3) if k != axis]
+        for sides in product((0, 1), repeat=2):
+            points = np.zeros((2, 3))
+            points[:, axis] = ends[axis]
+            points[:, others[0]], points[:, others[1]] = ends[others[0]][sides[0]], ends[others[1]][sides[1]]
+            edges.append(points)
+    return edges

@@ -1,0 +1,164 @@
+"""The control, what pushes it, and every state between its walls, against the time of the system."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+
+import sparserob_core as sr
+from sparserob_rerun import palette as ink
+from sparserob_rerun.canvas import Axes, Drawing
+from sparserob_rerun.palette import Floats
+from sparserob_rerun.switching import Switching
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+LEFT, WIDTH, HEIGHT, GAP = 60.0, 640.0, 118.0, 46.0
+MOST_CONTROLS, MOST_STATES = 2, 4
+SERIES = {"nominal": ink.SKY, "worst case from below": ink.GREY, "worst case from above": ink.GREY}
+
+
+def extent(count: int) -> tuple[float, float, float, float]:
+    """Left, right, top and bottom of ``count`` plots above one another."""
+    return 0.0, LEFT + WIDTH + 30.0, -30.0, count * (HEIGHT + GAP) + 8.0
+
+
+def plots(problem: sr.OptimalControlProblem) -> int:
+    """How many plots a problem has: two for every control, one for every state."""
+    return 2 * min(MOST_CONTROLS, problem.system.controls) + min(MOST_STATES, problem.system.states)
+
+
+@final
+class Physics:
+    """Draws one decision after the other below ``/physics``."""
+
+    def __init__(self, rr: Any, stream: Any, view: sr.Inspection) -> None:
+        self.rr, self.stream, self.view = rr, stream, view
+        self.switching = Switching(view.program)
+
+    def draw(self, decision: Floats, cuts: Sequence[sr.Cut], mu: Floats | None) -> None:
+        """One decision with the constraints that carry a multiplier; ``mu`` are the multipliers of the equalities, if they are known."""
+        from sparserob_rerun.phase import draw_phase
+
+        active = [cut for cut in cuts if cut.multiplier > 0.0]
+        times = np.unique([cut.index[0] for cut in active])
+        data = self.view.picture(decision, times)
+        worst = self.view.worst_cases(decision)
+        drawing = Drawing()
+        tops = iter(range(100))
+        push = self.switching.push(active, mu)
+        for channel in range(min(MOST_CONTROLS, len(data.control))):
+            self._control(drawing, _axes(next(tops), data, _control_limits(data, channel)), data, channel)
+            self._push(drawing, _axes(next(tops), data, (-2.0, 2.0)), data, push, channel)
+        for state in range(min(MOST_STATES, len(data.state))):
+            self._state(drawing, _axes(next(tops), data, _state_limits(data, state)), data, worst, state)
+        self._marks(drawing, data, times, next(tops))
+        drawing.log(self.rr, self.stream, "physics/plots", layers=("hatch", "tube", "frame", "marks", "worst", "curve", "wall"))
+        draw_phase(self.rr, self.stream, data, worst)
+
+    def signals(self, decision: Floats) -> None:
+        """The final control and states as series on a timeline of their own, ``t``: the time of the system in seconds."""
+        rr, data = self.rr, self.view.picture(decision, np.empty(0))
+        at = [rr.TimeColumn("t", duration=data.breakpoints[:-1])]
+        channels = len(data.control)
+        names = [_name("u", channel, channels) for channel in range(channels)]
+        self.stream.log("signals/control", rr.SeriesLines(names=names, interpolation_mode="StepAfter"), static=True)
+        rows = rr.Scalars.columns(scalars=data.control.T.ravel()).partition([channels] * data.control.shape[1])
+        self.stream.send_columns("signals/control", at, rows)
+        at = [rr.TimeColumn("t", duration=data.times)]
+        for state in range(len(data.state)):
+            path = f"signals/{_name('x', state, len(data.state))}"
+            self.stream.log(path, rr.SeriesLines(names=list(SERIES), colors=list(SERIES.values())), static=True)
+            values = np.stack([data.state[state], data.tube_lower[state], data.tube_upper[state]], axis=1)
+            self.stream.send_columns(path, at, rr.Scalars.columns(scalars=values.ravel()).partition([3] * len(values)))
+
+    def _control(self, drawing: Drawing, axes: Axes, data: sr.FigureData, channel: int) -> None:
+        name = _name("u", channel, len(data.control))
+        drawing.frame(axes, f"control {name}(t): dashed, its bounds", ticks_below=False)
+        for bound in (data.control_lower[channel], data.control_upper[channel]):
+            drawing.dashed("marks", axes.at(np.array(axes.x), np.full(2, bound)), ink.VERMILLION)
+        steps, edges = data.control[channel], data.breakpoints
+        drawing.band("tube", axes, *_fill(edges, steps), ink.TUBE)
+        drawing.line("curve", axes.at(np.repeat(edges, 2)[1:-1], np.repeat(steps, 2)), ink.SKY, 2.0)
+
+    def _push(self, drawing: Drawing, axes: Axes, data: sr.FigureData, push: Floats | None, channel: int) -> None:
+        name = _name("u", channel, len(data.control))
+        if push is None or not push.any():
+            drawing.frame(axes, f"why {name} switches: no constraint pushes, or its push is not known", ticks_below=False)
+            return
+        values = push[channel]
+        reach = max(1.5, float(np.abs(values).max()) * 1.15)
+        axes = Axes(axes.left, axes.top, axes.width, axes.height, axes.x, (-reach, reach))
+        drawing.frame(axes, f"why {name} switches: the active constraints' push on it; {name} acts where the push leaves the band", ticks_below=False)
+        for price in (-1.0, 1.0):
+            drawing.dashed("marks", axes.at(np.array(axes.x), np.full(2, price)), ink.GREY)
+        edges = data.breakpoints
+        middles = (edges[:-1] + edges[1:]) / 2
+        for side in (1.0, -1.0):
+            beyond = np.where(side * values > 1.0, values, side)
+            drawing.band("tube", axes, middles, np.full(middles.size, side), beyond, ink.TUBE)
+        drawing.line("curve", axes.at(middles, values), ink.PURPLE, 2.0)
+
+    def _state(self, drawing: Drawing, axes: Axes, data: sr.FigureData, worst: Mapping[str, Any], state: int) -> None:
+        name = _name("x", state, len(data.state))
+        drawing.frame(axes, f"state {name}(t): nominal, worst-case tube, walls", ticks_below=state == min(MOST_STATES, len(data.state)) - 1)
+        drawing.band("tube", axes, data.times, data.tube_lower[state], data.tube_upper[state], ink.TUBE)
+        for wall in data.walls:
+            if wall.state == state:
+                _wall(drawing, axes, wall.lower, wall.upper, wall.start, wall.end)
+        for path in worst.get("states", ()):
+            drawing.line("worst", axes.at(worst["state_times"], path[state]), ink.ORANGE, 1.2)
+        drawing.line("curve", axes.at(data.times, data.state[state]), ink.SKY, 2.0)
+
+    def _marks(self, drawing: Drawing, data: sr.FigureData, times: Floats, count: int) -> None:
+        """The times of the active constraints, through all plots and as dots on every time axis."""
+        for position in range(count):
+            axes = _axes(position, data, (0.0, 1.0))
+            for time in times:
+                drawing.dashed("marks", axes.at(np.full(2, time), np.array([0.0, 1.0])), ink.PURPLE)
+            if times.size:
+                drawing.dot(axes.at(times, 0.0), ink.PURPLE, 5.0)
+
+
+def _axes(position: int, data: sr.FigureData, limits: tuple[float, float]) -> Axes:
+    return Axes(LEFT, position * (HEIGHT + GAP), WIDTH, HEIGHT, (float(data.breakpoints[0]), float(data.breakpoints[-1])), limits)
+
+
+def _wall(drawing: Drawing, axes: Axes, lower: float, upper: float, start: float, end: float) -> None:
+    if start == end:
+        right = axes.at(end, axes.y[0])[0, 0]
+        top, bottom = axes.at(end, min(upper, axes.y[1]))[0, 1], axes.at(end, max(lower, axes.y[0]))[0, 1]
+        drawing.line("wall", np.array([[right + 2, top], [right + 7, top], [right + 7, bottom], [right + 2, bottom]]), ink.VERMILLION, 3.0)
+        return
+    for edge, outside in ((lower, axes.y[0]), (upper, axes.y[1])):
+        if np.isfinite(edge):
+            drawing.hatched("hatch", axes, (start, end), (min(edge, outside), max(edge, outside)), ink.HATCH)
+            drawing.line("wall", axes.at(np.array([start, end]), np.full(2, edge)), ink.VERMILLION, 1.5)
+
+
+def _fill(edges: Floats, steps: Floats) -> tuple[Floats, Floats, Floats]:
+    middles = (edges[:-1] + edges[1:]) / 2
+    return middles, np.minimum(steps, 0.0), np.maximum(steps, 0.0)
+
+
+def _control_limits(data: sr.FigureData, channel: int) -> tuple[float, float]:
+    known = [float(value) for value in (data.control_lower[channel], data.control_upper[channel]) if np.isfinite(value)]
+    return _padded([*known, 0.0, float(data.control[channel].min()), float(data.control[channel].max())])
+
+
+def _state_limits(data: sr.FigureData, state: int) -> tuple[float, float]:
+    edges = [edge for wall in data.walls if wall.state == state for edge in (wall.lower, wall.upper) if np.isfinite(edge)]
+    return _padded([*edges, float(data.tube_lower[state].min()), float(data.tube_upper[state].max())])
+
+
+def _padded(values: list[float]) -> tuple[float, float]:
+    low, high = min(values), max(values)
+    margin = 0.12 * max(high - low, 1e-9)
+    return low - margin, high + margin
+
+
+def _name(letter: str, index: int, count: int) -> str:
+    return f"{letter}{index + 1}" if count > 1 else letter

@@ -1,0 +1,190 @@
+"""From events to a recording: what happens in the process that does all the work."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+import sparserob_core as sr
+from sparserob_rerun import words
+from sparserob_rerun.clock import Clock
+from sparserob_rerun.explorer import Explorer
+from sparserob_rerun.layout import Shown
+from sparserob_rerun.options import LandscapeOptions
+from sparserob_rerun.palette import Floats
+from sparserob_rerun.physics import Physics
+from sparserob_rerun.rounds import Rounds
+from sparserob_rerun.search import Search
+from sparserob_rerun.terrain import Terrain
+from sparserob_rerun.way import Way
+
+PICTURES = 60       # rounds whose physics is drawn; of later ones every tenth
+PROOFS = 12         # lines about the proof of one family
+SLOTS = 16          # active constraints at most that make the tuple of a method without one
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Opening:
+    """What a recording knows of its run at the beginning. Without an ``inspection`` it is read from the ``directory``, if there is one."""
+
+    title: str
+    directory: Path | None
+    inspection: sr.Inspection | None
+    landscape: LandscapeOptions | None
+
+    def answers(self) -> sr.Inspection | None:
+        """Who answers questions about the run."""
+        if self.inspection is not None or self.directory is None:
+            return self.inspection
+        return sr.Inspection.read(self.directory)
+
+
+@final
+class Recorder:
+    """Logs the events of one run to a stream that is already open."""
+
+    def __init__(self, rr: Any, stream: Any, opening: Opening, shown: Shown, inspection: sr.Inspection | None) -> None:
+        self.rr, self.stream, self.opening, self.inspection = rr, stream, opening, inspection
+        self.clock, self.rounds = Clock(rr, stream), Rounds(rr, stream, inspection)
+        problem = None if inspection is None else inspection.problem
+        self.physics = Physics(rr, stream, inspection) if inspection is not None and problem is not None else None
+        self.terrain = Terrain(rr, stream)
+        self.explorer = Explorer(self.terrain, inspection, opening.landscape)
+        self.search = Search(rr, stream, self.clock)
+        self.searches, self.began = shown.searches, 0.0
+        self.best, self.best_value, self.block = np.zeros(0), -np.inf, 1
+        self.lower, self.upper, self.over = -np.inf, np.inf, -1.0
+        self.exact: float | None = None
+        self.proofs: dict[str, int] = {}
+        self.way = Way()
+        self.clock.move()
+        self.say(f"run: {opening.title}")
+        self._page("solving", [])
+
+    def receive(self, event: sr.Event, kept: np.ndarray | None = None) -> None:
+        """Log one event; of evaluated points only the coordinates ``kept`` have come along, or all of them."""
+        match event:
+            case sr.EvaluationsFinished():
+                self._evaluations(event, np.arange(event.best_point.size) if kept is None else kept)
+            case sr.RoundFinished():
+                self._round(event)
+            case sr.ProofProgress():
+                self.clock.move(seconds=event.seconds)
+                self.proofs[event.family] = self.proofs.get(event.family, 0) + 1
+                if self.proofs[event.family] <= PROOFS:
+                    self.say(f"proof of {event.family}: {event.cells} cells open, violation not excluded {event.bound:.1e}", "DEBUG")
+            case sr.RunFinished():
+                self._finished(event)
+
+    def say(self, line: str, level: str = "INFO") -> None:
+        """A line of the log."""
+        self.stream.log("log", self.rr.TextLog(line, level=level))
+
+    def mark(self) -> None:
+        """Mark on the last landscape where the maximum is, if it was proven."""
+        landscape = self.explorer.landscape
+        if landscape is not None and self.exact is not None and self.explorer.words.endswith(("the end", f"round {self.clock.round}")):
+            at = np.array([[landscape.anchor[landscape.first], landscape.anchor[landscape.second]]])
+            self.terrain.mark(at, f"exact maximum {self.exact:.5g}")
+
+    def _evaluations(self, event: sr.EvaluationsFinished, kept: np.ndarray) -> None:
+        if event.total == event.count:
+            self.began = self.clock.seconds
+        if event.family:
+            self.search.separation(event, self.began)
+            return
+        names = () if self.inspection is None else self.inspection.names(event.block)
+        self.search.show(event, self.began, names, kept)
+        if not event.best_point.size:
+            return
+        if event.total == event.count:
+            slots = event.best_point.reshape(-1, event.block)
+            self.explorer.aim(slots, event.epsilon, f"others as in the first tuples of search {max(1, event.round)}")
+        if event.best_value > self.best_value or event.total == event.count:
+            self.say(f"evaluation {self.clock.evaluation}: best g {event.best_value:.8g}", "TRACE")
+        self.best, self.best_value, self.block = event.best_point, event.best_value, event.block
+        self.way.go(event, kept, self.terrain)
+
+    def idle(self) -> None:
+        """Work on the landscape for a moment; the way of the search comes over to a new one."""
+        self.explorer.step()
+        if self.terrain.known is not None and self.terrain.known is not self.way.landscape:
+            self.way.project(self.terrain)
+
+    def _round(self, event: sr.RoundFinished) -> None:
+        self.clock.move(None if self.searches else event.relaxed_programs, event.round, event.seconds)
+        self.lower = max(self.lower, event.lower_bound)
+        self.upper = min(self.upper, np.inf if event.simplified else event.upper_bound)
+        self.rounds.bounds(event)
+        lines = words.round_lines(event)
+        for line in lines:
+            self.say(line, "INFO" if line is lines[0] else "DEBUG")
+        self._page("solving", lines[:1])
+        self._aim(event)
+        if event.decision is None or (event.round > PICTURES and event.round % 10):
+            return
+        cuts = active(event.imposed, event.multipliers)
+        if self.physics is not None:
+            self.physics.draw(event.decision, cuts, None)
+        self.rounds.violations(event.decision, cuts, event.added)
+
+    def _aim(self, event: sr.RoundFinished) -> None:
+        """The tuple whose surroundings are worth a look after a round: the best of the search, or the constraints that are active."""
+        if self.searches and self.best.size:
+            self.explorer.aim(self.best.reshape(-1, self.block), event.epsilon, f"others as in the best tuple of round {event.round}")
+        elif not self.searches:
+            slots = slots_of(active(event.imposed, event.multipliers))
+            if slots.size:
+                self.explorer.aim(slots, event.epsilon, f"others as active in round {event.round}")
+
+    def _finished(self, event: sr.RunFinished) -> None:
+        self.clock.move(seconds=event.seconds)
+        result = event.result
+        lines = words.verdict_lines(event)
+        if result is not None:
+            self.lower, self.upper = result.lower_bound, result.upper_bound
+            self.exact = result.value if event.status == "certified" else None
+            if result.decision is not None and self.physics is not None:
+                self.physics.draw(result.decision, result.indices, result.dual.mu)
+                self.physics.signals(result.decision)
+            if result.decision is not None:
+                self.rounds.violations(result.decision, result.indices, ())
+            if self.explorer.landscape is None and self.explorer.waiting is None and result.indices:  # a run that is shown again
+                self.explorer.aim(slots_of(list(result.indices)), result.epsilon, "others as active at the end")
+        self.say(f"{event.status}: {event.message}", {"failed": "ERROR", "refuted": "WARN", "undecided": "WARN"}.get(event.status, "INFO"))
+        self._page(event.status, lines)
+
+    def _page(self, status: str, lines: list[str]) -> None:
+        text = words.page(self.opening.title, status, self.lower, self.upper, lines)
+        self.stream.log("verdict", self.rr.TextDocument(text, media_type="text/markdown"))
+
+
+def shown_of(inspection: sr.Inspection | None, landscape: LandscapeOptions | None) -> Shown:
+    """What a run has to show."""
+    if inspection is None:
+        return Shown(None, 0, True, False)
+    searches = inspection.config["method"]["name"] not in ("exchange", "scenario", "nominal")
+    return Shown(inspection.problem, len(inspection.program.families), searches, landscape is not None)
+
+
+def active(cuts: Any, multipliers: Floats) -> list[sr.Cut]:
+    """The cuts that carry a multiplier, with it."""
+    from dataclasses import replace
+
+    return [replace(cut, multiplier=float(m)) for cut, m in zip(cuts, multipliers, strict=True) if m > 0.0]
+
+
+def slots_of(cuts: list[sr.Cut]) -> Floats:
+    """The distinct indices of cuts as a tuple ``(D, width)``, the one with the largest multiplier first."""
+    ordered = sorted(cuts, key=lambda cut: -cut.multiplier)
+    width = max((len(cut.index) for cut in ordered), default=0)
+    found: dict[bytes, Floats] = {}
+    for cut in ordered:
+        slot = np.zeros(width)
+        slot[:len(cut.index)] = cut.index
+        found.setdefault(np.round(slot, 9).tobytes(), slot)
+    return np.array(list(found.values())[:SLOTS]).reshape(-1, width) if found else np.zeros((0, 0))

@@ -1,0 +1,139 @@
+"""Where a recording goes: a file, a viewer that listens, a viewer that is started, a browser; and what to do where one is missing."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, final
+
+PORT, WEB_PORT = 9876, 9090
+STARTING = 15.0     # seconds that a viewer may take until it listens
+MEMORY = "25%"      # of the machine's, for a viewer that is started
+
+
+@final
+@dataclass(frozen=True)
+class Destinations:
+    """What is left of the wishes after looking at the machine: ``save`` a file, ``connect`` a host and port where a viewer listens,
+    ``spawn`` a viewer, ``serve`` to a browser through this port; ``missing`` says in words what could not be had."""
+
+    save: Path | None
+    connect: tuple[str, int] | None
+    spawn: bool
+    serve: int | None
+    missing: tuple[str, ...] = ()
+
+    @property
+    def any(self) -> bool:
+        """Whether there is anywhere to record to."""
+        return self.save is not None or self.connect is not None or self.spawn or self.serve is not None
+
+    @property
+    def page(self) -> str:
+        """The page that a browser is to open."""
+        return f"http://127.0.0.1:{WEB_PORT}/?url=rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{self.serve}%2Fproxy"
+
+
+def look(save: Path | None, connect: str | None, spawn: bool, serve: bool) -> Destinations:
+    """Which of the wishes can be fulfilled; every other is a sentence in ``missing``."""
+    missing = []
+    if find_spec("rerun") is None or find_spec("rerun_bindings") is None:
+        return Destinations(None, None, False, None, ("rerun-sdk is not installed; `pip install 'sparserob[rerun]'` brings it",))
+    if save is not None and (reason := _unwritable(save)):
+        missing.append(f"{save}: cannot be written to: {reason}")
+        save = None
+    address = None if connect is None else address_of(connect)
+    if address is not None and not listens(address, 2.0):
+        missing.append(f"no viewer answers at {address[0]}:{address[1]}")
+        address = None
+    if (spawn or serve) and not viewer().is_file():
+        missing.append("the viewer of rerun-sdk is not there")
+        spawn = serve = False
+    if spawn and sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        missing.append("there is no display for a viewer; `save: recording.rrd` records, `serve: true` shows it in a browser")
+        spawn = False
+    return Destinations(save, address, spawn, _free_port() if serve else None, tuple(missing))
+
+
+def address_of(text: str) -> tuple[str, int]:
+    """Host and port of ``host``, ``host:port`` or a Rerun address ``rerun+http://host:port/proxy``; raises `ValueError`."""
+    plain = text.split("://", 1)[-1].split("/", 1)[0]
+    host, colon, port = plain.rpartition(":")
+    if not colon:
+        host, port = plain, str(PORT)
+    if not host or not port.isdigit() or not 0 < int(port) < 65536:
+        raise ValueError(f"expected an address such as 127.0.0.1:{PORT}, got {text!r}")
+    return host, int(port)
+
+
+def listens(address: tuple[str, int], seconds: float) -> bool:
+    """Whether somebody accepts connections there."""
+    try:
+        with socket.create_connection(address, timeout=seconds):
+            return True
+    except OSError:
+        return False
+
+
+def viewer() -> Path:
+    """The viewer itself: the ``rerun`` script is a wrapper that would leave it behind."""
+    spec = find_spec("rerun_cli")
+    name = "rerun.exe" if sys.platform == "win32" else "rerun"
+    return Path(spec.origin).parent / name if spec is not None and spec.origin else Path(name)
+
+
+def open_sinks(rr: Any, stream: Any, chosen: Destinations, blueprint: Any) -> tuple[list[str], list[subprocess.Popen[bytes]]]:
+    """Send a stream to its destinations; returns what went wrong, and the servers that were started for a browser."""
+    sinks: list[Any] = [] if chosen.save is None else [rr.FileSink(str(chosen.save))]
+    wrong, servers = [], []
+    addresses = [] if chosen.connect is None else [chosen.connect]
+    for port, extra in ((PORT if chosen.spawn else None, []), (chosen.serve, ["--serve-web", "--web-viewer-port", str(WEB_PORT)])):
+        if port is None:
+            continue
+        address = ("127.0.0.1", port)
+        process = None if not extra and listens(address, 0.2) else _started(port, extra)
+        if _waited(address, process):
+            addresses.append(address)
+            servers += [process] if process is not None and extra else []
+        else:
+            wrong.append("the viewer did not start")
+    sinks += [rr.GrpcSink(f"rerun+http://{host}:{port}/proxy") for host, port in addresses]
+    if sinks:
+        stream.set_sinks(*sinks, default_blueprint=blueprint)
+    return wrong, servers
+
+
+def _unwritable(file: Path) -> str:
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with file.open("ab"):
+            return ""
+    except OSError as error:
+        return error.strerror or str(error)
+
+
+def _started(port: int, extra: list[str]) -> subprocess.Popen[bytes]:
+    """A viewer that outlives the run, and hears only this machine."""
+    command = [str(viewer()), "--bind", "127.0.0.1", "--port", str(port), "--memory-limit", MEMORY, "--hide-welcome-screen", *extra]
+    return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+
+
+def _waited(address: tuple[str, int], process: subprocess.Popen[bytes] | None) -> bool:
+    end = time.monotonic() + STARTING
+    while time.monotonic() < end and (process is None or process.poll() is None):
+        if listens(address, 0.5):
+            return True
+        time.sleep(0.1)
+    return False
+
+
+def _free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])

@@ -1,0 +1,382 @@
+"""The recording of a run, read back; and what is missing on a machine never hurts the run."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import socket
+import subprocess
+import time
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sparserob_core as sr
+from sparserob_core.experiment.cli import main
+
+pytest.importorskip("rerun", reason="a recording needs the extra rerun")
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+SEARCH = {"dictionaries.control.pieces": 20, "dictionaries.disturbance.pieces": 20, "maximiser.budget": 60, "method.indices": 4,
+          "continuation": {"start": 0.1, "stop": 0.001}}
+QUICK = {"dictionaries.control.pieces": 50, "dictionaries.disturbance.pieces": 50}
+SMALL = {"name": "rerun", "landscape": {"grid": 8, "evaluations": 200}}
+
+
+def viewer() -> Path:
+    import rerun_cli
+
+    return Path(rerun_cli.__file__).parent / "rerun"
+
+
+def recorded(directory: Path, config: str, changes: dict[str, object], **options: object) -> sr.Outcome:
+    return sr.run(CONFIGS / config, {**changes, "observers": [{**SMALL, **options}]}, directory, quiet=True, figures=False)
+
+
+@pytest.fixture(scope="module")
+def searched(tmp_path_factory: pytest.TempPathFactory) -> sr.Outcome:
+    """A recorded search over tuples."""
+    changes = {**SEARCH, "maximiser.name": "simulated_annealing"}
+    return recorded(tmp_path_factory.mktemp("search") / "run", "experiment1_reduced.yaml", changes)
+
+
+@pytest.fixture(scope="module")
+def exchanged(tmp_path_factory: pytest.TempPathFactory) -> sr.Outcome:
+    """A recorded exchange that ends certified."""
+    return recorded(tmp_path_factory.mktemp("exchange") / "run", "experiment1_repaired.yaml", QUICK)
+
+
+def read(file: Path) -> dict[str, list[Any]]:
+    """The chunks of a recording by entity, without the static ones."""
+    from rerun.chunk import RrdReader
+
+    found: dict[str, list[Any]] = defaultdict(list)
+    for chunk in RrdReader(str(file)).stream():
+        if not chunk.is_static:
+            found[chunk.entity_path].append(chunk)
+    return found
+
+
+def scalars(chunks: list[Any], timeline: str) -> tuple[np.ndarray, np.ndarray]:
+    """Times ``(k,)`` and values ``(k, series)`` of an entity, in the order of a timeline."""
+    times, values = [], []
+    for chunk in chunks:
+        batch = chunk.to_record_batch()
+        times += np.asarray(batch.column(timeline)).astype(np.int64).tolist()
+        values += [np.array(row, dtype=float) for row in batch.column("Scalars:scalars").to_pylist()]
+    order = np.argsort(times, kind="stable")
+    return np.array(times)[order], np.array(values)[order]
+
+
+def texts(chunks: list[Any], component: str) -> list[str]:
+    return [row[0] for chunk in chunks for row in chunk.to_record_batch().column(component).to_pylist()]
+
+
+def test_every_evaluation_is_in_the_recording_with_the_value_that_the_trace_has(searched: sr.Outcome) -> None:
+    trace = searched.result.trace
+    assert trace is not None and trace.value.size > 60
+    evaluations, values = scalars(read(searched.directory / "recording.rrd")["/search/g"], "evaluation")
+    assert (evaluations == np.arange(1, trace.value.size + 1)).all()
+    assert (values[:, 0] == trace.value).all()
+    for outer in np.unique(trace.outer):
+        mine = trace.outer == outer
+        assert (values[mine, 1] == np.maximum.accumulate(trace.value[mine])).all()
+    proven = values[:, 2][np.isfinite(values[:, 2])]
+    assert (np.diff(proven) >= 0).all()
+    assert proven.max() <= searched.result.lower_bound
+
+
+def test_rounds_have_the_bounds_of_the_history_on_all_three_timelines(exchanged: sr.Outcome) -> None:
+    chunks = read(exchanged.directory / "recording.rrd")["/rounds/bounds"]
+    assert all({"evaluation", "round", "time"} <= set(chunk.timeline_names) for chunk in chunks)
+    rounds, values = scalars(chunks, "round")
+    history = exchanged.result.history
+    assert rounds.tolist() == [entry.round for entry in history]
+    assert (values[:, 0] == [entry.lower_bound for entry in history]).all()
+    assert values[-1, 1] == history[-1].upper_bound
+    assert np.isnan(values[0, 1])
+
+
+@pytest.mark.parametrize("kind", ["searched", "exchanged"])
+def test_nothing_that_a_run_has_to_show_is_missing(kind: str, request: pytest.FixtureRequest) -> None:
+    outcome = request.getfixturevalue(kind)
+    found = read(outcome.directory / "recording.rrd")
+    common = {"/physics/plots/curve", "/physics/plots/tube", "/physics/plots/wall", "/physics/phase/curve", "/landscape/map/g",
+              "/landscape/surface/g", "/rounds/log10", "/violation/plots/curve", "/log", "/verdict", "/signals/control", "/signals/x1"}
+    search = {"/search/g", "/search/notes/temperature", "/search/notes/accepted", "/search/moves/t", "/landscape/map/now", "/landscape/map/visited"}
+    assert common | (search if kind == "searched" else set()) <= set(found)
+    rows = sum(chunk.num_rows for chunk in found["/physics/plots/curve"])
+    assert rows == len(outcome.result.history) + 1
+
+
+def test_the_last_page_and_the_log_tell_the_verdict(exchanged: sr.Outcome) -> None:
+    found = read(exchanged.directory / "recording.rrd")
+    assert "**certified**" in texts(found["/verdict"], "TextDocument:text")[-1]
+    assert any(line.startswith("certified") for line in texts(found["/log"], "TextLog:text"))
+    added = [line for line in texts(found["/log"], "TextLog:text") if line.startswith("+ ")]
+    assert len(added) >= len(exchanged.result.indices)
+
+
+def test_the_signals_are_the_control_and_the_tube_of_the_figures(exchanged: sr.Outcome) -> None:
+    found = read(exchanged.directory / "recording.rrd")
+    times, control = scalars(found["/signals/control"], "t")
+    assert exchanged.control is not None
+    assert (control[:, 0] == exchanged.control[0]).all()
+    assert (np.diff(times) > 0).all()
+    _, state = scalars(found["/signals/x1"], "t")
+    assert (state[:, 1] <= state[:, 0] + 1e-12).all() and (state[:, 0] <= state[:, 2] + 1e-12).all()
+
+
+def test_the_control_acts_just_where_the_push_of_the_active_constraints_leaves_the_band(exchanged: sr.Outcome) -> None:
+    from sparserob_rerun.switching import Switching
+
+    push = Switching(exchanged.program).push(exchanged.result.indices, None)
+    assert push is not None and exchanged.control is not None
+    acts = np.abs(exchanged.control) > 1e-6
+    assert acts.any() and not acts.all()
+    assert (np.abs(push[acts]) > 1.0 - 1e-4).all()
+    assert (np.abs(push[~acts]) < 1.0 + 1e-4).all()
+    assert (np.sign(push[acts]) == np.sign(exchanged.control[acts])).all()
+
+
+def test_the_landscape_is_g_and_decided_by_its_anchor_alone() -> None:
+    from sparserob_core.experiment.load import load_config
+    from sparserob_rerun.landscape import Landscape
+
+    loaded = load_config(CONFIGS / "experiment1_reduced.yaml", SEARCH)
+    anchor = np.array([[0.5], [0.9], [3.0], [4.9]])
+    found = []
+    for _ in range(2):
+        landscape = Landscape(sr.Inspection(loaded).relaxed_value(4, 0.01), anchor, (0, 0), (2, 0), 8)
+        levels = [complete for complete in landscape.evaluate() if complete]
+        assert len(levels) == 4 and landscape.spent == 64
+        found.append(landscape.values)
+    assert (found[0] == found[1]).all()
+    fresh = sr.Inspection(loaded).relaxed_value(4, 0.01)
+    for i, j in ((0, 0), (3, 5), (7, 7)):
+        slots = anchor.copy()
+        slots[0, 0], slots[2, 0] = landscape.axes[0][i], landscape.axes[1][j]
+        assert found[0][i, j] == pytest.approx(fresh.at(slots), abs=1e-7)
+    assert np.ptp(found[0]) > 1e-3
+
+
+def test_coordinates_of_the_landscape_are_named_or_refused_with_what_there_is() -> None:
+    from sparserob_core.experiment.load import load_config
+    from sparserob_rerun.landscape import coordinate, influential
+
+    g = sr.Inspection(load_config(CONFIGS / "experiment2_reduced.yaml", {"dictionaries.control.pieces": 20})).relaxed_value(3, 0.1)
+    assert g.names == ("t", "p1", "p2", "p3")
+    assert coordinate("p2", g, 3) == (0, 2)
+    assert coordinate("t[3]", g, 3) == (2, 0)
+    for wrong in ("q1", "t[4]", "t[0]", "t[x]"):
+        with pytest.raises(sr.InputError, match=r"expected one of t, p1, p2, p3.*t\[1\] to t\[3\]"):
+            coordinate(wrong, g, 3)
+    assert influential(g, np.zeros((3, 4)), np.array([0.0, 2.0, 1.0])) == ((1, 0), (1, 1))
+
+
+def test_watching_changes_nothing(searched: sr.Outcome, tmp_path: Path) -> None:
+    changes = {**SEARCH, "maximiser.name": "simulated_annealing", "observers": []}
+    plain = sr.run(CONFIGS / "experiment1_reduced.yaml", changes, tmp_path / "run", quiet=True, figures=False)
+    assert plain.result.trace is not None and searched.result.trace is not None
+    assert (plain.result.trace.value == searched.result.trace.value).all()
+    assert plain.result.cost == searched.result.cost
+
+
+@pytest.mark.parametrize(("options", "said"), [
+    ({"connect": "127.0.0.1:1", "save": None}, "no viewer answers at 127.0.0.1:1"),
+    ({"spawn": True}, "there is no display"),
+    ({"save": "/proc/nowhere/x.rrd"}, "/proc/nowhere/x.rrd: cannot be written to"),
+])
+def test_what_is_missing_is_one_warning_and_the_run_goes_on(
+        options: dict[str, object], said: str, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    outcome = recorded(tmp_path / "run", "experiment1_repaired.yaml", QUICK, **options)
+    assert outcome.status == "certified"
+    assert [record.getMessage().count(said) for record in caplog.records] == [1]
+
+
+def test_a_missing_package_is_one_warning_with_the_way_to_install_it(
+        tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    import sparserob_rerun.sinks
+
+    monkeypatch.setattr(sparserob_rerun.sinks, "find_spec", lambda name: None)
+    assert recorded(tmp_path / "run", "experiment1_repaired.yaml", QUICK).status == "certified"
+    assert [record.getMessage() for record in caplog.records] == ["rerun: rerun-sdk is not installed; `pip install 'sparserob[rerun]'` brings it"]
+    assert not (tmp_path / "run" / "recording.rrd").exists()
+
+
+def test_of_several_destinations_those_that_exist_are_used(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    recorded(tmp_path / "run", "experiment1_repaired.yaml", QUICK, connect="127.0.0.1:1", save="some/where.rrd")
+    assert len(caplog.records) == 1
+    assert read(tmp_path / "run" / "some" / "where.rrd")["/verdict"]
+
+
+@pytest.mark.parametrize("wrong", ["nobody:port", ":9876", "127.0.0.1:99999"])
+def test_an_address_that_is_none_is_refused_before_the_run(wrong: str, tmp_path: Path) -> None:
+    with pytest.raises(sr.ConfigError, match=r"observers.0.connect.*expected an address such as 127\.0\.0\.1:9876"):
+        recorded(tmp_path / "run", "experiment1_repaired.yaml", QUICK, connect=wrong)
+
+
+def test_a_run_that_breaks_off_leaves_a_complete_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from sparserob_core.experiment.journal import Journal
+
+    def broken(*anything: object) -> None:
+        raise RuntimeError("the disk is gone")
+
+    monkeypatch.setattr(Journal, "finish", broken)
+    with pytest.raises(RuntimeError, match="the disk is gone"):
+        recorded(tmp_path / "run", "experiment1_repaired.yaml", QUICK)
+    file = tmp_path / "run" / "recording.rrd"
+    subprocess.run([viewer(), "rrd", "verify", file], check=True, capture_output=True)
+    assert "the disk is gone" in "".join(texts(read(file)["/verdict"], "TextDocument:text"))
+
+
+def test_a_full_queue_drops_at_once_and_says_so(tmp_path: Path) -> None:
+    from sparserob_rerun.outlet import Outlet
+    from sparserob_rerun.recorder import Opening
+    from sparserob_rerun.sinks import Destinations
+
+    outlet = Outlet(Opening("many", None, None, None), Destinations(tmp_path / "x.rrd", None, False, None), 0, capacity=2)
+    event = sr.ProofProgress(family="path", cells=1, bound=0.0)
+    started = time.perf_counter()
+    for _ in range(1000):
+        outlet.send(event)
+    assert time.perf_counter() - started < 0.5
+    assert outlet.dropped > 500
+    assert [line for line in outlet.close() if "events came faster than they could be recorded" in line]
+    assert any("were dropped" in line for line in texts(read(tmp_path / "x.rrd")["/log"], "TextLog:text"))
+
+
+def test_a_process_that_dies_is_noticed_and_costs_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    from sparserob_rerun.outlet import Outlet
+    from sparserob_rerun.recorder import Opening
+    from sparserob_rerun.sinks import Destinations
+
+    outlet = Outlet(Opening("killed", None, None, None), Destinations(tmp_path / "x.rrd", None, False, None), 0)
+    outlet.process.kill()
+    outlet.process.join()
+    started = time.perf_counter()
+    for _ in range(2000):
+        outlet.send(sr.ProofProgress(family="path", cells=1, bound=0.0))
+    assert any("ended early" in line for line in outlet.close())
+    assert time.perf_counter() - started < 5.0
+
+
+def test_a_system_without_fork_records_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import sparserob_rerun.outlet
+
+    monkeypatch.setattr(sparserob_rerun.outlet, "START", "spawn")
+    recorded(tmp_path / "run", "experiment1_repaired.yaml", QUICK)
+    found = read(tmp_path / "run" / "recording.rrd")
+    assert {"/physics/plots/curve", "/landscape/map/g", "/verdict"} <= set(found)
+
+
+def command(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    return int(end.value.code or 0)
+
+
+def test_watch_records_a_run_and_replay_shows_it_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config, run = str(CONFIGS / "experiment1_repaired.yaml"), str(tmp_path / "run")
+    changes = [f"{key}={value}" for key, value in QUICK.items()]
+    assert command("watch", config, *changes, "--save", str(tmp_path / "live.rrd"), "--out", run, "--no-figures") == 0
+    assert command("replay", run, "--save", str(tmp_path / "again.rrd")) == 0
+    assert "recorded into" in capsys.readouterr().out
+    live, again = read(tmp_path / "live.rrd"), read(tmp_path / "again.rrd")
+    assert (scalars(live["/rounds/bounds"], "round")[1][:, 0] == scalars(again["/rounds/bounds"], "round")[1][:, 0]).all()
+    assert (scalars(live["/signals/control"], "t")[1] == scalars(again["/signals/control"], "t")[1]).all()
+    assert "/landscape/map/g" in again
+
+
+def test_an_outcome_can_be_shown_with_all_that_it_knows(searched: sr.Outcome, tmp_path: Path) -> None:
+    searched.show(save=tmp_path / "shown.rrd")
+    found = read(tmp_path / "shown.rrd")
+    assert searched.result.trace is not None
+    assert (scalars(found["/search/g"], "evaluation")[1][:, 0] == searched.result.trace.value).all()
+    assert sum(chunk.num_rows for chunk in found["/physics/plots/curve"]) == len(searched.result.history) + 1
+
+
+def test_replay_and_watch_refuse_what_they_cannot_do(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    config = str(CONFIGS / "experiment1_repaired.yaml")
+    for arguments, said in (
+            (["replay", str(tmp_path / "none")], "expected the directory of a run, got nothing"),
+            (["replay", str(tmp_path)], "got one without config.yaml"),
+            (["watch", config, "--save", str(tmp_path)], "save: expected a file, got the directory"),
+            (["watch", config, "--save", "/proc/x/y.rrd"], "cannot be written to"),
+            (["watch", config], "--save FILE records for later")):
+        assert command(*arguments) == 2
+        assert said in capsys.readouterr().err
+
+
+def free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
+
+
+def headless(port: int) -> subprocess.Popen[bytes]:
+    """A viewer without a screen; skips, loudly, where the machine cannot draw."""
+    command_line = [str(viewer()), "--headless", "--window-size", "1600x1000", "--port", str(port), "--bind", "127.0.0.1"]
+    process = subprocess.Popen(command_line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    end = time.monotonic() + 20.0
+    while time.monotonic() < end and process.poll() is None:
+        with socket.socket() as one:
+            if one.connect_ex(("127.0.0.1", port)) == 0:
+                return process
+        time.sleep(0.2)
+    process.kill()
+    process.wait()
+    pytest.skip("SKIPPED LOUDLY: the viewer of Rerun cannot draw here; `apt-get install mesa-vulkan-drivers` lets it draw without a graphics card")
+
+
+@pytest.mark.slow
+def test_a_viewer_that_is_killed_in_mid_run_changes_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    port = free_port()
+    process = headless(port)
+    try:
+        changes = {**SEARCH, "maximiser.name": "simulated_annealing", "maximiser.budget": 1500, "method.sc2": None}
+
+        class Killer(sr.Observer):
+            def receive(self, event: sr.Event) -> None:
+                if isinstance(event, sr.RoundFinished):
+                    process.kill()
+
+        options = {**changes, "observers": [{**SMALL, "connect": f"127.0.0.1:{port}", "save": "recording.rrd"}]}
+        outcome = sr.run(CONFIGS / "experiment1_reduced.yaml", options, tmp_path / "run", quiet=True, figures=False, observers=[Killer()])
+        plain = sr.run(CONFIGS / "experiment1_reduced.yaml", {**changes, "observers": []}, tmp_path / "plain", quiet=True, figures=False)
+        assert outcome.result.cost == plain.result.cost
+        assert len([record for record in caplog.records if record.levelno >= logging.WARNING]) <= 1
+        subprocess.run([viewer(), "rrd", "verify", tmp_path / "run" / "recording.rrd"], check=True, capture_output=True)
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # the client of the viewer does not wait for its process
+@pytest.mark.parametrize("kind", ["searched", "exchanged"])
+def test_the_viewer_draws_every_panel_without_complaint(kind: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    from rerun.experimental import ViewerClient
+
+    outcome = request.getfixturevalue(kind)
+    probe = headless(free_port())
+    probe.kill()
+    probe.wait()
+    file = tmp_path / "shown.rrd"
+    shutil.copy(outcome.directory / "recording.rrd", file)
+    with ViewerClient.spawn(headless=True, port=free_port(), hide_welcome_screen=True, executable_path=str(viewer())) as shown:
+        shown.open(str(file))
+        time.sleep(8.0)
+        picture = tmp_path / "screen.png"
+        shown.save_screenshot(str(picture))
+        state = shown.get_state()
+    assert len(state.views) >= 8
+    assert [view.reports for view in state.views] == [[]] * len(state.views)
+    assert picture.stat().st_size > 50_000
