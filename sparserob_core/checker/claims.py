@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sparserob_core.checker.balls import balls
 from sparserob_core.checker.case import Case, listed, number, numbers
 from sparserob_core.checker.constraints import bounded, kept
 from sparserob_core.checker.duality import Row
 from sparserob_core.checker.equalities import equalities
 from sparserob_core.checker.outcome import VIOLATION, Broken, Claim, Unchecked
 from sparserob_core.checker.replay import reached
-from sparserob_core.checker.shapes import balls, excess, limit, member, support
+from sparserob_core.checker.shapes import excess, limit, member, support
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sparserob_core.checker.balls import balls
 from sparserob_core.checker.case import Case, Window, number, numbers
 from sparserob_core.checker.flow import Flow
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.parameters import Corners, Parameters
 from sparserob_core.checker.prove import Interval, Work, prove
-from sparserob_core.checker.shapes import balls, facets, support
+from sparserob_core.checker.shapes import facets, support
 from sparserob_core.checker.sides import Sides
 from sparserob_core.checker.subdivision import fill
 from sparserob_core.checker.tube import Tube

@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.flow import Flow, exponential, stacked
+from sparserob_core.checker.balls import rational
+from sparserob_core.checker.flow import Flow, stacked
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.shapes import arrangement, facets, rational, support
+from sparserob_core.checker.shapes import arrangement, boxed, facets, support
 from sparserob_core.control.dictionary import Dictionary
 from sparserob_core.control.problem import OptimalControlProblem
-from sparserob_core.control.sets import Box, NormBall
+from sparserob_core.control.sets import Box
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ class Duality:
 
     def _lag(self, matrix: arb_mat, direction: Array, time: float, since: float) -> list[arb]:
         start = stacked([[_exact(v)] for v in (*direction, *np.zeros(matrix.nrows() - direction.size))])
-        column: list[arb] = (exponential(matrix, _exact(time) - _exact(since)) * start).entries()
+        column: list[arb] = ((matrix * (_exact(time) - _exact(since))).exp() * start).entries()
         return column
 
     def bound(self, rows: Sequence[tuple[float, Row]], pieces: Sequence[Sequence[float]] | None, priced: bool) -> arb:
@@ -115,9 +116,7 @@ class Duality:
 
     def _least(self, weights: list[arb], slope: list[arb]) -> arb:
         """At most ``min sum_i weights_i |u_i| + slope_i u_i`` over the controls' set."""
-        bound = self.problem.control
-        if isinstance(bound, NormBall) and bound.p == np.inf:
-            bound = Box(np.nextafter(bound.centre - bound.radius, -np.inf), np.nextafter(bound.centre + bound.radius, np.inf))
+        bound = boxed(self.problem.control)
         if isinstance(bound, Box):
             return sum((_least_between(w, s, float(low), float(high))
                         for w, s, low, high in zip(weights, slope, bound.lower, bound.upper, strict=True)), _exact(0.0))

@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from sparserob_core.checker.balls import balls
 from sparserob_core.checker.case import Case
 from sparserob_core.checker.flow import Flow
 from sparserob_core.checker.jets import Monomials, expanded
 from sparserob_core.checker.outcome import VIOLATION, Broken, Unchecked
-from sparserob_core.checker.shapes import balls, support
+from sparserob_core.checker.shapes import support
 from sparserob_core.checker.tube import Tube
 
 if TYPE_CHECKING:

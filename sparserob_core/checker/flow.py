@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.jets import Monomials, expanded
-from sparserob_core.checker.series import Series
+from sparserob_core.checker.series import Series, norm, upper
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -135,13 +135,6 @@ def column(matrix: arb_mat, number: int) -> arb_mat:
     return stacked([[matrix[i, number]] for i in range(matrix.nrows())])
 
 
-def norm(matrix: arb_mat) -> arb:
-    """The Frobenius norm, which bounds the 2-norm."""
-    from flint import arb
-
-    return sum((x * x for x in matrix.entries()), arb(0)).nonnegative_part().sqrt()
-
-
 def logarithmic_norm(matrix: arb_mat) -> arb:
     """An upper bound of the largest eigenvalue of the symmetric part (Gershgorin): ``|e^{A t}| <= e^{mu t}`` (Dahlquist 1958)."""
     d = matrix.nrows()
@@ -152,23 +145,11 @@ def logarithmic_norm(matrix: arb_mat) -> arb:
     return largest
 
 
-def upper(ball: arb) -> arb:
-    """The upper end of a ball, as an exact number."""
-    from flint import arb
-
-    return arb(ball.upper())
-
-
 def up_to(length: arb) -> arb:
     """The ball of all numbers from 0 to ``length``."""
     from flint import arb
 
     return arb(0).union(length)
-
-
-def exponential(matrix: arb_mat, time: arb) -> arb_mat:
-    """``e^{matrix time}``."""
-    return (matrix * time).exp()
 
 
 def in_time(matrix: Series, derivative: Series, length: arb, inside: Series) -> list[Series]:
@@ -184,13 +165,10 @@ def in_time(matrix: Series, derivative: Series, length: arb, inside: Series) -> 
 
 
 def held(matrix: arb_mat, inputs: arb_mat, time: arb) -> tuple[arb_mat, arb_mat]:
-    """``e^{matrix time}`` and ``int_0^time e^{matrix s} ds inputs`` from one exponential (Van Loan 1978)."""
-    from flint import arb
-
-    n, m = matrix.nrows(), inputs.ncols()
-    table = [[matrix[i, j] for j in range(n)] + [inputs[i, j] for j in range(m)] for i in range(n)] + [[arb(0)] * (n + m) for _ in range(m)]
-    whole = exponential(stacked(table), time)
-    return (stacked([[whole[i, j] for j in range(n)] for i in range(n)]), stacked([[whole[i, n + j] for j in range(m)] for i in range(n)]))
+    """`Series.held` of matrices that do not depend on the parameters."""
+    known = Monomials(0, 0)
+    Phi, Gamma = Series(known, [matrix]).held(Series(known, [inputs]), time)
+    return Phi.parts[0], Gamma.parts[0]
 
 
 def _modal(A: Array) -> Array:

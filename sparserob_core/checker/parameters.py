@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, TypeAlias, final
 
 import numpy as np
 
-from sparserob_core.checker.shapes import balls, facets, member, support
+from sparserob_core.checker.balls import above, balls
+from sparserob_core.checker.shapes import facets, member, support
 from sparserob_core.control.sets import Box, ConvexSet, Ellipsoid
 from sparserob_core.sip.convex_set import Array
 
@@ -46,13 +47,13 @@ class Parameters:
         weighted normals take up as much as they can of ``slope (nu,)``."""
         if self.is_box or self.shape is None or not slope.any():
             return []
-        found = [(slope[None], np.array([_above(support(self.shape, balls(slope)))]), np.ones(1))]
+        found = [(slope[None], np.array([above(support(self.shape, balls(slope)))]), np.ones(1))]
         low, high = np.array(box[0]), np.array(box[1])
         near = [(a, s) for a, s in self._halfspaces((low + high) / 2) if not -_least(-a, low, high) <= s]
         if near:
             from scipy.optimize import nnls
 
-            normals, limits = np.array([a for a, _ in near]), np.array([_above(s) for _, s in near])
+            normals, limits = np.array([a for a, _ in near]), np.array([above(s) for _, s in near])
             found.append((normals, limits, nnls(normals.T, slope)[0]))
         return found  # type: ignore[return-value]
 
@@ -71,7 +72,3 @@ def _least(normal: Array, low: Array, high: Array) -> arb:
     """The least ``a'p`` on a box."""
     ends = zip(normal, balls(normal), balls(low), balls(high), strict=True)
     return sum((c * (a if weight > 0 else b) for weight, c, a, b in ends), balls([0.0])[0])
-
-
-def _above(ball: arb) -> float:
-    return float(np.nextafter(float(ball.upper()), np.inf))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.shapes import corners
+from sparserob_core.checker.shapes import boxed, corners
 from sparserob_core.control.sets import Box, ConvexSet, Ellipsoid, NormBall, Polytope
 from sparserob_core.sip.convex_set import Array
 
@@ -47,8 +47,7 @@ def linear_bound(shape: ConvexSet, value: Array, spread: Array) -> tuple[Array, 
     For flat sets ``w`` is the corner that is best at ``value``, and nothing is lost where it stays the best; for round ones the loss is of
     second order in ``spread``: in the norm of the set, ``|f| - f0'f / |f0| <= |f - f0|^2 / (2 (|f0| - |f - f0|))``.
     """
-    if isinstance(shape, NormBall) and (shape.p == np.inf or shape.dimension == 1):
-        shape = Box(np.nextafter(shape.centre - shape.radius, -np.inf), np.nextafter(shape.centre + shape.radius, np.inf))
+    shape = boxed(shape)
     if isinstance(shape, Box):
         w = np.where(value >= 0, shape.upper, shape.lower)
         return w, (np.maximum(spread - np.abs(value), 0.0) * (shape.upper - shape.lower)).sum(axis=1) * OUTWARD

@@ -93,32 +93,36 @@ def _examine(place: Place, sides: Sides, todo: Sequence[Interval], left: _Left) 
     for interval, found, tops in _batch(place.tube, sides.rows, todo, place.tolerance):
         tops = [top if top <= place.tolerance else _cut(place, row, poly) for top, row, poly in zip(tops, sides.rows, found, strict=True)]
         bound = max(bound, *(top for top in tops if top <= place.tolerance), -np.inf)
-        failed = [poly for poly, top in zip(found, tops, strict=True) if not top <= place.tolerance]
+        failed = [(row, poly) for row, poly, top in zip(sides.rows, found, tops, strict=True) if not top <= place.tolerance]
         if not failed:
             continue
-        if _turn(place, sides, interval):
+        if _turn(place, sides, interval, failed):
             left.turned.append(interval)
-        elif place.box[0] and any(_to_blame(poly, interval) for poly in failed):
+        elif place.box[0] and any(_to_blame(poly, interval) for _, poly in failed):
             left.wide.append(interval)
-            left.influence += sum(_influence(place.tube, poly) for poly in failed)
+            left.influence += sum(_influence(place.tube, poly) for _, poly in failed)
         else:
             left.halves += _halves(interval)
     return bound
 
 
-def _turn(place: Place, sides: Sides, interval: Interval) -> bool:
+def _turn(place: Place, sides: Sides, interval: Interval, failed: Sequence[tuple[Bounded, Polynomial]]) -> bool:
     """Whether a cell fails because its directions differ too much. Stops at a violation that is certain: at the cell's start."""
     middle = sides.centre
-    rows = sides.rows if middle is None else [middle]
-    (_, found, tops), = _batch(place.tube, rows, [interval], place.tolerance)
-    for row, poly in zip(rows, found, strict=True):
-        least = float(poly.coefficients[0, 0]) - row.limit - poly.error - poly.kinks
-        certain = middle is not None or sides.shape is None
-        if least > place.tolerance and certain and place.parameters.holds(np.array(place.tube.flow.centre)):
-            raise Broken(f"it is exceeded by {least:.3g} at t = {interval[1]:.6g}")
     if middle is None:
+        if sides.shape is None:
+            _refute(place, interval, failed)
         return False
-    return tops[0] <= place.tolerance or _cut(place, middle, found[0]) <= place.tolerance
+    (_, (poly,), (top,)), = _batch(place.tube, [middle], [interval], place.tolerance)
+    _refute(place, interval, [(middle, poly)])
+    return top <= place.tolerance or _cut(place, middle, poly) <= place.tolerance
+
+
+def _refute(place: Place, interval: Interval, rows: Sequence[tuple[Bounded, Polynomial]]) -> None:
+    for row, poly in rows:
+        least = float(poly.coefficients[0, 0]) - row.limit - poly.error - poly.kinks
+        if least > place.tolerance and place.parameters.holds(np.array(place.tube.flow.centre)):
+            raise Broken(f"it is exceeded by {least:.3g} at t = {interval[1]:.6g}")
 
 
 def _batch(tube: Tube, rows: Sequence[Bounded], todo: Sequence[Interval],

@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sparserob_core.checker.balls import balls
 from sparserob_core.checker.case import Case, numbers
 from sparserob_core.checker.flow import Flow, held, stacked
 from sparserob_core.checker.outcome import Broken, Unchecked
-from sparserob_core.checker.shapes import balls, member
+from sparserob_core.checker.shapes import member
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -25,14 +26,12 @@ def reached(case: Case, time: float, parameter: Array, signal: object) -> list[a
     w = _admissible(case, signal) if wanted else None
     both = stacked([left + right for left, right in zip(flow.parts["B"][0].tolist(), flow.parts["E"][0].tolist(), strict=True)])
     x = stacked([[v] for v in balls(np.asarray(case.problem.initial_state))])
-    middles = [(a + b) / 2 for a, b in zip(case.grid[:-1], case.grid[1:], strict=True)]
-    which = np.clip(np.searchsorted(case.control.breakpoints, middles, side="right") - 1, 0, case.control.pieces - 1)
     for k, start in enumerate(case.grid[:-1]):
         if start >= time:
             break
         Phi, Gamma = held(flow.parts["A"][0], both, arb(min(case.grid[k + 1], time)) - arb(start))
         pushed = [arb(0)] * flow.parts["E"][0].ncols() if w is None else balls(w[:, k])
-        x = Phi * x + Gamma * arb_mat([[v] for v in case.pieces[which[k]].entries() + pushed])
+        x = Phi * x + Gamma * arb_mat([[v] for v in case.scene.control[k].entries() + pushed])
     state: list[arb] = x.entries()
     return state
 

@@ -50,7 +50,7 @@ class Series:
         """An upper bound of the summed Frobenius norms of the coefficients; that of a product is at most the product of those."""
         from flint import arb
 
-        return sum((arb(sum((x * x for x in part.entries()), arb(0)).nonnegative_part().sqrt().upper()) for part in self.parts), arb(0))
+        return sum((upper(norm(part)) for part in self.parts), arb(0))
 
     def exp(self) -> Series:
         """The exponential: its series where the norm is small, and squaring back (Moler and Van Loan 2003, method 3), with the tail bounded."""
@@ -86,3 +86,17 @@ class Series:
         whole = [part.tolist() for part in Series(self.monomials, joined).scaled(time).exp().parts]
         return (Series(self.monomials, [arb_mat([row[:n] for row in part[:n]]) for part in whole]),
                 Series(self.monomials, [arb_mat([row[n:] for row in part[:n]]) for part in whole]))
+
+
+def norm(matrix: arb_mat) -> arb:
+    """The Frobenius norm, which bounds the 2-norm."""
+    from flint import arb
+
+    return sum((x * x for x in matrix.entries()), arb(0)).nonnegative_part().sqrt()
+
+
+def upper(ball: arb) -> arb:
+    """The upper end of a ball, as an exact number."""
+    from flint import arb
+
+    return arb(ball.upper())

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sparserob_core.checker.balls import above, balls, rational
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.control.sets import Box, ConvexSet, Cylinder, Ellipsoid, NormBall, Polytope
 from sparserob_core.sip.convex_set import Array
@@ -70,13 +71,6 @@ def support(shape: ConvexSet, direction: Sequence[arb]) -> arb:
     return answer
 
 
-def rational(value: Fraction) -> arb:
-    """A ball around a fraction."""
-    from flint import arb, fmpq
-
-    return arb(fmpq(value.numerator, value.denominator))
-
-
 def _interval_support(c: arb, low: float, high: float) -> arb:
     from flint import arb
 
@@ -128,7 +122,7 @@ def radius(shape: ConvexSet) -> list[float]:
     from flint import arb
 
     axes = [[arb(int(i == j)) for j in range(shape.dimension)] for i in range(shape.dimension)]
-    return [float(np.nextafter(float(support(shape, e).max(support(shape, [-c for c in e])).upper()), np.inf)) for e in axes]
+    return [above(support(shape, e).max(support(shape, [-c for c in e]))) for e in axes]
 
 
 def corners(shape: ConvexSet) -> tuple[tuple[Fraction, ...], ...]:
@@ -145,7 +139,7 @@ def arrangement(shape: ConvexSet) -> tuple[tuple[Fraction, ...], ...]:
     """
     flat = facets(shape)
     assert flat is not None
-    rows = tuple((*map(float, c), float(b.mid()) if b.is_exact() else float(np.nextafter(float(b.upper()), np.inf))) for c, b in flat)
+    rows = tuple((*map(float, c), float(b.mid()) if b.is_exact() else above(b)) for c, b in flat)
     return _meets(rows, tuple(range(shape.dimension)))
 
 
@@ -204,11 +198,11 @@ def member(shape: ConvexSet, point: Sequence[float] | Array) -> bool:
     raise Unchecked(f"the checker cannot tell who is in a {type(shape).__name__}")
 
 
-def balls(vector: Sequence[float] | Array) -> list[arb]:
-    """Exact numbers as balls."""
-    from flint import arb
-
-    return [arb(float(v)) for v in vector]
+def boxed(shape: ConvexSet) -> ConvexSet:
+    """A ball of the maximum norm as a box, larger by rounding; any other set as it is."""
+    if isinstance(shape, NormBall) and (shape.p == np.inf or shape.dimension == 1):
+        return Box(np.nextafter(shape.centre - shape.radius, -np.inf), np.nextafter(shape.centre + shape.radius, np.inf))
+    return shape
 
 
 def limit(shape: ConvexSet, direction: Array) -> arb:

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
+from sparserob_core.checker.balls import below
 from sparserob_core.checker.shapes import dot, facets, member, support
 from sparserob_core.control.sets import ConvexSet, Cylinder
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
-    from flint import arb
+    pass
 
 INSIDE = 1.0 - 1e-14    # a point that is to be in a set is drawn inwards by rounding
 
@@ -76,11 +77,6 @@ class Sides:
         left, right = self.high.copy(), self.low.copy()
         left[axis] = right[axis] = middle
         return [Sides.curved(self.shape, self.low, left), Sides.curved(self.shape, right, self.high)]
-
-
-def below(ball: arb) -> float:
-    """A float that is certainly not above a ball."""
-    return float(ball.mid()) if ball.is_exact() and float(ball.mid()) == ball else float(np.nextafter(float(ball.lower()), -np.inf))
 
 
 def _direction(shape: ConvexSet, z: Array) -> Array:

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.flow import Flow, held, in_time, norm, stacked, up_to, upper
+from sparserob_core.checker.flow import Flow, held, in_time, stacked, up_to
 from sparserob_core.checker.polynomials import OUTWARD, ROUNDING, Enclosed
 from sparserob_core.checker.pushes import Pushes, Scene
-from sparserob_core.checker.series import Series
+from sparserob_core.checker.series import Series, norm, upper
 from sparserob_core.checker.shapes import radius
 from sparserob_core.sip.convex_set import Array
 

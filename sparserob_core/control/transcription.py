@@ -24,7 +24,7 @@ from sparserob_core.control.sets import Equality
 from sparserob_core.control.taylor import TaylorSpace
 from sparserob_core.control.windows import state_constraints
 from sparserob_core.errors import InputError, NotEnclosable
-from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
 
 if TYPE_CHECKING:
@@ -101,16 +101,23 @@ def _image(model: Transcription) -> tuple[csc_array | None, Array, Array, Array]
     axes = np.eye(channels)
     lower, upper = np.repeat(-bound.support(-axes), dictionary.pieces), np.repeat(bound.support(axes), dictionary.pieces)
     weights: Array = np.kron(np.asarray(model.problem.weights, dtype=float), dictionary.lengths)
-    flat = None if isinstance(bound, Box) else bound.halfspaces()
     values = csc_array(dictionary.values.T)
-    if flat is None:
+    if isinstance(bound, Box) or bound.halfspaces() is None:
         return (None if dictionary.is_indicators else csc_array(kron(eye_array(channels), values))), lower, upper, weights
-    H, h = flat
-    several = np.count_nonzero(H, axis=1) > 1
-    S = csc_array(vstack([kron(eye_array(channels), values), kron(csc_array(H[several]), values)]))
-    extra = np.repeat(h[several], dictionary.pieces)
+    H, h = slanted(bound)
+    S = csc_array(vstack([kron(eye_array(channels), values), kron(csc_array(H), values)]))
+    extra = np.repeat(h, dictionary.pieces)
     return (S, np.concatenate([lower, np.full(extra.size, -np.inf)]), np.concatenate([upper, extra]),
             np.concatenate([weights, np.zeros(extra.size)]))
+
+
+def slanted(bound: ConvexSet) -> tuple[Array, Array]:
+    """The sides ``(H (r, m), h (r,))`` of a set of controls that bound several of them together; none for a box or a curved set."""
+    flat = bound.halfspaces()
+    if flat is None:
+        return np.zeros((0, bound.dimension)), np.zeros(0)
+    several = np.count_nonzero(flat[0], axis=1) > 1
+    return flat[0][several], flat[1][several]
 
 
 def _equalities(model: Transcription) -> tuple[Array, Array]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from sparserob_core.control.problem import OptimalControlProblem
 from sparserob_core.control.sets import Box, ConvexSet
+from sparserob_core.control.transcription import slanted
 from sparserob_core.sip.certificate import TOLERANCE, Proof
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.program import Explanation, SemiInfiniteProgram
@@ -57,10 +58,9 @@ def _on_pieces(problem: OptimalControlProblem, z: Array | None) -> Array | None:
     """The multipliers of the control ``(m, K)`` on its pieces, those of its set's slanted sides folded in."""
     if z is None:
         return None
-    m, flat = problem.system.controls, None if isinstance(problem.control, Box) else problem.control.halfspaces()
-    slanted = np.zeros((0, m)) if flat is None else flat[0][np.count_nonzero(flat[0], axis=1) > 1]
-    rows = z.reshape(m + slanted.shape[0], -1)
-    answer: Array = rows[:m] + slanted.T @ rows[m:]
+    m, (sides, _) = problem.system.controls, slanted(problem.control)
+    rows = z.reshape(m + sides.shape[0], -1)
+    answer: Array = rows[:m] + sides.T @ rows[m:]
     return answer
 
 

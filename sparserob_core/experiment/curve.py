@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 
 from sparserob_core.errors import ConfigError, InputError
 from sparserob_core.experiment.config import read_source
+from sparserob_core.experiment.finished import read_summary
 from sparserob_core.sip.convex_set import Array
 
 WITHOUT_CURVE = frozenset({"failed", "infeasible"})
@@ -57,7 +57,7 @@ def read_curve(directory: Path) -> Curve:
         if not (directory / name).is_file():
             raise InputError(f"{directory}: expected the directory of a run, got one without {name}" if directory.is_dir() else
                              f"{directory}: expected the directory of a run, got {'a file' if directory.exists() else 'nothing'}")
-    summary, config = _summary(directory / "result.json"), _config(directory / "config.yaml")
+    summary, config = read_summary(directory / "result.json"), _config(directory / "config.yaml")
     counts, worst = _mapping(summary, "counts"), _mapping(summary, "worst")
     status, searched = str(summary["status"]), (directory / SEARCH[0]).is_file()
     spent, lower = _number(counts, "evaluations" if searched else "relaxed_programs"), _number(summary, "lower_bound")
@@ -93,16 +93,6 @@ def _columns(file: Path, names: tuple[str, ...]) -> list[Array]:
     if any(column.shape != columns[0].shape or column.ndim != 1 or np.isnan(column).any() for column in columns):
         raise InputError(f"{file}: expected {', '.join(names)} as columns of one length without nan")
     return columns
-
-
-def _summary(file: Path) -> dict[str, Any]:
-    try:
-        summary = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file}: cannot be read: {error}") from None
-    if not isinstance(summary, dict) or "status" not in summary:
-        raise InputError(f"{file}: expected the result of a run, with a status")
-    return summary
 
 
 def _config(file: Path) -> dict[str, Any]:

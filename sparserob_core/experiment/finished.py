@@ -38,7 +38,7 @@ def read_finished(directory: Path) -> FinishedRun:
     for name in ("config.yaml", "result.json"):
         if not (directory / name).is_file():
             raise InputError(f"{directory}: expected the directory of a run, got {_instead(directory, name)}")
-    summary = _summary(directory / "result.json")
+    summary = read_summary(directory / "result.json")
     solution = read_arrays(directory / "solution.npz")
     if "theta" not in solution:
         raise InputError(f"{directory}: there is no control in it; the status is '{summary['status']}': {summary.get('message')}")
@@ -63,7 +63,8 @@ def read_arrays(file: Path) -> dict[str, Array]:
         raise InputError(f"{file}: cannot be read: {error}") from None
 
 
-def _summary(file: Path) -> dict[str, Any]:
+def read_summary(file: Path) -> dict[str, Any]:
+    """The contents of ``result.json``; raises `InputError` when it is not the result of a run."""
     try:
         summary = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
