@@ -10,27 +10,44 @@ from pathlib import Path
 import click
 
 import sparserob_core as sr
-from sparserob_core.experiment.cli import commands
-from sparserob_core.experiment.commands.printing import EXIT
-from sparserob_core.experiment.option_rows import option_rows
-from sparserob_core.experiment.registry import Hooks
-from sparserob_core.experiment.run_config import RunConfig
-from sparserob_core.experiment.schema import config_schema
+from sparserob_core.experiment.cli.main import commands
+from sparserob_core.experiment.config.option_rows import option_rows
+from sparserob_core.experiment.config.run_config import RunConfig
+from sparserob_core.experiment.config.schema import config_schema
+from sparserob_core.experiment.plugins.registry import Hooks
+from sparserob_core.experiment.terminal.printing import EXIT
 
 ROOT = Path(__file__).resolve().parents[1]
-MEANING = {0: "certified or verified", 2: "the input is at fault", 3: "infeasible", 4: "refuted or undecided", 5: "failed",
-           130: "interrupted"}
+MEANING = {
+    0: "certified or verified",
+    2: "the input is at fault",
+    3: "infeasible",
+    4: "refuted or undecided",
+    5: "failed",
+    130: "interrupted",
+}
 FILES = {
     "config.yaml": "the complete, resolved config; `sparserob run` takes it",
-    "result.json": "status, message, cost, value, epsilon, bounds, gap, worst constraint, sparsity, counts, seconds, seed, versions; "
-                   "for the scenario approach `scenario_bound`",
-    "certificate.json": "what is claimed and what proves it; `sparserob check` takes it, [certificate.md](certificate.md) explains it",
-    "solution.npz": "`breakpoints (K+1,)`, `control (m, K)`, `theta (m, N)`; of the imposed constraints `times`, `indices`, `rows`, "
-                    "`families`, `multipliers`",
-    "evaluations.npz": "for a method that searches, one entry per value of g: outer iteration, epsilon, value, proven lower bound, seconds, "
-                       "`points (n, d)` unless they are too many, and `note_...` for what the maximiser noted",
+    "result.json": (
+        "status, message, cost, value, epsilon, bounds, gap, worst constraint, sparsity, counts, seconds, seed,"
+        " versions; for the scenario approach `scenario_bound`"
+    ),
+    "certificate.json": (
+        "what is claimed and what proves it; `sparserob check` takes it, [certificate.md](certificate.md) explains it"
+    ),
+    "solution.npz": (
+        "`breakpoints (K+1,)`, `control (m, K)`, `theta (m, N)`; of the imposed constraints `times`, `indices`, `rows`,"
+        " `families`, `multipliers`"
+    ),
+    "evaluations.npz": (
+        "for a method that searches, one entry per value of g: outer iteration, epsilon, value, proven lower bound,"
+        " seconds, `points (n, d)` unless they are too many, and `note_...` for what the maximiser noted"
+    ),
     "trace.npz": "one array per column, one entry per round: bounds, violation, epsilon, indices, seconds",
-    "rounds.npz": "the decision of every round and the constraints that it imposed, with their multipliers, unless they are too many",
+    "rounds.npz": (
+        "the decision of every round and the constraints that it imposed, with their multipliers, unless they are too"
+        " many"
+    ),
     "adversary.npz": "per constraint its worst time, parameter, disturbance and the states that these cause",
     "simulation-LAW.json": "written by `sparserob simulate`: how often trajectories under a law break each constraint",
     "figures/": "`control`, `states`, `convergence`, `adversary`, each as PDF and PNG; `clash` when infeasible",
@@ -59,10 +76,22 @@ def _commands() -> list[str]:
     lines = ["## Commands", ""]
     for name, command in commands.commands.items():
         context = click.Context(command, info_name=f"sparserob {name}")
-        usage = [parameter.make_metavar(context) for parameter in command.params if isinstance(parameter, click.Argument)]
-        lines += [f"### `sparserob {name}`", "", f"`{' '.join(['sparserob', name, *usage])}`", "", inspect.cleandoc(command.help or ""), ""]
-        options = [(f"`{'`, `'.join([*option.opts, *option.secondary_opts])}`", option.help or "") for option in command.params
-                   if isinstance(option, click.Option)]
+        usage = [
+            parameter.make_metavar(context) for parameter in command.params if isinstance(parameter, click.Argument)
+        ]
+        lines += [
+            f"### `sparserob {name}`",
+            "",
+            f"`{' '.join(['sparserob', name, *usage])}`",
+            "",
+            inspect.cleandoc(command.help or ""),
+            "",
+        ]
+        options = [
+            (f"`{'`, `'.join([*option.opts, *option.secondary_opts])}`", option.help or "")
+            for option in command.params
+            if isinstance(option, click.Option)
+        ]
         lines += [*table(("option", "meaning"), options), ""] if options else []
     ends = sorted({*EXIT.values(), *MEANING})
     return [*lines, "### Exit status", "", *table(("status", "meaning"), [(str(end), MEANING[end]) for end in ends])]
@@ -73,26 +102,50 @@ def _config() -> list[str]:
     for name, field in RunConfig.model_fields.items():
         default = "required" if field.is_required() else f"`{json.dumps(defaults[name])}`"
         rows.append((f"`{name}`", default, field.description or ""))
-    return ["## Keys of a config", "", *table(("key", "default", "meaning"), rows), "",
-            "A component is written as a mapping with its `name` and its options, or as its bare name. `maximiser` also takes `budget`."]
+    return [
+        "## Keys of a config",
+        "",
+        *table(("key", "default", "meaning"), rows),
+        "",
+        (
+            "A component is written as a mapping with its `name` and its options, or as its bare name. `maximiser` also"
+            " takes `budget`."
+        ),
+    ]
 
 
 def _components() -> list[str]:
     lines = ["## Components"]
     for record in sr.load_registry().records():
-        rows = [(f"`{row.name}`", row.type, row.default and f"`{row.default}`", row.range, row.meaning) for row in option_rows(record)]
+        rows = [
+            (f"`{row.name}`", row.type, row.default and f"`{row.default}`", row.range, row.meaning)
+            for row in option_rows(record)
+        ]
         lines += ["", f"### {record.kind} `{record.name}`", "", record.summary, ""]
         lines += table(("option", "type", "default", "range", "meaning"), rows) if rows else ["It has no options."]
     return lines
 
 
 def _hooks() -> list[str]:
-    hooks = [(f"`{name}`", inspect.getdoc(function) or "") for name, function in inspect.getmembers(Hooks, inspect.isfunction)]
-    return ["## Hooks", "", "[extending.md](extending.md) shows how to implement them.", "", *table(("hook", "yields"), hooks)]
+    hooks = [
+        (f"`{name}`", inspect.getdoc(function) or "")
+        for name, function in inspect.getmembers(Hooks, inspect.isfunction)
+    ]
+    return [
+        "## Hooks",
+        "",
+        "[extending.md](extending.md) shows how to implement them.",
+        "",
+        *table(("hook", "yields"), hooks),
+    ]
 
 
 def _files() -> list[str]:
-    return ["## Files of a run", "", *table(("file", "contents"), [(f"`{name}`", text) for name, text in FILES.items()])]
+    return [
+        "## Files of a run",
+        "",
+        *table(("file", "contents"), [(f"`{name}`", text) for name, text in FILES.items()]),
+    ]
 
 
 def _names() -> list[str]:

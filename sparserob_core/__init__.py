@@ -1,13 +1,16 @@
 """SparseRob: sparse robust optimal control of uncertain linear systems, with the proof.
 
-Every public name is an attribute of this module, and is imported when it is first used. To read the package, follow the data:
+Every public name is an attribute of this module, and is imported when it is first used. To read the package, follow the
+data:
 
-1. ``control/``     ``sets``, ``system``, ``problem``: what is to be controlled; ``dictionary``: how controls are written;
-   ``response``, ``transcription``: the problem as a convex semi-infinite program.
-2. ``sip/``         ``program``: such a program in general; ``finite``, ``solver``: finitely many of its constraints, and who solves them;
-   ``method``, ``exchange``: from there to the whole continuum; ``tuples``,
-   ``sparserob``: the paper's own way, a search over tuples of indices; ``result``: what was found and what of it was proven.
-3. ``experiment/``  ``config``: a file that names components; ``registry``: who offers them; ``run``: the whole walk; ``cli``: the commands.
+1. ``control/``     ``sets``, ``system``, ``problem``: what is to be controlled; ``dictionary``: how controls are
+   written; ``response``, ``transcription``: the problem as a convex semi-infinite program.
+2. ``sip/``         ``program``: such a program in general; ``finite``, ``solver``: finitely many of its constraints,
+   and who solves them; ``method``, ``exchange``: from there to the whole continuum; ``tuples``,
+   ``sparserob``: the paper's own way, a search over tuples of indices; ``result``: what was found and what of it was
+   proven.
+3. ``experiment/``  ``config``: a file that names components; ``registry``: who offers them; ``run``: the whole walk;
+  ``cli``: the commands.
 
 ``experiment`` imports ``control``, ``control`` imports ``sip``, never the other way; plugins import this module only.
 """
@@ -18,20 +21,22 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from sparserob_core.control.dictionary import Dictionary, DictionaryFactory
-    from sparserob_core.control.problem import OptimalControlProblem, PathConstraint, ProblemFactory
-    from sparserob_core.control.sets import Ellipsoid, Equality, NormBall, Polytope, cylinder, intersection
-    from sparserob_core.control.system import LinearSystem
-    from sparserob_core.control.transcription import transcribe
+    from sparserob_core.control.problem.dictionary import Dictionary, DictionaryFactory
+    from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint, ProblemFactory
+    from sparserob_core.control.problem.system import LinearSystem
+    from sparserob_core.control.sets.sets import Ellipsoid, Equality, NormBall, Polytope, cylinder, intersection
+    from sparserob_core.control.transcription.transcribe import transcribe
     from sparserob_core.errors import ConfigError, InputError, PluginError, SolverError, SparseRobError
     from sparserob_core.experiment.check import Check, check
-    from sparserob_core.experiment.compare import Comparison, compare
-    from sparserob_core.experiment.events import Observer, RunFinished, RunStarted
-    from sparserob_core.experiment.figure_data import FigureData, Wall
-    from sparserob_core.experiment.initial_states import InitialStates, initial_states
-    from sparserob_core.experiment.inspection import Inspection, RelaxedValue
-    from sparserob_core.experiment.margin import Margin, margin
-    from sparserob_core.experiment.plugin import (
+    from sparserob_core.experiment.comparison.compare import compare
+    from sparserob_core.experiment.comparison.comparison import Comparison
+    from sparserob_core.experiment.config.problems import LinearKeys, LinearProblem
+    from sparserob_core.experiment.config.set_options import SetOptions
+    from sparserob_core.experiment.figures.figure_data import FigureData, Wall
+    from sparserob_core.experiment.initial_states.initial_states import InitialStates, initial_states
+    from sparserob_core.experiment.margin.margin import Margin, margin
+    from sparserob_core.experiment.plugins.hookspecs import hookimpl
+    from sparserob_core.experiment.plugins.records import (
         DictionaryPlugin,
         InnerStopPlugin,
         MaximiserPlugin,
@@ -44,37 +49,121 @@ if TYPE_CHECKING:
         SelectionPlugin,
         SolverPlugin,
     )
-    from sparserob_core.experiment.problems import LinearKeys, LinearProblem
-    from sparserob_core.experiment.registry import hookimpl, load_registry
-    from sparserob_core.experiment.run import Outcome, run
-    from sparserob_core.experiment.set_options import SetOptions
-    from sparserob_core.experiment.simulate import simulate
-    from sparserob_core.experiment.simulation import ConstraintShare, Simulation
+    from sparserob_core.experiment.plugins.registry import load_registry
+    from sparserob_core.experiment.run.events import Observer, RunFinished, RunStarted
+    from sparserob_core.experiment.run.inspection import Inspection, RelaxedValue
+    from sparserob_core.experiment.run.run import Outcome, run
+    from sparserob_core.experiment.simulation.outcome import ConstraintShare, Simulation
+    from sparserob_core.experiment.simulation.simulate import simulate
     from sparserob_core.experiment.solve import maximise, solve
     from sparserob_core.options import Options
-    from sparserob_core.sip.batch import Batch
     from sparserob_core.sip.convex_set import Array, Box, ConvexSet
-    from sparserob_core.sip.events import EvaluationsFinished, Event, ProofProgress, RoundFinished
+    from sparserob_core.sip.events import Batch, EvaluationsFinished, Event, ProofProgress, RoundFinished
+    from sparserob_core.sip.evidence import Cut, Witness
     from sparserob_core.sip.maximiser import EvaluationError, Maximiser, Objective, Report, SearchEnded, Trace
     from sparserob_core.sip.method import Continuation, Method, Tools
     from sparserob_core.sip.program import ConstraintFamily, Enclosure, SemiInfiniteProgram, Separation
     from sparserob_core.sip.regulariser import ControlImage, Regulariser
-    from sparserob_core.sip.result import Cut, Result, SearchTrace, Witness
+    from sparserob_core.sip.result import Result, SearchTrace
     from sparserob_core.sip.rules import InnerStop, OuterStep, OuterStop, Progress, Schedule, Selection
+    from sparserob_core.sip.search.trust_region import TrustRegion
     from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
-    from sparserob_core.sip.trust_region import TrustRegion
 
 __all__ = [
-    "Array", "Batch", "Box", "Check", "Claim", "Comparison", "ConfigError", "ConstraintFamily", "ConstraintShare", "Continuation", "ControlImage",
-    "ConvexSet", "Cut", "Dictionary", "DictionaryFactory", "DictionaryPlugin", "Ellipsoid", "Enclosure", "Equality", "EvaluationError",
-    "EvaluationsFinished", "Event", "FigureData", "InitialStates", "InnerStop", "InnerStopPlugin", "InputError", "Inspection", "LinearKeys",
-    "LinearProblem", "LinearSystem", "Margin", "Maximiser", "MaximiserPlugin", "Method", "MethodPlugin", "NormBall", "Objective", "Observer",
-    "ObserverPlugin", "OptimalControlProblem", "Options", "Outcome", "OuterStep", "OuterStop", "OuterStopPlugin", "PathConstraint",
-    "PluginError", "Polytope", "ProblemFactory", "ProblemPlugin", "Progress", "ProofProgress", "QuadraticProgram", "Regulariser",
-    "RegulariserPlugin", "RelaxedValue", "Report", "Result", "RoundFinished", "RunFinished", "RunStarted", "Schedule", "SchedulePlugin",
-    "SearchEnded", "SearchTrace", "Selection", "SelectionPlugin", "SemiInfiniteProgram", "Separation", "SetOptions", "Simulation", "Solver",
-    "SolverError", "SolverPlugin", "SparseRobError", "Tools", "Trace", "TrustRegion", "Wall", "Witness", "check", "compare", "cylinder", "hookimpl",
-    "initial_states", "intersection", "load_registry", "margin", "maximise", "run", "simulate", "solve", "transcribe",
+    "Array",
+    "Batch",
+    "Box",
+    "Check",
+    "Claim",
+    "Comparison",
+    "ConfigError",
+    "ConstraintFamily",
+    "ConstraintShare",
+    "Continuation",
+    "ControlImage",
+    "ConvexSet",
+    "Cut",
+    "Dictionary",
+    "DictionaryFactory",
+    "DictionaryPlugin",
+    "Ellipsoid",
+    "Enclosure",
+    "Equality",
+    "EvaluationError",
+    "EvaluationsFinished",
+    "Event",
+    "FigureData",
+    "InitialStates",
+    "InnerStop",
+    "InnerStopPlugin",
+    "InputError",
+    "Inspection",
+    "LinearKeys",
+    "LinearProblem",
+    "LinearSystem",
+    "Margin",
+    "Maximiser",
+    "MaximiserPlugin",
+    "Method",
+    "MethodPlugin",
+    "NormBall",
+    "Objective",
+    "Observer",
+    "ObserverPlugin",
+    "OptimalControlProblem",
+    "Options",
+    "Outcome",
+    "OuterStep",
+    "OuterStop",
+    "OuterStopPlugin",
+    "PathConstraint",
+    "PluginError",
+    "Polytope",
+    "ProblemFactory",
+    "ProblemPlugin",
+    "Progress",
+    "ProofProgress",
+    "QuadraticProgram",
+    "Regulariser",
+    "RegulariserPlugin",
+    "RelaxedValue",
+    "Report",
+    "Result",
+    "RoundFinished",
+    "RunFinished",
+    "RunStarted",
+    "Schedule",
+    "SchedulePlugin",
+    "SearchEnded",
+    "SearchTrace",
+    "Selection",
+    "SelectionPlugin",
+    "SemiInfiniteProgram",
+    "Separation",
+    "SetOptions",
+    "Simulation",
+    "Solver",
+    "SolverError",
+    "SolverPlugin",
+    "SparseRobError",
+    "Tools",
+    "Trace",
+    "TrustRegion",
+    "Wall",
+    "Witness",
+    "check",
+    "compare",
+    "cylinder",
+    "hookimpl",
+    "initial_states",
+    "intersection",
+    "load_registry",
+    "margin",
+    "maximise",
+    "run",
+    "simulate",
+    "solve",
+    "transcribe",
 ]
 
 _MODULES = {
@@ -86,31 +175,35 @@ _MODULES = {
     "sip.regulariser": "ControlImage Regulariser",
     "sip.maximiser": "EvaluationError Maximiser Objective Report SearchEnded Trace",
     "sip.method": "Continuation Method Tools",
-    "sip.result": "Cut Result SearchTrace Witness",
+    "sip.result": "Result SearchTrace",
+    "sip.evidence": "Cut Witness",
     "sip.rules": "InnerStop OuterStep OuterStop Progress Schedule Selection",
-    "sip.trust_region": "TrustRegion",
-    "sip.batch": "Batch",
-    "sip.events": "EvaluationsFinished Event ProofProgress RoundFinished",
-    "control.dictionary": "Dictionary DictionaryFactory",
-    "control.sets": "Ellipsoid Equality NormBall Polytope cylinder intersection",
-    "control.system": "LinearSystem",
-    "control.problem": "OptimalControlProblem PathConstraint ProblemFactory",
-    "control.transcription": "transcribe",
+    "sip.search.trust_region": "TrustRegion",
+    "sip.events": "Batch EvaluationsFinished Event ProofProgress RoundFinished",
+    "control.problem.dictionary": "Dictionary DictionaryFactory",
+    "control.sets.sets": "Ellipsoid Equality NormBall Polytope cylinder intersection",
+    "control.problem.system": "LinearSystem",
+    "control.problem.problem": "OptimalControlProblem PathConstraint ProblemFactory",
+    "control.transcription.transcribe": "transcribe",
     "experiment.check": "Check check",
-    "experiment.compare": "Comparison compare",
-    "experiment.events": "Observer RunFinished RunStarted",
-    "experiment.figure_data": "FigureData Wall",
-    "experiment.initial_states": "InitialStates initial_states",
-    "experiment.inspection": "Inspection RelaxedValue",
-    "experiment.margin": "Margin margin",
-    "experiment.plugin": "DictionaryPlugin InnerStopPlugin MaximiserPlugin MethodPlugin ObserverPlugin OuterStopPlugin ProblemPlugin "
-                         "RegulariserPlugin SchedulePlugin SelectionPlugin SolverPlugin",
-    "experiment.problems": "LinearKeys LinearProblem",
-    "experiment.registry": "hookimpl load_registry",
-    "experiment.run": "Outcome run",
-    "experiment.set_options": "SetOptions",
-    "experiment.simulate": "simulate",
-    "experiment.simulation": "ConstraintShare Simulation",
+    "experiment.comparison.compare": "compare",
+    "experiment.comparison.comparison": "Comparison",
+    "experiment.run.events": "Observer RunFinished RunStarted",
+    "experiment.figures.figure_data": "FigureData Wall",
+    "experiment.initial_states.initial_states": "InitialStates initial_states",
+    "experiment.run.inspection": "Inspection RelaxedValue",
+    "experiment.margin.margin": "Margin margin",
+    "experiment.plugins.records": (
+        "DictionaryPlugin InnerStopPlugin MaximiserPlugin MethodPlugin ObserverPlugin OuterStopPlugin ProblemPlugin "
+        "RegulariserPlugin SchedulePlugin SelectionPlugin SolverPlugin"
+    ),
+    "experiment.config.problems": "LinearKeys LinearProblem",
+    "experiment.plugins.hookspecs": "hookimpl",
+    "experiment.plugins.registry": "load_registry",
+    "experiment.run.run": "Outcome run",
+    "experiment.config.set_options": "SetOptions",
+    "experiment.simulation.simulate": "simulate",
+    "experiment.simulation.outcome": "ConstraintShare Simulation",
     "experiment.solve": "maximise solve",
 }
 _HOME = {name: f"{__name__}.{module}" for module, names in _MODULES.items() for name in names.split()}

@@ -24,7 +24,8 @@ class ConfigError(InputError):
 
 
 class NotEnclosable(InputError):
-    """A function of the parameters has no rigorous enclosure on a cell: a singularity, or an operation that is not supported."""
+    """A function of the parameters has no rigorous enclosure on a cell: a singularity, or an operation that is not
+    supported."""
 
 
 class PluginError(InputError):

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-settings.register_profile("repeatable", derandomize=True)  # the same examples in every run; HYPOTHESIS_PROFILE=default searches for new ones
+# the same examples in every run; HYPOTHESIS_PROFILE=default searches for new ones
+settings.register_profile("repeatable", derandomize=True)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable"))
 
 

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 import sparserob_core as sr
-from sparserob_core.control.sampling import sample_disturbances, sample_parameters
-from sparserob_core.control.transcription import Transcription, prepare
+from sparserob_core.control.constraints.samples import sample_disturbances, sample_parameters
+from sparserob_core.control.transcription.record import Transcription
+from sparserob_core.control.transcription.transcribe import prepare
 
 TRAJECTORIES = 10_000
 SEED = 1
@@ -16,10 +17,12 @@ SEED = 1
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """The states ``(n, T, d)`` of ``n`` draws at the ends ``times (T,)`` of the pieces, every piece of a disturbance and every parameter uniform and
-    independent; ``violation (n,)``: the largest violation of each draw at these times, negative when all constraints hold.
+    """The states ``(n, T, d)`` of ``n`` draws at the ends ``times (T,)`` of the pieces, every piece of a disturbance
+    and every parameter uniform and independent; ``violation (n,)``: the largest violation of each draw at these times,
+    negative when all constraints hold.
 
-    ``lower``, ``upper`` ``(d, T)``: the worst case of every state, over all disturbances; of uncertain parameters only a lattice is tried.
+    ``lower``, ``upper`` ``(d, T)``: the worst case of every state, over all disturbances; of uncertain parameters only
+    a lattice is tried.
     """
 
     times: sr.Array
@@ -77,17 +80,22 @@ def _tube(model: Transcription, control: sr.Array) -> tuple[sr.Array, sr.Array]:
     lower, upper = np.empty((size, instants)), np.empty((size, instants))
     for state in range(size):
         direction = np.tile(np.eye(size)[state], (times.size, 1))
-        above, below = (model.functionals.offsets(times, side * direction, at).reshape(count, instants) for side in (1.0, -1.0))
+        above, below = (
+            model.functionals.offsets(times, side * direction, at).reshape(count, instants) for side in (1.0, -1.0)
+        )
         upper[state], lower[state] = (paths[:, :, state] + above).max(axis=0), (paths[:, :, state] - below).min(axis=0)
     return lower, upper
 
 
 def reachable_end(outcome: sr.Outcome, directions: int = 360) -> sr.Array:
-    """Corners ``(k, 2)`` of all ``(x1, x2)`` that a disturbance can lead to at the horizon, from ``k`` support directions; for a known system."""
+    """Corners ``(k, 2)`` of all ``(x1, x2)`` that a disturbance can lead to at the horizon, from ``k`` support
+    directions; for a known system."""
     model = model_of(outcome)
     angles = np.linspace(0.0, 2 * np.pi, directions, endpoint=False)
     normals = np.zeros((directions, model.response.initial_state.size))
     normals[:, 0], normals[:, 1] = np.cos(angles), np.sin(angles)
     still = model.response.states(model.pieces(outcome.result.decision), np.zeros((1, 0)))[0, -1]
-    support = normals @ still + model.functionals.offsets(np.full(directions, model.problem.horizon), normals, np.zeros((directions, 0)))
+    support = normals @ still + model.functionals.offsets(
+        np.full(directions, model.problem.horizon), normals, np.zeros((directions, 0))
+    )
     return np.array([np.linalg.solve(normals[[i - 1, i], :2], support[[i - 1, i]]) for i in range(directions)])

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import sparserob_core as sr
-from sparserob_core.experiment import figure_style as look
+from sparserob_core.experiment.figures import style as look
 
 if TYPE_CHECKING:
     from cloud import Cloud
@@ -29,7 +29,8 @@ def columns(rows: int, count: int, width: float, height: float) -> tuple[Figure,
 
 
 def forbid(ax: Axes, problem: sr.OptimalControlProblem, state: int, cloud: Cloud) -> None:
-    """Hatch what the path constraints forbid to one state, colour what of the worst case is there, and mark the terminal set.
+    """Hatch what the path constraints forbid to one state, colour what of the worst case is there, and mark the
+    terminal set.
 
     The limits of the axis must be known.
     """
@@ -38,15 +39,42 @@ def forbid(ax: Axes, problem: sr.OptimalControlProblem, state: int, cloud: Cloud
         end = problem.horizon if window.stop is None else window.stop
         for edge, outside in zip(_interval(window.set, state), (bottom, top), strict=True):
             if np.isfinite(edge):
-                ax.fill_between([window.start, end], edge, outside, facecolor=look.MIST, edgecolor=FORBIDDEN, hatch="////", linewidth=0, zorder=0,
-                                label="forbidden")
+                ax.fill_between(
+                    [window.start, end],
+                    edge,
+                    outside,
+                    facecolor=look.MIST,
+                    edgecolor=FORBIDDEN,
+                    hatch="////",
+                    linewidth=0,
+                    zorder=0,
+                    label="forbidden",
+                )
                 ax.plot([window.start, end], [edge, edge], color=look.GREY, linewidth=1.0, zorder=1)
                 _beyond(ax, cloud, state, (window.start, end), edge, outside > edge)
     for terminal in problem.terminal:
         ends = _interval(terminal, state) if isinstance(terminal, sr.ConvexSet) else (terminal.values[state],) * 2
         if np.isfinite(ends).all():
-            ax.plot([problem.horizon] * 2, ends, color=look.GREEN, linewidth=3.0, clip_on=False, zorder=6, label="terminal set")
-            ax.plot([problem.horizon] * 2, ends, linestyle="", marker=0, markersize=6, markeredgewidth=1.8, color=look.GREEN, clip_on=False, zorder=6)
+            ax.plot(
+                [problem.horizon] * 2,
+                ends,
+                color=look.GREEN,
+                linewidth=3.0,
+                clip_on=False,
+                zorder=6,
+                label="terminal set",
+            )
+            ax.plot(
+                [problem.horizon] * 2,
+                ends,
+                linestyle="",
+                marker=0,
+                markersize=6,
+                markeredgewidth=1.8,
+                color=look.GREEN,
+                clip_on=False,
+                zorder=6,
+            )
 
 
 def _beyond(ax: Axes, cloud: Cloud, state: int, window: tuple[float, float], edge: float, above: bool) -> None:
@@ -54,20 +82,33 @@ def _beyond(ax: Axes, cloud: Cloud, state: int, window: tuple[float, float], edg
     worst = (cloud.upper if above else cloud.lower)[state]
     reached = np.maximum(worst, edge) if above else np.minimum(worst, edge)
     if inside.any() and np.abs(reached[inside] - edge).max() > 1e-6:
-        ax.fill_between(cloud.times[inside], edge, reached[inside], color=look.ORANGE, alpha=0.6, linewidth=0, zorder=1,
-                        label="worst case where it is forbidden")
+        ax.fill_between(
+            cloud.times[inside],
+            edge,
+            reached[inside],
+            color=look.ORANGE,
+            alpha=0.6,
+            linewidth=0,
+            zorder=1,
+            label="worst case where it is forbidden",
+        )
 
 
 def _interval(bounds: sr.ConvexSet, state: int) -> tuple[float, float]:
-    axis = np.eye(bounds.dimension)[state:state + 1]
+    axis = np.eye(bounds.dimension)[state : state + 1]
     return -float(bounds.support(-axis)[0]), float(bounds.support(axis)[0])
 
 
 def judged(ax: Axes, title: str, outcome: sr.Outcome, cloud: Cloud) -> None:
-    """A heading that says how many draws break a constraint, and by how much the worst case does, or that it is proven that it does not."""
+    """A heading that says how many draws break a constraint, and by how much the worst case does, or that it is proven
+    that it does not."""
     share, proven = f"{100 * cloud.broken.mean():.3g} % of draws break it", outcome.status in ("certified", "verified")
-    heading(ax, title, f"{share}; proven: none can" if proven else f"{share}; worst by {outcome.result.worst.violation:.3g}",
-            look.GREEN if proven else look.VERMILLION)
+    heading(
+        ax,
+        title,
+        f"{share}; proven: none can" if proven else f"{share}; worst by {outcome.result.worst.violation:.3g}",
+        look.GREEN if proven else look.VERMILLION,
+    )
 
 
 def heading(ax: Axes, title: str, remark: str, colour: str = look.GREY) -> None:
@@ -79,12 +120,20 @@ def heading(ax: Axes, title: str, remark: str, colour: str = look.GREY) -> None:
 def legend(figure: Figure, axes: np.ndarray, per_row: int = 6) -> None:
     """One legend below all panels, every entry once."""
     entries = {label: handle for ax in axes.flat for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=min(per_row, len(entries)), columnspacing=1.6, handlelength=1.6,
-                  handletextpad=0.6)
+    figure.legend(
+        entries.values(),
+        entries.keys(),
+        loc="outside lower center",
+        ncols=min(per_row, len(entries)),
+        columnspacing=1.6,
+        handlelength=1.6,
+        handletextpad=0.6,
+    )
 
 
 def write(figure: Figure, directory: Path, name: str) -> None:
-    """``name.png`` at print quality (200 dots per inch), in a palette of 256 colours; the same figure gives the same bytes."""
+    """``name.png`` at print quality (200 dots per inch), in a palette of 256 colours; the same figure gives the same
+    bytes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image
 

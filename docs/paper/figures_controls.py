@@ -1,4 +1,5 @@
-"""Controls above one another: of different designs, and for different weights of the regulariser; and minimum attention."""
+"""Controls above one another: of different designs, and for different weights of the regulariser; and minimum
+attention."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ from figure_parts import columns, forbid, judged, legend, write
 from figures_states import trajectories
 
 import sparserob_core as sr
-from sparserob_core.experiment import figure_style as look
+from sparserob_core.experiment.figures import style as look
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,18 +28,28 @@ def draw_controls(directory: Path, name: str, titles: Mapping[str, str], outcome
             steps(ax, outcome, outcome.control[0], "control")
             bound = float(outcome.problem.control.support(np.ones((1, 1)))[0])
             for edge in (-bound, bound):
-                ax.axhline(edge, color=look.VERMILLION, linewidth=0.8, linestyle=(0, (5, 3)), zorder=1, label="control bound")
+                ax.axhline(
+                    edge, color=look.VERMILLION, linewidth=0.8, linestyle=(0, (5, 3)), zorder=1, label="control bound"
+                )
             ax.set_ylim(-1.25 * bound, 1.25 * bound)
             ax.set_ylabel("$u(t)$")
             active = 100 * outcome.summary["sparsity"]["active_fraction"]
-            ax.set_title(f"{title}    $J$ = {outcome.result.cost:.5g},  acts {active:.1f} % of the time", fontsize=9.5, pad=4)
+            ax.set_title(
+                f"{title}    $J$ = {outcome.result.cost:.5g},  acts {active:.1f} % of the time", fontsize=9.5, pad=4
+            )
         axes[-1, 0].set_xlabel("time $t$")
         axes[-1, 0].set_xlim(0.0, outcome.problem.horizon)
         legend(figure, axes)
         write(figure, directory, name)
 
 
-def draw_attention(directory: Path, name: str, titles: Mapping[str, str], outcomes: Mapping[str, sr.Outcome], clouds: Mapping[str, Cloud]) -> None:
+def draw_attention(
+    directory: Path,
+    name: str,
+    titles: Mapping[str, str],
+    outcomes: Mapping[str, sr.Outcome],
+    clouds: Mapping[str, Cloud],
+) -> None:
     """Minimum attention: states, control and its rate, one column per design."""
     with look.style():
         figure, axes = columns(4, len(titles), 3.3, 1.35)

@@ -8,18 +8,32 @@ from typing import Any
 
 from sparserob_core.sip.scenario_bound import at_most
 
-DESIGNS = {"nominal1": "non-robust", "scenario1_1000": "1000 scenarios", "scenario1_5000": "5000 scenarios", "search1": "the paper's search",
-           "repaired1_nominal": "non-robust", "repaired1_scenario_1000": "1000 scenarios", "repaired1_scenario_5000": "5000 scenarios",
-           "repaired1": "robust", "repaired2_nominal": "non-robust", "repaired2_scenario_1000": "1000 scenarios",
-           "repaired2_scenario_5000": "5000 scenarios", "repaired2": "robust", "scenario3_1000": "printed disturbance, 1000 scenarios",
-           "repaired3_nominal": "repaired, non-robust", "repaired3": "repaired, robust"}
+DESIGNS = {
+    "nominal1": "non-robust",
+    "scenario1_1000": "1000 scenarios",
+    "scenario1_5000": "5000 scenarios",
+    "search1": "the paper's search",
+    "repaired1_nominal": "non-robust",
+    "repaired1_scenario_1000": "1000 scenarios",
+    "repaired1_scenario_5000": "5000 scenarios",
+    "repaired1": "robust",
+    "repaired2_nominal": "non-robust",
+    "repaired2_scenario_1000": "1000 scenarios",
+    "repaired2_scenario_5000": "5000 scenarios",
+    "repaired2": "robust",
+    "scenario3_1000": "printed disturbance, 1000 scenarios",
+    "repaired3_nominal": "repaired, non-robust",
+    "repaired3": "repaired, robust",
+}
 COLUMNS = ("design", "J", "draws that break it", "promised by the scenario theory", "worst case", "status")
 
 
 def table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A Markdown table."""
     lines = [columns, ["---"] * len(columns), *rows]
-    return "\n".join("| " + " | ".join(" ".join(cell.replace("|", "\\|").split()) for cell in line) + " |" for line in lines)
+    return "\n".join(
+        "| " + " | ".join(" ".join(cell.replace("|", "\\|").split()) for cell in line) + " |" for line in lines
+    )
 
 
 def percent(share: float) -> str:
@@ -57,9 +71,17 @@ def design_rows(numbers: Mapping[str, Any], names: Sequence[str]) -> str:
 def _design(numbers: Mapping[str, Any], name: str) -> tuple[str, ...]:
     run = numbers["runs"][name]
     bound = run["scenario_bound"]
-    promised = "" if bound is None else f"at most {percent_up(bound['after'])} (before the solution was seen: {percent_up(bound['before'])})"
+    promised = (
+        ""
+        if bound is None
+        else f"at most {percent_up(bound['after'])} (before the solution was seen: {percent_up(bound['before'])})"
+    )
     proven = run["status"] in ("certified", "verified")
-    case = "proven: no violation" if proven else f"a violation of {worst(numbers, name):.4g} ({run['worst']['constraint']})"
+    case = (
+        "proven: no violation"
+        if proven
+        else f"a violation of {worst(numbers, name):.4g} ({run['worst']['constraint']})"
+    )
     return DESIGNS[name], cost(run["cost"]), broken(numbers, name), promised, case, run["status"]
 
 
@@ -85,4 +107,6 @@ def whole(count: int) -> str:
 
 def between(run: Mapping[str, Any]) -> str:
     """Both bounds of a run to nine decimals, rounded away from one another."""
-    return f"between {math.floor(run['lower_bound'] * 1e9) / 1e9:.9f} and {math.ceil(run['upper_bound'] * 1e9) / 1e9:.9f}"
+    return (
+        f"between {math.floor(run['lower_bound'] * 1e9) / 1e9:.9f} and {math.ceil(run['upper_bound'] * 1e9) / 1e9:.9f}"
+    )

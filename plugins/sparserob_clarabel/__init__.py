@@ -12,7 +12,8 @@ import sparserob_core as sr
 
 
 class Clarabel(sr.Solver, sr.Options):
-    """Robust and precise; slower than PIQP on programs with few rows. Gives a Farkas ray when a program is infeasible."""
+    """Robust and precise; slower than PIQP on programs with few rows. Gives a Farkas ray when a program is
+    infeasible."""
 
     sparse: ClassVar[bool] = True
     conic: ClassVar[bool] = True
@@ -30,14 +31,22 @@ class Clarabel(sr.Solver, sr.Options):
         rows = csc_matrix(vstack([program.A, program.G, identity[above], -identity[below]], format="csc"))
         rhs = np.concatenate([program.b, program.h, program.upper[above], -program.lower[below]])
         cones = [clarabel.ZeroConeT(e), clarabel.NonnegativeConeT(rhs.size - e)]
-        solver = clarabel.DefaultSolver(csc_matrix(triu(program.P, format="csc")), program.q, rows, rhs, cones, self._settings(accuracy))
+        solver = clarabel.DefaultSolver(
+            csc_matrix(triu(program.P, format="csc")), program.q, rows, rhs, cones, self._settings(accuracy)
+        )
         solution = solver.solve()
         dual, z_box = np.array(solution.z), np.zeros(n)
-        z_box[above] = dual[e + r: e + r + above.size]
-        z_box[below] -= dual[e + r + above.size:]
+        z_box[above] = dual[e + r : e + r + above.size]
+        z_box[below] -= dual[e + r + above.size :]
         kinds: dict[Any, Literal["solved", "infeasible"]] = {"Solved": "solved", "PrimalInfeasible": "infeasible"}
-        return sr.Claim(kinds.get(str(solution.status), "failed"), np.array(solution.x), dual[e: e + r], dual[:e], z_box,
-                        f"{solution.status} after {solution.iterations} iterations")
+        return sr.Claim(
+            kinds.get(str(solution.status), "failed"),
+            np.array(solution.x),
+            dual[e : e + r],
+            dual[:e],
+            z_box,
+            f"{solution.status} after {solution.iterations} iterations",
+        )
 
     def _settings(self, accuracy: float) -> Any:
         import clarabel
@@ -54,4 +63,6 @@ class Clarabel(sr.Solver, sr.Options):
 @sr.hookimpl
 def sparserob_solvers() -> Iterator[sr.SolverPlugin]:
     """Offer the solver."""
-    yield sr.SolverPlugin(name="clarabel", factory=Clarabel, summary="interior point on the homogeneous embedding, conic; robust")
+    yield sr.SolverPlugin(
+        name="clarabel", factory=Clarabel, summary="interior point on the homogeneous embedding, conic; robust"
+    )

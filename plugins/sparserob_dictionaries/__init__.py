@@ -48,7 +48,9 @@ class PiecewiseConstant(sr.DictionaryFactory, sr.Options):
         if self.step is not None:
             pieces = max(1, math.ceil(horizon / self.step * (1.0 - 1e-12)))
             if pieces > MOST_PIECES:
-                raise sr.InputError(f"step: expected at most {MOST_PIECES} pieces, got {pieces} on the horizon {horizon:g}")
+                raise sr.InputError(
+                    f"step: expected at most {MOST_PIECES} pieces, got {pieces} on the horizon {horizon:g}"
+                )
         return np.linspace(0.0, horizon, pieces + 1)
 
 
@@ -70,13 +72,14 @@ class Haar(sr.DictionaryFactory, sr.Options):
         for i in range(1, len(values)):
             scale = 2 ** (i.bit_length() - 1)
             half, first = K // scale // 2, (i - scale) * (K // scale)
-            values[i, first: first + half], values[i, first + half: first + 2 * half] = 1.0, -1.0
+            values[i, first : first + half], values[i, first + half : first + 2 * half] = 1.0, -1.0
         return sr.Dictionary(np.linspace(0.0, horizon, K + 1), values)
 
 
 @final
 class Walsh(sr.DictionaryFactory, sr.Options):
-    """The first Walsh functions (Walsh 1923) with values -1 and 1, ordered by their number of sign changes (sequency)."""
+    """The first Walsh functions (Walsh 1923) with values -1 and 1, ordered by their number of sign changes
+    (sequency)."""
 
     pieces: int = Field(default=128, ge=1, le=4096)
     """Number of equal pieces, a power of two."""
@@ -97,7 +100,9 @@ class Walsh(sr.DictionaryFactory, sr.Options):
 
 def _functions(functions: int | None, pieces: int) -> int:
     if functions is not None and functions > pieces:
-        raise sr.InputError(f"functions: expected at most {pieces}, as many as pieces, or they are linearly dependent; got {functions}")
+        raise sr.InputError(
+            f"functions: expected at most {pieces}, as many as pieces, or they are linearly dependent; got {functions}"
+        )
     return functions or pieces
 
 
@@ -111,8 +116,10 @@ def _power_of_two(pieces: int) -> int:
 def _checked(breakpoints: list[float], horizon: float) -> sr.Array:
     times = np.array(breakpoints)
     if times[0] != 0.0 or (np.diff(times) <= 0.0).any() or abs(times[-1] - horizon) > 1e-12 * horizon:
-        raise sr.InputError(f"breakpoints: expected increasing times from 0 to the horizon {horizon:g}, "
-                            f"got {times[0]:g} ... {times[-1]:g}" + (", not increasing" if (np.diff(times) <= 0.0).any() else ""))
+        raise sr.InputError(
+            f"breakpoints: expected increasing times from 0 to the horizon {horizon:g}, "
+            f"got {times[0]:g} ... {times[-1]:g}" + (", not increasing" if (np.diff(times) <= 0.0).any() else "")
+        )
     times[-1] = horizon
     return times
 
@@ -120,6 +127,12 @@ def _checked(breakpoints: list[float], horizon: float) -> sr.Array:
 @sr.hookimpl
 def sparserob_dictionaries() -> Iterator[sr.DictionaryPlugin]:
     """The shipped dictionaries."""
-    yield sr.DictionaryPlugin(name="piecewise_constant", factory=PiecewiseConstant, summary="One indicator function per piece of time.")
-    yield sr.DictionaryPlugin(name="haar", factory=Haar, summary="The first Haar functions: steps at ever finer scales.")
-    yield sr.DictionaryPlugin(name="walsh", factory=Walsh, summary="The first Walsh functions: values -1 and 1, by sign changes.")
+    yield sr.DictionaryPlugin(
+        name="piecewise_constant", factory=PiecewiseConstant, summary="One indicator function per piece of time."
+    )
+    yield sr.DictionaryPlugin(
+        name="haar", factory=Haar, summary="The first Haar functions: steps at ever finer scales."
+    )
+    yield sr.DictionaryPlugin(
+        name="walsh", factory=Walsh, summary="The first Walsh functions: values -1 and 1, by sign changes."
+    )

@@ -11,7 +11,8 @@ import sparserob_core as sr
 
 
 class Direct(sr.Maximiser, sr.Options):
-    """Dividing rectangles (Jones, Perttunen and Stuckman 1993), with the local bias of Gablonsky and Kelley (2001) unless switched off.
+    """Dividing rectangles (Jones, Perttunen and Stuckman 1993), with the local bias of Gablonsky and Kelley (2001)
+    unless switched off.
 
     Deterministic: the generator is not used. It proves no upper bound, unless every side of the box has length zero.
     """
@@ -31,17 +32,26 @@ class Direct(sr.Maximiser, sr.Options):
         if not free.any():
             return float(objective.evaluate(lower[np.newaxis])[0])
         descent = _Descent(objective, free)
-        # An iteration takes two evaluations at least, so only the budget ends the search; scipy allocates memory for maxiter.
-        direct(descent, Bounds(lower[free], upper[free]), eps=self.eps, maxfun=objective.remaining, maxiter=objective.remaining + 1,
-               locally_biased=self.locally_biased, vol_tol=0.0, len_tol=0.0)
+        # An iteration takes two evaluations at least, so only the budget ends the search; scipy allocates memory for
+        # maxiter.
+        direct(
+            descent,
+            Bounds(lower[free], upper[free]),
+            eps=self.eps,
+            maxfun=objective.remaining,
+            maxiter=objective.remaining + 1,
+            locally_biased=self.locally_biased,
+            vol_tol=0.0,
+            len_tol=0.0,
+        )
         return float("inf")
 
 
 class _Descent:
     """The negated objective at one point, in the coordinates that can move.
 
-    scipy finishes its iteration beyond ``maxfun``, and averages values: once the budget is spent, and where the objective is ``-inf``,
-    it is told the worst finite value that was seen.
+    scipy finishes its iteration beyond ``maxfun``, and averages values: once the budget is spent, and where the
+    objective is ``-inf``, it is told the worst finite value that was seen.
     """
 
     def __init__(self, objective: sr.Objective, free: np.ndarray) -> None:

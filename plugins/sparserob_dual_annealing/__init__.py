@@ -13,14 +13,15 @@ import sparserob_core as sr
 
 
 class DualAnnealing(sr.Maximiser, sr.Options):
-    """Generalised simulated annealing (Tsallis and Stariolo 1996) that sends an L-BFGS-B search with finite differences from what it finds
-    (Xiang, Sun, Fan and Gong 1997).
+    """Generalised simulated annealing (Tsallis and Stariolo 1996) that sends an L-BFGS-B search with finite differences
+    from what it finds (Xiang, Sun, Fan and Gong 1997).
 
-    The local searches make it the most accurate of the annealing methods on smooth functions of a few variables; each gradient costs ``d + 1``
-    evaluations, so beyond some hundred dimensions the budget is gone before the first search has moved. Its visiting distribution narrows
-    with the temperature and has moves of one coordinate, so Belisle's condition (1992) does not hold; ``simulated_annealing`` keeps it.
-    It chooses by its own acceptance, whatever selection rule the method was given. In a space of tuples every other step changes every block.
-    It proves no upper bound, unless every side of the box has length zero.
+    The local searches make it the most accurate of the annealing methods on smooth functions of a few variables; each
+    gradient costs ``d + 1`` evaluations, so beyond some hundred dimensions the budget is gone before the first search
+    has moved. Its visiting distribution narrows with the temperature and has moves of one coordinate, so Belisle's
+    condition (1992) does not hold; ``simulated_annealing`` keeps it. It chooses by its own acceptance, whatever
+    selection rule the method was given. In a space of tuples every other step changes every block. It proves no upper
+    bound, unless every side of the box has length zero.
     """
 
     initial_temp: float = Field(default=5230.0, gt=0.01, le=5e4)
@@ -47,18 +48,28 @@ class DualAnnealing(sr.Maximiser, sr.Options):
         if not free.any():
             return float(objective.evaluate(lower[np.newaxis])[0])
         start = objective.best_point[free] if objective.evaluations else None
-        # scipy renamed the argument (1.15), and knows no end but a count of its iterations: the objective ends the search.
+        # scipy renamed the argument (1.15), and knows no end but a count of its iterations: the objective ends the
+        # search.
         seeded: dict[str, Any] = {"rng" if "rng" in inspect.signature(dual_annealing).parameters else "seed": rng}
         while objective.remaining:
-            dual_annealing(_Energy(objective, free), list(zip(lower[free], upper[free], strict=True)), maxiter=objective.remaining + 1,
-                           initial_temp=self.initial_temp, restart_temp_ratio=self.restart_temp_ratio, visit=self.visit,
-                           accept=self.accept, no_local_search=self.no_local_search, x0=start, **seeded)
+            dual_annealing(
+                _Energy(objective, free),
+                list(zip(lower[free], upper[free], strict=True)),
+                maxiter=objective.remaining + 1,
+                initial_temp=self.initial_temp,
+                restart_temp_ratio=self.restart_temp_ratio,
+                visit=self.visit,
+                accept=self.accept,
+                no_local_search=self.no_local_search,
+                x0=start,
+                **seeded,
+            )
         return float("inf")
 
 
 class _Energy:
-    """The negated objective at one point, in the coordinates that can move; where the objective is ``-inf``, which scipy's differences
-    cannot rank, the worst finite value that was seen."""
+    """The negated objective at one point, in the coordinates that can move; where the objective is ``-inf``, which
+    scipy's differences cannot rank, the worst finite value that was seen."""
 
     def __init__(self, objective: sr.Objective, free: np.ndarray) -> None:
         self.objective, self.free = objective, free
@@ -77,4 +88,6 @@ class _Energy:
 @sr.hookimpl
 def sparserob_maximisers() -> Iterator[sr.MaximiserPlugin]:
     """Offer ``dual_annealing``."""
-    yield sr.MaximiserPlugin(name="dual_annealing", factory=DualAnnealing, summary="generalised annealing with L-BFGS-B (scipy)")
+    yield sr.MaximiserPlugin(
+        name="dual_annealing", factory=DualAnnealing, summary="generalised annealing with L-BFGS-B (scipy)"
+    )

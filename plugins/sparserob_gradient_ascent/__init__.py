@@ -1,4 +1,5 @@
-"""Ascent along the gradient from many starts: for functions that have one, such as the relaxed value ``g`` of a tuple of indices."""
+"""Ascent along the gradient from many starts: for functions that have one, such as the relaxed value ``g`` of a tuple
+of indices."""
 
 from __future__ import annotations
 
@@ -9,21 +10,23 @@ from pydantic import Field
 
 import sparserob_core as sr
 
-STEP = 1e-6     # of a side, for differences where no gradient is offered
-NUMBERS = 1_000_000   # in one batch of points
-SCALE = 10.0    # length of the box's sides for the local method, whose first step has length 1
+STEP = 1e-6  # of a side, for differences where no gradient is offered
+NUMBERS = 1_000_000  # in one batch of points
+SCALE = 10.0  # length of the box's sides for the local method, whose first step has length 1
 
 
 class GradientAscent(sr.Maximiser, sr.Options):
-    """Projected quasi-Newton ascent (L-BFGS-B: Byrd, Lu, Nocedal and Zhu 1995) from the best point and from new starts, until the budget is spent.
+    """Projected quasi-Newton ascent (L-BFGS-B: Byrd, Lu, Nocedal and Zhu 1995) from the best point and from new starts,
+    until the budget is spent.
 
-    A start is uniform in the box or, with probability ``redraw``, the best point with those blocks of coordinates drawn anew in which the
-    gradient vanishes there: of a tuple of indices these are the ones that impose nothing, and the others are kept. With gradients, one
-    evaluation is one step in any dimension; without, each gradient is taken from differences and costs an evaluation per coordinate, so
-    that in high dimension little is left. Where the function has kinks, as ``g`` does, a local method may stop at one: the restarts are what
-    it relies on. Proves no upper bound.
+    A start is uniform in the box or, with probability ``redraw``, the best point with those blocks of coordinates drawn
+    anew in which the gradient vanishes there: of a tuple of indices these are the ones that impose nothing, and the
+    others are kept. With gradients, one evaluation is one step in any dimension; without, each gradient is taken from
+    differences and costs an evaluation per coordinate, so that in high dimension little is left. Where the function has
+    kinks, as ``g`` does, a local method may stop at one: the restarts are what it relies on. Proves no upper bound.
 
-    Notes ``ascent`` (its number, from 1) and ``slope`` (the largest entry of the gradient, per width of the box) at every step.
+    Notes ``ascent`` (its number, from 1) and ``slope`` (the largest entry of the gradient, per width of the box) at
+    every step.
     """
 
     redraw: float = Field(default=0.5, ge=0.0, le=1.0)
@@ -80,13 +83,21 @@ class _Climb:
 
         self.ascent += 1
         scaled = np.clip((start - self.domain.lower)[self.free] / self.width, 0.0, 1.0) * SCALE
-        minimize(self.descent, scaled, jac=True, method="L-BFGS-B", bounds=[(0.0, SCALE)] * scaled.size,
-                 options={"maxfun": steps, "maxiter": steps, "ftol": 1e-15, "gtol": 1e-14})
+        minimize(
+            self.descent,
+            scaled,
+            jac=True,
+            method="L-BFGS-B",
+            bounds=[(0.0, SCALE)] * scaled.size,
+            options={"maxfun": steps, "maxiter": steps, "ftol": 1e-15, "gtol": 1e-14},
+        )
 
     def descent(self, scaled: sr.Array) -> tuple[float, sr.Array]:
         """The negated objective and its gradient."""
         point = self.place(scaled)
-        value, slope = self.objective.value_and_gradient(point) if self.objective.differentiable else self.differences(point)
+        value, slope = (
+            self.objective.value_and_gradient(point) if self.objective.differentiable else self.differences(point)
+        )
         if np.isfinite(value):
             self.worst = min(self.worst, value)
         if np.array_equal(point, self.objective.best_point):
@@ -99,13 +110,17 @@ class _Climb:
         """One-sided differences, inwards, in batches that fit into memory; 0 where a value is not finite."""
         value, slope = float(self.objective.evaluate(point[np.newaxis])[0]), np.zeros(point.size)
         inside = point[self.free] + STEP * self.width <= self.domain.upper[self.free]
-        moved = np.clip(point[self.free] + np.where(inside, STEP, -STEP) * self.width, self.domain.lower[self.free], self.domain.upper[self.free])
+        moved = np.clip(
+            point[self.free] + np.where(inside, STEP, -STEP) * self.width,
+            self.domain.lower[self.free],
+            self.domain.upper[self.free],
+        )
         batch = max(1, NUMBERS // point.size)
         for first in range(0, self.free.size if np.isfinite(value) else 0, batch):
-            axes = self.free[first:first + batch]
+            axes = self.free[first : first + batch]
             beside = np.repeat(point[np.newaxis], axes.size, axis=0)
-            beside[np.arange(axes.size), axes] = moved[first:first + batch]
-            values, run = self.objective.evaluate(beside), moved[first:first + batch] - point[axes]
+            beside[np.arange(axes.size), axes] = moved[first : first + batch]
+            values, run = self.objective.evaluate(beside), moved[first : first + batch] - point[axes]
             usable = np.isfinite(values) & (run != 0.0)
             slope[axes[usable]] = (values[usable] - value) / run[usable]
         return value, slope
@@ -114,4 +129,6 @@ class _Climb:
 @sr.hookimpl
 def sparserob_maximisers() -> Iterator[sr.MaximiserPlugin]:
     """Offer ``gradient_ascent``."""
-    yield sr.MaximiserPlugin(name="gradient_ascent", factory=GradientAscent, summary="quasi-Newton ascents along the gradient, with restarts")
+    yield sr.MaximiserPlugin(
+        name="gradient_ascent", factory=GradientAscent, summary="quasi-Newton ascents along the gradient, with restarts"
+    )

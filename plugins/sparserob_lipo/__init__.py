@@ -16,23 +16,26 @@ from sparserob_lipo.walk import Walk
 class Lipo(sr.Maximiser, sr.Options):
     """LIPO (Malherbe and Vayatis, ICML 2017) for a function whose Lipschitz constant is known.
 
-    A point ``x`` is evaluated only if ``min_i f(x_i) + constant |x - x_i| >= max_i f(x_i)``. Candidates are drawn in turn from the whole box and
-    from ever smaller boxes around the best point; the first of each evaluation is uniform. If the constant is right, the best value
-    after ``n`` evaluations is therefore never below that of the ``n`` independent uniform points that these first candidates are, seed by seed (the
-    paper compares the distributions for uniform candidates, and proves an exponentially falling regret where ``f* - f(x) >= c |x - x*|``).
-    Where 1024 candidates are excluded, that of the highest bound among the last is evaluated: the search never hangs.
+    A point ``x`` is evaluated only if ``min_i f(x_i) + constant |x - x_i| >= max_i f(x_i)``. Candidates are drawn in
+    turn from the whole box and from ever smaller boxes around the best point; the first of each evaluation is uniform.
+    If the constant is right, the best value after ``n`` evaluations is therefore never below that of the ``n``
+    independent uniform points that these first candidates are, seed by seed (the paper compares the distributions for
+    uniform candidates, and proves an exponentially falling regret where ``f* - f(x) >= c |x - x*|``). Where 1024
+    candidates are excluded, that of the highest bound among the last is evaluated: the search never hangs.
 
-    Upper bound: the highest Lipschitz bound over a partition of the box, proven provided that the constant is one; ``inf`` without a constant,
-    when two values or a value of ``-inf`` refute it, or when the search is ended before its budget.
+    Upper bound: the highest Lipschitz bound over a partition of the box, proven provided that the constant is one;
+    ``inf`` without a constant, when two values or a value of ``-inf`` refute it, or when the search is ended before its
+    budget.
 
-    In high dimension: balls cover a vanishing part of the box, nothing is excluded, and the search tends to pure random search; the bound says
-    little. It is for costly functions of up to some five coordinates. An evaluation costs time in proportion to those before it. Permutations of
-    an index tuple are different points to it.
+    In high dimension: balls cover a vanishing part of the box, nothing is excluded, and the search tends to pure random
+    search; the bound says little. It is for costly functions of up to some five coordinates. An evaluation costs time
+    in proportion to those before it. Permutations of an index tuple are different points to it.
     """
 
     constant: float | None = Field(default=None, gt=0.0)
     """A Lipschitz constant: ``|f(x) - f(y)| <= constant |x - y|`` in the Euclidean norm and the box's own units.
-    ``null``: none is known, so nothing can be excluded, and the search is pure random search; ``adalipo`` estimates one."""
+    ``null``: none is known, so nothing can be excluded, and the search is pure random search; ``adalipo`` estimates
+    one."""
 
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
         """See `sparserob_core.Maximiser`."""
@@ -54,24 +57,28 @@ class Lipo(sr.Maximiser, sr.Options):
 class AdaLipo(sr.Maximiser, sr.Options):
     """AdaLIPO (Malherbe and Vayatis, ICML 2017): LIPO with an estimate of the Lipschitz constant.
 
-    With probability ``exploration`` the next point is uniform; otherwise it is a candidate that `Lipo`'s test admits with the estimate: the smallest
-    ``(1 + growth)^i``, ``i`` an integer, that is no smaller than the steepest slope between any two evaluated points. Distances are taken in the
-    unit cube that the box is scaled to, so units of the coordinates and of the value do not matter; on a cube this is the paper's rule.
+    With probability ``exploration`` the next point is uniform; otherwise it is a candidate that `Lipo`'s test admits
+    with the estimate: the smallest ``(1 + growth)^i``, ``i`` an integer, that is no smaller than the steepest slope
+    between any two evaluated points. Distances are taken in the unit cube that the box is scaled to, so units of the
+    coordinates and of the value do not matter; on a cube this is the paper's rule.
 
-    Consistent for every Lipschitz function because ``exploration > 0`` (proven there), however the other candidates are drawn: as in
-    `Lipo` in turn from the whole box and from ever smaller boxes around the best point, 1024 at most, then one of a high bound.
-    It proves no upper bound, unless every side of the box has length zero. Values of ``-inf`` take no part in the slopes.
+    Consistent for every Lipschitz function because ``exploration > 0`` (proven there), however the other candidates are
+    drawn: as in `Lipo` in turn from the whole box and from ever smaller boxes around the best point, 1024 at most, then
+    one of a high bound. It proves no upper bound, unless every side of the box has length zero. Values of ``-inf`` take
+    no part in the slopes.
 
-    In high dimension: nearly nothing is excluded, and the search tends to pure random search. A function that is not Lipschitz, or noise, drives
-    the estimate up with the same effect. It is for costly functions of up to some five coordinates. An evaluation costs time in proportion to
-    those before it. Permutations of an index tuple are different points to it.
+    In high dimension: nearly nothing is excluded, and the search tends to pure random search. A function that is not
+    Lipschitz, or noise, drives the estimate up with the same effect. It is for costly functions of up to some five
+    coordinates. An evaluation costs time in proportion to those before it. Permutations of an index tuple are different
+    points to it.
     """
 
     exploration: float = Field(default=0.1, gt=0.0, le=1.0)
     """Probability that a point is uniform; the paper's experiments: 0.1."""
 
     growth: float | None = Field(default=None, gt=0.0, le=10.0)
-    """Spacing of the grid of constants; ``null``: 0.01 divided by the number of coordinates, as in the paper's experiments."""
+    """Spacing of the grid of constants; ``null``: 0.01 divided by the number of coordinates, as in the paper's
+    experiments."""
 
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
         """See `sparserob_core.Maximiser`."""
@@ -99,5 +106,7 @@ def _on_grid(slope: float, ratio: float) -> float:
 @sr.hookimpl
 def sparserob_maximisers() -> Iterator[sr.MaximiserPlugin]:
     """Offer ``lipo`` and ``adalipo``."""
-    yield sr.MaximiserPlugin(name="lipo", factory=Lipo, summary="LIPO for a known Lipschitz constant, with an upper bound")
+    yield sr.MaximiserPlugin(
+        name="lipo", factory=Lipo, summary="LIPO for a known Lipschitz constant, with an upper bound"
+    )
     yield sr.MaximiserPlugin(name="adalipo", factory=AdaLipo, summary="LIPO with an estimated Lipschitz constant")

@@ -16,12 +16,14 @@ ROUNDING: Final = 1e-12
 
 
 def lipschitz_bound(evaluated: Evaluated, constant: float, sides: np.ndarray) -> float:
-    """An upper bound, over the box ``0 <= z <= sides (d,)``, of every function with this Lipschitz constant and the evaluated values.
+    """An upper bound, over the box ``0 <= z <= sides (d,)``, of every function with this Lipschitz constant and the
+    evaluated values.
 
-    ``U(z) = min_i value_i + constant |z - z_i|`` bounds the function and has the constant itself, so on a cell with centre ``c`` and half
-    sides ``h`` nothing exceeds ``U(c) + constant |h|``. The cells with the highest bounds are halved across their longest side, again and
-    again (Piyavskii 1972, Shubert 1972, in boxes); the bound that is returned holds whenever one stops, and is raised by what rounding may cost.
-    ``inf`` when the values themselves refute the constant.
+    ``U(z) = min_i value_i + constant |z - z_i|`` bounds the function and has the constant itself, so on a cell with
+    centre ``c`` and half sides ``h`` nothing exceeds ``U(c) + constant |h|``. The cells with the highest bounds are
+    halved across their longest side, again and again (Piyavskii 1972, Shubert 1972, in boxes); the bound that is
+    returned holds whenever one stops, and is raised by what rounding may cost. ``inf`` when the values themselves
+    refute the constant.
     """
     allowance = ROUNDING * (float(np.abs(evaluated.values).max()) + constant * float(np.linalg.norm(sides)))
     if evaluated.refutes(constant, allowance):
@@ -38,7 +40,9 @@ def lipschitz_bound(evaluated: Evaluated, constant: float, sides: np.ndarray) ->
         kept = np.setdiff1d(np.arange(len(bounds)), worst)
         inner, narrow = _halved(centres[worst], halves[worst])
         fresh = np.minimum(_cell_bounds(evaluated, constant, inner, narrow), np.tile(bounds[worst], 2))
-        centres, halves, bounds = (np.concatenate(pair) for pair in ((centres[kept], inner), (halves[kept], narrow), (bounds[kept], fresh)))
+        centres, halves, bounds = (
+            np.concatenate(pair) for pair in ((centres[kept], inner), (halves[kept], narrow), (bounds[kept], fresh))
+        )
         open_still = bounds > best
         centres, halves, bounds = centres[open_still], halves[open_still], bounds[open_still]
     return float(bounds.max(initial=best)) + allowance

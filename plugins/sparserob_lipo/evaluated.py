@@ -14,10 +14,12 @@ ROUNDED: Final = 8 * float(np.finfo(float).eps)  # of a value, which is no rise
 
 
 class Evaluated:
-    """Points ``(n, d)`` with finite values ``(n,)``, ordered by value from the lowest, and the steepest slope between any two.
+    """Points ``(n, d)`` with finite values ``(n,)``, ordered by value from the lowest, and the steepest slope between
+    any two.
 
-    A point that is far below the best excludes the largest ball around it, so in this order a test ends early. Where all points would take too
-    much memory, those of high value, which exclude least, are forgotten: fewer places are excluded then, and none wrongly.
+    A point that is far below the best excludes the largest ball around it, so in this order a test ends early. Where
+    all points would take too much memory, those of high value, which exclude least, are forgotten: fewer places are
+    excluded then, and none wrongly.
     """
 
     def __init__(self, dimension: int, budget: int) -> None:
@@ -56,7 +58,8 @@ class Evaluated:
             self.count = count
 
     def first_possible(self, candidates: np.ndarray, constant: float) -> int | None:
-        """The first of the candidates ``(m, d)`` whose value can still reach the best, ``value_i + constant |x - x_i| >= best`` for all ``i``."""
+        """The first of the candidates ``(m, d)`` whose value can still reach the best,
+        ``value_i + constant |x - x_i| >= best`` for all ``i``."""
         radii = self._radii(constant)
         with np.errstate(over="ignore"):
             squares = np.square(radii[: int(np.searchsorted(-radii, 0.0))])
@@ -70,8 +73,11 @@ class Evaluated:
             group *= 4
         return None
 
-    def _outside(self, candidates: np.ndarray, alive: np.ndarray, squares: np.ndarray, start: int, size: int) -> np.ndarray:
-        """Those of the candidates that are alive which lie in none of the balls from ``start`` on (of the first ``FRONT`` only when it is 0)."""
+    def _outside(
+        self, candidates: np.ndarray, alive: np.ndarray, squares: np.ndarray, start: int, size: int
+    ) -> np.ndarray:
+        """Those of the candidates that are alive which lie in none of the balls from ``start`` on (of the first
+        ``FRONT`` only when it is 0)."""
         from scipy.spatial.distance import cdist
 
         last = len(squares) if start else min(FRONT, len(squares))
@@ -95,7 +101,8 @@ class Evaluated:
         return lowest
 
     def refutes(self, constant: float, allowance: float) -> bool:
-        """Whether two of the values differ by more than the constant permits, and more than the allowance for rounding beyond that."""
+        """Whether two of the values differ by more than the constant permits, and more than the allowance for rounding
+        beyond that."""
         for start in range(0, self.count, self.part):
             stop = min(self.count, start + self.part)
             bounds = self.bounds(self._points[self._order[start:stop]], constant)

@@ -1,4 +1,5 @@
-"""The search that both methods share: draw candidates until one can still beat the best value, evaluate it, and learn from it."""
+"""The search that both methods share: draw candidates until one can still beat the best value, evaluate it, and learn
+from it."""
 
 from __future__ import annotations
 
@@ -22,8 +23,8 @@ WORK: Final = 2**31  # differences of coordinates that the candidates of one eva
 class Walk:
     """Evaluates one point after the other, in coordinates ``z = (x - lower) / scale`` of the sides that have a length.
 
-    ``scale`` is the length of the longest side, or ``(d,)`` that of each: then ``z`` lies in the unit cube. Values of ``-inf`` are counted, and
-    take no part in slopes and exclusions.
+    ``scale`` is the length of the longest side, or ``(d,)`` that of each: then ``z`` lies in the unit cube. Values of
+    ``-inf`` are counted, and take no part in slopes and exclusions.
     """
 
     def __init__(self, objective: sr.Objective, rng: np.random.Generator, uniform_scale: bool) -> None:
@@ -47,7 +48,8 @@ class Walk:
         self._evaluate(self._inside(self.rng.random(self.dimension)))
 
     def exploit(self, constant: float) -> None:
-        """Evaluate the first candidate that the constant does not exclude, or, where all are, that of the highest bound among the last."""
+        """Evaluate the first candidate that the constant does not exclude, or, where all are, that of the highest bound
+        among the last."""
         if not self.evaluated.count:
             self.explore()
             return
@@ -65,15 +67,18 @@ class Walk:
         tried = drawn + (size if first is None else first + 1)
         self.drawn, self.rejected = self.drawn + tried, self.rejected + tried - (first is not None)
         self._last = max(FEWEST, tried)
-        self._skipped = (self._skipped + max(0, tried - FAIR_DRAWS)) // 2  # towards boxes half as deep as the last that were needed
+        # towards boxes half as deep as the last that were needed
+        self._skipped = (self._skipped + max(0, tried - FAIR_DRAWS)) // 2
         self._evaluate(points[chosen])
 
     def note(self, constant: float) -> None:
-        """Tell the constant in use, in units of the value per unit of ``z``, and the share of candidates that it has excluded."""
+        """Tell the constant in use, in units of the value per unit of ``z``, and the share of candidates that it has
+        excluded."""
         self.objective.note(constant=constant, rejected=self.rejected / max(1, self.drawn))
 
     def _candidates(self, drawn: int, count: int) -> np.ndarray:
-        """Candidates number ``drawn, ...``: uniform ones, number 0 among them, and others in ever smaller boxes around the best point."""
+        """Candidates number ``drawn, ...``: uniform ones, number 0 among them, and others in ever smaller boxes around
+        the best point."""
         number = np.arange(drawn, drawn + count)
         points = self._inside(self.rng.random((count, self.dimension)))
         near = np.where(number < FAIR_DRAWS, number % 2, number % 8) > 0

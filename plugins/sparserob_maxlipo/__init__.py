@@ -1,4 +1,5 @@
-"""MaxLIPO with a trust region: every other point maximises an upper bound fitted to the values, every other one climbs from the best."""
+"""MaxLIPO with a trust region: every other point maximises an upper bound fitted to the values, every other one climbs
+from the best."""
 
 from __future__ import annotations
 
@@ -19,19 +20,24 @@ SECONDARY = 6
 
 
 class MaxLIPO(sr.Maximiser, sr.Options):
-    """MaxLIPO+TR as in dlib (King 2017, after LIPO of Malherbe and Vayatis 2017), reproducible and about ten times as fast.
+    """MaxLIPO+TR as in dlib (King 2017, after LIPO of Malherbe and Vayatis 2017), reproducible and about ten times as
+    fast.
 
-    ``U(x) = min_i y_i + sqrt(o_i + sum_j s_j (x_j - x_ij)^2)`` with the least slopes ``s`` and per-point noise ``o`` (which absorbs jumps)
-    such that ``U(x_i) >= y_i`` at all evaluated points, up to a millionth of the spread of the values. Steps alternate: the highest of many
-    random candidates under ``U``, and a step of `sparserob_core.TrustRegion` from the best point. When that has converged, every seventh step
-    climbs from the next best point elsewhere. The first point is the centre of the box; a share is uniform, so that the search is consistent.
+    ``U(x) = min_i y_i + sqrt(o_i + sum_j s_j (x_j - x_ij)^2)`` with the least slopes ``s`` and per-point noise ``o``
+    (which absorbs jumps) such that ``U(x_i) >= y_i`` at all evaluated points, up to a millionth of the spread of the
+    values. Steps alternate: the highest of many random candidates under ``U``, and a step of
+    `sparserob_core.TrustRegion` from the best point. When that has converged, every seventh step climbs from the next
+    best point elsewhere. The first point is the centre of the box; a share is uniform, so that the search is
+    consistent.
 
-    ``U`` is fitted, not known: it bounds nothing with proof, and ``inf`` is returned. The slopes need few evaluations only in few
-    coordinates; as their number grows the highest candidate becomes just another uniform point. Beyond 30 coordinates that move,
-    quadratics are not fitted either: the local step is then the best candidate, under ``U``, of those that change one or few blocks of the
-    best point. The time per evaluation grows in proportion to their number: use it for functions that take a millisecond or more.
+    ``U`` is fitted, not known: it bounds nothing with proof, and ``inf`` is returned. The slopes need few evaluations
+    only in few coordinates; as their number grows the highest candidate becomes just another uniform point. Beyond 30
+    coordinates that move, quadratics are not fitted either: the local step is then the best candidate, under ``U``, of
+    those that change one or few blocks of the best point. The time per evaluation grows in proportion to their number:
+    use it for functions that take a millisecond or more.
 
-    Notes ``local`` (0 or 1, of the last step) and, while quadratics are fitted, the ``radius`` of the trust region in widths of the box.
+    Notes ``local`` (0 or 1, of the last step) and, while quadratics are fitted, the ``radius`` of the trust region in
+    widths of the box.
     """
 
     candidates: int = Field(default=1000, ge=10, le=100_000)
@@ -134,4 +140,6 @@ class _Walk:
 @sr.hookimpl
 def sparserob_maximisers() -> Iterator[sr.MaximiserPlugin]:
     """Offer ``maxlipo``."""
-    yield sr.MaximiserPlugin(name="maxlipo", factory=MaxLIPO, summary="fitted upper bound and trust region in turn, for costly functions")
+    yield sr.MaximiserPlugin(
+        name="maxlipo", factory=MaxLIPO, summary="fitted upper bound and trust region in turn, for costly functions"
+    )

@@ -46,7 +46,8 @@ class Ascents:
         self._region.tell(value)
 
     def hear(self, point: np.ndarray, value: float) -> None:
-        """A global step has added this point: if it is the better start, and far away, the ascent begins again from there."""
+        """A global step has added this point: if it is the better start, and far away, the ascent begins again from
+        there."""
         points, values = self._open()
         if not len(points) or value < values.max() or self._closed[-1]:
             return
@@ -70,7 +71,9 @@ class Ascents:
         """The points that lie below no summit, and their values."""
         points, values = self.seen.points, self.seen.raw
         known = self._closed.size
-        fresh = [self._is_below_a_summit(point, value) for point, value in zip(points[known:], values[known:], strict=True)]
+        fresh = [
+            self._is_below_a_summit(point, value) for point, value in zip(points[known:], values[known:], strict=True)
+        ]
         self._closed = np.concatenate([self._closed, np.array(fresh, dtype=bool)])
         return points[~self._closed], values[~self._closed]
 
@@ -78,4 +81,6 @@ class Ascents:
         """Whether recent progress would not carry this ascent to the best value."""
         self._progress.append(value)
         window = 2 * self.seen.points.shape[1] + 4
-        return len(self._progress) > window and bool(self.seen.best - value > 4.0 * (value - self._progress[-1 - window]))
+        return len(self._progress) > window and bool(
+            self.seen.best - value > 4.0 * (value - self._progress[-1 - window])
+        )

@@ -12,8 +12,8 @@ PASSES = 8
 
 
 class Ceiling:
-    """Maximises ``U``. A few points, those that decided before, bound it from above at all candidates; only where that is high are all
-    points asked."""
+    """Maximises ``U``. A few points, those that decided before, bound it from above at all candidates; only where that
+    is high are all points asked."""
 
     def __init__(self) -> None:
         self._decided = np.zeros(0)
@@ -48,7 +48,11 @@ class _Bound:
 
     def above(self, candidates: np.ndarray, which: np.ndarray) -> np.ndarray:
         """The least of the cones ``which`` at candidates ``(c, d)``: an upper bound of ``U``."""
-        return np.asarray(self._cones(self.scaled[which], self.squares[which], self.heights[which], candidates * self.root).min(axis=0))
+        return np.asarray(
+            self._cones(self.scaled[which], self.squares[which], self.heights[which], candidates * self.root).min(
+                axis=0
+            )
+        )
 
     def at(self, candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """``U`` at candidates ``(c, d)``, and which point decides it."""

@@ -13,7 +13,8 @@ NEGLIGIBLE = 1e-6
 SHORTFALL = 0.99
 """Constraints may fall short by this factor; noise makes up for it."""
 ALWAYS = 60
-"""Up to so many points all pairs are looked at again with every point, later each time their number has grown by a tenth."""
+"""Up to so many points all pairs are looked at again with every point, later each time their number has grown by a
+tenth."""
 LATEST = 2000
 NEAR = 1e-4
 """Squared distance below which the program would pay with noise rather than with slope."""
@@ -24,7 +25,8 @@ ROWS = 256
 
 
 class Pairs(NamedTuple):
-    """Constraints ``sum_j s_j squares_j + o_lower >= rise``, one for each pair of points: ``squares (m, d)``, ``lower (m,)``, ``rise (m,)``."""
+    """Constraints ``sum_j s_j squares_j + o_lower >= rise``, one for each pair of points: ``squares (m, d)``,
+    ``lower (m,)``, ``rise (m,)``."""
 
     squares: np.ndarray
     lower: np.ndarray
@@ -38,11 +40,12 @@ class Pairs(NamedTuple):
 
 
 class Slopes:
-    """The evaluated points of a unit box, and ``slope (d,)``, ``noise (n,)`` in squared units of ``unit``, of least squared norm such that
-    ``y_k <= y_i + unit sqrt(noise_i + sum_j slope_j (x_kj - x_ij)^2)`` for all pairs.
+    """The evaluated points of a unit box, and ``slope (d,)``, ``noise (n,)`` in squared units of ``unit``, of least
+    squared norm such that ``y_k <= y_i + unit sqrt(noise_i + sum_j slope_j (x_kj - x_ij)^2)`` for all pairs.
 
-    The pairs form a quadratic program (a linear support vector machine with hard margin, in dlib), solved on the few pairs that matter.
-    Between two looks at all pairs slopes only grow, so that what held keeps holding. Points with the value ``-inf`` take no part.
+    The pairs form a quadratic program (a linear support vector machine with hard margin, in dlib), solved on the few
+    pairs that matter. Between two looks at all pairs slopes only grow, so that what held keeps holding. Points with the
+    value ``-inf`` take no part.
     """
 
     def __init__(self, dimension: int, capacity: int) -> None:
@@ -165,7 +168,8 @@ class Slopes:
         return spread, Pairs(squares, order, (heights - heights[partner]) ** 2).take(worst)
 
     def _solve(self) -> tuple[np.ndarray, np.ndarray]:
-        """The least slopes and noise for the active pairs, of which the slack ones are dropped (Lawson and Hanson 1974, section 23.4)."""
+        """The least slopes and noise for the active pairs, of which the slack ones are dropped (Lawson and Hanson 1974,
+        section 23.4)."""
         from scipy.optimize import nnls
 
         pairs = self.active
@@ -177,7 +181,8 @@ class Slopes:
         target[-1] = 1.0
         dual, _ = nnls(np.vstack([least / scale, 1.0 / scale]), target)
         found = least @ (dual / scale)
-        # The residual's last entry is a positive multiple of the squared norm; what rounding loses, the caller adds as noise.
+        # The residual's last entry is a positive multiple of the squared norm; what rounding loses, the caller adds as
+        # noise.
         found /= max(1.0 - float((dual / scale).sum()), np.finfo(float).tiny)
         self.active = pairs.take(np.flatnonzero(dual > 0.0)[:ACTIVE])
         noise = np.zeros(self.count)
@@ -195,6 +200,7 @@ def _squares(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def _worst(ratio: np.ndarray, squares: np.ndarray) -> np.ndarray:
-    """The handful of pairs that are satisfied least, of those that are not near: near ones cost less as noise than as slope."""
+    """The handful of pairs that are satisfied least, of those that are not near: near ones cost less as noise than as
+    slope."""
     short = np.flatnonzero((ratio < SHORTFALL) & (squares > NEAR))
     return np.asarray(short[np.argsort(ratio[short], kind="stable")[:AT_ONCE]])

@@ -16,7 +16,8 @@ import sparserob_core as sr
 
 @final
 class MinimumAttention(sr.LinearKeys):
-    """Steer ``x' = A(p) x + B(p) u + E w`` with ``u(0)`` given and ``u(T) = 0``, at the least weighted integral of ``|u'|``."""
+    """Steer ``x' = A(p) x + B(p) u + E w`` with ``u(0)`` given and ``u(T) = 0``, at the least weighted integral of
+    ``|u'|``."""
 
     rate: sr.SetOptions
     """Set that the rate ``u'`` takes its values in, bounded."""
@@ -31,23 +32,35 @@ class MinimumAttention(sr.LinearKeys):
         """The problem of the augmented system; raises `InputError` that begins with the key at fault."""
         plain = self.system.build()
         d, m = plain.states, plain.controls
-        path = [sr.PathConstraint(sr.cylinder(item.set, d + m), item.start, item.stop, item.name) for item in self.windows(d)]
+        path = [
+            sr.PathConstraint(sr.cylinder(item.set, d + m), item.start, item.stop, item.name)
+            for item in self.windows(d)
+        ]
         ends = [_extended(end, m) for end in self.ends(d)]
         return sr.OptimalControlProblem(
-            system=self._augmented(d, m), horizon=self.horizon, initial_state=self.initial(d) + self._initial_control(m),
-            control=self.rate.build("rate", m), weights=self.weights, disturbance=self.noise(plain),
-            disturbance_class=self.disturbance_class, path=[*path, *self._bounds(d, m)],
-            terminal=[*ends, sr.Equality(np.append(np.full(d, np.nan), np.zeros(m)))])
+            system=self._augmented(d, m),
+            horizon=self.horizon,
+            initial_state=self.initial(d) + self._initial_control(m),
+            control=self.rate.build("rate", m),
+            weights=self.weights,
+            disturbance=self.noise(plain),
+            disturbance_class=self.disturbance_class,
+            path=[*path, *self._bounds(d, m)],
+            terminal=[*ends, sr.Equality(np.append(np.full(d, np.nan), np.zeros(m)))],
+        )
 
     def _augmented(self, d: int, m: int) -> sr.LinearSystem:
         """``A = [[A, B], [0, 0]]``, ``B = [0; I]``, ``E = [E; 0]``, still in expressions of the parameters."""
         system = self.system
         E = np.eye(d).tolist() if system.E is None else system.E
         rows = [[*left, *right] for left, right in zip(system.A, system.B, strict=True)]
-        return system.model_copy(update={
-            "A": rows + np.zeros((m, d + m)).tolist(),
-            "B": np.eye(d + m, m, -d).tolist(),
-            "E": E + np.zeros((m, len(E[0]))).tolist()}).build()
+        return system.model_copy(
+            update={
+                "A": rows + np.zeros((m, d + m)).tolist(),
+                "B": np.eye(d + m, m, -d).tolist(),
+                "E": E + np.zeros((m, len(E[0]))).tolist(),
+            }
+        ).build()
 
     def _initial_control(self, m: int) -> list[float]:
         given = self.initial_control if isinstance(self.initial_control, list) else [self.initial_control] * m
@@ -56,14 +69,17 @@ class MinimumAttention(sr.LinearKeys):
         return given
 
     def _bounds(self, d: int, m: int) -> list[sr.PathConstraint]:
-        """The bounds of ``u`` as path constraints; flat ones only, since they act on the last coordinates of the state."""
+        """The bounds of ``u`` as path constraints; flat ones only, since they act on the last coordinates of the
+        state."""
         if self.control is None:
             return []
         bound = self.control.build("control", m)
         flat = bound.halfspaces()
         if flat is None:
             raise sr.InputError("control: expected a set with flat sides (box, polytope, norm with p = 1 or inf)")
-        return [sr.PathConstraint(sr.Polytope(np.hstack([np.zeros((len(flat[0]), d)), flat[0]]), flat[1]), name="control")]
+        return [
+            sr.PathConstraint(sr.Polytope(np.hstack([np.zeros((len(flat[0]), d)), flat[0]]), flat[1]), name="control")
+        ]
 
 
 def _extended(end: sr.ConvexSet | sr.Equality, m: int) -> sr.ConvexSet | sr.Equality:
@@ -75,5 +91,8 @@ def _extended(end: sr.ConvexSet | sr.Equality, m: int) -> sr.ConvexSet | sr.Equa
 @sr.hookimpl
 def sparserob_problems() -> Iterator[sr.ProblemPlugin]:
     """The minimum attention problem."""
-    yield sr.ProblemPlugin(name="minimum_attention", factory=MinimumAttention,
-                           summary="Steers a linear system with a control that changes as seldom as possible.")
+    yield sr.ProblemPlugin(
+        name="minimum_attention",
+        factory=MinimumAttention,
+        summary="Steers a linear system with a control that changes as seldom as possible.",
+    )

@@ -14,21 +14,23 @@ from sparserob_nevergrad.guarded import Failed, Guarded
 
 
 class Nevergrad(sr.Maximiser, sr.Options):
-    """Any optimiser of nevergrad's registry (Rapin and Teytaud 2018): evolution strategies, differential evolution, particle swarms, and
-    portfolios of them such as NGOpt, which chooses by dimension and budget.
+    """Any optimiser of nevergrad's registry (Rapin and Teytaud 2018): evolution strategies, differential evolution,
+    particle swarms, and portfolios of them such as NGOpt, which chooses by dimension and budget.
 
-    An optional extra: ``pip install 'sparserob[nevergrad]'``. It works in the unit box, one point at a time, with its random numbers drawn
-    from the generator of the search and the global ones left as they were. Some of nevergrad's portfolios are not repeatable all the same:
-    NGOpt in three dimensions or more may run ``cma.fmin2``, which takes its seed from the clock. Where the function has no value the loss
-    1e20 is told. What an optimiser guarantees, and in how many dimensions it is of use, nevergrad's documentation says for each; in a space
-    of tuples nearly all of them change every block at each step. It proves no upper bound.
+    An optional extra: ``pip install 'sparserob[nevergrad]'``. It works in the unit box, one point at a time, with its
+    random numbers drawn from the generator of the search and the global ones left as they were. Some of nevergrad's
+    portfolios are not repeatable all the same: NGOpt in three dimensions or more may run ``cma.fmin2``, which takes its
+    seed from the clock. Where the function has no value the loss 1e20 is told. What an optimiser guarantees, and in how
+    many dimensions it is of use, nevergrad's documentation says for each; in a space of tuples nearly all of them
+    change every block at each step. It proves no upper bound.
 
-    An optimiser that raises does not end the run. With numpy 2.4 or later NGOpt and its relatives do so for many pairs of dimension and
-    budget ("only 0-dimensional arrays can be converted to Python scalars"). The exception is reported in one warning, and the search goes on
-    with ``fallback``, which is told all that was evaluated, or else shown the best of it.
+    An optimiser that raises does not end the run. With numpy 2.4 or later NGOpt and its relatives do so for many pairs
+    of dimension and budget ("only 0-dimensional arrays can be converted to Python scalars"). The exception is reported
+    in one warning, and the search goes on with ``fallback``, which is told all that was evaluated, or else shown the
+    best of it.
 
-    Its own time is 0.2 to 20 milliseconds for each evaluation, and importing it takes seconds. Notes ``spread``: the distance, root mean
-    square over the coordinates and in widths of the box, of each evaluated point from the best one.
+    Its own time is 0.2 to 20 milliseconds for each evaluation, and importing it takes seconds. Notes ``spread``: the
+    distance, root mean square over the coordinates and in widths of the box, of each evaluated point from the best one.
     """
 
     optimiser: str = Field(default="TwoPointsDE", min_length=1)
@@ -42,7 +44,11 @@ class Nevergrad(sr.Maximiser, sr.Options):
         import warnings
 
         registry = _registry()
-        names = [_known(key, name, registry) for key, name in (("optimiser", self.optimiser), ("fallback", self.fallback)) if name]
+        names = [
+            _known(key, name, registry)
+            for key, name in (("optimiser", self.optimiser), ("fallback", self.fallback))
+            if name
+        ]
         domain = objective.domain
         if not (domain.lower < domain.upper).any():
             return float(objective.evaluate(domain.lower[np.newaxis])[0])
@@ -51,8 +57,10 @@ class Nevergrad(sr.Maximiser, sr.Options):
             try:
                 walk.run(Guarded(registry[name], walk.free.size, objective.remaining, rng))
             except Failed as failure:
-                reason = (f"nevergrad's {name} failed after {objective.evaluations} evaluations ({failure}); the search "
-                          + (f"goes on with {following}" if following else "ends here"))
+                reason = (
+                    f"nevergrad's {name} failed after {objective.evaluations} evaluations ({failure}); the search "
+                    + (f"goes on with {following}" if following else "ends here")
+                )
                 warnings.warn(reason, stacklevel=2)
                 if following is None:
                     raise _ended(objective, reason) from failure
@@ -119,7 +127,9 @@ def _registry() -> Any:
             warnings.simplefilter("ignore")
             from nevergrad.optimization import registry
     except ImportError as error:
-        raise sr.PluginError("nevergrad: the package is not installed; `pip install 'sparserob[nevergrad]'` brings it") from error
+        raise sr.PluginError(
+            "nevergrad: the package is not installed; `pip install 'sparserob[nevergrad]'` brings it"
+        ) from error
     return registry
 
 

@@ -1,4 +1,5 @@
-"""One of nevergrad's optimisers, kept from warning, from failing unnoticed, and from touching the global random numbers."""
+"""One of nevergrad's optimisers, kept from warning, from failing unnoticed, and from touching the global random
+numbers."""
 
 from __future__ import annotations
 
@@ -18,18 +19,23 @@ class Failed(Exception):
 class Guarded:
     """An optimiser of the unit box ``[0, 1]^d``, seeded by the generator, one point at a time.
 
-    Its failures come out as `Failed`, its warnings not at all. It works with global random numbers of its own: some of its parts use them.
+    Its failures come out as `Failed`, its warnings not at all. It works with global random numbers of its own: some of
+    its parts use them.
     """
 
     def __init__(self, create: Any, dimension: int, budget: int, rng: np.random.Generator) -> None:
         seeds = [int(seed) for seed in rng.integers(2**31, size=3)]
-        self._numbers: tuple[Any, Any] = (random.Random(seeds[0]).getstate(), np.random.RandomState(seeds[1]).get_state())
+        self._numbers: tuple[Any, Any] = (
+            random.Random(seeds[0]).getstate(),
+            np.random.RandomState(seeds[1]).get_state(),
+        )
         self._create, self._shape, self._budget, self._seed = create, (dimension,), budget, seeds[2]
         self._optimiser: Any = None
         self._asked: Any = None
 
     def learn(self, told: Sequence[tuple[np.ndarray, float]]) -> None:
-        """Create the optimiser, and tell it of points and losses from before; it is shown the best where it takes none that it has not asked."""
+        """Create the optimiser, and tell it of points and losses from before; it is shown the best where it takes none
+        that it has not asked."""
         with self._guard():
             import nevergrad as ng
 
@@ -47,7 +53,8 @@ class Guarded:
     def next(self, loss: float | None) -> np.ndarray:
         """The next point ``(d,)`` after the loss at the one before; ``None`` at first.
 
-        Telling and asking are one step, so that an optimiser which thinks in a thread of its own rests while the function is evaluated.
+        Telling and asking are one step, so that an optimiser which thinks in a thread of its own rests while the
+        function is evaluated.
         """
         with self._guard():
             if loss is not None:

@@ -26,15 +26,28 @@ class Piqp(sr.Solver, sr.Options):
         settings.max_iter = self.max_iterations
         settings.eps_abs = settings.eps_duality_gap_abs = accuracy
         settings.eps_rel = settings.eps_duality_gap_rel = 0.0
-        solver.setup(program.P, program.q, program.A, program.b, program.G, None, program.h, program.lower, program.upper)
+        solver.setup(
+            program.P, program.q, program.A, program.b, program.G, None, program.h, program.lower, program.upper
+        )
         status = solver.solve()
         result = solver.result
-        kinds: dict[Any, Literal["solved", "infeasible"]] = {piqp.PIQP_SOLVED: "solved", piqp.PIQP_PRIMAL_INFEASIBLE: "infeasible"}
-        return sr.Claim(kinds.get(status, "failed"), result.x, result.z_u, result.y, result.z_bu - result.z_bl,
-                        f"{status.name} after {result.info.iter} iterations")
+        kinds: dict[Any, Literal["solved", "infeasible"]] = {
+            piqp.PIQP_SOLVED: "solved",
+            piqp.PIQP_PRIMAL_INFEASIBLE: "infeasible",
+        }
+        return sr.Claim(
+            kinds.get(status, "failed"),
+            result.x,
+            result.z_u,
+            result.y,
+            result.z_bu - result.z_bl,
+            f"{status.name} after {result.info.iter} iterations",
+        )
 
 
 @sr.hookimpl
 def sparserob_solvers() -> Iterator[sr.SolverPlugin]:
     """Offer the solver."""
-    yield sr.SolverPlugin(name="piqp", factory=Piqp, summary="proximal interior point, sparse; fast and precise (default)")
+    yield sr.SolverPlugin(
+        name="piqp", factory=Piqp, summary="proximal interior point, sparse; fast and precise (default)"
+    )

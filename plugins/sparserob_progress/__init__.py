@@ -1,4 +1,5 @@
-"""Tells the progress of a run on the terminal: a live block on a terminal, plain lines anywhere else, nothing for a short run."""
+"""Tells the progress of a run on the terminal: a live block on a terminal, plain lines anywhere else, nothing for a
+short run."""
 
 from __future__ import annotations
 
@@ -13,10 +14,11 @@ from sparserob_progress.status import Status, duration
 
 
 class Progress(sr.Observer, sr.Options):
-    """Bounds, round, worst violation, the search with its best value, rate and time left, and the proof, on the standard error stream.
+    """Bounds, round, worst violation, the search with its best value, rate and time left, and the proof, on the
+    standard error stream.
 
-    Nothing is shown for a quiet run, nor before ``patience`` seconds have passed. On a terminal the lines are renewed in place and disappear
-    when the run is over; anywhere else one line is written every five seconds.
+    Nothing is shown for a quiet run, nor before ``patience`` seconds have passed. On a terminal the lines are renewed
+    in place and disappear when the run is over; anywhere else one line is written every five seconds.
     """
 
     patience: float = Field(default=2.0, ge=0.0)
@@ -60,4 +62,6 @@ class Progress(sr.Observer, sr.Options):
 @sr.hookimpl
 def sparserob_observers() -> Iterator[sr.ObserverPlugin]:
     """Offer ``progress``."""
-    yield sr.ObserverPlugin(name="progress", factory=Progress, summary="Bounds, search and proof as they go on, on the terminal.")
+    yield sr.ObserverPlugin(
+        name="progress", factory=Progress, summary="Bounds, search and proof as they go on, on the terminal."
+    )

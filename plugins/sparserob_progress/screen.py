@@ -1,4 +1,5 @@
-"""Where the progress is shown: a block of lines that renews itself on a terminal, a plain line now and then anywhere else."""
+"""Where the progress is shown: a block of lines that renews itself on a terminal, a plain line now and then anywhere
+else."""
 
 from __future__ import annotations
 
@@ -14,11 +15,12 @@ if TYPE_CHECKING:
 
 DRAWN_EVERY: Final = 0.25
 PLAIN_EVERY: Final = 5.0
-LONGEST_GOODBYE: Final = 2.0   # a terminal that takes nothing any more shall not hold up the end of a run
+LONGEST_GOODBYE: Final = 2.0  # a terminal that takes nothing any more shall not hold up the end of a run
 
 
 class Screen:
-    """A thread that shows a `Status` after ``patience`` seconds, and again and again, so that the solver never waits for the terminal."""
+    """A thread that shows a `Status` after ``patience`` seconds, and again and again, so that the solver never waits
+    for the terminal."""
 
     def __init__(self, status: Status, patience: float, stream: TextIO) -> None:
         self.status, self.patience, self.stream = status, patience, stream

@@ -8,11 +8,12 @@ from typing import Final
 
 import sparserob_core as sr
 
-LABEL: Final = 9    # characters
+LABEL: Final = 9  # characters
 
 
 class Status:
-    """The last of what was heard. To hear an event costs microseconds; the words are put together when they are shown."""
+    """The last of what was heard. To hear an event costs microseconds; the words are put together when they are
+    shown."""
 
     def __init__(self, title: str) -> None:
         self.title, self.started = title, time.monotonic()
@@ -81,7 +82,10 @@ def duration(seconds: float) -> str:
 def _bounds(lower: float, upper: float) -> str:
     if not (math.isfinite(lower) and math.isfinite(upper)):
         return f"lower {_number(lower)}  upper {_number(upper)}"
-    return f"lower {_number(lower)}  upper {_number(upper)} (to be proven)  gap {(upper - lower) / max(1.0, abs(upper)):.1e}"
+    return (
+        f"lower {_number(lower)}  upper {_number(upper)} (to be proven)  gap"
+        f" {(upper - lower) / max(1.0, abs(upper)):.1e}"
+    )
 
 
 def _round(event: sr.RoundFinished) -> str:
@@ -97,7 +101,13 @@ def _work(event: sr.RoundFinished) -> str:
 
 
 def _search(event: sr.EvaluationsFinished) -> str:
-    what = f"of {event.family}  largest violation" if event.family else f"{event.round or ''}  best g" if event.round else "  best"
+    what = (
+        f"of {event.family}  largest violation"
+        if event.family
+        else f"{event.round or ''}  best g"
+        if event.round
+        else "  best"
+    )
     of = f" of {event.budget}" if event.budget else ""
     said = f"{what} {_number(event.best_value)}  {event.total}{of} evaluations  {_rate(event.total, event.seconds)}/s"
     if event.budget and event.total and event.seconds > 0.0:

@@ -12,7 +12,8 @@ import sparserob_core as sr
 
 
 class ProxQp(sr.Solver, sr.Options):
-    """Precise on strictly convex programs; slow, and given to false claims of infeasibility, when the curvature is small."""
+    """Precise on strictly convex programs; slow, and given to false claims of infeasibility, when the curvature is
+    small."""
 
     sparse: ClassVar[bool] = True
 
@@ -31,22 +32,49 @@ class ProxQp(sr.Solver, sr.Options):
         if self.backend == "dense":
             solver = proxqp.dense.QP(n, e, r, True)
             self._tune(solver.settings, accuracy)
-            solver.init(program.P.toarray(), program.q, program.A.toarray(), program.b, program.G.toarray(), no_floor, program.h,
-                        program.lower, program.upper)
+            solver.init(
+                program.P.toarray(),
+                program.q,
+                program.A.toarray(),
+                program.b,
+                program.G.toarray(),
+                no_floor,
+                program.h,
+                program.lower,
+                program.upper,
+            )
         else:
             from scipy.sparse import csc_matrix, eye_array, vstack
+
             rows = csc_matrix(vstack([program.G, eye_array(n)], format="csc"))
             solver = proxqp.sparse.QP(n, e, r + n)
             self._tune(solver.settings, accuracy)
-            solver.init(csc_matrix(program.P), program.q, csc_matrix(program.A), program.b, rows,
-                        np.concatenate([no_floor, program.lower]), np.concatenate([program.h, program.upper]))
+            solver.init(
+                csc_matrix(program.P),
+                program.q,
+                csc_matrix(program.A),
+                program.b,
+                rows,
+                np.concatenate([no_floor, program.lower]),
+                np.concatenate([program.h, program.upper]),
+            )
         solver.solve()
         result, status = solver.results, solver.results.info.status
-        kinds: dict[Any, Literal["solved", "infeasible"]] = {proxqp.PROXQP_SOLVED: "solved", proxqp.PROXQP_PRIMAL_INFEASIBLE: "infeasible"}
-        return sr.Claim(kinds.get(status, "failed"), np.array(result.x), np.array(result.z[:r]), np.array(result.y), np.array(result.z[r:]),
-                        f"{status.name} after {result.info.iter_ext} outer iterations")
+        kinds: dict[Any, Literal["solved", "infeasible"]] = {
+            proxqp.PROXQP_SOLVED: "solved",
+            proxqp.PROXQP_PRIMAL_INFEASIBLE: "infeasible",
+        }
+        return sr.Claim(
+            kinds.get(status, "failed"),
+            np.array(result.x),
+            np.array(result.z[:r]),
+            np.array(result.y),
+            np.array(result.z[r:]),
+            f"{status.name} after {result.info.iter_ext} outer iterations",
+        )
 
-    # The default of 1e-4 ends feasible programs as infeasible; without any detection infeasible ones run to the limit (80 s at N = 250).
+    # The default of 1e-4 ends feasible programs as infeasible; without any detection infeasible ones run to the limit
+    # (80 s at N = 250).
     def _tune(self, settings: Any, accuracy: float) -> None:
         settings.eps_abs, settings.eps_rel = accuracy, 0.0
         settings.max_iter, settings.max_iter_in = self.max_iterations, self.max_inner_iterations
@@ -56,4 +84,6 @@ class ProxQp(sr.Solver, sr.Options):
 @sr.hookimpl
 def sparserob_solvers() -> Iterator[sr.SolverPlugin]:
     """Offer the solver."""
-    yield sr.SolverPlugin(name="proxqp", factory=ProxQp, summary="primal-dual augmented Lagrangian; slow on nearly linear programs")
+    yield sr.SolverPlugin(
+        name="proxqp", factory=ProxQp, summary="primal-dual augmented Lagrangian; slow on nearly linear programs"
+    )

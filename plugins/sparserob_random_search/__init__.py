@@ -1,4 +1,5 @@
-"""Searches that do not look at the values: independent uniform points, and Sobol's sequence. The measure of every other maximiser."""
+"""Searches that do not look at the values: independent uniform points, and Sobol's sequence. The measure of every other
+maximiser."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ import numpy as np
 import sparserob_core as sr
 
 BATCH = 256
-NUMBERS = 2**22      # coordinates in a batch of Sobol's points
+NUMBERS = 2**22  # coordinates in a batch of Sobol's points
 
 
 class RandomSearch(sr.Maximiser, sr.Options):
@@ -27,15 +28,16 @@ class RandomSearch(sr.Maximiser, sr.Options):
 
 
 class Sobol(sr.Maximiser, sr.Options):
-    """Points of Sobol's sequence (1967) with Owen's scrambling in the form of Matousek (1998): each is uniform, and ``2^k`` of them in a row
-    fill the box more evenly than independent ones.
+    """Points of Sobol's sequence (1967) with Owen's scrambling in the form of Matousek (1998): each is uniform, and
+    ``2^k`` of them in a row fill the box more evenly than independent ones.
 
-    That helps in a few dimensions; in many, any affordable number of points is as good as independent ones. The sequence is known up to
-    21201 dimensions, beyond which `InputError` is raised. It proves no upper bound.
+    That helps in a few dimensions; in many, any affordable number of points is as good as independent ones. The
+    sequence is known up to 21201 dimensions, beyond which `InputError` is raised. It proves no upper bound.
     """
 
     scramble: bool = True
-    """Randomise the sequence by the generator; without, it is the same in every run and begins in the lowest corner of the box."""
+    """Randomise the sequence by the generator; without, it is the same in every run and begins in the lowest corner of
+    the box."""
 
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
         """See `sparserob_core.Maximiser`."""
@@ -43,8 +45,10 @@ class Sobol(sr.Maximiser, sr.Options):
 
         lower, upper = objective.domain.lower, objective.domain.upper
         if lower.size > qmc.Sobol.MAXDIM:
-            raise sr.InputError(f"sobol: the sequence is known up to {qmc.Sobol.MAXDIM} dimensions, this domain has {lower.size}; "
-                                "random_search has no such limit")
+            raise sr.InputError(
+                f"sobol: the sequence is known up to {qmc.Sobol.MAXDIM} dimensions, this domain has {lower.size}; "
+                "random_search has no such limit"
+            )
         # scipy renamed the argument in 1.15.
         seeded: dict[str, Any] = {"rng" if "rng" in inspect.signature(qmc.Sobol).parameters else "seed": rng}
         sequence = qmc.Sobol(lower.size, scramble=self.scramble, **seeded)

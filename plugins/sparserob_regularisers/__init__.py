@@ -36,7 +36,8 @@ class WeightedRidge(sr.Regulariser, sr.Options):
     """Weight of every control; a number serves every control."""
 
     def quadratic(self, image: sr.ControlImage) -> tuple[csc_array, sr.Array]:
-        """``S' diag(weights * lengths) S`` and zero; positive definite, since a dictionary's functions are independent."""
+        """``S' diag(weights * lengths) S`` and zero; positive definite, since a dictionary's functions are
+        independent."""
         from scipy.sparse import csc_array, diags_array
 
         energy = diags_array(image.lengths * np.repeat(_per_channel(self.weights, image.channels), image.pieces))
@@ -71,5 +72,9 @@ def _per_channel(weights: float | list[float], channels: int) -> sr.Array:
 def sparserob_regularisers() -> Iterator[sr.RegulariserPlugin]:
     """The shipped regularisers."""
     yield sr.RegulariserPlugin(name="ridge", factory=Ridge, summary="Sum of the squared coefficients.")
-    yield sr.RegulariserPlugin(name="weighted_ridge", factory=WeightedRidge, summary="Energy of the control, weighted by channel.")
-    yield sr.RegulariserPlugin(name="smoothness", factory=Smoothness, summary="Squared jumps of the control, and a small ridge.")
+    yield sr.RegulariserPlugin(
+        name="weighted_ridge", factory=WeightedRidge, summary="Energy of the control, weighted by channel."
+    )
+    yield sr.RegulariserPlugin(
+        name="smoothness", factory=Smoothness, summary="Squared jumps of the control, and a small ridge."
+    )

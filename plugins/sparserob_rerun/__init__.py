@@ -1,4 +1,5 @@
-"""Streams a run into Rerun while it runs: the search, the landscape of g, the physics, the bounds, to a viewer, a browser or a file."""
+"""Streams a run into Rerun while it runs: the search, the landscape of g, the physics, the bounds, to a viewer, a
+browser or a file."""
 
 from __future__ import annotations
 
@@ -21,9 +22,10 @@ logger = logging.getLogger("sparserob")
 class Rerun(sr.Observer, sr.Options):
     """A recording for the viewer of Rerun (rerun.io), an optional extra: ``pip install 'sparserob[rerun]'``.
 
-    Destinations can be combined; with none of them, ``recording.rrd`` in the run's directory. A missing package, viewer or listener is one
-    warning, and the run goes on without. Everything happens in a process of its own, on one core and with low priority; the solver hands
-    over its events and goes on. When too many are waiting, the newest are dropped, and their number is told at the end.
+    Destinations can be combined; with none of them, ``recording.rrd`` in the run's directory. A missing package, viewer
+    or listener is one warning, and the run goes on without. Everything happens in a process of its own, on one core and
+    with low priority; the solver hands over its events and goes on. When too many are waiting, the newest are dropped,
+    and their number is told at the end.
     """
 
     spawn: bool = False
@@ -77,9 +79,14 @@ class Rerun(sr.Observer, sr.Options):
         self.close()
         nowhere = not (self.spawn or self.connect or self.serve or self.save)
         file = "recording.rrd" if nowhere and event.directory is not None else self.save
-        chosen = look(None if file is None else (event.directory or Path()) / file, self.connect, self.spawn, self.serve)
+        chosen = look(
+            None if file is None else (event.directory or Path()) / file, self.connect, self.spawn, self.serve
+        )
         if chosen.missing or not chosen.any:
-            logger.warning("rerun: %s", "; ".join(chosen.missing) or "there is no run directory to record into; give it a place with save")
+            logger.warning(
+                "rerun: %s",
+                "; ".join(chosen.missing) or "there is no run directory to record into; give it a place with save",
+            )
         if chosen.serve is not None:
             logger.warning("rerun: to watch, open %s", chosen.page)
         if chosen.any:
@@ -93,4 +100,8 @@ class Rerun(sr.Observer, sr.Options):
 @sr.hookimpl
 def sparserob_observers() -> Iterator[sr.ObserverPlugin]:
     """Offer ``rerun``."""
-    yield sr.ObserverPlugin(name="rerun", factory=Rerun, summary="Search, landscape, physics and bounds, live in the viewer of Rerun or in a file.")
+    yield sr.ObserverPlugin(
+        name="rerun",
+        factory=Rerun,
+        summary="Search, landscape, physics and bounds, live in the viewer of Rerun or in a file.",
+    )

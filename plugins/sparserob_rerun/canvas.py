@@ -1,6 +1,7 @@
 """A plot as plain geometry: axes, ticks, curves and hatching in the pixels of a 2-D view.
 
-The viewer plots against its timelines only; the physics is a plot against the time of the system, which is another axis.
+The viewer plots against its timelines only; the physics is a plot against the time of the system, which is another
+axis.
 """
 
 from __future__ import annotations
@@ -14,13 +15,14 @@ import numpy as np
 from sparserob_rerun.palette import FAINT, GREY, INK, Colour, Floats
 
 HATCHES = 60
-LIFT = 9.0          # the viewer writes labels this far below their points
+LIFT = 9.0  # the viewer writes labels this far below their points
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Axes:
-    """A plot ``width`` by ``height`` pixels with its upper left corner at ``(left, top)``; ``x`` and ``y`` are the limits of its axes."""
+    """A plot ``width`` by ``height`` pixels with its upper left corner at ``(left, top)``; ``x`` and ``y`` are the
+    limits of its axes."""
 
     left: float
     top: float
@@ -39,7 +41,8 @@ class Axes:
 
 @final
 class Drawing:
-    """Lines and labels in layers: collected first, then logged as few entities, because many of them slow the viewer down."""
+    """Lines and labels in layers: collected first, then logged as few entities, because many of them slow the viewer
+    down."""
 
     def __init__(self) -> None:
         self.strips: dict[str, list[tuple[Floats, Colour, float]]] = {}
@@ -101,26 +104,52 @@ class Drawing:
         for start in np.arange(left - (bottom - top), right, step):
             first, last = max(start, left), min(start + (bottom - top), right)
             if last > first:
-                self.line(layer, np.array([[first, bottom - (first - start)], [last, bottom - (last - start)]]), colour, 1.0)
+                self.line(
+                    layer, np.array([[first, bottom - (first - start)], [last, bottom - (last - start)]]), colour, 1.0
+                )
 
     def log(self, rr: Any, stream: Any, path: str, static: bool = False, layers: Sequence[str] = ()) -> None:
         """Log everything below ``path``, later ``layers`` above earlier ones."""
         order = {layer: 10.0 * (place + 1) for place, layer in enumerate(layers)}
         for layer, strips in self.strips.items():
-            stream.log(f"{path}/{layer}", rr.LineStrips2D(
-                [points for points, _, _ in strips], colors=[colour for _, colour, _ in strips],
-                radii=rr.Radius.ui_points([width / 2 for _, _, width in strips]) if layer != "tube" else [w / 2 for _, _, w in strips],
-                draw_order=order.get(layer, 5.0)), static=static)
+            stream.log(
+                f"{path}/{layer}",
+                rr.LineStrips2D(
+                    [points for points, _, _ in strips],
+                    colors=[colour for _, colour, _ in strips],
+                    radii=(
+                        rr.Radius.ui_points([width / 2 for _, _, width in strips])
+                        if layer != "tube"
+                        else [w / 2 for _, _, w in strips]
+                    ),
+                    draw_order=order.get(layer, 5.0),
+                ),
+                static=static,
+            )
         if self.labels:
-            stream.log(f"{path}/labels", rr.Points2D(
-                np.array([place for place, _, _ in self.labels]), labels=[words for _, words, _ in self.labels],
-                colors=[colour for _, _, colour in self.labels], radii=rr.Radius.ui_points(0.0), show_labels=True, draw_order=90.0),
-                static=static)
+            stream.log(
+                f"{path}/labels",
+                rr.Points2D(
+                    np.array([place for place, _, _ in self.labels]),
+                    labels=[words for _, words, _ in self.labels],
+                    colors=[colour for _, _, colour in self.labels],
+                    radii=rr.Radius.ui_points(0.0),
+                    show_labels=True,
+                    draw_order=90.0,
+                ),
+                static=static,
+            )
         if self.dots:
             points = np.concatenate([places for places, _, _ in self.dots])
             sizes = np.concatenate([np.full(len(places), size) for places, _, size in self.dots])
-            colours = np.concatenate([np.tile(colour, (len(places), 1)) for places, colour, _ in self.dots]).astype(np.uint8)
-            stream.log(f"{path}/dots", rr.Points2D(points, colors=colours, radii=rr.Radius.ui_points(sizes), draw_order=80.0), static=static)
+            colours = np.concatenate([np.tile(colour, (len(places), 1)) for places, colour, _ in self.dots]).astype(
+                np.uint8
+            )
+            stream.log(
+                f"{path}/dots",
+                rr.Points2D(points, colors=colours, radii=rr.Radius.ui_points(sizes), draw_order=80.0),
+                static=static,
+            )
 
 
 def ticks(low: float, high: float, most: int = 5) -> Floats:

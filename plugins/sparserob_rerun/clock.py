@@ -13,7 +13,8 @@ TIMELINES = ("evaluation", "round", "time")
 
 @final
 class Clock:
-    """Evaluations of ``g`` so far (relaxed programs, for a method that does not search), the round, and the seconds since the start."""
+    """Evaluations of ``g`` so far (relaxed programs, for a method that does not search), the round, and the seconds
+    since the start."""
 
     def __init__(self, rr: Any, stream: Any) -> None:
         self.rr, self.stream = rr, stream
@@ -29,7 +30,12 @@ class Clock:
         self.stream.set_time("time", duration=self.seconds)
 
     def columns(self, evaluations: np.ndarray, seconds: Floats, number: int) -> list[Any]:
-        """The timelines of rows, one for each of the evaluations ``(k,)`` at these seconds ``(k,)`` of the run, all in one round."""
+        """The timelines of rows, one for each of the evaluations ``(k,)`` at these seconds ``(k,)`` of the run, all in
+        one round."""
         rr = self.rr
         rounds = np.full(evaluations.size, max(number, self.round))
-        return [rr.TimeColumn("evaluation", sequence=evaluations), rr.TimeColumn("round", sequence=rounds), rr.TimeColumn("time", duration=seconds)]
+        return [
+            rr.TimeColumn("evaluation", sequence=evaluations),
+            rr.TimeColumn("round", sequence=rounds),
+            rr.TimeColumn("time", duration=seconds),
+        ]

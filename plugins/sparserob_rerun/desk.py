@@ -1,4 +1,5 @@
-"""The process that records: it takes events from a queue, logs them, and works on the landscape while there are none."""
+"""The process that records: it takes events from a queue, logs them, and works on the landscape while there are
+none."""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ from sparserob_rerun.layout import layout
 from sparserob_rerun.recorder import Opening, Recorder, shown_of
 from sparserob_rerun.sinks import Destinations, open_sinks
 
-IDLE = 0.5          # seconds between two looks at whether the run is still alive
+IDLE = 0.5  # seconds between two looks at whether the run is still alive
 FLUSHING = 5.0
 NICE = 10
 
@@ -27,7 +28,8 @@ NICE = 10
 @final
 @dataclass(frozen=True)
 class Ending:
-    """The last message: how many events were dropped before it, and for how many seconds a browser is served from then on."""
+    """The last message: how many events were dropped before it, and for how many seconds a browser is served from then
+    on."""
 
     dropped: int = 0
     keep: float = 0.0
@@ -66,7 +68,9 @@ def _record(messages: Any, opening: Opening, chosen: Destinations, name: str, pa
     ending = Ending()
     try:
         recorder = Recorder(rr, stream, opening, shown, inspection)
-        ending = _listen(messages, recorder, parent, wrong, 1.0 if opening.landscape is None else opening.landscape.share)
+        ending = _listen(
+            messages, recorder, parent, wrong, 1.0 if opening.landscape is None else opening.landscape.share
+        )
         if ending.dropped:
             recorder.say(f"{ending.dropped} events came faster than they could be recorded, and were dropped", "WARN")
         _finish_landscape(recorder, opening)
@@ -114,7 +118,8 @@ def _serve(servers: list[subprocess.Popen[bytes]], keep: float, parent: int) -> 
 
 
 def _listen(messages: Any, recorder: Recorder, parent: int, wrong: list[str], share: float) -> Ending:
-    """Log whatever comes until the run is over, or gone; an event that cannot be drawn is left out, and the first of them is told."""
+    """Log whatever comes until the run is over, or gone; an event that cannot be drawn is left out, and the first of
+    them is told."""
     pause = Pause(share)
     while True:
         try:

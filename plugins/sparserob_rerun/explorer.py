@@ -14,15 +14,17 @@ from sparserob_rerun.options import LandscapeOptions
 from sparserob_rerun.palette import Floats
 from sparserob_rerun.terrain import Terrain
 
-SLICE = 0.02        # seconds of work between two looks at the queue
-FEWEST = 32         # evaluations that a first, coarse landscape needs
+SLICE = 0.02  # seconds of work between two looks at the queue
+FEWEST = 32  # evaluations that a first, coarse landscape needs
 
 
 @final
 class Explorer:
-    """Fills one landscape after the other: through the first tuple of a search, then through the best tuple of a round, the newest first.
+    """Fills one landscape after the other: through the first tuple of a search, then through the best tuple of a round,
+    the newest first.
 
-    All of them together take no more evaluations than the options allow. What a landscape shows is decided by its anchor alone, not by the clock.
+    All of them together take no more evaluations than the options allow. What a landscape shows is decided by its
+    anchor alone, not by the clock.
     """
 
     def __init__(self, terrain: Terrain, inspection: sr.Inspection | None, options: LandscapeOptions | None) -> None:
@@ -37,7 +39,9 @@ class Explorer:
     @property
     def busy(self) -> bool:
         """Whether there is something left to evaluate."""
-        return self.left > 0 and ((self.landscape is not None and self.landscape.level != 1) or self.waiting is not None)
+        return self.left > 0 and (
+            (self.landscape is not None and self.landscape.level != 1) or self.waiting is not None
+        )
 
     def aim(self, slots: Floats, epsilon: float, words: str) -> None:
         """Ask for the landscape through a tuple ``(D, width)``; it is begun when the one in work is complete."""

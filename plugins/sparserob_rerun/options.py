@@ -11,7 +11,8 @@ class LandscapeOptions(sr.Options):
     """The landscape of ``g``, evaluated in the background."""
 
     coordinates: tuple[str, str] | None = None
-    """Two coordinates of the tuple, such as [t, p1], or [t[1], t[4]] for the times of its first and fourth index; null: the most influential two."""
+    """Two coordinates of the tuple, such as [t, p1], or [t[1], t[4]] for the times of its first and fourth index; null:
+    the most influential two."""
 
     grid: int = Field(default=32, ge=8, le=256)
     """Points along each of the two."""
@@ -20,7 +21,9 @@ class LandscapeOptions(sr.Options):
     """Evaluations of g that all landscapes of a run may take."""
 
     share: float = Field(default=0.04, gt=0.0, le=1.0)
-    """Share of one core that it may take during the run: two cores are often one, and what works beside the solver slows it down."""
+    """Share of one core that it may take during the run: two cores are often one, and what works beside the solver
+    slows it down."""
 
     patience: float = Field(default=3.0, ge=0.0, le=600.0)
-    """Seconds that a short run waits for its landscape at its end; half of the run's own time is taken off once something is drawn."""
+    """Seconds that a short run waits for its landscape at its end; half of the run's own time is taken off once
+    something is drawn."""

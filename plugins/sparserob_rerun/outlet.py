@@ -19,10 +19,10 @@ from sparserob_rerun.desk import Account, Ending, record
 from sparserob_rerun.recorder import Opening
 from sparserob_rerun.sinks import Destinations
 
-CAPACITY = 512      # events that may wait
-COLLECTING = 0.4    # seconds for which evaluations are collected before they are sent
-LARGE = 64          # coordinates of one index from which on only times and parameters are sent
-CLOSING = 20.0      # seconds that the process may take to finish its files, beyond the patience of the landscape
+CAPACITY = 512  # events that may wait
+COLLECTING = 0.4  # seconds for which evaluations are collected before they are sent
+LARGE = 64  # coordinates of one index from which on only times and parameters are sent
+CLOSING = 20.0  # seconds that the process may take to finish its files, beyond the patience of the landscape
 START = "fork" if sys.platform.startswith("linux") else "spawn"
 
 
@@ -40,9 +40,12 @@ class Outlet:
         self.messages = context.Queue(capacity)
         self.report, theirs = context.Pipe(duplex=False)
         sent = opening if START == "fork" else replace(opening, inspection=None)
-        self.process = context.Process(target=record, args=(self.messages, theirs, sent, chosen, uuid.uuid4().hex), daemon=True)
+        self.process = context.Process(
+            target=record, args=(self.messages, theirs, sent, chosen, uuid.uuid4().hex), daemon=True
+        )
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # of a fork beside other threads: the child uses none of them
+            # of a fork beside other threads: the child uses none of them
+            warnings.simplefilter("ignore", DeprecationWarning)
             self.process.start()
         theirs.close()
 
@@ -109,10 +112,17 @@ class Outlet:
                     self.process.join(CLOSING)
                     return list(account.wrong) if isinstance(account, Account) else []
                 break
-        return ["the process that records ended early" if not self.process.is_alive() else "the recording could not be finished in time"]
+        return [
+            (
+                "the process that records ended early"
+                if not self.process.is_alive()
+                else "the recording could not be finished in time"
+            )
+        ]
 
     def _thin(self, event: sr.EvaluationsFinished) -> sr.EvaluationsFinished:
-        """The event without what is too much: of an index with many coordinates the time and the parameters are sent."""
+        """The event without what is too much: of an index with many coordinates the time and the parameters are
+        sent."""
         if event.block < LARGE or not event.best_point.size:
             self.kept = None
             return replace(event, domain=None)
@@ -120,7 +130,9 @@ class Outlet:
         kept = self.kept = (np.arange(0, event.best_point.size, event.block)[:, np.newaxis] + offsets).ravel()
         batch = event.batch
         origin = None if batch.origin is None else batch.origin[kept]
-        return replace(event, domain=None, batch=replace(batch, points=[piece[:, kept] for piece in batch.points], origin=origin))
+        return replace(
+            event, domain=None, batch=replace(batch, points=[piece[:, kept] for piece in batch.points], origin=origin)
+        )
 
 
 def follows(before: sr.EvaluationsFinished, event: sr.EvaluationsFinished) -> bool:

@@ -1,4 +1,5 @@
-"""The colours of a recording, as red, green, blue, opacity: those of the figures, light enough for the viewer's dark ground.
+"""The colours of a recording, as red, green, blue, opacity: those of the figures, light enough for the viewer's dark
+ground.
 
 Okabe and Ito (2008), "Color universal design"; a colour means the same thing in every panel.
 """
@@ -13,21 +14,35 @@ import numpy.typing as npt
 Colour: TypeAlias = tuple[int, int, int, int]
 Floats: TypeAlias = npt.NDArray[np.float64]
 
-SKY: Colour = (86, 180, 233, 255)          # the decision: control, nominal state, the current point
-TUBE: Colour = (86, 180, 233, 70)          # the worst case over everything uncertain
-VERMILLION: Colour = (225, 105, 40, 255)   # what is forbidden: walls, violations, upper bounds
+SKY: Colour = (86, 180, 233, 255)  # the decision: control, nominal state, the current point
+TUBE: Colour = (86, 180, 233, 70)  # the worst case over everything uncertain
+VERMILLION: Colour = (225, 105, 40, 255)  # what is forbidden: walls, violations, upper bounds
 HATCH: Colour = (225, 105, 40, 110)
-ORANGE: Colour = (240, 180, 50, 255)       # the best so far
-GREEN: Colour = (30, 190, 140, 255)        # what is proven: lower bounds
-PURPLE: Colour = (214, 140, 185, 255)      # the constraints that decide: active indices
+ORANGE: Colour = (240, 180, 50, 255)  # the best so far
+GREEN: Colour = (30, 190, 140, 255)  # what is proven: lower bounds
+PURPLE: Colour = (214, 140, 185, 255)  # the constraints that decide: active indices
 INK: Colour = (225, 225, 225, 255)
 GREY: Colour = (140, 140, 140, 255)
 FAINT: Colour = (90, 90, 90, 255)
 GROUND: Colour = (24, 26, 31, 255)
 
-_VIRIDIS = np.array([(68, 1, 84), (71, 44, 122), (59, 81, 139), (44, 113, 142), (33, 144, 141), (39, 173, 129), (92, 200, 99),
-                     (170, 220, 50), (253, 231, 37)], dtype=float)
-_DIVERGING = np.array([(33, 102, 172), (103, 169, 207), (209, 229, 240), (253, 219, 199), (239, 138, 98), (178, 24, 43)], dtype=float)
+_VIRIDIS = np.array(
+    [
+        (68, 1, 84),
+        (71, 44, 122),
+        (59, 81, 139),
+        (44, 113, 142),
+        (33, 144, 141),
+        (39, 173, 129),
+        (92, 200, 99),
+        (170, 220, 50),
+        (253, 231, 37),
+    ],
+    dtype=float,
+)
+_DIVERGING = np.array(
+    [(33, 102, 172), (103, 169, 207), (209, 229, 240), (253, 219, 199), (239, 138, 98), (178, 24, 43)], dtype=float
+)
 
 
 def sequential(values: Floats) -> npt.NDArray[np.uint8]:

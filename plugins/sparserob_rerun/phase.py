@@ -20,9 +20,12 @@ SLICES = 36
 
 
 def draw_phase(rr: Any, stream: Any, data: sr.FigureData, worst: Mapping[str, Any]) -> None:
-    """The nominal trajectory, the worst ones, slices of the tube and the terminal set below ``/physics/phase``; nothing for a single state."""
+    """The nominal trajectory, the worst ones, slices of the tube and the terminal set below ``/physics/phase``; nothing
+    for a single state."""
     if len(data.state) == 2:
-        _plane(data, worst).log(rr, stream, "physics/phase", layers=("hatch", "slices", "frame", "worst", "curve", "wall"))
+        _plane(data, worst).log(
+            rr, stream, "physics/phase", layers=("hatch", "slices", "frame", "worst", "curve", "wall")
+        )
     elif len(data.state) > 2:
         _space(rr, stream, data, worst)
 
@@ -58,7 +61,9 @@ def _walls(drawing: Drawing, axes: Axes, data: sr.FigureData) -> None:
             limits[wall.state] = (max(wall.lower, limits[wall.state][0]), min(wall.upper, limits[wall.state][1]))
         (a, b), (c, d) = limits
         drawing.line("wall", axes.at(np.array([a, b, b, a, a]), np.array([c, c, d, d, c])), ink.VERMILLION, 2.0)
-        drawing.text(float(axes.at((a + b) / 2, d)[0, 0]), float(axes.at(a, d)[0, 1]) - 12.0, "terminal set", ink.VERMILLION)
+        drawing.text(
+            float(axes.at((a + b) / 2, d)[0, 0]), float(axes.at(a, d)[0, 1]) - 12.0, "terminal set", ink.VERMILLION
+        )
     for wall in data.walls:
         if wall.start == wall.end:
             continue
@@ -71,7 +76,9 @@ def _walls(drawing: Drawing, axes: Axes, data: sr.FigureData) -> None:
 
 
 def _limits(data: sr.FigureData, state: int) -> tuple[float, float]:
-    edges = [edge for wall in data.walls if wall.state == state for edge in (wall.lower, wall.upper) if np.isfinite(edge)]
+    edges = [
+        edge for wall in data.walls if wall.state == state for edge in (wall.lower, wall.upper) if np.isfinite(edge)
+    ]
     low, high = min([*edges, float(data.tube_lower[state].min())]), max([*edges, float(data.tube_upper[state].max())])
     margin = 0.1 * max(high - low, 1e-9)
     return low - margin, high + margin
@@ -79,26 +86,54 @@ def _limits(data: sr.FigureData, state: int) -> tuple[float, float]:
 
 def _space(rr: Any, stream: Any, data: sr.FigureData, worst: Mapping[str, Any]) -> None:
     boxes = _slices(data)[:, :3]
-    stream.log("physics/phase/nominal", rr.LineStrips3D([data.state[:3].T], colors=[ink.SKY], radii=rr.Radius.ui_points(1.5)))
-    stream.log("physics/phase/tube", rr.Boxes3D(centers=boxes.mean(axis=2), half_sizes=(boxes[:, :, 1] - boxes[:, :, 0]) / 2,
-                                                colors=[ink.TUBE] * len(boxes), radii=rr.Radius.ui_points(0.7)))
+    stream.log(
+        "physics/phase/nominal", rr.LineStrips3D([data.state[:3].T], colors=[ink.SKY], radii=rr.Radius.ui_points(1.5))
+    )
+    stream.log(
+        "physics/phase/tube",
+        rr.Boxes3D(
+            centers=boxes.mean(axis=2),
+            half_sizes=(boxes[:, :, 1] - boxes[:, :, 0]) / 2,
+            colors=[ink.TUBE] * len(boxes),
+            radii=rr.Radius.ui_points(0.7),
+        ),
+    )
     if len(worst.get("states", ())):
-        stream.log("physics/phase/worst", rr.LineStrips3D([path[:3].T for path in worst["states"]], colors=[ink.ORANGE],
-                                                          radii=rr.Radius.ui_points(1.0)))
+        stream.log(
+            "physics/phase/worst",
+            rr.LineStrips3D(
+                [path[:3].T for path in worst["states"]], colors=[ink.ORANGE], radii=rr.Radius.ui_points(1.0)
+            ),
+        )
     ends = [(float(data.tube_lower[k].min()), float(data.tube_upper[k].max())) for k in range(3)]
     stream.log("physics/phase/axes", rr.LineStrips3D(_cage(ends), colors=[ink.FAINT], radii=rr.Radius.ui_points(0.5)))
     start = data.state[:3, 0]
     corners = [(tuple(ends[j][1 if j == k else 0] for j in range(3)), f"x{k + 1} = {ends[k][1]:.3g}") for k in range(3)]
-    stream.log("physics/phase/labels", rr.Points3D([start, *(place for place, _ in corners)], labels=["x(0)", *(words for _, words in corners)],
-                                                   colors=[ink.INK], radii=rr.Radius.ui_points(3.0), show_labels=True))
+    stream.log(
+        "physics/phase/labels",
+        rr.Points3D(
+            [start, *(place for place, _ in corners)],
+            labels=["x(0)", *(words for _, words in corners)],
+            colors=[ink.INK],
+            radii=rr.Radius.ui_points(3.0),
+            show_labels=True,
+        ),
+    )
     terminal = [list(limits) for limits in ends]
     for wall in data.walls:
         if wall.start == wall.end and wall.state < 3:
             terminal[wall.state] = [max(wall.lower, terminal[wall.state][0]), min(wall.upper, terminal[wall.state][1])]
     if any(wall.start == wall.end for wall in data.walls):
         box = np.array(terminal)
-        stream.log("physics/phase/terminal", rr.Boxes3D(centers=[box.mean(axis=1)], half_sizes=[(box[:, 1] - box[:, 0]) / 2],
-                                                        colors=[ink.VERMILLION], radii=rr.Radius.ui_points(1.5)))
+        stream.log(
+            "physics/phase/terminal",
+            rr.Boxes3D(
+                centers=[box.mean(axis=1)],
+                half_sizes=[(box[:, 1] - box[:, 0]) / 2],
+                colors=[ink.VERMILLION],
+                radii=rr.Radius.ui_points(1.5),
+            ),
+        )
 
 
 def _cage(ends: list[tuple[float, float]]) -> list[Floats]:

@@ -40,7 +40,8 @@ class Physics:
         self.switching = Switching(view.program)
 
     def draw(self, decision: Floats, cuts: Sequence[sr.Cut], mu: Floats | None) -> None:
-        """One decision with the constraints that carry a multiplier; ``mu`` are the multipliers of the equalities, if they are known."""
+        """One decision with the constraints that carry a multiplier; ``mu`` are the multipliers of the equalities, if
+        they are known."""
         from sparserob_rerun.phase import draw_phase
 
         active = [cut for cut in cuts if cut.multiplier > 0.0]
@@ -56,11 +57,14 @@ class Physics:
         for state in range(min(MOST_STATES, len(data.state))):
             self._state(drawing, _axes(next(tops), data, _state_limits(data, state)), data, worst, state)
         self._marks(drawing, data, times, next(tops))
-        drawing.log(self.rr, self.stream, "physics/plots", layers=("hatch", "tube", "frame", "marks", "worst", "curve", "wall"))
+        drawing.log(
+            self.rr, self.stream, "physics/plots", layers=("hatch", "tube", "frame", "marks", "worst", "curve", "wall")
+        )
         draw_phase(self.rr, self.stream, data, worst)
 
     def signals(self, decision: Floats) -> None:
-        """The final control and states as series on a timeline of their own, ``t``: the time of the system in seconds."""
+        """The final control and states as series on a timeline of their own, ``t``: the time of the system in
+        seconds."""
         rr, data = self.rr, self.view.picture(decision, np.empty(0))
         at = [rr.TimeColumn("t", duration=data.breakpoints[:-1])]
         channels = len(data.control)
@@ -87,12 +91,18 @@ class Physics:
     def _push(self, drawing: Drawing, axes: Axes, data: sr.FigureData, push: Floats | None, channel: int) -> None:
         name = _name("u", channel, len(data.control))
         if push is None or not push.any():
-            drawing.frame(axes, f"why {name} switches: no constraint pushes, or its push is not known", ticks_below=False)
+            drawing.frame(
+                axes, f"why {name} switches: no constraint pushes, or its push is not known", ticks_below=False
+            )
             return
         values = push[channel]
         reach = max(1.5, float(np.abs(values).max()) * 1.15)
         axes = Axes(axes.left, axes.top, axes.width, axes.height, axes.x, (-reach, reach))
-        drawing.frame(axes, f"why {name} switches: the active constraints' push on it; {name} acts where the push leaves the band", ticks_below=False)
+        drawing.frame(
+            axes,
+            f"why {name} switches: the active constraints' push on it; {name} acts where the push leaves the band",
+            ticks_below=False,
+        )
         for price in (-1.0, 1.0):
             drawing.dashed("marks", axes.at(np.array(axes.x), np.full(2, price)), ink.GREY)
         edges = data.breakpoints
@@ -104,7 +114,11 @@ class Physics:
 
     def _state(self, drawing: Drawing, axes: Axes, data: sr.FigureData, worst: Mapping[str, Any], state: int) -> None:
         name = _name("x", state, len(data.state))
-        drawing.frame(axes, f"state {name}(t): nominal, worst-case tube, walls", ticks_below=state == min(MOST_STATES, len(data.state)) - 1)
+        drawing.frame(
+            axes,
+            f"state {name}(t): nominal, worst-case tube, walls",
+            ticks_below=state == min(MOST_STATES, len(data.state)) - 1,
+        )
         drawing.band("tube", axes, data.times, data.tube_lower[state], data.tube_upper[state], ink.TUBE)
         for wall in data.walls:
             if wall.state == state:
@@ -124,14 +138,26 @@ class Physics:
 
 
 def _axes(position: int, data: sr.FigureData, limits: tuple[float, float]) -> Axes:
-    return Axes(LEFT, position * (HEIGHT + GAP), WIDTH, HEIGHT, (float(data.breakpoints[0]), float(data.breakpoints[-1])), limits)
+    return Axes(
+        LEFT,
+        position * (HEIGHT + GAP),
+        WIDTH,
+        HEIGHT,
+        (float(data.breakpoints[0]), float(data.breakpoints[-1])),
+        limits,
+    )
 
 
 def _wall(drawing: Drawing, axes: Axes, lower: float, upper: float, start: float, end: float) -> None:
     if start == end:
         right = axes.at(end, axes.y[0])[0, 0]
         top, bottom = axes.at(end, min(upper, axes.y[1]))[0, 1], axes.at(end, max(lower, axes.y[0]))[0, 1]
-        drawing.line("wall", np.array([[right + 2, top], [right + 7, top], [right + 7, bottom], [right + 2, bottom]]), ink.VERMILLION, 3.0)
+        drawing.line(
+            "wall",
+            np.array([[right + 2, top], [right + 7, top], [right + 7, bottom], [right + 2, bottom]]),
+            ink.VERMILLION,
+            3.0,
+        )
         return
     for edge, outside in ((lower, axes.y[0]), (upper, axes.y[1])):
         if np.isfinite(edge):
@@ -150,7 +176,9 @@ def _control_limits(data: sr.FigureData, channel: int) -> tuple[float, float]:
 
 
 def _state_limits(data: sr.FigureData, state: int) -> tuple[float, float]:
-    edges = [edge for wall in data.walls if wall.state == state for edge in (wall.lower, wall.upper) if np.isfinite(edge)]
+    edges = [
+        edge for wall in data.walls if wall.state == state for edge in (wall.lower, wall.upper) if np.isfinite(edge)
+    ]
     return _padded([*edges, float(data.tube_lower[state].min()), float(data.tube_upper[state].max())])
 
 

@@ -21,15 +21,16 @@ from sparserob_rerun.search import Search
 from sparserob_rerun.terrain import Terrain
 from sparserob_rerun.way import Way
 
-PICTURES = 60       # rounds whose physics is drawn; of later ones every tenth
-PROOFS = 12         # lines about the proof of one family
-SLOTS = 16          # active constraints at most that make the tuple of a method without one
+PICTURES = 60  # rounds whose physics is drawn; of later ones every tenth
+PROOFS = 12  # lines about the proof of one family
+SLOTS = 16  # active constraints at most that make the tuple of a method without one
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Opening:
-    """What a recording knows of its run at the beginning. Without an ``inspection`` it is read from the ``directory``, if there is one."""
+    """What a recording knows of its run at the beginning. Without an ``inspection`` it is read from the ``directory``,
+    if there is one."""
 
     title: str
     directory: Path | None
@@ -76,7 +77,10 @@ class Recorder:
                 self.clock.move(seconds=event.seconds)
                 self.proofs[event.family] = self.proofs.get(event.family, 0) + 1
                 if self.proofs[event.family] <= PROOFS:
-                    self.say(f"proof of {event.family}: {event.cells} cells open, violation not excluded {event.bound:.1e}", "DEBUG")
+                    self.say(
+                        f"proof of {event.family}: {event.cells} cells open, violation not excluded {event.bound:.1e}",
+                        "DEBUG",
+                    )
             case sr.RunFinished():
                 self._finished(event)
 
@@ -87,7 +91,11 @@ class Recorder:
     def mark(self) -> None:
         """Mark on the last landscape where the maximum is, if it was proven."""
         landscape = self.explorer.landscape
-        if landscape is not None and self.exact is not None and self.explorer.words.endswith(("the end", f"round {self.clock.round}")):
+        if (
+            landscape is not None
+            and self.exact is not None
+            and self.explorer.words.endswith(("the end", f"round {self.clock.round}"))
+        ):
             at = np.array([[landscape.anchor[landscape.first], landscape.anchor[landscape.second]]])
             self.terrain.mark(at, f"exact maximum {self.exact:.5g}")
 
@@ -133,9 +141,12 @@ class Recorder:
         self.rounds.violations(event.decision, cuts, event.added)
 
     def _aim(self, event: sr.RoundFinished) -> None:
-        """The tuple whose surroundings are worth a look after a round: the best of the search, or the constraints that are active."""
+        """The tuple whose surroundings are worth a look after a round: the best of the search, or the constraints that
+        are active."""
         if self.searches and self.best.size:
-            self.explorer.aim(self.best.reshape(-1, self.block), event.epsilon, f"others as in the best tuple of round {event.round}")
+            self.explorer.aim(
+                self.best.reshape(-1, self.block), event.epsilon, f"others as in the best tuple of round {event.round}"
+            )
         elif not self.searches:
             slots = slots_of(active(event.imposed, event.multipliers))
             if slots.size:
@@ -153,9 +164,13 @@ class Recorder:
                 self.physics.signals(result.decision)
             if result.decision is not None:
                 self.rounds.violations(result.decision, result.indices, ())
-            if self.explorer.landscape is None and self.explorer.waiting is None and result.indices:  # a run that is shown again
+            # a run that is shown again
+            if self.explorer.landscape is None and self.explorer.waiting is None and result.indices:
                 self.explorer.aim(slots_of(list(result.indices)), result.epsilon, "others as active at the end")
-        self.say(f"{event.status}: {event.message}", {"failed": "ERROR", "refuted": "WARN", "undecided": "WARN"}.get(event.status, "INFO"))
+        self.say(
+            f"{event.status}: {event.message}",
+            {"failed": "ERROR", "refuted": "WARN", "undecided": "WARN"}.get(event.status, "INFO"),
+        )
         self._page(event.status, lines)
 
     def _page(self, status: str, lines: list[str]) -> None:
@@ -185,6 +200,6 @@ def slots_of(cuts: list[sr.Cut]) -> Floats:
     found: dict[bytes, Floats] = {}
     for cut in ordered:
         slot = np.zeros(width)
-        slot[:len(cut.index)] = cut.index
+        slot[: len(cut.index)] = cut.index
         found.setdefault(np.round(slot, 9).tobytes(), slot)
     return np.array(list(found.values())[:SLOTS]).reshape(-1, width) if found else np.zeros((0, 0))

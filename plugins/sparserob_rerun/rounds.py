@@ -15,7 +15,7 @@ from sparserob_rerun.palette import Floats
 
 INSTANTS, PARAMETERS = 97, 15
 FAMILIES = 4
-LATTICE = 27        # points at most for the coordinates that are not drawn
+LATTICE = 27  # points at most for the coordinates that are not drawn
 LEFT, WIDTH, HEIGHT, GAP = 60.0, 640.0, 118.0, 46.0
 SMALLEST = 1e-12
 SERIES = {
@@ -38,14 +38,25 @@ class Rounds:
         self.rr, self.stream, self.inspection = rr, stream, inspection
         for path, series in SERIES.items():
             names, colours = list(series), list(series.values())
-            stream.log(path, rr.SeriesLines(names=names, colors=colours, widths=[2.0] * len(names)),
-                       rr.SeriesPoints(names=names, colors=colours, marker_sizes=[4.0] * len(names)), static=True)
+            stream.log(
+                path,
+                rr.SeriesLines(names=names, colors=colours, widths=[2.0] * len(names)),
+                rr.SeriesPoints(names=names, colors=colours, marker_sizes=[4.0] * len(names)),
+                static=True,
+            )
 
     def bounds(self, event: sr.RoundFinished) -> None:
         """The numbers of one round."""
-        rr, shown = self.rr, [value if np.isfinite(value) else np.nan for value in (event.lower_bound, event.upper_bound)]
+        rr, shown = (
+            self.rr,
+            [value if np.isfinite(value) else np.nan for value in (event.lower_bound, event.upper_bound)],
+        )
         self.stream.log("rounds/bounds", rr.Scalars(shown))
-        gap = (event.upper_bound - event.lower_bound) / max(1.0, abs(event.upper_bound)) if np.isfinite(shown).all() else np.nan
+        gap = (
+            (event.upper_bound - event.lower_bound) / max(1.0, abs(event.upper_bound))
+            if np.isfinite(shown).all()
+            else np.nan
+        )
         self.stream.log("rounds/log10", rr.Scalars([_decades(event.violation), _decades(gap)]))
         self.stream.log("rounds/counts", rr.Scalars([float(event.active_indices), float(event.cuts_added)]))
 
@@ -62,8 +73,14 @@ class Rounds:
                 maps += 1
         drawing.log(self.rr, self.stream, "violation/plots", layers=("hatch", "frame", "marks", "curve"))
 
-    def _plot(self, drawing: Drawing, place: int, family: sr.ConstraintFamily, found: tuple[Floats, Floats, Floats],
-              marked: tuple[Sequence[sr.Cut], Sequence[sr.Cut]]) -> None:
+    def _plot(
+        self,
+        drawing: Drawing,
+        place: int,
+        family: sr.ConstraintFamily,
+        found: tuple[Floats, Floats, Floats],
+        marked: tuple[Sequence[sr.Cut], Sequence[sr.Cut]],
+    ) -> None:
         across, _, field = found
         worst, box = field.max(axis=1), family.index_set
         ends = (float(box.lower[0]), float(box.upper[0]))
@@ -71,8 +88,13 @@ class Rounds:
             ends = (ends[0] - 1.0, ends[1] + 1.0)
         low = float(np.quantile(worst, 0.02))
         reach = max(abs(low), abs(float(worst.max())), 1e-9)
-        axes = Axes(LEFT, place * (HEIGHT + GAP), WIDTH, HEIGHT, ends, (-reach, max(0.35 * reach, 1.15 * float(worst.max()))))
-        drawing.frame(axes, f"{family.name}: worst violation {worst.max():.2e} at {across[worst.argmax()]:.4g}; above 0 is forbidden")
+        axes = Axes(
+            LEFT, place * (HEIGHT + GAP), WIDTH, HEIGHT, ends, (-reach, max(0.35 * reach, 1.15 * float(worst.max())))
+        )
+        drawing.frame(
+            axes,
+            f"{family.name}: worst violation {worst.max():.2e} at {across[worst.argmax()]:.4g}; above 0 is forbidden",
+        )
         drawing.hatched("hatch", axes, axes.x, (0.0, axes.y[1]), ink.HATCH)
         if across.size > 1:
             drawing.line("curve", axes.at(across, worst), ink.SKY, 2.0)
@@ -89,17 +111,29 @@ class Rounds:
         image = np.ascontiguousarray(ink.diverging(np.flipud(field.T) / reach)[:, :, :3])
         path = f"violation/maps/{name.replace('[', '_').replace(']', '')}"
         self.stream.log(path, rr.Transform3D(translation=(0.0, top, 0.0), scale=(4.0, 16.0, 1.0)), rr.Image(image))
-        self.stream.log(f"violation/names/{place}", rr.Points2D([(2.0 * INSTANTS, top - 20.0)], labels=[name], colors=[ink.INK],
-                                                                radii=rr.Radius.ui_points(0.0), show_labels=True))
+        self.stream.log(
+            f"violation/names/{place}",
+            rr.Points2D(
+                [(2.0 * INSTANTS, top - 20.0)],
+                labels=[name],
+                colors=[ink.INK],
+                radii=rr.Radius.ui_points(0.0),
+                show_labels=True,
+            ),
+        )
 
 
 def violation_field(family: sr.ConstraintFamily, decision: Floats) -> tuple[Floats, Floats, Floats]:
-    """Values of the first index coordinate ``(k,)`` and of the second ``(l,)``, and the largest violation ``(k, l)`` of all rows there,
-    over a coarse lattice of the other coordinates: a picture, not a proof."""
+    """Values of the first index coordinate ``(k,)`` and of the second ``(l,)``, and the largest violation ``(k, l)`` of
+    all rows there, over a coarse lattice of the other coordinates: a picture, not a proof."""
     box = family.index_set
     across = np.linspace(box.lower[0], box.upper[0], INSTANTS if box.upper[0] > box.lower[0] else 1)
     wide = box.dimension > 1 and box.upper[1] > box.lower[1]
-    along = np.linspace(box.lower[1], box.upper[1], PARAMETERS) if wide else np.array(box.lower[1:2] if box.dimension > 1 else [0.0])
+    along = (
+        np.linspace(box.lower[1], box.upper[1], PARAMETERS)
+        if wide
+        else np.array(box.lower[1:2] if box.dimension > 1 else [0.0])
+    )
     others = _lattice(box.lower[2:], box.upper[2:])
     field = np.full((across.size, along.size), -np.inf)
     for rest in others:
@@ -111,7 +145,7 @@ def violation_field(family: sr.ConstraintFamily, decision: Floats) -> tuple[Floa
 def _lattice(lower: Floats, upper: Floats) -> list[Floats]:
     """The corners and the middle of a box, or its middle alone where the corners are too many."""
     middle = (lower + upper) / 2
-    if 2 ** lower.size > LATTICE:
+    if 2**lower.size > LATTICE:
         return [middle]
     corners = [np.array(corner) for corner in product(*zip(lower, upper, strict=True))]
     return [middle, *corners] if lower.size else [middle]

@@ -11,14 +11,24 @@ from sparserob_rerun import palette as ink
 from sparserob_rerun.clock import Clock
 from sparserob_rerun.palette import Colour, Floats
 
-MOVES = 4           # coordinates of one evaluation that are shown; a search that changes all of them at once would bury the panel
-TOLD = {            # what a maximiser notes: the words for it, and its colour
-    "temperature": ("temperature", ink.VERMILLION), "accepted": ("share of moves accepted (last 50)", ink.GREEN),
-    "scale": ("size of a move", ink.SKY), "depth": ("depth of the opened cell", ink.SKY), "openings": ("cells opened", ink.GREEN),
-    "hmax": ("deepest cells allowed", ink.GREY), "constant": ("Lipschitz constant", ink.VERMILLION),
-    "rejected": ("share of points rejected", ink.GREEN), "spread": ("distance from the best point", ink.SKY),
-    "ascent": ("number of the ascent", ink.GREEN), "start": ("number of the start", ink.GREEN), "slope": ("norm of the gradient", ink.SKY),
-    "radius": ("radius of the trust region", ink.SKY), "step": ("0: global, 1: local step", ink.GREEN),
+MOVES = (
+    4  # coordinates of one evaluation that are shown; a search that changes all of them at once would bury the panel
+)
+TOLD = {  # what a maximiser notes: the words for it, and its colour
+    "temperature": ("temperature", ink.VERMILLION),
+    "accepted": ("share of moves accepted (last 50)", ink.GREEN),
+    "scale": ("size of a move", ink.SKY),
+    "depth": ("depth of the opened cell", ink.SKY),
+    "openings": ("cells opened", ink.GREEN),
+    "hmax": ("deepest cells allowed", ink.GREY),
+    "constant": ("Lipschitz constant", ink.VERMILLION),
+    "rejected": ("share of points rejected", ink.GREEN),
+    "spread": ("distance from the best point", ink.SKY),
+    "ascent": ("number of the ascent", ink.GREEN),
+    "start": ("number of the start", ink.GREEN),
+    "slope": ("norm of the gradient", ink.SKY),
+    "radius": ("radius of the trust region", ink.SKY),
+    "step": ("0: global, 1: local step", ink.GREEN),
 }
 WINDOW = 50
 
@@ -31,18 +41,28 @@ class Search:
         self.rr, self.stream, self.clock = rr, stream, clock
         self.base, self.known = 0, {"search/g"}
         self.recent = np.empty(0)
-        stream.log("search/g", rr.SeriesLines(names=["g of the tuple", "best so far", "proven lower bound"],
-                                              colors=[ink.SKY, ink.ORANGE, ink.GREEN], widths=[1.0, 2.5, 2.0]), static=True)
+        stream.log(
+            "search/g",
+            rr.SeriesLines(
+                names=["g of the tuple", "best so far", "proven lower bound"],
+                colors=[ink.SKY, ink.ORANGE, ink.GREEN],
+                widths=[1.0, 2.5, 2.0],
+            ),
+            static=True,
+        )
 
     def show(self, event: sr.EvaluationsFinished, began: float, names: tuple[str, ...], kept: np.ndarray) -> None:
-        """Log a batch of a search that began ``began`` seconds after the run; of the points the coordinates ``kept`` are there."""
+        """Log a batch of a search that began ``began`` seconds after the run; of the points the coordinates ``kept``
+        are there."""
         batch = event.batch.trace
         count = batch.values.size
         if event.total == event.count:
             self.base, self.recent = self.clock.evaluation, np.empty(0)
         numbers = self.base + event.total - count + 1 + np.arange(count)
         at = self.clock.columns(numbers, began + batch.seconds, event.round)
-        values = np.stack([_shown(batch.values), _shown(batch.best), np.full(count, _finite(event.lower_bound))], axis=1)
+        values = np.stack(
+            [_shown(batch.values), _shown(batch.best), np.full(count, _finite(event.lower_bound))], axis=1
+        )
         self.stream.send_columns("search/g", at, self.rr.Scalars.columns(scalars=values.ravel()).partition([3] * count))
         self._notes(event, numbers, began)
         self._moves(event, numbers, names, kept)
@@ -74,7 +94,9 @@ class Search:
         self.recent = joined[-WINDOW:]
         return np.asarray((sums[ends] - sums[starts]) / (ends - starts))
 
-    def _moves(self, event: sr.EvaluationsFinished, numbers: np.ndarray, names: tuple[str, ...], kept: np.ndarray) -> None:
+    def _moves(
+        self, event: sr.EvaluationsFinished, numbers: np.ndarray, names: tuple[str, ...], kept: np.ndarray
+    ) -> None:
         """The value of the coordinates that moved, one series for each kind: to which time, to which parameter."""
         trace, moves = event.batch.trace, event.batch.moves
         if not len(moves) or trace.points.shape[1:] != kept.shape:
@@ -89,7 +111,11 @@ class Search:
             path = f"search/moves/{name}"
             if path not in self.known:
                 self.known.add(path)
-                self.stream.log(path, self.rr.SeriesPoints(names=[f"{name} tried"], colors=[ink.PURPLE], marker_sizes=[2.0]), static=True)
+                self.stream.log(
+                    path,
+                    self.rr.SeriesPoints(names=[f"{name} tried"], colors=[ink.PURPLE], marker_sizes=[2.0]),
+                    static=True,
+                )
             at = [self.rr.TimeColumn("evaluation", sequence=numbers[mine[:, 0]])]
             self.stream.send_columns(path, at, self.rr.Scalars.columns(scalars=trace.points[mine[:, 0], mine[:, 1]]))
 

@@ -1,4 +1,5 @@
-"""Where a recording goes: a file, a viewer that listens, a viewer that is started, a browser; and what to do where one is missing."""
+"""Where a recording goes: a file, a viewer that listens, a viewer that is started, a browser; and what to do where one
+is missing."""
 
 from __future__ import annotations
 
@@ -13,15 +14,16 @@ from pathlib import Path
 from typing import Any, final
 
 PORT, WEB_PORT = 9876, 9090
-STARTING = 15.0     # seconds that a viewer may take until it listens
-MEMORY = "25%"      # of the machine's, for a viewer that is started
+STARTING = 15.0  # seconds that a viewer may take until it listens
+MEMORY = "25%"  # of the machine's, for a viewer that is started
 
 
 @final
 @dataclass(frozen=True)
 class Destinations:
-    """What is left of the wishes after looking at the machine: ``save`` a file, ``connect`` a host and port where a viewer listens,
-    ``spawn`` a viewer, ``serve`` to a browser through this port; ``missing`` says in words what could not be had."""
+    """What is left of the wishes after looking at the machine: ``save`` a file, ``connect`` a host and port where a
+    viewer listens, ``spawn`` a viewer, ``serve`` to a browser through this port; ``missing`` says in words what could
+    not be had."""
 
     save: Path | None
     connect: tuple[str, int] | None
@@ -44,7 +46,9 @@ def look(save: Path | None, connect: str | None, spawn: bool, serve: bool) -> De
     """Which of the wishes can be fulfilled; every other is a sentence in ``missing``."""
     missing = []
     if find_spec("rerun") is None or find_spec("rerun_bindings") is None:
-        return Destinations(None, None, False, None, ("rerun-sdk is not installed; `pip install 'sparserob[rerun]'` brings it",))
+        return Destinations(
+            None, None, False, None, ("rerun-sdk is not installed; `pip install 'sparserob[rerun]'` brings it",)
+        )
     if save is not None and (reason := _unwritable(save)):
         missing.append(f"{save}: cannot be written to: {reason}")
         save = None
@@ -55,14 +59,21 @@ def look(save: Path | None, connect: str | None, spawn: bool, serve: bool) -> De
     if (spawn or serve) and not viewer().is_file():
         missing.append("the viewer of rerun-sdk is not there")
         spawn = serve = False
-    if spawn and sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        missing.append("there is no display for a viewer; `save: recording.rrd` records, `serve: true` shows it in a browser")
+    if (
+        spawn
+        and sys.platform.startswith("linux")
+        and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    ):
+        missing.append(
+            "there is no display for a viewer; `save: recording.rrd` records, `serve: true` shows it in a browser"
+        )
         spawn = False
     return Destinations(save, address, spawn, _free_port() if serve else None, tuple(missing))
 
 
 def address_of(text: str) -> tuple[str, int]:
-    """Host and port of ``host``, ``host:port`` or a Rerun address ``rerun+http://host:port/proxy``; raises `ValueError`."""
+    """Host and port of ``host``, ``host:port`` or a Rerun address ``rerun+http://host:port/proxy``; raises
+    `ValueError`."""
     plain = text.split("://", 1)[-1].split("/", 1)[0]
     host, colon, port = plain.rpartition(":")
     if not colon:
@@ -88,12 +99,17 @@ def viewer() -> Path:
     return Path(spec.origin).parent / name if spec is not None and spec.origin else Path(name)
 
 
-def open_sinks(rr: Any, stream: Any, chosen: Destinations, blueprint: Any) -> tuple[list[str], list[subprocess.Popen[bytes]]]:
+def open_sinks(
+    rr: Any, stream: Any, chosen: Destinations, blueprint: Any
+) -> tuple[list[str], list[subprocess.Popen[bytes]]]:
     """Send a stream to its destinations; returns what went wrong, and the servers that were started for a browser."""
     sinks: list[Any] = [] if chosen.save is None else [rr.FileSink(str(chosen.save))]
     wrong, servers = [], []
     addresses = [] if chosen.connect is None else [chosen.connect]
-    for port, extra in ((PORT if chosen.spawn else None, []), (chosen.serve, ["--serve-web", "--web-viewer-port", str(WEB_PORT)])):
+    for port, extra in (
+        (PORT if chosen.spawn else None, []),
+        (chosen.serve, ["--serve-web", "--web-viewer-port", str(WEB_PORT)]),
+    ):
         if port is None:
             continue
         address = ("127.0.0.1", port)
@@ -120,8 +136,20 @@ def _unwritable(file: Path) -> str:
 
 def _started(port: int, extra: list[str]) -> subprocess.Popen[bytes]:
     """A viewer that outlives the run, and hears only this machine."""
-    command = [str(viewer()), "--bind", "127.0.0.1", "--port", str(port), "--memory-limit", MEMORY, "--hide-welcome-screen", *extra]
-    return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+    command = [
+        str(viewer()),
+        "--bind",
+        "127.0.0.1",
+        "--port",
+        str(port),
+        "--memory-limit",
+        MEMORY,
+        "--hide-welcome-screen",
+        *extra,
+    ]
+    return subprocess.Popen(
+        command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    )
 
 
 def _waited(address: tuple[str, int], process: subprocess.Popen[bytes] | None) -> bool:

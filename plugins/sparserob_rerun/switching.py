@@ -14,10 +14,12 @@ if TYPE_CHECKING:
 
 @final
 class Switching:
-    """The switching function of a program: minus the multipliers times the rows, on every piece, in units of what acting there costs.
+    """The switching function of a program: minus the multipliers times the rows, on every piece, in units of what
+    acting there costs.
 
-    At an optimiser the control of a piece is zero where it lies between -1 and 1, and acts towards its sign beyond: stationarity,
-    ``weights sign(S x) + S'^{-1} G'y = 0`` up to the regulariser. Known only where ``S`` is square and regular, and every piece has a cost.
+    At an optimiser the control of a piece is zero where it lies between -1 and 1, and acts towards its sign beyond:
+    stationarity, ``weights sign(S x) + S'^{-1} G'y = 0`` up to the regulariser. Known only where ``S`` is square and
+    regular, and every piece has a cost.
     """
 
     def __init__(self, program: sr.SemiInfiniteProgram) -> None:
@@ -31,7 +33,8 @@ class Switching:
             self.known = bool(np.linalg.matrix_rank(self.dense) == program.n)
 
     def push(self, cuts: Sequence[sr.Cut], mu: Floats | None) -> Floats | None:
-        """The switching function ``(m, K)`` under these constraints with their multipliers, or ``None`` where it is not known."""
+        """The switching function ``(m, K)`` under these constraints with their multipliers, or ``None`` where it is not
+        known."""
         program = self.program
         if not self.known or (program.A is not None and (mu is None or mu.size != len(np.atleast_2d(program.A)))):
             return None

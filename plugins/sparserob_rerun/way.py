@@ -11,8 +11,8 @@ from sparserob_rerun.landscape import Landscape
 from sparserob_rerun.palette import Floats
 from sparserob_rerun.terrain import Terrain
 
-KEPT = 1000         # evaluated points that are remembered
-SEEN = 10           # evaluations, or a hundredth of the budget, between two pictures
+KEPT = 1000  # evaluated points that are remembered
+SEEN = 10  # evaluations, or a hundredth of the budget, between two pictures
 
 
 @final

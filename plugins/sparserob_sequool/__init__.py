@@ -1,4 +1,5 @@
-"""SequOOL, the parameter-free optimistic tree search: the best cells of each depth are opened, fewer of them the deeper they lie."""
+"""SequOOL, the parameter-free optimistic tree search: the best cells of each depth are opened, fewer of them the deeper
+they lie."""
 
 from __future__ import annotations
 
@@ -15,30 +16,35 @@ NUMBERS_AT_ONCE: Final = 2**23  # coordinates of a batch: 64 MB, however many di
 
 
 class SequOOL(sr.Maximiser, sr.Options):
-    """Sequential online optimisation by opening cells (Bartlett, Gabillon and Valko, ALT 2019), with three children and centres.
+    """Sequential online optimisation by opening cells (Bartlett, Gabillon and Valko, ALT 2019), with three children and
+    centres.
 
-    The box is a tree of cells; to *open* a cell is to cut it into thirds across one coordinate and to evaluate the centres of the two outer
-    ones (the middle one inherits its value). The root is opened, and at each depth ``h = 1, ..., hmax`` the ``floor(hmax / h)`` best cells, or
-    all when there are fewer. Across depth ``h`` the cut is across coordinate ``h`` modulo the number of those that can move. Of equal values the
-    earlier cell is opened first (children in the order left, right, centre), so that the search is deterministic: the generator is not used.
-    All cells of one depth are evaluated in one batch.
+    The box is a tree of cells; to *open* a cell is to cut it into thirds across one coordinate and to evaluate the
+    centres of the two outer ones (the middle one inherits its value). The root is opened, and at each depth
+    ``h = 1, ..., hmax`` the ``floor(hmax / h)`` best cells, or all when there are fewer. Across depth ``h`` the cut is
+    across coordinate ``h`` modulo the number of those that can move. Of equal values the earlier cell is opened first
+    (children in the order left, right, centre), so that the search is deterministic: the generator is not used. All
+    cells of one depth are evaluated in one batch.
 
-    ``hmax`` is the largest one whose exact number of evaluations ``1 + 2 (1 + sum_h min(floor(hmax / h), 3^h))`` fits what remains of the
-    budget, or the paper's own for ``openings``. With fewer than three evaluations left the root is opened as far as they go.
+    ``hmax`` is the largest one whose exact number of evaluations ``1 + 2 (1 + sum_h min(floor(hmax / h), 3^h))`` fits
+    what remains of the budget, or the paper's own for ``openings``. With fewer than three evaluations left the root is
+    opened as far as they go.
 
-    Guarantee (proven there): no smoothness has to be known. If ``f(x) >= f* - nu rho^h`` holds on the cell of depth ``h`` around one maximiser,
-    the regret falls exponentially in ``n / log n`` where the near-optimality dimension ``d'`` is 0, and like ``(n / log n)^(-1/d')`` up to
-    logarithms otherwise. No upper bound of the maximum is proven, unless every side of the box has length zero.
+    Guarantee (proven there): no smoothness has to be known. If ``f(x) >= f* - nu rho^h`` holds on the cell of depth
+    ``h`` around one maximiser, the regret falls exponentially in ``n / log n`` where the near-optimality dimension
+    ``d'`` is 0, and like ``(n / log n)^(-1/d')`` up to logarithms otherwise. No upper bound of the maximum is proven,
+    unless every side of the box has length zero.
 
-    In high dimension: a coordinate is cut only once in every ``d`` depths, so ``rho`` is about ``3^(-1/d)``; coordinates from ``hmax + 1`` on
-    stay at the centre of the box for good (``hmax`` is about 140 for 1000 evaluations). It is strong up to some ten coordinates. Cells that are
-    permutations of one another, such as the same index tuple in another order, are not recognised; what an earlier search found is not used.
-    Below depth ``34 d`` the cells are smaller than the spacing of floating-point numbers, and points repeat.
+    In high dimension: a coordinate is cut only once in every ``d`` depths, so ``rho`` is about ``3^(-1/d)``;
+    coordinates from ``hmax + 1`` on stay at the centre of the box for good (``hmax`` is about 140 for 1000
+    evaluations). It is strong up to some ten coordinates. Cells that are permutations of one another, such as the same
+    index tuple in another order, are not recognised; what an earlier search found is not used. Below depth ``34 d`` the
+    cells are smaller than the spacing of floating-point numbers, and points repeat.
     """
 
     openings: int | None = Field(default=None, ge=1, le=10**7)
-    """The paper's ``n``: ``hmax = floor(n / (1 + 1/2 + ... + 1/n))``, which opens at most ``n + 1`` cells; the budget ends the
-    search if that is more.
+    """The paper's ``n``: ``hmax = floor(n / (1 + 1/2 + ... + 1/n))``, which opens at most ``n + 1`` cells; the budget
+    ends the search if that is more.
     ``null``: the largest ``hmax`` whose evaluations fit the budget."""
 
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
@@ -53,14 +59,16 @@ class SequOOL(sr.Maximiser, sr.Options):
 
 
 class _Tree:
-    """The cells of one depth that can still be opened: centres ``(k, c)`` in the coordinates that are ever cut, and values ``(k,)``, best first."""
+    """The cells of one depth that can still be opened: centres ``(k, c)`` in the coordinates that are ever cut, and
+    values ``(k,)``, best first."""
 
     def __init__(self, objective: sr.Objective, cut: np.ndarray, period: int) -> None:
         domain = objective.domain
         self.objective, self.cut, self.period = objective, cut, period
         self.root = np.clip(0.5 * domain.lower + 0.5 * domain.upper, domain.lower, domain.upper)
         self.lower, self.upper = domain.lower[cut], domain.upper[cut]
-        self.thirds = (0.5 * self.upper - 0.5 * self.lower) * (2 / CHILDREN)  # how far the children of the next cut stand off
+        # how far the children of the next cut stand off
+        self.thirds = (0.5 * self.upper - 0.5 * self.lower) * (2 / CHILDREN)
 
     def grow(self, schedule: np.ndarray) -> None:
         """Open ``schedule[h]`` cells of each depth ``h``."""
@@ -92,7 +100,9 @@ class _Tree:
         if centres.shape[1] == d and centres.size <= NUMBERS_AT_ONCE:
             return self.objective.evaluate(centres)
         rows = max(1, NUMBERS_AT_ONCE // d)
-        return np.concatenate([self._values_at(centres[start : start + rows]) for start in range(0, len(centres), rows)])
+        return np.concatenate(
+            [self._values_at(centres[start : start + rows]) for start in range(0, len(centres), rows)]
+        )
 
     def _values_at(self, centres: np.ndarray) -> np.ndarray:
         points = np.tile(self.root, (len(centres), 1))
@@ -133,4 +143,6 @@ def _paper(openings: int) -> int:
 @sr.hookimpl
 def sparserob_maximisers() -> Iterator[sr.MaximiserPlugin]:
     """Offer ``sequool``."""
-    yield sr.MaximiserPlugin(name="sequool", factory=SequOOL, summary="optimistic tree search without parameters, deterministic")
+    yield sr.MaximiserPlugin(
+        name="sequool", factory=SequOOL, summary="optimistic tree search without parameters, deterministic"
+    )

@@ -1,4 +1,5 @@
-"""Simulated annealing in a box: cheap moves of one or few coordinates at scales that adapt, and a share of uniform proposals."""
+"""Simulated annealing in a box: cheap moves of one or few coordinates at scales that adapt, and a share of uniform
+proposals."""
 
 from __future__ import annotations
 
@@ -14,21 +15,24 @@ from sparserob_simulated_annealing.moves import Moves
 
 
 class SimulatedAnnealing(sr.Maximiser, sr.Options):
-    """A walk that accepts what is worse with a probability that falls with the temperature (Kirkpatrick, Gelatt and Vecchi 1983).
+    """A walk that accepts what is worse with a probability that falls with the temperature (Kirkpatrick, Gelatt and
+    Vecchi 1983).
 
-    Condition of Belisle (1992, J. Appl. Prob. 29, 885-895) on the candidates: their density is bounded away from 0 on the box. It holds at
-    every step, with the bound ``exploration / volume``, because that share of the candidates is uniform, whatever the other moves do. For a
-    continuous function, Metropolis' rule, a kernel that does not adapt (``adapt: none``) and temperatures that tend to 0 in probability, at
-    any rate, the values of an endless walk then tend to the maximum in probability. Of the run that ends: ``n`` evaluations miss a set of a
-    share ``v`` of the volume with probability ``(1 - exploration v)^n`` at most, with every option, so the best value tends to the
-    maximum almost surely. With ``exploration: 0`` neither is true: one-coordinate moves have no density at all, and scales that shrink can
-    leave the walk in one basin for ever.
+    Condition of Belisle (1992, J. Appl. Prob. 29, 885-895) on the candidates: their density is bounded away from 0 on
+    the box. It holds at every step, with the bound ``exploration / volume``, because that share of the candidates is
+    uniform, whatever the other moves do. For a continuous function, Metropolis' rule, a kernel that does not adapt
+    (``adapt: none``) and temperatures that tend to 0 in probability, at any rate, the values of an endless walk then
+    tend to the maximum in probability. Of the run that ends: ``n`` evaluations miss a set of a share ``v`` of the
+    volume with probability ``(1 - exploration v)^n`` at most, with every option, so the best value tends to the maximum
+    almost surely. With ``exploration: 0`` neither is true: one-coordinate moves have no density at all, and scales that
+    shrink can leave the walk in one basin for ever.
 
-    In high dimension the guarantee is kept and worthless: ``v`` falls like ``radius^d``, and what is found is what the local moves find. They
-    stay cheap: one copy of the point, and random numbers for what changes only. Where coordinates come in blocks (tuples of indices), a move
-    changes one coordinate of a block, one block, or two or three; only the uniform candidates change every block, so the objective must
-    rebuild every row for that share of the budget. A permutation of a tuple is the same value at another point: the walk does not merge
-    them; that does it no harm, since every copy of a basin is as good. It proves no upper bound.
+    In high dimension the guarantee is kept and worthless: ``v`` falls like ``radius^d``, and what is found is what the
+    local moves find. They stay cheap: one copy of the point, and random numbers for what changes only. Where
+    coordinates come in blocks (tuples of indices), a move changes one coordinate of a block, one block, or two or
+    three; only the uniform candidates change every block, so the objective must rebuild every row for that share of the
+    budget. A permutation of a tuple is the same value at another point: the walk does not merge them; that does it no
+    harm, since every copy of a basin is as good. It proves no upper bound.
 
     Notes ``temperature``, ``accepted`` (0 or 1) and ``scale`` (of the step, in widths of the box) at every evaluation.
     """
@@ -46,8 +50,8 @@ class SimulatedAnnealing(sr.Maximiser, sr.Options):
     """Weight of moves of all coordinates; in a space of tuples, of one whole block."""
 
     coarse: float = Field(default=0.2, ge=0.0, le=1.0)
-    """Share of the moves that keep the initial scale, to cross from basin to basin when the adapted scale is small; a coarse move of a
-    block draws it anew."""
+    """Share of the moves that keep the initial scale, to cross from basin to basin when the adapted scale is small; a
+    coarse move of a block draws it anew."""
 
     step: Literal["cauchy", "gaussian"] = "cauchy"
     """Distribution of the steps: Cauchy's makes a long one now and then."""
@@ -56,8 +60,8 @@ class SimulatedAnnealing(sr.Maximiser, sr.Options):
     """Scale of the first steps, in widths of the box."""
 
     adapt: Literal["coordinate", "global", "none"] = "coordinate"
-    """One scale per coordinate (per place within a block), one for all, or no adaptation; one for all, too, when the budget allows less
-    than 20 evaluations for each."""
+    """One scale per coordinate (per place within a block), one for all, or no adaptation; one for all, too, when the
+    budget allows less than 20 evaluations for each."""
 
     adaptation: float = Field(default=0.3, gt=0.0, le=2.0)
     """Rate at which a scale follows the acceptance."""
@@ -66,8 +70,8 @@ class SimulatedAnnealing(sr.Maximiser, sr.Options):
     """Share of accepted moves that the scales aim at."""
 
     cooling: Literal["geometric", "logarithmic", "gap"] = "geometric"
-    """Geometric from the first to the last temperature; proportional to 1 / log(evaluations), which hardly cools within a usual budget; or
-    driven by the gap between the walk and the best value (Locatelli 2000)."""
+    """Geometric from the first to the last temperature; proportional to 1 / log(evaluations), which hardly cools within
+    a usual budget; or driven by the gap between the walk and the best value (Locatelli 2000)."""
 
     initial_temperature: float | None = Field(default=None, gt=0.0)
     """First temperature, in units of the function; none: from the spread of the first values."""
@@ -85,8 +89,8 @@ class SimulatedAnnealing(sr.Maximiser, sr.Options):
     """Power of the gap, for ``cooling: gap``."""
 
     restarts: int = Field(default=2, ge=0)
-    """How often the walk is heated again, its scales widened again; the budget is shared equally. A rule that ends the search at a
-    temperature ends it within the first cycle; choose 0 restarts with it."""
+    """How often the walk is heated again, its scales widened again; the budget is shared equally. A rule that ends the
+    search at a temperature ends it within the first cycle; choose 0 restarts with it."""
 
     restart_from: Literal["best", "anew"] = "best"
     """Where a restarted walk begins: at the best point so far, or at the best of the next few uniform points."""
@@ -95,8 +99,8 @@ class SimulatedAnnealing(sr.Maximiser, sr.Options):
     """First temperature of a cycle over that of the cycle before."""
 
     samples: int = Field(default=10, ge=1)
-    """Uniform points to begin with, at most a tenth of the budget; the walk starts at the best of them, or at a better point that the
-    objective has already."""
+    """Uniform points to begin with, at most a tenth of the budget; the walk starts at the best of them, or at a better
+    point that the objective has already."""
 
     @model_validator(mode="after")
     def _some_move(self) -> SimulatedAnnealing:
@@ -132,7 +136,9 @@ class SimulatedAnnealing(sr.Maximiser, sr.Options):
         return points[top], float(values[top])
 
 
-def _walk(objective: sr.Objective, rng: np.random.Generator, moves: Moves, cooling: Cooling, point: np.ndarray, value: float) -> None:
+def _walk(
+    objective: sr.Objective, rng: np.random.Generator, moves: Moves, cooling: Cooling, point: np.ndarray, value: float
+) -> None:
     """One cycle of the walk, from a point and its value."""
     for k in range(cooling.length):
         temperature = cooling.temperature(k, objective.best_value - value)
@@ -149,4 +155,6 @@ def _walk(objective: sr.Objective, rng: np.random.Generator, moves: Moves, cooli
 @sr.hookimpl
 def sparserob_maximisers() -> Iterator[sr.MaximiserPlugin]:
     """Offer ``simulated_annealing``."""
-    yield sr.MaximiserPlugin(name="simulated_annealing", factory=SimulatedAnnealing, summary="cooled walk of few-coordinate moves")
+    yield sr.MaximiserPlugin(
+        name="simulated_annealing", factory=SimulatedAnnealing, summary="cooled walk of few-coordinate moves"
+    )

@@ -12,7 +12,8 @@ if TYPE_CHECKING:
 
 
 def first_temperature(options: SimulatedAnnealing, values: np.ndarray) -> float:
-    """The given one, or ``temperature_share`` times the median distance of the finite values from their median; 1 if they are all equal."""
+    """The given one, or ``temperature_share`` times the median distance of the finite values from their median; 1 if
+    they are all equal."""
     if options.initial_temperature is not None:
         return options.initial_temperature
     finite = values[np.isfinite(values)]
@@ -26,8 +27,9 @@ def first_temperature(options: SimulatedAnnealing, values: np.ndarray) -> float:
 class Cooling:
     """The temperatures of one cycle of ``length`` evaluations, which starts at ``start``.
 
-    geometric: ``start * ratio^(k / length)``, ``ratio`` chosen so that every cycle ends at ``lowest``. logarithmic: ``start log(2) / log(k + 2)``.
-    gap: ``gap_factor * max(gap, e_k)^gap_power``, where ``gap = record - current`` and ``e_k`` is the geometric schedule (Locatelli 2000).
+    geometric: ``start * ratio^(k / length)``, ``ratio`` chosen so that every cycle ends at ``lowest``. logarithmic:
+    ``start log(2) / log(k + 2)``. gap: ``gap_factor * max(gap, e_k)^gap_power``, where ``gap = record - current`` and
+    ``e_k`` is the geometric schedule (Locatelli 2000).
     """
 
     def __init__(self, options: SimulatedAnnealing, start: float, lowest: float, length: int) -> None:
@@ -40,5 +42,7 @@ class Cooling:
             return self.start * log(2.0) / log(k + 2.0)
         level = self.start * float(np.exp(self.decay * k))
         if self.options.cooling == "gap":
-            return float(self.options.gap_factor * max(gap if isfinite(gap) else level, level) ** self.options.gap_power)
+            return float(
+                self.options.gap_factor * max(gap if isfinite(gap) else level, level) ** self.options.gap_power
+            )
         return level

@@ -16,14 +16,15 @@ if TYPE_CHECKING:
 CHUNK = 256
 FEW = 3
 SMALLEST, LARGEST = 1e-13, 0.5
-VISITS = 20          # evaluations per scale that are needed to adapt it
+VISITS = 20  # evaluations per scale that are needed to adapt it
 
 
 class Moves:
     """Draws a candidate near a point, and learns from whether it was accepted.
 
-    A step is noise times a scale times the width of the box, so that the units of the coordinates do not matter. In a space of tuples
-    (``block > 1``) the scale of a coordinate is that of its place within its block. ``scale`` is that of the last candidate.
+    A step is noise times a scale times the width of the box, so that the units of the coordinates do not matter. In a
+    space of tuples (``block > 1``) the scale of a coordinate is that of its place within its block. ``scale`` is that
+    of the last candidate.
     """
 
     def __init__(self, options: SimulatedAnnealing, objective: sr.Objective, rng: np.random.Generator) -> None:
@@ -91,7 +92,9 @@ class Moves:
         if kind == "few":
             for _ in range(2 + int(next(self.uniforms) * (FEW - 1))):
                 at = self._random_coordinate()
-                self.scale = factor * (self.options.initial_scale if coarse else self.scales[at if self.several > 1 else 0])
+                self.scale = factor * (
+                    self.options.initial_scale if coarse else self.scales[at if self.several > 1 else 0]
+                )
                 self._shift(moved, at, self.scale)
         else:
             self._shift_part(moved, slice(0, self.dimension), factor, coarse)
@@ -126,9 +129,19 @@ class Moves:
     def _shift_part(self, moved: np.ndarray, part: slice, factor: float, coarse: bool) -> None:
         """Move all coordinates of a part, in place."""
         lower, upper, widths = self.lower[part], self.upper[part], self.widths[part]
-        scales = np.array(self.scales) if self.several > 1 and not coarse else self.options.initial_scale if coarse else self.scales[0]
+        scales = (
+            np.array(self.scales)
+            if self.several > 1 and not coarse
+            else self.options.initial_scale
+            if coarse
+            else self.scales[0]
+        )
         self.scale = factor * float(np.mean(scales))
-        noise = np.tan(pi * (self.rng.random(widths.size) - 0.5)) if self.options.step == "cauchy" else self.rng.standard_normal(widths.size)
+        noise = (
+            np.tan(pi * (self.rng.random(widths.size) - 0.5))
+            if self.options.step == "cauchy"
+            else self.rng.standard_normal(widths.size)
+        )
         shifted = moved[part] + factor * scales * widths * noise
         outside = (shifted < lower) | (shifted > upper)
         if outside.any():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, TypeAlias, final
 
-VIOLATION = 1e-9        # a constraint that is exceeded by at most this counts as kept
+VIOLATION = 1e-9  # a constraint that is exceeded by at most this counts as kept
 
 Verdict: TypeAlias = Literal["holds", "fails", "not checked"]
 
@@ -15,7 +15,8 @@ class Unchecked(Exception):
 
 
 class Broken(Exception):
-    """A claim that is wrong, or a certificate that does not say what it must; the sentence says why. Never leaves the checker."""
+    """A claim that is wrong, or a certificate that does not say what it must; the sentence says why. Never leaves the
+    checker."""
 
 
 @final

@@ -8,22 +8,23 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from sparserob_core.control.dictionary import Dictionary
-from sparserob_core.control.problem import OptimalControlProblem
+from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.load import Loaded
+from sparserob_core.experiment.config.load import Loaded
 from sparserob_core.experiment.solve import indicators
 from sparserob_core.sip.method import Continuation, Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
 
 if TYPE_CHECKING:
-    from sparserob_core.experiment.run_config import Entry
+    from sparserob_core.experiment.config.run_config import Entry
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Described:
-    """The records that a config describes: a control problem and its two dictionaries, or a program that was ``stated`` as it is."""
+    """The records that a config describes: a control problem and its two dictionaries, or a program that was ``stated``
+    as it is."""
 
     loaded: Loaded
     problem: OptimalControlProblem | None = None
@@ -35,7 +36,8 @@ class Described:
 @final
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """What a config describes, built: the program, and for a control problem the problem itself and its two dictionaries."""
+    """What a config describes, built: the program, and for a control problem the problem itself and its two
+    dictionaries."""
 
     loaded: Loaded
     program: SemiInfiniteProgram
@@ -55,7 +57,8 @@ class Experiment:
 
 
 def described(loaded: Loaded) -> Described:
-    """Build the problem and the dictionaries of a checked config; raises `ConfigError` with the place of the key at fault."""
+    """Build the problem and the dictionaries of a checked config; raises `ConfigError` with the place of the key at
+    fault."""
     config = loaded.config
     try:
         problem = build(loaded, "problem", config.problem).build()
@@ -70,8 +73,9 @@ def described(loaded: Loaded) -> Described:
 
 
 def assemble(loaded: Loaded) -> Experiment:
-    """Build what a checked config describes, and its program; raises `ConfigError` with the place of the key at fault."""
-    from sparserob_core.control.transcription import transcribe
+    """Build what a checked config describes, and its program; raises `ConfigError` with the place of the key at
+    fault."""
+    from sparserob_core.control.transcription.transcribe import transcribe
 
     parts = described(loaded)
     if parts.stated is not None:
@@ -112,7 +116,11 @@ def tools_of(loaded: Loaded) -> Tools:
     """The components and numbers that a method works with."""
     config = loaded.config
     return Tools(
-        solver=build(loaded, "solver", config.solver), maximiser=build(loaded, "maximiser", config.maximiser),
+        solver=build(loaded, "solver", config.solver),
+        maximiser=build(loaded, "maximiser", config.maximiser),
         regulariser=None if config.regulariser is None else build(loaded, "regulariser", config.regulariser),
-        continuation=Continuation(**config.continuation.model_dump()), budget=config.maximiser.budget, polish=config.maximiser.polish,
-        rng=np.random.default_rng(config.seed))
+        continuation=Continuation(**config.continuation.model_dump()),
+        budget=config.maximiser.budget,
+        polish=config.maximiser.polish,
+        rng=np.random.default_rng(config.seed),
+    )

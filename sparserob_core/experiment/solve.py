@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from sparserob_core.control.dictionary import Dictionary, DictionaryFactory
-from sparserob_core.control.problem import OptimalControlProblem
+from sparserob_core.control.problem.dictionary import Dictionary, DictionaryFactory
+from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.components import Registry
-from sparserob_core.experiment.registry import load_registry
+from sparserob_core.experiment.plugins.components import Registry
+from sparserob_core.experiment.plugins.registry import load_registry
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.events import Event, silence
 from sparserob_core.sip.maximiser import Maximiser, Report
@@ -44,14 +44,15 @@ def solve(
     polish: float = 0.0,
     notify: Notify = silence,
 ) -> Result:
-    """Solve a semi-infinite program, or an optimal control problem on dictionaries, as ``sparserob run`` does, without files.
+    """Solve a semi-infinite program, or an optimal control problem on dictionaries, as ``sparserob run`` does, without
+    files.
 
-    A component is a name, a mapping such as ``{"name": "exchange", "tolerance": 1e-9}``, or the component itself. ``tolerance`` is the
-    relative gap, for a method that has such an option. ``control`` is by default 100 equal pieces, and ``disturbance`` one indicator
-    function on each piece of the control; both are for control problems only. ``regulariser`` is by default the ridge for control problems, whose
-    optimisers are to be unique, and none for other programs, so that ``value`` is the cost. ``budget``: evaluations per search of the
-    maximiser, of which the share ``polish`` goes to a local method at its end.
-    Raises `InputError` when an argument is at fault.
+    A component is a name, a mapping such as ``{"name": "exchange", "tolerance": 1e-9}``, or the component itself.
+    ``tolerance`` is the relative gap, for a method that has such an option. ``control`` is by default 100 equal pieces,
+    and ``disturbance`` one indicator function on each piece of the control; both are for control problems only.
+    ``regulariser`` is by default the ridge for control problems, whose optimisers are to be unique, and none for other
+    programs, so that ``value`` is the cost. ``budget``: evaluations per search of the maximiser, of which the share
+    ``polish`` goes to a local method at its end. Raises `InputError` when an argument is at fault.
     """
     registry = load_registry()
     program = _program(registry, problem, control, disturbance)
@@ -62,31 +63,53 @@ def solve(
         solver=component(registry, "solver", solver, Solver),
         maximiser=component(registry, "maximiser", maximiser, Maximiser),
         regulariser=None if regulariser is None else component(registry, "regulariser", regulariser, Regulariser),
-        continuation=steps, budget=_whole("budget", budget, 1), polish=_share(polish),
-        rng=np.random.default_rng(_whole("seed", seed, 0)), notify=_heard(notify))
+        continuation=steps,
+        budget=_whole("budget", budget, 1),
+        polish=_share(polish),
+        rng=np.random.default_rng(_whole("seed", seed, 0)),
+        notify=_heard(notify),
+    )
     chosen: Method = component(registry, "method", _with_tolerance(registry, method, tolerance), Method)
     return chosen.solve(program, tools)
 
 
-def maximise(f: Callable[[Array], object], box: Box, name: Choice | Maximiser = "direct", budget: int = 1000, seed: int = 0,
-             polish: float = 0.0, gradient: Callable[[Array], Array] | None = None, notify: Notify = silence, **options: object) -> Report:
-    """Search for the maximum of ``f`` (points ``(k, d)`` to values ``(k,)``) over a box with the maximiser of that name.
+def maximise(
+    f: Callable[[Array], object],
+    box: Box,
+    name: Choice | Maximiser = "direct",
+    budget: int = 1000,
+    seed: int = 0,
+    polish: float = 0.0,
+    gradient: Callable[[Array], Array] | None = None,
+    notify: Notify = silence,
+    **options: object,
+) -> Report:
+    """Search for the maximum of ``f`` (points ``(k, d)`` to values ``(k,)``) over a box with the maximiser of that
+    name.
 
-    The last share ``polish`` of the budget goes to a local method, from the best points. ``gradient`` maps a point ``(d,)`` to the
-    gradient ``(d,)`` of ``f``, for maximisers and a polish that use it. ``notify`` is called with `EvaluationsFinished` now and then.
-    Further keywords are the maximiser's options.
+    The last share ``polish`` of the budget goes to a local method, from the best points. ``gradient`` maps a point
+    ``(d,)`` to the gradient ``(d,)`` of ``f``, for maximisers and a polish that use it. ``notify`` is called with
+    `EvaluationsFinished` now and then. Further keywords are the maximiser's options.
     Raises `InputError` when an argument is at fault, and `EvaluationError` when ``f`` fails.
     """
-    from sparserob_core.sip.search import Rules, Target
-    from sparserob_core.sip.search import maximise as search
+    from sparserob_core.sip.search.search import Rules, Target
+    from sparserob_core.sip.search.search import maximise as search
 
     if not isinstance(box, Box):
         raise InputError(f"box: expected a sparserob_core.Box, got {type(box).__name__}")
     if options and not isinstance(name, str):
         raise InputError(f"{', '.join(options)}: options as keywords need the maximiser's name, got {name!r}")
-    chosen = component(load_registry(), "maximiser", {"name": name, **options} if isinstance(name, str) else name, Maximiser)
-    return search(Target(f, box, gradient), chosen, _whole("budget", budget, 1), np.random.default_rng(_whole("seed", seed, 0)),
-                  Rules(polish=_share(polish)), notify)
+    chosen = component(
+        load_registry(), "maximiser", {"name": name, **options} if isinstance(name, str) else name, Maximiser
+    )
+    return search(
+        Target(f, box, gradient),
+        chosen,
+        _whole("budget", budget, 1),
+        np.random.default_rng(_whole("seed", seed, 0)),
+        Rules(polish=_share(polish)),
+        notify,
+    )
 
 
 def component(registry: Registry, kind: str, choice: object, expected: type[Any]) -> Any:
@@ -116,11 +139,15 @@ def indicators(on: Dictionary) -> Dictionary:
 def _program(registry: Registry, problem: object, control: object, disturbance: object) -> SemiInfiniteProgram:
     if isinstance(problem, SemiInfiniteProgram):
         if control is not None or disturbance is not None:
-            raise InputError("control, disturbance: dictionaries are for an OptimalControlProblem, got a SemiInfiniteProgram")
+            raise InputError(
+                "control, disturbance: dictionaries are for an OptimalControlProblem, got a SemiInfiniteProgram"
+            )
         return problem
     if not isinstance(problem, OptimalControlProblem):
-        raise InputError(f"problem: expected an OptimalControlProblem or a SemiInfiniteProgram, got {type(problem).__name__}")
-    from sparserob_core.control.transcription import transcribe
+        raise InputError(
+            f"problem: expected an OptimalControlProblem or a SemiInfiniteProgram, got {type(problem).__name__}"
+        )
+    from sparserob_core.control.transcription.transcribe import transcribe
 
     controls = dictionary(registry, PIECES if control is None else control, problem.horizon)
     disturbances = indicators(controls) if disturbance is None else dictionary(registry, disturbance, problem.horizon)
@@ -130,13 +157,15 @@ def _program(registry: Registry, problem: object, control: object, disturbance: 
 def _continuation(given: Mapping[str, float]) -> Continuation:
     from pydantic import ValidationError
 
-    from sparserob_core.experiment.messages import complaints
-    from sparserob_core.experiment.run_config import ContinuationKeys
+    from sparserob_core.experiment.config.run_config import ContinuationKeys
+    from sparserob_core.experiment.plugins.messages import complaints
 
     try:
         return Continuation(**ContinuationKeys.model_validate(dict(given)).model_dump())
     except ValidationError as error:
-        raise InputError("\n".join(f"continuation.{item}" for item in complaints(error, ContinuationKeys, given))) from None
+        raise InputError(
+            "\n".join(f"continuation.{item}" for item in complaints(error, ContinuationKeys, given))
+        ) from None
 
 
 def _with_tolerance(registry: Registry, method: object, tolerance: float | None) -> object:
@@ -161,7 +190,11 @@ def _heard(notify: Notify) -> Callable[[Any], None]:
 
 
 def _share(polish: object) -> float:
-    if isinstance(polish, bool) or not isinstance(polish, int | float | np.integer | np.floating) or not 0.0 <= polish < 1.0:
+    if (
+        isinstance(polish, bool)
+        or not isinstance(polish, int | float | np.integer | np.floating)
+        or not 0.0 <= polish < 1.0
+    ):
         raise InputError(f"polish: expected a share of the budget, at least 0 and below 1, got {polish!r}")
     return float(polish)
 

@@ -15,7 +15,8 @@ Array: TypeAlias = npt.NDArray[np.float64]
 
 
 class ConvexSet(ABC):
-    """A closed convex set, described by its support function ``h(c) = max {c'x : x in the set}`` (Rockafellar 1970, section 13).
+    """A closed convex set, described by its support function ``h(c) = max {c'x : x in the set}`` (Rockafellar 1970,
+    section 13).
 
     Directions and points are arrays ``(..., d)``: any leading axes are kept, ``(k, d)`` gives ``(k,)``.
     """
@@ -48,11 +49,12 @@ class ConvexSet(ABC):
         return float(np.linalg.norm(self.reach(np.eye(self.dimension))))
 
     def linearisation_excess(self, centre: Array, spread: Array) -> Array:
-        """How much the support function can exceed its linearisation at ``centre (..., d)``, over ``centre + sum_j s_j spread_j``,
-        ``|s_j| <= 1``.
+        """How much the support function can exceed its linearisation at ``centre (..., d)``, over
+        ``centre + sum_j s_j spread_j``, ``|s_j| <= 1``.
 
-        ``spread (..., J, d)``; returns ``(...,)``, proven upper bounds of ``h(y) - w'y`` with ``w`` the support point of the centre
-        (0 where the same point stays the maximiser). This default follows from sublinearity of ``h``; sets override it with a tighter one.
+        ``spread (..., J, d)``; returns ``(...,)``, proven upper bounds of ``h(y) - w'y`` with ``w`` the support point
+        of the centre (0 where the same point stays the maximiser). This default follows from sublinearity of ``h``;
+        sets override it with a tighter one.
         """
         point = self.support_point(centre)[..., None, :]
         along = (point * spread).sum(axis=-1)
@@ -60,15 +62,18 @@ class ConvexSet(ABC):
         return excess
 
     def support_minorant(self, centre: Array, spread: Array) -> tuple[float, Array, Array]:
-        """A quadratic below ``h(centre + sum_j s_j spread_j)`` for ``|s_j| <= 1``: value, gradient ``(J,)`` and Hessian ``(J, J)`` in ``s``.
+        """A quadratic below ``h(centre + sum_j s_j spread_j)`` for ``|s_j| <= 1``: value, gradient ``(J,)`` and Hessian
+        ``(J, J)`` in ``s``.
 
-        ``centre (d,)``, ``spread (J, d)``. The support function is convex, so its linearisation will do; curved sets add what they are sure of.
+        ``centre (d,)``, ``spread (J, d)``. The support function is convex, so its linearisation will do; curved sets
+        add what they are sure of.
         """
         point = self.support_point(centre[None])[0]
         return float(self.support(centre[None])[0]), spread @ point, np.zeros((spread.shape[0], spread.shape[0]))
 
     def violation(self, points: Array) -> Array:
-        """``max {c'x - h(c) : |c| = 1}`` of points ``(..., d)``: how far outside (positive) or inside (negative) they are.
+        """``max {c'x - h(c) : |c| = 1}`` of points ``(..., d)``: how far outside (positive) or inside (negative) they
+        are.
 
         For a flat set the maximum is over the normals of its half-spaces only; ``-inf`` when there are none.
         """
@@ -95,7 +100,8 @@ class ConvexSet(ABC):
 
     @property
     def normals(self) -> Array:
-        """Orthonormal rows ``(b, d)`` that span every direction in which the support function is finite; here all of them."""
+        """Orthonormal rows ``(b, d)`` that span every direction in which the support function is finite; here all of
+        them."""
         return np.eye(self.dimension)
 
     @property
@@ -187,7 +193,8 @@ class Box(ConvexSet):
 
 
 def vertex_excess(vertices: Array, centre: Array, spread: Array, blocks: int = 4096) -> Array:
-    """`ConvexSet.linearisation_excess` of a polytope with ``vertices (v, d)``: how much any other vertex can gain on the centre's best one."""
+    """`ConvexSet.linearisation_excess` of a polytope with ``vertices (v, d)``: how much any other vertex can gain on
+    the centre's best one."""
     flat_centre, flat_spread = centre.reshape(-1, centre.shape[-1]), spread.reshape(-1, *spread.shape[-2:])
     excess = np.empty(flat_centre.shape[0])
     for start in range(0, excess.size, blocks):

@@ -7,16 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 import numpy as np
 
-from sparserob_core.sip.batch import Batch
 from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.evidence import Cut
+from sparserob_core.sip.maximiser import Trace
 
 if TYPE_CHECKING:
     from sparserob_core.sip.program import Separation
-    from sparserob_core.sip.result import Cut
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,7 +34,8 @@ def silence(event: Event) -> None:
 
 
 def retold(notify: Notify, kind: type[T], tell: Callable[[T], Event]) -> Notify:
-    """A listener that passes on what it hears, events of one kind as ``tell`` completes them; silence remains silence."""
+    """A listener that passes on what it hears, events of one kind as ``tell`` completes them; silence remains
+    silence."""
     if notify is silence:
         return silence
     return lambda event: notify(tell(event) if isinstance(event, kind) else event)
@@ -46,19 +48,78 @@ def frozen(array: Array) -> Array:
     return view
 
 
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """The evaluations of a search since it was last told of: ``trace`` and ``moves`` are computed when they are first
+    read.
+
+    ``points`` and ``values`` are the pieces ``(k_i, d)`` and ``(k_i,)`` as they were evaluated, ``moments`` their sizes
+    and seconds since the search began, ``notes`` per name the pairs (evaluations of the search so far, value).
+    ``first`` evaluations came before, the best of which was ``best``; ``origin (d,)`` is where the walk stood then,
+    ``None`` at the start.
+    """
+
+    points: Sequence[Array] = ()
+    values: Sequence[Array] = ()
+    moments: Sequence[tuple[int, float]] = ()
+    notes: Mapping[str, Sequence[tuple[float, float]]] = field(default_factory=dict)
+    first: int = 0
+    best: float = -np.inf
+    origin: Array | None = None
+
+    @cached_property
+    def trace(self) -> Trace:
+        """The evaluations as a `Trace`; ``best`` and ``notes`` count from the beginning of the search."""
+        if not self.values:
+            return Trace(np.empty((0, 0)), np.empty(0), np.empty(0), np.empty(0))
+        values = np.concatenate(self.values)
+        seconds = np.repeat([moment for _, moment in self.moments], [count for count, _ in self.moments])
+        notes = {name: np.array(rows, dtype=float).reshape(-1, 2) for name, rows in self.notes.items()}
+        return Trace(
+            np.concatenate(self.points), values, np.maximum(np.maximum.accumulate(values), self.best), seconds, notes
+        )
+
+    @cached_property
+    def moves(self) -> np.ndarray:
+        """Rows ``(evaluation in the batch, coordinate)``, ``(k, 2)``: where each point differs from where the walk
+        stood.
+
+        That is the point accepted last where the maximiser notes ``accepted``, and the point before where it does not.
+        The first point of a search has moved from nowhere, and is left out.
+        """
+        points = self.trace.points
+        place = np.arange(len(points))
+        if not place.size:
+            return np.zeros((0, 2), dtype=int)
+        standing = np.maximum.accumulate(np.where(self._accepted(), place, -1))
+        before = np.concatenate([[-1], standing[:-1]])
+        origin = np.full(points.shape[1], np.nan) if self.origin is None else self.origin
+        stood = np.where(before[:, np.newaxis] < 0, origin, points[before])
+        return np.argwhere((points != stood) & ~np.isnan(stood))
+
+    def _accepted(self) -> np.ndarray:
+        accepted = np.ones(len(self.trace.points), dtype=bool)
+        rows = self.trace.notes.get("accepted", np.empty((0, 2)))
+        which = rows[:, 0].astype(int) - 1 - self.first
+        mine = (which >= 0) & (which < accepted.size)
+        accepted[which[mine]] = rows[mine, 1] > 0.0
+        return accepted
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RoundFinished(Event):
     """One round of a method is over: a round of the exchange, or an outer iteration of the method ``sparserob``.
 
-    ``lower_bound`` and ``upper_bound`` enclose the value of the unregularised program (``-inf``, ``inf`` while unknown);
-    ``violation`` is the worst constraint violation of this round's decision over the continuum, reached in ``worst_family``;
-    ``active_indices`` are the rows kept, ``cuts_added`` and ``cuts_dropped`` the change since the round before; ``seconds`` since the start.
+    ``lower_bound`` and ``upper_bound`` enclose the value of the unregularised program (``-inf``, ``inf`` while
+    unknown); ``violation`` is the worst constraint violation of this round's decision over the continuum, reached in
+    ``worst_family``; ``active_indices`` are the rows kept, ``cuts_added`` and ``cuts_dropped`` the change since the
+    round before; ``seconds`` since the start.
 
-    ``decision (n,)`` has the ``cost`` J. ``separations``: per family what was found most violated at it, worst first. ``imposed``: the
-    constraints of this round's relaxed program, with their ``multipliers (r,)`` (the multiplier within each `Cut` is not filled); ``added`` and
-    ``dropped``: how they differ from those of the round before. ``simplified``: it is a round on a program with some of the uncertainty
-    only (methods ``nominal``, ``scenario``), whose ``upper_bound`` and ``violation`` say nothing of the program itself; its lower bound holds
-    for both.
+    ``decision (n,)`` has the ``cost`` J. ``separations``: per family what was found most violated at it, worst first.
+    ``imposed``: the constraints of this round's relaxed program, with their ``multipliers (r,)`` (the multiplier within
+    each `Cut` is not filled); ``added`` and ``dropped``: how they differ from those of the round before.
+    ``simplified``: it is a round on a program with some of the uncertainty only (methods ``nominal``, ``scenario``),
+    whose ``upper_bound`` and ``violation`` say nothing of the program itself; its lower bound holds for both.
     """
 
     round: int
@@ -84,7 +145,8 @@ class RoundFinished(Event):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ProofProgress(Event):
-    """A proof over the continuum goes on: ``cells`` of ``family`` are still open, ``bound`` is the violation not yet excluded.
+    """A proof over the continuum goes on: ``cells`` of ``family`` are still open, ``bound`` is the violation not yet
+    excluded.
 
     ``examined`` cells were bounded so far, of a ``budget`` after which the proof is given up (0: unknown).
     """
@@ -101,12 +163,13 @@ class ProofProgress(Event):
 class EvaluationsFinished(Event):
     """A maximiser has evaluated ``count`` more points, ``total`` so far in this search, of ``budget`` (0: unknown).
 
-    ``best_value`` was found at ``best_point (d,)``; ``seconds`` since the search began; ``notes`` are the maximiser's own scalars (temperature,
-    ...), the last of each. A new search begins where ``total == count``. ``batch``: every one of these evaluations.
+    ``best_value`` was found at ``best_point (d,)``; ``seconds`` since the search began; ``notes`` are the maximiser's
+    own scalars (temperature, ...), the last of each. A new search begins where ``total == count``. ``batch``: every one
+    of these evaluations.
 
-    What is searched: the tuples of the method ``sparserob`` in the outer iteration ``round`` (from 1) with the weight ``epsilon``, where
-    ``lower_bound`` is proven so far; or, where ``family`` is named, its indices for the most violated one. ``block`` consecutive
-    coordinates of the ``domain`` are one index.
+    What is searched: the tuples of the method ``sparserob`` in the outer iteration ``round`` (from 1) with the weight
+    ``epsilon``, where ``lower_bound`` is proven so far; or, where ``family`` is named, its indices for the most
+    violated one. ``block`` consecutive coordinates of the ``domain`` are one index.
     """
 
     count: int

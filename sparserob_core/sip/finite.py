@@ -51,7 +51,8 @@ class FiniteProgram:
         return float(self.weights @ np.abs(self.image(x)) + self.q @ x) + quadratic
 
     def residual(self, x: Array) -> float:
-        """The largest violation of bounds, rows and equalities at ``x``, each divided by its own scale (see `scaled_violation`)."""
+        """The largest violation of bounds, rows and equalities at ``x``, each divided by its own scale (see
+        `scaled_violation`)."""
         size = np.abs(x)
         worst = 0.0
         if self.G.shape[0]:
@@ -94,12 +95,13 @@ def scaled_violation(violations: Array, rows: Array, rhs: Array, size: Array) ->
 class FiniteSolution:
     """What was *checked* about a finite program; no number here was taken from a solver unread.
 
-    ``status``: ``optimal`` (``residual`` and ``gap`` are below the tolerance), ``infeasible`` (``infeasibility`` is proven) or ``failed``.
-    ``value`` is the cost at ``x (n,)``; ``lower_bound`` is proven by weak duality from ``y (r,) >= 0`` (of ``G x <= h``),
-    ``mu (e,)`` (of ``A x = b``) and ``z (k,)`` (of ``s = S x``), with ``P x + q + G'y + A'mu + S'z = 0`` at an optimum.
-    ``residual``: see `FiniteProgram.residual`; ``gap = value - lower_bound``. ``infeasibility``: a proven lower bound of the
-    smallest ``t`` for which ``G_i x <= h_i + t |G_i|`` and ``|A_i x - b_i| <= t |A_i|`` can be met within the bounds.
-    ``attempts``: what was tried and why it was not believed.
+    ``status``: ``optimal`` (``residual`` and ``gap`` are below the tolerance), ``infeasible`` (``infeasibility`` is
+    proven) or ``failed``. ``value`` is the cost at ``x (n,)``; ``lower_bound`` is proven by weak duality from
+    ``y (r,) >= 0`` (of ``G x <= h``), ``mu (e,)`` (of ``A x = b``) and ``z (k,)`` (of ``s = S x``), with
+    ``P x + q + G'y + A'mu + S'z = 0`` at an optimum. ``residual``: see `FiniteProgram.residual`;
+    ``gap = value - lower_bound``. ``infeasibility``: a proven lower bound of the smallest ``t`` for which
+    ``G_i x <= h_i + t |G_i|`` and ``|A_i x - b_i| <= t |A_i|`` can be met within the bounds. ``attempts``: what was
+    tried and why it was not believed.
     """
 
     status: Literal["optimal", "infeasible", "failed"]

@@ -20,9 +20,10 @@ class SearchEnded(Exception):
 class Objective(Protocol):
     """What a maximiser is handed: a box, a batched function that counts, and a place for notes.
 
-    ``best_value`` is ``-inf`` and ``best_point`` is NaN before the first evaluation; when there was one (``evaluations > 0``), the best
-    point is a good one to start from. ``block`` consecutive coordinates belong together: 1, or the coordinates of one index where points
-    are tuples of indices; to change one block at a time is then cheap. A maximiser reads, and never writes, the attributes.
+    ``best_value`` is ``-inf`` and ``best_point`` is NaN before the first evaluation; when there was one
+    (``evaluations > 0``), the best point is a good one to start from. ``block`` consecutive coordinates belong
+    together: 1, or the coordinates of one index where points are tuples of indices; to change one block at a time is
+    then cheap. A maximiser reads, and never writes, the attributes.
     """
 
     domain: Box
@@ -43,18 +44,21 @@ class Objective(Protocol):
     def evaluate(self, points: Array) -> Array:
         """Values ``(k,)`` at points ``(k, d)``; NaN comes back as ``-inf``.
 
-        A point outside the domain raises `InputError`. With fewer than ``k`` evaluations left, the first ``remaining`` points are
-        evaluated, recorded, and the search is ended; so it is by a value of ``+inf``: both raise `SearchEnded`, which is not to be caught.
+        A point outside the domain raises `InputError`. With fewer than ``k`` evaluations left, the first ``remaining``
+        points are evaluated, recorded, and the search is ended; so it is by a value of ``+inf``: both raise
+        `SearchEnded`, which is not to be caught.
         """
 
     def value_and_gradient(self, point: Array) -> tuple[float, Array]:
-        """Value and gradient ``(d,)`` at one point ``(d,)``; counts as one evaluation. The gradient is 0 where the value is not finite.
+        """Value and gradient ``(d,)`` at one point ``(d,)``; counts as one evaluation. The gradient is 0 where the
+        value is not finite.
 
         Raises `InputError` where no gradient is offered, and as `evaluate` does.
         """
 
     def accepts(self, current: float, candidate: float, temperature: float, rng: np.random.Generator) -> bool:
-        """Whether a walk goes on from the candidate (the paper's ``SlCr``): Metropolis' rule, unless the method was given another."""
+        """Whether a walk goes on from the candidate (the paper's ``SlCr``): Metropolis' rule, unless the method was
+        given another."""
 
     def note(self, **scalars: float) -> None:
         """Pass scalars (temperature, acceptance, ...) to the trace and to observers."""
@@ -65,11 +69,13 @@ class Maximiser(ABC):
 
     @abstractmethod
     def search(self, objective: Objective, rng: np.random.Generator) -> float:
-        """Evaluate until the budget is spent or nothing is left to gain; return a proven upper bound of the maximum, or ``inf``."""
+        """Evaluate until the budget is spent or nothing is left to gain; return a proven upper bound of the maximum, or
+        ``inf``."""
 
 
 class EvaluationError(SparseRobError):
-    """The function that is maximised raised, or did not return one number per point; ``report`` holds what was found before."""
+    """The function that is maximised raised, or did not return one number per point; ``report`` holds what was found
+    before."""
 
     def __init__(self, message: str, report: Report) -> None:
         super().__init__(message)
@@ -78,9 +84,9 @@ class EvaluationError(SparseRobError):
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """Every evaluation in order: ``points (n, d)``, ``values (n,)``, the running ``best (n,)``, and for each name that was noted the
-    rows ``(evaluations so far, value)`` as ``notes[name] (j, 2)``. ``points`` is empty ``(0, d)`` where all of them would be too many;
-    ``seconds (n,)`` since the search began, when each value was known."""
+    """Every evaluation in order: ``points (n, d)``, ``values (n,)``, the running ``best (n,)``, and for each name that
+    was noted the rows ``(evaluations so far, value)`` as ``notes[name] (j, 2)``. ``points`` is empty ``(0, d)`` where
+    all of them would be too many; ``seconds (n,)`` since the search began, when each value was known."""
 
     points: Array
     values: Array
@@ -91,7 +97,8 @@ class Trace:
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """The outcome of a search: the best evaluated value and where, and a proven ``upper_bound`` of the maximum (``inf``: none).
+    """The outcome of a search: the best evaluated value and where, and a proven ``upper_bound`` of the maximum
+    (``inf``: none).
 
     ``stopped`` says why the search ended; ``best_point`` is NaN ``(d,)`` when nothing was evaluated.
     """

@@ -17,8 +17,10 @@ from sparserob_core.sip.solver import Solver
 
 @dataclass(frozen=True)
 class Continuation:
-    """How the weight ``epsilon`` of the regulariser decreases: from ``start`` by ``factor`` down to ``stop`` at most (the paper's
-    ``Regu``), or until the cost ``J`` changes by no more than ``tolerance`` (relative) when it is reduced again (``SC1``)."""
+    """How the weight ``epsilon`` of the regulariser decreases: from ``start`` by ``factor`` down to ``stop`` at most
+    (the paper's ``Regu``), or until the cost ``J`` changes by no more than ``tolerance`` (relative) when it is reduced
+    again (``SC1``).
+    """
 
     start: float = 1.0
     factor: float = 0.5
@@ -28,9 +30,11 @@ class Continuation:
 
 @dataclass(frozen=True, eq=False)
 class Tools:
-    """The components that a config has chosen. ``regulariser`` may be ``None``: the unregularised program is then solved.
+    """The components that a config has chosen. ``regulariser`` may be ``None``: the unregularised program is then
+    solved.
 
-    ``budget``: evaluations that one search of the maximiser may spend, of which the share ``polish`` goes to a local method at its end.
+    ``budget``: evaluations that one search of the maximiser may spend, of which the share ``polish`` goes to a local
+    method at its end.
     """
 
     solver: Solver

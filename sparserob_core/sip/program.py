@@ -20,8 +20,9 @@ if TYPE_CHECKING:
 class Separation:
     """The most violated constraints of one family at a decision, worst first.
 
-    ``indices (k, d)``, ``rows (k,)`` the row of the family at that index, ``violations (k,)`` (``rows x - rhs``, negative when
-    satisfied), and ``bound``: a proven upper bound on the family's violation over its whole index set, ``inf`` if none is known.
+    ``indices (k, d)``, ``rows (k,)`` the row of the family at that index, ``violations (k,)`` (``rows x - rhs``,
+    negative when satisfied), and ``bound``: a proven upper bound on the family's violation over its whole index set,
+    ``inf`` if none is known.
     """
 
     indices: Array
@@ -32,7 +33,8 @@ class Separation:
 
 @dataclass(frozen=True, eq=False)
 class Enclosure:
-    """Proven upper bounds ``(k,)`` of the violation on index cells, and the coordinate ``(k,)`` whose halving would help most."""
+    """Proven upper bounds ``(k,)`` of the violation on index cells, and the coordinate ``(k,)`` whose halving would
+    help most."""
 
     bounds: Array
     split: Array
@@ -40,12 +42,13 @@ class Enclosure:
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """One constraint in words (``text``), and its time, parameter ``(nu,)``, worst disturbance ``(mw, pieces)`` and normal ``direction`` (of the
-    state, or of the control) where it has them.
+    """One constraint in words (``text``), and its time, parameter ``(nu,)``, worst disturbance ``(mw, pieces)`` and
+    normal ``direction`` (of the state, or of the control) where it has them.
 
-    Where it compares a quantity with a limit, also their words and numbers: ``quantity`` such as ``x1(5)``, what it may be (``bound``, such as
-    ``|x1| <= 0.3``), its value ``free`` without decision and disturbance, ``sign`` -1 for a lower limit, and how far the disturbance alone
-    moves it towards the ``limit`` (``push``). ``where``: the parameter in words.
+    Where it compares a quantity with a limit, also their words and numbers: ``quantity`` such as ``x1(5)``, what it may
+    be (``bound``, such as ``|x1| <= 0.3``), its value ``free`` without decision and disturbance, ``sign`` -1 for a
+    lower limit, and how far the disturbance alone moves it towards the ``limit`` (``push``). ``where``: the parameter
+    in words.
     """
 
     text: str
@@ -74,8 +77,10 @@ class ConstraintFamily:
     ``gradient(x, indices (k, d), rows (k,))``  derivative ``(k, d)`` of ``row x - rhs`` in the index;
     ``nominal``       the same constraints without the uncertainty;
     ``sample(count, rng)``  the same constraints for ``count`` sampled uncertainties only;
-    ``literal``       the same constraints with an inner maximisation left to the index, and ``reduced``, from such a family, the way back;
-    ``scale``         the size of the numbers that the constraint compares; where it is tiny, a violation is judged relative to it;
+    ``literal``       the same constraints with an inner maximisation left to the index, and ``reduced``, from such a
+        family, the way back;
+    ``scale``         the size of the numbers that the constraint compares; where it is tiny, a violation is judged
+        relative to it;
     ``explain(index (d,), row)``  the constraint in words and, for control problems, where it is (an `Explanation`).
     """
 
@@ -94,7 +99,8 @@ class ConstraintFamily:
     scale: float = 1.0
 
     def tolerance(self, level: float) -> float:
-        """``level``, or less where the numbers of this constraint are below a thousandth: a millionth of them, at the level 1e-9."""
+        """``level``, or less where the numbers of this constraint are below a thousandth: a millionth of them, at the
+        level 1e-9."""
         return level * min(1.0, 1e3 * self.scale)
 
     def violations(self, x: Array, indices: Array) -> Array:
@@ -105,11 +111,12 @@ class ConstraintFamily:
 
 @dataclass(frozen=True, eq=False)
 class SemiInfiniteProgram:
-    """minimise ``sum_k weights_k |(S x)_k| + 1/2 x'P x + q'x`` subject to ``lower <= S x <= upper``, ``G x <= h``, ``A x = b``
-    and every constraint family at every index.
+    """minimise ``sum_k weights_k |(S x)_k| + 1/2 x'P x + q'x`` subject to ``lower <= S x <= upper``, ``G x <= h``,
+    ``A x = b`` and every constraint family at every index.
 
-    ``n`` is the number of decision variables; ``S (k, n)`` is the identity when ``None``; ``lower``, ``upper`` and ``weights``
-    are numbers or ``(k,)``. ``lengths``: how much each entry of ``S x`` counts in a weighted regulariser (piece lengths), ``(k,)``.
+    ``n`` is the number of decision variables; ``S (k, n)`` is the identity when ``None``; ``lower``, ``upper`` and
+    ``weights`` are numbers or ``(k,)``. ``lengths``: how much each entry of ``S x`` counts in a weighted regulariser
+    (piece lengths), ``(k,)``.
     """
 
     n: int
@@ -148,7 +155,9 @@ class SemiInfiniteProgram:
         if len(set(names)) < len(names):
             raise InputError(f"families: names must differ, got {names}")
         object.__setattr__(self, "families", tuple(self.families))
-        object.__setattr__(self, "finite", FiniteProgram(q=q, weights=weights, lower=lower, upper=upper, G=G, h=h, A=A, b=b, P=P, S=S))
+        object.__setattr__(
+            self, "finite", FiniteProgram(q=q, weights=weights, lower=lower, upper=upper, G=G, h=h, A=A, b=b, P=P, S=S)
+        )
 
     def _rows(self, left: str, matrix: object, right: str, bounds: object) -> tuple[Array, Array]:
         if (matrix is None) != (bounds is None):
@@ -171,7 +180,8 @@ class SemiInfiniteProgram:
 
     @property
     def cost_scale(self) -> float:
-        """The largest possible cost of the bounded entries, at most 1: what a gap is relative to where the cost itself is smaller."""
+        """The largest possible cost of the bounded entries, at most 1: what a gap is relative to where the cost itself
+        is smaller."""
         program = self.finite
         reach = np.maximum(np.abs(program.lower), np.abs(program.upper))
         if program.q.any() or program.P is not None or not np.isfinite(reach[program.weights > 0]).all():

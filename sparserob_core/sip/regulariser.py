@@ -43,7 +43,8 @@ class ControlImage:
 
 
 class Regulariser(ABC):
-    """A strictly convex quadratic ``rho(x) = 1/2 x'P x + q'x`` that is added to the cost with a factor that goes to zero."""
+    """A strictly convex quadratic ``rho(x) = 1/2 x'P x + q'x`` that is added to the cost with a factor that goes to
+    zero."""
 
     @abstractmethod
     def quadratic(self, image: ControlImage) -> tuple[csc_array, Array]:

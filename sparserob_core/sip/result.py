@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.events import RoundFinished
+from sparserob_core.sip.evidence import NO_BOUND, Cut, Dual, Proof, Witness
 
 if TYPE_CHECKING:
-    from sparserob_core.sip.certificate import Proof
-    from sparserob_core.sip.events import RoundFinished
     from sparserob_core.sip.maximiser import Trace
     from sparserob_core.sip.scenario_bound import ScenarioBound
 
@@ -28,58 +28,19 @@ MEANING: Mapping[Status, str] = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Cut:
-    """One imposed constraint: row ``row`` of family ``family`` at ``index (d,)``, with its multiplier in the last relaxed program."""
-
-    family: str
-    index: Array
-    row: int
-    multiplier: float = 0.0
-
-
-@dataclass(frozen=True, eq=False)
-class Dual:
-    """Multipliers that prove a lower ``bound`` of the semi-infinite program's value, or of its infeasibility: those of the imposed
-    constraints (in ``cuts``), ``mu (e,)`` of the equalities, and ``z (k,)`` of the image ``S x`` unless ``S`` is the identity."""
-
-    bound: float
-    cuts: Sequence[Cut]
-    mu: Array
-    z: Array | None = None
-
-
-NO_BOUND = Dual(-np.inf, (), np.zeros(0))
-
-
-@dataclass(frozen=True, eq=False)
-class Witness:
-    """The worst constraint found: by how much it is violated (negative: satisfied with that margin), which one, and where.
-
-    ``time``, ``parameter`` and ``disturbance`` are filled for control problems; ``disturbance`` is ``(mw, pieces)``.
-    """
-
-    violation: float
-    constraint: str
-    index: Array
-    row: int = 0
-    time: float | None = None
-    parameter: Array | None = None
-    disturbance: Array | None = field(default=None, repr=False)
-
-
 COLUMNS = ("outer", "epsilon", "value", "bound", "seconds")
 NOTE = "note_"
-POINTS = 500_000   # coordinates of tuples that a run keeps
+POINTS = 500_000  # coordinates of tuples that a run keeps
 
 
 @dataclass(frozen=True, eq=False)
 class SearchTrace:
-    """Every evaluation of ``g``, in order: the outer iteration ``outer (n,)`` and its ``epsilon (n,)``, the ``value (n,)`` of ``g``, the best
-    lower bound ``bound (n,)`` proven until then of the unregularised semi-infinite program, and ``seconds (n,)`` since the start.
+    """Every evaluation of ``g``, in order: the outer iteration ``outer (n,)`` and its ``epsilon (n,)``, the
+    ``value (n,)`` of ``g``, the best lower bound ``bound (n,)`` proven until then of the unregularised semi-infinite
+    program, and ``seconds (n,)`` since the start.
 
-    ``points (n, d)``: the tuples, ``(n, 0)`` where all of them would be more than `POINTS` numbers. ``notes``: what the maximiser noted, one
-    column ``(n,)`` for each name, NaN where it noted nothing.
+    ``points (n, d)``: the tuples, ``(n, 0)`` where all of them would be more than `POINTS` numbers. ``notes``: what the
+    maximiser noted, one column ``(n,)`` for each name, NaN where it noted nothing.
     """
 
     outer: Array
@@ -100,41 +61,55 @@ class SearchTrace:
             notes[name] = np.full(count, np.nan)
             notes[name][last[:, 0].astype(int) - 1] = last[:, 1]
         points = trace.points if 0 < trace.points.size <= POINTS else np.zeros((count, 0))
-        return SearchTrace(np.full(count, outer), np.full(count, epsilon), trace.values, bounds, began + trace.seconds, points, notes)
+        return SearchTrace(
+            np.full(count, outer), np.full(count, epsilon), trace.values, bounds, began + trace.seconds, points, notes
+        )
 
     @staticmethod
     def joined(parts: Sequence[SearchTrace]) -> SearchTrace:
         """All outer iterations."""
-        outer, epsilon, value, bound, seconds = (np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS)
+        outer, epsilon, value, bound, seconds = (
+            np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS
+        )
         kept = len({part.points.shape[1] for part in parts}) == 1 and sum(part.points.size for part in parts) <= POINTS
         points = np.concatenate([part.points for part in parts]) if kept else np.zeros((value.size, 0))
         names = dict.fromkeys(name for part in parts for name in part.notes)
-        notes = {name: np.concatenate([part.notes.get(name, np.full(part.value.size, np.nan)) for part in parts]) for name in names}
+        notes = {
+            name: np.concatenate([part.notes.get(name, np.full(part.value.size, np.nan)) for part in parts])
+            for name in names
+        }
         return SearchTrace(outer, epsilon, value, bound, seconds, points, notes)
 
     def arrays(self) -> dict[str, Array]:
         """``evaluations.npz``: the columns, ``points``, and ``note_...`` for each name that was noted."""
         notes = {f"{NOTE}{name}": column for name, column in self.notes.items()}
-        return {**{name: getattr(self, name) for name in COLUMNS}, **({"points": self.points} if self.points.size else {}), **notes}
+        return {
+            **{name: getattr(self, name) for name in COLUMNS},
+            **({"points": self.points} if self.points.size else {}),
+            **notes,
+        }
 
     @staticmethod
     def stored(arrays: Mapping[str, Array]) -> SearchTrace:
         """The same from `arrays`; raises `KeyError` for a column that is missing."""
         notes = {name.removeprefix(NOTE): column for name, column in arrays.items() if name.startswith(NOTE)}
         outer, epsilon, value, bound, seconds = (arrays[name] for name in COLUMNS)
-        return SearchTrace(outer, epsilon, value, bound, seconds, arrays.get("points", np.zeros((value.size, 0))), notes)
+        return SearchTrace(
+            outer, epsilon, value, bound, seconds, arrays.get("points", np.zeros((value.size, 0))), notes
+        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Result:
     """The outcome of a method.
 
-    ``cost`` is ``J`` of ``decision`` (no regulariser), ``value`` is ``J + epsilon rho``; ``lower_bound`` and ``upper_bound`` enclose the
-    value of the *unregularised* semi-infinite program; ``lower_bound`` is proven in any case, ``upper_bound`` (the cost) only when ``status``
-    is certified or verified: it is what the search suggests when undecided, and infinite when refuted.
-    ``gap = (upper_bound - lower_bound) / max(1, |upper_bound|)``. ``dual``: the multipliers behind ``lower_bound``, or behind
-    infeasibility; ``proofs``: what was shown of every constraint family at the decision. ``trace``: for a method that searches, every value of
-    ``g``; ``scenario_bound``: for the scenario approach, what its theory promises.
+    ``cost`` is ``J`` of ``decision`` (no regulariser), ``value`` is ``J + epsilon rho``; ``lower_bound`` and
+    ``upper_bound`` enclose the value of the *unregularised* semi-infinite program; ``lower_bound`` is proven in any
+    case, ``upper_bound`` (the cost) only when ``status`` is certified or verified: it is what the search suggests when
+    undecided, and infinite when refuted. ``gap = (upper_bound - lower_bound) / max(1, |upper_bound|)``. ``dual``: the
+    multipliers behind ``lower_bound``, or behind infeasibility; ``proofs``: what was shown of every constraint family
+    at the decision. ``trace``: for a method that searches, every value of ``g``; ``scenario_bound``: for the scenario
+    approach, what its theory promises.
     """
 
     status: Status

@@ -19,8 +19,8 @@ from sparserob_core.sip.convex_set import Array
 
 @dataclass(frozen=True, eq=False)
 class OuterStep:
-    """What one outer iteration ``j`` ended with: ``epsilon``, the best ``value`` of ``g``, the ``cost`` J of its optimiser ``decision (n,)``,
-    and the lower bound of the semi-infinite program that its multipliers prove."""
+    """What one outer iteration ``j`` ended with: ``epsilon``, the best ``value`` of ``g``, the ``cost`` J of its
+    optimiser ``decision (n,)``, and the lower bound of the semi-infinite program that its multipliers prove."""
 
     j: int
     epsilon: float
@@ -32,8 +32,9 @@ class OuterStep:
 
 @dataclass(frozen=True, eq=False)
 class Progress:
-    """How a search stands: ``evaluations`` so far, ``best_value``, the last scalars that the maximiser noted (``temperature``, ...), and
-    ``improvements``, the pairs (evaluations so far, best value) at which the best value rose."""
+    """How a search stands: ``evaluations`` so far, ``best_value``, the last scalars that the maximiser noted
+    (``temperature``, ...), and ``improvements``, the pairs (evaluations so far, best value) at which the best value
+    rose."""
 
     evaluations: int
     best_value: float
@@ -41,7 +42,8 @@ class Progress:
     improvements: Sequence[tuple[int, float]]
 
     def gain(self, window: int) -> float:
-        """By how much the best value rose within the last ``window`` evaluations; ``inf`` where there were not so many."""
+        """By how much the best value rose within the last ``window`` evaluations; ``inf`` where there were not so
+        many."""
         earlier = bisect_right(self.improvements, (self.evaluations - window, np.inf)) - 1
         return np.inf if earlier < 0 or window >= self.evaluations else self.best_value - self.improvements[earlier][1]
 
@@ -51,7 +53,8 @@ class Schedule(ABC):
 
     @abstractmethod
     def __call__(self, epsilon: float, j: int) -> float:
-        """The weight in iteration ``j = 1, 2, ...`` where iteration ``j - 1`` had ``epsilon``; smaller, and positive."""
+        """The weight in iteration ``j = 1, 2, ...`` where iteration ``j - 1`` had ``epsilon``; smaller, and
+        positive."""
 
 
 class OuterStop(ABC):
@@ -103,7 +106,8 @@ class Accelerating(Schedule):
 @final
 @dataclass(frozen=True)
 class OptimisersSettle(OuterStop):
-    """The norm of the difference of successive optimisers is at most ``tolerance``, relative to the norm of the last one or 1."""
+    """The norm of the difference of successive optimisers is at most ``tolerance``, relative to the norm of the last
+    one or 1."""
 
     tolerance: float = 1e-3
 
@@ -122,7 +126,9 @@ class CostsSettle(OuterStop):
     tolerance: float = 1e-6
 
     def __call__(self, steps: Sequence[OuterStep]) -> bool:
-        return len(steps) >= 2 and abs(steps[-1].cost - steps[-2].cost) <= self.tolerance * max(1.0, abs(steps[-1].cost))
+        return len(steps) >= 2 and abs(steps[-1].cost - steps[-2].cost) <= self.tolerance * max(
+            1.0, abs(steps[-1].cost)
+        )
 
 
 @final
@@ -150,7 +156,8 @@ class Evaluations(InnerStop):
 @final
 @dataclass(frozen=True)
 class TemperatureFloor(InnerStop):
-    """When the temperature that an annealing maximiser notes is at most ``floor``; other maximisers note none, and are not stopped."""
+    """When the temperature that an annealing maximiser notes is at most ``floor``; other maximisers note none, and are
+    not stopped."""
 
     floor: float = 1e-6
 
@@ -173,7 +180,8 @@ class Stalled(InnerStop):
 @final
 @dataclass(frozen=True)
 class Metropolis(Selection):
-    """Accept what is not worse, and what is worse by ``delta`` with probability ``exp(-delta / temperature)`` (Metropolis et al. 1953)."""
+    """Accept what is not worse, and what is worse by ``delta`` with probability ``exp(-delta / temperature)``
+    (Metropolis et al. 1953)."""
 
     def __call__(self, current: float, candidate: float, temperature: float, rng: np.random.Generator) -> bool:
         if candidate >= current:

@@ -10,17 +10,19 @@ import numpy as np
 
 from sparserob_core.errors import InputError
 
-SURE = 1e-6     # the probability beta of drawing scenarios for which a bound fails
+SURE = 1e-6  # the probability beta of drawing scenarios for which a bound fails
 
 
 @final
 @dataclass(frozen=True)
 class ScenarioBound:
-    """With confidence ``1 - beta`` over the draw of ``scenarios``, one more uncertainty drawn by the same law breaks a constraint with probability
-    at most ``before`` (Campi and Garatti 2008: from the number ``variables`` of decision variables alone) and at most ``after`` (Campi and
-    Garatti 2018: from the number ``support`` of imposed constraints that carry a multiplier, which the support constraints are among).
+    """With confidence ``1 - beta`` over the draw of ``scenarios``, one more uncertainty drawn by the same law breaks a
+    constraint with probability at most ``before`` (Campi and Garatti 2008: from the number ``variables`` of decision
+    variables alone) and at most ``after`` (Campi and Garatti 2018: from the number ``support`` of imposed constraints
+    that carry a multiplier, which the support constraints are among).
 
-    Both are for convex programs whose optimiser is unique, ``after`` also supposes non-degeneracy; 1 means that nothing is said.
+    Both are for convex programs whose optimiser is unique, ``after`` also supposes non-degeneracy; 1 means that nothing
+    is said.
     """
 
     scenarios: int
@@ -36,9 +38,11 @@ class ScenarioBound:
         known = f"{at_most(self.before)} from the {self.variables} decision variables alone"
         if self.before == 1.0:
             known = f"nothing from the {self.variables} decision variables alone, for which these are too few scenarios"
-        return (f"with confidence 1 - {self.beta:g} an uncertainty drawn like the {self.scenarios} scenarios breaks a constraint with probability "
-                f"at most {at_most(self.after)} (seen {self.support} active constraints; {known}), which is a probability under the sampling law "
-                "and does not bound the worst case")
+        return (
+            f"with confidence 1 - {self.beta:g} an uncertainty drawn like the {self.scenarios} scenarios breaks a"
+            f" constraint with probability at most {at_most(self.after)} (seen {self.support} active constraints;"
+            f" {known}), which is a probability under the sampling law and does not bound the worst case"
+        )
 
 
 def at_most(bound: float) -> str:
@@ -48,15 +52,24 @@ def at_most(bound: float) -> str:
 
 
 def scenario_bound(scenarios: int, variables: int, support: int, beta: float = SURE) -> ScenarioBound:
-    """The bounds before and after a scenario program was solved; raises `InputError` for counts and probabilities that make no sense."""
-    return ScenarioBound(scenarios, variables, support, beta, bound_before(scenarios, variables, beta), bound_after(scenarios, support, beta))
+    """The bounds before and after a scenario program was solved; raises `InputError` for counts and probabilities that
+    make no sense."""
+    return ScenarioBound(
+        scenarios,
+        variables,
+        support,
+        beta,
+        bound_before(scenarios, variables, beta),
+        bound_after(scenarios, support, beta),
+    )
 
 
 def bound_before(scenarios: int, variables: int, beta: float = SURE) -> float:
     """The ``epsilon`` with ``sum_{i < n} C(S, i) epsilon^i (1 - epsilon)^(S - i) = beta``; 1 when ``S < n``.
 
     Campi and Garatti (2008), SIAM J. Optim. 19, 1211-1230, Theorem 1; ``S`` scenarios,
-    ``n`` decision variables. The sum is a binomial tail, so ``epsilon`` is a quantile of the beta distribution with ``n`` and ``S - n + 1``.
+    ``n`` decision variables. The sum is a binomial tail, so ``epsilon`` is a quantile of the beta distribution with
+    ``n`` and ``S - n + 1``.
     """
     from scipy.special import betaincinv
 
@@ -69,9 +82,10 @@ def bound_before(scenarios: int, variables: int, beta: float = SURE) -> float:
 def bound_after(scenarios: int, support: int, beta: float = SURE) -> float:
     """The ``epsilon = 1 - t`` with ``beta / (S + 1) sum_{m=k}^S C(m, k) t^(m-k) = C(S, k) t^(S-k)``; 1 when ``k >= S``.
 
-    Campi and Garatti (2018), "Wait-and-judge", Math. Program. 167, 155-189, Theorem 1; ``S`` scenarios, ``k`` support constraints. The finite sum is
-    ``epsilon^(-k-1) P(X > k)`` with ``X`` binomial of ``S + 1`` trials and probability ``epsilon``, which makes the equation
-    ``beta P(X > k) = (k + 1) P(X = k + 1)``; the ratio of the two sides is monotone in ``epsilon``. It grows with ``k``.
+    Campi and Garatti (2018), "Wait-and-judge", Math. Program. 167, 155-189, Theorem 1; ``S`` scenarios, ``k`` support
+    constraints. The finite sum is ``epsilon^(-k-1) P(X > k)`` with ``X`` binomial of ``S + 1`` trials and probability
+    ``epsilon``, which makes the equation ``beta P(X > k) = (k + 1) P(X = k + 1)``; the ratio of the two sides is
+    monotone in ``epsilon``. It grows with ``k``.
     """
     from scipy.optimize import brentq
 
@@ -96,7 +110,9 @@ def _log_terms(scenarios: int, support: int, epsilon: float, m: np.ndarray) -> n
     def log_choose(j: np.ndarray | int) -> np.ndarray:
         return np.asarray(-gammaln(np.asarray(j) + 1.0) - gammaln(scenarios + 2.0 - np.asarray(j)))
 
-    return np.asarray(log_choose(m) - log_choose(support + 1) + (m - support - 1) * (np.log(epsilon) - np.log1p(-epsilon)))
+    return np.asarray(
+        log_choose(m) - log_choose(support + 1) + (m - support - 1) * (np.log(epsilon) - np.log1p(-epsilon))
+    )
 
 
 def _check(scenarios: object, name: str, count: object, least: int, beta: float) -> None:

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class QuadraticProgram:
-    """minimise ``1/2 x'P x + q'x`` subject to ``G x <= h``, ``A x = b``, ``lower <= x <= upper``; bounds may be infinite."""
+    """minimise ``1/2 x'P x + q'x`` subject to ``G x <= h``, ``A x = b``, ``lower <= x <= upper``; bounds may be
+    infinite."""
 
     P: csc_array
     q: Array
@@ -28,7 +29,8 @@ class QuadraticProgram:
 
 @dataclass(frozen=True, eq=False)
 class Claim:
-    """What a solver says. Multipliers follow ``P x + q + G'z + A'y + z_box = 0``, ``z >= 0``, ``z_box <= 0`` at lower bounds."""
+    """What a solver says. Multipliers follow ``P x + q + G'z + A'y + z_box = 0``, ``z >= 0``, ``z_box <= 0`` at lower
+    bounds."""
 
     status: Literal["solved", "infeasible", "failed"]
     x: Array
@@ -41,8 +43,8 @@ class Claim:
 class Solver(ABC):
     """An inner convex solver: one quadratic program in, one claim out.
 
-    Capabilities, declared by the adapter: ``warm_start`` (starts from its last solution), ``sparse`` (exploits sparse rows),
-    ``conic`` (accepts more than linear rows).
+    Capabilities, declared by the adapter: ``warm_start`` (starts from its last solution), ``sparse`` (exploits sparse
+    rows), ``conic`` (accepts more than linear rows).
     """
 
     warm_start: ClassVar[bool] = False
@@ -53,6 +55,7 @@ class Solver(ABC):
     def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
         """Solve to the absolute residuals ``accuracy``; never raise for a program that is merely hard.
 
-        Rows arrive with unit norm and the cost with its largest linear coefficient near 1. A claim that is not ``solved`` may
-        still carry the last iterate: it is checked all the same. With ``infeasible``, ``z, y`` may carry the Farkas ray.
+        Rows arrive with unit norm and the cost with its largest linear coefficient near 1. A claim that is not
+        ``solved`` may still carry the last iterate: it is checked all the same. With ``infeasible``, ``z, y`` may carry
+        the Farkas ray.
         """

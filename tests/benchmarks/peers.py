@@ -1,7 +1,8 @@
-"""Other people's global optimisers, each as one function that spends a budget: ``run(value, box, budget, seed)``, ``value`` to be maximised.
+"""Other people's global optimisers, each as one function that spends a budget: ``run(value, box, budget, seed)``,
+``value`` to be maximised.
 
-They are called as their documentation says, with their defaults, and are ended by the budget. The package ``lipo`` is a wrapper of dlib's
-`global_function_search` that has to be compiled; dlib stands for it.
+They are called as their documentation says, with their defaults, and are ended by the budget. The package ``lipo`` is a
+wrapper of dlib's `global_function_search` that has to be compiled; dlib stands for it.
 """
 
 from __future__ import annotations
@@ -56,7 +57,8 @@ def sequool(value, box, budget, seed, partition):
 
 
 def dlib(value, box, budget, seed):
-    """Not ``find_max_global``: that puts random points in the place of MaxLIPO's where the function is cheap, depending on the clock."""
+    """Not ``find_max_global``: that puts random points in the place of MaxLIPO's where the function is cheap, depending
+    on the clock."""
     import dlib
 
     search = dlib.global_function_search(dlib.function_spec(box.lower.tolist(), box.upper.tolist()))
@@ -92,7 +94,13 @@ def scipy_annealing(value, box, budget, seed):
     """It does not obey ``maxfun`` within a local search, and is cut there."""
     from scipy.optimize import dual_annealing
 
-    dual_annealing(lambda x: -value(x), list(zip(box.lower, box.upper, strict=True)), maxiter=budget, maxfun=budget, **_seeded(dual_annealing, seed))
+    dual_annealing(
+        lambda x: -value(x),
+        list(zip(box.lower, box.upper, strict=True)),
+        maxiter=budget,
+        maxfun=budget,
+        **_seeded(dual_annealing, seed),
+    )
 
 
 def scipy_direct(value, box, budget, seed):
@@ -106,8 +114,13 @@ def scipy_evolution(value, box, budget, seed):
     from scipy.optimize import differential_evolution
 
     generations = max(1, int(0.9 * budget / (15 * box.dimension)) - 1)
-    differential_evolution(lambda x: -value(x), list(zip(box.lower, box.upper, strict=True)), maxiter=generations, tol=0.0,
-                           **_seeded(differential_evolution, seed))
+    differential_evolution(
+        lambda x: -value(x),
+        list(zip(box.lower, box.upper, strict=True)),
+        maxiter=generations,
+        tol=0.0,
+        **_seeded(differential_evolution, seed),
+    )
 
 
 def nevergrad(value, box, budget, seed, optimiser):

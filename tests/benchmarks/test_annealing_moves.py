@@ -1,7 +1,8 @@
-"""One annealing move of ``g`` at the paper's size beside one cold solve of the same relaxed program, in one run.
+"""Guards speed: one annealing move of ``g`` at the paper's size beside one cold solve of the same relaxed program, in
+one run.
 
-D = 250 indices (t, Beta), 125 250 numbers; a move draws one index anew. The cold solves are given all rows of the tuple, ready made, in the
-sparse epigraph form that one would write by hand.
+D = 250 indices (t, Beta), 125 250 numbers; a move draws one index anew. The cold solves are given all rows of the
+tuple, ready made, in the sparse epigraph form that one would write by hand.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ from scipy import sparse
 
 import sparserob_core as sr
 from sparserob_core.experiment.assemble import assemble
-from sparserob_core.experiment.load import load_config
-from sparserob_core.sip.relaxed import RelaxedProgram
-from sparserob_core.sip.tuples import TupleValue
+from sparserob_core.experiment.config.load import load_config
+from sparserob_core.sip.relaxed.relaxed import RelaxedProgram
+from sparserob_core.sip.relaxed.tuples import TupleValue
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "experiment1_repaired.yaml"
 MOVES = 400
@@ -33,8 +34,15 @@ def cold(program, G, h, weight, solver):
     one = sparse.identity(n)
     rows = sparse.csc_matrix(sparse.bmat([[sparse.csc_matrix(G), None], [one, -one], [-one, -one]]))
     start = time.perf_counter()
-    found = solve_qp(P, np.concatenate([base.q, base.weights]), rows, np.concatenate([h, np.zeros(2 * n)]),
-                     lb=np.concatenate([base.lower, np.zeros(n)]), ub=np.concatenate([base.upper, base.upper]), solver=solver)
+    found = solve_qp(
+        P,
+        np.concatenate([base.q, base.weights]),
+        rows,
+        np.concatenate([h, np.zeros(2 * n)]),
+        lb=np.concatenate([base.lower, np.zeros(n)]),
+        ub=np.concatenate([base.upper, base.upper]),
+        solver=solver,
+    )
     assert found is not None
     return time.perf_counter() - start, found[:n]
 
@@ -53,7 +61,7 @@ def test_a_move_costs_a_fiftieth_of_a_cold_solve(formulation, capsys):
     for _ in range(MOVES):
         trial = point.copy()
         i = int(rng.integers(250)) * g.block
-        trial[i:i + g.block] = rng.uniform(slot.lower, slot.upper)
+        trial[i : i + g.block] = rng.uniform(slot.lower, slot.upper)
         start = time.perf_counter()
         value = g.at(trial)
         seconds.append(time.perf_counter() - start)
@@ -64,8 +72,9 @@ def test_a_move_costs_a_fiftieth_of_a_cold_solve(formulation, capsys):
     G, h = (np.concatenate([part[k].reshape(-1, *part[k].shape[2:]) for part in rows]) for k in (0, 1))
     curvature = relaxed._terms[0].diagonal()
     assert np.ptp(curvature) <= 1e-12
-    lines = [(f"\n{formulation}: a move {1e3 * np.mean(seconds):.2f} ms on average ({1 / np.mean(seconds):.0f} values of g a second), "
-             f"median {1e3 * np.median(seconds):.2f} ms")]
+    lines = [
+        f"\n{formulation}: a move {1e3 * np.mean(seconds):.2f} ms on average, median {1e3 * np.median(seconds):.2f} ms"
+    ]
     ratios = {}
     for solver in ("piqp", "clarabel"):
         took, u = cold(program, G, h, 0.01 * curvature[0], solver)

@@ -1,4 +1,5 @@
-"""What a certificate costs: the run's own proof and the file, and the independent check, beside the solve that they are about."""
+"""Guards speed: what a certificate costs: the run's own proof and the file, and the independent check, beside the solve
+that they are about."""
 
 from __future__ import annotations
 
@@ -14,9 +15,13 @@ CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 pytestmark = pytest.mark.benchmark
 
 
-@pytest.mark.parametrize("name", ["experiment1_repaired", "experiment3_repaired", "coupled_masses", "double_integrator"])
-def test_the_proof_of_a_known_system_takes_no_longer_than_solving(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from sparserob_core.experiment.certificate import certificate
+@pytest.mark.parametrize(
+    "name", ["experiment1_repaired", "experiment3_repaired", "coupled_masses", "double_integrator"]
+)
+def test_the_proof_of_a_known_system_takes_no_longer_than_solving(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from sparserob_core.experiment.directory.certificate import certificate
 
     outcome = sr.run(CONFIGS / f"{name}.yaml", out=tmp_path / "first", quiet=True, figures=False)  # imports, caches
     outcome = sr.run(CONFIGS / f"{name}.yaml", out=tmp_path / "run", quiet=True, figures=False)
@@ -25,14 +30,16 @@ def test_the_proof_of_a_known_system_takes_no_longer_than_solving(name: str, tmp
     checking = least(lambda: sr.check(tmp_path / "run"))
     solving = outcome.result.seconds - min(proving, 0.5 * outcome.result.seconds)
     with capsys.disabled():
-        print(f"\n{name}: solve {solving:.3f} s; as shares of it: proof {proving / solving:.2f}, certificate {writing / solving:.2f}, "
-              f"independent check {checking / solving:.2f}")
+        print(
+            f"\n{name}: solve {solving:.3f} s; as shares of it: proof {proving / solving:.2f}, certificate"
+            f" {writing / solving:.2f}, independent check {checking / solving:.2f}"
+        )
     assert proving + writing <= solving
 
 
 def proof_seconds(outcome: sr.Outcome) -> float:
     """The proof of the decision on a program that has separated it before, as in a run, and remembers nothing else."""
-    from sparserob_core.sip.certificate import prove
+    from sparserob_core.sip.proof.branch_and_bound import prove
 
     experiment = outcome.experiment
     assert experiment.problem is not None and experiment.control is not None and outcome.result.decision is not None

@@ -1,7 +1,8 @@
-"""What events cost the method ``sparserob``: 10 000 evaluations with an observer that does nothing beside as many without one, in turns.
+"""Guards speed: what events cost the method ``sparserob``: 10 000 evaluations with an observer that does nothing beside
+as many without one, in turns.
 
-Two runs of the same work differ by a per cent or two on a shared machine, so the time that the core itself spends on telling is also
-measured inside a run; the wrappers that measure it are part of what they measure.
+Two runs of the same work differ by a per cent or two on a shared machine, so the time that the core itself spends on
+telling is also measured inside a run; the wrappers that measure it are part of what they measure.
 """
 
 from __future__ import annotations
@@ -15,14 +16,18 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.experiment.assemble import assemble, tools_of
-from sparserob_core.experiment.events import Broadcast, RunFinished, RunStarted
-from sparserob_core.experiment.load import load_config
-from sparserob_core.sip.sparserob import SparseRob
-from sparserob_core.sip.telling import Telling
+from sparserob_core.experiment.config.load import load_config
+from sparserob_core.experiment.run.events import Broadcast, RunFinished, RunStarted
+from sparserob_core.sip.methods.sparserob import SparseRob
+from sparserob_core.sip.search.notifier import Telling
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "experiment1_reduced.yaml"
-OVERRIDES = ["dictionaries.control.pieces=100", "dictionaries.disturbance.pieces=100", "maximiser={name: simulated_annealing, budget: 1000}",
-             "continuation={start: 1.0e-2, stop: 1.0e-2}"]
+OVERRIDES = [
+    "dictionaries.control.pieces=100",
+    "dictionaries.disturbance.pieces=100",
+    "maximiser={name: simulated_annealing, budget: 1000}",
+    "continuation={start: 1.0e-2, stop: 1.0e-2}",
+]
 TURNS = 10
 
 
@@ -67,8 +72,10 @@ def test_an_observer_that_does_nothing_costs_less_than_a_hundredth_of_a_run(work
         count += seconds[True][1].size
         ratios.append(seconds[True][0] / seconds[False][0])
     with capsys.disabled():
-        print(f"\n{count} evaluations with and without an idle observer: ratio {np.median(ratios):.4f} (median of {TURNS} pairs, "
-              f"{min(ratios):.4f} to {max(ratios):.4f})")
+        print(
+            f"\n{count} evaluations with and without an idle observer: ratio {np.median(ratios):.4f} (median of {TURNS}"
+            f" pairs, {min(ratios):.4f} to {max(ratios):.4f})"
+        )
     assert count == 1000 * TURNS
     assert np.median(ratios) < 1.03, "a hundredth, and what the machine may add"
 
@@ -85,6 +92,7 @@ def test_telling_takes_less_than_a_hundredth_of_a_run(work, monkeypatch, capsys)
             finally:
                 calls[0] += 1
                 spent[0] += time.perf_counter() - start
+
         return timed
 
     for name in ("add", "note", "tell"):
@@ -94,7 +102,10 @@ def test_telling_takes_less_than_a_hundredth_of_a_run(work, monkeypatch, capsys)
     count = sum(solved(*work, True, seed)[1].size for seed in range(TURNS))
     total = time.perf_counter() - start
     with capsys.disabled():
-        print(f"\ntelling of {count} evaluations: {1e6 * spent[0] / count:.2f} us each, {spent[0] / total:.2%} of {total:.1f} s")
+        print(
+            f"\ntelling of {count} evaluations: {1e6 * spent[0] / count:.2f} us each, {spent[0] / total:.2%} of"
+            f" {total:.1f} s"
+        )
     assert count == 1000 * TURNS
     assert calls[0] >= 2 * count, "nothing was told"
     assert spent[0] < 0.01 * total

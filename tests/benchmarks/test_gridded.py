@@ -1,8 +1,10 @@
-"""Our certified solve beside the gridded robust program that one would write by hand, in one run on one machine.
+"""Guards speed: our certified solve beside the gridded robust program that one would write by hand, in one run on one
+machine.
 
-The gridded program imposes the path constraint at the ``N`` nodes only, with the exact worst case of the disturbance there; it proves
-nothing between them. Its seconds are those of the solver (and of cvxpy's own translation); the response matrices are given to it. Ours are
-for everything: transcription, exchange, bounds, and the proof over all times. Ratios that any machine should show are asserted.
+The gridded program imposes the path constraint at the ``N`` nodes only, with the exact worst case of the disturbance
+there; it proves nothing between them. Its seconds are those of the solver (and of cvxpy's own translation); the
+response matrices are given to it. Ours are for everything: transcription, exchange, bounds, and the proof over all
+times. Ratios that any machine should show are asserted.
 """
 
 from __future__ import annotations
@@ -36,9 +38,18 @@ class Measured:
 
 def spring_mass_damper(pieces):
     """The repaired experiment 1."""
-    return Problem(A=np.array([[0.0, 1.0], [-2.0, -0.5]]), B=np.array([[0.0], [1.0]]), initial_state=np.array([-1.0, 1.0]), horizon=5.0,
-                   pieces=pieces, control=np.ones(1), weights=np.ones(1), disturbance=np.full(2, 0.06), terminal=np.full(2, 0.3),
-                   path=[(np.array([0.7, np.inf]), 0.3, 5.0)])
+    return Problem(
+        A=np.array([[0.0, 1.0], [-2.0, -0.5]]),
+        B=np.array([[0.0], [1.0]]),
+        initial_state=np.array([-1.0, 1.0]),
+        horizon=5.0,
+        pieces=pieces,
+        control=np.ones(1),
+        weights=np.ones(1),
+        disturbance=np.full(2, 0.06),
+        terminal=np.full(2, 0.3),
+        path=[(np.array([0.7, np.inf]), 0.3, 5.0)],
+    )
 
 
 def timed(function):
@@ -78,19 +89,29 @@ def by_qpsolvers(problem, G, h, solver):
     one = sparse.identity(n)
     both = sparse.csc_matrix(sparse.bmat([[sparse.csc_matrix(G), None], [one, -one], [-one, -one]]))
     bound = np.full(n, problem.control[0])
-    answer = solve_qp(sparse.csc_matrix((2 * n, 2 * n)), np.concatenate([np.zeros(n), cost(problem)]), both,
-                      np.concatenate([h, np.zeros(2 * n)]), lb=np.concatenate([-bound, np.zeros(n)]), ub=np.concatenate([bound, bound]),
-                      solver=solver)
+    answer = solve_qp(
+        sparse.csc_matrix((2 * n, 2 * n)),
+        np.concatenate([np.zeros(n), cost(problem)]),
+        both,
+        np.concatenate([h, np.zeros(2 * n)]),
+        lb=np.concatenate([-bound, np.zeros(n)]),
+        ub=np.concatenate([bound, bound]),
+        solver=solver,
+    )
     assert answer is not None
     return answer[:n]
 
 
 def ours(problem):
     control = sr.OptimalControlProblem(
-        system=sr.LinearSystem(problem.A, problem.B), horizon=problem.horizon, initial_state=problem.initial_state,
-        control=sr.Box(-problem.control, problem.control), disturbance=sr.Box(-problem.disturbance, problem.disturbance),
+        system=sr.LinearSystem(problem.A, problem.B),
+        horizon=problem.horizon,
+        initial_state=problem.initial_state,
+        control=sr.Box(-problem.control, problem.control),
+        disturbance=sr.Box(-problem.disturbance, problem.disturbance),
         path=[sr.PathConstraint(sr.Box(-width, width), start, stop) for width, start, stop in problem.path],
-        terminal=[sr.Box(-problem.terminal, problem.terminal)])
+        terminal=[sr.Box(-problem.terminal, problem.terminal)],
+    )
     pieces = {"name": "piecewise_constant", "pieces": problem.pieces}
     return sr.solve(control, method="exchange", solver="piqp", control=pieces, tolerance=1e-7)
 
@@ -115,8 +136,16 @@ def measured(problem):
 def table(pieces, lines):
     head = f"\nN = {pieces:<6} {'':14} {'seconds':>9} {'ratio':>7} {'J':>12} {'worst violation':>16}   proof"
     ratios = [line.seconds / lines[0].seconds for line in lines]
-    return "\n".join([head, *(f"  {line.name:24} {line.seconds:9.4f} {ratio:7.1f} {line.cost:12.8f} {line.violation:16.1e}   {line.proof}"
-                              for line, ratio in zip(lines, ratios, strict=True))])
+    return "\n".join(
+        [
+            head,
+            *(
+                f"  {line.name:24} {line.seconds:9.4f} {ratio:7.1f} {line.cost:12.8f} {line.violation:16.1e}  "
+                f" {line.proof}"
+                for line, ratio in zip(lines, ratios, strict=True)
+            ),
+        ]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +163,9 @@ def test_the_certified_solve_beside_the_gridded_program(pieces, capsys):
         print(table(pieces, lines))
     assert mine.violation <= 1e-9
     for peer in peers:
-        assert abs(peer.cost - mine.cost) <= 5 / pieces**2 + 1e-5, "the gridded program differs by more than its grid explains"
+        assert abs(peer.cost - mine.cost) <= 5 / pieces**2 + 1e-5, (
+            "the gridded program differs by more than its grid explains"
+        )
         assert peer.cost <= mine.cost + 1e-6, "nodes alone cannot cost more than all times"
     if pieces >= 250:
         assert mine.seconds < min(peer.seconds for peer in peers)

@@ -1,4 +1,5 @@
-"""What a recording costs the run that it records: the same 10 000 evaluations of g with and without, turn by turn."""
+"""Guards speed: what a recording costs the run that it records: the same 10 000 evaluations of g with and without, turn
+by turn."""
 
 from __future__ import annotations
 
@@ -14,14 +15,23 @@ import pytest
 
 import sparserob_core as sr
 
-psutil = pytest.importorskip("psutil", reason="the memory of another process is read with psutil, which comes with rerun-sdk")
+psutil = pytest.importorskip(
+    "psutil", reason="the memory of another process is read with psutil, which comes with rerun-sdk"
+)
 pytest.importorskip("rerun", reason="a recording needs the extra rerun")
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "experiment1_reduced.yaml"
 EVALUATIONS, TURNS = 10_000, 2
-SEARCH = {"maximiser.name": "simulated_annealing", "maximiser.budget": EVALUATIONS, "method.sc2": None, "method.indices": 20,
-          "continuation": {"start": 1e-3, "stop": 9e-4, "factor": 0.95}, "method.regu": None,
-          "method.sc1": {"name": "optimisers_settle", "tolerance": 1e9}, "observers": []}
+SEARCH = {
+    "maximiser.name": "simulated_annealing",
+    "maximiser.budget": EVALUATIONS,
+    "method.sc2": None,
+    "method.indices": 20,
+    "continuation": {"start": 1e-3, "stop": 9e-4, "factor": 0.95},
+    "method.regu": None,
+    "method.sc1": {"name": "optimisers_settle", "tolerance": 1e9},
+    "observers": [],
+}
 
 
 class Timed(sr.Observer):
@@ -81,9 +91,12 @@ def measured(directory: Path, *observers: sr.Observer) -> Measured:
 
 @pytest.mark.benchmark
 def test_a_recording_costs_a_run_of_ten_thousand_evaluations_less_than_two_per_cent_and_200_megabytes(
-        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Two measures: the seconds that the solver waits for the recording, with the work of the threads beside it, and the difference by the
-    clock, which on a busy machine says as much about its other users; of that no more is asked than that it hides among theirs."""
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two measures: the seconds that the solver waits for the recording, with the work of the threads beside it, and
+    the difference by the clock, which on a busy machine says as much about its other users; of that no more is asked
+    than that it hides among theirs.
+    """
     plain: list[Measured] = []
     recorded: list[tuple[Measured, Timed]] = []
     with peak_of_children() as peak:
@@ -99,11 +112,15 @@ def test_a_recording_costs_a_run_of_ten_thousand_evaluations_less_than_two_per_c
     clock = min(one.wall for one, _ in recorded) / fastest - 1.0
     noise = max(one.wall for one in plain) / fastest - 1.0
     with capsys.disabled():
-        print(f"\nwithout {[f'{one.wall:.2f}' for one in plain]} s, with {[f'{one.wall:.2f}' for one, _ in recorded]} s: "
-              f"{100 * clock:+.2f} % by the clock (runs without differ by {100 * noise:.2f} %)")
+        print(
+            f"\nwithout {[f'{one.wall:.2f}' for one in plain]} s, with {[f'{one.wall:.2f}' for one, _ in recorded]} s: "
+            f"{100 * clock:+.2f} % by the clock (runs without differ by {100 * noise:.2f} %)"
+        )
         for one, timed in recorded:
-            print(f"the solver waits {timed.seconds:.2f} s for {timed.events} events, {timed.closing:.2f} s of them at the end; "
-                  f"other threads work {one.beside:.2f} s")
+            print(
+                f"the solver waits {timed.seconds:.2f} s for {timed.events} events, {timed.closing:.2f} s of them at"
+                f" the end; other threads work {one.beside:.2f} s"
+            )
         print(f"in all {100 * direct:.2f} %; {peak[0]:.0f} MB in the process that records")
     assert direct < 0.02
     assert clock < 0.02 + noise

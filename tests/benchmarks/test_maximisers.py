@@ -1,7 +1,9 @@
-"""Every maximiser beside other people's, in one run on one machine: median regret after 100 and 1000 evaluations, and own time for each.
+"""Guards speed: every maximiser beside other people's, in one run on one machine: median regret after 100 and 1000
+evaluations, and own time for each.
 
-The optimum of the six functions lies off the centre of the box, where a centre-first method would meet it by luck. Own time is the CPU time
-of the process less that of the function and of counting. Regrets and ratios of times are asserted, never times.
+The optimum of the six functions lies off the centre of the box, where a centre-first method would meet it by luck. Own
+time is the CPU time of the process less that of the function and of counting. Regrets and ratios of times are asserted,
+never times.
 """
 
 from __future__ import annotations
@@ -41,7 +43,11 @@ class Counted:
         start = clock()
         values = self.landscape.function(points)
         self.own += clock() - start
-        self.calls, self.evaluations, self.best = self.calls + 1, self.evaluations + len(points), max(self.best, float(values.max()))
+        self.calls, self.evaluations, self.best = (
+            self.calls + 1,
+            self.evaluations + len(points),
+            max(self.best, float(values.max())),
+        )
         return values
 
     def one(self, point):
@@ -92,14 +98,17 @@ class Ours:
 
 @cache
 def steepest(landscape):
-    """The steepest slope between many pairs of near points, as the constant for ``lipo``; none where the function is not Lipschitz."""
+    """The steepest slope between many pairs of near points, as the constant for ``lipo``; none where the function is
+    not Lipschitz."""
     if landscape.name == "garland1":
         return None
     rng, box = np.random.default_rng(0), landscape.box
     step = 1e-4 * (box.upper - box.lower)
     points = rng.uniform(box.lower + step, box.upper - step, (200_000, box.dimension))
     moved = points + step * rng.uniform(-1.0, 1.0, points.shape)
-    return float(np.max(np.abs(landscape.function(moved) - landscape.function(points)) / np.linalg.norm(moved - points, axis=1)))
+    return float(
+        np.max(np.abs(landscape.function(moved) - landscape.function(points)) / np.linalg.norm(moved - points, axis=1))
+    )
 
 
 REPEATED = {100: 5, 1000: 5}
@@ -123,7 +132,8 @@ OURS = (
 
 @dataclass(repr=False)
 class Line:
-    """What was measured of one competitor: regrets by (function, budget), nanoseconds for an evaluation at the largest budget, failures."""
+    """What was measured of one competitor: regrets by (function, budget), nanoseconds for an evaluation at the largest
+    budget, failures."""
 
     name: str
     seeds: Mapping[int, int]
@@ -183,12 +193,22 @@ def short(regret):
 
 
 def table(lines):
-    head = f"{'median regret after 100 / 1000':32} {'seeds':>6}" + "".join(f" {name:>15}" for name in FUNCTIONS) + f" {'us each':>9}"
-    rows = [f"{line.name:32} {'/'.join(str(line.seeds[budget]) for budget in BUDGETS):>6}"
-            + "".join(f" {'/'.join(short(line.regret(name, budget)) for budget in BUDGETS):>15}" for name in FUNCTIONS)
-            + f" {line.overhead:9.1f}" for line in lines]
-    failed = [f"  {line.name}: {len(line.failures)} runs failed, the best value until then counts ({line.failures[0]})"
-              for line in lines if line.failures]
+    head = (
+        f"{'median regret after 100 / 1000':32} {'seeds':>6}"
+        + "".join(f" {name:>15}" for name in FUNCTIONS)
+        + f" {'us each':>9}"
+    )
+    rows = [
+        f"{line.name:32} {'/'.join(str(line.seeds[budget]) for budget in BUDGETS):>6}"
+        + "".join(f" {'/'.join(short(line.regret(name, budget)) for budget in BUDGETS):>15}" for name in FUNCTIONS)
+        + f" {line.overhead:9.1f}"
+        for line in lines
+    ]
+    failed = [
+        f"  {line.name}: {len(line.failures)} runs failed, the best value until then counts ({line.failures[0]})"
+        for line in lines
+        if line.failures
+    ]
     return "\n".join(["", head, *rows, *failed])
 
 
@@ -197,7 +217,9 @@ def lines(request):
     """Every competitor that is installed, by name, measured in turn; the table is printed."""
     competitors = [*OURS, *PEERS]
     found = {competitor.name: measured(competitor) for competitor in competitors if competitor.installed}
-    missing = [f"  SKIPPED, because {one.package} is not installed: {one.name}" for one in competitors if not one.installed]
+    missing = [
+        f"  SKIPPED, because {one.package} is not installed: {one.name}" for one in competitors if not one.installed
+    ]
     with request.config.pluginmanager.getplugin("capturemanager").global_and_fixture_disabled():
         print("\n".join([table(found.values()), *missing]))
     return found

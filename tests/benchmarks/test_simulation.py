@@ -1,4 +1,4 @@
-"""Ten thousand exact trajectories beside a plain loop over them with scipy, in one run on one machine."""
+"""Guards speed: ten thousand exact trajectories beside a plain loop over them with scipy, in one run on one machine."""
 
 from __future__ import annotations
 
@@ -9,18 +9,25 @@ import pytest
 from scipy.linalg import expm
 
 import sparserob_core as sr
-from sparserob_core.control.dictionary import Dictionary
-from sparserob_core.control.parameters import ParameterIndex
-from sparserob_core.control.response import Response
-from sparserob_core.control.simulate import fine_times, finer, walk
-from sparserob_core.control.transcription import prepare
+from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.response.parameters import ParameterIndex
+from sparserob_core.control.response.response import Response
+from sparserob_core.control.studies.simulate import fine_times, finer, walk
+from sparserob_core.control.transcription.transcribe import prepare
 
 PIECES, TRAJECTORIES, LOOPED = 250, 10_000, 20
 CONFIG = {
     "title": "Spring-mass-damper under process noise",
-    "problem": {"name": "linear", "system": {"A": [[0, 1], [-2, -0.5]], "B": [[0], [1]]}, "horizon": 5.0, "initial_state": [-1, 1],
-                "control": {"box": 1.0}, "disturbance": {"box": [0.06, 0.06]}, "path": [{"box": [0.7, None], "from": 0.3}],
-                "terminal": [{"box": [0.3, 0.3]}]},
+    "problem": {
+        "name": "linear",
+        "system": {"A": [[0, 1], [-2, -0.5]], "B": [[0], [1]]},
+        "horizon": 5.0,
+        "initial_state": [-1, 1],
+        "control": {"box": 1.0},
+        "disturbance": {"box": [0.06, 0.06]},
+        "path": [{"box": [0.7, None], "from": 0.3}],
+        "terminal": [{"box": [0.3, 0.3]}],
+    },
     "dictionaries": {"control": {"name": "piecewise_constant", "pieces": PIECES}},
 }
 
@@ -47,8 +54,13 @@ def looped(A, B, control, disturbances, start, times, which):
 def test_many_trajectories_cost_far_less_than_a_loop_over_them():
     dictionary = Dictionary(np.linspace(0.0, 5.0, PIECES + 1), np.eye(PIECES))
     A, B = np.array([[0.0, 1.0], [-2.0, -0.5]]), np.array([[0.0], [1.0]])
-    problem = sr.OptimalControlProblem(system=sr.LinearSystem(A, B), horizon=5.0, initial_state=[-1, 1], control=sr.Box([-1], [1]),
-                                       disturbance=sr.Box([-0.06, -0.06], [0.06, 0.06]))
+    problem = sr.OptimalControlProblem(
+        system=sr.LinearSystem(A, B),
+        horizon=5.0,
+        initial_state=[-1, 1],
+        control=sr.Box([-1], [1]),
+        disturbance=sr.Box([-0.06, -0.06], [0.06, 0.06]),
+    )
     model = prepare(problem, dictionary, dictionary)
     times = fine_times(model.response, ParameterIndex(None), np.zeros(0))
     fine = Response(problem.system, finer(model.response.grid, times), model.response.initial_state)
@@ -58,10 +70,15 @@ def test_many_trajectories_cost_far_less_than_a_loop_over_them():
     paths = np.stack(list(walk(fine, control, np.zeros((2000, 0)), disturbances)))
     ours = (time.perf_counter() - started) / 2000
     started = time.perf_counter()
-    theirs_paths = looped(A, B, control, disturbances[:LOOPED], model.response.initial_state, times, fine.grid.control_piece)
+    theirs_paths = looped(
+        A, B, control, disturbances[:LOOPED], model.response.initial_state, times, fine.grid.control_piece
+    )
     theirs = (time.perf_counter() - started) / LOOPED
     assert np.abs(paths[:, :, :LOOPED].transpose(2, 0, 1) - theirs_paths).max() <= 1e-10
-    print(f"\none trajectory at {times.size} times: batched {1e6 * ours:.1f} us, loop {1e6 * theirs:.1f} us, {theirs / ours:.0f} times as long")
+    print(
+        f"\none trajectory at {times.size} times: batched {1e6 * ours:.1f} us, loop {1e6 * theirs:.1f} us,"
+        f" {theirs / ours:.0f} times as long"
+    )
     assert theirs > 20 * ours
 
 

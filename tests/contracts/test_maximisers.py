@@ -1,4 +1,5 @@
-"""Every registered maximiser keeps the contract, and the contract is worth keeping: maximisers that are bad on purpose fail it."""
+"""Guards sparserob_core.testing and every registered component: every registered maximiser keeps the contract, and the
+contract is worth keeping: maximisers that are bad on purpose fail it."""
 
 from __future__ import annotations
 
@@ -33,7 +34,9 @@ class Uniform(sr.Maximiser):
 
     def points(self, objective, rng):
         domain = objective.domain
-        return np.clip(domain.lower + rng.random((1, domain.dimension)) * (domain.upper - domain.lower), domain.lower, domain.upper)
+        return np.clip(
+            domain.lower + rng.random((1, domain.dimension)) * (domain.upper - domain.lower), domain.lower, domain.upper
+        )
 
     def search(self, objective, rng):
         while objective.remaining:

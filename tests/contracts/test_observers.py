@@ -1,4 +1,5 @@
-"""Every registered observer keeps the contract, and the contract is worth keeping: observers that are bad on purpose fail it."""
+"""Guards sparserob_core.testing and every registered component: every registered observer keeps the contract, and the
+contract is worth keeping: observers that are bad on purpose fail it."""
 
 from __future__ import annotations
 
@@ -31,7 +32,8 @@ class TestRegisteredObserver(ObserverContract):
 
 
 class Counting(sr.Observer):
-    """An honest observer, for its flawed relatives to inherit from: a thread of its own, and a line on the standard error stream."""
+    """An honest observer, for its flawed relatives to inherit from: a thread of its own, and a line on the standard
+    error stream."""
 
     def __init__(self):
         self.over = threading.Event()
@@ -67,7 +69,9 @@ class Trusting(Counting):
 class Picky(Counting):
     def receive(self, event):
         super().receive(event)
-        if not isinstance(event, sr.RunStarted | sr.RunFinished | sr.RoundFinished | sr.EvaluationsFinished | sr.ProofProgress):
+        if not isinstance(
+            event, sr.RunStarted | sr.RunFinished | sr.RoundFinished | sr.EvaluationsFinished | sr.ProofProgress
+        ):
             raise TypeError("what is this?")
 
 
@@ -157,7 +161,7 @@ CAUGHT = {
 
 @pytest.mark.parametrize(("flawed", "test"), CAUGHT.items(), ids=lambda value: getattr(value, "__name__", ""))
 def test_the_contract_catches_an_observer_that_is_bad_on_purpose(flawed, test, monkeypatch):
-    monkeypatch.setattr("sparserob_core.testing_observers.GRACE", 0.2)
+    monkeypatch.setattr("sparserob_core.testing.observers.GRACE", 0.2)
     made = []
 
     class Trial(ObserverContract):

@@ -1,4 +1,5 @@
-"""Every registered solver keeps the contract, and solvers that lie are caught."""
+"""Guards sparserob_core.testing and every registered component: every registered solver keeps the contract, and solvers
+that lie are caught."""
 
 from __future__ import annotations
 
@@ -8,9 +9,15 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.sip.check import solve_finite
+from sparserob_core.sip.inner.solve import solve_finite
 from sparserob_core.testing import SolverContract
-from sparserob_core.testing_solvers import compare, infeasible_instances, linear_instances, regularised_instances, robust_terminal
+from sparserob_core.testing.solvers import (
+    compare,
+    infeasible_instances,
+    linear_instances,
+    regularised_instances,
+    robust_terminal,
+)
 
 REGISTRY = sr.load_registry()
 NAMES = REGISTRY.names("solver")
@@ -34,7 +41,11 @@ class TestRegisteredSolver(SolverContract):
 
 def test_all_solvers_find_the_same_value():
     for instance in [*linear_instances(), *regularised_instances()]:
-        values = [s.value for name in NAMES if (s := solve_finite(instance.program, REGISTRY.build("solver", name))).status == "optimal"]
+        values = [
+            s.value
+            for name in NAMES
+            if (s := solve_finite(instance.program, REGISTRY.build("solver", name))).status == "optimal"
+        ]
         assert values, instance.name
         assert np.ptp(values) <= 1e-8 * max(1.0, abs(values[0])), instance.name
 
@@ -61,7 +72,9 @@ class Pessimist(Distorted):
 
     def distort(self, program, claim):
         rng = np.random.default_rng(0)
-        return sr.Claim("infeasible", claim.x + 1, rng.random(claim.z.size), rng.standard_normal(claim.y.size), claim.z_box)
+        return sr.Claim(
+            "infeasible", claim.x + 1, rng.random(claim.z.size), rng.standard_normal(claim.y.size), claim.z_box
+        )
 
 
 class Inflated(Distorted):
@@ -108,6 +121,6 @@ def test_the_contract_catches_a_check_that_believes_everything(monkeypatch):
         def create(self):
             return Optimist()
 
-    monkeypatch.setattr("sparserob_core.sip.check._Case.believes", lambda case, solution: True)
+    monkeypatch.setattr("sparserob_core.sip.inner.solve._Case.believes", lambda case, solution: True)
     with pytest.raises(AssertionError):
         Trial().test_linear_programs_are_solved_or_given_up()

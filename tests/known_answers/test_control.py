@@ -1,4 +1,5 @@
-"""Optimal control problems whose values are known: closed forms, and independent linear programs."""
+"""Guards known answers: optimal control problems whose values are known: closed forms, and independent linear
+programs."""
 
 from __future__ import annotations
 
@@ -26,14 +27,18 @@ def run(tmp_path):
     count = iter(range(100))
 
     def ran(config, overrides=None):
-        return sr.run(config, {"observers": [], **(overrides or {})}, tmp_path / f"run{next(count)}", quiet=True, figures=False)
+        return sr.run(
+            config, {"observers": [], **(overrides or {})}, tmp_path / f"run{next(count)}", quiet=True, figures=False
+        )
 
     return ran
 
 
 def linear(pieces, **problem):
-    return {"problem": {"name": "linear", "control": {"box": 1.0}, **problem},
-            "dictionaries": {"control": {"name": "piecewise_constant", "pieces": pieces}}}
+    return {
+        "problem": {"name": "linear", "control": {"box": 1.0}, **problem},
+        "dictionaries": {"control": {"name": "piecewise_constant", "pieces": pieces}},
+    }
 
 
 def assert_cost(outcome, truth, accuracy=1e-6, proven=("certified",)):
@@ -46,6 +51,7 @@ def assert_cost(outcome, truth, accuracy=1e-6, proven=("certified",)):
 
 
 # Sparse control without uncertainty, to the origin.
+
 
 def to_the_origin(system, pieces, horizon, initial_state):
     return linear(pieces, system=system, horizon=horizon, initial_state=initial_state, terminal=[{"equals": [0, 0]}])
@@ -99,7 +105,8 @@ def test_the_oscillator_approaches_its_closed_form_from_above(run, k, r, pieces,
 @pytest.mark.parametrize("on", [2, 5, 10])
 @pytest.mark.parametrize("k", [1, 2])
 def test_an_oscillator_with_its_switches_on_the_grid_is_exact(run, k, on):
-    """``u = -sign sin`` where ``|sin t|`` exceeds a threshold: pulses of ``2 on`` pieces around the extrema of the sine."""
+    """``u = -sign sin`` where ``|sin t|`` exceeds a threshold: pulses of ``2 on`` pieces around the extrema of the
+    sine."""
     pieces, horizon = 40 * k, 2 * math.pi * k
     middles = (np.arange(pieces) + 0.5) * horizon / pieces
     signal = np.where(np.abs(np.sin(middles)) > math.cos(on * math.pi / 20), -np.sign(np.sin(middles)), 0.0)
@@ -119,22 +126,40 @@ def test_the_degenerate_double_integrator_recovers_the_optimiser_of_minimum_norm
     assert abs((outcome.control**2).sum() * 5.0 / pieces - (3 - 1 / math.sqrt(3))) <= 1e-3
 
 
-@pytest.mark.parametrize(("rate", "horizon", "distance", "pieces"), [(1.0, 4.0, 3.0, 40), (2.0, 5.0, 8.0, 50), (0.5, 4.0, -0.875, 40)])
+@pytest.mark.parametrize(
+    ("rate", "horizon", "distance", "pieces"), [(1.0, 4.0, 3.0, 40), (2.0, 5.0, 8.0, 50), (0.5, 4.0, -0.875, 40)]
+)
 def test_minimum_attention_of_an_integrator_has_its_closed_form(run, rate, horizon, distance, pieces):
     truth = rate * horizon - math.sqrt(rate**2 * horizon**2 - 4 * rate * abs(distance))
     first = truth / (2 * rate) * pieces / horizon
     assert abs(first - round(first)) <= 1e-9, "the switches are meant to lie on the grid"
-    config = {"problem": {"name": "minimum_attention", "system": {"A": [[0]], "B": [[1]]}, "horizon": horizon, "initial_state": [distance],
-                          "initial_control": 0.0, "rate": {"box": rate}, "terminal": [{"equals": [0]}]},
-              "dictionaries": {"control": {"name": "piecewise_constant", "pieces": pieces}}}
+    config = {
+        "problem": {
+            "name": "minimum_attention",
+            "system": {"A": [[0]], "B": [[1]]},
+            "horizon": horizon,
+            "initial_state": [distance],
+            "initial_control": 0.0,
+            "rate": {"box": rate},
+            "terminal": [{"equals": [0]}],
+        },
+        "dictionaries": {"control": {"name": "piecewise_constant", "pieces": pieces}},
+    }
     assert_cost(run(config), truth)
 
 
 # Robust.
 
+
 def robust_double_integrator(pieces):
-    return linear(pieces, system=DOUBLE_INTEGRATOR, horizon=5.0, initial_state=[4, 0], disturbance={"box": [0.02, 0.02]},
-                  terminal=[{"box": [0.5, 0.3]}])
+    return linear(
+        pieces,
+        system=DOUBLE_INTEGRATOR,
+        horizon=5.0,
+        initial_state=[4, 0],
+        disturbance={"box": [0.02, 0.02]},
+        terminal=[{"box": [0.5, 0.3]}],
+    )
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
@@ -148,15 +173,23 @@ def test_the_robust_double_integrator_costs_exactly_eight_fifths(run, pieces, so
 
 def test_the_same_problem_in_python_has_the_same_cost():
     problem = sr.OptimalControlProblem(
-        system=sr.LinearSystem(np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])), horizon=5.0, initial_state=[4.0, 0.0],
-        control=sr.Box([-1.0], [1.0]), disturbance=sr.Box([-0.02, -0.02], [0.02, 0.02]), terminal=[sr.Box([-0.5, -0.3], [0.5, 0.3])])
-    result = sr.solve(problem, method="exchange", solver="piqp", control={"name": "piecewise_constant", "pieces": 50}, tolerance=1e-7)
+        system=sr.LinearSystem(np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])),
+        horizon=5.0,
+        initial_state=[4.0, 0.0],
+        control=sr.Box([-1.0], [1.0]),
+        disturbance=sr.Box([-0.02, -0.02], [0.02, 0.02]),
+        terminal=[sr.Box([-0.5, -0.3], [0.5, 0.3])],
+    )
+    result = sr.solve(
+        problem, method="exchange", solver="piqp", control={"name": "piecewise_constant", "pieces": 50}, tolerance=1e-7
+    )
     assert abs(result.cost - 1.6) <= 1e-6
     assert result.status == "certified"
 
 
 def test_the_scenario_approach_is_cheaper_and_wrong(run):
-    """J = 1.3597 for one draw of 10 000 disturbances, violated by 0.257 in the worst case; another draw differs a little."""
+    """J = 1.3597 for one draw of 10 000 disturbances, violated by 0.257 in the worst case; another draw differs a
+    little."""
     outcome = run(robust_double_integrator(50), {"method": {"name": "scenario", "scenarios": 10_000}})
     assert abs(outcome.result.cost - 1.3597) <= 0.02
     assert outcome.result.status == "refuted"
@@ -164,8 +197,13 @@ def test_the_scenario_approach_is_cheaper_and_wrong(run):
 
 
 def scalar_with_uncertain_rate(pieces, radius):
-    return linear(pieces, system={"A": [["-a"]], "B": [[1]], "parameters": {"a": [0.5, 1]}}, horizon=1.0, initial_state=[2],
-                  terminal=[{"box": radius}])
+    return linear(
+        pieces,
+        system={"A": [["-a"]], "B": [[1]], "parameters": {"a": [0.5, 1]}},
+        horizon=1.0,
+        initial_state=[2],
+        terminal=[{"box": radius}],
+    )
 
 
 def test_a_scalar_with_uncertain_rate_approaches_its_closed_form_from_above(run):
@@ -186,8 +224,13 @@ def test_a_scalar_with_uncertain_rate_and_its_switch_on_the_grid_is_exact(run, o
 
 
 def uncertain_oscillator():
-    return linear(100, system={"A": [[0, 1], ["-omega**2", 0]], "B": [[0], [1]], "parameters": {"omega": [0.9, 1.1]}},
-                  horizon=2 * math.pi, initial_state=[1, 0], terminal=[{"box": [0.8, None]}])
+    return linear(
+        100,
+        system={"A": [[0, 1], ["-omega**2", 0]], "B": [[0], [1]], "parameters": {"omega": [0.9, 1.1]}},
+        horizon=2 * math.pi,
+        initial_state=[1, 0],
+        terminal=[{"box": [0.8, None]}],
+    )
 
 
 def test_the_worst_frequency_of_an_oscillator_lies_in_the_interior(run):
@@ -198,8 +241,10 @@ def test_the_worst_frequency_of_an_oscillator_lies_in_the_interior(run):
 @pytest.mark.parametrize("kind", ["piecewise_constant", "measurable"])
 @pytest.mark.parametrize("pieces", [25, 40])
 def test_a_measurable_disturbance_counts_what_a_piecewise_constant_one_cannot_do(run, pieces, kind):
-    """Steer only ``x1`` of an oscillator: ``x1(2 pi) = x1(0) - int sin(s) u(s) ds``. The cheapest control fills the pieces on which
-    ``|int sin|`` is largest (a fractional knapsack), until the disturbance's support ``int |sin|``, or its piecewise mean, is paid for."""
+    """Steer only ``x1`` of an oscillator: ``x1(2 pi) = x1(0) - int sin(s) u(s) ds``. The cheapest control fills the
+    pieces on which ``|int sin|`` is largest (a fractional knapsack), until the disturbance's support ``int |sin|``, or
+    its piecewise mean, is paid for.
+    """
     start, radius, bound = 1.0, 0.5, 0.05
     edges = np.linspace(0, 2 * math.pi, pieces + 1)
     gain = np.abs(np.diff(np.cos(edges)))
@@ -210,8 +255,15 @@ def test_a_measurable_disturbance_counts_what_a_piecewise_constant_one_cannot_do
         truth, needed = truth + share * length, needed - share * g
         if needed <= 0:
             break
-    config = linear(pieces, system={**OSCILLATOR, "E": [[0], [1]]}, horizon=2 * math.pi, initial_state=[start, 0],
-                    disturbance={"box": bound}, disturbance_class=kind, terminal=[{"box": [radius, None]}])
+    config = linear(
+        pieces,
+        system={**OSCILLATOR, "E": [[0], [1]]},
+        horizon=2 * math.pi,
+        initial_state=[start, 0],
+        disturbance={"box": bound},
+        disturbance_class=kind,
+        terminal=[{"box": [radius, None]}],
+    )
     assert_cost(run(config), truth)
 
 
@@ -220,10 +272,16 @@ def test_a_measurable_disturbance_counts_what_a_piecewise_constant_one_cannot_do
 EXPERIMENT_1, EXPERIMENT_2, EXPERIMENT_3 = (CONFIGS / f"experiment{i}_repaired.yaml" for i in (1, 2, 3))
 
 PAPER = {
-    # 0.175769 is the value with the path imposed at the 251 breakpoints only: see test_the_breakpoints_alone_are_not_enough.
+    # 0.175769 is the value with the path imposed at the 251 breakpoints only: see
+    # test_the_breakpoints_alone_are_not_enough.
     "no disturbance": (EXPERIMENT_1, {"problem.disturbance": None}, 0.1757928, 2e-7),
     "|w| <= 0.06": (EXPERIMENT_1, {}, 0.63212, 2e-5),
-    "|w| <= 0.06, N = 100": (EXPERIMENT_1, {"dictionaries.control.pieces": 100, "dictionaries.disturbance.pieces": 100}, 0.63230, 2e-5),
+    "|w| <= 0.06, N = 100": (
+        EXPERIMENT_1,
+        {"dictionaries.control.pieces": 100, "dictionaries.disturbance.pieces": 100},
+        0.63230,
+        2e-5,
+    ),
     "experiment 2": (EXPERIMENT_2, {}, 1.02007, 2e-5),
     "experiment 3": (EXPERIMENT_3, {}, 1.11230, 2e-5),
     "experiment 3, no disturbance": (EXPERIMENT_3, {"problem.disturbance": None}, 0.485453, 2e-6),
@@ -249,10 +307,20 @@ def test_the_first_experiment_without_disturbance_is_the_nominal_method(run):
 
 
 def test_the_breakpoints_alone_are_not_enough():
-    """Independent linear programs: 0.175769 with the path imposed at the breakpoints, 0.1757928 with it imposed between them as well."""
-    problem = Problem(A=np.array([[0.0, 1.0], [-2.0, -0.5]]), B=np.array([[0.0], [1.0]]), initial_state=np.array([-1.0, 1.0]), horizon=5.0,
-                      pieces=250, control=np.ones(1), weights=np.ones(1), disturbance=np.zeros(2), terminal=np.array([0.3, 0.3]),
-                      path=[(np.array([0.7, np.inf]), 0.3, 5.0)])
+    """Independent linear programs: 0.175769 with the path imposed at the breakpoints, 0.1757928 with it imposed between
+    them as well."""
+    problem = Problem(
+        A=np.array([[0.0, 1.0], [-2.0, -0.5]]),
+        B=np.array([[0.0], [1.0]]),
+        initial_state=np.array([-1.0, 1.0]),
+        horizon=5.0,
+        pieces=250,
+        control=np.ones(1),
+        weights=np.ones(1),
+        disturbance=np.zeros(2),
+        terminal=np.array([0.3, 0.3]),
+        path=[(np.array([0.7, np.inf]), 0.3, 5.0)],
+    )
     assert abs(value(problem, sample(problem, 1)) - 0.175769) <= 1e-6
     lower, upper = enclosed_value(problem, 16)
     assert upper - lower < 2e-6
@@ -278,6 +346,7 @@ def test_the_largest_disturbance_that_experiment_1_survives(run, bound, feasible
 
 
 # Random instances against linear programs that enclose the value.
+
 
 @pytest.mark.parametrize("seed", range(24))
 def test_a_random_instance_lies_between_two_independent_linear_programs(run, seed):

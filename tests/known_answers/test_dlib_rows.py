@@ -1,6 +1,8 @@
-"""dlib's own table of MaxLIPO+TR (King 2017): mean evaluations until the best value is within epsilon of the maximum.
+"""Guards known answers: dlib's own table of MaxLIPO+TR (King 2017): mean evaluations until the best value is within
+epsilon of the maximum.
 
-The table gives mean and deviation and not the number of runs; two standard errors of the mean of ours are allowed beyond the published mean.
+The table gives mean and deviation and not the number of runs; two standard errors of the mean of ours are allowed
+beyond the published mean.
 """
 
 from __future__ import annotations
@@ -27,11 +29,15 @@ def evaluations_to(landscape, budget, seed):
     """The number of evaluations until each epsilon is reached; the budget must suffice."""
     best = sr.maximise(landscape.function, landscape.box, "maxlipo", budget=budget, seed=seed).trace.best
     regret = landscape.maximum - best
-    assert regret[-1] <= EPSILONS[-1], f"{landscape.name}, seed {seed}: {regret[-1]:.2g} is left after {budget} evaluations"
+    assert regret[-1] <= EPSILONS[-1], (
+        f"{landscape.name}, seed {seed}: {regret[-1]:.2g} is left after {budget} evaluations"
+    )
     return [int(np.argmax(regret <= epsilon)) + 1 for epsilon in EPSILONS]
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name == "deb5" else ()) for name in ROWS])
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name == "deb5" else ()) for name in ROWS]
+)
 def test_no_more_evaluations_are_needed_than_dlib_needs(name):
     budget, means, deviations = ROWS[name]
     counts = np.array([evaluations_to(LANDSCAPES[name], budget, seed) for seed in range(SEEDS)])

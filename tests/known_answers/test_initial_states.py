@@ -1,4 +1,5 @@
-"""Sets of feasible initial states with closed forms: reachable sets backwards in time, segments, rectangles."""
+"""Guards known answers: sets of feasible initial states with closed forms: reachable sets backwards in time, segments,
+rectangles."""
 
 from __future__ import annotations
 
@@ -12,14 +13,23 @@ import sparserob_core as sr
 T, SIDE = 3.0, np.array([0.5, 0.4])
 CART: dict[str, Any] = {
     "title": "A cart",
-    "problem": {"name": "linear", "system": {"A": [[0, 1], [0, 0]], "B": [[0], [1]]}, "horizon": T, "initial_state": [1.0, 0.0],
-                "control": {"box": 1.0}, "terminal": [{"box": SIDE.tolist()}]},
-    "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 30}}, "observers": []}
+    "problem": {
+        "name": "linear",
+        "system": {"A": [[0, 1], [0, 0]], "B": [[0], [1]]},
+        "horizon": T,
+        "initial_state": [1.0, 0.0],
+        "control": {"box": 1.0},
+        "terminal": [{"box": SIDE.tolist()}],
+    },
+    "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 30}},
+    "observers": [],
+}
 NOISY = {"problem.disturbance": {"box": [0.0, 0.1]}}
 
 
 def support(direction: np.ndarray, pieces: int) -> float:
-    """Of the null-controllable set: that of the terminal box, moved back, and ``int |B'e^{-A's} d| ds``, piece by piece."""
+    """Of the null-controllable set: that of the terminal box, moved back, and ``int |B'e^{-A's} d| ds``, piece by
+    piece."""
     ends = np.linspace(0.0, T, pieces + 1)
     whole = direction[1] * ends - direction[0] * ends**2 / 2
     back = np.array([direction[0], direction[1] - T * direction[0]])
@@ -27,8 +37,14 @@ def support(direction: np.ndarray, pieces: int) -> float:
 
 
 def feasible(x0: np.ndarray, disturbance: sr.Box | None = None) -> str:
-    problem = sr.OptimalControlProblem(system=sr.LinearSystem(A=[[0, 1], [0, 0]], B=[[0], [1]]), horizon=T, initial_state=x0,
-                                       control=sr.Box([-1], [1]), disturbance=disturbance, terminal=[sr.Box(-SIDE, SIDE)])
+    problem = sr.OptimalControlProblem(
+        system=sr.LinearSystem(A=[[0, 1], [0, 0]], B=[[0], [1]]),
+        horizon=T,
+        initial_state=x0,
+        control=sr.Box([-1], [1]),
+        disturbance=disturbance,
+        terminal=[sr.Box(-SIDE, SIDE)],
+    )
     return sr.solve(problem, control={"name": "piecewise_constant", "pieces": 30}).status
 
 
@@ -87,9 +103,17 @@ def test_measured_costs_are_convex_and_their_interpolation_lies_above_the_optimu
     rng = np.random.default_rng(5)
     inside = [weights @ cart.points for weights in rng.dirichlet(np.full(len(cart.points), 0.1), size=4)]
     for point in inside:
-        problem = sr.OptimalControlProblem(system=sr.LinearSystem(A=[[0, 1], [0, 0]], B=[[0], [1]]), horizon=T, initial_state=point,
-                                           control=sr.Box([-1], [1]), terminal=[sr.Box(-SIDE, SIDE)])
-        assert cart.cost(point) >= sr.solve(problem, control={"name": "piecewise_constant", "pieces": 30}).lower_bound - 1e-7
+        problem = sr.OptimalControlProblem(
+            system=sr.LinearSystem(A=[[0, 1], [0, 0]], B=[[0], [1]]),
+            horizon=T,
+            initial_state=point,
+            control=sr.Box([-1], [1]),
+            terminal=[sr.Box(-SIDE, SIDE)],
+        )
+        assert (
+            cart.cost(point)
+            >= sr.solve(problem, control={"name": "piecewise_constant", "pieces": 30}).lower_bound - 1e-7
+        )
 
 
 def test_combined_controls_of_the_vertices_drive_any_point_of_the_inner_polygon_home(cart: sr.InitialStates) -> None:
@@ -105,9 +129,16 @@ def test_combined_controls_of_the_vertices_drive_any_point_of_the_inner_polygon_
 
 
 def test_uncertain_rates_give_the_rectangle_of_the_worst_rate() -> None:
-    config = {**CART, "problem": {
-        **CART["problem"], "system": {"A": [["-a", 0], [0, -1]], "B": [[1], [0]], "parameters": {"a": [0.5, 1.0]}}, "horizon": 1.0,
-        "terminal": [{"box": [0.5, 1.0]}]}, "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 8}}}
+    config = {
+        **CART,
+        "problem": {
+            **CART["problem"],
+            "system": {"A": [["-a", 0], [0, -1]], "B": [[1], [0]], "parameters": {"a": [0.5, 1.0]}},
+            "horizon": 1.0,
+            "terminal": [{"box": [0.5, 1.0]}],
+        },
+        "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 8}},
+    }
     found = sr.initial_states(config, directions=8, values=0)
     rates = np.linspace(0.5, 1.0, 2001)
     width = float((np.exp(rates) * (0.5 + (1.0 - np.exp(-rates)) / rates)).min())
@@ -118,8 +149,15 @@ def test_uncertain_rates_give_the_rectangle_of_the_worst_rate() -> None:
 
 
 def test_a_coordinate_that_nothing_moves_and_an_equality_pins_makes_a_segment() -> None:
-    config = {**CART, "problem": {**CART["problem"], "system": {"A": [[0, 1], [0, 0]], "B": [[1], [0]]}, "horizon": 1.0,
-                                  "terminal": [{"box": [0.5, None]}, {"equals": [None, 0.25]}]}}
+    config = {
+        **CART,
+        "problem": {
+            **CART["problem"],
+            "system": {"A": [[0, 1], [0, 0]], "B": [[1], [0]]},
+            "horizon": 1.0,
+            "terminal": [{"box": [0.5, None]}, {"equals": [None, 0.25]}],
+        },
+    }
     found = sr.initial_states(config, directions=8, values=5)
     np.testing.assert_allclose(found.outer.max(axis=0), [1.25, 0.25], atol=1e-5)
     np.testing.assert_allclose(found.outer.min(axis=0), [-1.75, 0.25], atol=1e-5)

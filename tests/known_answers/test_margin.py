@@ -1,4 +1,5 @@
-"""The margins of the paper's experiments, against bisections over programs that share nothing with the package."""
+"""Guards known answers: the margins of the paper's experiments, against bisections over programs that share nothing
+with the package."""
 
 from __future__ import annotations
 
@@ -16,9 +17,18 @@ CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
 
 def experiment_1(bound: float) -> Problem:
-    return Problem(A=np.array([[0.0, 1.0], [-2.0, -0.5]]), B=np.array([[0.0], [1.0]]), initial_state=np.array([-1.0, 1.0]), horizon=5.0, pieces=250,
-                   control=np.ones(1), weights=np.ones(1), disturbance=np.full(2, bound), terminal=np.full(2, 0.3),
-                   path=[(np.array([0.7, np.inf]), 0.3, 5.0)])
+    return Problem(
+        A=np.array([[0.0, 1.0], [-2.0, -0.5]]),
+        B=np.array([[0.0], [1.0]]),
+        initial_state=np.array([-1.0, 1.0]),
+        horizon=5.0,
+        pieces=250,
+        control=np.ones(1),
+        weights=np.ones(1),
+        disturbance=np.full(2, bound),
+        terminal=np.full(2, 0.3),
+        path=[(np.array([0.7, np.inf]), 0.3, 5.0)],
+    )
 
 
 def bisected(problem: Problem, low: float, high: float, width: float) -> tuple[float, float]:
@@ -47,19 +57,33 @@ def test_experiment_1_starts_its_window_no_earlier_than_the_state_can_be_there(t
     assert found.upper - found.lower <= 2e-5
     for start, status in ((found.upper, "certified"), (found.lower, "infeasible")):
         overrides = {"problem.path.0.from": start, "observers": []}
-        assert sr.run(CONFIGS / "experiment1_repaired.yaml", overrides, out=tmp_path / status, figures=False).status == status
+        assert (
+            sr.run(CONFIGS / "experiment1_repaired.yaml", overrides, out=tmp_path / status, figures=False).status
+            == status
+        )
 
 
 def test_an_oscillator_needs_the_control_that_its_interior_worst_parameter_asks_for():
-    """x'' + omega^2 x = u, omega in [0.9, 1.1], x0 = (1, 0), |x1(2 pi)| <= f 0.8: the smallest set against the runs on both sides."""
-    config = {"problem": {"name": "linear", "system": {"A": [[0, 1], ["-(1 + d)**2", 0]], "B": [[0], [1]], "parameters": {"d": [-0.1, 0.1]}},
-                          "horizon": 6.283185307179586, "initial_state": [1, 0], "control": {"box": 1.0}, "terminal": [{"box": [0.8, None]}]},
-              "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 50}}, "observers": []}
+    """x'' + omega^2 x = u, omega in [0.9, 1.1], x0 = (1, 0), |x1(2 pi)| <= f 0.8: the smallest set against the runs on
+    both sides."""
+    config = {
+        "problem": {
+            "name": "linear",
+            "system": {"A": [[0, 1], ["-(1 + d)**2", 0]], "B": [[0], [1]], "parameters": {"d": [-0.1, 0.1]}},
+            "horizon": 6.283185307179586,
+            "initial_state": [1, 0],
+            "control": {"box": 1.0},
+            "terminal": [{"box": [0.8, None]}],
+        },
+        "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 50}},
+        "observers": [],
+    }
     found = sr.margin(config, of="control")
     assert found.status == "certified"
     assert "at d = 0.01" in found.message
     gains = []
-    for d in np.linspace(-0.1, 0.1, 401):  # where the control, whatever its sign, can push x1(T) most, it needs least of it
+    # where the control, whatever its sign, can push x1(T) most, it needs least of it
+    for d in np.linspace(-0.1, 0.1, 401):
         omega, pieces = 1 + d, np.linspace(0, 2 * np.pi, 51)
         response = np.diff(np.cos(omega * (2 * np.pi - pieces))) / omega**2
         gains.append((np.cos(2 * np.pi * omega) - 0.8) / np.abs(response).sum())

@@ -1,7 +1,9 @@
-"""Maximisers against published results and exact expectations, on functions whose maxima are known.
+"""Guards known answers: maximisers against published results and exact expectations, on functions whose maxima are
+known.
 
-The target at level ``t`` is ``f* - (f* - mean f)(1 - t)``, the mean over the box, as in Malherbe and Vayatis (ICML 2017); a search counts the
-evaluations until it is reached, 1000 at most. Means of two samples agree if they differ by less than two standard errors of the difference.
+The target at level ``t`` is ``f* - (f* - mean f)(1 - t)``, the mean over the box, as in Malherbe and Vayatis (ICML
+2017); a search counts the evaluations until it is reached, 1000 at most. Means of two samples agree if they differ by
+less than two standard errors of the difference.
 """
 
 from __future__ import annotations
@@ -28,12 +30,18 @@ def test_every_landscape_attains_its_maximum_where_it_says_and_exceeds_it_nowher
         floor = GARLAND_FLOOR if landscape.name == "garland1" else 1e-12 * scale
         assert landscape.function(landscape.maximiser[np.newaxis])[0] == pytest.approx(landscape.maximum, abs=floor)
         everywhere = rng.uniform(box.lower, box.upper, (50_000, box.dimension))
-        nearby = np.clip(landscape.maximiser + 1e-3 * (box.upper - box.lower) * rng.standard_normal(everywhere.shape), box.lower, box.upper)
+        nearby = np.clip(
+            landscape.maximiser + 1e-3 * (box.upper - box.lower) * rng.standard_normal(everywhere.shape),
+            box.lower,
+            box.upper,
+        )
         assert landscape.function(np.concatenate([everywhere, nearby])).max() <= landscape.maximum + floor
 
 
-# SequOOL. The paper (Bartlett, Gabillon and Valko 2019) shows curves only. These regrets come from two independent implementations of its
-# rule with three children, the centre's value inherited, and splits that go round the coordinates; "floor": what is left is rounding.
+# SequOOL. The paper (Bartlett, Gabillon and Valko 2019) shows curves only. These regrets come from two independent
+# implementations of its
+# rule with three children, the centre's value inherited, and splits that go round the coordinates; "floor": what is
+# left is rounding.
 
 OPENINGS = {25: (6, 25), 50: (11, 45), 100: (19, 91), 250: (40, 223), 500: (73, 465)}
 REGRETS = {
@@ -60,7 +68,9 @@ def test_sequool_has_the_known_regret_after_n_openings(name):
             assert regret == pytest.approx(expected, rel=5e-4)
 
 
-@pytest.mark.parametrize(("budget", "hmax", "evaluations"), [(100, 20, 99), (300, 51, 297), (1000, 139, 987), (10_000, 983, 9993)])
+@pytest.mark.parametrize(
+    ("budget", "hmax", "evaluations"), [(100, 20, 99), (300, 51, 297), (1000, 139, 987), (10_000, 983, 9993)]
+)
 def test_sequool_fills_the_budget_with_the_largest_depth_that_fits(budget, hmax, evaluations):
     landscape = LANDSCAPES["holder2"]
     report = sr.maximise(landscape.function, landscape.box, "sequool", budget=budget)
@@ -75,18 +85,30 @@ def test_sequool_under_the_paper_s_rule_evaluates_as_often_as_is_known(openings,
     assert (report.evaluations, report.trace.notes["hmax"][-1, 1]) == (evaluations, hmax)
 
 
-# After 1000 evaluations: no worse than the best implementation of SequOOL that was measured before this one (PyXAB 0.3.0, binary or ternary).
-PEER = {"garland1": 1.3e-8, "holder2": 1.8e-12, "himmelblau2": 3.2e-8, "ackley2s": 1.8e-4, "rastrigin3s": 2.0, "rosenbrock2": 2.1e-3}
+# After 1000 evaluations: no worse than the best implementation of SequOOL that was measured before this one (PyXAB
+# 0.3.0, binary or ternary).
+PEER = {
+    "garland1": 1.3e-8,
+    "holder2": 1.8e-12,
+    "himmelblau2": 3.2e-8,
+    "ackley2s": 1.8e-4,
+    "rastrigin3s": 2.0,
+    "rosenbrock2": 2.1e-3,
+}
 
 
 @pytest.mark.parametrize("name", PEER)
 def test_sequool_is_no_worse_than_its_peer_after_1000_evaluations(name):
     landscape = LANDSCAPES[name]
-    assert landscape.regret(sr.maximise(landscape.function, landscape.box, "sequool", budget=CAP).best_value) <= PEER[name]
+    assert (
+        landscape.regret(sr.maximise(landscape.function, landscape.box, "sequool", budget=CAP).best_value) <= PEER[name]
+    )
 
 
-# Random search. With the probability P of a point at the target, the expected number of evaluations is 1 / P, and (1 - (1 - P)^n) / P when it
+# Random search. With the probability P of a point at the target, the expected number of evaluations is 1 / P, and (1 -
+# (1 - P)^n) / P when it
 # is cut at n.
+
 
 @cache
 def sampled(name):
@@ -116,19 +138,27 @@ def first_reached(trace, target, cap=CAP):
 
 
 def counts(maximiser, name, goals, seeds, cap=CAP):
-    """Evaluations until each of the ascending goals ``(seeds, goals)``; a value at the last one is turned into ``inf``, which ends the search."""
+    """Evaluations until each of the ascending goals ``(seeds, goals)``; a value at the last one is turned into ``inf``,
+    which ends the search."""
     landscape = LANDSCAPES[name]
 
     def until_the_last(points):
         values = landscape.function(points)
         return np.where(values >= goals[-1], np.inf, values)
 
-    traces = [sr.maximise(until_the_last, landscape.box, maximiser, budget=cap, seed=seed).trace for seed in range(seeds)]
+    traces = [
+        sr.maximise(until_the_last, landscape.box, maximiser, budget=cap, seed=seed).trace for seed in range(seeds)
+    ]
     return np.array([[first_reached(trace, goal, cap) for goal in goals] for trace in traces])
 
 
-EXPECTED = {"holder2": (191, 350, 781), "sphere4": (903, 993, 1000), "deb5": (956, 993, 1000), "rosenbrock3": (9.7, 19.5, 116),
-            "linear_slope4": (932, 996, 1000)}
+EXPECTED = {
+    "holder2": (191, 350, 781),
+    "sphere4": (903, 993, 1000),
+    "deb5": (956, 993, 1000),
+    "rosenbrock3": (9.7, 19.5, 116),
+    "linear_slope4": (932, 996, 1000),
+}
 
 
 @pytest.mark.parametrize("name", EXPECTED)
@@ -142,7 +172,8 @@ def test_random_search_needs_as_many_evaluations_as_is_expected_exactly(name):
     assert (np.abs(found.mean(axis=0) - expected) <= 2 * error + 0.5).all()
 
 
-# Rows of the results table in dlib's documentation for pure random search, mean and standard deviation; its number of runs is not said there,
+# Rows of the results table in dlib's documentation for pure random search, mean and standard deviation; its number of
+# runs is not said there,
 # and taken to be 100.
 DLIB_RANDOM = {("holder2", 0.1): (3043, 2901), ("sphere4", 0.1): (1929, 2034), ("deb5", 0.1): (3933, 3869)}
 
@@ -158,8 +189,10 @@ def test_random_search_needs_as_many_evaluations_as_dlib_s(name, accuracy):
     assert abs(found.mean() - 1 / chance) <= 2 * math.hypot(found.std(ddof=1) / math.sqrt(1000), unsure / chance)
 
 
-# AdaLIPO, p = 0.1 and alpha = 0.01 / d: mean and standard deviation over 100 runs as in Malherbe and Vayatis (2017). Their Rosenbrock and LinearSlope
-# columns are not here: random search, whose expectation is exact, does not give their figures either with the functions as they are stated.
+# AdaLIPO, p = 0.1 and alpha = 0.01 / d: mean and standard deviation over 100 runs as in Malherbe and Vayatis (2017).
+# Their Rosenbrock and LinearSlope
+# columns are not here: random search, whose expectation is exact, does not give their figures either with the functions
+# as they are stated.
 # For Sphere at 99 % only the range 45 to 50 is known, without a deviation.
 PUBLISHED = {
     "holder2": ((77, 58), (102, 65), (212, 129)),

@@ -1,4 +1,5 @@
-"""Convex semi-infinite programs whose values are known in closed form, through the public call."""
+"""Guards known answers: convex semi-infinite programs whose values are known in closed form, through the public
+call."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ def solved(program, solver):
 
 
 def assert_solved(program, solver, truth, accuracy=1e-6):
-    """Both bounds enclose the truth, and meet there. ProxQP may fall short on a badly conditioned program, but then it says so."""
+    """Both bounds enclose the truth, and meet there. ProxQP may fall short on a badly conditioned program, but then it
+    says so."""
     result = solved(program, solver)
     slack = 1e-9 * max(1.0, abs(truth))
     assert result.lower_bound <= truth + slack
@@ -35,8 +37,11 @@ def assert_solved(program, solver, truth, accuracy=1e-6):
     return result
 
 
-# One-sided approximation in the mean by polynomials. The dual of the program is a quadrature of f with positive weights that is exact
-# for degree n - 1 and whose error has one sign: Gauss, Radau or Lobatto (Bojanic and DeVore 1966; Karlin and Studden 1966).
+# One-sided approximation in the mean by polynomials. The dual of the program is a quadrature of f with positive weights
+# that is exact
+# for degree n - 1 and whose error has one sign: Gauss, Radau or Lobatto (Bojanic and DeVore 1966; Karlin and Studden
+# 1966).
+
 
 def jacobi(nodes, at_left, at_right):
     """The Gauss-type rule on [0, 1] with the given number of nodes that contains 0, 1, both or neither."""
@@ -82,9 +87,15 @@ def test_one_sided_polynomial_approximation_has_the_value_of_its_quadrature(name
     assert_solved(one_sided(n, f), solver, float(weights @ f(nodes)))
 
 
-@pytest.mark.parametrize(("name", "value"), [
-    ("tan", 0.6490420933), ("exp", 1.7262797759), ("1/(2-t)", 0.7), ("-even powers", -1.5765889346),
-])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("tan", 0.6490420933),
+        ("exp", 1.7262797759),
+        ("1/(2-t)", 0.7),
+        ("-even powers", -1.5765889346),
+    ],
+)
 def test_the_quadratures_reproduce_the_listed_values(name, value):
     f, sign = FUNCTIONS[name]
     nodes, weights = quadrature(3, sign)
@@ -102,14 +113,23 @@ def test_one_sided_approximation_of_an_exponential_of_any_rate(decay, solver):
 def test_watson_8_with_two_index_dimensions(solver):
     def rows(y):
         a, b = y.T
-        return -np.stack([np.ones_like(a), a, b, a**2, a * b, b**2], axis=1)[:, np.newaxis], -np.exp(a**2 + b**2)[:, np.newaxis]
+        return (
+            -np.stack([np.ones_like(a), a, b, a**2, a * b, b**2], axis=1)[:, np.newaxis],
+            -np.exp(a**2 + b**2)[:, np.newaxis],
+        )
 
-    program = sr.SemiInfiniteProgram(n=6, q=np.array([1, 1 / 2, 1 / 2, 1 / 3, 1 / 4, 1 / 3]), lower=-100.0, upper=100.0,
-                                     families=[family("above", [0.0, 0.0], [1.0, 1.0], rows)])
+    program = sr.SemiInfiniteProgram(
+        n=6,
+        q=np.array([1, 1 / 2, 1 / 2, 1 / 3, 1 / 4, 1 / 3]),
+        lower=-100.0,
+        upper=100.0,
+        families=[family("above", [0.0, 0.0], [1.0, 1.0], rows)],
+    )
     assert_solved(program, solver, 2.4356434882)
 
 
 # Best approximation in the maximum norm: both signs of the error are families of their own.
+
 
 def best_approximation(f, basis, bound=200.0):
     """Minimise the level of ``|f - sum_i c_i basis_i|`` on [-1, 1]; the decision is the coefficients and the level."""
@@ -148,10 +168,13 @@ def test_best_approximation_of_a_kink(solver):
 
 # Quadratic costs, curved sets given by their tangents, and robust linear programs.
 
+
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_a_quadratic_cost_over_a_touching_parabola(solver):
     touching = family("below", [0.0], [1.0], lambda t: (np.ones((len(t), 1, 1)), 0.5 + (t - 0.5) ** 2))
-    program = sr.SemiInfiniteProgram(n=1, P=np.array([[2.0]]), q=np.array([-2.0]), lower=-10.0, upper=10.0, families=[touching])
+    program = sr.SemiInfiniteProgram(
+        n=1, P=np.array([[2.0]]), q=np.array([-2.0]), lower=-10.0, upper=10.0, families=[touching]
+    )
     result = assert_solved(program, solver, -0.75)  # (x - 1)^2 = x^2 - 2 x + 1: the value 1/4 less the constant
     assert abs(result.decision[0] - 0.5) <= 1e-6
 
@@ -162,6 +185,7 @@ def circle(angles):
 
 def ellipse_tangents(half_axes):
     """``x`` in the ellipse with those half-axes: every tangent."""
+
     def rows(angles):
         return circle(angles)[:, np.newaxis], np.linalg.norm(circle(angles) * half_axes, axis=1, keepdims=True)
 
@@ -172,14 +196,18 @@ def ellipse_tangents(half_axes):
 @pytest.mark.parametrize("half_axes", [(1.0, 1.0), (2.0, 0.5), (0.3, 3.0)])
 @pytest.mark.parametrize("direction", [(1.0, 0.0), (-0.6, 0.8), (1.3, 2.1)])
 def test_a_linear_cost_over_an_ellipse_given_by_its_tangents(direction, half_axes, solver):
-    program = sr.SemiInfiniteProgram(n=2, q=np.array(direction), lower=-10.0, upper=10.0, families=[ellipse_tangents(np.array(half_axes))])
+    program = sr.SemiInfiniteProgram(
+        n=2, q=np.array(direction), lower=-10.0, upper=10.0, families=[ellipse_tangents(np.array(half_axes))]
+    )
     assert_solved(program, solver, -float(np.linalg.norm(np.multiply(direction, half_axes))))
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_the_projection_onto_a_disc_given_by_its_tangents(solver):
     point = np.array([1.2, -0.5])
-    program = sr.SemiInfiniteProgram(n=2, P=np.eye(2), q=-point, lower=-10.0, upper=10.0, families=[ellipse_tangents(np.ones(2))])
+    program = sr.SemiInfiniteProgram(
+        n=2, P=np.eye(2), q=-point, lower=-10.0, upper=10.0, families=[ellipse_tangents(np.ones(2))]
+    )
     result = assert_solved(program, solver, (math.hypot(*point) - 1) ** 2 / 2 - point @ point / 2)
     np.testing.assert_allclose(result.decision, point / math.hypot(*point), atol=1e-4)
 
@@ -187,22 +215,38 @@ def test_the_projection_onto_a_disc_given_by_its_tangents(solver):
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_a_linear_cost_over_a_ball_given_by_its_tangents_in_spherical_coordinates(solver):
     def tangents(a):
-        normals = np.stack([np.sin(a[:, 0]) * np.cos(a[:, 1]), np.sin(a[:, 0]) * np.sin(a[:, 1]), np.cos(a[:, 0])], axis=1)
+        normals = np.stack(
+            [np.sin(a[:, 0]) * np.cos(a[:, 1]), np.sin(a[:, 0]) * np.sin(a[:, 1]), np.cos(a[:, 0])], axis=1
+        )
         return normals[:, np.newaxis], np.ones((len(a), 1))
 
     direction = np.array([0.3, -1.1, 0.7])
-    program = sr.SemiInfiniteProgram(n=3, q=direction, lower=-10.0, upper=10.0,
-                                     families=[family("tangents", [0.0, 0.0], [np.pi, 2 * np.pi], tangents)])
+    program = sr.SemiInfiniteProgram(
+        n=3,
+        q=direction,
+        lower=-10.0,
+        upper=10.0,
+        families=[family("tangents", [0.0, 0.0], [np.pi, 2 * np.pi], tangents)],
+    )
     assert_solved(program, solver, -float(np.linalg.norm(direction)))
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-@pytest.mark.parametrize(("half_angle", "squared_radius"), [(0.7, math.sin(0.7) ** 2), (1.2, math.sin(1.2) ** 2), (2.0, 1.0), (3.1, 1.0)])
+@pytest.mark.parametrize(
+    ("half_angle", "squared_radius"), [(0.7, math.sin(0.7) ** 2), (1.2, math.sin(1.2) ** 2), (2.0, 1.0), (3.1, 1.0)]
+)
 def test_the_smallest_disc_around_an_arc(half_angle, squared_radius, solver):
-    """Minimise ``z + |c|^2``, the squared radius, with ``|p|^2 - 2 p'c <= z`` on the arc: its chord decides until it is a half circle."""
-    arc = family("covered", [-half_angle], [half_angle],
-                 lambda a: (np.hstack([-2 * circle(a), -np.ones((len(a), 1))])[:, np.newaxis], -np.ones((len(a), 1))))
-    program = sr.SemiInfiniteProgram(n=3, P=np.diag([2.0, 2.0, 0.0]), q=np.array([0.0, 0.0, 1.0]), lower=-10.0, upper=10.0, families=[arc])
+    """Minimise ``z + |c|^2``, the squared radius, with ``|p|^2 - 2 p'c <= z`` on the arc: its chord decides until it is
+    a half circle."""
+    arc = family(
+        "covered",
+        [-half_angle],
+        [half_angle],
+        lambda a: (np.hstack([-2 * circle(a), -np.ones((len(a), 1))])[:, np.newaxis], -np.ones((len(a), 1))),
+    )
+    program = sr.SemiInfiniteProgram(
+        n=3, P=np.diag([2.0, 2.0, 0.0]), q=np.array([0.0, 0.0, 1.0]), lower=-10.0, upper=10.0, families=[arc]
+    )
     assert_solved(program, solver, squared_radius)
 
 
@@ -210,7 +254,9 @@ def test_the_smallest_disc_around_an_arc(half_angle, squared_radius, solver):
 @pytest.mark.parametrize("radius", [0.1, 0.5, 0.9])
 def test_a_linear_program_with_an_uncertain_row_in_a_disc(radius, solver):
     """Maximise ``x1 + x2`` with ``(1 + r cos a) x1 + (1 + r sin a) x2 <= 1``: by symmetry ``2 / (2 + r sqrt 2)``."""
-    uncertain = family("uncertain row", [0.0], [2 * np.pi], lambda a: ((1 + radius * circle(a))[:, np.newaxis], np.ones((len(a), 1))))
+    uncertain = family(
+        "uncertain row", [0.0], [2 * np.pi], lambda a: ((1 + radius * circle(a))[:, np.newaxis], np.ones((len(a), 1)))
+    )
     program = sr.SemiInfiniteProgram(n=2, q=-np.ones(2), lower=-50.0, upper=50.0, families=[uncertain])
     assert_solved(program, solver, -2 / (2 + radius * math.sqrt(2)))
 
@@ -218,7 +264,9 @@ def test_a_linear_program_with_an_uncertain_row_in_a_disc(radius, solver):
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_an_absolute_cost_over_a_parabola_given_by_its_tangents(solver):
     """Minimise ``|x1| + |x2|`` with ``x2 >= (x1 - 2)^2``: at (3/2, 1/4)."""
-    tangents = family("above", [-3.0], [3.0], lambda s: (np.hstack([2 * s, -np.ones_like(s)])[:, np.newaxis], s**2 + 4 * s))
+    tangents = family(
+        "above", [-3.0], [3.0], lambda s: (np.hstack([2 * s, -np.ones_like(s)])[:, np.newaxis], s**2 + 4 * s)
+    )
     program = sr.SemiInfiniteProgram(n=2, weights=1.0, lower=-10.0, upper=10.0, families=[tangents])
     result = assert_solved(program, solver, 1.75)
     np.testing.assert_allclose(result.decision, [1.5, 0.25], atol=1e-3)
@@ -226,10 +274,24 @@ def test_an_absolute_cost_over_a_parabola_given_by_its_tangents(solver):
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_an_absolute_cost_of_an_image_with_an_equality(solver):
-    """Minimise ``|x1 - x2| + |x1 + x2|`` on the tangents of the disc around (2, 2) with ``x1 = x2``: ``2 (2 - 1/sqrt 2)``."""
-    disc = family("tangents", [0.0], [2 * np.pi], lambda a: (circle(a)[:, np.newaxis], 1 + 2 * circle(a).sum(axis=1, keepdims=True)))
-    program = sr.SemiInfiniteProgram(n=2, weights=1.0, S=np.array([[1.0, -1.0], [1.0, 1.0]]), lower=-20.0, upper=20.0,
-                                     A=np.array([[1.0, -1.0]]), b=np.zeros(1), families=[disc])
+    """Minimise ``|x1 - x2| + |x1 + x2|`` on the tangents of the disc around (2, 2) with ``x1 = x2``:
+    ``2 (2 - 1/sqrt 2)``."""
+    disc = family(
+        "tangents",
+        [0.0],
+        [2 * np.pi],
+        lambda a: (circle(a)[:, np.newaxis], 1 + 2 * circle(a).sum(axis=1, keepdims=True)),
+    )
+    program = sr.SemiInfiniteProgram(
+        n=2,
+        weights=1.0,
+        S=np.array([[1.0, -1.0], [1.0, 1.0]]),
+        lower=-20.0,
+        upper=20.0,
+        A=np.array([[1.0, -1.0]]),
+        b=np.zeros(1),
+        families=[disc],
+    )
     assert_solved(program, solver, 4 - math.sqrt(2))
 
 
@@ -243,6 +305,8 @@ def test_a_program_whose_families_contradict_each_other_is_infeasible(solver):
 
 
 def test_a_random_search_ends_at_the_same_value():
-    result = sr.solve(one_sided(3, np.tan), method="exchange", solver="piqp", maximiser="random_search", tolerance=1e-7, seed=0)
+    result = sr.solve(
+        one_sided(3, np.tan), method="exchange", solver="piqp", maximiser="random_search", tolerance=1e-7, seed=0
+    )
     assert abs(result.cost - 0.6490420933) <= 1e-7
     assert result.gap <= 1e-6

@@ -1,4 +1,4 @@
-"""The shipped dictionaries."""
+"""Guards plugins/sparserob_dictionaries: the shipped dictionaries."""
 
 from __future__ import annotations
 
@@ -55,17 +55,20 @@ def test_haar_functions_beyond_the_first_have_mean_zero() -> None:
     np.testing.assert_array_equal(Haar(pieces=8).build(1.0).values[1:].sum(axis=1), np.zeros(7))
 
 
-@pytest.mark.parametrize(("factory", "message"), [
-    (PiecewiseConstant(pieces=3, functions=4), "functions: expected at most 3, as many as pieces"),
-    (Haar(pieces=4, functions=5), "functions: expected at most 4"),
-    (Haar(pieces=6), "pieces: expected a power of two, such as 4 or 8, got 6"),
-    (Walsh(pieces=6), "pieces: expected a power of two"),
-    (PiecewiseConstant(breakpoints=[0, 1]), "breakpoints: expected increasing times from 0 to the horizon 2"),
-    (PiecewiseConstant(breakpoints=[0.5, 2]), "breakpoints: expected"),
-    (PiecewiseConstant(breakpoints=[0, 1, 1, 2]), "not increasing"),
-    (PiecewiseConstant(pieces=3, step=0.1), "expected one of pieces, step and breakpoints, got pieces and step"),
-    (PiecewiseConstant(step=1e-9), "step: expected at most"),
-])
+@pytest.mark.parametrize(
+    ("factory", "message"),
+    [
+        (PiecewiseConstant(pieces=3, functions=4), "functions: expected at most 3, as many as pieces"),
+        (Haar(pieces=4, functions=5), "functions: expected at most 4"),
+        (Haar(pieces=6), "pieces: expected a power of two, such as 4 or 8, got 6"),
+        (Walsh(pieces=6), "pieces: expected a power of two"),
+        (PiecewiseConstant(breakpoints=[0, 1]), "breakpoints: expected increasing times from 0 to the horizon 2"),
+        (PiecewiseConstant(breakpoints=[0.5, 2]), "breakpoints: expected"),
+        (PiecewiseConstant(breakpoints=[0, 1, 1, 2]), "not increasing"),
+        (PiecewiseConstant(pieces=3, step=0.1), "expected one of pieces, step and breakpoints, got pieces and step"),
+        (PiecewiseConstant(step=1e-9), "step: expected at most"),
+    ],
+)
 def test_options_that_do_not_fit_say_so(factory, message: str) -> None:
     with pytest.raises(sr.InputError, match=message):
         factory.build(2.0)

@@ -1,4 +1,5 @@
-"""scipy's dual annealing behind the contract: its budget, its boxes, and values that are no numbers."""
+"""Guards plugins/sparserob_dual_annealing: scipy's dual annealing behind the contract: its budget, its boxes, and
+values that are no numbers."""
 
 from __future__ import annotations
 
@@ -6,7 +7,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.sip.search import CountedObjective, Target, maximise
+from sparserob_core.sip.search.search import CountedObjective, Target, maximise
 from sparserob_dual_annealing import DualAnnealing
 
 BOX = sr.Box(np.array([-5.0, -4.0]), np.array([5.0, 6.0]))
@@ -70,6 +71,8 @@ def test_a_search_that_is_continued_starts_from_the_best_point():
     assert objective.report("").trace.points[1].tolist() == [2.9, 2.1]
 
 
-@pytest.mark.parametrize("options", [{"visit": 2.0, "accept": -50.0}, {"initial_temp": 10.0, "restart_temp_ratio": 0.5}])
+@pytest.mark.parametrize(
+    "options", [{"visit": 2.0, "accept": -50.0}, {"initial_temp": 10.0, "restart_temp_ratio": 0.5}]
+)
 def test_scipys_parameters_are_passed_on(options):
     assert search(himmelblau, **options).trace.points.tolist() != search(himmelblau).trace.points.tolist()

@@ -1,11 +1,12 @@
-"""Gradient ascent: finds the local maxima that it can reach, with and without gradients, and keeps what matters of a tuple."""
+"""Guards plugins/sparserob_gradient_ascent: gradient ascent: finds the local maxima that it can reach, with and without
+gradients, and keeps what matters of a tuple."""
 
 from __future__ import annotations
 
 import numpy as np
 
 import sparserob_core as sr
-from sparserob_core.sip.search import Target, maximise
+from sparserob_core.sip.search.search import Target, maximise
 
 BOX = sr.Box([-2.0] * 6, [3.0] * 6)
 PEAK = np.array([0.3, -1.7, 2.9, 0.0, 1.1, -0.4])
@@ -28,7 +29,13 @@ def test_a_gradient_replaces_an_evaluation_per_coordinate():
 
 
 def test_a_maximum_on_the_boundary_is_met_exactly():
-    report = sr.maximise(lambda points: points @ np.arange(1.0, 7.0), BOX, "gradient_ascent", budget=40, gradient=lambda p: np.arange(1.0, 7.0))
+    report = sr.maximise(
+        lambda points: points @ np.arange(1.0, 7.0),
+        BOX,
+        "gradient_ascent",
+        budget=40,
+        gradient=lambda p: np.arange(1.0, 7.0),
+    )
     np.testing.assert_array_equal(report.best_point, BOX.upper)
 
 
@@ -40,7 +47,10 @@ def test_restarts_leave_a_local_maximum():
         return -6 * np.sin(6 * point) - 0.2 * (point - 1.0)
 
     box = sr.Box([-3.0], [3.0])
-    values = [sr.maximise(hills, box, "gradient_ascent", budget=300, gradient=slope, seed=seed).best_value for seed in range(5)]
+    values = [
+        sr.maximise(hills, box, "gradient_ascent", budget=300, gradient=slope, seed=seed).best_value
+        for seed in range(5)
+    ]
     assert min(values) >= 1.0 - 1e-3
 
 
@@ -55,7 +65,12 @@ def test_restarts_keep_the_blocks_with_a_gradient():
         return np.where(matters, -1.5 * np.sign(point - PEAK) * np.sqrt(np.abs(point - PEAK)) + 1e-12, 0.0)
 
     registry, target = sr.load_registry(), Target(value, BOX, slope, block=2)
-    report = maximise(target, registry.build("maximiser", "gradient_ascent", {"redraw": 1.0, "steps": 20}), 200, np.random.default_rng(0))
+    report = maximise(
+        target,
+        registry.build("maximiser", "gradient_ascent", {"redraw": 1.0, "steps": 20}),
+        200,
+        np.random.default_rng(0),
+    )
     ascents = report.trace.points[40:]
     assert np.abs(ascents[:, :4] - PEAK[:4]).max() < 0.1
     assert np.ptp(ascents[:, 4:], axis=0).min() > 1.0

@@ -1,4 +1,5 @@
-"""LIPO evaluates only what can still be the best, AdaLIPO learns the constant; both stay bounded, and only what is proven is called a bound."""
+"""Guards plugins/sparserob_lipo: lIPO evaluates only what can still be the best, AdaLIPO learns the constant; both stay
+bounded, and only what is proven is called a bound."""
 
 from __future__ import annotations
 
@@ -47,8 +48,10 @@ def test_lipo_evaluates_no_point_that_is_excluded_by_an_earlier_one():
 def test_adalipo_evaluates_excluded_points_only_when_it_explores():
     report = sr.maximise(TWO, UNIT, "adalipo", budget=300, growth=0.01)
     constants = report.trace.notes["constant"][1:, 1]
-    shares = [excluded(sr.Trace(report.trace.points[: t + 2], report.trace.values[: t + 2], report.trace.best, {}), k)[-1]
-              for t, k in enumerate(constants)]
+    shares = [
+        excluded(sr.Trace(report.trace.points[: t + 2], report.trace.values[: t + 2], report.trace.best, {}), k)[-1]
+        for t, k in enumerate(constants)
+    ]
     assert 0.02 < np.mean(shares) < 0.2
 
 
@@ -90,7 +93,12 @@ def test_without_a_constant_lipo_is_pure_random_search_and_proves_nothing():
 
 
 @settings(max_examples=40, deadline=None)
-@given(seed=st.integers(0, 10_000), budget=st.sampled_from([1, 2, 5, 30, 120]), slack=st.sampled_from([1.0, 1.5]), d=st.integers(1, 4))
+@given(
+    seed=st.integers(0, 10_000),
+    budget=st.sampled_from([1, 2, 5, 30, 120]),
+    slack=st.sampled_from([1.0, 1.5]),
+    d=st.integers(1, 4),
+)
 def test_the_bound_of_lipo_is_never_below_the_maximum(seed, budget, slack, d):
     rng = np.random.default_rng(seed)
     sides = 10.0 ** rng.integers(-3, 4, d)
@@ -98,7 +106,9 @@ def test_the_bound_of_lipo_is_never_below_the_maximum(seed, budget, slack, d):
     centres, heights = lower + rng.random((4, d)) * sides, rng.normal(size=4)
     steepness = float(10.0 ** rng.integers(-2, 3))
     function = cones(centres, heights, steepness)
-    report = sr.maximise(function, sr.Box(lower, lower + sides), "lipo", budget=budget, seed=seed, constant=slack * steepness)
+    report = sr.maximise(
+        function, sr.Box(lower, lower + sides), "lipo", budget=budget, seed=seed, constant=slack * steepness
+    )
     assert np.isfinite(report.upper_bound)
     assert report.upper_bound >= function(centres).max()
 
@@ -130,10 +140,16 @@ def test_adalipo_does_not_depend_on_the_units_of_the_coordinates():
 
 
 @pytest.mark.parametrize("maximiser", [AdaLipo(), Lipo(constant=1e-12), Lipo(constant=1e12)])
-@pytest.mark.parametrize("function", [
-    lambda x: np.zeros(len(x)), lambda x: np.sign(x[:, 0] - 0.37), lambda x: -1e300 * (x[:, 0] - 0.4) ** 2,
-    lambda x: 1.7e308 * np.cos(40 * x[:, 0]), lambda x: np.where(x[:, 0] < 0.9, -np.inf, x[:, 0]),
-])
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda x: np.zeros(len(x)),
+        lambda x: np.sign(x[:, 0] - 0.37),
+        lambda x: -1e300 * (x[:, 0] - 0.4) ** 2,
+        lambda x: 1.7e308 * np.cos(40 * x[:, 0]),
+        lambda x: np.where(x[:, 0] < 0.9, -np.inf, x[:, 0]),
+    ],
+)
 def test_no_function_hangs_or_breaks_the_search(maximiser, function):
     started = time.process_time()
     report = sr.maximise(function, sr.Box([0.0, 5.0, 0.0], [1.0, 5.0, 1e-3]), maximiser, budget=100)

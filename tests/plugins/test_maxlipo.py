@@ -1,4 +1,5 @@
-"""The bound of maxlipo passes above everything that was evaluated, its highest candidate is the highest, and its steps find the hill."""
+"""Guards plugins/sparserob_maxlipo: the bound of maxlipo passes above everything that was evaluated, its highest
+candidate is the highest, and its steps find the hill."""
 
 from __future__ import annotations
 
@@ -61,7 +62,9 @@ def test_clusters_and_jumps_are_passed_above_as_well(seed, dimension, count, pow
     values[rng.random(count) < 0.1] = -np.inf
     values[0] = 0.0
     finite = np.isfinite(values)
-    assert (bound(told(points, values), points[finite]) >= values[finite] - 3 * NEGLIGIBLE * np.ptp(values[finite])).all()
+    assert (
+        bound(told(points, values), points[finite]) >= values[finite] - 3 * NEGLIGIBLE * np.ptp(values[finite])
+    ).all()
 
 
 def test_the_slopes_are_no_larger_than_those_of_the_function():

@@ -1,4 +1,4 @@
-"""Minimum attention: the augmented problem."""
+"""Guards plugins/sparserob_minimum_attention: minimum attention: the augmented problem."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from sparserob_minimum_attention import MinimumAttention
 
 CONFIG = {
     "system": {"A": [[0, 1], ["-2 + p1", -0.5]], "B": [[0, 1], ["1 + p1", 0]], "parameters": {"p1": [-0.1, 0.1]}},
-    "horizon": 5.0, "initial_state": [-1, 1], "rate": {"box": 2.0}, "disturbance": {"box": 0.05},
+    "horizon": 5.0,
+    "initial_state": [-1, 1],
+    "rate": {"box": 2.0},
+    "disturbance": {"box": 0.05},
 }
 
 
@@ -33,8 +36,11 @@ def test_the_control_starts_where_it_is_told_and_ends_at_zero() -> None:
 
 
 def test_sets_of_the_state_leave_the_control_free_and_its_own_bounds_are_a_path_constraint() -> None:
-    made = build(control={"box": [1.0, 2.0]}, path=[{"box": [0.7, None], "from": 1.0}],
-                 terminal=[{"box": 0.3}, {"equals": [0, None]}, {"ellipsoid": {"shape": 1.0}}])
+    made = build(
+        control={"box": [1.0, 2.0]},
+        path=[{"box": [0.7, None], "from": 1.0}],
+        terminal=[{"box": 0.3}, {"equals": [0, None]}, {"ellipsoid": {"shape": 1.0}}],
+    )
     state, control = made.path
     assert (state.start, state.stop, control.start, control.stop) == (1.0, 5.0, 0.0, 5.0)
     assert state.set.contains(np.array([0.7, 9, 9, 9])) and not state.set.contains(np.array([0.8, 0, 0, 0]))
@@ -51,12 +57,15 @@ def test_the_rate_is_the_control_of_the_augmented_problem() -> None:
     np.testing.assert_array_equal(made.weights, [1, 2])
 
 
-@pytest.mark.parametrize(("changes", "message"), [
-    ({"initial_control": [0, 0, 0]}, "initial_control: expected 2 numbers, one per control, got 3"),
-    ({"rate": {"box": [1, 2, 3]}}, r"rate\.box: half-widths: expected 2 numbers, got 3"),
-    ({"control": {"ellipsoid": {"shape": 1}}}, "control: expected a set with flat sides"),
-    ({"rate": {}}, "expected a set"),
-])
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"initial_control": [0, 0, 0]}, "initial_control: expected 2 numbers, one per control, got 3"),
+        ({"rate": {"box": [1, 2, 3]}}, r"rate\.box: half-widths: expected 2 numbers, got 3"),
+        ({"control": {"ellipsoid": {"shape": 1}}}, "control: expected a set with flat sides"),
+        ({"rate": {}}, "expected a set"),
+    ],
+)
 def test_options_that_do_not_fit_say_so(changes, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         build(**changes)

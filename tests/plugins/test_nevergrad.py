@@ -1,4 +1,5 @@
-"""nevergrad's optimisers behind the contract: names, budget, random numbers, and what happens when one of them raises."""
+"""Guards plugins/sparserob_nevergrad: nevergrad's optimisers behind the contract: names, budget, random numbers, and
+what happens when one of them raises."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.sip.search import CountedObjective, Target, maximise
+from sparserob_core.sip.search.search import CountedObjective, Target, maximise
 from sparserob_nevergrad import Nevergrad
 
 pytest.importorskip("nevergrad")
@@ -89,7 +90,10 @@ def test_an_optimiser_by_name_climbs_and_spends_the_budget_exactly(name):
 
 
 def test_a_misspelt_name_names_the_nearest_one():
-    with pytest.raises(sr.InputError, match="nevergrad: optimiser: there is no optimiser 'OnePlusTwo'; the nearest name is 'OnePlusOne'"):
+    with pytest.raises(
+        sr.InputError,
+        match="nevergrad: optimiser: there is no optimiser 'OnePlusTwo'; the nearest name is 'OnePlusOne'",
+    ):
         search(optimiser="OnePlusTwo")
     with pytest.raises(sr.InputError, match=r"nevergrad: fallback: .* the nearest name is 'NGOpt'"):
         search(fallback="NGOpt!")
@@ -97,13 +101,18 @@ def test_a_misspelt_name_names_the_nearest_one():
 
 def test_a_missing_package_is_one_sentence_that_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "nevergrad.optimization", None)
-    with pytest.raises(sr.PluginError, match=r"nevergrad: the package is not installed; `pip install 'sparserob\[nevergrad\]'` brings it"):
+    with pytest.raises(
+        sr.PluginError,
+        match=r"nevergrad: the package is not installed; `pip install 'sparserob\[nevergrad\]'` brings it",
+    ):
         search()
 
 
 def test_listing_the_plugins_does_not_import_the_package():
-    code = ("import sys, sparserob_core as sr; registry = sr.load_registry(); assert 'nevergrad' in registry.names('maximiser'); "
-            "registry.build('maximiser', 'nevergrad'); assert 'nevergrad' not in sys.modules")
+    code = (
+        "import sys, sparserob_core as sr; registry = sr.load_registry(); assert 'nevergrad' in"
+        " registry.names('maximiser'); registry.build('maximiser', 'nevergrad'); assert 'nevergrad' not in sys.modules"
+    )
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
@@ -122,8 +131,13 @@ def test_an_optimiser_that_raises_is_explained_and_the_fallback_is_told_all_that
     heard = []
     registry("Crashing", Crashing)
     registry("Recording", recording(heard, refuses=False))
-    with pytest.warns(UserWarning, match=f"nevergrad's Crashing failed after 7 evaluations .TypeError: {NUMPY_TYPE_ERROR}.; "
-                                         "the search goes on with Recording") as caught:
+    with pytest.warns(
+        UserWarning,
+        match=(
+            f"nevergrad's Crashing failed after 7 evaluations .TypeError: {NUMPY_TYPE_ERROR}.; "
+            "the search goes on with Recording"
+        ),
+    ) as caught:
         report = search(optimiser="Crashing", fallback="Recording")
     assert len(caught) == 1
     assert report.evaluations == 60
@@ -160,7 +174,10 @@ def test_an_optimiser_that_raises_before_anything_is_found_is_an_error_of_the_pl
         last = 1
 
     registry("Stillborn", Stillborn)
-    with pytest.warns(UserWarning, match="failed after 0"), pytest.raises(sr.PluginError, match="Stillborn failed after 0 evaluations"):
+    with (
+        pytest.warns(UserWarning, match="failed after 0"),
+        pytest.raises(sr.PluginError, match="Stillborn failed after 0 evaluations"),
+    ):
         search(optimiser="Stillborn", fallback=None)
 
 

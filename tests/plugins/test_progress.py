@@ -1,4 +1,5 @@
-"""The progress observer: silent for short and quiet runs, plain without a terminal, and gone afterwards."""
+"""Guards plugins/sparserob_progress: the progress observer: silent for short and quiet runs, plain without a terminal,
+and gone afterwards."""
 
 from __future__ import annotations
 
@@ -17,7 +18,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.testing_observers import CONFIG, METHODS
+from sparserob_core.testing.observers import CONFIG, METHODS
 
 CODES = re.compile(r"\x1b\[[0-9;?]*[a-zA-Z]|\r")
 
@@ -42,15 +43,23 @@ def started(quiet: bool = False) -> sr.RunStarted:
 
 
 def finished_round(number: int, **fields: object) -> sr.RoundFinished:
-    return sr.RoundFinished(round=number, epsilon=0.5, lower_bound=0.25, upper_bound=np.inf, violation=1e-3, worst_family="path",
-                            **fields)  # type: ignore[arg-type]
+    return sr.RoundFinished(
+        round=number, epsilon=0.5, lower_bound=0.25, upper_bound=np.inf, violation=1e-3, worst_family="path", **fields
+    )  # type: ignore[arg-type]
 
 
 ROUND = finished_round(2, cost=0.75, active_indices=7, relaxed_programs=30, seconds=2.0)
 PROOF = sr.ProofProgress(family="path", cells=12, bound=1e-4, examined=100, budget=1000, seconds=0.5)
 SEARCH = sr.EvaluationsFinished(
-    count=4, total=20, best_value=-0.5, seconds=2.0, budget=50, round=3, lower_bound=0.5,
-    batch=sr.Batch(notes={"accepted": [(17, 1.0), (18, 0.0), (19, 0.0), (20, 0.0)], "temperature": [(20, 0.125)]}))
+    count=4,
+    total=20,
+    best_value=-0.5,
+    seconds=2.0,
+    budget=50,
+    round=3,
+    lower_bound=0.5,
+    batch=sr.Batch(notes={"accepted": [(17, 1.0), (18, 0.0), (19, 0.0), (20, 0.0)], "temperature": [(20, 0.125)]}),
+)
 ENDING = sr.RunFinished(status="certified", message="done", seconds=1.0)
 
 
@@ -77,9 +86,14 @@ def watch(stream: io.StringIO, monkeypatch: pytest.MonkeyPatch, events: list[sr.
 
 
 def test_a_verbose_run_has_one_plain_line_for_every_event(monkeypatch: pytest.MonkeyPatch) -> None:
-    lines = watch(io.StringIO(), monkeypatch, [started(), ROUND, PROOF, SEARCH, sr.Event(), ENDING], verbose=True).splitlines()
+    lines = watch(
+        io.StringIO(), monkeypatch, [started(), ROUND, PROOF, SEARCH, sr.Event(), ENDING], verbose=True
+    ).splitlines()
     assert [line.partition("s  ")[2] for line in lines] == [
-        "round 2  J 0.75  violation 1.0e-03 in path  eps 5.0e-01  lower 0.25  upper unknown  7 cuts  30 relaxed programs at 15/s",
+        (
+            "round 2  J 0.75  violation 1.0e-03 in path  eps 5.0e-01  lower 0.25  upper unknown  7 cuts  30 relaxed"
+            " programs at 15/s"
+        ),
         "proof of path  cells open 12  100 examined at 200/s  violation not excluded 1.0e-04",
         "search 3  best g -0.5  20 of 50 evaluations  10/s  3.0 s left  accepted 25%  temperature 0.125",
     ]
@@ -115,7 +129,16 @@ def test_plain_lines_say_everything_that_is_known(monkeypatch: pytest.MonkeyPatc
     watching.receive(ENDING)
     lines = stream.getvalue().splitlines()
     both = next(line for line in lines if "best g" in line)
-    for said in ("lower 0.5", "upper unknown", "round 2", "J 0.75", "best g -0.5", "20 of 50 evaluations", "10/s", "3.0 s left"):
+    for said in (
+        "lower 0.5",
+        "upper unknown",
+        "round 2",
+        "J 0.75",
+        "best g -0.5",
+        "20 of 50 evaluations",
+        "10/s",
+        "3.0 s left",
+    ):
         assert said in both
     assert "\x1b" not in stream.getvalue()
 
@@ -158,7 +181,9 @@ def test_events_before_a_start_and_after_the_end_are_ignored(monkeypatch: pytest
     assert watch(io.StringIO(), monkeypatch, [ROUND, ENDING, SEARCH], verbose=True) == ""
 
 
-@pytest.mark.parametrize(("seconds", "said"), [(0.04, "0.0 s"), (12.34, "12.3 s"), (245.2, "4 min 05 s"), (7384.0, "2 h 03 min")])
+@pytest.mark.parametrize(
+    ("seconds", "said"), [(0.04, "0.0 s"), (12.34, "12.3 s"), (245.2, "4 min 05 s"), (7384.0, "2 h 03 min")]
+)
 def test_a_duration_is_written_in_few_figures(seconds: float, said: str) -> None:
     from sparserob_progress.status import duration
 
@@ -167,9 +192,19 @@ def test_a_duration_is_written_in_few_figures(seconds: float, said: str) -> None
 
 def command(tmp_path: Path, terminal: int | None, *arguments: str) -> subprocess.CompletedProcess[str]:
     """``sparserob run`` of a small search, with its standard error stream on a terminal if one is given."""
-    (tmp_path / "small.yaml").write_text(json.dumps({**CONFIG, **METHODS["sparserob"], "observers": [{"name": "progress", "patience": 0.0}]}))
-    return subprocess.run([sys.executable, "-m", "sparserob_core", "run", "small.yaml", "--no-figures", *arguments], cwd=tmp_path, text=True,
-                          stdout=subprocess.PIPE, stderr=terminal or subprocess.PIPE, timeout=120, check=False, env={**os.environ, "TERM": "xterm"})
+    (tmp_path / "small.yaml").write_text(
+        json.dumps({**CONFIG, **METHODS["sparserob"], "observers": [{"name": "progress", "patience": 0.0}]})
+    )
+    return subprocess.run(
+        [sys.executable, "-m", "sparserob_core", "run", "small.yaml", "--no-figures", *arguments],
+        cwd=tmp_path,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=terminal or subprocess.PIPE,
+        timeout=120,
+        check=False,
+        env={**os.environ, "TERM": "xterm"},
+    )
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a pseudo-terminal")

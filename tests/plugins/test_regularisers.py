@@ -1,4 +1,4 @@
-"""The shipped regularisers are what their formulas say, and strictly convex."""
+"""Guards plugins/sparserob_regularisers: the shipped regularisers are what their formulas say, and strictly convex."""
 
 from __future__ import annotations
 
@@ -16,8 +16,11 @@ def image(dictionary: sr.Dictionary, channels: int) -> sr.ControlImage:
     return sr.ControlImage(S, channels, np.tile(dictionary.lengths, channels))
 
 
-IMAGES = [image(PiecewiseConstant(breakpoints=[0, 0.2, 1, 1.5]).build(1.5), 2), image(Haar(pieces=8, functions=5).build(2.0), 2),
-          image(PiecewiseConstant(pieces=1).build(1.0), 1)]
+IMAGES = [
+    image(PiecewiseConstant(breakpoints=[0, 0.2, 1, 1.5]).build(1.5), 2),
+    image(Haar(pieces=8, functions=5).build(2.0), 2),
+    image(PiecewiseConstant(pieces=1).build(1.0), 1),
+]
 
 
 @pytest.mark.parametrize("regulariser", [Ridge(), WeightedRidge(), WeightedRidge(weights=2.0), Smoothness()])

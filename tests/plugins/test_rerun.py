@@ -1,4 +1,5 @@
-"""The recording of a run, read back; and what is missing on a machine never hurts the run."""
+"""Guards plugins/sparserob_rerun: the recording of a run, read back; and what is missing on a machine never hurts the
+run."""
 
 from __future__ import annotations
 
@@ -15,13 +16,18 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.experiment.cli import main
+from sparserob_core.experiment.cli.main import main
 
 pytest.importorskip("rerun", reason="a recording needs the extra rerun")
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-SEARCH = {"dictionaries.control.pieces": 20, "dictionaries.disturbance.pieces": 20, "maximiser.budget": 60, "method.indices": 4,
-          "continuation": {"start": 0.1, "stop": 0.001}}
+SEARCH = {
+    "dictionaries.control.pieces": 20,
+    "dictionaries.disturbance.pieces": 20,
+    "maximiser.budget": 60,
+    "method.indices": 4,
+    "continuation": {"start": 0.1, "stop": 0.001},
+}
 QUICK = {"dictionaries.control.pieces": 50, "dictionaries.disturbance.pieces": 50}
 SMALL = {"name": "rerun", "landscape": {"grid": 8, "evaluations": 200}}
 
@@ -33,7 +39,9 @@ def viewer() -> Path:
 
 
 def recorded(directory: Path, config: str, changes: dict[str, object], **options: object) -> sr.Outcome:
-    return sr.run(CONFIGS / config, {**changes, "observers": [{**SMALL, **options}]}, directory, quiet=True, figures=False)
+    return sr.run(
+        CONFIGS / config, {**changes, "observers": [{**SMALL, **options}]}, directory, quiet=True, figures=False
+    )
 
 
 @pytest.fixture(scope="module")
@@ -104,9 +112,28 @@ def test_rounds_have_the_bounds_of_the_history_on_all_three_timelines(exchanged:
 def test_nothing_that_a_run_has_to_show_is_missing(kind: str, request: pytest.FixtureRequest) -> None:
     outcome = request.getfixturevalue(kind)
     found = read(outcome.directory / "recording.rrd")
-    common = {"/physics/plots/curve", "/physics/plots/tube", "/physics/plots/wall", "/physics/phase/curve", "/landscape/map/g",
-              "/landscape/surface/g", "/rounds/log10", "/violation/plots/curve", "/log", "/verdict", "/signals/control", "/signals/x1"}
-    search = {"/search/g", "/search/notes/temperature", "/search/notes/accepted", "/search/moves/t", "/landscape/map/now", "/landscape/map/visited"}
+    common = {
+        "/physics/plots/curve",
+        "/physics/plots/tube",
+        "/physics/plots/wall",
+        "/physics/phase/curve",
+        "/landscape/map/g",
+        "/landscape/surface/g",
+        "/rounds/log10",
+        "/violation/plots/curve",
+        "/log",
+        "/verdict",
+        "/signals/control",
+        "/signals/x1",
+    }
+    search = {
+        "/search/g",
+        "/search/notes/temperature",
+        "/search/notes/accepted",
+        "/search/moves/t",
+        "/landscape/map/now",
+        "/landscape/map/visited",
+    }
     assert common | (search if kind == "searched" else set()) <= set(found)
     rows = sum(chunk.num_rows for chunk in found["/physics/plots/curve"])
     assert rows == len(outcome.result.history) + 1
@@ -143,7 +170,7 @@ def test_the_control_acts_just_where_the_push_of_the_active_constraints_leaves_t
 
 
 def test_the_landscape_is_g_and_decided_by_its_anchor_alone() -> None:
-    from sparserob_core.experiment.load import load_config
+    from sparserob_core.experiment.config.load import load_config
     from sparserob_rerun.landscape import Landscape
 
     loaded = load_config(CONFIGS / "experiment1_reduced.yaml", SEARCH)
@@ -164,10 +191,12 @@ def test_the_landscape_is_g_and_decided_by_its_anchor_alone() -> None:
 
 
 def test_coordinates_of_the_landscape_are_named_or_refused_with_what_there_is() -> None:
-    from sparserob_core.experiment.load import load_config
+    from sparserob_core.experiment.config.load import load_config
     from sparserob_rerun.landscape import coordinate, influential
 
-    g = sr.Inspection(load_config(CONFIGS / "experiment2_reduced.yaml", {"dictionaries.control.pieces": 20})).relaxed_value(3, 0.1)
+    g = sr.Inspection(
+        load_config(CONFIGS / "experiment2_reduced.yaml", {"dictionaries.control.pieces": 20})
+    ).relaxed_value(3, 0.1)
     assert g.names == ("t", "p1", "p2", "p3")
     assert coordinate("p2", g, 3) == (0, 2)
     assert coordinate("t[3]", g, 3) == (2, 0)
@@ -185,13 +214,21 @@ def test_watching_changes_nothing(searched: sr.Outcome, tmp_path: Path) -> None:
     assert plain.result.cost == searched.result.cost
 
 
-@pytest.mark.parametrize(("options", "said"), [
-    ({"connect": "127.0.0.1:1", "save": None}, "no viewer answers at 127.0.0.1:1"),
-    ({"spawn": True}, "there is no display"),
-    ({"save": "/proc/nowhere/x.rrd"}, "/proc/nowhere/x.rrd: cannot be written to"),
-])
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"connect": "127.0.0.1:1", "save": None}, "no viewer answers at 127.0.0.1:1"),
+        ({"spawn": True}, "there is no display"),
+        ({"save": "/proc/nowhere/x.rrd"}, "/proc/nowhere/x.rrd: cannot be written to"),
+    ],
+)
 def test_what_is_missing_is_one_warning_and_the_run_goes_on(
-        options: dict[str, object], said: str, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    options: dict[str, object],
+    said: str,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     outcome = recorded(tmp_path / "run", "experiment1_repaired.yaml", QUICK, **options)
@@ -200,12 +237,15 @@ def test_what_is_missing_is_one_warning_and_the_run_goes_on(
 
 
 def test_a_missing_package_is_one_warning_with_the_way_to_install_it(
-        tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import sparserob_rerun.sinks
 
     monkeypatch.setattr(sparserob_rerun.sinks, "find_spec", lambda name: None)
     assert recorded(tmp_path / "run", "experiment1_repaired.yaml", QUICK).status == "certified"
-    assert [record.getMessage() for record in caplog.records] == ["rerun: rerun-sdk is not installed; `pip install 'sparserob[rerun]'` brings it"]
+    assert [record.getMessage() for record in caplog.records] == [
+        "rerun: rerun-sdk is not installed; `pip install 'sparserob[rerun]'` brings it"
+    ]
     assert not (tmp_path / "run" / "recording.rrd").exists()
 
 
@@ -222,7 +262,7 @@ def test_an_address_that_is_none_is_refused_before_the_run(wrong: str, tmp_path:
 
 
 def test_a_run_that_breaks_off_leaves_a_complete_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from sparserob_core.experiment.journal import Journal
+    from sparserob_core.experiment.run.journal import Journal
 
     def broken(*anything: object) -> None:
         raise RuntimeError("the disk is gone")
@@ -240,7 +280,9 @@ def test_a_full_queue_drops_at_once_and_says_so(tmp_path: Path) -> None:
     from sparserob_rerun.recorder import Opening
     from sparserob_rerun.sinks import Destinations
 
-    outlet = Outlet(Opening("many", None, None, None), Destinations(tmp_path / "x.rrd", None, False, None), 0, capacity=2)
+    outlet = Outlet(
+        Opening("many", None, None, None), Destinations(tmp_path / "x.rrd", None, False, None), 0, capacity=2
+    )
     event = sr.ProofProgress(family="path", cells=1, bound=0.0)
     started = time.perf_counter()
     for _ in range(1000):
@@ -288,7 +330,9 @@ def test_watch_records_a_run_and_replay_shows_it_again(tmp_path: Path, capsys: p
     assert command("replay", run, "--save", str(tmp_path / "again.rrd")) == 0
     assert "recorded into" in capsys.readouterr().out
     live, again = read(tmp_path / "live.rrd"), read(tmp_path / "again.rrd")
-    assert (scalars(live["/rounds/bounds"], "round")[1][:, 0] == scalars(again["/rounds/bounds"], "round")[1][:, 0]).all()
+    assert (
+        scalars(live["/rounds/bounds"], "round")[1][:, 0] == scalars(again["/rounds/bounds"], "round")[1][:, 0]
+    ).all()
     assert (scalars(live["/signals/control"], "t")[1] == scalars(again["/signals/control"], "t")[1]).all()
     assert "/landscape/map/g" in again
 
@@ -301,16 +345,19 @@ def test_an_outcome_can_be_shown_with_all_that_it_knows(searched: sr.Outcome, tm
     assert sum(chunk.num_rows for chunk in found["/physics/plots/curve"]) == len(searched.result.history) + 1
 
 
-def test_replay_and_watch_refuse_what_they_cannot_do(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_replay_and_watch_refuse_what_they_cannot_do(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     config = str(CONFIGS / "experiment1_repaired.yaml")
     for arguments, said in (
-            (["replay", str(tmp_path / "none")], "expected the directory of a run, got nothing"),
-            (["replay", str(tmp_path)], "got one without config.yaml"),
-            (["watch", config, "--save", str(tmp_path)], "save: expected a file, got the directory"),
-            (["watch", config, "--save", "/proc/x/y.rrd"], "cannot be written to"),
-            (["watch", config], "--save FILE records for later")):
+        (["replay", str(tmp_path / "none")], "expected the directory of a run, got nothing"),
+        (["replay", str(tmp_path)], "got one without config.yaml"),
+        (["watch", config, "--save", str(tmp_path)], "save: expected a file, got the directory"),
+        (["watch", config, "--save", "/proc/x/y.rrd"], "cannot be written to"),
+        (["watch", config], "--save FILE records for later"),
+    ):
         assert command(*arguments) == 2
         assert said in capsys.readouterr().err
 
@@ -323,7 +370,16 @@ def free_port() -> int:
 
 def headless(port: int) -> subprocess.Popen[bytes]:
     """A viewer without a screen; skips, loudly, where the machine cannot draw."""
-    command_line = [str(viewer()), "--headless", "--window-size", "1600x1000", "--port", str(port), "--bind", "127.0.0.1"]
+    command_line = [
+        str(viewer()),
+        "--headless",
+        "--window-size",
+        "1600x1000",
+        "--port",
+        str(port),
+        "--bind",
+        "127.0.0.1",
+    ]
     process = subprocess.Popen(command_line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     end = time.monotonic() + 20.0
     while time.monotonic() < end and process.poll() is None:
@@ -333,7 +389,10 @@ def headless(port: int) -> subprocess.Popen[bytes]:
         time.sleep(0.2)
     process.kill()
     process.wait()
-    pytest.skip("SKIPPED LOUDLY: the viewer of Rerun cannot draw here; `apt-get install mesa-vulkan-drivers` lets it draw without a graphics card")
+    pytest.skip(
+        "SKIPPED LOUDLY: the viewer of Rerun cannot draw here; `apt-get install mesa-vulkan-drivers` lets it draw"
+        " without a graphics card"
+    )
 
 
 @pytest.mark.slow
@@ -349,8 +408,21 @@ def test_a_viewer_that_is_killed_in_mid_run_changes_nothing(tmp_path: Path, capl
                     process.kill()
 
         options = {**changes, "observers": [{**SMALL, "connect": f"127.0.0.1:{port}", "save": "recording.rrd"}]}
-        outcome = sr.run(CONFIGS / "experiment1_reduced.yaml", options, tmp_path / "run", quiet=True, figures=False, observers=[Killer()])
-        plain = sr.run(CONFIGS / "experiment1_reduced.yaml", {**changes, "observers": []}, tmp_path / "plain", quiet=True, figures=False)
+        outcome = sr.run(
+            CONFIGS / "experiment1_reduced.yaml",
+            options,
+            tmp_path / "run",
+            quiet=True,
+            figures=False,
+            observers=[Killer()],
+        )
+        plain = sr.run(
+            CONFIGS / "experiment1_reduced.yaml",
+            {**changes, "observers": []},
+            tmp_path / "plain",
+            quiet=True,
+            figures=False,
+        )
         assert outcome.result.cost == plain.result.cost
         assert len([record for record in caplog.records if record.levelno >= logging.WARNING]) <= 1
         subprocess.run([viewer(), "rrd", "verify", tmp_path / "run" / "recording.rrd"], check=True, capture_output=True)
@@ -360,9 +432,13 @@ def test_a_viewer_that_is_killed_in_mid_run_changes_nothing(tmp_path: Path, capl
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # the client of the viewer does not wait for its process
+@pytest.mark.filterwarnings(
+    "ignore::pytest.PytestUnraisableExceptionWarning"
+)  # the client of the viewer does not wait for its process
 @pytest.mark.parametrize("kind", ["searched", "exchanged"])
-def test_the_viewer_draws_every_panel_without_complaint(kind: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+def test_the_viewer_draws_every_panel_without_complaint(
+    kind: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
     from rerun.experimental import ViewerClient
 
     outcome = request.getfixturevalue(kind)
@@ -371,7 +447,9 @@ def test_the_viewer_draws_every_panel_without_complaint(kind: str, request: pyte
     probe.wait()
     file = tmp_path / "shown.rrd"
     shutil.copy(outcome.directory / "recording.rrd", file)
-    with ViewerClient.spawn(headless=True, port=free_port(), hide_welcome_screen=True, executable_path=str(viewer())) as shown:
+    with ViewerClient.spawn(
+        headless=True, port=free_port(), hide_welcome_screen=True, executable_path=str(viewer())
+    ) as shown:
         shown.open(str(file))
         time.sleep(8.0)
         picture = tmp_path / "screen.png"

@@ -1,4 +1,5 @@
-"""SequOOL opens the cells that it promises to open, wherever the box lies, with any budget and in any dimension."""
+"""Guards plugins/sparserob_sequool: sequOOL opens the cells that it promises to open, wherever the box lies, with any
+budget and in any dimension."""
 
 from __future__ import annotations
 
@@ -91,7 +92,9 @@ def test_the_generator_is_not_used():
 
 def test_scaling_and_shifting_box_and_value_changes_nothing():
     lower, sides = np.array([-1e6, 1e-7]), np.array([4e6, 2e-7])
-    scaled = sr.maximise(lambda x: 1e9 * bumps((x - lower) / sides) - 1e7, sr.Box(lower, lower + sides), "sequool", budget=200)
+    scaled = sr.maximise(
+        lambda x: 1e9 * bumps((x - lower) / sides) - 1e7, sr.Box(lower, lower + sides), "sequool", budget=200
+    )
     plain = sr.maximise(bumps, sr.Box([0.0, 0.0], [1.0, 1.0]), "sequool", budget=200)
     np.testing.assert_allclose((scaled.trace.points - lower) / sides, plain.trace.points, atol=1e-8)
 
@@ -102,7 +105,9 @@ def test_equal_values_are_opened_left_first():
 
 
 def test_values_that_are_not_defined_are_opened_last():
-    report = sr.maximise(lambda x: np.where(x[:, 0] > 1.0, -np.inf, x[:, 0]), sr.Box([0.0], [3.0]), "sequool", budget=300)
+    report = sr.maximise(
+        lambda x: np.where(x[:, 0] > 1.0, -np.inf, x[:, 0]), sr.Box([0.0], [3.0]), "sequool", budget=300
+    )
     assert 1 - 1e-6 < report.best_value <= 1.0
 
 
@@ -121,7 +126,9 @@ def test_each_depth_is_one_batch():
 def test_memory_is_that_of_a_batch_in_a_hundred_thousand_dimensions():
     d = 100_000
     tracemalloc.start()
-    report = sr.maximise(lambda points: -np.abs(points[:, :50] - 0.3).sum(axis=1), sr.Box(np.zeros(d), np.ones(d)), "sequool", budget=500)
+    report = sr.maximise(
+        lambda points: -np.abs(points[:, :50] - 0.3).sum(axis=1), sr.Box(np.zeros(d), np.ones(d)), "sequool", budget=500
+    )
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert report.evaluations > 480

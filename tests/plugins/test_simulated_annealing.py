@@ -1,4 +1,5 @@
-"""Simulated annealing: what its candidates are, how it cools and restarts, and that it finds the basin of a function with many."""
+"""Guards plugins/sparserob_simulated_annealing: simulated annealing: what its candidates are, how it cools and
+restarts, and that it finds the basin of a function with many."""
 
 from __future__ import annotations
 
@@ -7,7 +8,7 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.sip.rules import Improvement, Selection
-from sparserob_core.sip.search import CountedObjective, Rules, Target, maximise
+from sparserob_core.sip.search.search import CountedObjective, Rules, Target, maximise
 from sparserob_simulated_annealing import SimulatedAnnealing
 
 SQUARE = sr.Box(np.array([-1.0, 3.0]), np.array([1.0, 13.0]))
@@ -35,7 +36,9 @@ def ever_lower():
 
 
 def search(function, domain=SQUARE, budget=1000, seed=0, rules=None, block=1, **options):
-    return maximise(Target(function, domain, block=block), SimulatedAnnealing(**options), budget, np.random.default_rng(seed), rules)
+    return maximise(
+        Target(function, domain, block=block), SimulatedAnnealing(**options), budget, np.random.default_rng(seed), rules
+    )
 
 
 def unit_box(dimension):
@@ -44,12 +47,25 @@ def unit_box(dimension):
 
 def changes(budget, block, dimension, **options):
     """Which coordinates each candidate changes, of a walk that never leaves its first point."""
-    points = search(ever_lower(), unit_box(dimension), budget, rules=Rules(selection=Improvement()), block=block, **STILL, **options).trace.points
+    points = search(
+        ever_lower(), unit_box(dimension), budget, rules=Rules(selection=Improvement()), block=block, **STILL, **options
+    ).trace.points
     return points[1:] != points[0]
 
 
 def test_a_uniform_share_of_the_candidates_visits_every_region_at_its_rate():
-    report = search(corner, budget=8000, exploration=0.3, one=1.0, few=0.0, full=0.0, coarse=0.0, initial_scale=1e-3, adapt="none", restarts=0)
+    report = search(
+        corner,
+        budget=8000,
+        exploration=0.3,
+        one=1.0,
+        few=0.0,
+        full=0.0,
+        coarse=0.0,
+        initial_scale=1e-3,
+        adapt="none",
+        restarts=0,
+    )
     uniform = report.trace.points[10:][report.trace.notes["scale"][:, 1] == 1.0]
     assert abs(len(uniform) - 0.3 * 7990) < LIMIT * np.sqrt(0.3 * 0.7 * 7990)
     unit = (uniform - SQUARE.lower) / (SQUARE.upper - SQUARE.lower)
@@ -69,7 +85,8 @@ def test_without_the_uniform_share_small_steps_stay_in_one_basin():
 @pytest.mark.parametrize("step", ["gaussian", "cauchy"])
 @pytest.mark.parametrize("kind", ["one", "full"])
 def test_reflected_steps_favour_no_place_of_the_box(step, kind):
-    # On a level function every candidate is accepted, and a symmetric kernel has the uniform distribution as its stationary one.
+    # On a level function every candidate is accepted, and a symmetric kernel has the uniform distribution as its
+    # stationary one.
     weights = {"one": 0.0, "few": 0.0, "full": 0.0, kind: 1.0}
     report = search(level, budget=20_000, step=step, adapt="none", initial_scale=0.5, coarse=0.0, **STILL, **weights)
     unit = (report.trace.points - SQUARE.lower) / (SQUARE.upper - SQUARE.lower)
@@ -104,7 +121,9 @@ def test_in_a_space_of_tuples_a_move_changes_one_coordinate_or_one_block_or_up_t
 
 
 def test_only_the_uniform_share_changes_every_block():
-    points = search(ever_lower(), unit_box(20), 2000, rules=Rules(selection=Improvement()), block=4, exploration=0.1, samples=1).trace.points
+    points = search(
+        ever_lower(), unit_box(20), 2000, rules=Rules(selection=Improvement()), block=4, exploration=0.1, samples=1
+    ).trace.points
     every = (points[1:] != points[0]).reshape(-1, 5, 4).any(axis=2).all(axis=1)
     assert abs(every.sum() - 0.1 * 1999) < LIMIT * np.sqrt(0.1 * 0.9 * 1999)
 
@@ -133,7 +152,9 @@ def test_the_geometric_schedule_goes_from_the_first_temperature_to_the_last_in_e
 
 
 def test_the_logarithmic_schedule_is_inverse_to_the_logarithm_of_the_time():
-    temperature = search(corner, budget=500, initial_temperature=2.0, cooling="logarithmic", restarts=0).trace.notes["temperature"][:, 1]
+    temperature = search(corner, budget=500, initial_temperature=2.0, cooling="logarithmic", restarts=0).trace.notes[
+        "temperature"
+    ][:, 1]
     np.testing.assert_allclose(temperature * np.log(np.arange(temperature.size) + 2), 2.0 * np.log(2), rtol=1e-12)
 
 
@@ -146,8 +167,17 @@ def test_the_gap_driven_temperature_is_a_power_of_the_gap_to_the_record():
             return True
 
     rule = Recorded()
-    report = search(corner, budget=300, cooling="gap", gap_factor=0.5, gap_power=1.5, initial_temperature=1e-6, restarts=0, samples=1,
-                    rules=Rules(selection=rule))
+    report = search(
+        corner,
+        budget=300,
+        cooling="gap",
+        gap_factor=0.5,
+        gap_power=1.5,
+        initial_temperature=1e-6,
+        restarts=0,
+        samples=1,
+        rules=Rules(selection=rule),
+    )
     record = report.trace.best[:-1]
     current, temperature = np.array(rule.pairs).T
     far = record - current > 1e-5
@@ -156,22 +186,38 @@ def test_the_gap_driven_temperature_is_a_power_of_the_gap_to_the_record():
 
 
 def test_the_first_temperature_follows_the_units_of_the_function():
-    first, scaled = (search(lambda points, c=c: c * corner(points)).trace.notes["temperature"][:, 1] for c in (1.0, 1024.0))
+    first, scaled = (
+        search(lambda points, c=c: c * corner(points)).trace.notes["temperature"][:, 1] for c in (1.0, 1024.0)
+    )
     np.testing.assert_allclose(scaled, 1024.0 * first, rtol=1e-12)
 
 
 def test_each_restart_heats_again_by_its_share():
-    temperature = search(corner, budget=1000, initial_temperature=8.0, reheat=0.25, restarts=3).trace.notes["temperature"][:, 1]
+    temperature = search(corner, budget=1000, initial_temperature=8.0, reheat=0.25, restarts=3).trace.notes[
+        "temperature"
+    ][:, 1]
     starts = np.flatnonzero(np.diff(temperature) > 0) + 1
     np.testing.assert_allclose(temperature[[0, *starts]], [8.0, 2.0, 0.5, 0.125])
     assert np.diff([0, *starts, temperature.size]).std() < 2
 
 
 def test_a_restart_from_the_best_begins_there_and_one_anew_at_uniform_points():
-    calm = {"restarts": 1, "exploration": 0.0, "one": 1.0, "few": 0.0, "full": 0.0, "coarse": 0.0, "initial_scale": 1e-4, "step": "gaussian",
-            "adapt": "none", "samples": 5}
+    calm = {
+        "restarts": 1,
+        "exploration": 0.0,
+        "one": 1.0,
+        "few": 0.0,
+        "full": 0.0,
+        "coarse": 0.0,
+        "initial_scale": 1e-4,
+        "step": "gaussian",
+        "adapt": "none",
+        "samples": 5,
+    }
     for begin in ("best", "anew"):
-        report = search(lambda points: -((points - SQUARE.upper) ** 2).sum(axis=1), budget=505, restart_from=begin, **calm)
+        report = search(
+            lambda points: -((points - SQUARE.upper) ** 2).sum(axis=1), budget=505, restart_from=begin, **calm
+        )
         steps = np.abs(np.diff(report.trace.points, axis=0)).max(axis=1)[5:]
         assert (steps > 0.1).any() == (begin == "anew")
 
@@ -204,10 +250,21 @@ def test_scales_widen_when_everything_is_accepted_and_narrow_when_nothing_is():
     assert (search(level, adapt="none", **options).trace.notes["scale"][:, 1] == 0.1).all()
 
 
-@pytest.mark.parametrize("options", [
-    {"step": "gaussian"}, {"cooling": "logarithmic"}, {"cooling": "gap"}, {"restart_from": "anew"}, {"adapt": "global"}, {"adapt": "none"},
-    {"exploration": 1.0}, {"restarts": 50}, {"samples": 1000}, {"coarse": 1.0},
-])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"step": "gaussian"},
+        {"cooling": "logarithmic"},
+        {"cooling": "gap"},
+        {"restart_from": "anew"},
+        {"adapt": "global"},
+        {"adapt": "none"},
+        {"exploration": 1.0},
+        {"restarts": 50},
+        {"samples": 1000},
+        {"coarse": 1.0},
+    ],
+)
 @pytest.mark.parametrize("budget", [1, 2, 3, 11, 150])
 def test_the_budget_is_spent_to_the_last_evaluation_with_every_option(options, budget):
     assert search(corner, budget=budget, **options).evaluations == budget
@@ -215,7 +272,9 @@ def test_the_budget_is_spent_to_the_last_evaluation_with_every_option(options, b
 
 def test_a_search_that_is_continued_starts_from_the_best_point():
     box = unit_box(6)
-    objective = CountedObjective(Target(lambda points: -((points - 0.25) ** 2).sum(axis=1), box), 200, Rules(selection=Improvement()))
+    objective = CountedObjective(
+        Target(lambda points: -((points - 0.25) ** 2).sum(axis=1), box), 200, Rules(selection=Improvement())
+    )
     known = np.full((1, 6), 0.2501)
     objective.evaluate(known)
     SimulatedAnnealing(one=1.0, few=0.0, full=0.0, coarse=0.0, **STILL).search(objective, np.random.default_rng(0))

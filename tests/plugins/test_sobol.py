@@ -1,4 +1,5 @@
-"""Sobol's sequence: evenly spread, seeded, and clear about the number of dimensions for which it is known."""
+"""Guards plugins/sparserob_random_search: sobol's sequence: evenly spread, seeded, and clear about the number of
+dimensions for which it is known."""
 
 from __future__ import annotations
 
@@ -7,14 +8,16 @@ import pytest
 from scipy.stats import qmc
 
 import sparserob_core as sr
-from sparserob_core.sip.search import Target, maximise
+from sparserob_core.sip.search.search import Target, maximise
 from sparserob_random_search import Sobol
 
 BOX = sr.Box(np.array([-1.0, 0.0, 10.0]), np.array([1.0, 0.5, 30.0]))
 
 
 def points(domain=BOX, budget=512, seed=0, **options):
-    report = maximise(Target(lambda at: np.zeros(len(at)), domain), Sobol(**options), budget, np.random.default_rng(seed))
+    report = maximise(
+        Target(lambda at: np.zeros(len(at)), domain), Sobol(**options), budget, np.random.default_rng(seed)
+    )
     assert report.evaluations == budget
     return report.trace.points
 
@@ -48,7 +51,10 @@ def test_a_budget_that_is_no_power_of_two_is_spent_without_a_warning_on_the_same
 
 def test_beyond_the_known_dimensions_one_sentence_says_so():
     box = sr.Box(np.zeros(21202), np.ones(21202))
-    with pytest.raises(sr.InputError, match=r"sobol: the sequence is known up to 21201 dimensions, this domain has 21202; random_search has no"):
+    with pytest.raises(
+        sr.InputError,
+        match=r"sobol: the sequence is known up to 21201 dimensions, this domain has 21202; random_search has no",
+    ):
         points(box, 1)
 
 

@@ -1,4 +1,5 @@
-"""The shipped solvers: their options, what they import, and the paper's instance, on which all agree."""
+"""Guards the solver plugins: the shipped solvers: their options, what they import, and the paper's instance, on which
+all agree."""
 
 from __future__ import annotations
 
@@ -13,10 +14,10 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_clarabel import Clarabel
-from sparserob_core.sip.check import solve_finite
 from sparserob_core.sip.finite import FiniteProgram
-from sparserob_core.sip.relaxed import RelaxedProgram, rows_at
-from sparserob_core.testing_solvers import regularised, robust_terminal
+from sparserob_core.sip.inner.solve import solve_finite
+from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, rows_at
+from sparserob_core.testing.solvers import regularised, robust_terminal
 from sparserob_dictionaries import PiecewiseConstant, Walsh
 from sparserob_piqp import Piqp
 from sparserob_proxqp import ProxQp
@@ -27,11 +28,17 @@ EPSILONS = (1.0, 1e-2, 1e-4, 1e-6, 0.0)
 
 @cache
 def experiment_one(dictionary: sr.DictionaryFactory) -> FiniteProgram:
-    """The spring-mass-damper with ``|w| <= 0.06``, its constraints at eight times, tightened for the worst disturbance."""
+    """The spring-mass-damper with ``|w| <= 0.06``, its constraints at eight times, tightened for the worst
+    disturbance."""
     problem = sr.OptimalControlProblem(
-        system=sr.LinearSystem(np.array([[0, 1], [-2, -0.5]]), np.array([[0], [1]])), horizon=5.0, initial_state=[-1, 1],
-        control=sr.Box([-1], [1]), disturbance=sr.Box([-0.06, -0.06], [0.06, 0.06]),
-        path=[sr.PathConstraint(sr.Box([-0.7, -np.inf], [0.7, np.inf]), start=0.3)], terminal=[sr.Box([-0.3, -0.3], [0.3, 0.3])])
+        system=sr.LinearSystem(np.array([[0, 1], [-2, -0.5]]), np.array([[0], [1]])),
+        horizon=5.0,
+        initial_state=[-1, 1],
+        control=sr.Box([-1], [1]),
+        disturbance=sr.Box([-0.06, -0.06], [0.06, 0.06]),
+        path=[sr.PathConstraint(sr.Box([-0.7, -np.inf], [0.7, np.inf]), start=0.3)],
+        terminal=[sr.Box([-0.3, -0.3], [0.3, 0.3])],
+    )
     built = dictionary.build(5.0)
     program = sr.transcribe(problem, control=built, disturbance=built)
     rows = None
@@ -99,6 +106,6 @@ def test_capabilities_are_declared():
 
 @pytest.mark.parametrize("package", ["piqp", "proxsuite", "clarabel"])
 def test_a_solver_is_imported_only_when_it_solves(package):
-    adapters = "sparserob_piqp, sparserob_proxqp, sparserob_clarabel, sparserob_core.sip.check"
+    adapters = "sparserob_piqp, sparserob_proxqp, sparserob_clarabel, sparserob_core.sip.inner.solve"
     script = f"import sys, {adapters}; sys.exit({package!r} in sys.modules or 'scipy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0

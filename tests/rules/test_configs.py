@@ -1,4 +1,5 @@
-"""Every config is complete, commented, valid, and comes back with the answer that is expected of it."""
+"""Guards configs/: every config is complete, commented, valid, and comes back with the answer that is expected of
+it."""
 
 from __future__ import annotations
 
@@ -46,11 +47,10 @@ def test_the_table_of_expectations_is_complete() -> None:
     assert {path.stem for path in CONFIGS.glob("*.yaml")} == set(EXPECTED)
 
 
-@pytest.mark.parametrize("name", sorted(EXPECTED))
-def test_a_config_says_what_it_shows(name: str) -> None:
-    first, second, *_ = (CONFIGS / f"{name}.yaml").read_text().splitlines()
-    assert first == "# yaml-language-server: $schema=./schema.json"
-    assert second.startswith("# ")
+def test_a_config_says_what_it_shows() -> None:
+    heads = {name: (CONFIGS / f"{name}.yaml").read_text().splitlines()[:2] for name in EXPECTED}
+    assert {first for first, _ in heads.values()} == {"# yaml-language-server: $schema=./schema.json"}
+    assert not [name for name, (_, second) in heads.items() if not second.startswith("# ")]
 
 
 @pytest.mark.parametrize("name", sorted(set(EXPECTED) - SLOW))
@@ -64,16 +64,25 @@ def test_a_config_comes_back_with_the_expected_answer(name: str, tmp_path: Path)
         assert outcome.result.gap <= 1e-6
     written = json.loads((tmp_path / "run" / "result.json").read_text())
     assert written["status"] == status
-    failed = [claim for claim in sr.check(tmp_path / "run").claims if claim.verdict != "holds" and (name, claim.name) not in UNCHECKED]
+    failed = [
+        claim
+        for claim in sr.check(tmp_path / "run").claims
+        if claim.verdict != "holds" and (name, claim.name) not in UNCHECKED
+    ]
     assert not failed
 
 
 @pytest.fixture(scope="module")
 def exact(tmp_path_factory: pytest.TempPathFactory) -> dict[str, float]:
     """The value of every problem that the searches are about, from the exchange."""
+
     def solved(name: str) -> float:
-        result = sr.run(CONFIGS / f"{name}.yaml", {"method": "exchange", "observers": []}, out=tmp_path_factory.mktemp(name) / "run",
-                        figures=False).result
+        result = sr.run(
+            CONFIGS / f"{name}.yaml",
+            {"method": "exchange", "observers": []},
+            out=tmp_path_factory.mktemp(name) / "run",
+            figures=False,
+        ).result
         assert result.status == "certified"
         return float(result.upper_bound)
 
@@ -81,18 +90,22 @@ def exact(tmp_path_factory: pytest.TempPathFactory) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("name", SEARCHES)
-@pytest.mark.parametrize("maximiser", sr.load_registry().names("maximiser"))
 def test_every_maximiser_takes_part_in_every_experiment_and_none_claims_too_much(
-        name: str, maximiser: str, exact: dict[str, float], tmp_path: Path) -> None:
-    overrides = {"maximiser": {"name": maximiser, "budget": 24}, "observers": [], "continuation.stop": 0.1, "method.indices": 6}
-    result = sr.run(CONFIGS / f"{name}.yaml", overrides, out=tmp_path / "run", figures=False).result
-    assert result.status in ("certified", "verified", "refuted"), result.message
-    assert 0.0 < result.lower_bound <= exact[name] + 1e-8
-    assert result.counts["evaluations"] <= 2 * 24
-    if result.status == "refuted":
-        assert result.worst is not None and result.worst.violation > 1e-9
-    else:
-        assert result.cost >= exact[name] - 1e-8
+    name: str, exact: dict[str, float], tmp_path: Path
+) -> None:
+    """The method ``sparserob`` with each registered maximiser; lists those whose answer says more than is true."""
+    search = {"observers": [], "continuation.stop": 0.1, "method.indices": 6}
+    wrong = []
+    for maximiser in sr.load_registry().names("maximiser"):
+        overrides = {"maximiser": {"name": maximiser, "budget": 24}, **search}
+        result = sr.run(CONFIGS / f"{name}.yaml", overrides, out=tmp_path / maximiser, figures=False).result
+        bounded = 0.0 < result.lower_bound <= exact[name] + 1e-8 and result.counts["evaluations"] <= 2 * 24
+        if result.status == "refuted":
+            honest = result.worst is not None and result.worst.violation > 1e-9
+        else:
+            honest = result.status in ("certified", "verified") and result.cost >= exact[name] - 1e-8
+        wrong += [] if bounded and honest else [(maximiser, result.status, result.message, result.lower_bound)]
+    assert not wrong
 
 
 @pytest.mark.parametrize("name", sorted(name for name, (status, *_) in EXPECTED.items() if status == "infeasible"))
@@ -116,6 +129,11 @@ def test_the_schema_in_the_folder_is_the_schema_of_the_program() -> None:
 def test_the_cost_grows_with_the_uncertainty(tmp_path: Path) -> None:
     config, costs = CONFIGS / "double_integrator.yaml", []
     for bound in (0.0, 0.01, 0.02):
-        outcome = sr.run(config, {"problem.disturbance.box": [bound, bound], "observers": []}, out=tmp_path / str(bound), figures=False)
+        outcome = sr.run(
+            config,
+            {"problem.disturbance.box": [bound, bound], "observers": []},
+            out=tmp_path / str(bound),
+            figures=False,
+        )
         costs.append(outcome.result.cost)
     assert costs == sorted(costs)

@@ -1,63 +1,158 @@
-"""House rules: short functions and files, no catch-all modules, the same packages in every list, and no words from outside."""
+"""Guards the whole tree: where things stand, who imports whom, what a start-up costs, and how the text is written.
+
+Each test lists every offender at once. What import-linter can state (layers of folders, who knows which library) is in
+pyproject.toml only.
+"""
 
 from __future__ import annotations
 
 import ast
 import re
+import subprocess
+import sys
 import tokenize
 import tomllib
+from collections.abc import Iterable, Iterator, Mapping
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-SOURCES = sorted([*(ROOT / "sparserob_core").rglob("*.py"), *(ROOT / "plugins").rglob("*.py")])
+CORE = sorted((ROOT / "sparserob_core").rglob("*.py"))
+PLUGINS = sorted((ROOT / "plugins").glob("sparserob_*/**/*.py"))
 WRITTEN = ("*.md", "docs/**/*.md", "configs/*", "tests/**/*.py", "Makefile", "pyproject.toml")
 PAGES = sorted({path for pattern in WRITTEN for path in ROOT.glob(pattern)} - {Path(__file__).resolve()})
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
-PLUGINS = {path.name for path in (ROOT / "plugins").glob("sparserob_*") if path.is_dir()}
+HEAVY = {
+    "scipy", "matplotlib", "rich", "qpsolvers", "piqp", "proxsuite", "clarabel", "cvxpy", "rerun", "nevergrad", "dask",
+    "flint", "jaxtyping",
+}  # fmt: skip
+A_DOZEN = 12
+PLACES = ("sparserob_core/experiment/cli/", "sparserob_core/experiment/terminal/")
 
 
 def relative(path: Path) -> str:
     return str(path.relative_to(ROOT))
 
 
-def code_lines(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
-    """Lines of a function without its signature, docstring and blank lines."""
-    body = node.body[1:] if ast.get_docstring(node) else node.body
-    return len({line for statement in body for line in range(statement.lineno, (statement.end_lineno or 0) + 1)})
+def trees(paths: Iterable[Path]) -> Iterator[tuple[Path, ast.Module]]:
+    return ((path, ast.parse(path.read_text())) for path in paths)
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=relative)
-def test_functions_are_short(path: Path) -> None:
-    functions = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
-    assert not {node.name: code_lines(node) for node in functions if code_lines(node) > 30}
+def imports(tree: ast.AST) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Every imported module with the names taken from it, wherever it stands, for types too."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, ()) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield "." * node.level + (node.module or ""), tuple(alias.name for alias in node.names)
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=relative)
-def test_files_are_read_in_one_go(path: Path) -> None:
-    assert len(path.read_text().splitlines()) <= 260
+def imported_at_start(tree: ast.Module) -> set[str]:
+    """Top-level packages imported by importing the module: neither inside a function nor for types only."""
+    found, pending = set(), list(tree.body)
+    while pending:
+        node = pending.pop()
+        if isinstance(node, ast.Import):
+            found |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found.add((node.module or "").split(".")[0])
+        elif isinstance(node, ast.If) and "TYPE_CHECKING" not in ast.unparse(node.test):
+            pending += [*node.body, *node.orelse]
+        elif isinstance(node, ast.ClassDef | ast.Try | ast.With):
+            pending += node.body
+    return found
+
+
+def module_name(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+def import_graph() -> Mapping[str, set[str]]:
+    """Which modules of the core each of its modules imports, wherever and for whatever."""
+    known = {module_name(path) for path in CORE}
+    graph: dict[str, set[str]] = {}
+    for path, tree in trees(CORE):
+        targets = {
+            f"{module}.{name}" if f"{module}.{name}" in known else module
+            for module, names in imports(tree)
+            for name in names or ("",)
+        }
+        graph[module_name(path)] = (targets & known) - {module_name(path)}
+    del graph["sparserob_core"]  # the public face points everywhere, and nobody in the core imports it
+    return graph
+
+
+def circle(graph: Mapping[str, set[str]]) -> list[str]:
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
 
 
 def test_no_module_is_a_drawer_for_everything() -> None:
-    assert not [relative(path) for path in SOURCES if path.stem in {"utils", "util", "common", "base", "manager", "helpers", "misc"}]
+    drawers = {"utils", "util", "common", "base", "manager", "helpers", "misc"}
+    assert not [relative(path) for path in CORE + PLUGINS if path.stem in drawers]
 
 
-def test_every_plugin_is_in_every_list() -> None:
-    shipped = {Path(name).name for name in PROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]}
-    entries = set(PROJECT["project"]["entry-points"]["sparserob"].values())
-    linted = set(PROJECT["tool"]["importlinter"]["root_packages"])
-    assert shipped == linted == PLUGINS | {"sparserob_core"}
-    assert {entry.split(".")[0] for entry in entries} == PLUGINS | {"sparserob_core"}
-    for contract in PROJECT["tool"]["importlinter"]["contracts"]:
-        if "plugin" in contract["name"].lower():
-            assert set(contract.get("modules", contract.get("forbidden_modules"))) == PLUGINS
+def test_a_folder_holds_a_dozen_modules_at_most_and_says_what_it_is() -> None:
+    folders = {path.parent for path in CORE}
+    crowded = {relative(one): len(list(one.glob("*.py"))) - 1 for one in folders}
+    assert not {name: count for name, count in crowded.items() if count > A_DOZEN}
+    silent = [one for one in folders if not ast.get_docstring(ast.parse((one / "__init__.py").read_text()))]
+    assert not [relative(one) for one in silent]
 
 
-@pytest.mark.parametrize("path", SOURCES + PAGES, ids=relative)
-def test_the_text_names_no_place_of_this_machine(path: Path) -> None:
+def test_no_import_goes_round_in_a_circle_between_modules_or_folders() -> None:
+    graph = import_graph()
+    assert not circle(graph)
+    packages = {module_name(path) for path in CORE if path.name == "__init__.py"}
+    of = {name: name if name in packages else name.rpartition(".")[0] for name in graph}
+    folders: dict[str, set[str]] = {}
+    for name, targets in graph.items():
+        folders.setdefault(of[name], set()).update({of[target] for target in targets} - {of[name], "sparserob_core"})
+    assert not circle(folders)
+
+
+def test_imports_are_absolute_and_heavy_packages_are_imported_where_they_are_used() -> None:
+    offenders = [relative(path) for path, tree in trees(CORE) if HEAVY & imported_at_start(tree)]
+    offenders += [relative(path) for path, tree in trees(CORE + PLUGINS) if any(m[0] == "." for m, _ in imports(tree))]
+    assert not offenders
+
+
+def test_the_core_imports_no_plugin_and_plugins_only_the_public_face() -> None:
+    offenders = [
+        f"{relative(path)} imports {module}"
+        for path, tree in trees(CORE + PLUGINS)
+        for module, _ in imports(tree)
+        if module.startswith("sparserob_") and not allowed(path, module)
+    ]
+    assert not offenders
+
+
+def allowed(path: Path, module: str) -> bool:
+    own = path.relative_to(ROOT).parts[1] if path in PLUGINS else "sparserob_core"
+    return module.split(".", maxsplit=1)[0] == own or (path in PLUGINS and module == "sparserob_core")
+
+
+def test_only_the_command_line_knows_the_library_of_commands() -> None:
+    users = [relative(path) for path, tree in trees(CORE) if "click" in {module for module, _ in imports(tree)}]
+    assert users
+    assert not [user for user in users if not user.startswith(PLACES)]
+
+
+def test_a_plugin_of_this_repository_is_one_folder_and_one_line() -> None:
+    project = (ROOT / "pyproject.toml").read_text()
+    entries = set(tomllib.loads(project)["project"]["entry-points"]["sparserob"].values())
+    folders = {path.name for path in (ROOT / "plugins").glob("sparserob_*") if path.is_dir()}
+    assert {entry.split(".")[0] for entry in entries} == folders | {"sparserob_core"}
+    assert not {name: found for name in folders if (found := len(re.findall(rf"\b{name}\b", project))) != 1}
+
+
+def test_the_text_names_no_place_of_this_machine() -> None:
     outside = re.compile(r"/home/|/root/|/work/|/tmp/|pypi\.org|localhost:")
-    assert not outside.search(path.read_text())
+    assert not [relative(path) for path in CORE + PLUGINS + PAGES if outside.search(path.read_text())]
 
 
 def prose(path: Path) -> str:
@@ -67,7 +162,39 @@ def prose(path: Path) -> str:
         return " ".join(token.string for token in tokens if token.type in {tokenize.COMMENT, tokenize.STRING})
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=relative)
-def test_the_spelling_is_british(path: Path) -> None:
-    american = re.compile(r"\b(?:regulariz|maximiz|minimiz|optimiz|discretiz|normaliz|initializ|behavior|neighbor)\w*", re.IGNORECASE)
-    assert not american.findall(prose(path))
+def test_the_spelling_is_british() -> None:
+    american = re.compile(
+        r"\b(?:regulariz|maximiz|minimiz|optimiz|discretiz|normaliz|initializ|behavior|neighbor)\w*", re.IGNORECASE
+    )
+    assert not {relative(path): words for path in CORE + PLUGINS if (words := american.findall(prose(path)))}
+
+
+def test_a_test_file_says_in_its_first_line_what_it_guards() -> None:
+    tests = sorted((ROOT / "tests").rglob("test_*.py"))
+    assert not [relative(path) for path in tests if not path.read_text().startswith('"""Guards ')]
+
+
+def loaded_after(statement: str) -> set[str]:
+    """The top-level packages in a fresh interpreter after a statement."""
+    report = "print('LOADED', *{name.split('.')[0] for name in sys.modules})"
+    program = f"import sys\ntry:\n    {statement}\nexcept SystemExit:\n    pass\n{report}"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    return set(done.stdout.split("LOADED")[-1].split())
+
+
+def test_importing_the_package_costs_little_more_than_numpy() -> None:
+    assert not (HEAVY | {"pluggy", "pydantic", "ruamel", "click"}) & loaded_after("import sparserob_core")
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["plugins"], ["plugins", "piqp"]], ids=" ".join)
+def test_asking_for_help_or_plugins_loads_no_solver(arguments: list[str]) -> None:
+    command = f"sys.argv = {['sparserob', *arguments]!r}; from sparserob_core.experiment.cli.main import main; main()"
+    loaded = loaded_after(command)
+    assert "click" in loaded
+    assert not (HEAVY - {"rich"} - ({"scipy"} if arguments == ["plugins", "piqp"] else set())) & loaded
+
+
+def test_every_public_name_can_be_imported() -> None:
+    import sparserob_core
+
+    assert not [name for name in sparserob_core.__all__ if getattr(sparserob_core, name) is None]

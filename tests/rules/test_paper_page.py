@@ -1,4 +1,5 @@
-"""The page about the paper is what its builder writes, its figures are there, and its verdicts rest on what the runs say."""
+"""Guards docs/paper.md: the page about the paper is what its builder writes, its figures are there, and its verdicts
+rest on what the runs say."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 NUMBERS = json.loads((DOCS / "paper" / "numbers.json").read_text())
-RELATIVE, ABSOLUTE = 0.02, 2e-3     # of numbers that depend on what a solver of another version rounds differently
+RELATIVE, ABSOLUTE = 0.02, 2e-3  # of numbers that depend on what a solver of another version rounds differently
 
 
 @pytest.fixture
@@ -32,12 +33,18 @@ def differences(found, stored, where=""):
         keys = sorted({*stored, *found})
         return [place for key in keys for place in differences(found.get(key), stored.get(key), f"{where}.{key}")]
     if isinstance(stored, list) and isinstance(found, list) and len(stored) == len(found):
-        return [place for i, (one, other) in enumerate(zip(found, stored, strict=True)) for place in differences(one, other, f"{where}.{i}")]
+        return [
+            place
+            for i, (one, other) in enumerate(zip(found, stored, strict=True))
+            for place in differences(one, other, f"{where}.{i}")
+        ]
     if where.endswith(".message"):
         return []
     if isinstance(stored, int | float) and isinstance(found, int | float) and not isinstance(stored, bool):
-        share = 20 if where.endswith(".broken") else ABSOLUTE   # draws: 0.2 % of ten thousand
-        return [] if found == pytest.approx(stored, rel=RELATIVE, abs=share) else [f"{where}: {found} instead of {stored}"]
+        share = 20 if where.endswith(".broken") else ABSOLUTE  # draws: 0.2 % of ten thousand
+        return (
+            [] if found == pytest.approx(stored, rel=RELATIVE, abs=share) else [f"{where}: {found} instead of {stored}"]
+        )
     return [] if found == stored else [f"{where}: {found!r} instead of {stored!r}"]
 
 
@@ -75,7 +82,9 @@ def test_the_verdicts_rest_on_proofs(prefix):
     for name, run in NUMBERS["runs"].items():
         if "nominal" in name or "scenario" in name or name == "search1":
             assert run["status"] == "refuted"
-            assert run["worst"]["violation"] >= NUMBERS["draws"][name]["worst"], "the worst case is at least as bad as what was drawn"
+            assert run["worst"]["violation"] >= NUMBERS["draws"][name]["worst"], (
+                "the worst case is at least as bad as what was drawn"
+            )
         if run["status"] == "certified" and name in NUMBERS["draws"]:
             assert NUMBERS["draws"][name]["broken"] == 0
 
@@ -94,7 +103,10 @@ def test_no_draws_share_exceeds_what_the_scenario_theory_promises():
     checked = [name for name, run in NUMBERS["runs"].items() if run["scenario_bound"]]
     assert len(checked) == 7
     for name in checked:
-        assert NUMBERS["draws"][name]["broken"] <= NUMBERS["runs"][name]["scenario_bound"]["after"] * NUMBERS["draws"][name]["count"]
+        assert (
+            NUMBERS["draws"][name]["broken"]
+            <= NUMBERS["runs"][name]["scenario_bound"]["after"] * NUMBERS["draws"][name]["count"]
+        )
 
 
 def test_a_small_study_goes_all_the_way_from_runs_to_figures(builder, tmp_path):
@@ -106,14 +118,22 @@ def test_a_small_study_goes_all_the_way_from_runs_to_figures(builder, tmp_path):
     import sparserob_core as sr
 
     overrides = {"observers": [], "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 25}}}
-    outcomes = {name: sr.run(ROOT / "configs" / f"{config}.yaml", {**overrides, **more}, out=tmp_path / name, figures=False)
-                for name, config, more in (("robust", "experiment1_repaired", {}), ("sampled", "experiment1_scenario", {"method.scenarios": 20}),
-                                           ("attention", "experiment3_repaired", {"method": "nominal"}))}
+    outcomes = {
+        name: sr.run(ROOT / "configs" / f"{config}.yaml", {**overrides, **more}, out=tmp_path / name, figures=False)
+        for name, config, more in (
+            ("robust", "experiment1_repaired", {}),
+            ("sampled", "experiment1_scenario", {"method.scenarios": 20}),
+            ("attention", "experiment3_repaired", {"method": "nominal"}),
+        )
+    }
     clouds = {name: cloud_of(outcome, 200) for name, outcome in outcomes.items()}
     assert not clouds["robust"].broken.any()
     assert 0 < clouds["attention"].broken.sum() < 200
     for name, outcome in outcomes.items():
-        below, above = clouds[name].lower.T[None] - clouds[name].states, clouds[name].states - clouds[name].upper.T[None]
+        below, above = (
+            clouds[name].lower.T[None] - clouds[name].states,
+            clouds[name].states - clouds[name].upper.T[None],
+        )
         assert max(below.max(), above.max()) <= 1e-9, "no draw leaves the worst case"
         assert run_numbers(outcome)["status"] == outcome.status
         assert clouds[name].violation.max() <= outcome.result.worst.violation + 1e-9 or outcome.status == "certified"

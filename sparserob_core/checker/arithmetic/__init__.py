@@ -1,0 +1,1 @@
+"""Balls, power series of ball matrices, Bernstein maxima."""

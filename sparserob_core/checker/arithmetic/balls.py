@@ -1,0 +1,42 @@
+"""Between floats and balls, with the direction of rounding in the name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from fractions import Fraction
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from flint import arb
+
+
+def balls(vector: Sequence[float] | Array) -> list[arb]:
+    """Exact numbers as balls."""
+    from flint import arb
+
+    return [arb(float(v)) for v in vector]
+
+
+def rational(value: Fraction) -> arb:
+    """A ball around a fraction."""
+    from flint import arb, fmpq
+
+    return arb(fmpq(value.numerator, value.denominator))
+
+
+def above(ball: arb) -> float:
+    """A float that is certainly not below a ball."""
+    return float(np.nextafter(float(ball.upper()), np.inf))
+
+
+def below(ball: arb) -> float:
+    """A float that is certainly not above a ball; the ball itself where it is one."""
+    return (
+        float(ball.mid())
+        if ball.is_exact() and float(ball.mid()) == ball
+        else float(np.nextafter(float(ball.lower()), -np.inf))
+    )

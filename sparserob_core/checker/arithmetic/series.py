@@ -1,0 +1,109 @@
+"""Matrices that depend on the parameters: truncated power series with ball matrices as coefficients."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, final
+
+from sparserob_core.checker.arithmetic.jets import Monomials
+
+if TYPE_CHECKING:
+    from flint import arb, arb_mat
+
+SMALL = 0.25  # norm below which the exponential series is summed
+TERMS = 24  # of it: what is left out is below 1e-38 then
+
+
+@final
+class Series:
+    """``sum_k parts_k delta^k``; products drop what is beyond the degree of the monomials, which Lagrange's remainder
+    accounts for."""
+
+    __slots__ = ("monomials", "parts")
+
+    def __init__(self, monomials: Monomials, parts: Sequence[arb_mat]) -> None:
+        self.monomials, self.parts = monomials, list(parts)
+
+    @staticmethod
+    def constant(monomials: Monomials, value: arb_mat) -> Series:
+        """A matrix that does not depend on the parameters."""
+        return Series(monomials, [value] + [value * 0] * (monomials.size - 1))
+
+    def __add__(self, other: Series) -> Series:
+        return Series(self.monomials, [a + b for a, b in zip(self.parts, other.parts, strict=True)])
+
+    def __mul__(self, other: Series) -> Series:
+        total: list[arb_mat | None] = [None] * self.monomials.size
+        for i, j, k in self.monomials.products:
+            term, so_far = self.parts[i] * other.parts[j], total[k]
+            total[k] = term if so_far is None else so_far + term
+        return Series(self.monomials, [part for part in total if part is not None])
+
+    def scaled(self, factor: arb) -> Series:
+        """Every coefficient times a number."""
+        return Series(self.monomials, [part * factor for part in self.parts])
+
+    def applied(self, vector: arb_mat) -> Series:
+        """The product with a matrix that does not depend on the parameters."""
+        return Series(self.monomials, [part * vector for part in self.parts])
+
+    def size(self) -> arb:
+        """An upper bound of the summed Frobenius norms of the coefficients; that of a product is at most the product of
+        those."""
+        from flint import arb
+
+        return sum((upper(norm(part)) for part in self.parts), arb(0))
+
+    def exp(self) -> Series:
+        """The exponential: its series where the norm is small, and squaring back (Moler and Van Loan 2003, method 3),
+        with the tail bounded."""
+        from flint import arb, arb_mat
+
+        if self.monomials.size == 1:
+            return Series(self.monomials, [self.parts[0].exp()])
+        halvings = 0
+        size = self.size()
+        while not size < SMALL:
+            size, halvings = size / 2, halvings + 1
+            if halvings > 60:
+                return Series(self.monomials, [part * arb("nan") for part in self.parts])
+        small, n = self.scaled(arb(1) / 2**halvings), self.parts[0].nrows()
+        unit = arb_mat([[int(i == j) for j in range(n)] for i in range(n)])
+        result = Series.constant(self.monomials, unit)
+        for order in range(TERMS, 0, -1):
+            result = Series.constant(self.monomials, unit) + (small * result).scaled(arb(1) / order)
+        tail = arb(0, (size ** (TERMS + 1) * 2 / arb(TERMS + 1).fac()).upper())
+        result = Series(self.monomials, [part + arb_mat([[tail] * n] * n) for part in result.parts])
+        for _ in range(halvings):
+            result = result * result
+        return result
+
+    def held(self, inputs: Series, time: arb) -> tuple[Series, Series]:
+        """``e^{matrix time}`` and ``int_0^time e^{matrix s} ds inputs`` from one exponential (Van Loan 1978)."""
+        from flint import arb, arb_mat
+
+        n, m = self.parts[0].nrows(), inputs.parts[0].ncols()
+        below = [[arb(0)] * (n + m)] * m
+        joined = [
+            arb_mat([a + b for a, b in zip(left.tolist(), right.tolist(), strict=True)] + below)
+            for left, right in zip(self.parts, inputs.parts, strict=True)
+        ]
+        whole = [part.tolist() for part in Series(self.monomials, joined).scaled(time).exp().parts]
+        return (
+            Series(self.monomials, [arb_mat([row[:n] for row in part[:n]]) for part in whole]),
+            Series(self.monomials, [arb_mat([row[n:] for row in part[:n]]) for part in whole]),
+        )
+
+
+def norm(matrix: arb_mat) -> arb:
+    """The Frobenius norm, which bounds the 2-norm."""
+    from flint import arb
+
+    return sum((x * x for x in matrix.entries()), arb(0)).nonnegative_part().sqrt()
+
+
+def upper(ball: arb) -> arb:
+    """The upper end of a ball, as an exact number."""
+    from flint import arb
+
+    return arb(ball.upper())

@@ -1,0 +1,1 @@
+"""What a run claims, one claim after another."""

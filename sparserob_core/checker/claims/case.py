@@ -1,0 +1,187 @@
+"""A run as the checker sees it: the problem's records, and the certificate."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+
+from sparserob_core.checker.claims.duality import Duality
+from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.reach.disturbance_support import Scene
+from sparserob_core.checker.reach.flow import stacked
+from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.sets.sets import ConvexSet, Equality
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from flint import arb_mat
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Window:
+    """``x(t)`` in ``shape`` for all ``t`` from ``start`` to ``stop``."""
+
+    name: str
+    shape: ConvexSet
+    start: float
+    stop: float
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Case:
+    """What is checked: a certificate (plain data) against a problem on its two dictionaries."""
+
+    problem: OptimalControlProblem
+    control: Dictionary
+    disturbance: Dictionary
+    certificate: Mapping[str, Any]
+
+    @cached_property
+    def windows(self) -> list[Window]:
+        """The state constraints, under the names that the certificate uses."""
+        path = [entry for entry in self.problem.path if isinstance(entry, PathConstraint)]
+        ends = [end for end in self.problem.terminal if not isinstance(end, Equality)]
+        found = [
+            Window(
+                entry.name or (f"path[{i}]" if len(path) > 1 else "path"),
+                entry.set,
+                entry.start,
+                self.problem.horizon if entry.stop is None else entry.stop,
+            )
+            for i, entry in enumerate(path)
+        ]
+        return found + [
+            Window(f"terminal[{i}]" if len(ends) > 1 else "terminal", end, self.problem.horizon, self.problem.horizon)
+            for i, end in enumerate(ends)
+        ]
+
+    @property
+    def equalities(self) -> list[tuple[int, float]]:
+        """The states that are fixed at the end, and at what."""
+        return [
+            (int(i), float(end.values[i]))
+            for end in self.problem.terminal
+            if isinstance(end, Equality)
+            for i in end.fixed
+        ]
+
+    def window(self, name: str) -> Window:
+        """The constraint of that name."""
+        found = [window for window in self.windows if window.name == name]
+        if not found:
+            raise Broken(f"the problem has no constraint {name!r}")
+        return found[0]
+
+    @cached_property
+    def changes(self) -> list[float] | None:
+        """Where the disturbance may jump; ``None`` when there is none. Other classes than piecewise constant ones are
+        not checked."""
+        if self.problem.disturbance is None:
+            return None
+        values = self.disturbance.values
+        jumps = np.flatnonzero((np.diff(values, axis=1) != 0).any(axis=0)) + 1
+        if self.problem.disturbance_class != "piecewise_constant":
+            raise Unchecked(
+                "the checker knows piecewise constant disturbances, not those of the class"
+                f" {self.problem.disturbance_class}"
+            )
+        if self.disturbance.functions != jumps.size + 1:
+            raise Unchecked(
+                "the checker knows disturbances that take any value on each piece, this dictionary has fewer functions"
+                " than pieces"
+            )
+        return [0.0, *(float(self.disturbance.breakpoints[j]) for j in jumps)]
+
+    @cached_property
+    def grid(self) -> list[float]:
+        """Every breakpoint of either dictionary."""
+        ends = {float(self.control.breakpoints[-1]), float(self.disturbance.breakpoints[-1])}
+        last = max(*ends, self.problem.horizon)
+        inner = {float(t) for t in (*self.control.breakpoints, *self.disturbance.breakpoints)} - ends
+        return sorted({t for t in inner if t < last} | {last})
+
+    @cached_property
+    def theta(self) -> Array:
+        """The coefficients ``(m, N)`` of the decision."""
+        theta = numbers(self.certificate.get("decision"), "decision")
+        if theta.shape != (self.problem.system.controls, self.control.functions):
+            raise Broken(
+                f"the decision has shape {theta.shape}, expected"
+                f" {(self.problem.system.controls, self.control.functions)}"
+            )
+        return theta
+
+    @cached_property
+    def pieces(self) -> list[arb_mat]:
+        """The control ``(m, 1)`` on every piece of its dictionary."""
+        from flint import arb
+
+        values = self.control.values
+        if np.array_equal(values, np.eye(values.shape[0])):
+            return [stacked([[arb(float(v))] for v in column]) for column in self.theta.T]
+        theta = stacked([[arb(float(v)) for v in row] for row in self.theta])
+        table = (theta * stacked([[arb(float(v)) for v in row] for row in values])).transpose().tolist()
+        return [stacked([[x] for x in row]) for row in table]
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The control and the disturbance on the common grid."""
+        middles = [(a + b) / 2 for a, b in zip(self.grid[:-1], self.grid[1:], strict=True)]
+        which = np.clip(
+            np.searchsorted(self.control.breakpoints, middles, side="right") - 1, 0, self.control.pieces - 1
+        )
+        changes = self.changes
+        return Scene(
+            self.grid,
+            [self.pieces[k] for k in which],
+            [float(v) for v in np.asarray(self.problem.initial_state)],
+            None if changes is None else self.problem.disturbance,
+            changes or [],
+        )
+
+    @cached_property
+    def duality(self) -> Duality:
+        return Duality(self.problem, self.control, self.changes)
+
+
+def numbers(data: object, name: str) -> Array:
+    """Finite numbers from the certificate; raises `Broken` where they are none."""
+    if not _numeric(data):
+        raise Broken(f"{name}: expected numbers")
+    try:
+        array = np.array(data, dtype=float)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise Broken(f"{name}: expected numbers") from error
+    if not np.isfinite(array).all():
+        raise Broken(f"{name}: expected finite numbers")
+    return array
+
+
+def _numeric(data: object) -> bool:
+    """Whether that is a number, or lists of them: text and truth values are none."""
+    if isinstance(data, list):
+        return all(_numeric(value) for value in data)
+    return isinstance(data, int | float) and not isinstance(data, bool)
+
+
+def number(data: Mapping[str, Any], name: str) -> float:
+    """One finite number of the certificate."""
+    value = numbers(data.get(name), name)
+    if value.shape != ():
+        raise Broken(f"{name}: expected a number")
+    return float(value)
+
+
+def listed(data: Mapping[str, Any], name: str) -> Sequence[Any]:
+    """One list of the certificate."""
+    value = data.get(name)
+    if not isinstance(value, list):
+        raise Broken(f"{name}: expected a list")
+    return value

@@ -1,0 +1,218 @@
+"""Proof of one constraint at one decision: every cell of the certificate's subdivision is bounded, and halved further
+where that is needed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, TypeAlias, final
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.bernstein import highest
+from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.reach.tube import Polynomial, Tube
+from sparserob_core.checker.sets.parameters import Corners, Parameters
+from sparserob_core.checker.sets.polynomials import OUTWARD, ROUNDING
+from sparserob_core.checker.sets.sides import Bounded, Sides
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+MOST_CELLS = 40_000  # cells of time examined per constraint
+MOST_BOXES = 8_000  # boxes of parameters and cells of directions
+BLAME = 0.2  # share of the error from which the box of parameters is to blame for it
+
+Interval: TypeAlias = tuple[int, float, float]
+"""A piece of the grid, and a part of it from one time to another (which may be the same)."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Proven:
+    """A constraint is exceeded by at most ``bound``; shown on ``cells`` cells of time in ``boxes`` boxes of
+    parameters."""
+
+    bound: float
+    cells: int
+    boxes: int
+
+
+Work: TypeAlias = tuple[Corners, Sides, list[Interval]]
+"""A box of parameters, what is to be bounded, and when."""
+
+
+def prove(tubes: Callable[[Corners], Tube], parameters: Parameters, work: Sequence[Work], tolerance: float) -> Proven:
+    """Show that no row is exceeded by more than ``tolerance`` on the cells ``work``; raises `Broken` where one is, and
+    `Unchecked` where neither could be shown."""
+    stack = list(reversed(work))
+    bound, cells, items = -np.inf, 0, 0
+    while stack:
+        box, sides, todo = stack.pop()
+        if not parameters.meets(box):
+            continue
+        items += 1
+        left = _Left(np.zeros(len(box[0])))
+        while todo:
+            cells += len(todo)
+            if cells > MOST_CELLS or items > MOST_BOXES:
+                raise Unchecked(
+                    f"neither shown nor refuted: after {cells} cells a violation of more than {tolerance:.1e} is not"
+                    " excluded"
+                )
+            bound, todo = (
+                max(bound, _examine(Place(tubes(box), parameters, box, tolerance), sides, todo, left)),
+                left.halves,
+            )
+            left.halves = []
+        if left.turned:
+            stack += [(box, half, left.turned) for half in reversed(sides.halves())]
+        if left.wide:
+            stack += [(half, sides, left.wide) for half in reversed(_split(box, int(left.influence.argmax())))]
+    return Proven(bound, cells, items)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Place:
+    """One box of parameters, and what counts as a violation there."""
+
+    tube: Tube
+    parameters: Parameters
+    box: Corners
+    tolerance: float
+
+
+@final
+@dataclass(eq=False)
+class _Left:
+    """What a box leaves open: cells to be halved in time, those for smaller cells of directions, those for smaller
+    boxes."""
+
+    influence: Array
+    halves: list[Interval] = field(default_factory=list)
+    turned: list[Interval] = field(default_factory=list)
+    wide: list[Interval] = field(default_factory=list)
+
+
+def _examine(place: Place, sides: Sides, todo: Sequence[Interval], left: _Left) -> float:
+    """Bound every cell of time; returns the largest bound that will do, and sorts what will not."""
+    bound = -np.inf
+    for interval, found, tops in _batch(place.tube, sides.rows, todo, place.tolerance):
+        tops = [
+            top if top <= place.tolerance else _cut(place, row, poly)
+            for top, row, poly in zip(tops, sides.rows, found, strict=True)
+        ]
+        bound = max(bound, *(top for top in tops if top <= place.tolerance), -np.inf)
+        failed = [
+            (row, poly) for row, poly, top in zip(sides.rows, found, tops, strict=True) if not top <= place.tolerance
+        ]
+        if not failed:
+            continue
+        if _turn(place, sides, interval, failed):
+            left.turned.append(interval)
+        elif place.box[0] and any(_to_blame(poly, interval) for _, poly in failed):
+            left.wide.append(interval)
+            left.influence += sum(_influence(place.tube, poly) for _, poly in failed)
+        else:
+            left.halves += _halves(interval)
+    return bound
+
+
+def _turn(place: Place, sides: Sides, interval: Interval, failed: Sequence[tuple[Bounded, Polynomial]]) -> bool:
+    """Whether a cell fails because its directions differ too much. Stops at a violation that is certain: at the cell's
+    start."""
+    middle = sides.centre
+    if middle is None:
+        if sides.shape is None:
+            _refute(place, interval, failed)
+        return False
+    ((_, (poly,), (top,)),) = _batch(place.tube, [middle], [interval], place.tolerance)
+    _refute(place, interval, [(middle, poly)])
+    return top <= place.tolerance or _cut(place, middle, poly) <= place.tolerance
+
+
+def _refute(place: Place, interval: Interval, rows: Sequence[tuple[Bounded, Polynomial]]) -> None:
+    for row, poly in rows:
+        least = float(poly.coefficients[0, 0]) - row.limit - poly.error - poly.kinks
+        if least > place.tolerance and place.parameters.holds(np.array(place.tube.flow.centre)):
+            raise Broken(f"it is exceeded by {least:.3g} at t = {interval[1]:.6g}")
+
+
+def _batch(
+    tube: Tube, rows: Sequence[Bounded], todo: Sequence[Interval], tolerance: float
+) -> Iterator[tuple[Interval, list[Polynomial], list[float]]]:
+    """Every interval with its polynomials, one per row, and their proven upper bounds."""
+    directions = [row.direction for row in rows]
+    every = [tube.cells(*interval, directions) for interval in todo]
+    tops = _tops(tube, [(poly, row.limit) for found in every for poly, row in zip(found, rows, strict=True)], tolerance)
+    for number, (interval, found) in enumerate(zip(todo, every, strict=True)):
+        yield interval, found, tops[number * len(rows) : (number + 1) * len(rows)].tolist()
+
+
+def _tops(tube: Tube, flat: Sequence[tuple[Polynomial, float]], tolerance: float) -> Array:
+    """Upper bounds of polynomials less their limits."""
+    tops, monomials = np.empty(len(flat)), tube.flow.monomials
+    for orders in {poly.coefficients.shape[0] for poly, _ in flat}:
+        which = [i for i, (poly, _) in enumerate(flat) if poly.coefficients.shape[0] == orders]
+        dense = np.zeros((len(which), orders, *(monomials.degree + 1,) * monomials.count))
+        together = dense.reshape(len(which), orders, -1)
+        powers = np.array(monomials.exponents, dtype=int).reshape(monomials.size, -1).T
+        places = np.ravel_multi_index(tuple(powers), dense.shape[2:]) if monomials.count else [0]
+        together[:, :, places] = np.array([flat[i][0].coefficients for i in which])
+        together[:, 0, 0] -= np.array([flat[i][1] for i in which])
+        errors = np.array([flat[i][0].error + 1e-15 * abs(flat[i][1]) for i in which]) * OUTWARD
+        if not (np.isfinite(dense).all() and np.isfinite(errors).all()):
+            raise Unchecked("the response grows beyond what numbers can hold")
+        tops[which] = highest(dense, [False] + [True] * monomials.count, errors, tolerance)
+    return tops
+
+
+def _cut(place: Place, row: Bounded, poly: Polynomial) -> float:
+    """The bound with the help of the set of parameters: where ``a'p <= s`` on the set, ``v <= v + weight (s - a'p)``
+    there."""
+    tube, top = place.tube, np.inf
+    centre, radius = np.array(tube.flow.centre), np.array(tube.flow.radius)
+    if place.parameters.is_box:
+        return top
+    linear = [tube.flow.monomials.number[tuple(int(i == j) for j in range(centre.size))] for i in range(centre.size)]
+    slope = poly.coefficients[:, linear].sum(axis=0) / np.where(radius > 0, radius, 1.0)
+    for normals, limits, weights in place.parameters.bounds(place.box, slope):
+        coefficients = poly.coefficients.copy()
+        coefficients[0, linear] -= (weights @ normals) * radius
+        coefficients[0, 0] += float(weights @ (limits - normals @ centre))
+        size = float(weights @ (np.abs(limits) + np.abs(normals) @ (np.abs(centre) + radius)))
+        changed = replace(poly, coefficients=coefficients, error=poly.error + ROUNDING * size)
+        top = min(top, float(_tops(tube, [(changed, row.limit)], place.tolerance)[0]))
+    return top
+
+
+def _to_blame(poly: Polynomial, interval: Interval) -> bool:
+    if interval[1] == interval[2] or poly.expansion > BLAME * poly.error:
+        return True
+    return bool(np.abs(poly.coefficients[0, 1:]).sum() > np.abs(poly.coefficients[1:]).sum())
+
+
+def _influence(tube: Tube, poly: Polynomial) -> Array:
+    sizes = np.abs(poly.coefficients).sum(axis=0)
+    answer: Array = np.array(tube.flow.monomials.exponents, dtype=float).T @ sizes
+    return answer
+
+
+def _halves(interval: Interval) -> list[Interval]:
+    piece, start, stop = interval
+    middle = (start + stop) / 2
+    if not start < middle < stop:
+        raise Unchecked(f"the times around {start!r} cannot be halved any more")
+    return [(piece, start, middle), (piece, middle, stop)]
+
+
+def _split(box: Corners, axis: int) -> list[Corners]:
+    lower, upper = list(box[0]), list(box[1])
+    middle = (lower[axis] + upper[axis]) / 2
+    if not lower[axis] < middle < upper[axis]:
+        raise Unchecked("a box of parameters cannot be halved any more")
+    left, right = upper.copy(), lower.copy()
+    left[axis] = right[axis] = middle
+    return [(tuple(lower), tuple(left)), (tuple(right), tuple(upper))]

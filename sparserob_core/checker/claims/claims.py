@@ -1,0 +1,233 @@
+"""What a certificate claims, each claim derived anew from the problem's data in ball arithmetic."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.claims.case import Case, listed, number, numbers
+from sparserob_core.checker.claims.constraints import bounded, kept
+from sparserob_core.checker.claims.duality import Row
+from sparserob_core.checker.claims.equalities import equalities
+from sparserob_core.checker.claims.replay import reached
+from sparserob_core.checker.outcome import VIOLATION, Broken, Claim, Unchecked
+from sparserob_core.checker.sets.shapes import excess, limit, member, support
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from flint import arb
+
+PRECISION = 96  # bits
+FIGURES = 1e-11  # relative to the larger of it and 1: how closely a written figure must agree with the one derived
+MOST_MULTIPLIERS = 100_000
+
+
+def check(case: Case, gap_tolerance: float | None) -> list[Claim]:
+    """One verdict per claim of the certificate; nothing that the file says is believed."""
+    from flint import ctx
+
+    status = case.certificate.get("status")
+    with ctx.workprec(PRECISION):
+        if type(case.certificate.get("format")) is not int or case.certificate["format"] != 1:
+            return [Claim("certificate", "fails", f"its format is {case.certificate.get('format')!r}, expected 1")]
+        if status == "infeasible":
+            return [judged("infeasibility", lambda: _infeasible(case))]
+        if status not in ("certified", "verified", "refuted", "undecided"):
+            return [Claim("status", "fails", f"it is {status!r}, which claims nothing")]
+        claims = [judged("control", lambda: _control(case)), judged("cost", lambda: _cost(case))]
+        claims += [judged("lower bound", lambda: _lower(case))]
+        if status == "refuted":
+            return [*claims, judged("violation", lambda: _witness(case))]
+        if case.equalities:
+            claims.append(judged("equalities", lambda: equalities(case)))
+        claims += [judged(window.name, lambda window=window: bounded(case, window)) for window in case.windows]  # type: ignore[misc]
+        return [*claims, judged("status", lambda: _status(case, str(status), gap_tolerance, claims))]
+
+
+def judged(name: str, derive: Callable[[], str]) -> Claim:
+    """The verdict of a derivation that returns a sentence or raises."""
+    try:
+        return Claim(name, "holds", derive())
+    except Broken as fault:
+        return Claim(name, "fails", str(fault))
+    except Unchecked as gap:
+        return Claim(name, "not checked", str(gap))
+    except ZeroDivisionError:
+        return Claim(name, "not checked", "a ball around a divisor holds 0")
+
+
+def _control(case: Case) -> str:
+    """Every piece of the control in its set."""
+    over = max(excess(case.problem.control, piece.entries()) for piece in case.pieces)
+    if over > VIOLATION:
+        raise Broken(f"it leaves its set by {over:.3g}, relative to the set's size")
+    return f"{case.control.pieces} pieces in their set" + (f", to {over:.1e} of its size" if over > 0 else "")
+
+
+def cost_of(case: Case) -> arb:
+    """``J`` of the decision."""
+    from flint import arb
+
+    total = arb(0)
+    for k, piece in enumerate(case.pieces):
+        length = arb(float(case.control.breakpoints[k + 1])) - arb(float(case.control.breakpoints[k]))
+        total = total + length * sum(
+            (arb(float(w)) * abs(u) for w, u in zip(np.asarray(case.problem.weights), piece.entries(), strict=True)),
+            arb(0),
+        )
+    return total
+
+
+def _cost(case: Case) -> str:
+    derived = cost_of(case)
+    _agrees("cost", number(case.certificate, "cost"), derived, _scale(case))
+    return f"J = {float(derived.mid()):.12g}"
+
+
+def _agrees(name: str, written: float, derived: arb, scale: float) -> None:
+    from flint import arb
+
+    off = abs(arb(written) - derived)
+    if not off <= arb(FIGURES) * arb(scale).max(abs(derived)):
+        raise Broken(f"{name}: {written!r} is written, {float(derived.mid())!r} is derived")
+
+
+def _multiplied(case: Case, priced: bool) -> arb:
+    """The bound that the certificate's multipliers give."""
+    from flint import arb
+
+    data = case.certificate.get("multipliers")
+    if data is None:
+        raise Unchecked("the certificate holds no multipliers, which this method does not offer")
+    if not isinstance(data, Mapping):
+        raise Broken("multipliers: expected those of constraints, equalities and pieces")
+    entries = listed(data, "constraints")
+    if len(entries) > MOST_MULTIPLIERS:
+        raise Broken(f"{len(entries)} multipliers are too many to be checked")
+    rows = [_row(case, entry) for entry in entries]
+    nu = numbers(listed(data, "equalities"), "equalities")
+    if nu.shape != (len(case.equalities),):
+        raise Broken(f"{nu.size} multipliers of equalities, expected {len(case.equalities)}")
+    bound = case.problem.system.parameters
+    middle = [] if bound is None else bound.interior_point().tolist()
+    for multiplier, (state, value) in zip(nu.tolist(), case.equalities, strict=True):
+        row = case.duality.row(
+            np.eye(case.problem.system.states)[state], case.problem.horizon, middle, arb(value), disturbed=False
+        )
+        rows.append((multiplier, row))
+    pieces = data.get("pieces")
+    if case.control.functions < case.control.pieces:
+        pieces, expected = numbers(pieces, "pieces"), (case.problem.system.controls, case.control.pieces)
+        if pieces.shape != expected:
+            raise Broken(f"multipliers of the control's pieces have shape {pieces.shape}, expected {expected}")
+    return case.duality.bound(rows, pieces, priced)
+
+
+def _row(case: Case, entry: object) -> tuple[float, Row]:
+    """A multiplier and its constraint, which must be one of the problem's."""
+    if not isinstance(entry, Mapping):
+        raise Broken("multipliers: expected a constraint, a time, a parameter, a direction and a number each")
+    name = str(entry.get("constraint"))
+    direction, time, y = (
+        numbers(entry.get("direction"), f"{name}: direction"),
+        number(entry, "time"),
+        number(entry, "multiplier"),
+    )
+    if not y > 0:
+        raise Broken(f"a multiplier of {name} is {y!r}, expected a positive number")
+    if name == "control" and not any(window.name == name for window in case.windows):
+        _sized(direction, case.problem.system.controls, name)
+        return y, case.duality.control_row(direction, time)
+    window, parameter = case.window(name), numbers(entry.get("parameter"), f"{name}: parameter")
+    _sized(direction, case.problem.system.states, name)
+    if not window.start <= time <= window.stop:
+        raise Broken(f"{name}: t = {time!r} is not within {window.start:g} to {window.stop:g}")
+    _sized(parameter, case.problem.system.parameter_count, name)
+    if case.problem.system.parameters is not None and not member(case.problem.system.parameters, parameter):
+        raise Broken(f"{name}: the parameter {parameter.tolist()} is not shown to be in its set")
+    return y, case.duality.row(direction, time, parameter.tolist(), limit(window.shape, direction))
+
+
+def _sized(vector: Array, size: int, name: str) -> None:
+    if vector.shape != (size,):
+        raise Broken(f"{name}: {vector.size} numbers where {size} are expected")
+
+
+def _lower(case: Case) -> str:
+    written, derived = number(case.certificate, "lower_bound"), _multiplied(case, priced=True)
+    if not derived >= written:
+        raise Broken(f"{written!r} is written, the multipliers prove {float(derived.lower())!r}")
+    return f"no control costs less than {written:.12g}" + (
+        f" (the multipliers prove {float(derived.lower()):.12g})"
+        if not derived - written < FIGURES * max(1.0, abs(written))
+        else ""
+    )
+
+
+def _infeasible(case: Case) -> str:
+    amount = _multiplied(case, priced=False)
+    if not amount > 0:
+        raise Broken(f"the multipliers prove {float(amount.lower()):.3g}, expected a positive number")
+    entries = case.certificate["multipliers"]["constraints"]
+    return (
+        f"{len(entries)} constraints clash: their weighted sum is at least {float(amount.lower()):.4g} for every"
+        " control, it must not be positive"
+    )
+
+
+def _status(case: Case, status: str, tolerance: float | None, claims: list[Claim]) -> str:
+    """The status must follow from the claims before it."""
+    if status == "undecided":
+        return "nothing is claimed beyond the figures above"
+    kept = [claim for claim in claims if claim.name not in ("cost", "lower bound")]
+    wrong = [claim.name for claim in kept if claim.verdict == "fails"]
+    if wrong:
+        raise Broken(f"it is {status}, but {', '.join(wrong)} does not hold")
+    if any(claim.verdict == "not checked" for claim in (kept if status == "verified" else claims)):
+        raise Unchecked(f"{status} rests on claims that were not checked")
+    cost, lower = number(case.certificate, "cost"), number(case.certificate, "lower_bound")
+    gap = (cost - lower) / max(_scale(case), abs(cost))
+    if status == "verified":
+        return f"every constraint is kept; the gap is {gap:.2e}"
+    written = case.certificate.get("gap_tolerance")
+    if tolerance is None or written != tolerance:
+        raise Broken(f"the gap is to be within {written!r}, the config says {tolerance!r}")
+    if not gap <= tolerance:
+        raise Broken(f"it is certified, but the gap is {gap:.3g}, more than {tolerance:g}")
+    return f"every constraint is kept, and the bounds meet within {max(gap, 0.0):.2e}"
+
+
+def _scale(case: Case) -> float:
+    """What the gap is relative to where the cost is smaller: the largest cost of any control, at most 1."""
+    axes = np.eye(case.problem.system.controls)
+    reach = [
+        max(abs(float(support(case.problem.control, balls(s * axis)).mid())) for s in (1.0, -1.0)) for axis in axes
+    ]
+    return min(1.0, float(np.dot(np.asarray(case.problem.weights), reach)) * case.problem.horizon) or 1.0
+
+
+def _witness(case: Case) -> str:
+    """The state that the witness leads to, and by how much it leaves the constraint."""
+    data = case.certificate.get("witness")
+    if not isinstance(data, Mapping):
+        raise Unchecked("the certificate holds no witness")
+    window, time = case.window(str(data.get("constraint"))), number(data, "time")
+    direction, parameter = (numbers(data.get(key), key) for key in ("direction", "parameter"))
+    _sized(direction, case.problem.system.states, window.name)
+    _sized(parameter, case.problem.system.parameter_count, window.name)
+    if not window.start <= time <= window.stop:
+        raise Broken(f"t = {time!r} is not within {window.start:g} to {window.stop:g}")
+    if case.problem.system.parameters is not None and not member(case.problem.system.parameters, parameter):
+        raise Broken(f"the parameter {parameter.tolist()} is not shown to be in its set")
+    state = reached(case, time, parameter, data.get("disturbance"))
+    over = sum((balls([c])[0] * x for c, x in zip(direction, state, strict=True)), balls([0.0])[0]) - limit(
+        window.shape, direction
+    )
+    if not over > kept(case, window) * float(np.linalg.norm(direction)):
+        raise Broken(f"it leads to a violation of {float(over.mid()):.3g}, which is none")
+    if abs(float(over.mid()) - number(data, "violation")) > 1e-6 * max(1.0, abs(float(over.mid()))):
+        raise Broken(f"a violation of {data.get('violation')!r} is written, {float(over.mid())!r} is derived")
+    return f"{window.name} is exceeded by {float(over.lower()):.6g} at t = {time:.6g}"

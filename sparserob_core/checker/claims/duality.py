@@ -1,0 +1,206 @@
+"""Weak duality in ball arithmetic: a lower bound of the cost, or the proof that no control is feasible.
+
+For multipliers ``y >= 0`` of constraints ``c'x(t) + sigma <= h(c)`` and any ``nu`` of equalities, no admissible control
+costs less than ``sum_i y_i (c_i'e^{A t_i} x(0) + sigma_i - h(c_i)) + min_u J(u) + sum_i y_i g_i u``, the minimum over
+the controls' set alone, piece by piece. With ``J`` left out, a positive number proves that nothing is feasible
+(Farkas).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.balls import rational
+from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.checker.reach.flow import Flow, stacked
+from sparserob_core.checker.sets.shapes import arrangement, boxed, facets, support
+from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.sets.sets import Box
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from flint import arb, arb_mat
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Row:
+    """``constant + sum_k slope_k u_k <= 0`` for every feasible control; ``slope`` is a list of ``m`` balls per piece of
+    the control."""
+
+    constant: arb
+    slope: list[list[arb]]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Duality:
+    """The data that bounds are derived from. ``changes``: where the disturbance may jump, ``None`` when there is
+    none."""
+
+    problem: OptimalControlProblem
+    control: Dictionary
+    changes: list[float] | None
+
+    def control_row(self, direction: Array, time: float) -> Row:
+        """``c'u(t) <= h(c)`` for a curved set of controls."""
+        piece = int(
+            np.clip(np.searchsorted(self.control.breakpoints, time, side="right") - 1, 0, self.control.pieces - 1)
+        )
+        slope = [[_exact(0.0)] * direction.size for _ in range(self.control.pieces)]
+        slope[piece] = [_exact(c) for c in direction]
+        return Row(-support(self.problem.control, slope[piece]), slope)
+
+    def row(self, direction: Array, time: float, parameter: Sequence[float], limit: arb, disturbed: bool = True) -> Row:
+        """``c'x(t) <= limit`` at one parameter, for the worst disturbance, or where none reaches the state."""
+        flow = Flow(self.problem.system, tuple(map(float, parameter)), (0.0,) * len(parameter), 0)
+        d, m = flow.parts["A"][0].nrows(), flow.parts["B"][0].ncols()
+        matrix = _joined(flow)
+        breaks = [float(s) for s in self.control.breakpoints[:-1]]
+        jumps = self.changes if self.changes is not None else []
+        lags = {s: self._lag(matrix, direction, time, s) for s in {0.0, *(s for s in (*breaks, *jumps) if s < time)}}
+        constant = (
+            sum((lags[0.0][i] * _exact(x) for i, x in enumerate(np.asarray(self.problem.initial_state))), _exact(0.0))
+            - limit
+        )
+        slope = _differences([lags[s][d : d + m] if s < time else None for s in breaks], m)
+        if disturbed and self.changes is not None and self.problem.disturbance is not None:
+            mw = flow.parts["E"][0].ncols()
+            for weights in _differences([lags[s][d + m :] if s < time else None for s in jumps], mw):
+                if any(not w.is_zero() for w in weights):
+                    constant = constant + support(self.problem.disturbance, weights)
+        return Row(constant, slope)
+
+    def _lag(self, matrix: arb_mat, direction: Array, time: float, since: float) -> list[arb]:
+        start = stacked([[_exact(v)] for v in (*direction, *np.zeros(matrix.nrows() - direction.size))])
+        column: list[arb] = ((matrix * (_exact(time) - _exact(since))).exp() * start).entries()
+        return column
+
+    def bound(self, rows: Sequence[tuple[float, Row]], pieces: Sequence[Sequence[float]] | None, priced: bool) -> arb:
+        """The bound that multipliers ``y`` of ``rows`` give; ``priced``: with the cost, otherwise as a proof of
+        infeasibility."""
+        constant = sum((_exact(y) * row.constant for y, row in rows), _exact(0.0))
+        m, K = self.problem.system.controls, self.control.pieces
+        slopes = [
+            [
+                sum((_exact(y) * row.slope[k][c] for y, row in rows if not row.slope[k][c].is_zero()), _exact(0.0))
+                for c in range(m)
+            ]
+            for k in range(K)
+        ]
+        if pieces is not None and self.control.functions < K:
+            slopes, slip = self._moved(slopes, pieces)
+            constant = constant - slip
+        weights = np.asarray(self.problem.weights, dtype=float) if priced else np.zeros(m)
+        lengths = [
+            _exact(b) - _exact(a)
+            for a, b in zip(self.control.breakpoints[:-1], self.control.breakpoints[1:], strict=True)
+        ]
+        return sum(
+            (
+                self._least([_exact(w) * length for w in weights], slope)
+                for length, slope in zip(lengths, slopes, strict=True)
+            ),
+            constant,
+        )
+
+    def _moved(self, slopes: list[list[arb]], pieces: Sequence[Sequence[float]]) -> tuple[list[list[arb]], arb]:
+        """With fewer functions than pieces, slopes that act alike on every control of the dictionary are as good: those
+        of the certificate.
+
+        What they act differently is bounded by the largest coefficients.
+        """
+        m, K, N = self.problem.system.controls, self.control.pieces, self.control.functions
+        mine = [[-_exact(pieces[c][k]) for c in range(m)] for k in range(K)]
+        slip = _exact(0.0)
+        for c in range(m):
+            largest = self._largest_coefficients(c)
+            for n in range(N):
+                off = sum(
+                    ((mine[k][c] - slopes[k][c]) * _exact(v) for k, v in enumerate(self.control.values[n]) if v),
+                    _exact(0.0),
+                )
+                slip = slip + abs(off) * largest[n]
+        return mine, slip
+
+    def _largest_coefficients(self, channel: int) -> list[arb]:
+        axis = [_exact(float(i == channel)) for i in range(self.problem.system.controls)]
+        reach = support(self.problem.control, axis).max(support(self.problem.control, [-a for a in axis]))
+        return [sum((abs(x) for x in row), _exact(0.0)) * reach for row in self._pseudoinverse]
+
+    @cached_property
+    def _pseudoinverse(self) -> list[list[arb]]:
+        """``(V V')^-1 V``: the coefficients of a control in the span of the dictionary."""
+        V = stacked([[_exact(v) for v in row] for row in self.control.values])
+        table: list[list[arb]] = ((V * V.transpose()).inv() * V).tolist()
+        return table
+
+    def _least(self, weights: list[arb], slope: list[arb]) -> arb:
+        """At most ``min sum_i weights_i |u_i| + slope_i u_i`` over the controls' set."""
+        bound = boxed(self.problem.control)
+        if isinstance(bound, Box):
+            return sum(
+                (
+                    _least_between(w, s, float(low), float(high))
+                    for w, s, low, high in zip(weights, slope, bound.lower, bound.upper, strict=True)
+                ),
+                _exact(0.0),
+            )
+        flat = facets(bound)
+        if flat is not None:
+            values = [
+                sum(
+                    (w * rational(abs(v)) + s * rational(v) for w, s, v in zip(weights, slope, point, strict=True)),
+                    _exact(0.0),
+                )
+                for point in arrangement(bound)
+            ]
+            return _smallest(values)
+        tilt = [
+            s + _exact(float(np.clip(-float(s.mid()), -float(w.lower()), float(w.lower()))))
+            for w, s in zip(weights, slope, strict=True)
+        ]
+        return -support(bound, [-t for t in tilt])  # |u_i| >= v_i u_i for any |v_i| <= 1
+
+
+def _joined(flow: Flow) -> arb_mat:
+    """``y' = A'y`` with the integrals of ``B'y`` and ``E'y``."""
+    A, B, E = (flow.parts[name][0].transpose() for name in ("A", "B", "E"))
+    table = [row for part in (A, B, E) for row in part.tolist()]
+    return stacked([row + [_exact(0.0)] * (len(table) - len(row)) for row in table])
+
+
+def _differences(integrals: Sequence[list[arb] | None], width: int) -> list[list[arb]]:
+    """What each piece contributes: the integral since its start less that since its end."""
+    zero = [_exact(0.0)] * width
+    nexts = [*integrals[1:], None]
+    return [
+        zero if now is None else [a - b for a, b in zip(now, later or zero, strict=True)]
+        for now, later in zip(integrals, nexts, strict=True)
+    ]
+
+
+def _least_between(w: arb, s: arb, low: float, high: float) -> arb:
+    ends = [low, high, float(np.clip(0.0, low, high))]
+    return _smallest([w * abs(_exact(v)) + s * _exact(v) for v in ends])
+
+
+def _smallest(values: Sequence[arb]) -> arb:
+    if not values:
+        raise Unchecked("the set of controls has no corners")
+    least = values[0]
+    for value in values[1:]:
+        least = least.min(value)
+    return least
+
+
+def _exact(value: float) -> arb:
+    from flint import arb
+
+    return arb(float(value))

@@ -1,0 +1,67 @@
+"""States that are fixed at the end: no parameter and no disturbance may reach them, and the control must bring them
+there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.arithmetic.jets import Monomials, expanded
+from sparserob_core.checker.claims.case import Case
+from sparserob_core.checker.outcome import VIOLATION, Broken, Unchecked
+from sparserob_core.checker.reach.flow import Flow
+from sparserob_core.checker.reach.tube import Tube
+from sparserob_core.checker.sets.shapes import support
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from flint import arb
+
+
+def equalities(case: Case) -> str:
+    """Show that the fixed states are met at every parameter and disturbance; a sentence with the figures."""
+    middle = [] if case.problem.system.parameters is None else case.problem.system.parameters.interior_point().tolist()
+    tube = Tube(
+        Flow(case.problem.system, tuple(middle), (0.0,) * len(middle), 0), replace(case.scene, disturbance=None)
+    )
+    worst = 0.0
+    for state, value in case.equalities:
+        if _reached(case, state):
+            raise Unchecked(f"the uncertainty may reach x{state + 1}, which is to be fixed")
+        missed = abs(tube.nodes[-1].parts[0][state, 0] - balls([value])[0])
+        if not missed <= VIOLATION:
+            raise Broken(f"x{state + 1} is missed by up to {float(missed.upper()):.3g}")
+        worst = max(worst, float(missed.upper()))
+    return f"kept to {worst:.1e}"
+
+
+def _reached(case: Case, state: int) -> bool:
+    """Whether an uncertain entry may reach a state: follow the entries of ``A`` that are not 0 at every parameter."""
+    system = case.problem.system
+    wide = _hull(case)
+    parts = expanded(system, Monomials(len(wide), 1), wide, [1.0] * len(wide))
+    d, reaching = system.states, {state}
+    for _ in range(d):
+        reaching |= {j for i in reaching for j in range(d) if not parts["A"][0][i, j].is_zero()}
+    uncertain = any(
+        not part[i, j].is_zero()
+        for name in ("A", "B")
+        for part in parts[name][1:]
+        for i in reaching
+        for j in range(part.ncols())
+    )
+    pushed = case.problem.disturbance is not None and any(
+        not part[i, j].is_zero() for part in parts["E"] for i in reaching for j in range(part.ncols())
+    )
+    return uncertain or pushed
+
+
+def _hull(case: Case) -> Sequence[arb]:
+    """A ball around every parameter's values."""
+    bound = case.problem.system.parameters
+    if bound is None:
+        return []
+    axes = [[float(i == j) for j in range(bound.dimension)] for i in range(bound.dimension)]
+    return [(-support(bound, balls([-a for a in axis]))).union(support(bound, balls(axis))) for axis in axes]

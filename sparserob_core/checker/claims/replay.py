@@ -1,0 +1,57 @@
+"""One trajectory, for one disturbance and one parameter that must be admissible."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.claims.case import Case, numbers
+from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.reach.flow import Flow, held, stacked
+from sparserob_core.checker.sets.shapes import member
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from flint import arb
+
+
+def reached(case: Case, time: float, parameter: Array, signal: object) -> list[arb]:
+    """The state at ``time`` under the case's control, and ``signal (mw, pieces)`` on the pieces of the common grid
+    (``None``: no disturbance)."""
+    from flint import arb, arb_mat
+
+    flow = Flow(case.problem.system, tuple(map(float, parameter)), (0.0,) * parameter.size, 0)
+    wanted = case.problem.disturbance is not None
+    w = _admissible(case, signal) if wanted else None
+    both = stacked(
+        [left + right for left, right in zip(flow.parts["B"][0].tolist(), flow.parts["E"][0].tolist(), strict=True)]
+    )
+    x = stacked([[v] for v in balls(np.asarray(case.problem.initial_state))])
+    for k, start in enumerate(case.grid[:-1]):
+        if start >= time:
+            break
+        Phi, Gamma = held(flow.parts["A"][0], both, arb(min(case.grid[k + 1], time)) - arb(start))
+        pushed = [arb(0)] * flow.parts["E"][0].ncols() if w is None else balls(w[:, k])
+        x = Phi * x + Gamma * arb_mat([[v] for v in case.scene.control[k].entries() + pushed])
+    state: list[arb] = x.entries()
+    return state
+
+
+def _admissible(case: Case, signal: object) -> Array:
+    """The disturbance, shown to be one of the problem's."""
+    changes, bound = case.changes, case.problem.disturbance
+    assert changes is not None and bound is not None
+    w = numbers(signal, "disturbance")
+    if w.ndim != 2 or w.shape[0] != bound.dimension:
+        raise Broken(f"disturbance: expected {bound.dimension} rows, got shape {w.shape}")
+    if w.shape[1] != len(case.grid) - 1:
+        raise Unchecked("the disturbance is given on another grid")
+    jumps = set(changes)
+    for k in range(w.shape[1]):
+        if k and case.grid[k] not in jumps and not np.array_equal(w[:, k], w[:, k - 1]):
+            raise Broken(f"the disturbance jumps at t = {case.grid[k]:.6g}, within a piece")
+        if not member(bound, w[:, k]):
+            raise Broken(f"the disturbance {w[:, k].tolist()} at t = {case.grid[k]:.6g} is not shown to be in its set")
+    return w

@@ -1,0 +1,52 @@
+"""Whether cells fill a box: exact, in rational arithmetic."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+
+from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.sip.convex_set import Array
+
+MOST_CELLS = 100_000
+
+
+def fill(lower: Array, upper: Array, low: Array, high: Array) -> None:
+    """Raise `Broken` unless the cells ``[lower_i, upper_i]`` (``(k, d)``) fill the box ``[low, high]`` without overlap.
+
+    Cells inside the box, disjoint but for their faces, with the box's volume between them, fill it. A coordinate in
+    which the box is a point is left out of the volume, and must be that point in every cell.
+    """
+    if (
+        lower.ndim != 2
+        or lower.shape != upper.shape
+        or lower.shape[1] != low.size
+        or not (np.isfinite(lower).all() and np.isfinite(upper).all())
+    ):
+        raise Broken(f"its cells are no pairs of corners with {low.size} coordinates")
+    if (lower < low).any() or (upper > high).any() or (lower > upper).any():
+        raise Broken("a cell lies outside what is to be covered")
+    thick = high > low
+    if lower.shape[0] > MOST_CELLS:
+        raise Unchecked(f"{lower.shape[0]} cells are too many to be told apart one by one")
+    if not thick.any():
+        if lower.shape[0] != 1:
+            raise Broken(f"{lower.shape[0]} cells stand for a single point, expected one")
+        return
+    a, b = lower[:, thick], upper[:, thick]
+    for i in range(a.shape[0]):
+        if ((a[i] < b[i + 1 :]) & (a[i + 1 :] < b[i])).all(axis=1).any():
+            raise Broken("two cells overlap")
+    missing = _volume(low[thick], high[thick]) - sum((_volume(x, y) for x, y in zip(a, b, strict=True)), Fraction(0))
+    if missing != 0:
+        raise Broken(
+            f"the cells leave a share of {float(missing / _volume(low[thick], high[thick])):.3g} of the index set out"
+        )
+
+
+def _volume(low: Array, high: Array) -> Fraction:
+    product = Fraction(1)
+    for x, y in zip(low.tolist(), high.tolist(), strict=True):
+        product *= Fraction(y) - Fraction(x)
+    return product

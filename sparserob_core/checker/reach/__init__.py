@@ -1,0 +1,1 @@
+"""What the state does, in ball arithmetic: flows, worst disturbances, tubes."""

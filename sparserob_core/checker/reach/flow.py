@@ -1,0 +1,202 @@
+"""The response of an uncertain linear system over one box of parameters, as polynomials in the parameters with balls as
+coefficients.
+
+Power series of ball matrices solve for the coefficients; Lagrange's remainder is bounded by a comparison system for the
+norms of the first coefficients left out, with the logarithmic norm in modal coordinates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from math import sqrt
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.jets import Monomials, expanded
+from sparserob_core.checker.arithmetic.series import Series, norm, upper
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from flint import arb, arb_mat
+
+    from sparserob_core.control.problem.system import LinearSystem
+
+WELL_CONDITIONED = 1e4
+ORDER = 6  # of the expansion in time
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Flow:
+    """The system over the box ``centre +- radius`` (``(nu,)`` exact numbers), expanded to ``degree`` in the parameters.
+
+    A *row* is the functional ``c'e^{A s}``, as a column, and below it its integral times ``E``.
+    """
+
+    system: LinearSystem
+    centre: tuple[float, ...]
+    radius: tuple[float, ...]
+    degree: int
+
+    @cached_property
+    def monomials(self) -> Monomials:
+        return Monomials(len(self.centre), self.degree if self.centre else 0)
+
+    @cached_property
+    def parts(self) -> dict[str, list[arb_mat]]:
+        """Taylor coefficients of ``A``, ``B``, ``E`` at the centre."""
+        from flint import arb
+
+        return expanded(self.system, self.monomials, [arb(c) for c in self.centre], self.radius)
+
+    @cached_property
+    def states(self) -> Series:
+        """``A``."""
+        return Series(self.monomials, self.parts["A"])
+
+    @cached_property
+    def inputs(self) -> Series:
+        """``B``."""
+        return Series(self.monomials, self.parts["B"])
+
+    @cached_property
+    def rows(self) -> Series:
+        """The matrix of a row and of its integral times ``E``."""
+        from flint import arb, arb_mat
+
+        mw = self.parts["E"][0].ncols()
+        table = [
+            [row + [arb(0)] * mw for row in a.transpose().tolist() + e.transpose().tolist()]
+            for a, e in zip(self.parts["A"], self.parts["E"], strict=True)
+        ]
+        return Series(self.monomials, [arb_mat(part) for part in table])
+
+    @cached_property
+    def remainder(self) -> Remainder | None:
+        """Bounds of what the expansion leaves out; ``None`` for a known system."""
+        return Remainder.of(self) if self.centre else None
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Remainder:
+    """``n_j``, the summed norms of all coefficients of degree ``j`` anywhere in the box, obey
+    ``n' <= growth n + source |u|``.
+
+    ``growth (D+2, D+2)``; ``control``, ``disturbance``: per degree, the norms of ``B``, and of every column of ``E``.
+    ``transform`` ``T``: norms are those of ``T^-1 x``.
+    """
+
+    growth: arb_mat
+    control: list[arb]
+    disturbance: list[list[arb]]
+    transform: Array
+    inverse: arb_mat
+
+    @staticmethod
+    def of(flow: Flow) -> Remainder:
+        from flint import arb, arb_mat
+
+        degree = flow.degree + 1
+        monomials = Monomials(len(flow.centre), degree)
+        wide = [arb(c, abs(r)) for c, r in zip(flow.centre, flow.radius, strict=True)]
+        parts = expanded(flow.system, monomials, wide, flow.radius)
+        T = _modal(
+            np.array(
+                [
+                    [float(flow.parts["A"][0][i, j].mid()) for j in range(flow.system.states)]
+                    for i in range(flow.system.states)
+                ]
+            )
+        )
+        exact = arb_mat(T.tolist())
+        inverse = exact.inv()
+
+        def per_degree(matrices: Sequence[arb_mat]) -> list[arb]:
+            totals = [arb(0)] * (degree + 1)
+            for e, matrix in zip(monomials.exponents, matrices, strict=True):
+                totals[sum(e)] = totals[sum(e)] + upper(norm(matrix))
+            return totals
+
+        A = per_degree([inverse * a * exact for a in parts["A"]])
+        A[0] = upper(logarithmic_norm(inverse * parts["A"][0] * exact))
+        growth = stacked([[A[i - j] if j <= i else arb(0) for j in range(degree + 1)] for i in range(degree + 1)])
+        columns = [per_degree([inverse * column(e, c) for e in parts["E"]]) for c in range(parts["E"][0].ncols())]
+        return Remainder(growth, per_degree([inverse * b for b in parts["B"]]), columns, T, inverse)
+
+    def start(self, size: arb) -> arb_mat:
+        """The norms at the beginning, where nothing depends on the parameters."""
+        from flint import arb
+
+        return stacked([[size if j == 0 else arb(0)] for j in range(self.growth.nrows())])
+
+
+def stacked(table: Sequence[Sequence[arb]]) -> arb_mat:
+    """A ball matrix from its rows."""
+    from flint import arb_mat
+
+    return arb_mat([list(row) for row in table])
+
+
+def column(matrix: arb_mat, number: int) -> arb_mat:
+    """One column of a ball matrix."""
+    return stacked([[matrix[i, number]] for i in range(matrix.nrows())])
+
+
+def logarithmic_norm(matrix: arb_mat) -> arb:
+    """An upper bound of the largest eigenvalue of the symmetric part (Gershgorin): ``|e^{A t}| <= e^{mu t}`` (Dahlquist
+    1958)."""
+    d = matrix.nrows()
+    discs = [
+        matrix[i, i] + sum((abs(matrix[i, j] + matrix[j, i]) / 2 for j in range(d) if j != i), start=matrix[i, i] * 0)
+        for i in range(d)
+    ]
+    largest = discs[0]
+    for disc in discs[1:]:
+        largest = largest.max(disc)
+    return largest
+
+
+def up_to(length: arb) -> arb:
+    """The ball of all numbers from 0 to ``length``."""
+    from flint import arb
+
+    return arb(0).union(length)
+
+
+def in_time(matrix: Series, derivative: Series, length: arb, inside: Series) -> list[Series]:
+    """The terms of order 1, 2, ... of a solution of ``y' = matrix y`` in the time over ``length``, from its derivative
+    at the start.
+
+    The last term is Lagrange's: with ``inside``, which holds ``e^{matrix s}`` for every ``s`` up to ``length``, it is
+    right anywhere in between.
+    """
+    terms, v, factor = [], derivative, length
+    for order in range(1, ORDER):
+        terms.append(v.scaled(factor))
+        v, factor = matrix * v, factor * length / (order + 1)
+    return [*terms, (inside * v).scaled(factor)]
+
+
+def held(matrix: arb_mat, inputs: arb_mat, time: arb) -> tuple[arb_mat, arb_mat]:
+    """`Series.held` of matrices that do not depend on the parameters."""
+    known = Monomials(0, 0)
+    Phi, Gamma = Series(known, [matrix]).held(Series(known, [inputs]), time)
+    return Phi.parts[0], Gamma.parts[0]
+
+
+def _modal(A: Array) -> Array:
+    """Any invertible matrix would be right; this one makes the logarithmic norm small: real modal coordinates, where
+    well conditioned."""
+    values, vectors = np.linalg.eig(A)
+    columns = [
+        part
+        for i, value in enumerate(values)
+        if value.imag >= 0
+        for part in ((vectors[:, i].real,) if value.imag == 0 else (vectors[:, i].real, vectors[:, i].imag))
+    ]
+    T = np.stack(columns, axis=1) * sqrt(A.shape[0])
+    return T if T.shape[0] == T.shape[1] and np.linalg.cond(T) < WELL_CONDITIONED else np.eye(A.shape[0])

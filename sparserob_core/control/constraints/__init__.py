@@ -1,0 +1,1 @@
+"""State and control constraints as families of a semi-infinite program."""

@@ -1,0 +1,194 @@
+"""State constraints with curved sets: the normal direction is one more index, so that every constraint stays a
+half-space."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from sparserob_core.control.constraints.flat import FlatConstraint
+from sparserob_core.control.constraints.local_maxima import climb, local_maxima, vertices
+from sparserob_core.control.enclosures.cache import remember
+from sparserob_core.control.enclosures.combination import Combination, combination
+from sparserob_core.control.response.enclosure import CELLS_KEPT, CellEnclosure, enclose
+from sparserob_core.control.response.functional import WorstCase
+from sparserob_core.control.response.lifted import LiftedSystem
+from sparserob_core.control.response.parameters import ParameterIndex
+from sparserob_core.control.sets.directions import faces, on_surface, sampled, unit
+from sparserob_core.sip.convex_set import Array, Box, ConvexSet
+from sparserob_core.sip.program import Enclosure, Explanation, Separation
+
+CANDIDATES = 24  # sampled maxima that are climbed from
+KEPT = 8  # separated constraints per round
+
+
+@dataclass(frozen=True, eq=False)
+class CurvedConstraint:
+    """``x(t)`` in a curved set for all ``t`` in ``[start, stop]``, ``p`` and ``w``: ``c'x(t) <= h(c)`` for every unit
+    direction ``c``.
+
+    The index is ``(t, p, z)`` with ``z`` in ``[-1, 1]^b`` a direction, not normalised, in the span where the support
+    function ``h`` is finite.
+    """
+
+    name: str
+    functionals: WorstCase
+    set: ConvexSet
+    start: float
+    stop: float
+    parameters: ParameterIndex
+
+    @property
+    def index_set(self) -> Box:
+        box, cube = self._flat.index_set, np.ones(self._b)
+        return Box(np.concatenate([box.lower, -cube]), np.concatenate([box.upper, cube]))
+
+    @property
+    def scale(self) -> float:
+        """The size of the states that the constraint is about."""
+        return self._flat.scale
+
+    def rows(self, indices: Array) -> tuple[Array, Array]:
+        """``G (k, 1, n)``, ``rhs (k, 1)`` at indices ``(k, 1 + nu + b)``."""
+        times, directions, parameters, rhs = self.functionals_at(indices)
+        G, offset = self.functionals.rows(times, directions, parameters)
+        return G[:, None], (rhs - offset)[:, None]
+
+    def functionals_at(self, indices: Array) -> tuple[Array, Array, Array, Array]:
+        """Times, unit directions, parameters and right-hand sides of every index, ``(k, ...)``."""
+        nu = self.parameters.count
+        directions = unit(self.set, indices[:, 1 + nu :])
+        return indices[:, 0], directions, self.parameters.clamp(indices[:, 1 : 1 + nu]), self.set.support(directions)
+
+    def violations(self, x: Array, indices: Array) -> Array:
+        """``row x - rhs``, ``(k,)``, without building rows."""
+        times, directions, parameters, rhs = self.functionals_at(indices)
+        return self.functionals.values(x, times, directions, parameters) - rhs
+
+    def worst(self, x: Array) -> Separation:
+        """The largest local maxima over a lattice of times, parameters and directions, climbed from until the steps
+        vanish."""
+        flat, count = self._flat, self._flat.parameters.count
+        values = flat.on_lattice(x)
+        positions = local_maxima(values, flat.lattice[1], CANDIDATES)
+        heights = values[tuple(positions.T)]
+        positions = positions[np.argsort(-heights, kind="stable")][:CANDIDATES]
+        times = vertices(values, positions, flat.times)[0]
+        points = np.hstack([times[:, None], flat.lattice[0][positions[:, 0]], sampled(self._b)[positions[:, 1]]])
+        box = self.index_set
+        step = np.concatenate(
+            [
+                [np.max(np.diff(flat.times), initial=0.0)],
+                (box.upper - box.lower)[1 : 1 + count] / 4,
+                np.full(self._b, 0.1),
+            ]
+        )
+
+        def project(inside: Array) -> Array:
+            inside = np.clip(inside, box.lower, box.upper)
+            return np.hstack(
+                [inside[:, :1], self.parameters.clamp(inside[:, 1 : 1 + count]), on_surface(inside[:, 1 + count :])]
+            )
+
+        indices, found = climb(lambda at, which: self.violations(x, at), points, step, project)
+        order = _distinct(indices, found)[:KEPT]
+        return Separation(indices[order], np.zeros(order.size, dtype=int), found[order])
+
+    @property
+    def cells(self) -> tuple[Array, Array]:
+        """The cells of times and parameters, times the faces of the cube of directions."""
+        lower, upper = self._flat.cells
+        low, high = faces(self._b)
+        return (
+            np.hstack([np.repeat(lower, low.shape[0], axis=0), np.tile(low, (lower.shape[0], 1))]),
+            np.hstack([np.repeat(upper, high.shape[0], axis=0), np.tile(high, (upper.shape[0], 1))]),
+        )
+
+    def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
+        """Proven upper bounds of the violation (in the length of the cube's directions, at least 1) on cells
+        ``(k, 1 + nu + b)``."""
+        nu = self.parameters.count
+        touched = self.parameters.touches(lower[:, 1 : 1 + nu], upper[:, 1 : 1 + nu])
+        return enclose(lower, upper, touched, nu, lambda low, high: self._cell(x, low, high))
+
+    def explain(self, index: Array, row: int) -> Explanation:
+        """One constraint in words."""
+        times, directions, parameters, rhs = self.functionals_at(index[None])
+        one = FlatConstraint(self.name, self.functionals, directions, rhs, self.start, self.stop, self.parameters)
+        words = one.explain(np.concatenate([times, parameters[0]]), 0)
+        return replace(words, text=f"{words.text} (a tangent of the {type(self.set).__name__.lower()})")
+
+    def nominal(self) -> CurvedConstraint:
+        """The same constraint without uncertainty."""
+        return replace(self, functionals=self.functionals.nominal(), parameters=ParameterIndex(None))
+
+    def _cell(self, x: Array, low: Array, high: Array) -> CellEnclosure:
+        key = x.tobytes() + low.tobytes() + high.tobytes()
+        if key not in self._cells:
+            nu = self.parameters.count
+            centre, radius = (low + high)[nu:] / 2, (high - low)[nu:] / 2
+            free = np.flatnonzero(radius > 0)
+            H = np.vstack([centre, np.diag(radius)[free]]) @ self.set.normals
+            lifted = self._flat.lifted(low[:nu], high[:nu])
+            joined = self._combination(lifted, free.size)
+            push = self.functionals.push(lifted, H, joined)
+            rhs, looseness = self._minorant(H, joined, nu)
+            control = self.functionals.dictionary.control(x)
+            cuts = self.parameters.cuts(low[:nu], high[:nu])
+            remember(
+                self._cells, key, CellEnclosure(lifted, push, H, rhs, control, joined, looseness, cuts), CELLS_KEPT
+            )
+        return self._cells[key]
+
+    def _minorant(self, H: Array, joined: Combination, nu: int) -> tuple[Array, Array]:
+        """A quadratic polynomial below ``h(c_0 + sum_j eta_j c_j)``, ``(1, M')``, and how far below at the ends of
+        every coordinate."""
+        value, gradient, hessian = self.set.support_minorant(H[0], H[1:])
+        rhs = np.zeros((1, joined.space.size))
+        rhs[0, 0] = value
+        unit_exponents = np.eye(joined.space.nu, dtype=int)[nu:]
+        for i, first in enumerate(unit_exponents):
+            rhs[0, joined.space.index[tuple(first.tolist())]] = gradient[i]
+            for j, second in enumerate(unit_exponents):
+                rhs[0, joined.space.index[tuple((first + second).tolist())]] += hessian[i, j] / 2
+        ends = [
+            self.set.support(H[0] + sign * H[1:]) - value - sign * gradient - np.diag(hessian) / 2
+            for sign in (-1.0, 1.0)
+        ]
+        return rhs, np.concatenate([np.zeros(nu), np.maximum(*ends)])
+
+    def _combination(self, lifted: LiftedSystem, free: int) -> Combination:
+        if free not in self._combinations:
+            self._combinations[free] = combination(lifted.space, free)
+        return self._combinations[free]
+
+    @cached_property
+    def _combinations(self) -> dict[int, Combination]:
+        return {}
+
+    @cached_property
+    def _cells(self) -> dict[bytes, CellEnclosure]:
+        return {}
+
+    @property
+    def _b(self) -> int:
+        return int(self.set.normals.shape[0])
+
+    @cached_property
+    def _flat(self) -> FlatConstraint:
+        """The half-spaces of the sampled directions: an outer polytope of the set, on which the search starts."""
+        H = unit(self.set, sampled(self._b))
+        return FlatConstraint(
+            self.name, self.functionals, H, self.set.support(H), self.start, self.stop, self.parameters
+        )
+
+
+def _distinct(indices: Array, found: Array) -> np.ndarray:
+    """Positions of different maxima, highest first."""
+    kept: list[int] = []
+    for position in np.argsort(-found, kind="stable"):
+        if all(np.abs(indices[position] - indices[other]).max() > 1e-6 for other in kept):
+            kept.append(int(position))
+    return np.array(kept, dtype=int)

@@ -1,0 +1,259 @@
+"""State constraints as families of a semi-infinite program: ``c'x(t) <= h(c)`` for all times of a window, parameters
+and disturbances."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from sparserob_core.control.constraints.explanation import explanation
+from sparserob_core.control.constraints.local_maxima import climb, local_maxima, step_out, vertices
+from sparserob_core.control.enclosures.cache import remember
+from sparserob_core.control.response.disturbance_support import Push
+from sparserob_core.control.response.enclosure import CELLS_KEPT, CellEnclosure, enclose
+from sparserob_core.control.response.functional import WorstCase
+from sparserob_core.control.response.lifted import LiftedSystem, lift
+from sparserob_core.control.response.measurable import MeasurablePush
+from sparserob_core.control.response.parameters import ParameterIndex
+from sparserob_core.control.response.response import distinct_times, transitions
+from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.program import Enclosure, Explanation, Separation
+
+SURE = 1e-8  # a vertex that is predicted to this accuracy is one
+INSIDE, MOST_INSIDE = 3, 64  # times sampled inside every piece, beside its ends: more where the system moves on it
+SMOOTH = 0.1  # norm of A times the spacing of samples between which a parabola is a good guide
+CLIMBED = 10  # of them, those that parameters are climbed for
+KEPT = 12  # separated constraints per row and round
+
+
+@dataclass(frozen=True, eq=False)
+class FlatConstraint:
+    """``H x(t) <= h`` for all ``t`` in ``[start, stop]``, ``p`` and ``w``; the index is ``(t, p)``.
+
+    ``H (r, d)``, ``h (r,)``. A terminal constraint is the window ``[T, T]``.
+    """
+
+    name: str
+    functionals: WorstCase
+    H: Array
+    h: Array
+    start: float
+    stop: float
+    parameters: ParameterIndex
+
+    @property
+    def index_set(self) -> Box:
+        if not self.parameters.count:
+            return Box(np.array([self.start]), np.array([self.stop]))
+        box = self.parameters.box
+        return Box(np.concatenate([[self.start], box.lower]), np.concatenate([[self.stop], box.upper]))
+
+    @property
+    def scale(self) -> float:
+        """The size of the states that the constraint is about: its bounds, and the initial state."""
+        return float(max(np.abs(self.h).max(), np.abs(self.H @ self.functionals.response.initial_state).max())) or 1.0
+
+    def rows(self, indices: Array) -> tuple[Array, Array]:
+        """``G (k, r, n)``, ``rhs (k, r)`` at indices ``(k, 1 + nu)``."""
+        times, directions, parameters, rhs = self.functionals_at(indices)
+        G, offset = self.functionals.rows(times, directions, parameters)
+        shape = (indices.shape[0], self.h.size)
+        return G.reshape(*shape, -1), (rhs - offset).reshape(shape)
+
+    def functionals_at(self, indices: Array) -> tuple[Array, Array, Array, Array]:
+        """Times, directions, parameters and right-hand sides of all ``r`` constraints of every index, index by index:
+        ``(k r, ...)``."""
+        parameters = np.repeat(self.parameters.clamp(indices[:, 1:]), self.h.size, axis=0)
+        count = indices.shape[0]
+        return np.repeat(indices[:, 0], self.h.size), np.tile(self.H, (count, 1)), parameters, np.tile(self.h, count)
+
+    def violations(self, x: Array, indices: Array, rows: np.ndarray) -> Array:
+        """``row x - rhs`` for one row per index, ``(k,)``, without building rows."""
+        parameters = self.parameters.clamp(indices[:, 1:])
+        answer: Array = self.functionals.values(x, indices[:, 0], self.H[rows], parameters) - self.h[rows]
+        return answer
+
+    def worst(self, x: Array) -> Separation:
+        """The largest local maxima of the violation over the index set, times refined between the nodes, parameters
+        between lattice points."""
+        values = self.on_lattice(x)
+        positions = local_maxima(values, self.lattice[1], KEPT)
+        heights, rows = values[tuple(positions.T)], positions[:, 1]
+        times, predicted = vertices(values, positions, self.times)
+        indices = np.hstack([times[:, None], self.lattice[0][positions[:, 0]]])
+        if self.parameters.count:
+            likely = np.argsort(-heights, kind="stable")[:CLIMBED]
+            # a maximum at a breakpoint is a kink: it is climbed along, not across
+            indices[:, 0] = self.times[positions[:, 2]]
+            indices, found = self._climbed(x, indices[likely], rows[likely])
+            rows = rows[likely]
+        else:
+            found = self.violations(x, indices, rows)
+            error = np.abs(predicted - found)
+            lost = heights > found  # a kink, where a parabola is no guide
+            indices[lost, 0], found[lost] = self.times[positions[lost, 2]], heights[lost]
+            unsure = np.flatnonzero(
+                (error > SURE * np.maximum(1.0, np.abs(found))) & (found + 4.0 * error >= found.max(initial=-np.inf))
+            )
+            unsure = unsure[np.argsort(-found[unsure], kind="stable")][:CLIMBED]
+            if unsure.size:
+                indices[unsure], found[unsure] = self._climbed(x, indices[unsure], rows[unsure])
+        order = np.argsort(-found, kind="stable")
+        return Separation(indices[order], rows[order], found[order])
+
+    def explain(self, index: Array, row: int) -> Explanation:
+        """One constraint in words: what is bounded, when, and what the uncertainty does to it."""
+        time, parameter = float(index[0]), self.parameters.clamp(index[None, 1:])[0]
+        return explanation(self.name, self.functionals, self.H, self.h, row, time, parameter)
+
+    def nominal(self) -> FlatConstraint:
+        """The same constraint without uncertainty: a middle parameter, and no disturbance (or a middle one where none
+        is not admissible)."""
+        return replace(self, functionals=self.functionals.nominal(), parameters=ParameterIndex(None))
+
+    @property
+    def cells(self) -> tuple[Array, Array]:
+        """The window cut at the breakpoints, times the whole box of parameters: ``(lower, upper)``, ``(k, 1 + nu)``
+        each."""
+        breaks = self.functionals.response.grid.breakpoints
+        points = distinct_times(
+            np.concatenate([[self.start], breaks[(breaks > self.start) & (breaks < self.stop)], [self.stop]]),
+            breaks[-1],
+        )
+        starts, stops = (points[:-1], points[1:]) if points.size > 1 else (points, points)
+        box = self.index_set
+        return (
+            np.hstack([starts[:, None], np.tile(box.lower[1:], (starts.size, 1))]),
+            np.hstack([stops[:, None], np.tile(box.upper[1:], (starts.size, 1))]),
+        )
+
+    def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
+        """Proven upper bounds of the violation on cells ``(k, 1 + nu)``, each within one piece; cells of parameters
+        share their work."""
+        touched = self.parameters.touches(lower[:, 1:], upper[:, 1:])
+        return enclose(lower, upper, touched, self.parameters.count, lambda low, high: self._cell(x, low, high))
+
+    def lifted(self, low: Array, high: Array) -> LiftedSystem:
+        """The lifted system over a cell of parameters, remembered."""
+        key = low.tobytes() + high.tobytes()
+        if key not in self._lifted:
+            response = self.functionals.response
+            remember(
+                self._lifted,
+                key,
+                lift(response.system, response.grid, response.initial_state, (low + high) / 2, (high - low) / 2),
+                CELLS_KEPT,
+            )
+        return self._lifted[key]
+
+    def _cell(self, x: Array, low: Array, high: Array) -> CellEnclosure:
+        key = x.tobytes() + low.tobytes() + high.tobytes()
+        if key not in self._cells:
+            lifted = self.lifted(low, high)
+            control = self.functionals.dictionary.control(x)
+            rhs = np.zeros((self.h.size, lifted.space.size))
+            rhs[:, 0] = self.h
+            remember(
+                self._cells,
+                key,
+                CellEnclosure(
+                    lifted, self._push(low, high), self.H, rhs, control, cuts=self.parameters.cuts(low, high)
+                ),
+                CELLS_KEPT,
+            )
+        return self._cells[key]
+
+    def _push(self, low: Array, high: Array) -> Push | MeasurablePush | None:
+        lifted = self.lifted(low, high)
+        key = low.tobytes() + high.tobytes()
+        if key not in self._pushes:
+            remember(self._pushes, key, self.functionals.push(lifted, self.H), CELLS_KEPT)
+        return self._pushes[key]
+
+    @cached_property
+    def _cells(self) -> dict[bytes, CellEnclosure]:
+        return {}
+
+    @cached_property
+    def _lifted(self) -> dict[bytes, LiftedSystem]:
+        return {}
+
+    @cached_property
+    def _pushes(self) -> dict[bytes, Push | MeasurablePush | None]:
+        return {}
+
+    @cached_property
+    def times(self) -> Array:
+        """Sampled times: the window's ends, the breakpoints in it, and a few times in every piece, increasing."""
+        grid = self.functionals.response.grid
+        pace = float(np.linalg.norm(self.functionals.response.steps(self.lattice[0]).A, axis=(1, 2)).max())
+        counts = np.clip(np.ceil(pace * grid.lengths / SMOOTH), INSIDE + 1, MOST_INSIDE).astype(int)
+        inside = np.concatenate(
+            [
+                np.linspace(left, right, count, endpoint=False)
+                for left, right, count in zip(grid.breakpoints[:-1], grid.breakpoints[1:], counts, strict=True)
+            ]
+        )
+        inside = inside[(inside > self.start) & (inside < self.stop)]
+        return distinct_times(np.concatenate([[self.start], inside, [self.stop]]), float(grid.breakpoints[-1]))
+
+    @cached_property
+    def lattice(self) -> tuple[Array, tuple[int, ...]]:
+        """Sampled parameters ``(v, nu)`` and the shape of their lattice."""
+        return self.parameters.lattice()
+
+    @cached_property
+    def _margins(self) -> Array:
+        """``h - sigma`` on the lattice, ``(v, r, times)``: what the worst disturbance leaves of every side."""
+        points, _ = self.lattice
+        if self.functionals.disturbance is None:
+            return np.broadcast_to(self.h[None, :, None], (points.shape[0], self.h.size, self.times.size))
+        return self.h[None, :, None] - np.stack([self.functionals.profile(self.times, self.H, p).T for p in points])
+
+    def on_lattice(self, x: Array) -> Array:
+        """Violations ``(v, r, times)`` at every lattice point and sampled time."""
+        response, points = self.functionals.response, self.lattice[0]
+        control = self.functionals.dictionary.control(x)
+        nodes = response.states(control, points)
+        pieces, flow, driven = self._sampling
+        steps = response.steps(points)
+        drive = np.einsum("vdm,ml->vld", steps.B, self.functionals.on_grid(x))
+        states = np.einsum("vtij,vtj->vti", flow, nodes[:, pieces]) + np.einsum(
+            "vtij,vtj->vti", driven, drive[:, pieces]
+        )
+        answer: Array = np.einsum("ri,vti->vrt", self.H, states) - self._margins
+        return answer
+
+    @cached_property
+    def _sampling(self) -> tuple[np.ndarray, Array, Array]:
+        response = self.functionals.response
+        pieces = response.grid.locate(self.times)
+        distinct, which = response.grid.distinct(self.times - response.grid.breakpoints[pieces])
+        A = response.steps(self.lattice[0]).A
+        flow, driven = transitions(A[:, None], distinct[None])
+        return pieces, flow[:, which], driven[:, which]
+
+    def _climbed(self, x: Array, indices: Array, rows: np.ndarray) -> tuple[Array, Array]:
+        """Climb from every candidate ``(t, p)``; the set of parameters is never left."""
+        box = self.index_set
+        radius = np.concatenate([[np.max(np.diff(self.times), initial=0.0)], (box.upper - box.lower)[1:] / 4])
+
+        def project(points: Array) -> Array:
+            inside = np.clip(points, box.lower, box.upper)
+            return np.hstack([inside[:, :1], self.parameters.clamp(inside[:, 1:])])
+
+        def evaluate(points: Array, which: np.ndarray) -> Array:
+            return self.violations(x, points, rows[which])
+
+        points, found = climb(evaluate, indices, radius, project)
+        bound = self.parameters.set
+        if bound is None or isinstance(bound, Box):
+            return points, found
+        stepped, higher = step_out(evaluate, points, found, bound)
+        moved = np.flatnonzero(higher > found)
+        points[moved], found[moved] = climb(
+            lambda at, which: evaluate(at, moved[which]), stepped[moved], radius / 16, project
+        )
+        return points, found

@@ -1,0 +1,105 @@
+"""The paper's own index: the disturbance stays in it, beside the time and the parameter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from sparserob_core.control.constraints.curved import CurvedConstraint
+from sparserob_core.control.constraints.flat import FlatConstraint
+from sparserob_core.control.constraints.sensitivity import Sensitivity
+from sparserob_core.control.response.disturbance import DisturbanceModel
+from sparserob_core.control.response.parameters import ParameterIndex
+from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.program import ConstraintFamily, Separation
+
+
+@dataclass(frozen=True, eq=False)
+class LiteralConstraint:
+    """A state constraint whose index is ``(t, Beta, p)``, and a direction where the set is curved.
+
+    ``Beta`` are the coefficients of the disturbance's blocks, block by block, in the bounding box of their set;
+    coefficients outside the set are drawn to it along the ray from an interior point. Maximised over ``Beta`` it is the
+    reduced constraint, exactly.
+    """
+
+    base: FlatConstraint | CurvedConstraint
+    disturbance: DisturbanceModel
+
+    def family(self, reduced: ConstraintFamily) -> ConstraintFamily:
+        """The constraint as a family; proofs go through ``reduced``."""
+        lower, upper = self.base.index_set.lower, self.base.index_set.upper
+        block, count = self._blocks.box, self.disturbance.block_count
+        index_set = Box(
+            np.concatenate([lower[:1], np.tile(block.lower, count), lower[1:]]),
+            np.concatenate([upper[:1], np.tile(block.upper, count), upper[1:]]),
+        )
+        return ConstraintFamily(
+            name=self.base.name,
+            index_set=index_set,
+            rows=self.rows,
+            worst=self.worst,
+            gradient=self.gradient,
+            reduced=reduced,
+            explain=lambda index, row: self.base.explain(self._split(index[None])[0][0], row),
+        )
+
+    def rows(self, indices: Array) -> tuple[Array, Array]:
+        """``G (k, r, n)``, ``rhs (k, r)`` at indices ``(k, 1 + beta + ...)``."""
+        reduced, beta = self._split(indices)
+        times, directions, parameters, rhs = self.base.functionals_at(reduced)
+        per_index = times.size // indices.shape[0]
+        signals = np.repeat(self._signals(beta), per_index, axis=0)
+        G, offset = self.base.functionals.rows_under(times, directions, parameters, signals)
+        shape = (indices.shape[0], per_index)
+        return G.reshape(*shape, -1), (rhs - offset).reshape(shape)
+
+    def worst(self, x: Array) -> Separation:
+        """The separation of the reduced constraint, with the worst disturbance of each index written out."""
+        found = self.base.worst(x)
+        times, directions, parameters, _ = self.base.functionals_at(found.indices)
+        per_index = times.size // found.rows.size
+        pick = np.arange(found.rows.size) * per_index + found.rows
+        blocks = self.base.functionals.worst_blocks(times[pick], directions[pick], parameters[pick]).reshape(
+            found.rows.size, -1
+        )
+        indices = np.hstack([found.indices[:, :1], blocks, found.indices[:, 1:]])
+        return Separation(indices, found.rows, found.violations, found.bound)
+
+    def gradient(self, x: Array, indices: Array, rows: Array) -> Array:
+        """The derivative ``(k, d)`` of ``row x - rhs`` in the index (`Sensitivity`); in ``Beta``: the functional on
+        every block."""
+        reduced, beta = self._split(np.asarray(indices, dtype=float))
+        slopes, weights = self._sensitivity.slopes(x, reduced, rows, self._signals(beta))
+        size, moves = self.disturbance.set.dimension, np.tile(self._movable, self.disturbance.block_count)
+        in_beta = self._blocks.pulled_back(
+            beta.reshape(-1, size), self.disturbance.blocks(weights).reshape(-1, size)
+        ).reshape(beta.shape)
+        return np.hstack([slopes[:, :1], in_beta * moves, slopes[:, 1:]])
+
+    @cached_property
+    def _sensitivity(self) -> Sensitivity:
+        return Sensitivity(self.base)
+
+    @cached_property
+    def _movable(self) -> np.ndarray:
+        """Which coefficients of a block have more than one value."""
+        box = self._blocks.box
+        return np.asarray(box.upper > box.lower)
+
+    @cached_property
+    def _blocks(self) -> ParameterIndex:
+        return ParameterIndex(self.disturbance.set)
+
+    def _split(self, indices: Array) -> tuple[Array, Array]:
+        """The reduced index, and the coefficients of the disturbance."""
+        beta = self.disturbance.block_count * self.disturbance.set.dimension
+        return np.hstack([indices[:, :1], indices[:, 1 + beta :]]), indices[:, 1 : 1 + beta]
+
+    def _signals(self, beta: Array) -> Array:
+        blocks = self._blocks.clamp(beta.reshape(-1, self.disturbance.set.dimension))
+        return self.disturbance.signals(
+            blocks.reshape(beta.shape[0], self.disturbance.block_count, self.disturbance.set.dimension)
+        )

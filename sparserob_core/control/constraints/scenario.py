@@ -1,0 +1,118 @@
+"""State constraints for finitely many sampled disturbances and parameters: what the scenario approach imposes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from sparserob_core.control.constraints.flat import KEPT, FlatConstraint
+from sparserob_core.control.constraints.local_maxima import local_maxima, vertices
+from sparserob_core.control.response.response import SAME_TIME, Response, TimeGrid, distinct_times
+from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.program import ConstraintFamily, Separation
+
+BLOCK = 2_000_000  # sampled violations that are held at once
+
+
+@dataclass(frozen=True, eq=False)
+class ScenarioConstraint:
+    """``H x(t) <= h`` for all times of a window and for ``S`` samples only; the index is ``(t, sample number)``.
+
+    ``disturbances (S, mw, L)`` on the pieces of the merged grid or ``None``; ``parameters (S, nu)``.
+    """
+
+    base: FlatConstraint
+    disturbances: Array | None
+    parameters: Array
+
+    def family(self) -> ConstraintFamily:
+        """The constraint as a family."""
+        last = float(self.parameters.shape[0] - 1)
+        index_set = Box(np.array([self.base.start, 0.0]), np.array([self.base.stop, last]))
+        return ConstraintFamily(name=self.base.name, index_set=index_set, rows=self.rows, worst=self.worst)
+
+    def rows(self, indices: Array) -> tuple[Array, Array]:
+        """``G (k, r, n)``, ``rhs (k, r)`` at indices ``(k, 2)``."""
+        k, r = indices.shape[0], self.base.h.size
+        which = np.repeat(np.rint(indices[:, 1]).astype(int), r)
+        times, directions = np.repeat(indices[:, 0], r), np.tile(self.base.H, (k, 1))
+        signals = None if self.disturbances is None else self.disturbances[which]
+        G, offset = self.base.functionals.rows_under(times, directions, self.parameters[which], signals)
+        return G.reshape(k, r, -1), self.base.h - offset.reshape(k, r)
+
+    def worst(self, x: Array) -> Separation:
+        """Local maxima in time of the worst sample's violation, at the breakpoints and between them."""
+        values, sample = self._worst_samples(x)
+        positions = local_maxima(values[None], (1,), KEPT)
+        times = vertices(values[None], positions, self._times)[0]
+        rows = positions[:, 1]
+        indices = np.stack([times, sample[rows, positions[:, 2]].astype(float)], axis=1)
+        G, h = self.rows(indices)
+        found = (G @ x - h)[np.arange(rows.size), rows]
+        order = np.argsort(-found, kind="stable")
+        return Separation(indices[order], rows[order], found[order])
+
+    def _worst_samples(self, x: Array) -> tuple[Array, np.ndarray]:
+        """Largest violation over the samples, ``(r, times)``, and the sample that has it."""
+        if self.parameters.shape[1] == 0:
+            margins, sample = self._known
+            undisturbed = self._states(x, slice(0, 1), None)[0]
+            return self.base.H @ undisturbed.T - margins, sample
+        return self._maximum(lambda part: self._states(x, part, self.disturbances))
+
+    @cached_property
+    def _known(self) -> tuple[Array, np.ndarray]:
+        """For a known system: ``h - max_s H d_s(t)``, and the maximising samples; it does not depend on the
+        decision."""
+        if self.disturbances is None:
+            return np.repeat(self.base.h[:, None], self._times.size, axis=1), np.zeros(
+                (self.base.h.size, self._times.size), dtype=int
+            )
+        still = np.zeros(self.base.functionals.variables)
+        rest = self._states(still, slice(0, 1), None)
+        worst, sample = self._maximum(lambda part: self._states(still, part, self.disturbances) - rest)
+        return -worst, sample
+
+    def _maximum(self, states: Callable[[slice], Array]) -> tuple[Array, np.ndarray]:
+        """``max_s H x_s(t) - h`` over the samples, block by block, and where it is attained."""
+        samples, r, times = self.parameters.shape[0], self.base.h.size, self._times.size
+        best, where = np.full((r, times), -np.inf), np.zeros((r, times), dtype=int)
+        size = max(1, BLOCK // (r * times))
+        for start in range(0, samples, size):
+            values = np.einsum("ri,sti->srt", self.base.H, states(slice(start, start + size))) - self.base.h[:, None]
+            top = values.argmax(axis=0)
+            height = np.take_along_axis(values, top[None], axis=0)[0]
+            where = np.where(height > best, start + top, where)
+            best = np.maximum(best, height)
+        return best, where
+
+    def _states(self, x: Array, part: slice, disturbances: Array | None) -> Array:
+        """States ``(s, times, d)`` of some samples."""
+        signal = None if disturbances is None else disturbances[part]
+        path = self._fine.states(self.base.functionals.on_grid(x), self.parameters[part], signal)
+        return path[:, self._kept]
+
+    @cached_property
+    def _fine(self) -> Response:
+        """The response on the grid's breakpoints, the window's ends and the middles between them."""
+        response, base = self.base.functionals.response, self.base
+        points = distinct_times(
+            np.concatenate([response.grid.breakpoints, [base.start, base.stop]]), response.grid.breakpoints[-1]
+        )
+        points = np.sort(np.concatenate([points, (points[:-1] + points[1:]) / 2]))
+        origin = response.grid.locate((points[:-1] + points[1:]) / 2)
+        return Response(response.system, TimeGrid(points, origin, origin), response.initial_state)
+
+    @cached_property
+    def _kept(self) -> np.ndarray:
+        points = self._fine.grid.breakpoints
+        slack = SAME_TIME * points[-1]
+        return np.flatnonzero((points >= self.base.start - slack) & (points <= self.base.stop + slack))
+
+    @cached_property
+    def _times(self) -> Array:
+        answer: Array = np.clip(self._fine.grid.breakpoints[self._kept], self.base.start, self.base.stop)
+        return answer

@@ -1,0 +1,225 @@
+"""Derivatives of state constraints in their index ``(t, p)``, and in the direction where the set is curved.
+
+By the envelope theorem (Danskin 1967) the derivative of a maximum is that of what is maximised, with the maximiser held
+fixed: here the worst disturbance of the index. For fixed inputs the state is a smooth function of the index between two
+breakpoints.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from sparserob_core.control.constraints.curved import CurvedConstraint
+from sparserob_core.control.constraints.flat import FlatConstraint
+from sparserob_core.control.response.functional import CHUNK
+from sparserob_core.control.response.response import Response
+from sparserob_core.control.response.sensitivity_system import tangent
+from sparserob_core.control.sets.directions import across, unit
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.relaxed.index_gradient import differences
+
+ENTERED = 1e-9  # of a piece: what has passed of one that is just entered, to know the worst disturbance on it
+
+
+@dataclass(frozen=True, eq=False)
+class Functional:
+    """``c'x(t)`` of every index and its derivatives in the ``nu`` parameters, as weights on the initial state and on
+    what drives every piece.
+
+    ``c = sum_b shares_b directions_b`` with ``directions (k, b, d)`` and ``shares (k, b)``; ``along (k, b, 1 + nu, d)``
+    and ``gains (k, b, L, 1 + nu, d)`` are those of every direction. ``A (k, d, d)``, and ``B (k, 1 + nu, d, m)``,
+    ``W (k, 1 + nu, d, mw)`` with their derivatives; ``now (k,)``: the piece whose inputs act at the time of the index.
+    """
+
+    start: Array
+    directions: Array
+    shares: Array
+    along: Array
+    gains: Array
+    A: Array
+    B: Array
+    W: Array
+    now: np.ndarray
+
+    @cached_property
+    def direction(self) -> Array:
+        """``c (k, d)``."""
+        return self._joined(self.directions)
+
+    @cached_property
+    def free(self) -> Array:
+        """Weights ``(k, 1 + nu, d)`` on the initial state: ``e^{A't} c`` and its derivatives."""
+        return self._joined(self.along)
+
+    @cached_property
+    def driven(self) -> Array:
+        """Weights ``(k, L, 1 + nu, d)`` on what drives every piece."""
+        return self._joined(self.gains)
+
+    def force(self, control: Array, signals: Array | None) -> Array:
+        """``B u + E w`` and its derivatives, ``(k, L, 1 + nu, d)``, from inputs on the pieces, ``(m, L)`` and
+        ``(k, mw, L)``."""
+        force: Array = np.moveaxis(self.B @ control, -1, 1)
+        return force if signals is None else force + np.moveaxis(self.W @ signals[:, None], -1, 1)
+
+    def in_time(self, force: Array) -> Array:
+        """``c'(A x(t) + B u(t) + E w(t))``, as ``(k, 1)``; ``e^{As}`` and ``A`` commute."""
+        drift = (self.free[:, :1] @ self.A)[:, 0] @ self.start + ((self.driven[:, :, 0] @ self.A) * force[:, :, 0]).sum(
+            axis=(1, 2)
+        )
+        push = (self.direction * force[np.arange(self.now.size), self.now, 0]).sum(axis=1)
+        return np.asarray(drift + push)[:, None]
+
+    def in_parameters(self, force: Array) -> Array:
+        """The derivatives ``(k, nu)`` of ``c'x(t)`` in the parameters, the inputs fixed."""
+        through_A = np.einsum("klad,kld->ka", self.driven[:, :, 1:], force[:, :, 0])
+        return np.asarray(
+            self.free[:, 1:] @ self.start + through_A + np.einsum("kld,klad->ka", self.driven[:, :, 0], force[:, :, 1:])
+        )
+
+    def states(self, force: Array) -> Array:
+        """``directions_b'x(t)``, ``(k, b)``."""
+        return np.asarray(
+            self.along[:, :, 0] @ self.start + np.einsum("kbld,kld->kb", self.gains[:, :, :, 0], force[:, :, 0])
+        )
+
+    def _joined(self, parts: Array) -> Array:
+        return parts[:, 0] if parts.shape[1] == 1 else np.einsum("kb,kb...->k...", self.shares, parts)
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivity:
+    """The derivatives of ``max_w c'x(t) - h(c)`` in the index, at a decision.
+
+    Time: ``c'(A x + B u + E w)``. Inputs jump at breakpoints, so the constraint, and with it the value of a relaxed
+    program, has kinks there: the derivative is the one from the left, except at the start of the window, where it is
+    the one from the right. Parameters: the functional is propagated together with its derivatives (`tangent`), and
+    through the map of a box onto a set that is not one (`ParameterIndex.pulled_back`). Direction ``z``: the state less
+    the support point of ``c``, across ``z``; 0 at ``z = 0``. Where the worst disturbance (or the support point) is not
+    unique there is a kink too, and the derivative is that of one of them.
+
+    Measurable disturbances: the derivative in time is in closed form, ``h_W(E'e^{A't} c)`` for the push; those in
+    parameters and directions are differences of the push, two tables of integrals for each. Coordinates that cannot
+    move, as the time of a terminal constraint, have derivative 0.
+    """
+
+    constraint: FlatConstraint | CurvedConstraint
+
+    def gradient(self, x: Array, indices: Array, rows: Array) -> Array:
+        """The derivative ``(k, d)`` of ``row x - rhs`` at ``indices (k, d)``, one row of the family per index,
+        ``rows (k,)``."""
+        return self.slopes(x, indices, rows)[0]
+
+    def slopes(self, x: Array, indices: Array, rows: Array, signals: Array | None = None) -> tuple[Array, Array]:
+        """The gradient ``(k, d)``, and the weights ``(k, L, mw)`` of the disturbance on the pieces of the grid.
+
+        ``signals (k, mw, L)``: the disturbance of every index; the worst one if not given.
+        """
+        indices, rows = np.asarray(indices, dtype=float), np.asarray(rows, dtype=int)
+        size = self._response.grid.pieces * self._tangent.initial_state.size * max(1, indices.shape[1] - 1 - self._nu)
+        step = max(1, CHUNK // size)
+        parts = [slice(start, start + step) for start in range(0, indices.shape[0], step)]
+        if not parts:
+            return indices, np.zeros((0, self._response.grid.pieces, self._response.system.disturbances))
+        found = [
+            self._slopes(x, indices[part], rows[part], None if signals is None else signals[part]) for part in parts
+        ]
+        return np.vstack([slope for slope, _ in found]) * self._moves, np.concatenate([weights for _, weights in found])
+
+    def _slopes(self, x: Array, indices: Array, rows: Array, signals: Array | None) -> tuple[Array, Array]:
+        times, points, z = np.split(indices, [1, 1 + self._nu], axis=1)
+        parameters, model = self.constraint.parameters.clamp(points), self.constraint.functionals.disturbance
+        at = self._functional(times[:, 0], parameters, z, rows)
+        weights = at.driven[:, :, 0] @ at.W[:, 0]
+        closed = signals is None and model is not None and model.kind == "measurable"
+        if signals is None and model is not None and not closed:
+            signals = model.worst(self._entered(weights, at))
+        force = at.force(self.constraint.functionals.on_grid(x), signals)
+        in_time, in_parameters, states = at.in_time(force), at.in_parameters(force), at.states(force)
+        if closed:
+            push = self._push_slopes(times[:, 0], parameters, at)
+            in_time, in_parameters, states = in_time + push[0], in_parameters + push[1], states + push[2]
+        in_parameters = self.constraint.parameters.pulled_back(points, in_parameters)
+        if isinstance(self.constraint, CurvedConstraint):
+            z = across(z, states - self.constraint.set.support_point(at.direction) @ self.constraint.set.normals.T)
+        return np.hstack([in_time, in_parameters, z]), weights
+
+    def _functional(self, times: Array, parameters: Array, z: Array, rows: np.ndarray) -> Functional:
+        directions, shares = self._directions(z, rows)
+        (k, b, d), response = directions.shape, self._tangent
+        blocks = response.initial_state.size // d
+        larger = np.concatenate([directions, np.zeros((k, b, (blocks - 1) * d))], axis=2).reshape(k * b, -1)
+        free, gains, B, W = response.adjoint(np.repeat(times, b), larger, np.repeat(parameters, b, axis=0))
+        A = self._response.system.matrices(parameters)[0]
+        return Functional(
+            self._response.initial_state,
+            directions,
+            shares,
+            free.reshape(k, b, blocks, d),
+            gains.reshape(k, b, -1, blocks, d),
+            A,
+            B[::b].reshape(k, blocks, d, -1),
+            W[::b].reshape(k, blocks, d, -1),
+            self._pieces(times),
+        )
+
+    def _directions(self, z: Array, rows: np.ndarray) -> tuple[Array, Array]:
+        if isinstance(self.constraint, FlatConstraint):
+            return self.constraint.H[rows][:, None], np.ones((rows.size, 1))
+        normals, direction = self.constraint.set.normals, unit(self.constraint.set, z)
+        return np.broadcast_to(normals, (rows.size, *normals.shape)), direction @ normals.T
+
+    def _pieces(self, times: Array) -> np.ndarray:
+        """The pieces on which the times are approached: from the left, but from the right at the start of the
+        window."""
+        grid = self._response.grid
+        entered = np.clip(np.searchsorted(grid.breakpoints, times, side="right") - 1, 0, grid.pieces - 1)
+        return np.where(times <= self.constraint.start, entered, grid.locate(times))
+
+    def _entered(self, weights: Array, at: Functional) -> Array:
+        """The weights on the disturbance, with a trace of a piece that is only just entered and has none yet."""
+        fresh = np.flatnonzero(~at.driven[np.arange(at.now.size), at.now, 0].any(axis=1))
+        if not fresh.size:
+            return weights
+        entered = weights.copy()
+        trace = ENTERED * self._response.grid.lengths[at.now[fresh], None] * at.direction[fresh]
+        entered[fresh, at.now[fresh]] = (trace[:, None] @ at.W[fresh, 0])[:, 0]
+        return entered
+
+    def _push_slopes(self, times: Array, parameters: Array, at: Functional) -> tuple[Array, Array, Array]:
+        """What measurable disturbances add to the derivatives in time, parameters and directions."""
+        support = self.constraint.functionals.measurable
+        in_time = support.bound.support((at.free[:, :1] @ at.W[:, 0])[:, 0])[:, None]
+        in_parameters, in_shares = np.zeros((times.size, self._nu)), np.zeros(at.shares.shape)
+        if self._nu:
+            box = self.constraint.parameters.box
+            in_parameters = differences(
+                lambda p, of: support(times[of], at.direction[of], p), parameters, box.lower, box.upper
+            )
+        if isinstance(self.constraint, CurvedConstraint):
+            normals, wide = self.constraint.set.normals, np.full(at.shares.shape[1], 2.0)
+            in_shares = differences(
+                lambda s, of: support(times[of], s @ normals, parameters[of]), at.shares, -wide, wide
+            )
+        return in_time, in_parameters, in_shares
+
+    @property
+    def _response(self) -> Response:
+        return self.constraint.functionals.response
+
+    @property
+    def _nu(self) -> int:
+        return self.constraint.parameters.count
+
+    @cached_property
+    def _tangent(self) -> Response:
+        return tangent(self._response)
+
+    @cached_property
+    def _moves(self) -> Array:
+        """1 for the coordinates ``(d,)`` of the index that can move, 0 for the others."""
+        box = self.constraint.index_set
+        return np.asarray(box.upper > box.lower, dtype=float)

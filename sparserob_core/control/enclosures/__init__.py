@@ -1,0 +1,1 @@
+"""Rigorous bounds: Taylor models in the parameters, matrix exponentials, polynomials on boxes."""

@@ -1,0 +1,87 @@
+"""Polynomials with matrix coefficients, as an algebra: a lifted system's transitions without exponentials of its large
+matrix.
+
+Lifted matrices multiply like the truncated polynomials ``A(delta) = sum_g A_g delta^g`` that they stand for, so the
+exponential of the one is the lifted matrix of the exponential of the other: ``M`` small coefficients instead of one
+matrix of ``M^2`` blocks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+import numpy as np
+
+from sparserob_core.control.enclosures.matrix_exponential import COEFFICIENTS
+from sparserob_core.control.enclosures.taylor import TaylorSpace
+from sparserob_core.sip.convex_set import Array
+
+Transitions: TypeAlias = Callable[[Array, Array], tuple[Array, Array]]
+
+
+def lifted_matrix(space: TaylorSpace, coefficients: Array, rows: bool) -> Array:
+    """The lifted matrices ``(..., M d, M d)`` of polynomials ``(..., M, d, d)``: their products with columns, or with
+    ``rows`` from the right."""
+    size, d = space.size, coefficients.shape[-1]
+    lifted = np.zeros((size, size, *coefficients.shape[:-3], d, d))
+    left, right, target = space.products
+    lifted[(right, target) if rows else (target, right)] = np.moveaxis(coefficients, -3, 0)[left]
+    return np.moveaxis(lifted, (0, 1), (-4, -2)).reshape(*coefficients.shape[:-3], size * d, size * d)
+
+
+def lifted_transitions(space: TaylorSpace, A: Array, rows: bool, transposed: bool = False) -> Transitions:
+    """`transitions` of the lifted matrix of ``A (M, d, d)``, or of its transpose; in the place of the function of that
+    name."""
+
+    def of(matrix: Array, durations: Array) -> tuple[Array, Array]:
+        shape = np.broadcast_shapes(matrix.shape[:-2], durations.shape)
+        flows = [
+            lifted_matrix(space, part, rows)
+            for part in flows_of(space, A, np.broadcast_to(durations, shape).reshape(-1))
+        ]
+        both = [np.swapaxes(flow, -1, -2) if transposed else flow for flow in flows]
+        return both[0].reshape(*shape, *matrix.shape[-2:]), both[1].reshape(*shape, *matrix.shape[-2:])
+
+    return of
+
+
+def flows_of(space: TaylorSpace, A: Array, durations: Array) -> tuple[Array, Array]:
+    """Truncations ``(k, M, d, d)`` of ``e^{A(delta) r}`` and of its integral over ``[0, r]``, for ``A (M, d, d)`` and
+    durations ``(k,)``."""
+    d = A.shape[-1]
+    block = np.zeros((durations.size, space.size, 2 * d, 2 * d))
+    block[:, :, :d, :d] = A * durations[:, None, None, None]
+    block[:, 0, :d, d:] = np.eye(d) * durations[:, None, None]
+    both = exponential(space, block)
+    return both[:, :, :d, :d], both[:, :, :d, d:]
+
+
+def exponential(space: TaylorSpace, polynomials: Array) -> Array:
+    """``e^A`` of polynomials ``(k, M, d, d)``, truncated; as
+    `sparserob_core.control.enclosures.matrix_exponential.exponential` does it for matrices.
+
+    The sum over the coefficients of their 1-norms is a norm of the algebra, so the same scaling and the same degree
+    serve.
+    """
+    left, right, target = space.products
+    order = np.argsort(target, kind="stable")
+    left, right, starts = left[order], right[order], np.searchsorted(target[order], np.arange(space.size))
+
+    def times(first: Array, second: Array) -> Array:
+        product: Array = np.add.reduceat(first[:, left] @ second[:, right], starts, axis=1)
+        return product
+
+    norms = np.abs(polynomials).sum(axis=-2).max(axis=-1).sum(axis=-1)
+    squarings = np.maximum(0, np.ceil(np.log2(np.maximum(norms, np.finfo(float).tiny)))).astype(int)
+    scaled = polynomials / np.exp2(squarings)[:, None, None, None]
+    one = np.zeros_like(scaled)
+    one[:, 0] = np.eye(scaled.shape[-1])
+    second = times(scaled, scaled)
+    third, powers = times(second, scaled), (one, scaled, second)
+    result: Array = COEFFICIENTS[18] * one
+    for block in (15, 12, 9, 6, 3, 0):
+        result = times(result, third) + sum(COEFFICIENTS[block + i] * powers[i] for i in range(3))
+    for done in range(int(squarings.max(initial=0))):
+        result = np.where((squarings > done)[:, None, None, None], times(result, result), result)
+    return result

@@ -1,0 +1,31 @@
+"""The exponential of many small matrices at once."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sparserob_core.sip.convex_set import Array
+
+# 1 / k!; beyond degree 18 nothing is left on the unit ball (1 / 19! < 1e-17)
+COEFFICIENTS = 1.0 / np.cumprod([1.0, *range(1, 19)])
+
+
+def exponential(matrices: Array) -> Array:
+    """``e^A`` of matrices ``(..., d, d)``, by scaling and squaring of the Taylor polynomial of degree 18 (Moler and Van
+    Loan 2003, method 3).
+
+    Matrix products only. `scipy.linalg.expm` solves a tiny linear system per matrix, for which a threaded LAPACK wakes
+    all its threads: on a busy machine that takes twenty times as long.
+    """
+    norms = np.abs(matrices).sum(axis=-2).max(axis=-1)
+    squarings = np.maximum(0, np.ceil(np.log2(np.maximum(norms, np.finfo(float).tiny)))).astype(int)
+    scaled = matrices / np.exp2(squarings)[..., None, None]
+    second = scaled @ scaled
+    third = second @ scaled
+    powers = (np.broadcast_to(np.eye(matrices.shape[-1]), matrices.shape), scaled, second)
+    result: Array = COEFFICIENTS[18] * powers[0]
+    for block in (15, 12, 9, 6, 3, 0):  # in blocks of three: Paterson and Stockmeyer 1973
+        result = result @ third + sum(COEFFICIENTS[block + i] * powers[i] for i in range(3))
+    for done in range(int(squarings.max(initial=0))):
+        result = np.where((squarings > done)[..., None, None], result @ result, result)
+    return result

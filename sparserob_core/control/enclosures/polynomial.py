@@ -1,0 +1,164 @@
+"""Upper bounds of polynomials in several variables on the box ``[-1, 1]^nu``."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sparserob_core.control.enclosures.cache import remember
+from sparserob_core.control.enclosures.taylor import TaylorSpace
+from sparserob_core.sip.convex_set import Array
+
+DEFINITE = 1e-12  # relative to the largest, how negative the eigenvalues of a Hessian are made
+SLOPE = 1e-9  # relative to the Hessian, that at which a side of the box is left again
+ROUNDS = 3  # of the active set method, per variable
+FACES_KEPT = 256  # matrices of faces that a space remembers
+
+
+def polynomial_bound(space: TaylorSpace, coefficients: Array) -> tuple[Array, Array]:
+    """Upper bounds of polynomials ``(..., M)`` on ``[-1, 1]^nu``, and how much each variable adds to their range,
+    ``(..., nu)``.
+
+    Variables in which the polynomial is monotone are set to their better end; in the others the quadratic part is
+    maximised, exactly where it is concave, variable by variable or less a multiple of ``|delta|^2`` otherwise.
+    Terms of degree three and more are bounded by their modulus.
+    """
+    nu = space.nu
+    shape = coefficients.shape[:-1]
+    if nu == 0 or space.degree == 0:
+        return coefficients[..., 0].copy(), np.zeros((*shape, nu))
+    flat = coefficients.reshape(-1, space.size)
+    gradient, hessian = quadratic_part(space, flat)
+    tail, steepness = _tail(space, flat)
+    bound = flat[:, 0] + tail
+    slope = np.abs(hessian).sum(axis=2)
+    ends = np.where(np.abs(gradient) >= slope + steepness, np.sign(gradient), 0.0)
+    bound += (gradient * ends).sum(axis=1) + 0.5 * np.einsum("ki,kij,kj->k", ends, hessian, ends)
+    inner = (ends == 0) & ((gradient != 0) | (slope > 0))
+    gradient = np.where(inner, gradient + np.einsum("kij,kj->ki", hessian, ends), 0.0)
+    hessian = np.where(inner[:, :, None] & inner[:, None, :], hessian, 0.0)
+    bound += np.minimum(_separable(gradient, hessian), _concave(gradient, hessian, inner))
+    spread = np.abs(gradient) + steepness + slope
+    return bound.reshape(shape), spread.reshape(*shape, nu)
+
+
+def monotone_ends(space: TaylorSpace, coefficients: Array, swing: Array) -> Array:
+    """The end, -1 or 1, of every variable in which polynomials ``(k, M)`` are monotone, whatever is added whose partial
+    derivatives are at most ``swing (k, nu)``; 0 for the other variables. ``(k, nu)``."""
+    if space.nu == 0 or space.degree == 0:
+        return np.zeros((coefficients.shape[0], space.nu))
+    gradient, hessian = quadratic_part(space, coefficients)
+    certain = np.abs(gradient) > np.abs(hessian).sum(axis=2) + _tail(space, coefficients)[1] + swing
+    return np.where(certain, np.sign(gradient), 0.0)
+
+
+def distinct_patterns(ends: Array) -> tuple[Array, np.ndarray]:
+    """The distinct rows of ``ends (k, r, nu)``, and which of them stands at every ``(k, r)``."""
+    if not ends.shape[2]:
+        return np.zeros((1, 0)), np.zeros(ends.shape[:2], dtype=int)
+    patterns, which = np.unique(ends.reshape(-1, ends.shape[2]), axis=0, return_inverse=True)
+    return patterns, which.reshape(ends.shape[:2])
+
+
+def face_matrix(space: TaylorSpace, ends: Array) -> Array:
+    """The matrix ``(M, M)`` that sets the variables with ``ends (nu,)`` not 0 to them, in coefficient vectors on its
+    right; remembered."""
+    key = ends.tobytes()
+    if key not in space.faces:
+        remember(space.faces, key, _face_matrix(space, ends), FACES_KEPT)
+    return space.faces[key]
+
+
+def _face_matrix(space: TaylorSpace, ends: Array) -> Array:
+    fixed = ends != 0
+    sign = np.prod(np.where(fixed, ends, 1.0) ** space.exponents, axis=1)
+    target = [space.index[tuple(int(e) for e in exponents)] for exponents in np.where(fixed, 0, space.exponents)]
+    matrix = np.zeros((space.size, space.size))
+    matrix[target, np.arange(space.size)] = sign
+    return matrix
+
+
+def quadratic_part(space: TaylorSpace, flat: Array) -> tuple[Array, Array]:
+    """Gradient ``(k, nu)`` and Hessian ``(k, nu, nu)`` at the centre."""
+    nu = space.nu
+    unit = np.eye(nu, dtype=int)
+    gradient = flat[:, [space.index[tuple(unit[i])] for i in range(nu)]]
+    hessian = np.zeros((flat.shape[0], nu, nu))
+    if space.degree >= 2:
+        for i in range(nu):
+            for j in range(i + 1):
+                entry = flat[:, space.index[tuple(unit[i] + unit[j])]]
+                hessian[:, i, j] = hessian[:, j, i] = 2 * entry if i == j else entry
+    return gradient, hessian
+
+
+def _tail(space: TaylorSpace, flat: Array) -> tuple[Array, Array]:
+    """Bounds of the terms of degree three and more, ``(k,)``, and of their partial derivatives, ``(k, nu)``."""
+    high = space.degrees >= 3
+    terms = flat[:, high]
+    value = np.where(space.even[high], np.maximum(terms, 0.0), np.abs(terms)).sum(axis=1)
+    return value, np.abs(terms) @ space.exponents[high]
+
+
+def _separable(gradient: Array, hessian: Array) -> Array:
+    """``sum_i max_s g_i s + h_ii s^2 / 2`` plus the modulus of the mixed terms."""
+    square = np.einsum("kii->ki", hessian) / 2
+    inside = (square < 0) & (np.abs(gradient) < -2 * square)
+    top = np.where(inside, -(gradient**2) / np.where(inside, 4 * square, 1.0), np.abs(gradient) + square)
+    mixed = (np.abs(hessian).sum(axis=(1, 2)) - 2 * np.abs(square).sum(axis=1)) / 2
+    return np.asarray(top.sum(axis=1) + mixed)
+
+
+def _concave(gradient: Array, hessian: Array, inner: np.ndarray) -> Array:
+    """An upper bound of ``g's + s'H s / 2`` over the box in the inner variables, exact where ``H`` is negative definite
+    in them.
+
+    Elsewhere ``H`` is first lowered by a multiple of the identity, which costs half of that per variable. ``inf`` where
+    fewer than two variables are inner: there, the bound variable by variable is exact.
+    """
+    top = np.full(gradient.shape[0], np.inf)
+    several = np.flatnonzero(inner.sum(axis=1) > 1)
+    if not several.size:
+        return top
+    H, free = hessian[several], inner[several]
+    values = np.linalg.eigvalsh(H)  # the other variables add zeros only
+    size = np.abs(values).max(axis=1)
+    lowered = np.maximum(values[:, -1], 0.0) + DEFINITE * size
+    H = np.where(free[:, :, None] & free[:, None, :], H - lowered[:, None, None] * np.eye(H.shape[1]), 0.0)
+    top[several] = _highest(gradient[several], H, free, size) + lowered * free.sum(axis=1) / 2
+    return top
+
+
+def _solved(matrices: Array, right: Array) -> Array:
+    """``matrices^-1 right``, ``(k, d)``; in the least-squares sense for all where one is singular, since a tangent at
+    any point will do."""
+    try:
+        return np.asarray(np.linalg.solve(matrices, right[..., None])[..., 0], dtype=float)
+    except np.linalg.LinAlgError:
+        return np.asarray(np.einsum("kij,kj->ki", np.linalg.pinv(matrices), right), dtype=float)
+
+
+def _highest(gradient: Array, hessian: Array, inner: np.ndarray, size: Array) -> Array:
+    """The maximum on the box of concave functions ``g's + s'H s / 2`` of the inner variables, from above, ``(k,)``: the
+    least maximum of the tangents at the points of an active set method, in which one variable at a time is held at a
+    side or released from it.
+    """
+    rows, free, held = np.arange(gradient.shape[0]), inner.copy(), np.zeros(gradient.shape)
+    filler = -np.where(size > 0, size, 1.0)[:, None, None] * np.eye(gradient.shape[1])
+    top = np.full(rows.size, np.inf)
+    for _ in range(ROUNDS * gradient.shape[1]):
+        pull = np.where(free, gradient + np.einsum("kij,kj->ki", hessian, held), 0.0)
+        reached = held - _solved(np.where(free[:, :, None] & free[:, None, :], hessian, filler), pull)
+        point = np.clip(np.nan_to_num(reached), -1.0, 1.0)
+        bent = np.einsum("kij,kj->ki", hessian, point)
+        slope = np.where(inner, gradient + bent, 0.0)
+        top = np.minimum(top, ((gradient + bent / 2) * point).sum(axis=1) + (np.abs(slope) - slope * point).sum(axis=1))
+        beyond = np.where(free, np.abs(reached) - 1.0, 0.0)
+        inward = np.where(free, 0.0, -slope * held)
+        worst = np.where(beyond.max(axis=1) > 0.0, beyond.argmax(axis=1), inward.argmax(axis=1))
+        changed = (beyond.max(axis=1) > 0.0) | (inward.max(axis=1) > SLOPE * size)
+        if not changed.any():
+            break
+        which = (rows[changed], worst[changed])
+        held[which] = np.where(free[which], point[which], 0.0)
+        free[which] = ~free[which]
+    return top

@@ -1,0 +1,274 @@
+"""Taylor models: polynomials with a rigorous remainder, the arithmetic in which functions of the parameters are
+enclosed.
+
+After Makino and Berz (2003), "Taylor models and other validated functional inclusion methods"; rounding is left aside.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import combinations_with_replacement
+from typing import NoReturn, final
+
+import numpy as np
+import numpy.typing as npt
+
+from sparserob_core.control.enclosures.elementary import (
+    Series,
+    exp_series,
+    log_series,
+    power_series,
+    sin_series,
+    tanh_series,
+    undefined,
+)
+from sparserob_core.errors import InputError, NotEnclosable
+from sparserob_core.sip.convex_set import Array
+
+_NUMBERS = (float, int, np.floating, np.integer)
+_LARGEST_POWER = 64
+
+
+@final
+class TaylorSpace:
+    """Polynomials in ``delta in [-1, 1]^nu`` of total degree at most ``degree``, over one fixed list of ``M``
+    monomials.
+
+    ``exponents (M, nu)`` in graded order, the constant first; ``degrees (M,)``; ``index`` from an exponent tuple to its
+    place; ``products``: three arrays ``(left, right, target)``, every pair of monomials whose product is in the space;
+    ``faces``: what `face_matrix` remembers.
+    """
+
+    def __init__(self, nu: int, degree: int) -> None:
+        if nu < 0 or degree < 0:
+            raise InputError(f"Taylor space: expected nu >= 0 and degree >= 0, got {nu} and {degree}")
+        self.nu, self.degree = nu, degree
+        monomials = [
+            tuple(choice.count(i) for i in range(nu))
+            for order in range(degree + 1)
+            for choice in combinations_with_replacement(range(nu), order)
+        ]
+        self.index: dict[tuple[int, ...], int] = {monomial: place for place, monomial in enumerate(monomials)}
+        self.exponents: npt.NDArray[np.int64] = np.array(monomials, dtype=np.int64).reshape(len(monomials), nu)
+        self.degrees: npt.NDArray[np.int64] = self.exponents.sum(axis=1)
+        self.even: npt.NDArray[np.bool_] = (self.exponents % 2 == 0).all(axis=1)
+        left, right = np.nonzero(self.degrees[:, None] + self.degrees <= degree)
+        codes = self.exponents @ (degree + 1) ** np.arange(nu, dtype=np.int64)
+        order = np.argsort(codes)
+        target = order[np.searchsorted(codes[order], codes[left] + codes[right])]
+        self.products = (left, right, target)
+        self.faces: dict[bytes, Array] = {}
+
+    @property
+    def size(self) -> int:
+        """Number ``M`` of monomials."""
+        return len(self.exponents)
+
+    def overflow(self, first: Array, second: Array) -> float:
+        """Bound of what two polynomials ``(M,)`` multiply to above ``degree``: the modulus of all products that leave
+        the space."""
+        size = self.degree + 1
+        a = np.bincount(self.degrees, weights=np.abs(first), minlength=size)
+        b = np.bincount(self.degrees, weights=np.abs(second), minlength=size)
+        tails = np.append(np.cumsum(b[::-1])[::-1], 0.0)
+        return float(a @ tails[size - np.arange(size)])
+
+    def constant(self, value: float) -> TaylorModel:
+        """The model of a number."""
+        coefficients = np.zeros(self.size)
+        coefficients[0] = value
+        return TaylorModel(self, coefficients, 0.0)
+
+    def variables(self, centre: Array, radius: Array) -> list[TaylorModel]:
+        """Models of ``p_i = centre_i + radius_i delta_i``, for ``centre, radius (nu,)``."""
+        models = []
+        for i in range(self.nu):
+            model = self.constant(float(centre[i]))
+            if self.degree:
+                model.coefficients[self.index[tuple(int(i == j) for j in range(self.nu))]] = radius[i]
+            else:
+                model.remainder = abs(float(radius[i]))
+            models.append(model)
+        return models
+
+    def monomials(self, delta: Array) -> Array:
+        """Values ``(k, M)`` of every monomial at ``delta (k, nu)``."""
+        values: Array = np.prod(np.asarray(delta)[:, None, :] ** self.exponents[None], axis=-1)
+        return values
+
+
+@final
+class TaylorModel:
+    """``p(delta) + [-remainder, remainder]`` with the ``coefficients (M,)`` of ``p`` in ``space``.
+
+    Knows ``+ - * /``, powers, and sin, cos, tan, exp, log, sqrt, tanh, also when held in an object array of numpy.
+    Anything else that would need its value (comparison, conversion to float) raises `NotEnclosable` or `TypeError`.
+    """
+
+    __slots__ = ("coefficients", "remainder", "space")
+    __hash__ = None  # type: ignore[assignment]
+
+    def __init__(self, space: TaylorSpace, coefficients: Array, remainder: float) -> None:
+        self.space, self.coefficients, self.remainder = space, coefficients, remainder
+
+    def __repr__(self) -> str:
+        low, high = self.bounds()
+        return f"TaylorModel({low:.6g} .. {high:.6g})"
+
+    def evaluate(self, delta: Array) -> Array:
+        """Values ``(k,)`` of the polynomial at ``delta (k, nu)``; the truth is within ``remainder`` of them."""
+        return self.space.monomials(delta) @ self.coefficients
+
+    def bounds(self) -> tuple[float, float]:
+        """An interval that holds every value; even monomials are in ``[0, 1]``, the others in ``[-1, 1]``."""
+        rest, even = self.coefficients[1:], self.space.even[1:]
+        odd = float(np.abs(rest[~even]).sum()) + self.remainder
+        low = float(self.coefficients[0] + np.minimum(rest[even], 0.0).sum()) - odd
+        high = float(self.coefficients[0] + np.maximum(rest[even], 0.0).sum()) + odd
+        return low, high
+
+    def _magnitude(self) -> float:
+        return float(np.abs(self.coefficients).sum())
+
+    def _shifted(self, number: float) -> TaylorModel:
+        coefficients = self.coefficients.copy()
+        coefficients[0] += number
+        return TaylorModel(self.space, coefficients, self.remainder)
+
+    def __neg__(self) -> TaylorModel:
+        return TaylorModel(self.space, -self.coefficients, self.remainder)
+
+    def __pos__(self) -> TaylorModel:
+        return self
+
+    def __add__(self, other: object) -> TaylorModel:
+        if isinstance(other, TaylorModel):
+            return TaylorModel(self.space, self.coefficients + other.coefficients, self.remainder + other.remainder)
+        return self._shifted(float(other)) if isinstance(other, _NUMBERS) else NotImplemented
+
+    __radd__ = __add__
+
+    def __sub__(self, other: object) -> TaylorModel:
+        return self + (-other) if isinstance(other, (TaylorModel, *_NUMBERS)) else NotImplemented
+
+    def __rsub__(self, other: object) -> TaylorModel:
+        return (-self).__add__(other)
+
+    def __mul__(self, other: object) -> TaylorModel:
+        if isinstance(other, TaylorModel):
+            return self._product(other)
+        if not isinstance(other, _NUMBERS):
+            return NotImplemented
+        return TaylorModel(self.space, float(other) * self.coefficients, abs(float(other)) * self.remainder)
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other: object) -> TaylorModel:
+        if isinstance(other, TaylorModel):
+            return self * other.reciprocal()
+        if not isinstance(other, _NUMBERS):
+            return NotImplemented
+        return self * (1.0 / float(other)) if other else undefined("a division by zero")
+
+    def __rtruediv__(self, other: object) -> TaylorModel:
+        return self.reciprocal().__mul__(other)
+
+    def __pow__(self, exponent: object) -> TaylorModel:
+        if isinstance(exponent, TaylorModel):
+            return (self.log() * exponent).exp()
+        if not isinstance(exponent, _NUMBERS):
+            return NotImplemented
+        power = float(exponent)
+        if not power.is_integer() or abs(power) > _LARGEST_POWER:
+            return self._compose(power_series(power, *self._domain()))
+        return self._power(int(power)) if power >= 0 else self.reciprocal()._power(int(-power))
+
+    def __rpow__(self, base: object) -> TaylorModel:
+        if not isinstance(base, _NUMBERS):
+            return NotImplemented
+        return (self * math.log(base)).exp() if base > 0 else undefined(f"a power of {base}")
+
+    def _product(self, other: TaylorModel) -> TaylorModel:
+        left, right, target = self.space.products
+        a, b = self.coefficients, other.coefficients
+        coefficients = np.bincount(target, weights=a[left] * b[right], minlength=self.space.size).astype(float)
+        cross = self._magnitude() * other.remainder + self.remainder * (other._magnitude() + other.remainder)
+        return TaylorModel(self.space, coefficients, self.space.overflow(a, b) + cross)
+
+    def _power(self, count: int) -> TaylorModel:
+        result, base = self.space.constant(1.0), self
+        while count:
+            result = result * base if count & 1 else result
+            base, count = base * base if count > 1 else base, count >> 1
+        return result
+
+    def __abs__(self) -> TaylorModel:
+        low, high = self.bounds()
+        return (
+            self if low >= 0 else -self if high <= 0 else undefined(f"the modulus of values in [{low:.6g}, {high:.6g}]")
+        )
+
+    def _compose(self, series: Series) -> TaylorModel:
+        """``f(centre + y)`` by Horner's rule, ``y`` the model without its constant, and Lagrange's form of the
+        remainder."""
+        coefficients, bound = series
+        if not math.isfinite(bound):
+            raise NotEnclosable("values this large have no enclosure")
+        y = self._shifted(-float(self.coefficients[0]))
+        result = self.space.constant(coefficients[-1])
+        for coefficient in reversed(coefficients[:-1]):
+            result = result * y + coefficient
+        low, high = y.bounds()
+        return TaylorModel(
+            self.space, result.coefficients, result.remainder + bound * max(-low, high) ** len(coefficients)
+        )
+
+    def _domain(self) -> tuple[int, float, float, float]:
+        return self.space.degree, float(self.coefficients[0]), *self.bounds()
+
+    def exp(self) -> TaylorModel:
+        """Exponential."""
+        return self._compose(exp_series(*self._domain()))
+
+    def sin(self) -> TaylorModel:
+        """Sine."""
+        return self._compose(sin_series(*self._domain()))
+
+    def cos(self) -> TaylorModel:
+        """Cosine."""
+        return (self + 0.5 * math.pi).sin()
+
+    def tan(self) -> TaylorModel:
+        """Tangent; the values must stay between two of its poles."""
+        return self.sin() / self.cos()
+
+    def tanh(self) -> TaylorModel:
+        """Hyperbolic tangent."""
+        return self._compose(tanh_series(*self._domain()))
+
+    def log(self) -> TaylorModel:
+        """Natural logarithm of positive values."""
+        return self._compose(log_series(*self._domain()))
+
+    def sqrt(self) -> TaylorModel:
+        """Square root of positive values."""
+        return self._compose(power_series(0.5, *self._domain()))
+
+    def reciprocal(self) -> TaylorModel:
+        """``1 / self``, for values of one sign."""
+        if self.bounds()[1] < 0:
+            return -(-self).reciprocal()
+        return self._compose(power_series(-1.0, *self._domain()))
+
+    def square(self) -> TaylorModel:
+        """``self ** 2``."""
+        return self * self
+
+    def _compared(self, other: object) -> NoReturn:
+        raise NotEnclosable("a function of the parameters may not branch on their values (a comparison was met)")
+
+    __lt__ = __le__ = __gt__ = __ge__ = _compared
+    __eq__ = __ne__ = _compared
+
+    def __bool__(self) -> bool:
+        raise NotEnclosable("a function of the parameters may not branch on their values (a truth value was asked for)")

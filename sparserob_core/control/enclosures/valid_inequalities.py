@@ -1,0 +1,190 @@
+"""What is known of a cell's parameters beyond the cell itself, taken into the bound of a function by multipliers.
+
+Where ``q_j >= 0`` holds on the set, ``v <= v + sum_j lambda_j q_j`` there for any ``lambda >= 0`` (weak duality). The
+``q_j`` are half-spaces of the set, products of a half-space with the side of the cell that faces it (Sherali and Adams
+1999), and the quadratic of a round set, whose best multiplier is that of a trust region (More and Sorensen 1983).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import chain, combinations
+from typing import final
+
+import numpy as np
+
+from sparserob_core.control.enclosures.polynomial import polynomial_bound, quadratic_part
+from sparserob_core.control.enclosures.taylor import TaylorSpace
+from sparserob_core.control.sets.curved import Ellipsoid, NormBall
+from sparserob_core.sip.convex_set import Array, ConvexSet
+
+TOGETHER = 6  # cuts of one cell that are tried in all combinations; singly, beyond
+HALVINGS = 40  # of the interval of a trust region's multiplier
+TINY = 1e-300  # instead of nothing to divide by
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Cuts:
+    """Functions of ``delta in [-1, 1]^nu`` that are at least 0 wherever a cell ``centre + radius delta`` holds
+    parameters of a set.
+
+    Half-spaces ``slack - slopes delta``, ``(q, nu), (q,)``, all of them crossing the cell;
+    ``(1 - |base + image delta|^2) / 2`` for a ``ball`` ``(base (nu,), image (nu, nu))``. ``bent (nu,)``: about how far
+    the set curves away from its half-spaces over the cell, along every coordinate; it only guides the halving.
+    """
+
+    slopes: Array
+    slack: Array
+    ball: tuple[Array, Array] | None
+    bent: Array
+
+    def lowered(self, space: TaylorSpace, polynomials: Array, rest: Array | float) -> tuple[Array, Array]:
+        """Polynomials that are above ``polynomials (k, r, M)`` where the parameters are, such that they with the
+        ``rest (k, r, M)`` are low; and how much of their range halving each variable would take away,
+        ``(k, r, nu')``."""
+        total = polynomials + rest
+        additions, multipliers = self._additions(space, total)
+        found = [polynomial_bound(space, total + addition) for addition in additions]
+        spreads = [spread for _, spread in found]
+        if self.slack.size:
+            spreads[1][..., : self.bent.size] += multipliers.sum(axis=-1, keepdims=True) * self.bent
+            spreads[2] = spreads[1]  # that products bend downwards is no reason to halve
+        best = np.array([heights for heights, _ in found]).argmin(axis=0)[None, ..., None]
+        lowered = polynomials + np.take_along_axis(np.array(additions), best, axis=0)[0]
+        return lowered, np.take_along_axis(np.array(spreads), best, axis=0)[0]
+
+    def _additions(self, space: TaylorSpace, total: Array) -> tuple[list[Array], Array]:
+        """The polynomials that are tried: none, those of the half-spaces, of their products, of the ball; and the
+        multipliers ``(k, r, q)``."""
+        count = self.bent.size
+        gradient, hessian = (
+            part.reshape(*total.shape[:2], *part.shape[1:])
+            for part in quadratic_part(space, total.reshape(-1, space.size))
+        )
+        gradient, hessian = gradient[..., :count], hessian[..., :count, :count]
+        additions, multipliers = [np.zeros_like(total)], np.zeros((*total.shape[:2], 0))
+        if self.slack.size:
+            multipliers = cheapest_multipliers(self.slopes, self.slack, gradient)
+            additions.append(
+                _quadratic(space, multipliers @ self.slack, -multipliers @ self.slopes, np.zeros_like(hessian))
+            )
+            additions.append(_quadratic(space, *self._products(multipliers)))
+        if self.ball is not None:
+            additions += [
+                _quadratic(space, *self._of_ball(multiplier))
+                for multiplier in self._ball_multipliers(gradient, hessian)
+            ]
+        return additions, multipliers
+
+    def _products(self, multipliers: Array) -> tuple[Array, Array, Array]:
+        """``sum lambda (s - a'd)(a'd + |a|_1) / (s + |a|_1)``: nowhere on the cell above ``sum lambda (s - a'd)``. As
+        value, gradient, Hessian."""
+        reach = np.abs(self.slopes).sum(axis=1)
+        weights = multipliers / np.maximum(self.slack + reach, TINY)
+        return (
+            weights @ (self.slack * reach),
+            (weights * (self.slack - reach)) @ self.slopes,
+            -2.0 * _squares(weights, self.slopes),
+        )
+
+    def _of_ball(self, multiplier: Array) -> tuple[Array, Array, Array]:
+        assert self.ball is not None
+        base, image = self.ball
+        return (
+            multiplier * (1.0 - base @ base) / 2,
+            -multiplier[..., None] * (base @ image),
+            -multiplier[..., None, None] * (image.T @ image),
+        )
+
+    def _ball_multipliers(self, gradient: Array, hessian: Array) -> list[Array]:
+        """``(k, r)`` each: the best one for the quadratic part on the whole set, and the one that balances it next to
+        the cell."""
+        assert self.ball is not None
+        base, _ = self.ball
+        inverse = self._inverse
+        bend = inverse.T @ hessian @ inverse
+        slope = gradient @ inverse - bend @ base
+        length = np.linalg.norm(base)
+        towards = base / length if length > 0 else base
+        local = np.maximum((slope + bend @ towards) @ towards, 0.0)
+        values, vectors = np.linalg.eigh(bend)
+        along = np.abs(np.einsum("...ij,...i->...j", vectors, slope))
+        low = np.maximum(values[..., -1], 0.0)
+        high = low + np.linalg.norm(slope, axis=-1)
+        for _ in range(HALVINGS):
+            middle = (low + high) / 2
+            outside = ((along / np.maximum(middle[..., None] - values, TINY)) ** 2).sum(axis=-1) > 1.0
+            low, high = np.where(outside, middle, low), np.where(outside, high, middle)
+        return [high, local]
+
+    @cached_property
+    def _inverse(self) -> Array:
+        assert self.ball is not None
+        return np.asarray(np.linalg.inv(self.ball[1]), dtype=float)
+
+
+def ball_of(convex: ConvexSet | None, centre: Array, radius: Array) -> tuple[Array, Array] | None:
+    """A set that is the image of the unit ball, ``{p : |L^-1 (p - middle)| <= 1}``, in ``delta``: base and image of
+    `Cuts`; else ``None``."""
+    if isinstance(convex, Ellipsoid):
+        factor = convex.factor
+    elif isinstance(convex, NormBall) and convex.p == 2.0 and convex.radius > 0.0:
+        factor = convex.radius * np.eye(convex.dimension)
+    else:
+        return None
+    if not (radius > 0.0).all():
+        return None
+    return np.asarray(np.linalg.solve(factor, centre - convex.centre), dtype=float), np.asarray(
+        np.linalg.solve(factor, np.diag(radius)), dtype=float
+    )
+
+
+def cheapest_multipliers(slopes: Array, slack: Array, gradient: Array) -> Array:
+    """Multipliers ``(..., q)``, at least 0, for ``gradient (..., nu)``: small ``lambda's + |gradient - lambda'A|_1``, a
+    bound of ``gradient'delta`` for ``|delta_i| <= 1`` with ``A delta <= s`` (weak duality, for any ``lambda >= 0``).
+
+    ``slopes`` is ``A (q, nu)``, ``slack`` is ``s (q,)``. Tried are the projections on every few rows of ``A``, which
+    are exact at a corner of the set, and the multipliers of single rows that cancel one coordinate, which are exact
+    beside one.
+    """
+    q, nu = slopes.shape
+    trials = [np.zeros((*gradient.shape[:-1], q))]
+    most = min(q, nu) if q <= TOGETHER else 1
+    for chosen in chain.from_iterable(combinations(range(q), size) for size in range(1, most + 1)):
+        trials.append(_placed(trials[0], chosen, gradient @ np.linalg.pinv(slopes[list(chosen)])))
+    for row, coordinate in np.argwhere(slopes != 0.0):
+        trials.append(_placed(trials[0], (row,), gradient[..., [coordinate]] / slopes[row, coordinate]))
+    multipliers = np.stack(trials, axis=-2)
+    heights = multipliers @ slack + np.abs(gradient[..., None, :] - multipliers @ slopes).sum(axis=-1)
+    best: Array = np.take_along_axis(multipliers, heights.argmin(axis=-1)[..., None, None], axis=-2)[..., 0, :]
+    return best
+
+
+def _placed(zeros: Array, chosen: tuple[int, ...], values: Array) -> Array:
+    trial = zeros.copy()
+    trial[..., list(chosen)] = np.maximum(np.where(np.isfinite(values), values, 0.0), 0.0)
+    return trial
+
+
+def _squares(weights: Array, rows: Array) -> Array:
+    """``sum_j weights_j rows_j rows_j'``, ``(..., nu, nu)``."""
+    return np.asarray(np.einsum("...q,qi,qj->...ij", weights, rows, rows))
+
+
+def _linear(space: TaylorSpace, count: int) -> list[int]:
+    """Where the first variables of a space are among its monomials."""
+    return [space.index[tuple(unit)] for unit in np.eye(space.nu, dtype=int)[:count].tolist()]
+
+
+def _quadratic(space: TaylorSpace, value: Array, gradient: Array, hessian: Array) -> Array:
+    """The coefficients ``(..., M)`` of ``value + gradient'd + d'hessian d / 2`` in the first variables of a space."""
+    coefficients = np.zeros((*value.shape, space.size))
+    coefficients[..., 0] = value
+    coefficients[..., _linear(space, gradient.shape[-1])] = gradient
+    units = np.eye(space.nu, dtype=int)[: gradient.shape[-1]]
+    for i, first in enumerate(units):
+        for j, second in enumerate(units):
+            coefficients[..., space.index[tuple((first + second).tolist())]] += hessian[..., i, j] / 2
+    return coefficients

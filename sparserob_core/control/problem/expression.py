@@ -1,0 +1,196 @@
+"""Arithmetic expressions in named parameters, parsed against a whitelist and never evaluated as code."""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import Array
+
+Value: TypeAlias = Any
+"""A float, an array, or anything else with arithmetic, such as a `TaylorModel`."""
+Evaluation: TypeAlias = Callable[[Mapping[str, Value]], Value]
+
+FUNCTIONS: dict[str, Callable[[Value], Value]] = {
+    "sin": np.sin,
+    "cos": np.cos,
+    "tan": np.tan,
+    "exp": np.exp,
+    "sqrt": np.sqrt,
+    "log": np.log,
+    "tanh": np.tanh,
+}
+CONSTANTS = {"pi": math.pi, "e": math.e}
+_OPERATORS: dict[type[ast.operator], Callable[[Value, Value], Value]] = {
+    ast.Add: np.add,
+    ast.Sub: np.subtract,
+    ast.Mult: np.multiply,
+    ast.Div: np.true_divide,
+    ast.Pow: np.power,
+}
+_LENGTH, _NODES, _DEPTH = 1000, 400, 40
+
+
+@dataclass(frozen=True, eq=False)
+class Expression:
+    """A parsed expression: ``text`` as written, the ``names`` that occur in it, and how to evaluate it."""
+
+    text: str
+    names: frozenset[str]
+    evaluation: Evaluation
+
+    def __call__(self, values: Mapping[str, Value]) -> Value:
+        """Its value for parameter values by name; arrays are taken entry by entry. NaN or infinite where it is
+        undefined."""
+        with np.errstate(all="ignore"):
+            return self.evaluation(values)
+
+
+def parse_expression(source: str | float, names: Sequence[str]) -> Expression:
+    """Parse numbers, the given names, ``pi``, ``e``, ``+ - * / **``, parentheses and the functions sin, cos, tan, exp,
+    sqrt, log, tanh.
+
+    Raises `InputError`, which names the expression, the part at fault and the known parameters. Lengths and depths are
+    limited.
+    """
+    text = str(source)
+    if len(text) > _LENGTH:
+        raise InputError(f"expression {text[:40] + '...'!r}: longer than {_LENGTH} characters")
+    try:
+        tree = ast.parse(text.strip(), mode="eval").body
+        nodes = sum(1 for _ in ast.walk(tree))
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        raise InputError(f"expression {text!r}: cannot be read as arithmetic, such as '-2 + 3*p1' ({error})") from error
+    if nodes > _NODES:
+        raise InputError(f"expression {text!r}: more than {_NODES} terms")
+    return _Parser(text, tuple(names)).expression(tree)
+
+
+class _Parser:
+    """One walk over a syntax tree; every node is either on the whitelist or an error."""
+
+    def __init__(self, text: str, names: tuple[str, ...]) -> None:
+        self.text, self.names = text, names
+        self.seen: set[str] = set()
+
+    def expression(self, tree: ast.expr) -> Expression:
+        evaluation = self.parse(tree, 0)
+        return Expression(self.text, frozenset(self.seen), evaluation)
+
+    def parse(self, node: ast.expr, depth: int) -> Evaluation:
+        if depth > _DEPTH:
+            raise self.fault(f"nested more than {_DEPTH} deep")
+        if isinstance(node, ast.Constant):
+            return self.number(node)
+        if isinstance(node, ast.Name):
+            return self.name(node.id)
+        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.UAdd):
+            return self.sign(node, depth)
+        if isinstance(node, ast.BinOp) and type(node.op) in _OPERATORS:
+            operator, left, right = (
+                _OPERATORS[type(node.op)],
+                self.parse(node.left, depth + 1),
+                self.parse(node.right, depth + 1),
+            )
+            return lambda values: operator(left(values), right(values))
+        if isinstance(node, ast.Call):
+            return self.call(node, depth)
+        raise self.fault(
+            f"{ast.unparse(node)!r} is not allowed; expected numbers, + - * / **, parentheses and functions"
+        )
+
+    def number(self, node: ast.Constant) -> Evaluation:
+        if isinstance(node.value, bool) or not isinstance(node.value, int | float):
+            raise self.fault(f"{node.value!r} is not a real number")
+        try:
+            value = np.float64(node.value)
+        except OverflowError as error:
+            raise self.fault("a number is too large") from error
+        return lambda values: value
+
+    def name(self, name: str) -> Evaluation:
+        if name in self.names:
+            self.seen.add(name)
+            return lambda values: values[name]
+        if name in CONSTANTS:
+            value = np.float64(CONSTANTS[name])
+            return lambda values: value
+        raise self.fault(
+            f"unknown name {name!r}{self.nearest(name)}; known parameters: {', '.join(self.names) or 'none'}"
+        )
+
+    def sign(self, node: ast.UnaryOp, depth: int) -> Evaluation:
+        operand = self.parse(node.operand, depth + 1)
+        return (lambda values: -operand(values)) if isinstance(node.op, ast.USub) else operand
+
+    def call(self, node: ast.Call, depth: int) -> Evaluation:
+        name = node.func.id if isinstance(node.func, ast.Name) else ast.unparse(node.func)
+        if name not in FUNCTIONS:
+            raise self.fault(f"unknown function {name!r}; known functions: {', '.join(FUNCTIONS)}")
+        if len(node.args) != 1 or node.keywords or isinstance(node.args[0], ast.Starred):
+            raise self.fault(f"{name} takes one argument, as in {name}(p1)")
+        function, argument = FUNCTIONS[name], self.parse(node.args[0], depth + 1)
+        return lambda values: function(argument(values))
+
+    def nearest(self, name: str) -> str:
+        close = difflib.get_close_matches(name, [*self.names, *CONSTANTS], n=1)
+        return f", did you mean {close[0]!r}?" if close else ""
+
+    def fault(self, reason: str) -> InputError:
+        return InputError(f"expression {self.text!r}: {reason}")
+
+
+@dataclass(frozen=True, eq=False)
+class ExpressionMatrix:
+    """A matrix whose entries are expressions in ``names``; a function of the parameter vector ``p (nu,)``.
+
+    ``entries``: rows of `Expression`. Calling it takes any sequence of ``nu`` numbers, arrays or Taylor models.
+    """
+
+    entries: tuple[tuple[Expression, ...], ...]
+    names: tuple[str, ...]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """``(rows, columns)``."""
+        return len(self.entries), len(self.entries[0])
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether no entry depends on a parameter."""
+        return not any(entry.names for row in self.entries for entry in row)
+
+    def __call__(self, p: Iterable[Value]) -> Value:
+        """The matrix at one parameter vector: floats, or an object array when ``p`` holds other things than numbers."""
+        values = dict(zip(self.names, p, strict=True))
+        return np.array([[entry(values) for entry in row] for row in self.entries])
+
+    def evaluate(self, parameters: Array) -> Array:
+        """The matrices ``(k, rows, columns)`` at parameters ``(k, nu)``."""
+        values = {name: parameters[:, i] for i, name in enumerate(self.names)}
+        out = np.empty((len(parameters), *self.shape))
+        for i, row in enumerate(self.entries):
+            for j, entry in enumerate(row):
+                out[:, i, j] = entry(values)
+        return out
+
+
+def parse_matrix(name: str, rows: Sequence[Sequence[str | float]], names: Sequence[str]) -> ExpressionMatrix:
+    """A matrix of numbers and expressions, given row by row; ``name`` is for the errors (`InputError`)."""
+    if not rows or not rows[0] or len({len(row) for row in rows}) > 1:
+        raise InputError(
+            f"{name}: expected a matrix, rows of equal length, got rows of lengths {[len(row) for row in rows]}"
+        )
+    try:
+        return ExpressionMatrix(
+            tuple(tuple(parse_expression(entry, names) for entry in row) for row in rows), tuple(names)
+        )
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from error

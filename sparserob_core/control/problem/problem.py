@@ -1,0 +1,171 @@
+"""Uncertain linear optimal control problems, as data."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.sets.sets import Equality
+from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import Array, Box, ConvexSet, as_bound
+
+if TYPE_CHECKING:
+    from sparserob_core.sip.program import SemiInfiniteProgram
+
+DisturbanceClass: TypeAlias = Literal["piecewise_constant", "measurable", "l1_ball"]
+
+
+@dataclass(frozen=True, eq=False)
+class PathConstraint:
+    """The state stays in ``set`` for all times in ``[start, stop]``; ``stop`` is the horizon when ``None``."""
+
+    set: ConvexSet
+    start: float = 0.0
+    stop: float | None = None
+    name: str | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class OptimalControlProblem:
+    """Minimise ``sum_i weights_i int_0^T |u_i(t)| dt`` such that for every disturbance and every parameter
+
+    ``x' = A(p) x + B(p) u + E(p) w``, ``x(0) = initial_state (d,)``, ``u(t)`` in ``control``, ``x(t)`` in every
+    ``path`` set during its window, and ``x(T)`` in every ``terminal`` set, where ``T = horizon`` (in the time unit of
+    the system).
+
+    ``disturbance``: the bounded set of ``w``, or ``None``; ``disturbance_class`` says which functions it makes:
+    ``piecewise_constant`` (every piece of the disturbance's dictionary in the set), ``measurable`` (any measurable
+    function into the set), or ``l1_ball`` (the coefficients of channel ``i`` in the dictionary have absolute sum at
+    most ``upper_i`` of a symmetric box: a far smaller set). After construction ``weights`` is ``(m,)``, ``path`` and
+    ``terminal`` are tuples, every window has its ``stop``, and constraints that restrict nothing are gone. An initial
+    state outside a path set is legal: that problem is infeasible. Raises `InputError`.
+    """
+
+    system: LinearSystem
+    horizon: float
+    initial_state: npt.ArrayLike
+    control: ConvexSet
+    weights: npt.ArrayLike | None = None
+    disturbance: ConvexSet | None = None
+    disturbance_class: DisturbanceClass = "piecewise_constant"
+    path: Sequence[PathConstraint | ConvexSet] = ()
+    terminal: Sequence[ConvexSet | Equality] = ()
+    title: str = ""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.system, LinearSystem):
+            raise InputError(f"system: expected a LinearSystem, got {type(self.system).__name__}")
+        horizon = as_bound("horizon", self.horizon)
+        if horizon.shape != (1,) or not 0.0 < horizon[0] < np.inf:
+            raise InputError(f"horizon: expected a positive, finite time, got {self.horizon!r}")
+        self._set("horizon", float(horizon[0]))
+        self._set("initial_state", self._state())
+        self._set("weights", self._weights())
+        _checked_set("control", self.control, self.system.controls, "controls", bounded=True)
+        self._check_disturbance()
+        windows = [self._windowed(f"path.{i}", entry) for i, entry in enumerate(_listed("path", self.path))]
+        self._set("path", tuple(window for window in windows if not _restricts_nothing(window.set)))
+        self._set("terminal", tuple(self._terminal()))
+
+    def _set(self, name: str, value: object) -> None:
+        object.__setattr__(self, name, value)
+
+    def _state(self) -> Array:
+        d = self.system.states
+        state = np.atleast_1d(as_bound("initial_state", self.initial_state))
+        if state.size != d or not np.isfinite(state).all():
+            raise InputError(f"initial_state: expected {d} finite numbers, one per state, got {state.tolist()}")
+        return state
+
+    def _weights(self) -> Array:
+        m = self.system.controls
+        weights = as_bound("weights", 1.0 if self.weights is None else self.weights, m)
+        if not ((weights > 0.0) & np.isfinite(weights)).all():
+            raise InputError(f"weights: expected {m} positive numbers, one per control, got {weights.tolist()}")
+        return weights
+
+    def _check_disturbance(self) -> None:
+        if self.disturbance_class not in get_args(DisturbanceClass):
+            raise InputError(
+                f"disturbance_class: expected one of {', '.join(get_args(DisturbanceClass))}, got"
+                f" {self.disturbance_class!r}"
+            )
+        if self.disturbance is None:
+            return
+        _checked_set("disturbance", self.disturbance, self.system.disturbances, "columns of E", bounded=True)
+        box = self.disturbance
+        if self.disturbance_class == "l1_ball" and not (isinstance(box, Box) and np.array_equal(box.lower, -box.upper)):
+            raise InputError(
+                "disturbance: the class l1_ball needs a box that is symmetric about the origin, such as box: 0.1"
+            )
+
+    def _windowed(self, where: str, entry: object) -> PathConstraint:
+        item = (
+            entry
+            if isinstance(entry, PathConstraint)
+            else PathConstraint(_checked_set(where, entry, self.system.states, "states"))
+        )
+        _checked_set(where, item.set, self.system.states, "states")
+        start, stop = float(item.start), self.horizon if item.stop is None else float(item.stop)
+        if not 0.0 <= start <= stop <= self.horizon:
+            raise InputError(
+                f"{where}: expected 0 <= from <= to <= {self.horizon:g} (the horizon), got from {start:g} to {stop:g}"
+            )
+        return replace(item, start=start, stop=stop)
+
+    def _terminal(self) -> list[ConvexSet | Equality]:
+        kept: list[ConvexSet | Equality] = []
+        for i, item in enumerate(_listed("terminal", self.terminal)):
+            if not isinstance(item, Equality):
+                end = _checked_set(f"terminal.{i}", item, self.system.states, "states")
+                kept += [] if _restricts_nothing(end) else [end]
+                continue
+            if item.dimension != self.system.states:
+                raise InputError(
+                    f"terminal.{i}: expected {self.system.states} values, one per state, got {item.dimension}"
+                )
+            kept += [item] if item.fixed.size else []
+        return kept
+
+
+class ProblemFactory(ABC):
+    """A problem that a config can name: its options are its fields."""
+
+    @abstractmethod
+    def build(self) -> OptimalControlProblem | SemiInfiniteProgram:
+        """The problem; raises `InputError` when the options do not describe one."""
+
+
+def _listed(name: str, value: object) -> list[object]:
+    if isinstance(value, ConvexSet | PathConstraint | Equality):
+        return [value]
+    if not isinstance(value, Sequence):
+        raise InputError(f"{name}: expected a list of sets, got {type(value).__name__}")
+    return list(value)
+
+
+def _checked_set(name: str, value: object, dimension: int, of: str, bounded: bool = False) -> ConvexSet:
+    if isinstance(value, Equality):
+        raise InputError(f"{name}: an equality is allowed in terminal only")
+    if not isinstance(value, ConvexSet):
+        raise InputError(
+            f"{name}: expected a convex set, such as Box, Polytope or Ellipsoid, got {type(value).__name__}"
+        )
+    if value.dimension != dimension:
+        raise InputError(
+            f"{name}: expected a set of dimension {dimension}, the number of {of}, got dimension {value.dimension}"
+        )
+    if bounded and not value.is_bounded:
+        raise InputError(f"{name}: the set must be bounded")
+    return value
+
+
+def _restricts_nothing(value: ConvexSet) -> bool:
+    flat = value.halfspaces()
+    return flat is not None and flat[1].size == 0

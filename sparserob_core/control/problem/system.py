@@ -1,0 +1,223 @@
+"""Uncertain linear systems ``x' = A(p) x + B(p) u + E(p) w``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from sparserob_core.control.enclosures.taylor import TaylorModel, TaylorSpace
+from sparserob_core.control.problem.expression import ExpressionMatrix
+from sparserob_core.errors import InputError, NotEnclosable
+from sparserob_core.sip.convex_set import Array, ConvexSet
+
+Matrix: TypeAlias = npt.ArrayLike | Callable[..., object] | ExpressionMatrix
+_Entry: TypeAlias = Array | Callable[..., object] | ExpressionMatrix
+
+
+@dataclass(frozen=True, eq=False)
+class LinearSystem:
+    """``x' = A(p) x + B(p) u + E(p) w`` with state ``x (d,)``, control ``u (m,)``, disturbance ``w (mw,)`` and a
+    constant, unknown parameter ``p (nu,)`` in ``parameters``.
+
+    ``A (d, d)``, ``B (d, m)``, ``E (d, mw)`` are arrays, or functions of ``p`` that return such arrays; ``E`` is the
+    identity unless given. ``parameters`` is a bounded set, or ``None`` when everything is known; ``names`` are for
+    messages, p1, p2, ... unless given. A function should be arithmetic with numpy functions: then it can be enclosed
+    over cells of parameters, for proofs. Raises `InputError` when shapes disagree or an entry is not finite somewhere
+    that was looked at.
+    """
+
+    A: Matrix
+    B: Matrix
+    E: Matrix | None = None
+    parameters: ConvexSet | None = None
+    names: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        self._check_parameters()
+        for name in ("A", "B"):
+            object.__setattr__(self, name, self._matrix(name, getattr(self, name)))
+        d, columns = self._shape("A")
+        if d != columns:
+            raise InputError(f"system: A must be square, got shape {(d, columns)}")
+        object.__setattr__(self, "E", np.eye(d) if self.E is None else self._matrix("E", self.E))
+        for name in ("B", "E"):
+            if self._shape(name)[0] != d:
+                raise InputError(f"system: {name} must have {d} rows, as A has, got shape {self._shape(name)}")
+        self.matrices(self._probes())
+
+    @property
+    def states(self) -> int:
+        """Number ``d`` of states."""
+        return self._shape("A")[0]
+
+    @property
+    def controls(self) -> int:
+        """Number ``m`` of controls."""
+        return self._shape("B")[1]
+
+    @property
+    def disturbances(self) -> int:
+        """Number ``mw`` of disturbances that ``E`` takes."""
+        return self._shape("E")[1]
+
+    @property
+    def parameter_count(self) -> int:
+        """Number ``nu`` of parameters, 0 for a known system."""
+        return 0 if self.parameters is None else self.parameters.dimension
+
+    def matrices(self, parameters: Array) -> tuple[Array, Array, Array]:
+        """``A (k, d, d)``, ``B (k, d, m)``, ``E (k, d, mw)`` at parameters ``(k, nu)``; raises `InputError` where they
+        are not finite."""
+        points = np.asarray(parameters, dtype=float)
+        if points.ndim != 2 or points.shape[1] != self.parameter_count:
+            raise InputError(f"system: parameters must have shape (k, {self.parameter_count}), got {points.shape}")
+        A, B, E = (self._values(name, points) for name in ("A", "B", "E"))
+        return A, B, E
+
+    def taylor(
+        self, space: TaylorSpace, centre: Array, radius: Array
+    ) -> tuple[Array, Array, Array, Array, Array, Array]:
+        """Taylor models of all entries over the cell ``centre +- radius``, both ``(nu,)``.
+
+        Returns ``A_coefficients (M, d, d), A_remainder (d, d)`` and the same for ``B`` and ``E``.
+        Raises `NotEnclosable` when a function cannot be evaluated on Taylor models, or has a singularity on the cell.
+        """
+        p = np.empty(self.parameter_count, dtype=object)
+        p[:] = space.variables(centre, radius)
+        A, B, E = (self._enclosed(name, space, p) for name in ("A", "B", "E"))
+        return *A, *B, *E
+
+    def describe(self, parameter: Array) -> str:
+        """A parameter vector in words, such as ``p1 = 0.1, p2 = -0.1``."""
+        return ", ".join(f"{name} = {value:.6g}" for name, value in zip(self.names, parameter, strict=True))
+
+    def _entry(self, name: str) -> _Entry:
+        entry: _Entry = getattr(self, name)
+        return entry
+
+    def _check_parameters(self) -> None:
+        if self.parameters is not None and not self.parameters.is_bounded:
+            raise InputError("system: the set of parameters must be bounded")
+        names = tuple(self.names) or tuple(f"p{i + 1}" for i in range(self.parameter_count))
+        if len(names) != self.parameter_count:
+            raise InputError(
+                f"system: expected {self.parameter_count} parameter names, got {len(names)}: {', '.join(names)}"
+            )
+        object.__setattr__(self, "names", names)
+
+    def _matrix(self, name: str, value: object) -> _Entry:
+        if isinstance(value, ExpressionMatrix):
+            return (
+                value(np.zeros(len(value.names))).astype(float) if value.is_constant else self._known_names(name, value)
+            )
+        if callable(value):
+            if self.parameters is None:
+                raise InputError(f"system: {name} is a function of the parameters, but no set of parameters is given")
+            return value
+        try:
+            array = np.array(value, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise InputError(
+                f"system: {name} must be a matrix of numbers or a function of the parameters, got {value!r}"
+            ) from error
+        if array.ndim != 2 or array.size == 0 or not np.isfinite(array).all():
+            raise InputError(f"system: {name} must be a matrix of finite numbers, rows by columns, got {_seen(array)}")
+        return array
+
+    def _known_names(self, name: str, matrix: ExpressionMatrix) -> ExpressionMatrix:
+        if matrix.names != tuple(self.names):
+            raise InputError(
+                f"system: the expressions of {name} are in the parameters {', '.join(matrix.names)}, "
+                f"the system has {', '.join(self.names) or 'none'}"
+            )
+        return matrix
+
+    def _shape(self, name: str) -> tuple[int, int]:
+        entry = self._entry(name)
+        if isinstance(entry, np.ndarray | ExpressionMatrix):
+            rows, columns = entry.shape
+            return rows, columns
+        return self._probed_shape(name)
+
+    def _probed_shape(self, name: str) -> tuple[int, int]:
+        cache: dict[str, tuple[int, int]] = self.__dict__.setdefault("_shapes", {})
+        if name not in cache:
+            value = np.asarray(self._called(name, self._probes()[0]))
+            if value.ndim != 2 or value.size == 0:
+                raise InputError(
+                    f"system: the function {name} must return a matrix, rows by columns, got {_seen(value)}"
+                )
+            cache[name] = (value.shape[0], value.shape[1])
+        return cache[name]
+
+    def _probes(self) -> Array:
+        """A few parameters ``(k, nu)`` at which a system is tried out: a middle one and support points."""
+        if self.parameters is None:
+            return np.empty((1, 0))
+        axes = np.eye(self.parameter_count)
+        points = self.parameters.support_point(np.vstack([axes, -axes]))
+        return np.vstack([self.parameters.interior_point(), points])
+
+    def _called(self, name: str, parameter: Array) -> Array:
+        function = self._entry(name)
+        assert callable(function)
+        try:
+            with np.errstate(all="ignore"):  # what is not finite is reported with its parameter
+                return np.asarray(function(parameter), dtype=float)
+        except (TypeError, ValueError, ArithmeticError, IndexError, KeyError, AttributeError) as error:
+            raise InputError(f"system: the function {name} failed at {self.describe(parameter)}: {error}") from error
+
+    def _values(self, name: str, points: Array) -> Array:
+        entry, shape = self._entry(name), self._shape(name)
+        if isinstance(entry, np.ndarray):
+            return np.broadcast_to(entry, (len(points), *shape))
+        if isinstance(entry, ExpressionMatrix):
+            values = entry.evaluate(points)
+        else:
+            rows = [self._called(name, point) for point in points]
+            other = next((row.shape for row in rows if row.shape != shape), None)
+            if other is not None:
+                raise InputError(f"system: the function {name} must always return shape {shape}, got {other}")
+            values = np.array(rows).reshape(len(points), *shape)
+        finite = np.isfinite(values).all(axis=(1, 2))
+        if not finite.all():
+            raise InputError(f"system: {name} is not finite at {self.describe(points[np.flatnonzero(~finite)[0]])}")
+        return values
+
+    def _enclosed(self, name: str, space: TaylorSpace, p: npt.NDArray[np.object_]) -> tuple[Array, Array]:
+        entry, shape = self._entry(name), self._shape(name)
+        coefficients, remainder = np.zeros((space.size, *shape)), np.zeros(shape)
+        if isinstance(entry, np.ndarray):
+            coefficients[0] = entry
+            return coefficients, remainder
+        try:
+            models = np.array(entry(p), dtype=object)
+        except NotEnclosable as error:
+            raise NotEnclosable(f"system: {name}: {error}") from error
+        except (TypeError, ValueError, ArithmeticError, AttributeError) as error:
+            raise NotEnclosable(
+                f"system: the function {name} cannot be enclosed over parameters; use arithmetic and numpy's "
+                f"sin, cos, tan, exp, log, sqrt, tanh on the entries of p only ({error})"
+            ) from error
+        if models.shape != shape:
+            raise NotEnclosable(
+                f"system: the function {name} returns shape {shape} for numbers, but {models.shape} for Taylor models"
+            )
+        for place, model in np.ndenumerate(models):
+            if isinstance(model, TaylorModel):
+                coefficients[:, *place], remainder[place] = model.coefficients, model.remainder
+            elif isinstance(model, int | float | np.integer | np.floating):
+                coefficients[0, *place] = model
+            else:
+                raise NotEnclosable(
+                    f"system: the function {name} returned {type(model).__name__} for an entry, expected a number"
+                )
+        return coefficients, remainder
+
+
+def _seen(array: npt.NDArray[np.float64]) -> str:
+    return str(array.tolist()) if array.size <= 8 else f"an array of shape {array.shape}"

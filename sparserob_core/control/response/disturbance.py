@@ -1,0 +1,137 @@
+"""Which disturbances are admissible, and how far the worst of them can push the state.
+
+Every class is a product of copies of one convex set ``D``, one copy per *block*; the state is linear in the blocks, so
+the worst disturbance at a given index is found block by block: ``sigma = sum_b h_D(y_b)`` with ``h_D`` the support
+function of ``D`` (Rockafellar 1970, Corollary 16.4.1). It does not depend on the control: the disturbance is eliminated
+exactly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.response.response import TimeGrid
+from sparserob_core.control.sets.sets import NormBall, Polytope
+from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import Array, Box, ConvexSet
+
+
+@dataclass(frozen=True, eq=False)
+class DisturbanceModel:
+    """Blocks of the disturbance, from the weights ``y (..., L, mw)`` that a functional gives to the disturbance on
+    every grid piece.
+
+    ``basis (nb, L, q)`` lists for block ``b`` the grid-piece values of its ``q`` functions; a block is a vector of
+    ``q mw`` coefficients (channel-major) scaled by ``scale (mw,)``, and it ranges over ``set``. ``pieces`` is a
+    shortcut when the blocks are the pieces themselves.
+    """
+
+    kind: Literal["piecewise_constant", "measurable", "l1_ball"]
+    set: ConvexSet
+    bound: ConvexSet
+    grid: TimeGrid
+    starts: np.ndarray | None = None
+    functions: Array | None = None
+    scale: Array | None = None
+
+    @property
+    def channels(self) -> int:
+        """Number ``mw`` of disturbances."""
+        return self.bound.dimension
+
+    @property
+    def radius(self) -> float:
+        """An upper bound of the 2-norm of any admissible disturbance at any time."""
+        if self.scale is not None and self.functions is not None:
+            return float(np.linalg.norm(self.scale) * np.abs(self.functions).max())
+        return self.bound.radius_bound
+
+    @property
+    def by_piece(self) -> bool:
+        """Whether the blocks are the pieces of the grid, one each."""
+        return self.starts is not None and self.starts.size == self.grid.pieces
+
+    def blocks(self, weights: Array) -> Array:
+        """The functional on every block, ``(..., nb, q)``, from weights ``(..., L, mw)``; linear, so it also serves
+        Taylor coefficients."""
+        if self.starts is not None:
+            return np.add.reduceat(weights, self.starts, axis=-2)
+        assert self.functions is not None
+        coefficients = np.einsum("...li,jl->...ij", weights, self.functions)
+        blocks: Array = (
+            coefficients.reshape(*coefficients.shape[:-2], 1, -1)
+            if self.scale is None
+            else coefficients * self.scale[:, None]
+        )
+        return blocks
+
+    def support(self, weights: Array) -> Array:
+        """``sigma (...,)``, the largest value of the functional over the admissible disturbances."""
+        answer: Array = self.set.support(self.blocks(weights)).sum(axis=-1)
+        return answer
+
+    def worst(self, weights: Array) -> Array:
+        """A disturbance ``(..., mw, L)`` on the grid's pieces that attains `support`."""
+        return self.signals(self.set.support_point(self.blocks(weights)))
+
+    @property
+    def block_count(self) -> int:
+        """Number of blocks."""
+        if self.starts is not None:
+            return int(self.starts.size)
+        return self.channels if self.scale is not None else 1
+
+    def signals(self, points: Array) -> Array:
+        """Disturbances ``(..., mw, L)`` on the grid's pieces from one point of the set per block, ``(..., nb, q)``."""
+        if self.starts is not None:
+            which = np.searchsorted(self.starts, np.arange(self.grid.pieces), side="right") - 1
+            return np.swapaxes(points[..., which, :], -1, -2)
+        assert self.functions is not None
+        coefficients = points if self.scale is not None else points.reshape(*points.shape[:-2], self.channels, -1)
+        signal = np.einsum("...ij,jl->...il", coefficients, self.functions)
+        answer: Array = signal if self.scale is None else signal * self.scale[:, None]
+        return answer
+
+
+def disturbance_model(kind: str, bound: ConvexSet, dictionary: Dictionary, grid: TimeGrid) -> DisturbanceModel:
+    """The model of a disturbance class.
+
+    ``piecewise_constant``: every combination of the dictionary's functions whose values stay in ``bound`` on every
+    piece; ``measurable``: every measurable function with values in ``bound``; ``l1_ball``: coefficients with
+    ``||beta_i||_1 <= bound_i`` per channel (the paper's sufficient condition read as an uncertainty set, far smaller).
+    """
+    on_grid = dictionary.values[:, grid.disturbance_piece]
+    if kind == "measurable":
+        return DisturbanceModel("measurable", bound, bound, grid, starts=np.arange(grid.pieces))
+    if kind == "l1_ball":
+        if not isinstance(bound, Box) or not np.array_equal(bound.lower, -bound.upper):
+            raise InputError("disturbance_class: l1_ball needs a disturbance box that is symmetric about 0")
+        ball = NormBall(p=1.0, radius=1.0, dimension=dictionary.values.shape[0])
+        return DisturbanceModel("l1_ball", ball, bound, grid, functions=on_grid, scale=bound.upper)
+    merged = dictionary.merged()
+    if dictionary.is_complete:
+        which = np.clip(
+            np.searchsorted(merged.breakpoints, _middles(grid), side="right") - 1, 0, merged.breakpoints.size - 2
+        )
+        return DisturbanceModel(
+            "piecewise_constant", bound, bound, grid, starts=np.flatnonzero(np.diff(which, prepend=-1))
+        )
+    flat = bound.halfspaces()
+    if flat is None:
+        raise InputError(
+            "dictionaries.disturbance: fewer functions than pieces needs a disturbance set with flat sides "
+            f"(box, polytope, 1-norm or inf-norm), got {type(bound).__name__}"
+        )
+    H, h = flat
+    rows = np.einsum("ri,jk->krij", H, merged.values).reshape(-1, H.shape[1] * merged.values.shape[0])
+    return DisturbanceModel(
+        "piecewise_constant", Polytope(rows, np.tile(h, merged.values.shape[1])), bound, grid, functions=on_grid
+    )
+
+
+def _middles(grid: TimeGrid) -> Array:
+    return (grid.breakpoints[:-1] + grid.breakpoints[1:]) / 2

@@ -1,0 +1,275 @@
+"""Proven upper bounds of the worst-case violation on cells of times and parameters.
+
+On a cell ``[a, b]`` of times inside one piece of the grid, every Taylor coefficient of the state lies within
+``(b - a)^2 / 8 max |second derivative|`` of its chord, and a support function of a chord lies below the chord of the
+support functions. So the violation is at most the larger of its bounds at ``a`` and at ``b``, plus that curvature, plus
+what the Taylor models neglect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from sparserob_core.control.enclosures.combination import Combination
+from sparserob_core.control.enclosures.polynomial import distinct_patterns, face_matrix, monotone_ends, polynomial_bound
+from sparserob_core.control.enclosures.taylor import TaylorSpace
+from sparserob_core.control.enclosures.valid_inequalities import Cuts
+from sparserob_core.control.response.disturbance_support import Push
+from sparserob_core.control.response.lifted import LiftedSystem, grown_less_one
+from sparserob_core.control.response.measurable import MeasurablePush
+from sparserob_core.errors import NotEnclosable
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.program import Enclosure
+
+LONG_STEP = 1.0  # in norm times duration: longer steps are taken by matrix exponentials
+SMALL_SHARE = 1e-6  # so that no coordinate is ever entirely blameless
+CELLS_KEPT = 256  # cells of parameters whose matrices are kept
+TIME_FIRST = (
+    0.25  # times are halved before anything else unless that gains less than this share: their cells share all work
+)
+TINY = 1e-4  # of a cell of parameters: a cell on which a system that can be enclosed at all will be
+TAYLOR_TERMS = 1e-17  # relative size below which further terms of the exponential series are left out
+
+
+@dataclass(frozen=True, eq=False)
+class CellEnclosure:
+    """Bounds of ``H x(t) - rhs`` for one decision over one cell of parameters, and of directions where there is a
+    ``combination``.
+
+    ``H (r, d)``; ``rhs (r', M')``, polynomials over the cell; ``control (m, K)`` on the pieces of the control's
+    dictionary. Without a combination every row of ``H`` is a constraint (``r' = r``, ``M' = M``); with one they are the
+    parts of a single constraint. ``looseness (nu',)``: how far ``rhs`` may be below the truth at the ends of every
+    coordinate; it only guides the halving. ``cuts``: beyond them the cell holds no parameters.
+    """
+
+    lifted: LiftedSystem
+    push: Push | MeasurablePush | None
+    H: Array
+    rhs: Array
+    control: Array
+    combination: Combination | None = None
+    looseness: Array | float = 0.0
+    cuts: Cuts | None = None
+
+    def bounds(self, start: Array, stop: Array) -> tuple[Array, Array, Array]:
+        """For time cells ``[start, stop]`` (``(k,)``, each inside one piece): upper bounds ``(k,)``, the part of them
+        that halving the times would reduce, and the parts ``(k, nu)`` that halving each parameter would."""
+        with np.errstate(over="ignore", invalid="ignore"):  # a bound that overflows is no bound, and is told as such
+            return self._bounds(start, stop)
+
+    def _bounds(self, start: Array, stop: Array) -> tuple[Array, Array, Array]:
+        pieces = self.lifted.grid.locate(stop)
+        ends, which = _ends(start, stop, pieces)
+        bounds, spreads = self._at(*ends)
+        left, right = bounds[which[: start.size]], bounds[which[start.size :]]
+        bend = self._curvature(start, stop, pieces)
+        neglected = self._neglected[:, pieces].T
+        if self.combination is not None:  # the parts of one constraint, each with a factor of at most 1
+            bend, neglected = bend.sum(axis=1, keepdims=True), neglected.sum(axis=1, keepdims=True)
+        total = np.maximum(left, right) + bend + neglected
+        worst = total.argmax(axis=1)
+        pick = (np.arange(worst.size), worst)
+        spread = (
+            np.maximum(spreads[which[: start.size]][pick], spreads[which[start.size :]][pick])
+            + self._shares * neglected[pick][:, None]
+        )
+        return total[pick], bend[pick], spread + self.looseness
+
+    def _at(self, times: Array, pieces: np.ndarray) -> tuple[Array, Array]:
+        """Bounds ``(k, r)`` at single times, and how much of them each parameter accounts for, ``(k, r, nu)``."""
+        states = self._states(times, pieces)
+        coefficients = np.einsum("ri,kai->kra", self._rows, states)
+        space = self.lifted.space
+        if self.combination is not None:
+            coefficients, space = self.combination.apply(coefficients), self.combination.space
+        coefficients = coefficients - self.rhs
+        swing = (
+            np.zeros((*coefficients.shape[:2], space.nu))
+            if self.push is None or not space.nu
+            else self.push.swing(times)
+        )
+        coefficients, gain = self._cut_off(space, coefficients, times)
+        ends = self._better_ends(space, coefficients, swing)
+        coefficients, excess = _on_faces(space, coefficients, ends), np.zeros(coefficients.shape[:2])
+        if self.push is not None:
+            pushed, excess = self.push.at(times, ends)
+            coefficients = coefficients + pushed
+        bound, spread = polynomial_bound(space, coefficients)
+        blame = np.where(ends == 0, swing, 0.0) + np.finfo(float).tiny
+        spread = spread if gain is None else gain
+        return bound + excess, spread + excess[..., None] * blame / blame.sum(axis=2, keepdims=True)
+
+    def _cut_off(self, space: TaylorSpace, coefficients: Array, times: Array) -> tuple[Array, Array | None]:
+        """Polynomials above ``coefficients (k, r, M)`` where the parameters are, and what halving the cell would gain
+        with them."""
+        if self.cuts is None:
+            return coefficients, None
+        pushed = 0.0 if self.push is None else self.push.at(times, np.zeros((*coefficients.shape[:2], space.nu)))[0]
+        return self.cuts.lowered(space, coefficients, pushed)
+
+    @staticmethod
+    def _better_ends(space: TaylorSpace, coefficients: Array, swing: Array) -> Array:
+        """Parameters in which the violation is monotone over the cell, whatever the disturbance: their better ends,
+        ``(k, r, nu)``."""
+        if not space.nu:
+            return np.zeros(swing.shape)
+        return monotone_ends(space, coefficients.reshape(-1, space.size), swing.reshape(-1, space.nu)).reshape(
+            swing.shape
+        )
+
+    def _states(self, times: Array, pieces: np.ndarray) -> Array:
+        """Taylor coefficients ``(k, M, d)`` of the state under the control alone, from the last breakpoint."""
+        within = times - self.lifted.grid.breakpoints[pieces]
+        start = self._nodes.reshape(self._nodes.shape[0], -1)[pieces]
+        size = self.lifted.norm * float(within.max(initial=0.0))
+        moved = (
+            self._by_series(start, self._slopes[pieces], within[:, None], size)
+            if size < LONG_STEP
+            else self._by_exponential(start, pieces, within)
+        )
+        return moved.reshape(times.size, self.lifted.space.size, -1)
+
+    def _by_series(self, start: Array, slopes: Array, within: Array, size: float) -> Array:
+        """The exponential series, for short steps: no matrix is built."""
+        total, term, order, bound = start + within * slopes, slopes, 1, size
+        while bound > TAYLOR_TERMS:
+            order += 1
+            term = term @ self.lifted.matrix.T * (within / order)
+            total = total + within * term
+            bound *= size / order
+        return total
+
+    def _by_exponential(self, start: Array, pieces: np.ndarray, within: Array) -> Array:
+        distinct, which = self.lifted.grid.distinct(within)
+        flow, driven = self.lifted.forward.flows(distinct)
+        return np.asarray(
+            np.einsum("kij,kj->ki", flow[which], start) + np.einsum("kij,kj->ki", driven[which], self._drive[pieces])
+        )
+
+    def _curvature(self, start: Array, stop: Array, pieces: np.ndarray) -> Array:
+        """``(b - a)^2 / 8`` times the largest second time derivative, summed over the Taylor coefficients,
+        ``(k, r)``."""
+        space, matrix, width = self.lifted.space, self.lifted.matrix, stop - start
+        states = self._states(start, pieces).reshape(start.size, -1)
+        second = (states @ matrix.T + self._drive[pieces]) @ matrix.T
+        growth = grown_less_one(self.lifted.norm * width)
+        by_row = np.abs(np.einsum("ri,kai->kra", self._rows, second.reshape(start.size, space.size, -1))).sum(axis=2)
+        loose = np.sqrt(space.size) * np.linalg.norm(second, axis=1) * growth
+        total = by_row + np.linalg.norm(self._rows, axis=1) * loose[:, None]
+        if self.push is not None:
+            total = total + self.push.curvature(start, width)
+        answer: Array = total * (width**2 / 8)[:, None]
+        return answer
+
+    @property
+    def _rows(self) -> Array:
+        return self.H @ self.lifted.transform
+
+    @cached_property
+    def _nodes(self) -> Array:
+        return self.lifted.nodes(self.control)
+
+    @cached_property
+    def _drive(self) -> Array:
+        inputs = self.control[:, self.lifted.grid.control_piece]
+        return np.asarray(inputs.T @ self.lifted.B.reshape(-1, self.lifted.B.shape[2]).T)
+
+    @cached_property
+    def _slopes(self) -> Array:
+        start = self._nodes[:-1].reshape(self.lifted.grid.pieces, -1)
+        return np.asarray(start @ self.lifted.matrix.T + self._drive)
+
+    @cached_property
+    def _shares(self) -> Array:
+        """How what the models neglect is blamed on the parameters (and directions): by their first-order part in the
+        system, ``(nu,)``."""
+        space, lifted = self.lifted.space, self.lifted
+        sizes = (
+            [
+                sum(float(np.linalg.norm(part[space.index[tuple(unit)]])) for part in (lifted.A, lifted.B, lifted.W))
+                for unit in np.eye(space.nu, dtype=int).tolist()
+            ]
+            if space.degree
+            else [1.0] * space.nu
+        )
+        directions = (self.combination.space.nu - space.nu) if self.combination is not None else 0
+        total = np.array(sizes + [0.0] * directions) + SMALL_SHARE
+        return np.asarray(total / total.sum())
+
+    @cached_property
+    def _neglected(self) -> Array:
+        """What the Taylor models neglect, ``(r, L)``."""
+        state = self.lifted.state_remainder(self.control)
+        total = np.outer(np.linalg.norm(self._rows, axis=1), state)
+        return total if self.push is None else total + self.push.neglected
+
+
+def _on_faces(space: TaylorSpace, coefficients: Array, ends: Array) -> Array:
+    """Polynomials ``(k, r, M)`` with the variables that have an end in ``ends (k, r, nu)`` set to it."""
+    if not ends.any():
+        return coefficients
+    patterns, which = distinct_patterns(ends)
+    matrices = np.stack([face_matrix(space, pattern) for pattern in patterns])
+    return np.asarray(np.einsum("krab,krb->kra", matrices[which], coefficients))
+
+
+def _ends(start: Array, stop: Array, pieces: np.ndarray) -> tuple[tuple[Array, np.ndarray], np.ndarray]:
+    """The distinct ends of the cells with the piece that each is looked at from, and where each of ``start`` and then
+    ``stop`` is among them."""
+    both = np.stack([np.concatenate([start, stop]), np.concatenate([pieces, pieces])])
+    unique, which = np.unique(both, axis=1, return_inverse=True)
+    return (unique[0], unique[1].astype(int)), which.reshape(-1)
+
+
+def enclose(
+    lower: Array, upper: Array, touched: np.ndarray, nu: int, cell_over: Callable[[Array, Array], CellEnclosure]
+) -> Enclosure:
+    """Bounds on cells ``(k, 1 + nu + b)`` of times, ``nu`` parameters and directions; those of one box ``(low, high)``
+    share its ``cell_over``.
+
+    Cells that are not ``touched (k,)`` are closed. A cell without an enclosure is halved; raises `NotEnclosable` when a
+    tiny one has none either.
+    """
+    bounds, split = np.full(lower.shape[0], -np.inf), np.zeros(lower.shape[0], dtype=int)
+    for members in _groups(np.hstack([lower[:, 1:], upper[:, 1:]]), touched):
+        low, high = lower[members[0], 1:], upper[members[0], 1:]
+        try:
+            cell = cell_over(low, high)
+        except NotEnclosable:
+            middle, radius = (low + high) / 2, (high - low) / 2
+            radius[:nu] *= TINY
+            cell_over(middle - radius, middle + radius)
+            bounds[members], split[members] = np.inf, 1 + int(np.argmax((high - low)[:nu]))
+            continue
+        bounds[members], bend, spread = cell.bounds(lower[members, 0], upper[members, 0])
+        coordinates = np.concatenate([np.arange(1 + nu), 1 + nu + np.flatnonzero(high[nu:] > low[nu:])])
+        split[members] = coordinates[where_to_halve(bend, spread, bounds[members])]
+    return Enclosure(bounds, split)
+
+
+def _groups(keys: Array, touched: np.ndarray) -> list[np.ndarray]:
+    """Positions of the touched rows of ``keys``, those with the same row together."""
+    places = np.flatnonzero(touched)
+    if not places.size or not keys.shape[1]:
+        return [places] if places.size else []
+    _, which = np.unique(keys[places], axis=0, return_inverse=True)
+    order = np.argsort(which.reshape(-1), kind="stable")
+    return np.split(places[order], np.flatnonzero(np.diff(which.reshape(-1)[order])) + 1)
+
+
+def where_to_halve(bend: Array, spread: Array, bounds: Array) -> np.ndarray:
+    """Halve the times where they matter most, else one other coordinate, the same for the whole group so that its cells
+    stay shared.
+
+    ``bend (k,)``: what halving the times of a cell would gain; ``spread (k, j)``: what halving each other coordinate
+    would.
+    """
+    if not spread.shape[1]:
+        return np.zeros(bend.size, dtype=int)
+    open_ = bounds > 0
+    total = spread[open_].sum(axis=0) if open_.any() else spread.sum(axis=0)
+    return np.where(bend > TIME_FIRST * spread.max(axis=1), 0, 1 + int(total.argmax()))

@@ -1,0 +1,183 @@
+"""Worst-case functionals of the state: ``max_w c'x(t; theta, w, p)`` split into what the control does and what it
+cannot help."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from sparserob_core.control.enclosures.combination import Combination
+from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.response.disturbance import DisturbanceModel
+from sparserob_core.control.response.disturbance_support import Push
+from sparserob_core.control.response.lifted import LiftedSystem, frozen
+from sparserob_core.control.response.measurable import MeasurablePush, MeasurableSupport
+from sparserob_core.control.response.response import Response
+from sparserob_core.errors import NotEnclosable
+from sparserob_core.sip.convex_set import Array, Box
+
+CHUNK = 4_000_000  # entries of a gain array that are built at once (32 MB)
+
+
+@dataclass(frozen=True, eq=False)
+class WorstCase:
+    """The functionals ``c'x(t)`` of one system under its worst disturbance.
+
+    Indices are given as ``times (k,)``, ``directions (k, d)``, ``parameters (k, nu)``; the decision is ``theta``
+    raveled, ``(m N,)``.
+    """
+
+    response: Response
+    dictionary: Dictionary
+    disturbance: DisturbanceModel | None
+
+    @property
+    def variables(self) -> int:
+        return self.response.system.controls * self.dictionary.functions
+
+    def nominal(self) -> WorstCase:
+        """The functionals of the system at an interior point of its parameters, under one admissible disturbance: none,
+        where it may be."""
+        system, model = self.response.system, self.disturbance
+        middle = np.zeros((1, 0)) if system.parameters is None else system.parameters.interior_point()[None]
+        A, B, E = system.matrices(middle)
+        known = LinearSystem(A[0], B[0], E[0])
+        if model is not None:
+            zero = np.zeros(model.channels)
+            point = zero if model.bound.contains(zero) else model.bound.interior_point()
+            single = Box(point, point)
+            fixed = DisturbanceModel(
+                "piecewise_constant", single, single, model.grid, starts=np.arange(model.grid.pieces)
+            )
+            model = fixed if point.any() else None
+        return WorstCase(Response(known, self.response.grid, self.response.initial_state), self.dictionary, model)
+
+    def rows(self, times: Array, directions: Array, parameters: Array) -> tuple[Array, Array]:
+        """``G (k, n)`` and ``offset (k,)`` with ``max_w c'x(t) = G theta + offset``."""
+        return self._rows(
+            times,
+            directions,
+            parameters,
+            lambda part, gains, W: self._support(gains, W, times[part], directions[part], parameters[part]),
+        )
+
+    def rows_under(
+        self, times: Array, directions: Array, parameters: Array, disturbances: Array | None
+    ) -> tuple[Array, Array]:
+        """``G (k, n)`` and ``offset (k,)`` with ``c'x(t) = G theta + offset`` under given disturbances ``(k, mw, L)``
+        on the grid's pieces."""
+        return self._rows(
+            times,
+            directions,
+            parameters,
+            lambda part, gains, W: (
+                0.0 if disturbances is None else np.einsum("kli,kil->k", gains @ W, disturbances[part])
+            ),
+        )
+
+    def _rows(
+        self, times: Array, directions: Array, parameters: Array, pushed: Callable[[slice, Array, Array], Array | float]
+    ) -> tuple[Array, Array]:
+        """Rows and offsets; ``pushed(part, gains, W)`` is what the disturbance adds to the offsets of a part of the
+        indices."""
+        G, offset = np.empty((times.size, self.variables)), np.empty(times.size)
+        for part in self._chunks(times.size):
+            free, gains, B, W = self.response.adjoint(times[part], directions[part], parameters[part])
+            G[part] = self.on_decision(gains @ B)
+            offset[part] = free @ self.response.initial_state + pushed(part, gains, W)
+        return G, offset
+
+    def worst_blocks(self, times: Array, directions: Array, parameters: Array) -> Array:
+        """The coefficients ``(k, nb, q)`` of a worst disturbance at every index."""
+        assert self.disturbance is not None
+        _, gains, _, W = self.response.adjoint(times, directions, parameters)
+        return self.disturbance.set.support_point(self.disturbance.blocks(gains @ W))
+
+    def values(self, theta: Array, times: Array, directions: Array, parameters: Array) -> Array:
+        """``max_w c'x(t)`` at a decision, ``(k,)``, without building the rows."""
+        control = self.on_grid(theta)
+        result = np.empty(times.size)
+        for part in self._chunks(times.size):
+            free, gains, B, W = self.response.adjoint(times[part], directions[part], parameters[part])
+            driven = np.einsum("kld,kdm,ml->k", gains, B, control, optimize=True)
+            support = self._support(gains, W, times[part], directions[part], parameters[part])
+            result[part] = free @ self.response.initial_state + driven + support
+        return result
+
+    def profile(self, times: Array, directions: Array, parameter: Array) -> Array:
+        """``sigma (k, r)`` at one parameter, for all ``times (k,)`` and ``directions (r, d)``; by the age of the pieces
+        where the grid allows."""
+        model = self.disturbance
+        if model is None or model.kind == "measurable" or not (self.response.uniform and model.by_piece):
+            k, r = times.size, directions.shape[0]
+            every = np.broadcast_to(parameter, (k * r, parameter.size))
+            return self.offsets(np.repeat(times, r), np.tile(directions, (k, 1)), every).reshape(k, r)
+        known = frozen(self.response.system, self.response.grid, self.response.initial_state, parameter)
+        return Push(known, model, directions).at(times, np.zeros((times.size, directions.shape[0], 0)))[0][:, :, 0]
+
+    def push(self, lifted: LiftedSystem, H: Array, joined: Combination | None = None) -> Push | MeasurablePush | None:
+        """The push of the disturbance on functionals ``H (r, d)`` over a cell; raises `NotEnclosable` where no bound of
+        it is proven."""
+        model = self.disturbance
+        if model is None:
+            return None
+        if model.kind != "measurable":
+            return Push(lifted, model, H @ lifted.transform, joined)
+        if lifted.space.nu or joined is not None:
+            raise NotEnclosable(
+                "measurable disturbances are proven only for known systems and sets with flat sides; "
+                "expected disturbance_class piecewise_constant"
+            )
+        return MeasurablePush(self.measurable, H)
+
+    def offsets(self, times: Array, directions: Array, parameters: Array) -> Array:
+        """``sigma (k,)``: how far the worst disturbance alone pushes ``c'x(t)``."""
+        if self.disturbance is None:
+            return np.zeros(times.size)
+        result = np.empty(times.size)
+        for part in self._chunks(times.size):
+            _, gains, _, W = self.response.adjoint(times[part], directions[part], parameters[part])
+            result[part] = self._support(gains, W, times[part], directions[part], parameters[part])
+        return result
+
+    def worst_disturbance(self, time: float, direction: Array, parameter: Array) -> Array | None:
+        """A disturbance ``(mw, L)`` on the pieces of the merged grid that attains the worst case at one index."""
+        if self.disturbance is None:
+            return None
+        _, gains, _, W = self.response.adjoint(np.array([time]), direction[None], parameter[None])
+        answer: Array | None = self.disturbance.worst(gains @ W)[0]
+        return answer
+
+    @cached_property
+    def measurable(self) -> MeasurableSupport:
+        """The support of measurable disturbances."""
+        assert self.disturbance is not None
+        return MeasurableSupport(self.response, self.disturbance.bound)
+
+    def on_decision(self, weights: Array) -> Array:
+        """Weights ``(k, L, m)`` on the control of every grid piece, as rows ``(k, n)`` of the decision."""
+        on_pieces = np.add.reduceat(weights, self._control_starts(), axis=1)
+        coefficients = on_pieces if self.dictionary.is_indicators else self.dictionary.values @ on_pieces
+        return coefficients.swapaxes(1, 2).reshape(-1, self.variables)
+
+    def on_grid(self, theta: Array) -> Array:
+        """The control ``(m, L)`` on the pieces of the merged grid."""
+        return self.dictionary.control(theta)[:, self.response.grid.control_piece]
+
+    def _support(self, gains: Array, W: Array, times: Array, directions: Array, parameters: Array) -> Array:
+        if self.disturbance is None:
+            return np.zeros(times.size)
+        if self.disturbance.kind == "measurable":
+            return self.measurable(times, directions, parameters)
+        return self.disturbance.support(gains @ W)
+
+    def _control_starts(self) -> np.ndarray:
+        return np.flatnonzero(np.diff(self.response.grid.control_piece, prepend=-1))
+
+    def _chunks(self, count: int) -> list[slice]:
+        size = max(1, CHUNK // (self.response.grid.pieces * self.response.initial_state.size))
+        return [slice(start, start + size) for start in range(0, count, size)]

@@ -1,0 +1,118 @@
+"""Parameter sets as index coordinates: a bounding box to search in, and a continuous map of the box onto the set."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from sparserob_core.control.enclosures.valid_inequalities import Cuts, ball_of
+from sparserob_core.control.sets.gauge import outward, shares
+from sparserob_core.sip.convex_set import Array, Box, ConvexSet
+
+TOUCHING = 1e-12  # relative: a cell this close to the set meets it
+LATTICE = 4096  # points at most in the lattice over the parameters
+
+
+@dataclass(frozen=True, eq=False)
+class ParameterIndex:
+    """The part of an index that is the parameter ``p``; empty (``nu = 0``) for a known system."""
+
+    set: ConvexSet | None
+
+    @property
+    def count(self) -> int:
+        return 0 if self.set is None else self.set.dimension
+
+    @property
+    def box(self) -> Box:
+        """The smallest box ``(nu,)`` around the set; only for ``count > 0``."""
+        assert self.set is not None
+        if isinstance(self.set, Box):
+            return self.set
+        axes = np.eye(self.count)
+        return Box(-self.set.support(-axes), self.set.support(axes))
+
+    def clamp(self, parameters: Array) -> Array:
+        """Points ``(k, nu)`` of the box mapped onto the set: kept where inside, else drawn along the ray to an interior
+        point."""
+        if self.set is None or isinstance(self.set, Box):
+            return parameters
+        share, middle = shares(self.set, parameters)[:, None], self.set.interior_point()
+        return np.where(share == 1.0, parameters, middle + share * (parameters - middle))
+
+    def pulled_back(self, parameters: Array, slopes: Array) -> Array:
+        """Derivatives ``(k, nu)`` in the points of the box, from derivatives ``slopes (k, nu)`` in what `clamp` makes
+        of them.
+
+        A point ``p`` outside the set is drawn to ``middle + s (p - middle)`` on the boundary. With an outward normal
+        ``v`` there, the derivative of ``s`` is ``-s v / v'(p - middle)``. Points of the set stay where they are; at a
+        corner of the set one of its normals is taken.
+        """
+        if self.set is None or isinstance(self.set, Box):
+            return slopes
+        share, middle, result = shares(self.set, parameters), self.set.interior_point(), slopes.astype(float)
+        outside = np.flatnonzero(share < 1.0)
+        ray, before, kept = parameters[outside] - middle, result[outside], share[outside, None]
+        normals = outward(self.set, middle + kept * ray)
+        across, along = (normals * ray).sum(axis=1, keepdims=True), (before * ray).sum(axis=1, keepdims=True)
+        result[outside] = kept * (
+            before - np.where(across > 0, along / np.where(across > 0, across, 1.0), 0.0) * normals
+        )
+        return result
+
+    def touches(self, lower: Array, upper: Array) -> np.ndarray:
+        """Whether cells ``[lower, upper]`` (``(k, nu)``) may meet the set; ``False`` only when they provably do not."""
+        if self.set is None or isinstance(self.set, Box):
+            return np.ones(lower.shape[0], dtype=bool)
+        H, h = self._halfspaces(self.set, (lower + upper) / 2)
+        smallest = np.minimum(H * lower[:, None], H * upper[:, None]).sum(axis=2)
+        return np.asarray((smallest <= h + TOUCHING * np.maximum(1.0, np.abs(h))).all(axis=1))
+
+    def cuts(self, low: Array, high: Array) -> Cuts | None:
+        """What the set says about the parameters of a cell ``[low, high]``; ``None`` where all of the cell is in it, as
+        far as can be told."""
+        if self.set is None or isinstance(self.set, Box):
+            return None
+        centre, radius = (low + high) / 2, (high - low) / 2
+        ball, flat = ball_of(self.set, centre, radius), self.set.halfspaces() is not None
+        towards = (
+            centre[None] if flat or ball is not None else np.vstack([centre, *product(*zip(low, high, strict=True))])
+        )
+        H, h = (side.reshape(-1, *side.shape[2:]) for side in self._halfspaces(self.set, towards))
+        slopes, slack = H * radius, h - H @ centre
+        crossing = np.abs(slopes).sum(axis=1) > slack
+        if not crossing.any() and (
+            ball is None or np.linalg.norm(np.abs(ball[0]) + np.abs(ball[1]).sum(axis=1)) <= 1.0
+        ):
+            return None
+        bent = np.zeros(centre.size)
+        if not flat:
+            box = self.box
+            bent = float((h - H @ self.set.interior_point()).max()) * ((high - low) / (box.upper - box.lower)) ** 2 / 2
+        return Cuts(slopes[crossing], slack[crossing], ball, bent)
+
+    @staticmethod
+    def _halfspaces(convex_set: ConvexSet, points: Array) -> tuple[Array, Array]:
+        """Half-spaces ``H p <= h`` that contain the set: its own, or a tangent one on the ray to each of ``points``;
+        ``(k, q, nu), (k, q)``."""
+        flat = convex_set.halfspaces()
+        if flat is not None:
+            return np.broadcast_to(flat[0], (points.shape[0], *flat[0].shape)), np.broadcast_to(
+                flat[1], (points.shape[0], flat[1].size)
+            )
+        middle = convex_set.interior_point()
+        normals = outward(convex_set, middle + shares(convex_set, points)[:, None] * (points - middle))
+        sizes = np.linalg.norm(normals, axis=1, keepdims=True)
+        normals = normals / np.where(sizes > 0, sizes, 1.0)
+        return normals[:, None], convex_set.support(normals)[:, None]
+
+    def lattice(self) -> tuple[Array, tuple[int, ...]]:
+        """A tensor lattice ``(v, nu)`` over the box (ends and middle included), clamped onto the set, and its shape."""
+        if self.set is None:
+            return np.zeros((1, 0)), ()
+        per_axis = next(n for n in (9, 7, 5, 3, 2, 1) if n**self.count <= (125 if n > 3 else LATTICE) or n == 1)
+        box = self.box
+        axes = [np.linspace(low, high, per_axis) for low, high in zip(box.lower, box.upper, strict=True)]
+        return self.clamp(np.array(list(product(*axes)))), (per_axis,) * self.count

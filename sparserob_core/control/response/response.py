@@ -1,0 +1,254 @@
+"""State responses by matrix exponentials: no time stepping, any times, any parameters, all vectorised.
+
+On every piece of the merged time grid the inputs are constant, so the state follows
+``x(tau_l + r) = e^{A r} x(tau_l) + F(r) (B u_l + E w_l)`` with ``F(r) = int_0^r e^{A s} ds``; both blocks come from one
+exponential of ``[[A, I], [0, 0]]`` (Van Loan 1978, Theorem 1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from sparserob_core.control.enclosures.cache import remember
+from sparserob_core.control.enclosures.matrix_exponential import exponential
+from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.sip.convex_set import Array
+
+FEW = 64  # indices for which a table beats the loop over the pieces
+STEPS_KEPT = 16  # sets of parameters whose transitions are remembered
+SAME_TIME = 1e-12  # times closer than this share of the horizon are one
+
+
+@dataclass(frozen=True, eq=False)
+class TimeGrid:
+    """The union of the breakpoints of control and disturbance.
+
+    ``breakpoints (L+1,)``; ``control_piece (L,)`` and ``disturbance_piece (L,)``: which piece of each dictionary a
+    piece of the grid lies in.
+    """
+
+    breakpoints: Array
+    control_piece: np.ndarray
+    disturbance_piece: np.ndarray
+
+    @property
+    def pieces(self) -> int:
+        return int(self.breakpoints.size - 1)
+
+    @property
+    def lengths(self) -> Array:
+        return np.diff(self.breakpoints)
+
+    def distinct(self, durations: Array) -> tuple[Array, np.ndarray]:
+        """The distinct durations ``(u,)`` among ``(k,)``, those that differ by rounding as one, and which of them each
+        is."""
+        horizon = self.breakpoints[-1]
+        shares, which = np.unique(np.round(durations / horizon, 15), return_inverse=True)
+        return shares * horizon, which.reshape(-1)
+
+    def locate(self, times: Array) -> np.ndarray:
+        """Index of the piece that each time ``(k,)`` lies in; a breakpoint belongs to the piece that it ends."""
+        return np.clip(np.searchsorted(self.breakpoints, times, side="left") - 1, 0, self.pieces - 1)
+
+
+def distinct_times(times: Array, horizon: float) -> Array:
+    """The times in increasing order, those closer than rounding as one; the first and the last are kept as they are."""
+    points = np.unique(times)
+    kept = points[np.concatenate([[True], np.diff(points) > SAME_TIME * horizon])]
+    kept[-1] = points[-1]
+    answer: Array = kept
+    return answer
+
+
+def merge_grids(control: Array, disturbance: Array) -> TimeGrid:
+    """The merged grid of two sets of breakpoints over the same horizon; points closer than rounding are one."""
+    horizon = float(control[-1])
+    points = distinct_times(np.concatenate([control, disturbance]), horizon)
+    middles = (points[:-1] + points[1:]) / 2
+    return TimeGrid(points, np.searchsorted(control, middles) - 1, np.searchsorted(disturbance, middles) - 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """Transition matrices over whole pieces: ``E (v, q, d, d)`` and ``F (v, q, d, d)`` for ``v`` parameters and ``q``
+    distinct lengths."""
+
+    A: Array
+    B: Array
+    W: Array
+    E: Array
+    F: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """The responses of one system on one time grid; ``propagate`` takes the place of `transitions` for matrices with a
+    structure."""
+
+    system: LinearSystem
+    grid: TimeGrid
+    initial_state: Array
+    propagate: Callable[[Array, Array], tuple[Array, Array]] | None = None
+    _steps: dict[bytes, Steps] = field(default_factory=dict, repr=False)
+
+    def __post_init__(self) -> None:
+        _, which = np.unique(np.round(self.grid.lengths / self.grid.breakpoints[-1], 13), return_inverse=True)
+        # means: the rounding must not add up
+        object.__setattr__(self, "_lengths", np.bincount(which, self.grid.lengths) / np.bincount(which))
+        object.__setattr__(self, "_which", which)
+
+    _lengths: Array = field(init=False, repr=False)
+    _which: np.ndarray = field(init=False, repr=False)
+
+    def steps(self, parameters: Array) -> Steps:
+        """Matrices and whole-piece transitions at parameters ``(v, nu)``; remembered for the last few calls."""
+        # no parameters: any number of rows has the same bytes
+        key = bytes(str(parameters.shape), "ascii") + parameters.tobytes()
+        if key not in self._steps:
+            A, B, W = self.system.matrices(parameters)
+            E, F = self._transitions(A[:, None], self._lengths[None, :])
+            remember(self._steps, key, Steps(A, B, W, E, F), STEPS_KEPT)
+        return self._steps[key]
+
+    def adjoint(self, times: Array, directions: Array, parameters: Array) -> tuple[Array, Array, Array, Array]:
+        """The functional ``c'x(t)`` of each index, as weights on the initial state and on what drives every piece.
+
+        ``times (k,)``, ``directions (k, d)``, ``parameters (k, nu)`` give ``free (k, d) = e^{A't} c``,
+        ``gains (k, L, d) = int_{piece, s < t} e^{A'(t-s)} c ds``, and the input matrices ``B (k, d, m)``,
+        ``W (k, d, mw)`` at the parameters.
+        """
+        unique, which = _unique_rows(parameters)
+        steps = self.steps(unique)
+        pieces = self.grid.locate(times)
+        if self.uniform and not parameters.shape[1] and times.size <= FEW:
+            return self._adjoint_of_few(steps, times, directions, pieces)
+        order = np.argsort(-pieces, kind="stable")
+        within = np.clip(times - self.grid.breakpoints[pieces], 0.0, None)
+        partial_E, partial_F = self._partial(steps, which, within)
+        rows = np.ascontiguousarray(directions[order], dtype=float)[:, None, :]
+        gains = np.zeros((times.size, self.grid.pieces, directions.shape[1]))
+        gains[np.arange(times.size), pieces[order]] = (rows @ partial_F[order])[:, 0]
+        rows = rows @ partial_E[order]
+        which, sorted_pieces = which[order], pieces[order]
+        for piece in range(int(sorted_pieces[0]) - 1, -1, -1):
+            active = int(np.searchsorted(-sorted_pieces, -piece))
+            E, F = self._whole(steps, piece, which[:active])
+            gains[:active, piece] = (rows[:active] @ F)[:, 0]
+            rows[:active] = rows[:active] @ E
+        back = np.empty_like(order)
+        back[order] = np.arange(order.size)
+        return rows[back, 0], gains[back], steps.B[which[back]], steps.W[which[back]]
+
+    def _adjoint_of_few(
+        self, steps: Steps, times: Array, directions: Array, pieces: np.ndarray
+    ) -> tuple[Array, Array, Array, Array]:
+        """`adjoint` of a known system on equal pieces, without a loop over them: what a piece still gives depends on
+        its age only."""
+        count, last = np.zeros(times.size, dtype=int), int(pieces.max())
+        partial_E, partial_F = self._partial(steps, count, np.clip(times - self.grid.breakpoints[pieces], 0.0, None))
+        rows = np.einsum("kd,kde->ke", directions, partial_E)
+        gains = np.zeros((times.size, self.grid.pieces, directions.shape[1]))
+        age = pieces[:, None] - 1 - np.arange(last)
+        gains[:, :last] = np.where(
+            (age >= 0)[..., None], np.einsum("kd,klde->kle", rows, self.ages[np.maximum(age, 0)]), 0.0
+        )
+        gains[np.arange(times.size), pieces] = np.einsum("kd,kde->ke", directions, partial_F)
+        free = np.einsum("kd,kde->ke", rows, self._powers[pieces])
+        return free, gains, np.repeat(steps.B, times.size, axis=0), np.repeat(steps.W, times.size, axis=0)
+
+    def _partial(self, steps: Steps, which: np.ndarray, within: Array) -> tuple[Array, Array]:
+        horizon = self.grid.breakpoints[-1]
+        distinct, inverse = np.unique(np.stack([which, np.round(within / horizon, 15)]), axis=1, return_inverse=True)
+        E, F = self._transitions(steps.A[distinct[0].astype(int)], distinct[1] * horizon)
+        return E[inverse.reshape(-1)], F[inverse.reshape(-1)]
+
+    @property
+    def uniform(self) -> bool:
+        """Whether all pieces of the grid are equally long."""
+        return bool(self._lengths.size == 1)
+
+    def flows(self, durations: Array) -> tuple[Array, Array]:
+        """``e^{A r}`` and its integral ``(k, d, d)`` for durations ``(k,)``; for a known system."""
+        return self._transitions(self.steps(np.zeros((1, 0))).A[0], durations)
+
+    def _transitions(self, A: Array, durations: Array) -> tuple[Array, Array]:
+        return (self.propagate or transitions)(A, durations)
+
+    @cached_property
+    def _powers(self) -> Array:
+        """``e^{A tau}`` at the breakpoints, ``(L + 1, d, d)``; for a known system."""
+        return self.flows(self.grid.breakpoints)[0]
+
+    @cached_property
+    def ages(self) -> Array:
+        """``e^{A i h} F(h)`` for ``i = 0, ..., L - 1``, ``(L, d, d)``: what a piece of age ``i`` still gives; for a
+        known system and equal pieces."""
+        steps = self.steps(np.zeros((1, 0)))
+        powers = np.empty((self.grid.pieces, *steps.A.shape[1:]))
+        powers[0] = steps.F[0, 0]
+        done = 1
+        while done < powers.shape[0]:  # doubling: e^{A (done + i) h} = e^{A done h} e^{A i h}
+            count = min(done, powers.shape[0] - done)
+            leap = self._transitions(steps.A[0], np.array(done * self._lengths[0]))[0]
+            powers[done : done + count] = leap @ powers[:count]
+            done += count
+        return powers
+
+    def length_of(self, piece: int) -> int:
+        """Which of the distinct lengths, in the order of `Steps`, a piece has."""
+        return int(self._which[piece])
+
+    def _whole(self, steps: Steps, piece: int, which: np.ndarray) -> tuple[Array, Array]:
+        length = self._which[piece]
+        if steps.E.shape[0] == 1:
+            return steps.E[0, length], steps.F[0, length]
+        return steps.E[which, length], steps.F[which, length]
+
+    def states(self, control: Array, parameters: Array, disturbance: Array | None = None) -> Array:
+        """States ``(v, L+1, d)`` at the breakpoints of the grid.
+
+        ``control (m, K)`` on the control's pieces, ``parameters (v, nu)`` (one row serves all disturbances),
+        ``disturbance (v, mw, M)`` on the disturbance's pieces or ``None``.
+        """
+        steps = self.steps(parameters)
+        count = parameters.shape[0] if disturbance is None else max(parameters.shape[0], disturbance.shape[0])
+        drive = np.einsum("vdm,ml->vld", steps.B, control[:, self.grid.control_piece])
+        if disturbance is not None:
+            drive = drive + np.einsum(
+                "vdi,vil->vld",
+                np.broadcast_to(steps.W, (count, *steps.W.shape[1:])),
+                disturbance[:, :, self.grid.disturbance_piece],
+            )
+        path = np.empty((count, self.grid.pieces + 1, self.initial_state.size))
+        path[:, 0] = self.initial_state
+        shared = steps.E.shape[0] == 1
+        for piece in range(self.grid.pieces):
+            E, F = steps.E[:, self._which[piece]], steps.F[:, self._which[piece]]
+            if shared:
+                path[:, piece + 1] = path[:, piece] @ E[0].T + drive[:, piece] @ F[0].T
+            else:
+                path[:, piece + 1] = (E @ path[:, piece, :, None] + F @ drive[:, piece, :, None])[..., 0]
+        return path
+
+
+def transitions(A: Array, durations: Array) -> tuple[Array, Array]:
+    """``e^{A r}`` and ``int_0^r e^{A s} ds`` for matrices ``(..., d, d)`` and durations ``(...,)``, broadcast
+    together."""
+    size = A.shape[-1]
+    shape = np.broadcast_shapes(A.shape[:-2], durations.shape)
+    block = np.zeros((*shape, 2 * size, 2 * size))
+    block[..., :size, :size] = A * durations[..., None, None]
+    block[..., :size, size:] = np.eye(size) * durations[..., None, None]
+    both = exponential(block)
+    return both[..., :size, :size], both[..., :size, size:]
+
+
+def _unique_rows(parameters: Array) -> tuple[Array, np.ndarray]:
+    if parameters.shape[1] == 0 or parameters.shape[0] == 1:
+        return parameters[:1], np.zeros(parameters.shape[0], dtype=int)
+    unique, which = np.unique(parameters, axis=0, return_inverse=True)
+    return unique, which.reshape(-1)

@@ -1,0 +1,113 @@
+"""A system together with its derivatives in the parameters, as one larger system.
+
+The rows ``r(s) = c'e^{A s}`` and their derivatives ``r_i = dr/dp_i`` obey ``r' = r A`` and
+``r_i' = r_i A + r dA/dp_i``: the rows ``(r, r_1, ..., r_nu)`` are those of one linear system, which is propagated
+exactly, as any other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from sparserob_core.control.enclosures.cache import remember
+from sparserob_core.control.enclosures.taylor import TaylorSpace
+from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.response.parameters import ParameterIndex
+from sparserob_core.control.response.response import Response
+from sparserob_core.errors import NotEnclosable
+from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.relaxed.index_gradient import differences
+
+# of the width of the parameters: the cell of the Taylor models, whose first coefficients do not depend on its size
+CELL = 1e-6
+POINTS_KEPT = 512  # parameters whose derivatives are remembered
+
+
+def tangent(response: Response) -> Response:
+    """The response whose functionals are ``c'x(t)`` and its derivatives in the ``nu`` parameters, for directions
+    ``(c, 0, ..., 0)``.
+
+    Its states are ``1 + nu`` blocks of ``d``; its ``B`` and ``E`` hold those of the system and their derivatives, block
+    below block. A known system is its own.
+    """
+    system, blocks = response.system, 1 + response.system.parameter_count
+    if blocks == 1:
+        return response
+    at = Derivatives(system)
+    larger = LinearSystem(
+        lambda p: _acting_on_rows(at(p)[0]),
+        lambda p: np.concatenate(at(p)[1]),
+        lambda p: np.concatenate(at(p)[2]),
+        parameters=system.parameters,
+        names=system.names,
+    )
+    return Response(
+        larger, response.grid, np.concatenate([response.initial_state, np.zeros((blocks - 1) * system.states)])
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Derivatives:
+    """The matrices of a system and their derivatives in the parameters, at one parameter at a time.
+
+    They are the first coefficients of Taylor models on a tiny cell, which is exact; where a function cannot be
+    evaluated on Taylor models, second-order differences within the bounding box of the parameters.
+    """
+
+    system: LinearSystem
+    _known: dict[bytes, tuple[Array, Array, Array]] = field(default_factory=dict, repr=False)
+
+    def __call__(self, parameter: Array) -> tuple[Array, Array, Array]:
+        """``A (1 + nu, d, d)``, ``B (1 + nu, d, m)``, ``E (1 + nu, d, mw)`` at ``parameter (nu,)``: values, then
+        derivatives."""
+        key = np.asarray(parameter, dtype=float).tobytes()
+        if key not in self._known:
+            remember(self._known, key, self._at(np.asarray(parameter, dtype=float)), POINTS_KEPT)
+        return self._known[key]
+
+    @cached_property
+    def _box(self) -> Box:
+        return ParameterIndex(self.system.parameters).box
+
+    def _at(self, parameter: Array) -> tuple[Array, Array, Array]:
+        values = self.system.matrices(parameter[None])
+        try:
+            slopes = self._enclosed(parameter)
+        except NotEnclosable:
+            slopes = self._differenced(parameter)
+        A, B, E = (np.concatenate([value, slope]) for value, slope in zip(values, slopes, strict=True))
+        return A, B, E
+
+    def _enclosed(self, parameter: Array) -> tuple[Array, Array, Array]:
+        box = self._box
+        width = box.upper - box.lower
+        radius = CELL * np.where(width > 0, width, 1.0 + np.abs(parameter))
+        space = TaylorSpace(parameter.size, 1)
+        parts = self.system.taylor(space, parameter, radius)
+        linear = [space.index[tuple(exponents)] for exponents in np.eye(parameter.size, dtype=int).tolist()]
+        A, B, E = (parts[part][linear] / radius[:, None, None] for part in (0, 2, 4))
+        return A, B, E
+
+    def _differenced(self, parameter: Array) -> tuple[Array, Array, Array]:
+        box = self._box
+        shapes = [matrix.shape[1:] for matrix in self.system.matrices(parameter[None])]
+
+        def entries(points: Array, _: np.ndarray) -> Array:
+            return np.hstack([matrix.reshape(points.shape[0], -1) for matrix in self.system.matrices(points)])
+
+        slopes = differences(entries, parameter[None], box.lower, box.upper)[0]
+        parts = np.split(slopes, np.cumsum([np.prod(shape) for shape in shapes])[:-1], axis=1)
+        A, B, E = (part.reshape(-1, *shape) for part, shape in zip(parts, shapes, strict=True))
+        return A, B, E
+
+
+def _acting_on_rows(A: Array) -> Array:
+    """``A (1 + nu, d, d)`` and its derivatives as the matrix ``((1 + nu) d, (1 + nu) d)`` of the rows
+    ``(r, r_1, ..., r_nu)``."""
+    blocks, d = A.shape[:2]
+    matrix = np.kron(np.eye(blocks), A[0])
+    matrix[:d, d:] = A[1:].swapaxes(0, 1).reshape(d, -1)
+    return matrix

@@ -1,0 +1,1 @@
+"""Convex sets by their support functions: polytopes, curved sets, gauges, directions, samples."""

@@ -1,0 +1,264 @@
+"""Curved sets: ellipsoids and norm balls, with their support functions in closed form."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+import numpy.typing as npt
+
+from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import Array, Box, ConvexSet, as_bound, vertex_excess
+
+_SIGN_DIMENSIONS = 10
+_BISECTIONS = 60
+
+
+@dataclass(frozen=True, eq=False)
+class Ellipsoid(ConvexSet):
+    """``{x : (x - centre)' shape^-1 (x - centre) <= 1} = {centre + L z : |z| <= 1}`` with ``L L' = shape``.
+
+    ``centre (d,)``, ``shape (d, d)`` symmetric positive definite. Raises `InputError` when it is not.
+    Support function ``c'centre + sqrt(c' shape c)``.
+    """
+
+    centre: Array
+    shape: Array
+
+    def __post_init__(self) -> None:
+        try:
+            shape = np.atleast_2d(np.array(self.shape, dtype=float))
+        except (TypeError, ValueError) as error:
+            raise InputError("ellipsoid: shape must be a square matrix of numbers") from error
+        if shape.ndim != 2 or shape.shape[0] != shape.shape[1] or not np.isfinite(shape).all():
+            raise InputError(f"ellipsoid: shape must be a square matrix of finite numbers, got shape {shape.shape}")
+        if not np.allclose(shape, shape.T, rtol=1e-12, atol=0.0) or np.linalg.eigvalsh(shape)[0] <= 0.0:
+            raise InputError(f"ellipsoid: shape must be symmetric positive definite, got {shape.tolist()}")
+        object.__setattr__(self, "centre", _finite("ellipsoid: centre", self.centre, shape.shape[0]))
+        object.__setattr__(self, "shape", shape)
+
+    @property
+    def dimension(self) -> int:
+        return int(self.centre.size)
+
+    @cached_property
+    def factor(self) -> Array:
+        """Lower triangular ``L (d, d)`` with ``L L' = shape``."""
+        return np.asarray(np.linalg.cholesky(self.shape), dtype=float)
+
+    def support(self, directions: Array) -> Array:
+        directions = np.asarray(directions, dtype=float)
+        height: Array = directions @ self.centre + np.linalg.norm(directions @ self.factor, axis=-1)
+        return height
+
+    def support_point(self, directions: Array) -> Array:
+        images = np.asarray(directions, dtype=float) @ self.factor
+        norms = np.linalg.norm(images, axis=-1, keepdims=True)
+        point: Array = self.centre + images / np.where(norms > 0.0, norms, 1.0) @ self.factor.T
+        return point
+
+    def linearisation_excess(self, centre: Array, spread: Array) -> Array:
+        return _round_excess(
+            np.asarray(centre, dtype=float) @ self.factor, np.asarray(spread, dtype=float) @ self.factor
+        )
+
+    def support_minorant(self, centre: Array, spread: Array) -> tuple[float, Array, Array]:
+        value, gradient, _ = super().support_minorant(centre, spread)
+        return value, gradient, norm_curvature(centre @ self.factor, spread @ self.factor)
+
+    def violation(self, points: Array) -> Array:
+        """Distance to the ellipsoid outside; inside, ``(gauge - 1) * shortest half-axis``, which is at least minus the
+        depth."""
+        squares, axes = np.linalg.eigh(self.shape)
+        z = np.abs((np.asarray(points, dtype=float) - self.centre) @ axes)
+        gauge = np.sqrt((z**2 / squares).sum(axis=-1))
+        low, high = np.zeros(gauge.shape), np.sqrt(squares[-1]) * np.linalg.norm(z, axis=-1)
+        for _ in range(_BISECTIONS):  # the multiplier of the projection: |shape^(1/2) z / (shape + multiplier)| = 1
+            middle = 0.5 * (low + high)
+            outside = (squares * (z / (squares + middle[..., None])) ** 2).sum(axis=-1) > 1.0
+            low, high = np.where(outside, middle, low), np.where(outside, high, middle)
+        distance = np.linalg.norm(z * (high[..., None] / (squares + high[..., None])), axis=-1)
+        excess: Array = np.where(gauge > 1.0, distance, (gauge - 1.0) * np.sqrt(squares[0]))
+        return excess
+
+    def interior_point(self) -> Array:
+        return self.centre.copy()
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class NormBall(ConvexSet):
+    """``{x : |x - centre|_p <= radius}`` for ``1 <= p <= inf``; give ``centre (d,)``, or ``dimension`` for a ball about
+    the origin.
+
+    Flat for ``p = 1`` (up to ten dimensions) and ``p = inf``. Support function ``c'centre + radius |c|_q``,
+    ``1/p + 1/q = 1``.
+    """
+
+    p: float
+    radius: float
+    centre: Array
+
+    def __init__(
+        self, p: float, radius: float, centre: npt.ArrayLike | None = None, dimension: int | None = None
+    ) -> None:
+        if not float(p) >= 1.0:
+            raise InputError(f"norm ball: p must be at least 1 (inf for the maximum norm), got {p!r}")
+        if not 0.0 <= float(radius) < np.inf:
+            raise InputError(f"norm ball: radius must be a finite number, at least 0, got {radius!r}")
+        if centre is None and dimension is None:
+            raise InputError("norm ball: expected a centre, or a dimension for a ball about the origin")
+        if dimension is not None and dimension < 1:
+            raise InputError(f"norm ball: dimension must be at least 1, got {dimension}")
+        middle = np.zeros(dimension or 0) if centre is None else _finite("norm ball: centre", centre, dimension)
+        object.__setattr__(self, "p", float(p))
+        object.__setattr__(self, "radius", float(radius))
+        object.__setattr__(self, "centre", middle)
+
+    @property
+    def dimension(self) -> int:
+        return int(self.centre.size)
+
+    @property
+    def dual(self) -> float:
+        """The exponent ``q`` of the dual norm."""
+        return np.inf if self.p == 1.0 else 1.0 if self.p == np.inf else self.p / (self.p - 1.0)
+
+    def support(self, directions: Array) -> Array:
+        directions = np.asarray(directions, dtype=float)
+        height: Array = directions @ self.centre + self.radius * np.linalg.norm(directions, ord=self.dual, axis=-1)
+        return height
+
+    def support_point(self, directions: Array) -> Array:
+        c = np.asarray(directions, dtype=float)
+        size = np.abs(c).max(axis=-1, keepdims=True)
+        c = c / np.where(size > 0.0, size, 1.0)
+        if self.p == 1.0:
+            unit = np.where(np.arange(self.dimension) == np.abs(c).argmax(axis=-1)[..., None], np.sign(c), 0.0)
+        elif self.p == np.inf:
+            unit = np.sign(c)
+        else:
+            steep = np.sign(c) * np.abs(c) ** (self.dual - 1.0)
+            norms = np.linalg.norm(steep, ord=self.p, axis=-1, keepdims=True)
+            unit = steep / np.where(norms > 0.0, norms, 1.0)
+        point: Array = self.centre + self.radius * unit
+        return point
+
+    def linearisation_excess(self, centre: Array, spread: Array) -> Array:
+        if self.p == 1.0:
+            corners = self.radius * np.vstack([np.eye(self.dimension), -np.eye(self.dimension)])
+            return vertex_excess(
+                self.centre + corners, np.asarray(centre, dtype=float), np.asarray(spread, dtype=float)
+            )
+        if self.p == np.inf:
+            return Box(self.centre - self.radius, self.centre + self.radius).linearisation_excess(
+                np.asarray(centre), np.asarray(spread)
+            )
+        if self.p != 2.0:
+            smooth = self.radius * _power_excess(
+                np.asarray(centre, dtype=float), np.abs(spread).sum(axis=-2), self.dual
+            )
+            return np.minimum(super().linearisation_excess(centre, spread), smooth)
+        return self.radius * _round_excess(np.asarray(centre, dtype=float), np.asarray(spread, dtype=float))
+
+    def halfspaces(self) -> tuple[Array, Array] | None:
+        d = self.dimension
+        if self.p == np.inf or d == 1:
+            H = np.vstack([np.eye(d), -np.eye(d)])
+        elif self.p == 1.0 and d <= _SIGN_DIMENSIONS:
+            H = np.array(list(product([1.0, -1.0], repeat=d)))
+        else:
+            return None
+        return H, H @ self.centre + self.radius
+
+    def violation(self, points: Array) -> Array:
+        """Distance to the ball outside; inside, ``(|x - centre|_p - radius) / max {|v|_p : |v|_2 = 1}``, at least minus
+        the depth."""
+        if self.halfspaces() is not None:
+            return super().violation(points)
+        z = np.abs(np.asarray(points, dtype=float) - self.centre)
+        excess: Array = np.linalg.norm(z, ord=self.p, axis=-1) - self.radius
+        if self.p == 2.0:
+            return excess
+        if self.radius == 0.0:
+            return np.asarray(np.linalg.norm(z, axis=-1))
+        distance = self.radius * np.linalg.norm(z / self.radius - self._projected(z / self.radius), axis=-1)
+        steepest = self.dimension ** max(0.0, 1.0 / self.p - 0.5)
+        signed: Array = np.where(excess > 0.0, distance, excess / steepest)
+        return signed
+
+    def _projected(self, z: Array) -> Array:
+        """Euclidean projection of ``z >= 0`` on the unit ball: ``y_i + multiplier y_i^(p-1) = z_i``, and the multiplier
+        gives norm 1."""
+        power = self.p - 1.0
+        low, high = np.full(z.shape[:-1], -50.0), np.full(z.shape[:-1], 50.0)
+        for _ in range(_BISECTIONS):
+            middle = 0.5 * (low + high)
+            large = np.linalg.norm(_shrunk(z, np.exp(middle)[..., None], power), ord=self.p, axis=-1) > 1.0
+            low, high = np.where(large, middle, low), np.where(large, high, middle)
+        return _shrunk(z, np.exp(high)[..., None], power)
+
+    def interior_point(self) -> Array:
+        return self.centre.copy()
+
+
+def _round_excess(centre: Array, spread: Array) -> Array:
+    """The largest ``|y| - g'y`` over ``y = centre + sum_j s_j spread_j``, ``g`` the unit vector of the centre:
+    ``sqrt(a^2 + b^2) - a``, which decreases in ``a <= g'y`` and increases in ``b >= |y - g g'y|``."""
+    length = np.linalg.norm(centre, axis=-1)
+    unit = centre / np.where(length > 0.0, length, 1.0)[..., None]
+    along = (spread * unit[..., None, :]).sum(axis=-1)
+    across = np.linalg.norm(spread - along[..., None] * unit[..., None, :], axis=-1).sum(axis=-1)
+    least = length - np.abs(along).sum(axis=-1)
+    excess: Array = np.hypot(least, across) - least
+    return excess
+
+
+def _shrunk(z: Array, multiplier: Array, power: float) -> Array:
+    """The root ``0 <= y <= z`` of ``y + multiplier y^power = z``, by bisection."""
+    low, high = np.zeros_like(z), z.copy()
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        above = middle + multiplier * middle**power > z
+        low, high = np.where(above, low, middle), np.where(above, middle, high)
+    return high
+
+
+def _finite(name: str, value: object, size: int | None) -> Array:
+    numbers = as_bound(name, value, size)
+    if not np.isfinite(numbers).all():
+        raise InputError(f"{name}: expected finite numbers, got {numbers.tolist()}")
+    return numbers
+
+
+def norm_curvature(centre: Array, spread: Array) -> Array:
+    """``H (J, J)`` with ``|a + B's| >= |a| + a'B's / |a| + s'H s / 2`` for ``|s_j| <= 1``; ``centre`` is ``a (b,)``,
+    ``spread`` is ``B (J, b)``.
+
+    With the part of ``B's`` along ``a`` at most ``p`` and the part across at most ``q``:
+    ``sqrt(u^2 + v^2) >= u + v^2 / (2 u) - v^4 / (8 u^3)`` for ``|a| - p <= u <= |a| + p`` and ``v <= q``. Zero where
+    that is not positive.
+    """
+    size = float(np.linalg.norm(centre))
+    if size == 0.0:
+        return np.zeros((spread.shape[0], spread.shape[0]))
+    along = spread @ centre / size
+    across = spread - np.outer(along, centre / size)
+    p, q = float(np.abs(along).sum()), float(np.linalg.norm(across, axis=1).sum())
+    factor = 0.0 if p >= size else 1.0 / (size + p) - q**2 / (4.0 * (size - p) ** 3)
+    return max(0.0, factor) * (across @ across.T)
+
+
+def _power_excess(a: Array, b: Array, q: float) -> Array:
+    """A bound of ``|a + s|_q - |a|_q - gradient's`` for ``|s_i| <= b_i``: the root is concave in ``sum |a_i + s_i|^q``,
+    whose terms are convex.
+
+    ``a, b (..., d)``; returns ``(...,)``, infinite where ``a`` vanishes.
+    """
+    slope = q * np.sign(a) * np.abs(a) ** (q - 1.0)
+    ends = [np.abs(a + sign * b) ** q - np.abs(a) ** q - sign * slope * b for sign in (-1.0, 1.0)]
+    norms = np.linalg.norm(a, ord=q, axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        excess = norms ** (1.0 - q) * np.maximum(*ends).sum(axis=-1) / q
+    return np.where(norms > 0.0, excess, np.inf)

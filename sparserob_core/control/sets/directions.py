@@ -1,0 +1,57 @@
+"""Directions of a curved set as index coordinates: points of the surface of the cube ``[-1, 1]^b``."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+
+from sparserob_core.sip.convex_set import Array, ConvexSet
+
+PER_EDGE = {1: 1, 2: 33, 3: 13, 4: 7}  # sampled directions along an edge of the cube, by dimension; 3 beyond
+
+
+def unit(convex_set: ConvexSet, z: Array) -> Array:
+    """Unit directions ``(k, d)`` of cube points ``(k, b)``, in the span in which the support function is finite; 0
+    stays 0."""
+    directions = z @ convex_set.normals
+    norms = np.linalg.norm(directions, axis=1, keepdims=True)
+    return np.asarray(directions / np.where(norms > 0, norms, 1.0))
+
+
+def across(z: Array, slopes: Array) -> Array:
+    """Derivatives ``(k, b)`` in cube points, from derivatives ``slopes (k, b)`` in the coordinates of their unit
+    directions; 0 at the point 0."""
+    lengths = np.linalg.norm(z, axis=1, keepdims=True)
+    shares = z / np.where(lengths > 0, lengths, 1.0)
+    sideways = slopes - (slopes * shares).sum(axis=1, keepdims=True) * shares
+    return np.asarray(np.where(lengths > 0, sideways / np.where(lengths > 0, lengths, 1.0), 0.0))
+
+
+def on_surface(z: Array) -> Array:
+    """Cube points scaled to the surface of the cube."""
+    size = np.abs(z).max(axis=-1, keepdims=True)
+    return np.asarray(z / np.where(size > 0, size, 1.0))
+
+
+def sampled(dimension: int) -> Array:
+    """A lattice ``(k, b)`` on the surface of the cube."""
+    points = np.linspace(-1.0, 1.0, PER_EDGE.get(dimension, 3)) if dimension > 1 else np.zeros(0)
+    every = [
+        np.insert(rest, axis, sign)
+        for axis in range(dimension)
+        for sign in (-1.0, 1.0)
+        for rest in np.array(list(product(points, repeat=dimension - 1))).reshape(
+            len(points) ** (dimension - 1), dimension - 1
+        )
+    ]
+    return np.unique(np.array(every), axis=0)
+
+
+def faces(dimension: int) -> tuple[Array, Array]:
+    """The faces of the cube as degenerate boxes, ``lower`` and ``upper`` ``(2 b, b)``."""
+    lower, upper = -np.ones((2 * dimension, dimension)), np.ones((2 * dimension, dimension))
+    for axis in range(dimension):
+        lower[2 * axis, axis] = upper[2 * axis, axis] = -1.0
+        lower[2 * axis + 1, axis] = upper[2 * axis + 1, axis] = 1.0
+    return lower, upper

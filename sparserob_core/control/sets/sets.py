@@ -1,0 +1,127 @@
+"""The sets that controls, disturbances, parameters, states and terminal states live in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from sparserob_core.control.sets.curved import Ellipsoid, NormBall
+from sparserob_core.control.sets.polytope import Polytope
+from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import Array, Box, ConvexSet
+
+__all__ = ["Box", "ConvexSet", "Cylinder", "Ellipsoid", "Equality", "NormBall", "Polytope", "cylinder", "intersection"]
+
+
+@dataclass(frozen=True, eq=False)
+class Equality:
+    """``x_i = values_i`` wherever ``values (d,)`` is a number; NaN leaves that coordinate free.
+
+    Not a `ConvexSet`: a set without interior would destroy every Slater point, so equalities stay equalities of the
+    finite programs.
+    """
+
+    values: Array
+
+    def __post_init__(self) -> None:
+        try:
+            values = np.atleast_1d(np.array(self.values, dtype=float))
+        except (TypeError, ValueError) as error:
+            raise InputError(f"equality: expected a list of numbers, null where free, got {self.values!r}") from error
+        if values.ndim != 1 or values.size == 0 or np.isinf(values).any():
+            raise InputError(f"equality: expected a list of finite numbers, null where free, got {values.tolist()}")
+        object.__setattr__(self, "values", values)
+
+    @property
+    def dimension(self) -> int:
+        """Dimension of the space."""
+        return int(self.values.size)
+
+    @property
+    def fixed(self) -> npt.NDArray[np.intp]:
+        """Indices of the coordinates that are fixed."""
+        return np.flatnonzero(~np.isnan(self.values))
+
+    def violation(self, points: Array) -> Array:
+        """Largest absolute deviation ``(...,)`` of points ``(..., d)`` from the fixed values; 0 when nothing is
+        fixed."""
+        deviation: Array = np.abs(np.asarray(points)[..., self.fixed] - self.values[self.fixed]).max(
+            axis=-1, initial=0.0
+        )
+        return deviation
+
+    def contains(self, points: Array, tolerance: float = 1e-9) -> npt.NDArray[np.bool_]:
+        """Whether points ``(..., d)`` deviate by at most the absolute ``tolerance``."""
+        inside: npt.NDArray[np.bool_] = np.asarray(self.violation(points) <= tolerance)
+        return inside
+
+
+def intersection(sets: Sequence[ConvexSet]) -> ConvexSet | tuple[ConvexSet, ...]:
+    """The intersection as one set where that is a box or a polytope, else the members as they are.
+
+    Raises `InputError` when there is no member, dimensions differ, or a flat intersection is empty.
+    """
+    if not sets:
+        raise InputError("intersection: expected at least one set")
+    if len({member.dimension for member in sets}) > 1:
+        raise InputError(f"intersection: dimensions differ, {[member.dimension for member in sets]}")
+    if len(sets) == 1:
+        return sets[0]
+    boxes = [member for member in sets if isinstance(member, Box)]
+    if len(boxes) == len(sets):
+        return Box(np.max([box.lower for box in boxes], axis=0), np.min([box.upper for box in boxes], axis=0))
+    flats = [flat for member in sets if (flat := member.halfspaces()) is not None]
+    if len(flats) < len(sets):
+        return tuple(sets)
+    return Polytope(np.vstack([H for H, _ in flats]), np.concatenate([h for _, h in flats]))
+
+
+@dataclass(frozen=True, eq=False)
+class Cylinder(ConvexSet):
+    """``{x in R^size : x[:b] in base}`` for a curved ``base`` in ``R^b``: the other coordinates are free. Made by
+    `cylinder`."""
+
+    base: ConvexSet
+    size: int
+
+    @property
+    def dimension(self) -> int:
+        return self.size
+
+    @property
+    def normals(self) -> Array:
+        return np.eye(self.base.dimension, self.size)
+
+    def support(self, directions: Array) -> Array:
+        directions = np.asarray(directions, dtype=float)
+        bounded = (directions[..., self.base.dimension :] == 0.0).all(axis=-1)
+        height: Array = np.where(bounded, self.base.support(directions[..., : self.base.dimension]), np.inf)
+        return height
+
+    def support_point(self, directions: Array) -> Array:
+        directions = np.asarray(directions, dtype=float)
+        inner = self.base.support_point(directions[..., : self.base.dimension])
+        return np.concatenate([inner, np.zeros((*inner.shape[:-1], self.size - self.base.dimension))], axis=-1)
+
+    def violation(self, points: Array) -> Array:
+        return self.base.violation(np.asarray(points)[..., : self.base.dimension])
+
+    def interior_point(self) -> Array:
+        return np.concatenate([self.base.interior_point(), np.zeros(self.size - self.base.dimension)])
+
+
+def cylinder(base: ConvexSet, size: int) -> ConvexSet:
+    """``{x in R^size : x[:b] in base}``, as a box or a polytope where it is one. Raises `InputError` when ``size`` is
+    below ``b``."""
+    free = size - base.dimension
+    if free < 0:
+        raise InputError(f"cylinder: size must be at least {base.dimension}, the dimension of its base, got {size}")
+    if isinstance(base, Box):
+        return Box(np.append(base.lower, np.full(free, -np.inf)), np.append(base.upper, np.full(free, np.inf)))
+    flat = base.halfspaces()
+    if flat is None:
+        return Cylinder(base, size)
+    return Polytope(np.hstack([flat[0], np.zeros((len(flat[0]), free))]), flat[1])

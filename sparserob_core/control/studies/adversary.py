@@ -1,0 +1,148 @@
+"""The worst that can happen to one constraint at a decision, as a parameter and a signal that can be plotted and
+replayed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sparserob_core.control.response.disturbance import DisturbanceModel
+from sparserob_core.control.response.functional import WorstCase
+from sparserob_core.control.response.response import transitions
+from sparserob_core.control.transcription.state_constraints import StateConstraint
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.program import ConstraintFamily
+
+PARTS = 4  # equal parts of every piece on which a measurable worst case is looked for
+HALVINGS = 40  # of a part across a switch of the worst disturbance
+SIGNAL = 4096  # parts at most; a set without corners has a worst disturbance that is constant nowhere
+LOST = 1e-14  # of the largest integrand times the horizon: what a constant on a part may lose
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Adversary:
+    """The worst case of one family: ``direction'x(time) - bound = violation`` (negative: a margin) under
+    ``parameter (nu,)`` and the disturbance.
+
+    ``direction (d,)`` is row ``row`` of a set with flat sides, or a unit normal of a curved one. The disturbance
+    ``(mw, L)`` is constant between ``breakpoints (L + 1,)``; ``None`` where there is none.
+    """
+
+    name: str
+    row: int
+    time: float
+    direction: Array
+    bound: float
+    parameter: Array
+    violation: float
+    breakpoints: Array
+    disturbance: Array | None
+
+
+def find_adversary(
+    functionals: WorstCase, constraint: StateConstraint, family: ConstraintFamily, decision: Array
+) -> Adversary | None:
+    """The `Adversary` of a family that ``constraint`` describes, at the largest violation that its separation finds;
+    ``None`` if it finds none."""
+    assert family.worst is not None
+    found = family.worst(decision)
+    if not found.violations.size:
+        return None
+    row = int(found.rows[0])
+    times, directions, parameters, bounds = (part[row] for part in constraint.functionals_at(found.indices[:1]))
+    time = float(times)
+    breakpoints, disturbance = worst_signal(functionals, time, directions, parameters)
+    return Adversary(
+        name=family.name,
+        row=row,
+        time=time,
+        direction=directions,
+        bound=float(bounds),
+        parameter=parameters,
+        violation=float(found.violations[0]),
+        breakpoints=breakpoints,
+        disturbance=disturbance,
+    )
+
+
+def worst_signal(functionals: WorstCase, time: float, direction: Array, parameter: Array) -> tuple[Array, Array | None]:
+    """``breakpoints (L + 1,)`` and a disturbance ``(mw, L)`` that maximises ``direction'x(time)``; ``None`` without
+    disturbances.
+
+    Among measurable disturbances the maximiser is ``w(s)`` in the set with the largest
+    ``direction'e^{A (time - s)} E w`` (Pontryagin's principle): constant between finitely many switches for a polytope,
+    approached by `SIGNAL` constants for a set without corners.
+    """
+    grid, model = functionals.response.grid, functionals.disturbance
+    if model is None or model.kind != "measurable":
+        return grid.breakpoints, functionals.worst_disturbance(time, direction, parameter)
+    A, _, W = (matrix[0] for matrix in functionals.response.system.matrices(parameter[None]))
+    starts = np.concatenate(
+        [
+            left + (right - left) * np.arange(PARTS) / PARTS
+            for left, right in zip(grid.breakpoints[:-1], grid.breakpoints[1:], strict=True)
+        ]
+    )
+    ends = np.append(starts[1:], grid.breakpoints[-1])
+    past = starts < time
+    starts, ends = _halved(model, (A, W), (starts[past], np.minimum(ends[past], time)), (time, direction))
+    values = model.bound.support_point(_gains((A, W), starts, ends, time, direction))
+    if time < grid.breakpoints[-1]:  # afterwards nothing matters
+        starts, values = np.append(starts, time), np.vstack([values, model.bound.interior_point()])
+    return _merged(starts, values, grid.breakpoints)
+
+
+def _halved(
+    model: DisturbanceModel, matrices: tuple[Array, Array], parts: tuple[Array, Array], at: tuple[float, Array]
+) -> tuple[Array, Array]:
+    """The parts, halved wherever the best constant on one is not the best at both of its ends; the most lossy of them
+    when they are too many."""
+    starts, ends = parts
+    here = np.arange(starts.size)
+    for _ in range(HALVINGS):
+        lost, allowed = _lost(model, matrices, starts[here], ends[here], at)
+        middles = (starts[here] + ends[here]) / 2
+        open_ = np.flatnonzero((lost > allowed) & (middles > starts[here]) & (middles < ends[here]))
+        open_ = open_[np.argsort(-lost[open_], kind="stable")][: max(0, SIGNAL - starts.size)]
+        if not open_.size:
+            break
+        split, middles = here[open_], middles[open_]
+        starts, ends = np.concatenate([starts, middles]), np.concatenate([ends, ends[split]])
+        ends[split] = middles
+        here = np.concatenate([split, np.arange(starts.size - split.size, starts.size)])
+    order = np.argsort(starts)
+    return starts[order], ends[order]
+
+
+def _lost(
+    model: DisturbanceModel, matrices: tuple[Array, Array], starts: Array, ends: Array, at: tuple[float, Array]
+) -> tuple[Array, float]:
+    """What the best constant on each part misses at its two ends, times the part's length, ``(k,)``, and how much of
+    that is rounding."""
+    A, W = matrices
+    time, direction = at
+    best = model.bound.support_point(_gains(matrices, starts, ends, time, direction))
+    missed, largest = np.zeros(starts.size), 0.0
+    for times in (starts, ends):
+        rows = np.einsum("i,kij,jw->kw", direction, transitions(A[None], time - times)[0], W)
+        height = model.bound.support(rows)
+        missed += (ends - starts) * (height - (best * rows).sum(axis=1))
+        largest = max(largest, float(np.abs(height).max(initial=0.0)))
+    return missed, LOST * largest * float(model.grid.breakpoints[-1])
+
+
+def _gains(matrices: tuple[Array, Array], starts: Array, ends: Array, time: float, direction: Array) -> Array:
+    """``int_start^end E' e^{A' (time - s)} direction ds`` for parts ``(k,)`` before ``time``, ``(k, mw)``."""
+    A, W = matrices
+    flow, _ = transitions(A[None], time - ends)
+    _, driven = transitions(A[None], ends - starts)
+    return np.asarray(np.einsum("i,kij,kjl,lw->kw", direction, flow, driven, W, optimize=True))
+
+
+def _merged(starts: Array, values: Array, breakpoints: Array) -> tuple[Array, Array]:
+    """Parts with the same value as one, but for the breakpoints of the grid, which all stay."""
+    changes = np.concatenate([[True], (np.diff(values, axis=0) != 0).any(axis=1)])
+    points = np.unique(np.concatenate([breakpoints, starts[changes]]))
+    which = np.searchsorted(starts, (points[:-1] + points[1:]) / 2, side="right") - 1
+    return points, values[which].T

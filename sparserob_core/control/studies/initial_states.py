@@ -1,0 +1,268 @@
+"""The initial state as a part of the decision: which ones can be met by a control, in a plane of two coordinates.
+
+The state is affine in ``(theta, x(0))``, so the set of initial states from which one control satisfies every
+constraint, whatever the disturbance and the parameter, is convex: the projection of a convex semi-infinite program. Its
+support functions are programs again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from copy import copy
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, TypeAlias, final
+
+import numpy as np
+
+from sparserob_core.control.constraints.curved import CurvedConstraint
+from sparserob_core.control.constraints.flat import FlatConstraint
+from sparserob_core.control.enclosures.cache import remember
+from sparserob_core.control.response.response import Response
+from sparserob_core.control.transcription.record import Transcription
+from sparserob_core.control.transcription.transcribe import program_of
+from sparserob_core.errors import InputError, NotEnclosable
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.evidence import Cut
+from sparserob_core.sip.program import ConstraintFamily, Enclosure, Explanation, SemiInfiniteProgram, Separation
+from sparserob_core.sip.proof.branch_and_bound import TOLERANCE
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_array
+
+PROGRAMS_KEPT = 4  # ordinary programs, each at one initial state, that are remembered
+StateConstraint: TypeAlias = FlatConstraint | CurvedConstraint
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class InitialPlane:
+    """Initial states ``x(0)`` with the coordinates ``states (2,)`` at ``centre + radius z``, ``|z_i| <= 1``, the others
+    as the problem has them.
+
+    ``centre (2,)`` and ``radius (2,)`` are in the units of the states.
+    """
+
+    model: Transcription
+    states: tuple[int, int]
+    centre: Array
+    radius: Array
+    _programs: dict[bytes, SemiInfiniteProgram] = field(default_factory=dict, repr=False)
+
+    def point(self, z: Array) -> Array:
+        """The two coordinates ``(..., 2)`` of the initial state."""
+        return np.asarray(self.centre + self.radius * z)
+
+    def scaled(self, points: Array) -> Array:
+        """The ``z (..., 2)`` of coordinates ``(..., 2)``."""
+        return np.asarray((points - self.centre) / self.radius)
+
+    def resized(self, lower: Array, upper: Array) -> InitialPlane:
+        """The same plane with another box of coordinates."""
+        return InitialPlane(self.model, self.states, (lower + upper) / 2, (upper - lower) / 2)
+
+    def at(self, z: Array) -> SemiInfiniteProgram:
+        """The ordinary program from one initial state; what does not depend on the initial state is shared by all of
+        them."""
+        key = z.tobytes()
+        if key not in self._programs:
+            families = [_moved(family, self._state(z)) for family in self._base.families]
+            A, b = self._equalities(z)
+            remember(self._programs, key, replace(self._base, families=families, A=A, b=b), PROGRAMS_KEPT)
+        return self._programs[key]
+
+    def _equalities(self, z: Array) -> tuple[Array | None, Array | None]:
+        """Those of the program at ``z``, without any that no control moves and that holds there but for rounding."""
+        base = self._base
+        if base.A is None or base.b is None:
+            return None, None
+        b = base.b - self._columns @ z
+        needed = base.A.any(axis=1) | (np.abs(b) > TOLERANCE)
+        return (base.A[needed], b[needed]) if needed.any() else (None, None)
+
+    def support(self, direction: Array, known: Sequence[Cut] = ()) -> SemiInfiniteProgram:
+        """Minimise ``-direction'z`` over all ``(theta, z)``: its value is minus the support function of the feasible
+        initial states.
+
+        ``known`` are constraints that are likely to matter: they are among the program's fixed rows, which changes
+        nothing but its work.
+        """
+        base, finite, n = self._base, self._base.finite, self._base.n
+        G, h = self._rows(known)
+        A = None if base.A is None else np.hstack([base.A, self._columns])
+        return SemiInfiniteProgram(
+            n=n + 2,
+            q=np.concatenate([np.zeros(n), -direction]),
+            S=_with_identity(finite.S),
+            lower=np.append(finite.lower, [-1.0, -1.0]),
+            upper=np.append(finite.upper, [1.0, 1.0]),
+            G=G,
+            h=h,
+            A=A,
+            b=base.b,
+            families=self._families,
+            channels=base.channels,
+        )
+
+    def _rows(self, cuts: Sequence[Cut]) -> tuple[Array | None, Array | None]:
+        if not cuts:
+            return None, None
+        parts = [next(f for f in self._families if f.name == cut.family).rows(cut.index[None]) for cut in cuts]
+        return (
+            np.stack([G[0, cut.row] for (G, _), cut in zip(parts, cuts, strict=True)]),
+            np.array([h[0, cut.row] for (_, h), cut in zip(parts, cuts, strict=True)]),
+        )
+
+    @cached_property
+    def _families(self) -> list[ConstraintFamily]:
+        return [_Joined(self, family).family() for family in self._base.families]
+
+    def _state(self, z: Array) -> Array:
+        state = np.array(self.model.problem.initial_state, dtype=float)
+        state[list(self.states)] = self.point(z)
+        return state
+
+    @cached_property
+    def _base(self) -> SemiInfiniteProgram:
+        """The ordinary program at the centre, each of its families asked once, so that there is something to share."""
+        program = program_of(self._model(np.zeros(2)))
+        still = np.zeros(program.n)
+        for family in program.families:
+            if family.worst is not None:
+                family.worst(still)
+            if family.enclosure is not None and family.cells is not None:
+                with suppress(NotEnclosable):
+                    family.enclosure(still, family.cells[0][:1], family.cells[1][:1])
+        return program
+
+    @cached_property
+    def _columns(self) -> Array:
+        """The columns ``(e, 2)`` of ``z`` in the equalities."""
+        b = [program_of(self._model(z)).b for z in (np.zeros(2), *np.eye(2))]
+        return np.zeros((0, 2)) if b[0] is None else np.stack([b[0] - np.asarray(moved) for moved in b[1:]], axis=1)
+
+    def _model(self, z: Array) -> Transcription:
+        state, functionals = self._state(z), copy(self.model.functionals)
+        object.__setattr__(functionals, "response", _from(functionals.response, state))
+        return replace(self.model, problem=replace(self.model.problem, initial_state=state), functionals=functionals)
+
+
+def check_states(states: object, count: int) -> tuple[int, int]:
+    """Two different states, counted from 0; raises `InputError`."""
+    given = tuple(states) if isinstance(states, Sequence | np.ndarray) else ()
+    if len(given) != 2 or any(isinstance(one, bool) or not isinstance(one, int | np.integer) for one in given):
+        raise InputError(f"states: expected two different states, counted from 0, got {states!r}")
+    a, b = (int(one) for one in given)
+    if a == b or not (0 <= a < count and 0 <= b < count):
+        raise InputError(f"states: expected two different states of the {count}, counted from 0, got {a} and {b}")
+    return a, b
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Joined:
+    """One family of the ordinary program as a family in ``(theta, z)``."""
+
+    plane: InitialPlane
+    base: ConstraintFamily
+
+    def family(self) -> ConstraintFamily:
+        offers = self.base.enclosure is not None
+        return ConstraintFamily(
+            name=self.base.name,
+            index_set=self.base.index_set,
+            rows=self.rows,
+            worst=self.worst,
+            cells=self.base.cells,
+            enclosure=self.enclosure if offers else None,
+            explain=self.explain,
+            scale=self.base.scale,
+        )
+
+    def rows(self, indices: Array) -> tuple[Array, Array]:
+        """The rows at the centre, and two columns more: ``c'e^{A(p)t}`` at the two coordinates."""
+        G, h = self.base.rows(indices)
+        owner = _owner(self.base)
+        if owner is None:
+            return np.concatenate([G, np.zeros((*G.shape[:2], 2))], axis=2), h
+        times, directions, parameters, _ = owner.functionals_at(indices)
+        free = owner.functionals.response.adjoint(times, directions, parameters)[0]
+        columns = free[:, list(self.plane.states)] * self.plane.radius
+        return np.concatenate([G, columns.reshape(*G.shape[:2], 2)], axis=2), h
+
+    def worst(self, x: Array) -> Separation:
+        """The exact separation of the family at that initial state."""
+        worst = self._at(x).worst
+        assert worst is not None  # every family of a control problem has its own separation
+        return worst(x[:-2])
+
+    def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
+        """The enclosure of the family at that initial state."""
+        enclosure = self._at(x).enclosure
+        assert enclosure is not None
+        return enclosure(x[:-2], lower, upper)
+
+    def explain(self, index: Array, row: int) -> Explanation:
+        """The constraint in words, without what the centre's initial state gives: it is free."""
+        assert self.base.explain is not None
+        words = self.base.explain(index, row)
+        return replace(words, text=words.text.partition(" (")[0]) if words.time == 0.0 else words
+
+    def _at(self, x: Array) -> ConstraintFamily:
+        return self.plane.at(x[-2:]).family(self.base.name)
+
+
+def _owner(family: ConstraintFamily) -> StateConstraint | None:
+    """The constraint on the state that a family is made of; ``None`` for one on the control."""
+    owner = getattr(family.rows, "__self__", None)
+    return owner if isinstance(owner, FlatConstraint | CurvedConstraint) else None
+
+
+def _moved(family: ConstraintFamily, state: Array) -> ConstraintFamily:
+    """The same family from another initial state."""
+    owner = _owner(family)
+    if owner is None:
+        return family
+    moved = _constraint_from(owner, state)
+    return replace(
+        family,
+        rows=moved.rows,
+        worst=moved.worst,
+        enclosure=moved.enclosure,
+        gradient=None,
+        nominal=None,
+        sample=None,
+        literal=None,
+        explain=moved.explain,
+        scale=moved.scale,
+    )
+
+
+def _constraint_from(constraint: StateConstraint, state: Array) -> StateConstraint:
+    """A copy with another initial state that keeps what was remembered of times, margins and pushes: none of it depends
+    on that state."""
+    moved = copy(constraint)
+    functionals = copy(constraint.functionals)
+    object.__setattr__(functionals, "response", _from(functionals.response, state))
+    object.__setattr__(moved, "functionals", functionals)
+    for dependent in ("_cells", "_lifted"):
+        vars(moved).pop(dependent, None)
+    if isinstance(constraint, CurvedConstraint):
+        vars(moved)["_flat"] = _constraint_from(constraint._flat, state)
+    return moved
+
+
+def _from(response: Response, state: Array) -> Response:
+    """A copy with another initial state; flows and steps do not depend on it."""
+    moved = copy(response)
+    object.__setattr__(moved, "initial_state", state)
+    return moved
+
+
+def _with_identity(S: csc_array | None) -> csc_array | None:
+    if S is None:
+        return None
+    from scipy.sparse import block_diag, csc_array
+
+    return csc_array(block_diag([S, np.eye(2)]))

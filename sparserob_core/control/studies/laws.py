@@ -1,0 +1,159 @@
+"""Laws of random disturbances and parameters for simulation: each draws admissible signals only, and none of them
+proves anything."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from sparserob_core.control.response.disturbance import DisturbanceModel
+from sparserob_core.control.response.functional import WorstCase
+from sparserob_core.control.response.parameters import ParameterIndex
+from sparserob_core.control.sets.gauge import shares
+from sparserob_core.control.sets.sampling import extreme_points, uniform_points
+from sparserob_core.control.transcription.state_constraints import StateConstraint
+from sparserob_core.sip.convex_set import Array, ConvexSet
+
+LawName: TypeAlias = Literal["iid", "vertices", "slow", "neighbours"]
+KNOTS = 6  # a slow disturbance is linear between at most so many extreme points
+BASES = 48  # random worst cases that neighbours are made of, beside the adversaries
+FLIPPED = 5  # pieces of a worst case that a neighbour changes, at most
+MIXED = 0.2  # where a disturbance has too few blocks to flip: how far it is drawn towards an extreme point, at most
+NEAR = 0.1  # how far the parameter of a neighbour is drawn towards a random one, at most
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """What is uncertain in a system: the disturbance (``None``: nothing) and the parameters, and the worst cases found
+    of them.
+
+    ``worst``: times ``(k,)``, directions ``(k, d)`` and parameters ``(k, nu)`` of functionals whose worst disturbances
+    are known to matter.
+    """
+
+    functionals: WorstCase
+    parameters: ParameterIndex
+    constraints: Sequence[StateConstraint]
+    worst: tuple[Array, Array, Array]
+
+    def draw(self, law: LawName, count: int, rng: np.random.Generator) -> tuple[Array | None, Array]:
+        """``count`` disturbances ``(count, mw, L)`` on the pieces of the merged grid (or ``None``) and parameters
+        ``(count, nu)``."""
+        if law == "neighbours":
+            return self._neighbours(count, rng)
+        points = {"iid": uniform_points, "vertices": extreme_points, "slow": uniform_points}[law]
+        parameters = np.zeros((count, 0)) if self.parameters.set is None else points(self.parameters.set, count, rng)
+        model = self.functionals.disturbance
+        if model is None:
+            return None, parameters
+        blocks = self._slow(model, count, rng) if law == "slow" else _every_block(model, count, rng, points)
+        return model.signals(blocks), parameters
+
+    def _slow(self, model: DisturbanceModel, count: int, rng: np.random.Generator) -> Array:
+        """Linear between extreme points of the set at equally spaced times, one to `KNOTS` of them: convex
+        combinations, so admissible.
+
+        Where a block is more than one piece the signal is projected on the span of the dictionary and drawn to the set
+        along a ray.
+        """
+        breaks = model.grid.breakpoints
+        middles = (breaks[:-1] + breaks[1:]) / (2 * breaks[-1])
+        signal = np.empty((count, middles.size, model.channels))
+        knots = rng.integers(1, KNOTS + 1, size=count)
+        for number in range(1, KNOTS + 1):
+            here = np.flatnonzero(knots == number)
+            points = extreme_points(model.bound, here.size * number, rng).reshape(here.size, number, -1)
+            signal[here] = np.einsum("lk,nki->nli", _hats(middles, number), points)
+        if model.starts is not None:
+            return signal[:, model.starts]
+        coefficients = np.einsum("nli,lj->nij", signal, np.linalg.pinv(np.asarray(model.functions)))
+        if model.scale is None:
+            return _drawn_in(model.set, coefficients.reshape(count, 1, -1))
+        return _drawn_in(model.set, coefficients / np.where(model.scale > 0, model.scale, 1.0)[:, None])
+
+    def _neighbours(self, count: int, rng: np.random.Generator) -> tuple[Array | None, Array]:
+        """The worst disturbance of a random time and constraint with a few blocks replaced by extreme points, and a
+        parameter near its own."""
+        bases, base = self._bases, rng.integers(0, self._bases[2].shape[0], size=count)
+        parameters = bases[2][base]
+        if self.parameters.set is not None:
+            near = rng.uniform(0.0, NEAR, size=(count, 1))
+            parameters = parameters + near * (uniform_points(self.parameters.set, count, rng) - parameters)
+        model = self.functionals.disturbance
+        if model is None:
+            return None, parameters
+        blocks, size = self._worst_blocks[base], model.block_count
+        flips = min(FLIPPED, size)
+        which = rng.integers(0, size, size=(count, flips))
+        drawn = rng.integers(1, flips + 1, size=(count, 1)) > np.arange(flips)
+        step = drawn[..., None] * (
+            np.ones((count, flips, 1)) if size > FLIPPED else rng.uniform(0.0, MIXED, size=(count, flips, 1))
+        )
+        extreme = extreme_points(model.set, count * flips, rng).reshape(count, flips, -1)
+        trajectory = np.arange(count)
+        for flip in range(flips):
+            place = which[:, flip]
+            before = blocks[trajectory, place]
+            blocks[trajectory, place] = before + step[:, flip] * (extreme[:, flip] - before)
+        return model.signals(blocks), parameters
+
+    @cached_property
+    def _bases(self) -> tuple[Array, Array, Array]:
+        """The known worst cases, and random ones: always the same, whatever is drawn from them."""
+        rng = np.random.default_rng(0)
+        found = [self.worst]
+        for constraint in self.constraints:
+            box, number = constraint.index_set, -(-BASES // len(self.constraints))
+            times, directions, parameters, _ = constraint.functionals_at(
+                rng.uniform(box.lower, box.upper, size=(number, box.dimension))
+            )
+            pick = np.arange(number) * (times.size // number) + rng.integers(0, times.size // number, size=number)
+            found.append((times[pick], directions[pick], parameters[pick]))
+        times, directions, parameters = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        return times, directions, parameters
+
+    @cached_property
+    def _worst_blocks(self) -> Array:
+        return self.functionals.worst_blocks(*self._bases)
+
+
+def admissibility(model: DisturbanceModel, signals: Array) -> Array:
+    """By how much disturbances ``(n, mw, L)`` on the merged grid miss being admissible, ``(n,)``; at most rounding when
+    they are."""
+    if model.starts is not None:
+        which = np.searchsorted(model.starts, np.arange(model.grid.pieces), side="right") - 1
+        values = signals.swapaxes(1, 2)
+        uneven = np.abs(values - values[:, model.starts[which]]).max(axis=(1, 2))
+        return np.asarray(np.maximum(model.bound.violation(values).max(axis=1), uneven))
+    functions = np.asarray(model.functions)
+    coefficients = signals @ np.linalg.pinv(functions)
+    outside = np.abs(coefficients @ functions - signals).max(axis=(1, 2))
+    if model.scale is not None:
+        used = np.abs(coefficients).sum(axis=2) - model.scale
+        return np.asarray(np.maximum(used.max(axis=1), outside))
+    return np.asarray(np.maximum(model.set.violation(coefficients.reshape(signals.shape[0], -1)), outside))
+
+
+def _every_block(
+    model: DisturbanceModel,
+    count: int,
+    rng: np.random.Generator,
+    points: Callable[[ConvexSet, int, np.random.Generator], Array],
+) -> Array:
+    return points(model.set, count * model.block_count, rng).reshape(count, model.block_count, -1)
+
+
+def _hats(places: Array, knots: int) -> Array:
+    """Weights ``(l, knots)`` of linear interpolation at places in ``[0, 1]`` between equally spaced knots."""
+    at = places * (knots - 1)
+    return np.clip(1.0 - np.abs(at[:, None] - np.arange(knots)), 0.0, None)
+
+
+def _drawn_in(convex: ConvexSet, points: Array) -> Array:
+    flat = points.reshape(-1, points.shape[-1])
+    middle = convex.interior_point()
+    return (middle + shares(convex, flat)[:, None] * (flat - middle)).reshape(points.shape)

@@ -1,0 +1,91 @@
+"""Many trajectories at once, exactly: matrix exponentials of the pieces, no time stepping."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from sparserob_core.control.constraints.flat import INSIDE, MOST_INSIDE, SMOOTH
+from sparserob_core.control.response.parameters import ParameterIndex
+from sparserob_core.control.response.response import Response, TimeGrid, distinct_times, transitions
+from sparserob_core.sip.convex_set import Array
+
+HELD = 2_000_000  # numbers of signals, or of transition matrices, that are held at once
+
+
+def fine_times(response: Response, parameters: ParameterIndex, more: Array) -> Array:
+    """The breakpoints, ``more (k,)`` times, and times inside every piece: three of them, or more where the system moves
+    on it; ``(T,)``."""
+    grid = response.grid
+    A, _, _ = response.system.matrices(parameters.lattice()[0])
+    pace = float(np.linalg.norm(A, axis=(1, 2)).max())
+    counts = np.clip(np.ceil(pace * grid.lengths / SMOOTH), INSIDE + 1, MOST_INSIDE).astype(int)
+    inside = np.concatenate(
+        [
+            left + (right - left) * np.arange(count) / count
+            for left, right, count in zip(grid.breakpoints[:-1], grid.breakpoints[1:], counts, strict=True)
+        ]
+    )
+    return distinct_times(np.concatenate([inside, more, grid.breakpoints[-1:]]), float(grid.breakpoints[-1]))
+
+
+def finer(grid: TimeGrid, times: Array) -> TimeGrid:
+    """A grid on other times, ``(T,)`` from 0 to the horizon, that include the breakpoints; its inputs are given on the
+    pieces of ``grid``."""
+    origin = grid.locate((times[:-1] + times[1:]) / 2)
+    return TimeGrid(times, origin, origin)
+
+
+def walk(response: Response, control: Array, parameters: Array, disturbances: Array | None) -> Iterator[Array]:
+    """The states ``(d, n)`` of ``n`` trajectories at every breakpoint of the response's grid, one time after another,
+    from the initial state.
+
+    ``control (m, K)`` and ``disturbances (n, mw, M)`` (or ``None``) on the pieces that the grid refers to,
+    ``parameters (n, nu)``: the variation of constants over each piece, in which both inputs are constant.
+    """
+    grid = response.grid
+    A, B, W = (
+        np.moveaxis(matrix, 0, -1) if parameters.shape[1] else matrix[0]
+        for matrix in response.system.matrices(parameters if parameters.shape[1] else parameters[:1])
+    )
+    signal = None if disturbances is None else np.ascontiguousarray(disturbances.transpose(2, 1, 0))
+    lengths, which = grid.distinct(grid.lengths)
+    flows, integrals = _transitions(A, lengths)
+    state = np.repeat(response.initial_state[:, None], parameters.shape[0], axis=1)
+    yield state
+    before, push = (-1, -1, -1), np.zeros(0)
+    for piece in range(grid.pieces):
+        inputs = (int(which[piece]), int(grid.control_piece[piece]), int(grid.disturbance_piece[piece]))
+        if inputs != before:
+            drive = _times(B, control[:, inputs[1], None])
+            push, before = (
+                _times(integrals[inputs[0]], drive if signal is None else drive + _times(W, signal[inputs[2]])),
+                inputs,
+            )
+        state = _times(flows[inputs[0]], state) + push
+        yield state
+
+
+def trajectories_at_once(response: Response, uncertain: bool) -> int:
+    """How many trajectories are held in memory together."""
+    grid, system = response.grid, response.system
+    signals = HELD // (max(1, system.disturbances) * (int(grid.disturbance_piece.max()) + 1))
+    flows = HELD // (grid.distinct(grid.lengths)[0].size * 4 * system.states**2) if uncertain else signals
+    return int(np.clip(min(signals, flows), 16, 4096))
+
+
+def _transitions(A: Array, lengths: Array) -> tuple[Array, Array]:
+    """``e^{A r}`` and its integral for every distinct length, ``(q, d, d)``, or ``(q, d, d, n)`` for ``n`` matrices
+    ``(d, d, n)``."""
+    if A.ndim == 2:
+        return transitions(A[None], lengths)
+    flows, integrals = transitions(np.moveaxis(A, -1, 0)[None], lengths[:, None])
+    return np.ascontiguousarray(np.moveaxis(flows, 1, -1)), np.ascontiguousarray(np.moveaxis(integrals, 1, -1))
+
+
+def _times(matrix: Array, vectors: Array) -> Array:
+    """Matrix times vectors ``(b, n)``, for one matrix ``(a, b)`` or one for each vector ``(a, b, n)``."""
+    if matrix.ndim == 2:
+        return matrix @ vectors
+    return np.asarray(np.einsum("abn,bn->an", matrix, np.broadcast_to(vectors, (vectors.shape[0], matrix.shape[2]))))

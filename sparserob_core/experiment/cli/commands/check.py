@@ -1,0 +1,43 @@
+"""``sparserob check``: verify a finished run anew."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from sparserob_core.experiment.terminal.printing import EXIT, print_json
+
+
+@click.command()
+@click.argument("directory", metavar="RUN", type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="Print the verdicts as JSON instead of the table.")
+def check(directory: Path, as_json: bool) -> int:
+    """Verify a finished run: every claim of its certificate, derived anew.
+
+    Reads RUN/config.yaml and RUN/certificate.json, computes every bound again in ball arithmetic, and shares no code
+    with what solved the problem. Prints one verdict per claim: it holds, fails, or was not checked, with the reason.
+
+    Exit status: 0 when every claim holds, 4 when one fails or was not checked, 2 when the input is at fault.
+    """
+    from dataclasses import asdict
+
+    from sparserob_core.experiment.check import check as verify
+    from sparserob_core.experiment.terminal.table import print_table
+
+    found = verify(directory)
+    if as_json:
+        print_json(
+            {
+                "title": found.title,
+                "status": found.status,
+                "seconds": found.seconds,
+                "claims": [asdict(claim) for claim in found.claims],
+            }
+        )
+    else:
+        print_table(
+            found.title, ("claim", "verdict", "what was derived"), [(c.name, c.verdict, c.text) for c in found.claims]
+        )
+        click.echo(f"{found.status}, in {found.seconds:.2f} s")
+    return EXIT[found.status]

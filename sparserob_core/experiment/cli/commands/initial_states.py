@@ -1,0 +1,127 @@
+"""``sparserob initial-states``: from which initial states an experiment is feasible, and at what cost."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import final
+
+import click
+
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.terminal.printing import EXIT, print_json
+
+PATIENCE = 2.0  # seconds of silence
+
+
+@click.command("initial-states")
+@click.argument("config", type=click.Path(path_type=Path))
+@click.argument("overrides", nargs=-1, metavar="[KEY=VALUE]...")
+@click.option(
+    "--states",
+    default="1,2",
+    show_default=True,
+    metavar="I,J",
+    help="The two states whose initial values are free, from 1.",
+)
+@click.option(
+    "--directions", type=int, default=32, show_default=True, help="Support functions asked for at most, at least 4."
+)
+@click.option(
+    "--values",
+    type=int,
+    default=15,
+    show_default=True,
+    help="Costs are measured on a lattice of so many points each way; 0: none.",
+)
+@click.option(
+    "--about",
+    metavar="X,...",
+    help="The initial state whose other coordinates the plane has; the config's unless given.",
+)
+@click.option(
+    "--within",
+    type=float,
+    help="Only initial values of at most this size are looked at; needed where the set is unbounded.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print initial_states.json instead of the table.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    help="A new or empty directory for the config, initial_states.json, initial_states.npz and initial_states.png.",
+)
+def initial_states(
+    config: Path,
+    overrides: tuple[str, ...],
+    states: str,
+    directions: int,
+    values: int,
+    about: str | None,
+    within: float | None,
+    as_json: bool,
+    out: Path | None,
+) -> int:
+    """Find the initial states from which the experiment that CONFIG describes is feasible.
+
+    They make a convex set. The command prints an inner polygon, every point of which is proven feasible, and an outer
+    one, outside of which every point is proven infeasible, and draws both with the cost as colour. KEY=VALUE changes
+    the config.
+
+    Exit status: 0 the set is known from both sides, 2 the input is at fault, 3 it is empty, proven, 4 no point is
+    proven, 130 interrupted.
+    """
+    from sparserob_core.experiment.directory.artefacts import finite
+    from sparserob_core.experiment.initial_states.initial_states import initial_states as find
+    from sparserob_core.experiment.terminal.table import print_table
+
+    line = _Line()
+    try:
+        found = find(
+            config,
+            overrides,
+            [int(one) - 1 for one in _numbers("states", states)],
+            directions=directions,
+            values=values,
+            about=None if about is None else _numbers("about", about),
+            within=within,
+            out=out,
+            tell=line.show,
+        )
+    finally:
+        line.clear()
+    if as_json:
+        print_json(finite(found.summary()))
+    else:
+        print_table(found.title, (), found.rows())
+        for remark in (*found.remarks, *([f"written to {out}"] if out is not None else [])):
+            click.echo(remark)
+    return EXIT[found.status]
+
+
+def _numbers(name: str, text: str) -> list[float]:
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if not numbers or (name == "states" and any(not number.is_integer() or number < 1 for number in numbers)):
+        expected = "two different states, counted from 1, such as 1,2" if name == "states" else "numbers, such as 0,0.5"
+        raise InputError(f"--{name}: expected {expected}, got {text!r}")
+    return numbers
+
+
+@final
+class _Line:
+    """One live line on the standard error stream of a terminal, after some patience."""
+
+    def __init__(self) -> None:
+        self.started, self.shown = time.perf_counter(), False
+
+    def show(self, text: str) -> None:
+        if sys.stderr.isatty() and time.perf_counter() - self.started > PATIENCE:
+            click.echo(f"\r\x1b[K{text}", nl=False, err=True)
+            self.shown = True
+
+    def clear(self) -> None:
+        if self.shown:
+            click.echo("\r\x1b[K", nl=False, err=True)

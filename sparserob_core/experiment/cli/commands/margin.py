@@ -1,0 +1,90 @@
+"""``sparserob margin``: how much uncertainty a problem bears, or how little room it needs."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import final
+
+import click
+
+from sparserob_core.experiment.terminal.printing import print_json
+
+EXIT = {"certified": 0, "unbounded": 0, "infeasible": 3, "undecided": 4}
+PATIENCE = 2.0  # seconds of silence
+
+
+@click.command()
+@click.argument("config", type=click.Path(path_type=Path))
+@click.argument("overrides", nargs=-1, metavar="[KEY=VALUE]...")
+@click.option(
+    "--of",
+    default="disturbance",
+    show_default=True,
+    metavar="WHAT",
+    help="disturbance, parameters, initial_state, path.0, terminal.0, control, or path.0.from; entries count from 0.",
+)
+@click.option(
+    "--tolerance",
+    type=float,
+    default=1e-6,
+    show_default=True,
+    help="How close the two sides are to be, relative to the factor or 1.",
+)
+@click.option(
+    "--curve", type=int, default=20, show_default=True, help="Points of the curve of cost against the factor; 0: none."
+)
+@click.option("--json", "as_json", is_flag=True, help="Print margin.json instead of the table.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    help=(
+        "A new or empty directory for the config, margin.json and margin.png; runs/NAME-margin/STAMP-HASH unless given."
+    ),
+)
+def margin(
+    config: Path, overrides: tuple[str, ...], of: str, tolerance: float, curve: int, as_json: bool, out: Path | None
+) -> int:
+    """Find how far something of the experiment that CONFIG describes can be changed before nothing is feasible any
+    more.
+
+    The largest factor on the set of disturbances, of parameters, or on the initial state; the smallest factor on a
+    path, terminal or control set; the earliest start of a path's window. On one side a control is proven feasible, on
+    the other nothing is, by a checked certificate. Sets are scaled about their centre. KEY=VALUE changes the config.
+
+    Exit status: 0 both sides are proven, or no end was found as far as was looked; 2 the input is at fault, 3 nothing
+    is feasible at any factor, 4 a side could not be proven, 130 interrupted.
+    """
+    from sparserob_core.experiment.margin.margin import margin as find
+    from sparserob_core.experiment.margin.margin import margin_rows, summary_of_margin
+    from sparserob_core.experiment.terminal.table import print_table
+
+    line = _Line()
+    try:
+        found = find(config, of, overrides, tolerance=tolerance, curve=curve, out=out, write=True, tell=line.show)
+    finally:
+        line.clear()
+    if as_json:
+        print_json(summary_of_margin(found))
+    else:
+        print_table(found.title, (), margin_rows(found))
+        click.echo(f"written to {found.directory}")
+    return EXIT[found.status]
+
+
+@final
+class _Line:
+    """One line of progress on a terminal, once the search has taken a while."""
+
+    def __init__(self) -> None:
+        self.started, self.shown = time.monotonic(), False
+
+    def show(self, text: str) -> None:
+        if sys.stderr.isatty() and time.monotonic() - self.started > PATIENCE:
+            click.echo(f"\r\x1b[2K{text}", nl=False, err=True)
+            self.shown = True
+
+    def clear(self) -> None:
+        if self.shown:
+            click.echo("\r\x1b[2K", nl=False, err=True)

@@ -1,0 +1,28 @@
+"""``sparserob replay``: a finished run in the viewer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+
+@click.command()
+@click.argument("directory", metavar="RUN", type=click.Path(path_type=Path))
+@click.option(
+    "--save", type=click.Path(path_type=Path), help="Record into this file instead, for a machine without a display."
+)
+@click.option("--serve", is_flag=True, help="Show it in a browser of this machine, until Ctrl-C.")
+@click.option("--connect", metavar="ADDRESS", help="Send it to a viewer that listens there, such as 127.0.0.1:9876.")
+def replay(directory: Path, save: Path | None, serve: bool, connect: str | None) -> int:
+    """Show the finished run RUN in the viewer of Rerun; nothing is solved again.
+
+    An optional extra: pip install 'sparserob[rerun]'. Controls of earlier rounds are only in a recording that was made
+    during the run.
+    """
+    from sparserob_core.experiment.run.replay import replay as replay_run
+
+    replay_run(directory, save=save, serve=serve, connect=connect)
+    if save is not None:
+        click.echo(f"recorded into {save}")
+    return 0

@@ -1,0 +1,49 @@
+"""``sparserob run``: solve an experiment and prove the answer."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+from types import FrameType
+
+import click
+
+from sparserob_core.experiment.terminal.printing import EXIT, print_json
+
+
+@click.command()
+@click.argument("config", type=click.Path(path_type=Path))
+@click.argument("overrides", nargs=-1, metavar="[KEY=VALUE]...")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    help="The run's directory, new or empty; runs/NAME/STAMP-HASH unless given.",
+)
+@click.option("--quiet", is_flag=True, help="Print nothing but errors.")
+@click.option("--json", "as_json", is_flag=True, help="Print result.json instead of the table.")
+@click.option("--figures/--no-figures", default=True, help="Whether to draw the figures.", show_default=True)
+def run(config: Path, overrides: tuple[str, ...], out: Path | None, quiet: bool, as_json: bool, figures: bool) -> int:
+    """Solve the experiment that CONFIG describes, and prove the answer.
+
+    KEY=VALUE changes the config, for example: method.name=nominal problem.disturbance.box=[0.05,0.05]
+
+    Exit status: 0 certified or verified, 2 the input is at fault, 3 infeasible, 4 refuted or undecided, 5 failed, 130
+    interrupted.
+    """
+    signal.signal(signal.SIGTERM, _interrupt)
+    from sparserob_core.experiment.directory.artefacts import finite
+    from sparserob_core.experiment.run.run import run as run_experiment
+    from sparserob_core.experiment.terminal.table import print_table, result_rows
+
+    outcome = run_experiment(config, overrides, out, quiet=quiet or as_json, figures=figures)
+    if as_json:
+        print_json(finite(outcome.summary))
+    elif not quiet:
+        print_table(outcome.experiment.title, (), result_rows(finite(outcome.summary)))
+        for line in (*outcome.remarks, f"written to {outcome.directory}"):
+            click.echo(line)
+    return EXIT[outcome.status]
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt

@@ -1,0 +1,66 @@
+"""The command ``sparserob``. Its exit status: 0 certified or verified, 2 the input is at fault, 3 infeasible, 4 refuted
+or undecided, 5 failed, 130 interrupted."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+
+import click
+
+from sparserob_core.errors import SparseRobError
+from sparserob_core.experiment.cli.commands.check import check
+from sparserob_core.experiment.cli.commands.compare import compare
+from sparserob_core.experiment.cli.commands.figures import figures
+from sparserob_core.experiment.cli.commands.initial_states import initial_states
+from sparserob_core.experiment.cli.commands.margin import margin
+from sparserob_core.experiment.cli.commands.plugins import plugins
+from sparserob_core.experiment.cli.commands.replay import replay
+from sparserob_core.experiment.cli.commands.run import run
+from sparserob_core.experiment.cli.commands.schema import schema
+from sparserob_core.experiment.cli.commands.simulate import simulate
+from sparserob_core.experiment.cli.commands.watch import watch
+
+INTERRUPTED = 130
+DEBUG = "SPARSEROB_DEBUG"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command and exit; an error of the input is one message, never a traceback (unless SPARSEROB_DEBUG=1)."""
+    sys.exit(_status(arguments))
+
+
+def _status(arguments: Sequence[str] | None) -> int:
+    try:
+        return int(commands.main(args=arguments, prog_name="sparserob", standalone_mode=False) or 0)
+    except click.Abort as error:
+        return _end("interrupted", error.__cause__ or error, INTERRUPTED)
+    except click.ClickException as error:
+        error.show()
+        return 2
+    except SparseRobError as error:
+        return _end(str(error), error, error.exit_status)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except Exception as error:  # noqa: BLE001  the last resort: a fault of the program is told in one line too
+        return _end(f"internal error: {type(error).__name__}: {error}; {DEBUG}=1 shows where", error, 5)
+
+
+def _end(message: str, error: BaseException, status: int) -> int:
+    if os.environ.get(DEBUG):
+        raise error
+    for line in (f"error: {message}", *getattr(error, "__notes__", ())):
+        click.echo(line, err=True)
+    return status
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="sparserob", message="%(prog)s %(version)s")
+def commands() -> None:
+    """Sparse robust optimal control of uncertain linear systems, with the proof."""
+
+
+for command in (run, watch, replay, check, simulate, margin, initial_states, compare, figures, plugins, schema):
+    commands.add_command(command)

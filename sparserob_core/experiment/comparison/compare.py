@@ -1,0 +1,141 @@
+"""Runs of one problem side by side: the lower bounds that they prove, against the evaluations and the seconds that
+these take."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.comparison.comparison import Comparison
+from sparserob_core.experiment.comparison.curve import WITHOUT_CURVE, Curve, read_curve
+from sparserob_core.experiment.comparison.figure import write_comparison
+from sparserob_core.experiment.comparison.labels import labels, value_text
+from sparserob_core.sip.result import relative_gap
+
+SHARES = (0.1, 0.01, 0.001)
+SLACK = 1e-7
+"""By how much a proven bound may exceed another run's before one of them is called wrong, relative to the larger of 1
+and its size."""
+
+
+def compare(runs: Sequence[str | Path], out: str | Path | None = None) -> Comparison:
+    """Read run directories, and draw them into the picture ``out`` (.png, .pdf or .svg) when it is given: what
+    ``sparserob compare`` does.
+
+    Raises `InputError` when one of them is no run directory, when they are not all of one problem on the same
+    dictionaries, when there is nothing to draw, and when the picture cannot be written.
+    """
+    if isinstance(runs, str | Path) or not runs:
+        raise InputError(f"runs: expected a list of at least one run directory, got {runs!r}")
+    curves = [read_curve(Path(run)) for run in runs]
+    for curve in curves[1:]:
+        _require_same_problem(curves[0], curve)
+    names = labels([curve.config for curve in curves], [curve.searched for curve in curves])
+    certified = min(
+        (k for k, curve in enumerate(curves) if curve.status == "certified"),
+        key=lambda k: _gap(curves[k]),
+        default=None,
+    )
+    exact = np.nan if certified is None else (curves[certified].lower_bound + curves[certified].upper_bound) / 2
+    comparison = Comparison(curves, names, exact, certified)
+    if out is not None:
+        write_comparison(Path(out), comparison)
+    return comparison
+
+
+def comparison_table(comparison: Comparison) -> tuple[list[str], list[list[str]]]:
+    """Column names, and one row per run; what is relative to the exact value only when it is known."""
+    known = np.isfinite(comparison.exact)
+    relative = (
+        ["share of exact", *(f"to {share:.4g} %" for share in (100 * share for share in SHARES))] if known else []
+    )
+    columns = ["run", "status", "lower bound", "cost", *relative, "worst violation", "evaluations", "seconds"]
+    rows = []
+    for curve, label in zip(comparison.curves, comparison.labels, strict=True):
+        part = (
+            [
+                _text(comparison.share(curve.lower_bound), ".4%"),
+                *(_text(comparison.within(curve, share), ".0f") for share in SHARES),
+            ]
+            if known
+            else []
+        )
+        rows.append(
+            [
+                label,
+                curve.status,
+                _text(curve.lower_bound, ".9g"),
+                _text(curve.cost, ".9g"),
+                *part,
+                _text(curve.violation, ".2e"),
+                _text(curve.all_evaluations, ".0f"),
+                _text(curve.all_seconds, ".3f"),
+            ]
+        )
+    return columns, rows
+
+
+def comparison_remarks(comparison: Comparison) -> Iterator[str]:
+    """What is to be said beside the table: where the exact value comes from, who has no curve, and bounds that
+    contradict it."""
+    if comparison.certified is None:
+        yield "no run is certified: the exact optimum is not known, and no line is drawn for it"
+        above = np.inf
+    else:
+        best = comparison.curves[comparison.certified]
+        yield (
+            f"exact optimum {comparison.exact:.9g}: certified by {comparison.labels[comparison.certified]} "
+            f"to a relative gap of {_gap(best):.1e}"
+        )
+        above = best.upper_bound + SLACK * max(1.0, abs(best.upper_bound))
+    for curve, label in zip(comparison.curves, comparison.labels, strict=True):
+        if not curve.bound.size:
+            yield f"no curve of {label}: {_reason(curve)}"
+        elif curve.bound[-1] > above:
+            yield (
+                f"the lower bound of {label} exceeds the certified upper bound {best.upper_bound:.9g}: one of the two"
+                " is wrong"
+            )
+
+
+def _reason(curve: Curve) -> str:
+    return f"{curve.status}: {curve.message}" if curve.status in WITHOUT_CURVE else "no finite lower bound was proven"
+
+
+def _gap(curve: Curve) -> float:
+    return relative_gap(curve.lower_bound, curve.upper_bound)
+
+
+def _text(value: float, form: str) -> str:
+    return format(value, form) if np.isfinite(value) else "-"
+
+
+def _require_same_problem(first: Curve, other: Curve) -> None:
+    for section in ("problem", "dictionaries"):
+        found = _difference(first.config.get(section), other.config.get(section), section)
+        if found is not None:
+            path, here, there = found
+            raise InputError(
+                f"{other.directory}: expected a run of the same problem as {first.directory}; "
+                f"{path} is {value_text(there)} here and {value_text(here)} there"
+            )
+
+
+def _difference(one: Any, two: Any, path: str) -> tuple[str, Any, Any] | None:
+    """The first place at which two parts of a config differ, and what stands there; a key that is missing is null."""
+    if isinstance(one, Mapping) and isinstance(two, Mapping):
+        steps = [(str(key), one.get(key), two.get(key)) for key in {**one, **two}]
+    elif (
+        isinstance(one, list)
+        and isinstance(two, list)
+        and len(one) == len(two)
+        and any(isinstance(entry, Mapping) for entry in one)
+    ):
+        steps = [(str(key), *pair) for key, pair in enumerate(zip(one, two, strict=True))]
+    else:
+        return None if one == two else (path, one, two)
+    return next((found for key, here, there in steps if (found := _difference(here, there, f"{path}.{key}"))), None)

@@ -1,0 +1,136 @@
+"""What a run directory says of the run's progress: the best lower bound against the evaluations and the seconds that it
+took."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, final
+from zipfile import BadZipFile
+
+import numpy as np
+
+from sparserob_core.errors import ConfigError, InputError
+from sparserob_core.experiment.config.reader import read_source
+from sparserob_core.experiment.directory.finished import read_summary
+from sparserob_core.sip.convex_set import Array
+
+WITHOUT_CURVE = frozenset({"failed", "infeasible"})
+SEARCH, ROUNDS = (
+    ("evaluations.npz", ("bound", "seconds")),
+    ("trace.npz", ("lower_bound", "seconds", "relaxed_programs")),
+)
+
+
+@final
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Curve:
+    """A run. ``bound (n,)`` is the best lower bound of the semi-infinite program proven after ``evaluations (n,)`` and
+    ``seconds (n,)``; all three are empty for a run that failed, has not finished, or is infeasible.
+
+    For a run that searches (``searched``) an evaluation is a value of g, and the entries are those at which the bound
+    rose; for any other it is a relaxed program, and the entries are the rounds. Numbers that the run does not know are
+    nan.
+    """
+
+    directory: Path
+    config: Mapping[str, Any] = field(repr=False)
+    title: str
+    status: str
+    message: str
+    searched: bool
+    evaluations: Array
+    seconds: Array
+    bound: Array
+    lower_bound: float
+    upper_bound: float
+    cost: float
+    violation: float
+    all_evaluations: float
+    all_seconds: float
+
+    def reached(self, target: float) -> float:
+        """The evaluations after which the bound was at least ``target``; nan when it never was."""
+        there = np.flatnonzero(self.bound >= target)
+        return float(self.evaluations[there[0]]) if there.size else np.nan
+
+
+def read_curve(directory: Path) -> Curve:
+    """Read a run directory; raises `InputError` when it is none, or a file of it cannot be understood."""
+    for name in ("config.yaml", "result.json"):
+        if not (directory / name).is_file():
+            raise InputError(
+                f"{directory}: expected the directory of a run, got one without {name}"
+                if directory.is_dir()
+                else (
+                    f"{directory}: expected the directory of a run, got {'a file' if directory.exists() else 'nothing'}"
+                )
+            )
+    summary, config = read_summary(directory / "result.json"), _config(directory / "config.yaml")
+    counts, worst = _mapping(summary, "counts"), _mapping(summary, "worst")
+    status, searched = str(summary["status"]), (directory / SEARCH[0]).is_file()
+    spent, lower = _number(counts, "evaluations" if searched else "relaxed_programs"), _number(summary, "lower_bound")
+    seconds = _number(summary, "seconds")
+    evaluations, times, bound = _points(directory, searched) if status not in WITHOUT_CURVE else (np.empty(0),) * 3
+    if bound.size and lower > bound[-1]:  # the last relaxed program came after the last evaluation
+        evaluations, times, bound = np.append(evaluations, spent), np.append(times, seconds), np.append(bound, lower)
+    return Curve(
+        directory=directory,
+        config=config,
+        title=str(summary.get("title") or ""),
+        status=status,
+        message=str(summary.get("message") or ""),
+        searched=searched,
+        evaluations=evaluations,
+        seconds=times,
+        bound=bound,
+        lower_bound=lower,
+        upper_bound=_number(summary, "upper_bound"),
+        cost=_number(summary, "cost"),
+        violation=_number(worst, "violation"),
+        all_evaluations=spent,
+        all_seconds=seconds,
+    )
+
+
+def _points(directory: Path, searched: bool) -> tuple[Array, Array, Array]:
+    name, columns = SEARCH if searched else ROUNDS
+    bound, seconds, *counted = _columns(directory / name, columns)
+    evaluations = counted[0] if counted else np.arange(1.0, bound.size + 1)
+    best = np.maximum.accumulate(bound) if bound.size else bound
+    kept = np.isfinite(best)
+    if searched:
+        kept &= np.diff(best, prepend=-np.inf) > 0
+    return evaluations[kept], seconds[kept], best[kept]
+
+
+def _columns(file: Path, names: tuple[str, ...]) -> list[Array]:
+    try:
+        with np.load(file, allow_pickle=False) as stored:
+            columns = [np.asarray(stored[name], dtype=float) for name in names]
+    except FileNotFoundError:
+        raise InputError(f"{file}: there is no such file; expected one, for the run has finished") from None
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile, AttributeError) as error:
+        raise InputError(f"{file}: cannot be read: {error}") from None
+    if any(column.shape != columns[0].shape or column.ndim != 1 or np.isnan(column).any() for column in columns):
+        raise InputError(f"{file}: expected {', '.join(names)} as columns of one length without nan")
+    return columns
+
+
+def _config(file: Path) -> dict[str, Any]:
+    data = read_source(file).data
+    for section in ("problem", "method", "maximiser"):
+        if not isinstance(data.get(section), Mapping) or "name" not in data[section]:
+            raise ConfigError(f"{file}: {section}: expected a mapping with a name, as in the resolved config of a run")
+    return data
+
+
+def _mapping(data: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    found = data.get(key)
+    return found if isinstance(found, Mapping) else {}
+
+
+def _number(data: Mapping[str, Any], key: str) -> float:
+    value = data.get(key)
+    return float(value) if isinstance(value, int | float) else np.nan

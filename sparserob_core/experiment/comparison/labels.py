@@ -1,0 +1,92 @@
+"""Names for runs that stand side by side: what differs between their configs, and nothing else."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+COMPONENTS = ("method", "maximiser", "regulariser", "solver")
+UNSEEN = frozenset({"problem", "dictionaries", "title", "observers", "plugins", "method", "maximiser", "seed"})
+
+
+def labels(configs: Sequence[Mapping[str, Any]], searched: Sequence[bool]) -> list[str]:
+    """One label per resolved config; equal ones are told apart by a number.
+
+    It begins with the method, for a run that searches with the maximiser; options are compared between runs of the same
+    method (and those of a component between runs with the same component), since others have no such option or do not
+    use it. The seed is for runs that differ in nothing else.
+    """
+    names = {config["method"]["name"] for config in configs}
+    found = []
+    for config, searches in zip(configs, searched, strict=True):
+        peers = [other for other in configs if other["method"]["name"] == config["method"]["name"]]
+        found.append(", ".join([_head(config, peers, searches, len(names) > 1), *_differences(config, peers)]))
+    return _numbered(_with_seeds(found, [config.get("seed") for config in configs]))
+
+
+def value_text(value: object) -> str:
+    """A value of a config in a few letters: a component is its name and the options that are not null."""
+    if isinstance(value, Mapping):
+        options = ", ".join(
+            f"{key} {value_text(item)}" for key, item in value.items() if key != "name" and item is not None
+        )
+        return f"{value.get('name', '')} ({options})".strip() if options else str(value.get("name", "{}"))
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(value_text, value)) + "]"
+    if isinstance(value, bool) or value is None:
+        return {True: "on", False: "off", None: "none"}[value]
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _head(config: Mapping[str, Any], peers: Sequence[Mapping[str, Any]], searches: bool, several: bool) -> str:
+    method, maximiser = str(config["method"]["name"]), str(config["maximiser"]["name"])
+    if not searches and len({peer["maximiser"]["name"] for peer in peers}) == 1:
+        return method
+    return f"{method} with {maximiser}" if several or not searches else maximiser
+
+
+def _differences(config: Mapping[str, Any], peers: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    yield from _options(config, peers, "method")
+    yield from _options(config, peers, "maximiser")
+    for section in config:
+        if section in UNSEEN:
+            continue
+        if section in COMPONENTS and len({_name(peer, section) for peer in peers}) > 1:
+            yield f"{section} {_name(config, section)}"
+        yield from (f"{section} {option}" for option in _options(config, peers, section))
+
+
+def _options(config: Mapping[str, Any], peers: Sequence[Mapping[str, Any]], section: str) -> Iterator[str]:
+    own = config.get(section)
+    if not isinstance(own, Mapping):
+        return
+    same = [
+        peer[section]
+        for peer in peers
+        if isinstance(peer.get(section), Mapping) and _name(peer, section) == _name(config, section)
+    ]
+    for key, value in own.items():
+        if key != "name" and any(other.get(key) != value for other in same):
+            yield value if isinstance(value, str) else f"{key} {value_text(value)}"
+
+
+def _name(config: Mapping[str, Any], section: str) -> str:
+    entry = config.get(section)
+    return str(entry.get("name", "")) if isinstance(entry, Mapping) else "none"
+
+
+def _with_seeds(found: list[str], seeds: list[object]) -> list[str]:
+    alike = {label: {str(seed) for other, seed in zip(found, seeds, strict=True) if other == label} for label in found}
+    return [
+        f"{label}, seed {seed}" if len(alike[label]) > 1 else label for label, seed in zip(found, seeds, strict=True)
+    ]
+
+
+def _numbered(found: list[str]) -> list[str]:
+    total, seen = Counter(found), Counter[str]()
+    numbered = []
+    for label in found:
+        seen[label] += 1
+        numbered.append(f"{label} ({seen[label]})" if total[label] > 1 else label)
+    return numbered

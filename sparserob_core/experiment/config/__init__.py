@@ -1,0 +1,1 @@
+"""A config file as checked, typed data, and errors that name the place."""

@@ -1,0 +1,171 @@
+"""From a config file to a checked `RunConfig`: every fault at once, each with its place and what was expected."""
+
+from __future__ import annotations
+
+import copy
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path as File
+from typing import Any, final
+
+from pydantic import ValidationError
+
+from sparserob_core.errors import ConfigError, InputError, PluginError
+from sparserob_core.experiment.config.overrides import Override, apply_override, parse_overrides
+from sparserob_core.experiment.config.reader import Source, read_source, read_value
+from sparserob_core.experiment.config.run_config import SLOTS, MaximiserEntry, RunConfig
+from sparserob_core.experiment.plugins.components import Registry
+from sparserob_core.experiment.plugins.messages import Complaint, Path, complaints, malformed
+from sparserob_core.experiment.plugins.registry import load_registry
+
+KEPT = {*MaximiserEntry.model_fields} - {"name"}  # keys of a maximiser that are the framework's own
+
+
+@final
+@dataclass(frozen=True)
+class Loaded:
+    """A checked config with the registry that offers its components, and where it came from."""
+
+    config: RunConfig
+    registry: Registry
+    source: Source
+    overrides: tuple[Override, ...] = ()
+
+    def blame(self, slot: Path, error: InputError) -> ConfigError:
+        """The same error with the place of the key that it is about: what building a component found wrong with its
+        options."""
+        head, colon, tail = str(error).partition(": ")
+        path = slot
+        if colon and re.fullmatch(r"\w+(\.\w+|\[\d+\])*", head):
+            below = tuple(int(step) if step.isdigit() else step for step in re.findall(r"\w+", head))
+            if _at(self.config.plain(), (*slot, *below)) is not None:
+                path, head = (*slot, *below), ""
+        message = tail if not head else str(error)
+        return ConfigError(_line(self.source, self.overrides, Complaint(path, message)))
+
+
+def load_config(
+    config: str | File | Mapping[str, Any], overrides: Mapping[str, object] | Iterable[str] | None = None
+) -> Loaded:
+    """Read a config, apply the overrides, and check every key of it against the installed plugins.
+
+    Raises `ConfigError`: one line for each key at fault, ``file:line:column: key.path: what is wrong (got ...)``.
+    """
+    given = read_source(config)
+    changes = tuple(parse_overrides(overrides, read_value))
+    data = copy.deepcopy(given.data)
+    wrong = list(malformed(data))
+    if wrong:
+        raise _refusal(given, changes, wrong)
+    _spell_out(data)
+    for change in changes:
+        apply_override(data, change)
+        _spell_out(data)
+    wrong = list(malformed(data))
+    registry = _registry(data, given, changes)
+    resolved, more = _checked(data, registry)
+    if wrong or more or resolved is None:
+        raise _refusal(given, changes, wrong or more)
+    if not resolved.title:
+        resolved = resolved.model_copy(update={"title": File(given.name).stem})
+    return Loaded(resolved, registry, given, changes)
+
+
+def _spell_out(data: dict[str, Any]) -> None:
+    for path, (_, default) in SLOTS.items():
+        holder = _at(data, path[:-1])
+        if isinstance(holder, dict) and path[-1] in holder:
+            holder[path[-1]] = _entry(holder[path[-1]], default)
+    if isinstance(data.get("observers"), list):
+        data["observers"] = [_entry(entry, None) for entry in data["observers"]]
+
+
+def _entry(entry: object, default: str | None) -> object:
+    if isinstance(entry, str):
+        return {"name": entry}
+    if isinstance(entry, dict) and default and "name" not in entry:
+        return {"name": default, **entry}
+    return entry
+
+
+def _registry(data: dict[str, Any], source: Source, changes: tuple[Override, ...]) -> Registry:
+    files = data.get("plugins") or []
+    if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
+        return load_registry()
+    on_command_line = any(change.path[0] == "plugins" for change in changes)
+    folder = File.cwd() if on_command_line else source.folder
+    data["plugins"] = [str((folder / file).resolve()) for file in files]
+    try:
+        return load_registry(data["plugins"])
+    except PluginError as error:
+        raise ConfigError(_line(source, changes, Complaint(("plugins",), str(error)))) from error
+
+
+def _checked(data: dict[str, Any], registry: Registry) -> tuple[RunConfig | None, list[Complaint]]:
+    wrong: list[Complaint] = []
+    checked: RunConfig | None = None
+    try:
+        checked = RunConfig.model_validate(data)
+    except ValidationError as error:
+        wrong += complaints(error, RunConfig, data)
+    plain = checked.plain() if checked else data
+    for path, kind, entry in _entries(plain):
+        options = {
+            key: value for key, value in entry.items() if key != "name" and not (kind == "maximiser" and key in KEPT)
+        }
+        try:
+            typed, faults = registry.check(kind, entry["name"], options)
+        except PluginError as error:
+            wrong.append(Complaint((*path, "name"), str(error)))
+            continue
+        wrong += [fault.under(path) for fault in faults]
+        if typed is not None:
+            entry.update(typed.model_dump(mode="json", by_alias=True))
+    return (RunConfig.model_validate(plain) if not wrong else None), wrong
+
+
+def _entries(data: dict[str, Any]) -> Iterator[tuple[Path, str, dict[str, Any]]]:
+    slots: list[tuple[Path, str]] = [(path, kind) for path, (kind, _) in SLOTS.items()]
+    observers = data.get("observers")
+    slots += [
+        (("observers", position), "observer")
+        for position in range(len(observers) if isinstance(observers, list) else 0)
+    ]
+    for path, kind in slots:
+        entry = _at(data, path)
+        if isinstance(entry, dict) and isinstance(entry.get("name"), str):
+            yield path, kind, entry
+
+
+def _at(data: Any, path: Path) -> Any:
+    for step in path:
+        try:
+            data = data[step]
+        except (KeyError, IndexError, TypeError):
+            return None
+    return data
+
+
+def _refusal(source: Source, changes: tuple[Override, ...], wrong: list[Complaint]) -> ConfigError:
+    inside = {complaint: source.position(complaint.path) for complaint in wrong}
+    ordered = sorted(
+        wrong, key=lambda complaint: (_override(source, changes, complaint) is not None, inside[complaint])
+    )
+    return ConfigError("\n".join(dict.fromkeys(_line(source, changes, complaint) for complaint in ordered)))
+
+
+def _line(source: Source, changes: tuple[Override, ...], complaint: Complaint) -> str:
+    change = _override(source, changes, complaint)
+    return f"{source.where(complaint.path) if change is None else f'override {change.text}'}: {complaint}"
+
+
+def _override(source: Source, changes: tuple[Override, ...], complaint: Complaint) -> Override | None:
+    """The override that put the key there: it set the key, or something below a key that was not written before."""
+    path = [str(step) for step in complaint.path]
+    for change in reversed(changes):
+        changed = [str(step) for step in change.path]
+        made = path and changed[: len(path)] == path and _at(source.data, complaint.path) is None
+        if made or path[: len(changed)] == changed:
+            return change
+    return None

@@ -1,0 +1,65 @@
+"""Kinds of values in a config: which member of a union is meant shows in the value, so that an error speaks of that
+member only."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any, TypeAlias
+
+import numpy as np
+from pydantic import Discriminator, SerializerFunctionWrapHandler, Tag, model_serializer
+
+from sparserob_core.errors import InputError
+from sparserob_core.options import Options
+from sparserob_core.sip.convex_set import Array
+
+
+def one_of(expected: str, **kinds: type | tuple[type, ...]) -> Discriminator:
+    """Chooses the member of a union by the type of the value; anything else is not what was ``expected``."""
+
+    def chosen(value: object) -> str | None:
+        return (
+            None
+            if isinstance(value, bool)
+            else next((tag for tag, kind in kinds.items() if isinstance(value, kind)), None)
+        )
+
+    return Discriminator(chosen, custom_error_type="kind", custom_error_message=f"expected {expected}")
+
+
+NUMBER, LIST = (int, float, np.number), (list, tuple)
+Number: TypeAlias = Annotated[float, Tag("number")]
+Numbers: TypeAlias = Annotated[list[float], Tag("list")]
+FreeNumbers: TypeAlias = Annotated[list[float | None], Tag("list")]
+OneOrMore: TypeAlias = Annotated[Number | Numbers, one_of("a number or a list of numbers", number=NUMBER, list=LIST)]
+OneOrMoreFree: TypeAlias = Annotated[
+    Number | FreeNumbers, one_of("a number or a list of numbers, null where free", number=NUMBER, list=LIST)
+]
+
+
+class Sparse(Options):
+    """Options that are written back without the keys that were left out."""
+
+    @model_serializer(mode="wrap")
+    def _written(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {key: value for key, value in handler(self).items() if value is not None}
+
+
+def count(dimension: int) -> str:
+    """How many numbers, in words."""
+    return f"{dimension} numbers" if dimension > 1 else "1 number"
+
+
+def free_bound(name: str, value: float | Sequence[float | None] | None, dimension: int, free: float) -> Array:
+    """A bound ``(dimension,)`` with ``free`` where it is null or missing."""
+    return broadcast(name, free if value is None else value, dimension, free)
+
+
+def broadcast(name: str, value: float | Sequence[float | None], dimension: int, free: float = np.nan) -> Array:
+    """A vector ``(dimension,)`` from a number or a list, nulls replaced; raises `InputError` when the length is
+    another."""
+    if not isinstance(value, Sequence):
+        return np.full(dimension, float(value))
+    if len(value) not in (1, dimension):
+        raise InputError(f"{name}: expected {count(dimension)}, got {len(value)}")
+    return np.full(dimension, [free if item is None else float(item) for item in value])

@@ -1,0 +1,112 @@
+"""The options of a component as the rows of a table: name, type, default, range, meaning."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, final
+
+from sparserob_core.experiment.config.schema import options_schema
+from sparserob_core.experiment.plugins.records import Plugin
+
+LIMITS = {
+    "minimum": ">= {}",
+    "exclusiveMinimum": "> {}",
+    "maximum": "<= {}",
+    "exclusiveMaximum": "< {}",
+    "minItems": "at least {} entries",
+    "maxItems": "at most {} entries",
+    "minLength": "at least {} characters",
+    "pattern": "matches {}",
+}
+TYPES = {"object": "mapping", "string": "text", "boolean": "true or false", "integer": "whole number"}
+
+
+@dataclass(frozen=True)
+class OptionRow:
+    """One option; ``name`` is dotted where an option is itself a mapping."""
+
+    name: str
+    type: str
+    default: str
+    range: str
+    meaning: str
+
+
+def option_rows(record: Plugin) -> list[OptionRow]:
+    """Every option of a component, and what may be below it; keys that several options share are listed below the first
+    of them."""
+    schema = options_schema(record)
+    prefix = f"#/$defs/{record.kind}.{record.name}."
+    return list(_Walk({prefix + name: part for name, part in schema.get("$defs", {}).items()}).rows(schema, ""))
+
+
+@final
+class _Walk:
+    """Goes through a schema once; ``parts`` are its definitions, ``seen`` where each was first met."""
+
+    def __init__(self, parts: Mapping[str, Any]) -> None:
+        self.parts = parts
+        self.seen: dict[str, str] = {}
+
+    def rows(self, schema: Mapping[str, Any], above: str) -> Iterator[OptionRow]:
+        for name, field in schema.get("properties", {}).items():
+            members = [member for _, member in self._members(field)]
+            below = list(self._references(field, above + name))
+            known = [f"keys as in {self.seen[reference]}" for reference, _ in below if reference in self.seen]
+            meaning = " ".join(str(field.get("description", "")).split())
+            yield OptionRow(
+                name=above + name,
+                type=" or ".join(dict.fromkeys(self._type(member) for member in members)) or "anything",
+                default=_default(field, name in schema.get("required", [])),
+                range=", ".join(dict.fromkeys(_limits(field, members))),
+                meaning=" ".join([meaning, *(f"({known[0]})" for _ in known[:1])]).strip(),
+            )
+            for reference, place in below:
+                if self.seen.setdefault(reference, place) == place:
+                    yield from self.rows(self.parts.get(reference, {}), f"{place}.")
+
+    def _members(self, field: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
+        """The alternatives of a type, each with the name of its definition."""
+        reference = field.get("$ref", "")
+        whole = self.parts.get(reference, {}) if reference else field
+        several = whole.get("anyOf") or whole.get("oneOf") or whole.get("allOf")
+        if several is None:
+            yield reference, whole
+            return
+        for member in several:
+            yield from self._members(member)
+
+    def _references(self, field: Mapping[str, Any], place: str) -> Iterator[tuple[str, str]]:
+        for reference, member in self._members(field):
+            if reference and "properties" in member:
+                yield reference, place
+            elif member.get("type") == "array":
+                yield from self._references(member.get("items", {}), f"{place}.0")
+
+    def _type(self, member: Mapping[str, Any]) -> str:
+        if "enum" in member:
+            return ", ".join(str(value) for value in member["enum"])
+        if "const" in member:
+            return str(member["const"])
+        if "component" in member:
+            return f"{str(member['component']).replace('_', ' ')} by name, or with its options"
+        kind = member.get("type")
+        if kind == "array":
+            inside = " or ".join(dict.fromkeys(self._type(item) for _, item in self._members(member.get("items", {}))))
+            return f"list of ({inside})" if " or " in inside else f"list of {inside}"
+        return TYPES.get(str(kind), str(kind or "anything"))
+
+
+def _default(field: Mapping[str, Any], required: bool) -> str:
+    if required:
+        return "required"
+    return json.dumps(field["default"]) if "default" in field else ""
+
+
+def _limits(field: Mapping[str, Any], members: list[Mapping[str, Any]]) -> Iterator[str]:
+    for part in (field, *members):
+        for key, words in LIMITS.items():
+            if key in part:
+                yield words.format(part[key])

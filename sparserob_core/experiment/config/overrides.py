@@ -1,0 +1,88 @@
+"""Changes to a config on the command line: ``key.sub=value``, where a number as key counts the entries of a list from
+0."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from sparserob_core.errors import ConfigError
+from sparserob_core.experiment.plugins.messages import Path, dotted, shown
+
+
+@dataclass(frozen=True)
+class Override:
+    """``value`` for the key at ``path``; ``text`` as it was written."""
+
+    path: Path
+    value: object
+    text: str
+
+
+def parse_overrides(
+    given: Mapping[str, object] | Iterable[str] | None, parse: Callable[[str], object]
+) -> list[Override]:
+    """Overrides from ``key=value`` texts, whose values ``parse`` reads, or from a mapping of keys to values."""
+    if given is None:
+        return []
+    if isinstance(given, Mapping):
+        return [Override(_path(key), value, f"{key}={value}") for key, value in given.items()]
+    found = []
+    for text in given:
+        key, equals, value = str(text).partition("=")
+        if not equals:
+            raise ConfigError(f"override {shown(text)}: expected key=value, for example method.name=nominal")
+        found.append(Override(_path(key), parse(value), str(text)))
+    return found
+
+
+def _path(key: str) -> Path:
+    steps = tuple(int(step) if step.isdigit() else step for step in key.strip().split("."))
+    if "" in steps:
+        raise ConfigError(f"override {shown(key)}: expected a key such as problem.horizon, got {shown(key)}")
+    return steps
+
+
+def apply_override(data: dict[str, Any], override: Override) -> None:
+    """Set the value in place; keys between that are missing, or null, are made. Raises `ConfigError` when the path
+    leads nowhere."""
+    node: Any = data
+    for position, given in enumerate(override.path):
+        last = position == len(override.path) - 1
+        step: Any = _fitting(node, given, override, position)
+        if last:
+            _put(node, step, override.value)
+            return
+        below = (
+            node[step]
+            if isinstance(node, list) and step < len(node)
+            else node.get(step)
+            if isinstance(node, dict)
+            else None
+        )
+        if below is None:
+            below = [] if override.path[position + 1] == 0 else {}
+            _put(node, step, below)
+        node = below
+
+
+def _put(node: Any, step: Any, value: object) -> None:
+    if isinstance(node, list) and step == len(node):
+        node.append(value)
+    else:
+        node[step] = value
+
+
+def _fitting(node: object, step: str | int, override: Override, position: int) -> str | int:
+    at = dotted(override.path[:position])
+    if isinstance(node, dict):
+        return str(step)
+    if not isinstance(node, list):
+        raise ConfigError(f"override {override.text}: {at} is {shown(node)}, which has no key '{step}'")
+    if not isinstance(step, int) or step > len(node):
+        entries = f"a list with {len(node)} entries, counted from 0"
+        raise ConfigError(
+            f"override {override.text}: {at} is {entries}, expected a number of at most {len(node)}, got '{step}'"
+        )
+    return step

@@ -1,0 +1,204 @@
+"""The problem ``linear``: every key of an uncertain linear optimal control problem, as a config writes it."""
+
+from __future__ import annotations
+
+import keyword
+from collections.abc import Mapping
+from typing import Annotated, Literal, TypeAlias, final
+
+import numpy as np
+from pydantic import BeforeValidator, Discriminator, Field, Tag
+
+from sparserob_core.control.problem.expression import CONSTANTS, FUNCTIONS, parse_matrix
+from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint, ProblemFactory
+from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.sets.sets import Box, ConvexSet, Equality
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.config.option_kinds import OneOrMore
+from sparserob_core.experiment.config.set_options import PathOptions, SetOptions, TerminalOptions
+from sparserob_core.options import Options
+
+
+def _entry(value: object) -> object:
+    if isinstance(value, bool) or not isinstance(value, int | float | str | np.number):
+        raise InputError(f"expected a number or an expression in the parameters such as '-2 + p1', got {value!r}")
+    return value
+
+
+Entry: TypeAlias = Annotated[float | str, BeforeValidator(_entry)]
+
+
+def _interval(value: object) -> object:
+    if not isinstance(value, list | tuple) or len(value) != 2:
+        raise InputError(f"expected an interval [lower, upper], got {value!r}")
+    return value
+
+
+Interval: TypeAlias = Annotated[tuple[float, float], BeforeValidator(_interval)]
+Rows: TypeAlias = Annotated[list[Annotated[list[Entry], Field(min_length=1)]], Field(min_length=1)]
+
+
+@final
+class ParameterSetOptions(SetOptions):
+    """Parameters in any bounded set."""
+
+    names: list[str] = Field(min_length=1)
+    """Names of the parameters, in the order of the set's coordinates."""
+
+
+def _parameters_kind(value: object) -> str | None:
+    if isinstance(value, ParameterSetOptions) or (isinstance(value, Mapping) and "names" in value):
+        return "set"
+    return "intervals" if isinstance(value, Mapping) else None
+
+
+Parameters: TypeAlias = Annotated[
+    Annotated[dict[str, Interval], Tag("intervals")] | Annotated[ParameterSetOptions, Tag("set")],
+    Discriminator(
+        _parameters_kind,
+        custom_error_type="kind",
+        custom_error_message="expected {name: [lower, upper], ...} or {names: [...], polytope: ...}",
+    ),
+]
+
+
+@final
+class SystemOptions(Options):
+    """``x' = A(p) x + B(p) u + E(p) w``; entries are numbers, or arithmetic expressions in the parameters."""
+
+    A: Rows
+    """Square matrix, row by row."""
+
+    B: Rows
+    """As many rows as ``A``, one column per control."""
+
+    E: Rows | None = None
+    """How the disturbance enters, one column per component of it; the identity unless given."""
+
+    parameters: Parameters | None = None
+    """Intervals ``{name: [lower, upper]}``, or ``{names: [...], polytope: {H: ..., h: ...}}`` (also ellipsoid, norm);
+    none if known."""
+
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters; raises `InputError` when one cannot stand in an expression."""
+        given = (
+            self.parameters.names if isinstance(self.parameters, ParameterSetOptions) else list(self.parameters or {})
+        )
+        for name in given:
+            if not name.isidentifier() or keyword.iskeyword(name) or name in CONSTANTS or name in FUNCTIONS:
+                raise InputError(
+                    f"system.parameters: {name!r} cannot name a parameter; expected letters, digits and underscores, "
+                    f"and not one of {', '.join([*CONSTANTS, *FUNCTIONS])}"
+                )
+        if len(set(given)) < len(given):
+            raise InputError(f"system.parameters.names: a name occurs twice, got {', '.join(given)}")
+        return tuple(given)
+
+    def build(self) -> LinearSystem:
+        """The system; raises `InputError` that begins with the key."""
+        names = self.names()
+        d = len(self.A)
+        for key, rows in (("A", self.A), ("B", self.B), ("E", self.E)):
+            if rows is not None and len(rows) != d:
+                raise InputError(f"system.{key}: expected {d} rows, as A has, got {len(rows)}")
+        if any(len(row) != d for row in self.A):
+            raise InputError(
+                f"system.A: expected a square matrix, {d} numbers in each of its {d} rows, got"
+                f" {[len(row) for row in self.A]}"
+            )
+        A, B = parse_matrix("system.A", self.A, names), parse_matrix("system.B", self.B, names)
+        E = None if self.E is None else parse_matrix("system.E", self.E, names)
+        return LinearSystem(A, B, E, parameters=self._parameter_set(names), names=names)
+
+    def _parameter_set(self, names: tuple[str, ...]) -> ConvexSet | None:
+        if isinstance(self.parameters, ParameterSetOptions):
+            return self.parameters.build("system.parameters", len(names))
+        if not self.parameters:
+            return None
+        for name, (lower, upper) in self.parameters.items():
+            if lower > upper:
+                raise InputError(
+                    f"system.parameters.{name}: expected [lower, upper] with lower <= upper, got [{lower:g}, {upper:g}]"
+                )
+        return Box(*np.array(list(self.parameters.values())).T)
+
+
+class LinearKeys(ProblemFactory, Options):
+    """The keys that problems about a linear system share; what the control is, they say themselves."""
+
+    system: SystemOptions
+    """The system."""
+
+    horizon: float = Field(gt=0.0)
+    """Final time."""
+
+    initial_state: OneOrMore
+    """State at time 0, one number per state; a number serves every state."""
+
+    weights: OneOrMore | None = None
+    """Weight of every control in the cost, positive; 1 unless given."""
+
+    disturbance: SetOptions | None = None
+    """Set that the disturbance takes its values in; none unless given."""
+
+    disturbance_class: Literal["piecewise_constant", "measurable", "l1_ball"] = "piecewise_constant"
+    """``piecewise_constant``: in the disturbance's dictionary; ``measurable``: any measurable function; ``l1_ball``:
+    the coefficients of each channel have absolute sum at most the box's bound (a far smaller set)."""
+
+    path: list[PathOptions] = Field(default_factory=list)
+    """Sets that the state stays in, each from ``from`` (0 unless given) to ``to`` (the horizon unless given)."""
+
+    terminal: list[TerminalOptions] = Field(default_factory=list)
+    """Sets that the state ends in, and values that it ends at."""
+
+    def initial(self, states: int) -> list[float]:
+        """Initial state, one number per state; raises `InputError`."""
+        given = self.initial_state if isinstance(self.initial_state, list) else [self.initial_state] * states
+        if len(given) != states:
+            raise InputError(f"initial_state: expected {states} numbers, one per state, got {len(given)}")
+        return given
+
+    def noise(self, system: LinearSystem) -> ConvexSet | None:
+        """The set of disturbances; raises `InputError`."""
+        return None if self.disturbance is None else self.disturbance.build("disturbance", system.disturbances)
+
+    def windows(self, states: int) -> list[PathConstraint]:
+        """The path constraints, one per set; raises `InputError`."""
+        found = []
+        for i, item in enumerate(self.path):
+            stop = self.horizon if item.stop is None else item.stop
+            if not item.start <= stop <= self.horizon:
+                raise InputError(
+                    f"path.{i}: expected from <= to <= {self.horizon:g} (the horizon), got from {item.start:g} to"
+                    f" {stop:g}"
+                )
+            found += [PathConstraint(member, item.start, stop) for member in item.members(f"path.{i}", states)]
+        return found
+
+    def ends(self, states: int) -> list[ConvexSet | Equality]:
+        """The terminal sets and equalities; raises `InputError`."""
+        return [end for i, item in enumerate(self.terminal) for end in item.ends(f"terminal.{i}", states)]
+
+
+@final
+class LinearProblem(LinearKeys):
+    """Sparse robust control of ``x' = A(p) x + B(p) u + E w`` from an initial state, at the least integral of
+    ``|u|``."""
+
+    control: SetOptions
+    """Set that the control takes its values in, bounded."""
+
+    def build(self) -> OptimalControlProblem:
+        """The problem; raises `InputError` that begins with the key at fault."""
+        system = self.system.build()
+        return OptimalControlProblem(
+            system=system,
+            horizon=self.horizon,
+            initial_state=self.initial(system.states),
+            control=self.control.build("control", system.controls),
+            weights=self.weights,
+            disturbance=self.noise(system),
+            disturbance_class=self.disturbance_class,
+            path=self.windows(system.states),
+            terminal=self.ends(system.states),
+        )

@@ -1,0 +1,168 @@
+"""Reads and writes configs; the only module that knows YAML (version 1.2). Nothing in a config is ever executed."""
+
+from __future__ import annotations
+
+import io
+import json
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path as File
+from typing import TYPE_CHECKING, Any, final
+
+from sparserob_core.errors import ConfigError
+from sparserob_core.experiment.plugins.messages import Path
+
+if TYPE_CHECKING:
+    from ruamel.yaml import YAML
+
+__all__ = ["Source", "read_source", "read_value", "write_yaml"]
+
+
+@final
+@dataclass(frozen=True)
+class Source:
+    """A config as it was given: its ``data``, and where each key of it stands. ``name`` is the file as the user wrote
+    it."""
+
+    name: str
+    folder: File
+    data: dict[str, Any]
+    marks: object = None
+
+    def where(self, path: Path) -> str:
+        """``file:line:column`` of the key, or of the nearest one above it that was written."""
+        line, column = self.position(path)
+        return self.name if self.marks is None else f"{self.name}:{line + 1}:{column + 1}"
+
+    def position(self, path: Path) -> tuple[int, int]:
+        """Line and column of the same, counted from 0; ``(0, 0)`` where positions are unknown."""
+        node, place = self.marks, (0, 0)
+        for step in path:
+            found = _position(node, step)
+            if found is None:
+                break
+            place, node = found
+        return place
+
+
+def read_source(config: str | File | Mapping[str, Any]) -> Source:
+    """Read a config from a ``.yaml``, ``.json`` or ``.toml`` file, or take it from a mapping.
+
+    Raises `ConfigError` when there is no such file, it cannot be read, or it does not hold a mapping.
+    """
+    if isinstance(config, Mapping):
+        return Source("config", File.cwd(), _plain(config))
+    file = File(config)
+    text = _text(file)
+    data, marks = _parsed(file, text)
+    if data is None:
+        raise ConfigError(f"{file}: the file is empty; expected at least the key 'problem'")
+    if not isinstance(data, dict):
+        raise ConfigError(
+            f"{file}: expected a mapping of keys to values, got"
+            f" {'a list' if isinstance(data, list) else repr(data)[:60]}"
+        )
+    return Source(str(file), file.resolve().parent, data, marks)
+
+
+def read_value(text: str) -> object:
+    """The value of an override, as YAML."""
+    from ruamel.yaml.error import MarkedYAMLError
+
+    try:
+        return _yaml("safe").load(text)
+    except MarkedYAMLError as error:
+        raise ConfigError(f"override value {text!r}: {_problem(error)}") from error
+
+
+def write_yaml(data: Mapping[str, Any], heading: str = "") -> str:
+    """A mapping as YAML; lists of plain values stand on one line."""
+    yaml = _yaml("safe")
+    yaml.version = None  # 1.2 all the same, without the directive
+    yaml.default_flow_style = None
+    yaml.width = 140
+    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
+    stream = io.StringIO()
+    yaml.dump(dict(data), stream)
+    return "".join(f"# {line}\n" for line in heading.splitlines()) + stream.getvalue()
+
+
+def _yaml(kind: str) -> YAML:
+    from ruamel.yaml import YAML
+
+    yaml = YAML(typ=kind, pure=True)
+    yaml.version = (1, 2)
+    return yaml
+
+
+def _text(file: File) -> str:
+    try:
+        return file.read_bytes().decode("utf-8-sig")
+    except FileNotFoundError:
+        raise ConfigError(f"{file}: there is no such file") from None
+    except IsADirectoryError:
+        raise ConfigError(f"{file}: is a directory, expected a file such as {file / 'config.yaml'}") from None
+    except UnicodeDecodeError as error:
+        raise ConfigError(
+            f"{file}: expected text in UTF-8, got the byte 0x{error.object[error.start]:02x} at {error.start}"
+        ) from None
+    except OSError as error:
+        raise ConfigError(f"{file}: cannot be read: {error.strerror}") from None
+
+
+def _parsed(file: File, text: str) -> tuple[Any, object]:
+    from ruamel.yaml.error import MarkedYAMLError, YAMLError
+
+    try:
+        if file.suffix == ".toml":
+            return tomllib.loads(text), None
+        if file.suffix == ".json":
+            return json.loads(text), _marks_of_json(text)
+        return _yaml("safe").load(text), _yaml("rt").load(text)
+    except MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        at = f":{mark.line + 1}:{mark.column + 1}" if mark else ""
+        raise ConfigError(f"{file}{at}: {_problem(error)}") from None
+    except json.JSONDecodeError as error:
+        raise ConfigError(f"{file}:{error.lineno}:{error.colno}: not valid JSON: {error.msg}") from None
+    except (YAMLError, tomllib.TOMLDecodeError) as error:
+        raise ConfigError(f"{file}: {' '.join(str(error).split())}") from None
+    except RecursionError:
+        raise ConfigError(f"{file}: nested too deeply") from None
+    except ValueError as error:
+        raise ConfigError(f"{file}: {error}") from None
+
+
+def _marks_of_json(text: str) -> object:
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        return _yaml("rt").load(text)
+    except (YAMLError, ValueError):
+        return None
+
+
+def _problem(error: Any) -> str:
+    said = " ".join(str(part) for part in (error.context, error.problem) if part)
+    hint = "; indent with spaces" if "'\\t'" in said else ""
+    return f"not valid YAML: {' '.join(said.split())}{hint}"
+
+
+def _position(node: Any, step: str | int) -> tuple[tuple[int, int], object] | None:
+    try:
+        if isinstance(node, Mapping):
+            return node.lc.key(step), node[step]  # type: ignore[attr-defined]
+        if isinstance(node, list) and isinstance(step, int):
+            return node.lc.item(step), node[step]  # type: ignore[attr-defined]
+    except (KeyError, IndexError, AttributeError, TypeError):
+        pass
+    return None
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value

@@ -1,0 +1,126 @@
+"""The keys of a config and their defaults; what a component's own keys are, its options say."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import Annotated, Any, final
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from sparserob_core.options import Options
+
+
+class Entry(BaseModel):
+    """A component by ``name``; the other keys are its options. A bare name stands for a component with its default
+    options."""
+
+    model_config = ConfigDict(extra="allow", frozen=True, use_attribute_docstrings=True)
+
+    name: str
+    """Which one; ``sparserob plugins`` lists them."""
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The component's options as they stand in the config."""
+        return dict(self.model_extra or {})
+
+
+@final
+class MaximiserEntry(Entry):
+    """A maximiser; the framework itself keeps its budget."""
+
+    budget: int = Field(default=2000, ge=1)
+    """Evaluations that one search may spend."""
+
+    polish: float = Field(default=0.0, ge=0.0, lt=1.0)
+    """Share of the budget that goes to a local method, from the best points, at the end."""
+
+
+@final
+class Dictionaries(Options):
+    """In which functions the control and the disturbance are written."""
+
+    control: Entry = Entry.model_validate({"name": "piecewise_constant", "pieces": 100})
+    """Dictionary of the control; 100 equal pieces unless told otherwise."""
+
+    disturbance: Entry | None = None
+    """Dictionary of the disturbance; null: one indicator function on each piece of the control's dictionary."""
+
+
+@final
+class ContinuationKeys(Options):
+    """How the weight of the regulariser decreases."""
+
+    start: float = Field(default=1.0, gt=0.0)
+    """First weight."""
+
+    factor: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
+    """Each weight is this times the one before."""
+
+    stop: float = Field(default=1e-6, gt=0.0)
+    """Last weight at the latest."""
+
+    tolerance: float = Field(default=1e-7, ge=0.0)
+    """Relative change of the cost below which a smaller weight changes nothing any more."""
+
+
+@final
+class RunConfig(Options):
+    """A complete experiment. Every key but ``problem`` has a default."""
+
+    title: str = ""
+    """Title of the figures and tables; the file's name when empty."""
+
+    problem: Entry
+    """What is to be solved."""
+
+    dictionaries: Dictionaries = Dictionaries()
+    """In which functions the control and the disturbance are written."""
+
+    regulariser: Entry | None = Entry(name="ridge")
+    """The strictly convex term that makes the optimiser unique; null for none."""
+
+    continuation: ContinuationKeys = ContinuationKeys()
+    """How the weight of the regulariser decreases."""
+
+    method: Entry = Entry(name="exchange")
+    """How the semi-infinite program is solved."""
+
+    maximiser: MaximiserEntry = MaximiserEntry(name="direct")
+    """The global search, wherever a family of constraints has no closed form of its own."""
+
+    solver: Entry = Entry(name="piqp")
+    """The inner solver of quadratic programs."""
+
+    observers: tuple[Entry, ...] = (Entry(name="progress"),)
+    """Who is told of the progress."""
+
+    seed: int = Field(default=0, ge=0)
+    """Seed of every random number."""
+
+    plugins: tuple[str, ...] = ()
+    """Python files that are loaded as plugins; relative to the config, or to the working directory when given on the
+    command line."""
+
+    def plain(self) -> dict[str, Any]:
+        """The config as mappings, lists, numbers and text."""
+        plain: dict[str, Any] = self.model_dump(mode="json", by_alias=True)
+        return plain
+
+    def digest(self) -> str:
+        """Eight hexadecimal digits that change when the config does."""
+        return hashlib.sha256(json.dumps(self.plain(), sort_keys=True).encode()).hexdigest()[:8]
+
+
+SLOTS = {
+    ("problem",): ("problem", None),
+    ("dictionaries", "control"): ("dictionary", "piecewise_constant"),
+    ("dictionaries", "disturbance"): ("dictionary", "piecewise_constant"),
+    ("regulariser",): ("regulariser", "ridge"),
+    ("method",): ("method", "exchange"),
+    ("maximiser",): ("maximiser", "direct"),
+    ("solver",): ("solver", "piqp"),
+}
+"""Where a config names one component: its kind, and the name that is meant when only options are given. ``observers``
+is a list."""

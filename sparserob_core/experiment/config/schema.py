@@ -1,0 +1,76 @@
+"""The JSON schema of a config, for the plugins that are installed: editors complete and check with it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic.json_schema import GenerateJsonSchema
+from pydantic_core import core_schema
+
+from sparserob_core.experiment.config.run_config import SLOTS, MaximiserEntry, RunConfig
+from sparserob_core.experiment.plugins.components import Registry
+from sparserob_core.experiment.plugins.components import parts as components
+from sparserob_core.experiment.plugins.records import Plugin
+
+
+class _Lenient(GenerateJsonSchema):
+    """Says nothing about a type that JSON has no words for."""
+
+    def handle_invalid_for_json_schema(self, schema: core_schema.CoreSchema, error_info: str) -> dict[str, Any]:
+        return {}
+
+
+def options_schema(record: Plugin) -> dict[str, Any]:
+    """The JSON schema of a component's options, with the references of its parts under ``kind.name.``."""
+    template = f"#/$defs/{record.kind}.{record.name}.{{model}}"
+    return record.options_type().model_json_schema(ref_template=template, schema_generator=_Lenient)
+
+
+def config_schema(registry: Registry) -> dict[str, Any]:
+    """The JSON schema (draft 2020-12) of the whole config."""
+    schema = RunConfig.model_json_schema(schema_generator=_Lenient)
+    parts: dict[str, Any] = schema["$defs"]
+    for path, (kind, default) in SLOTS.items():
+        holder = schema if len(path) == 1 else parts["Dictionaries"]
+        previous = holder["properties"][path[-1]]
+        choice = _choice(registry, kind, default, parts)
+        if any(option.get("type") == "null" for option in previous.get("anyOf", [])):
+            choice["anyOf"].append({"type": "null"})
+        holder["properties"][path[-1]] = {
+            **{key: previous[key] for key in ("default", "description") if key in previous},
+            **choice,
+        }
+    schema["properties"]["observers"]["items"] = _choice(registry, "observer", None, parts)
+    for unused in ("Entry", "MaximiserEntry"):
+        parts.pop(unused, None)
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "SparseRob config"}
+
+
+def _choice(registry: Registry, kind: str, default: str | None, parts: dict[str, Any]) -> dict[str, Any]:
+    names = registry.names(kind)
+    entries = []
+    for name in names:
+        entry = options_schema(registry.get(kind, name))
+        for key, part in components(registry.get(kind, name).options_type()).items():
+            described = entry["properties"][key]
+            described.pop("component")
+            described["anyOf"] = [*_choice(registry, part, None, parts)["anyOf"], {"type": "null"}]
+        parts.update({f"{kind}.{name}.{part}": value for part, value in entry.pop("$defs", {}).items()})
+        entries.append(_named(entry, registry.get(kind, name), needs_name=name != default))
+    return {"anyOf": [{"enum": names, "description": f"A {kind} with its default options."}, *entries]}
+
+
+def _named(entry: dict[str, Any], record: Plugin, needs_name: bool) -> dict[str, Any]:
+    properties = {"name": {"const": record.name, "description": record.summary}, **entry.get("properties", {})}
+    if record.kind == "maximiser":
+        own = MaximiserEntry.model_json_schema()["properties"]
+        properties |= {key: own[key] for key in own if key != "name"}
+    required = (["name"] if needs_name else []) + entry.get("required", [])
+    return {
+        "type": "object",
+        "title": f"{record.kind} {record.name}",
+        "description": record.summary,
+        "properties": properties,
+        "required": required,
+        "additionalProperties": False,
+    }

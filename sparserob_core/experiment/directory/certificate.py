@@ -1,0 +1,159 @@
+"""The contents of ``certificate.json``: what a run claims, and everything that proves it, without the means that found
+it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.sets.sets import Box, ConvexSet
+from sparserob_core.control.transcription.transcribe import slanted
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.evidence import Cut, Proof
+from sparserob_core.sip.program import Explanation, SemiInfiniteProgram
+from sparserob_core.sip.proof.branch_and_bound import TOLERANCE
+from sparserob_core.sip.result import Result
+
+if TYPE_CHECKING:
+    from sparserob_core.experiment.assemble import Experiment
+
+FORMAT = 1
+INWARDS = 1.0 - 1e-13  # points that must be in a curved set are drawn inwards by rounding
+
+
+def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None:
+    """The certificate of a result, as plain data; ``None`` for a program that is no control problem, or when nothing
+    was reached.
+
+    ``cost`` and ``lower_bound`` are as in ``result.json``. ``multipliers``: of constraints at a time, a parameter and a
+    normal direction, of equalities, and of the control's pieces where the dictionary is not that of their indicators.
+    ``proof``: per constraint the cells ``[lower, upper]`` of (time, parameters, directions) on which it was shown.
+    ``witness``: what refutes the decision.
+    """
+    problem, program = experiment.problem, experiment.program
+    if problem is None or experiment.control is None or result.status == "failed":
+        return None
+    theta = (
+        None
+        if result.decision is None
+        else np.asarray(result.decision).reshape(program.channels, experiment.control.functions)
+    )
+    return {
+        "format": FORMAT,
+        "config": experiment.loaded.config.digest(),
+        "status": result.status,
+        "cost": result.cost,
+        "lower_bound": result.lower_bound,
+        "gap_tolerance": experiment.gap_tolerance,
+        "decision": theta,
+        "multipliers": _multipliers(problem, program, result),
+        "proof": {proof.family: _cells(program, proof) for proof in result.proofs if proof.verdict == "proven"},
+        "witness": _witness(problem, program, result) if result.status == "refuted" else None,
+    }
+
+
+def _multipliers(problem: OptimalControlProblem, program: SemiInfiniteProgram, result: Result) -> dict[str, Any] | None:
+    """``None`` unless every constraint can be told: a sampled one, of the scenario approach, cannot."""
+    told = [
+        (cut, words)
+        for cut in result.dual.cuts
+        if (words := _explained(program, cut)) is not None and words.direction is not None
+    ]
+    if len(told) < len(result.dual.cuts) or result.dual.mu.size != program.finite.b.size:
+        return None
+    return {
+        "constraints": [
+            {
+                "constraint": cut.family,
+                "time": words.time,
+                "parameter": _parameter(problem, words),
+                "direction": _direction(words),
+                "multiplier": cut.multiplier,
+            }
+            for cut, words in told
+        ],
+        "equalities": result.dual.mu,
+        "pieces": _on_pieces(problem, result.dual.z),
+    }
+
+
+def _on_pieces(problem: OptimalControlProblem, z: Array | None) -> Array | None:
+    """The multipliers of the control ``(m, K)`` on its pieces, those of its set's slanted sides folded in."""
+    if z is None:
+        return None
+    m, (sides, _) = problem.system.controls, slanted(problem.control)
+    rows = z.reshape(m + sides.shape[0], -1)
+    answer: Array = rows[:m] + sides.T @ rows[m:]
+    return answer
+
+
+def _explained(program: SemiInfiniteProgram, cut: Cut) -> Explanation | None:
+    family = program.family(cut.family)
+    explain = family.explain
+    if explain is None:
+        return None
+    if cut.index.size == family.index_set.dimension:
+        return explain(cut.index, cut.row)
+    if (
+        family.nominal is not None
+        and family.nominal.explain is not None
+        and cut.index.size == family.nominal.index_set.dimension
+    ):
+        return family.nominal.explain(cut.index, cut.row)
+    literal = family.literal
+    return (
+        literal.explain(cut.index, cut.row)
+        if literal is not None and literal.explain and cut.index.size == literal.index_set.dimension
+        else None
+    )
+
+
+def _parameter(problem: OptimalControlProblem, words: Explanation) -> Array:
+    """The parameter of a constraint, certainly inside its set; the middle one for a constraint without uncertainty."""
+    bound = problem.system.parameters
+    if bound is None:
+        return np.zeros(0)
+    middle = bound.interior_point()
+    return (
+        middle
+        if words.parameter is None or words.parameter.size == 0
+        else _inside(bound, np.asarray(words.parameter), middle)
+    )
+
+
+def _direction(words: Explanation) -> Array | None:
+    return None if words.direction is None else words.direction + 0.0  # no negative zeros
+
+
+def _inside(bound: ConvexSet, point: Array, middle: Array) -> Array:
+    if isinstance(bound, Box):
+        return np.asarray(np.clip(point, bound.lower, bound.upper))
+    answer: Array = middle + INWARDS * (point - middle)
+    return answer
+
+
+def _cells(program: SemiInfiniteProgram, proof: Proof) -> dict[str, Any]:
+    lower, upper = proof.leaves if proof.leaves is not None else (np.zeros((0, 0)), np.zeros((0, 0)))
+    return {"tolerance": program.family(proof.family).tolerance(TOLERANCE), "lower": lower, "upper": upper}
+
+
+def _witness(problem: OptimalControlProblem, program: SemiInfiniteProgram, result: Result) -> dict[str, Any] | None:
+    worst = result.worst
+    words = None if worst is None else _explained(program, Cut(worst.constraint, worst.index, worst.row))
+    if worst is None or words is None:
+        return None
+    signal: Sequence[Any] | Array | None = words.disturbance
+    if signal is not None and problem.disturbance is not None:
+        middle = problem.disturbance.interior_point()
+        signal = np.array([_inside(problem.disturbance, column, middle) for column in np.asarray(signal).T]).T
+    return {
+        "constraint": worst.constraint,
+        "time": words.time,
+        "parameter": _parameter(problem, words),
+        "direction": _direction(words),
+        "disturbance": signal,
+        "violation": worst.violation,
+    }

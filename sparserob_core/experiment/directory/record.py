@@ -1,0 +1,108 @@
+"""What a run writes down of its result: the contents of ``result.json`` and ``solution.npz``."""
+
+from __future__ import annotations
+
+import platform
+from dataclasses import asdict
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+
+from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.experiment.directory.sparsity import sparsity
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.evidence import Witness
+from sparserob_core.sip.program import SemiInfiniteProgram
+from sparserob_core.sip.result import Result
+
+PACKAGES = ("sparserob", "numpy", "scipy", "piqp", "proxsuite", "clarabel")
+
+
+def summary_of(result: Result, control: Array | None, dictionary: Dictionary | None) -> dict[str, Any]:
+    """``result.json`` but for what only the run knows (title, seed, versions)."""
+    acting = (
+        asdict(sparsity(control, dictionary.breakpoints)) if control is not None and dictionary is not None else None
+    )
+    return {
+        "status": result.status,
+        "message": result.message,
+        "cost": result.cost,
+        "value": result.value,
+        "epsilon": result.epsilon,
+        "lower_bound": result.lower_bound,
+        "upper_bound": result.upper_bound,
+        "gap": result.gap,
+        "worst": _witness(result.worst),
+        "sparsity": acting or {"active_fraction": None, "switches": None},
+        "counts": {
+            "relaxed_programs": 0,
+            "rounds": len(result.history),
+            "active_indices": len(result.indices),
+            **result.counts,
+        },
+        **({} if result.scenario_bound is None else {"scenario_bound": asdict(result.scenario_bound)}),
+        "seconds": result.seconds,
+    }
+
+
+def _witness(worst: Witness | None) -> dict[str, Any]:
+    if worst is None:
+        return {"violation": None, "constraint": None, "time": None, "parameter": None}
+    return {
+        "violation": worst.violation,
+        "constraint": worst.constraint,
+        "time": worst.time,
+        "parameter": worst.parameter,
+    }
+
+
+def control_of(result: Result, program: SemiInfiniteProgram, dictionary: Dictionary | None) -> Array | None:
+    """The control on every piece ``(m, K)`` of the dictionary; ``None`` without a decision or for a program of another
+    kind."""
+    if result.decision is None or dictionary is None:
+        return None
+    theta = np.asarray(result.decision).reshape(program.channels, dictionary.functions)
+    return np.asarray(theta @ dictionary.values)
+
+
+def arrays_of(
+    result: Result, program: SemiInfiniteProgram, dictionary: Dictionary | None, control: Array | None
+) -> dict[str, Any]:
+    """``solution.npz``: the decision, and for a control problem ``breakpoints``, ``control``, ``theta``; one row per
+    imposed index in ``times``, ``indices`` (padded with NaN where families differ in dimension), ``rows``, ``families``
+    and ``multipliers``; ``worst_disturbance (mw, pieces)`` where the worst constraint has one."""
+    cuts = list(result.indices)
+    width = max((np.size(cut.index) for cut in cuts), default=0)
+    indices = np.full((len(cuts), width), np.nan)
+    for position, cut in enumerate(cuts):
+        indices[position, : np.size(cut.index)] = cut.index
+    arrays = {
+        "decision": np.zeros(0) if result.decision is None else result.decision,
+        "times": indices[:, 0] if dictionary is not None and width else np.full(len(cuts), np.nan),
+        "indices": indices,
+        "rows": np.array([cut.row for cut in cuts], dtype=int),
+        "families": np.array([cut.family for cut in cuts], dtype=str),
+        "multipliers": np.array([cut.multiplier for cut in cuts], dtype=float),
+    }
+    if dictionary is not None:
+        arrays["breakpoints"] = dictionary.breakpoints
+    if result.worst is not None and result.worst.disturbance is not None:
+        arrays["worst_disturbance"] = result.worst.disturbance
+    if control is not None and dictionary is not None:
+        arrays |= {
+            "control": control,
+            "theta": np.asarray(result.decision).reshape(program.channels, dictionary.functions),
+        }
+    return arrays
+
+
+def versions(packages: tuple[str, ...] = PACKAGES) -> dict[str, str]:
+    """Versions of Python and of the packages that decide the numbers."""
+    found = {"python": platform.python_version()}
+    for package in packages:
+        try:
+            found[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    return found

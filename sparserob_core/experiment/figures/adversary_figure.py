@@ -1,0 +1,111 @@
+"""The figure of the adversary: the worst disturbances, and what they do to the state."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from textwrap import shorten
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sparserob_core.experiment.figures import style as look
+from sparserob_core.experiment.figures.figure_data import FigureData
+from sparserob_core.experiment.figures.run_figures import draw_legend, draw_time_axis, draw_walls
+from sparserob_core.experiment.figures.style import panels, require_writable, style, write_figure
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLOURS = (look.BLUE, look.GREEN, look.PURPLE, look.ORANGE, look.INK)  # vermillion is the terminal set's
+DASHES: tuple[Any, ...] = ("solid", (0, (5, 2)), (0, (1.5, 1.5)))
+
+
+def write_adversary(file: Path, arrays: Mapping[str, Array], data: FigureData) -> None:
+    """Draw the contents of ``adversary.npz`` into a file (.png, .pdf, .svg); raises `InputError` when it cannot be
+    written."""
+    require_writable(file)
+    with style():
+        write_figure(file, draw_adversary(arrays, data))
+
+
+def draw_adversary(arrays: Mapping[str, Array], data: FigureData) -> Figure:
+    """Above the states under the worst case of every constraint, with a dot where it is attained, below the
+    disturbances that cause them."""
+    disturbances = arrays["disturbances"]
+    states, channels = len(data.state), disturbances.shape[1]
+    figure, axes = panels(states + channels, 1.7, extra=0.35)
+    for number, name in enumerate(arrays["names"].tolist()):
+        pen = {"color": COLOURS[number % len(COLOURS)], "linestyle": DASHES[number // len(COLOURS) % len(DASHES)]}
+        at = int(np.abs(arrays["state_times"] - arrays["times"][number]).argmin())
+        for component, ax in enumerate(axes[:states]):
+            path = arrays["states"][number, component]
+            ax.plot(
+                arrays["state_times"],
+                path,
+                linewidth=1.4,
+                zorder=3 - 0.01 * number,
+                label=f"worst case of {name}",
+                **pen,
+            )
+            if arrays["directions"][number, component]:
+                ax.plot(
+                    arrays["times"][number],
+                    path[at],
+                    "o",
+                    color=pen["color"],
+                    markersize=5,
+                    markeredgecolor="white",
+                    markeredgewidth=0.7,
+                    zorder=6,
+                    clip_on=False,
+                )
+        for channel, ax in enumerate(axes[states:]):
+            ax.stairs(
+                disturbances[number, channel],
+                arrays["breakpoints"],
+                baseline=None,
+                linewidth=1.3,
+                zorder=3 - 0.01 * number,
+                **pen,
+            )
+    for component, ax in enumerate(axes[:states]):
+        draw_tube(ax, data, component)
+        finish_panel(ax, data, component, tuple(arrays["states"][:, component]))
+    for channel, ax in enumerate(axes[states:]):
+        ax.axhline(0.0, color=look.GREY, linewidth=0.6, zorder=1)
+        ax.set_ylabel(f"$w_{{{channel + 1}}}(t)$" if channels > 1 else "$w(t)$")
+        ax.margins(y=0.15)
+    caption(figure, axes, data, "the worst disturbance and parameter of every constraint")
+    return figure
+
+
+def draw_tube(ax: Axes, data: FigureData, component: int) -> None:
+    """The worst-case tube of one state."""
+    lower, upper = data.tube_lower[component], data.tube_upper[component]
+    ax.fill_between(data.times, lower, upper, color=look.SKY, alpha=0.4, linewidth=0, zorder=2, label="worst-case tube")
+    for edge in (lower, upper):
+        ax.plot(data.times, edge, color=look.SKY, linewidth=0.8, zorder=2)
+
+
+def finish_panel(ax: Axes, data: FigureData, component: int, curves: tuple[Array, ...]) -> None:
+    """Limits around everything that is drawn, then the walls within them."""
+    walls = [wall for wall in data.walls if wall.state == component]
+    edges = [edge for wall in walls for edge in (wall.lower, wall.upper) if np.isfinite(edge)]
+    low = min([*edges, float(data.tube_lower[component].min()), *(float(curve.min()) for curve in curves)])
+    high = max([*edges, float(data.tube_upper[component].max()), *(float(curve.max()) for curve in curves)])
+    margin = 0.12 * max(high - low, 1e-9)
+    ax.set_ylim(low - margin, high + margin)
+    draw_walls(ax, walls)
+    ax.set_ylabel(data.state_label(component))
+
+
+def caption(figure: Figure, axes: list[Axes], data: FigureData, text: str) -> None:
+    """The time axis, the title, a line of text, and the legend."""
+    draw_time_axis(axes[-1], data)
+    axes[0].set_title(shorten(data.title, 80, placeholder=" ..."), pad=20)
+    axes[0].text(0.0, 1.045, text, transform=axes[0].transAxes, fontsize=9.5, color=look.GREY)
+    draw_legend(figure, axes)
+    figure.align_ylabels(axes)

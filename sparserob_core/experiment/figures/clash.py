@@ -1,0 +1,213 @@
+"""The picture of an infeasible run: for every constraint that clashes, where the control can bring it, and what is
+allowed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.figures import style as look
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.evidence import Cut
+from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
+from sparserob_core.sip.proof.reasons import least_of, reasons
+from sparserob_core.sip.relaxed.relaxed import rows_at
+from sparserob_core.sip.result import Result
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from sparserob_core.experiment.assemble import Experiment
+
+SHOWN = 8  # quantities at most
+BAR = 0.16  # half the height of a bar
+
+
+@final
+@dataclass(frozen=True)
+class Strip:
+    """One quantity ``label``: allowed in ``[low, high]``, brought by the control to ``[reach_low, reach_high]`` where
+    nothing disturbs it, and moved from there by the worst disturbance by ``push_low`` downwards and ``push_high``
+    upwards."""
+
+    label: str
+    low: float
+    high: float
+    reach_low: float
+    reach_high: float
+    push_low: float
+    push_high: float
+
+    @property
+    def best(self) -> float:
+        """Where the control does best to bring it: in the middle of what is allowed and possible once the disturbance
+        has taken its part."""
+        low, high = self.low + self.push_low, self.high - self.push_high
+        wanted = (low + high) / 2 if np.isfinite(low + high) else low if np.isfinite(low) else high
+        wanted = float(np.clip(self.reach_low, low, high)) if low <= high and np.isinf(high - low) else wanted
+        return float(np.clip(wanted, self.reach_low, self.reach_high))
+
+
+def draw_clash(experiment: Experiment, result: Result, directory: Path) -> list[Path]:
+    """Draw why nothing is feasible into ``directory/figures``: ``clash.pdf`` and ``clash.png``. Returns the files.
+
+    One strip for every quantity of the reasons, or else of the rows whose multipliers prove the clash. Raises
+    `InputError` when the result is not infeasible, when it is about no quantity that can be drawn (equalities alone,
+    another kind of program), and without matplotlib.
+    """
+    if result.status != "infeasible":
+        raise InputError(f"figures: a clash is drawn of infeasible results, got one that is {result.status}")
+    strips = clash_strips(experiment.program, result)
+    if not strips:
+        raise InputError(
+            "figures: the constraints that clash are none on a single combination of states; there is nothing to draw"
+        )
+    look.require_matplotlib()
+    with look.style():
+        figure, axes = look.panels(1, 0.62 * len(strips) + 0.5, extra=0.35)
+        _draw(axes[0], strips)
+        alone = any(
+            strip.best - strip.push_low < strip.low or strip.best + strip.push_high > strip.high for strip in strips
+        )
+        axes[0].set_title(experiment.title, pad=8 if alone else 22)
+        if not alone:
+            axes[0].text(
+                0.0,
+                1.0,
+                "each of them can be met, but not all by one control",
+                transform=axes[0].transAxes,
+                fontsize=9.5,
+                color=look.GREY,
+                va="bottom",
+            )
+        axes[0].set_xlabel("value of the quantity")
+        entries = dict(zip(*reversed(axes[0].get_legend_handles_labels()), strict=True))
+        figure.legend(
+            entries.values(), entries.keys(), loc="outside lower center", ncols=2, columnspacing=1.6, handlelength=1.6
+        )
+        return look.save(figure, directory / "figures", "clash")
+
+
+def clash_strips(program: SemiInfiniteProgram, result: Result) -> list[Strip]:
+    """The strips of a figure: of every separate reason, else of the rows of the certificate."""
+    found = reasons(program)
+    cuts = (
+        [cut for reason in found for cut in reason.rows.cuts]
+        if found
+        else [cut for cut in result.indices if cut.multiplier > 0]
+    )
+    strips: dict[str, Strip] = {}
+    for cut in cuts:
+        family = program.family(cut.family)
+        strip = _strip(program, family.reduced or family, cut)
+        if strip is not None:
+            strips.setdefault(strip.label, strip)
+    return list(strips.values())[:SHOWN]
+
+
+def _strip(program: SemiInfiniteProgram, family: ConstraintFamily, cut: Cut) -> Strip | None:
+    if family.explain is None or cut.index.size != family.index_set.dimension:
+        return None
+    said = family.explain(cut.index, cut.row)
+    if not said.quantity:
+        return None
+    G, h = family.rows(cut.index[None])
+    row = rows_at(_reduced(program, family), family.name, cut.index[None], np.array([cut.row])).G[0]
+    towards, away = (float(least_of(program.finite, sign * row[None], np.zeros(1))[0]) for sign in (1.0, -1.0))
+    reach = sorted([said.free + said.sign * towards, said.free - said.sign * away])
+    limits, pushes = {said.sign: said.limit}, {said.sign: said.push}
+    opposite = [
+        j
+        for j in range(h.shape[1])
+        if j != cut.row and np.abs(G[0, j] + row).max() <= 1e-12 * np.abs(row).max(initial=1e-300)
+    ]
+    others = [family.explain(cut.index, j) for j in opposite]
+    for other in others:
+        if other.quantity == said.quantity:
+            limits[other.sign], pushes[other.sign] = other.limit, other.push
+    label = f"{said.quantity}\n{family.name}" + (f", {said.where}" if said.where and said.time else "")
+    return Strip(
+        label,
+        limits.get(-1.0, -np.inf),
+        limits.get(1.0, np.inf),
+        reach[0],
+        reach[1],
+        pushes.get(-1.0, 0.0),
+        pushes.get(1.0, 0.0),
+    )
+
+
+def _reduced(program: SemiInfiniteProgram, family: ConstraintFamily) -> SemiInfiniteProgram:
+    return SemiInfiniteProgram(n=program.n, families=[family])
+
+
+def _draw(ax: Axes, strips: Sequence[Strip]) -> None:
+    left, right = _view(strips)
+    ax.set_xlim(left, right)
+    for place, strip in enumerate(strips):
+        y = len(strips) - 1.0 - place
+        _forbidden(ax, strip, y, left, right)
+        _bar(
+            ax,
+            strip.best - strip.push_low,
+            strip.best + strip.push_high,
+            y - 0.17,
+            look.ORANGE,
+            "what the worst disturbance makes of its best",
+        )
+        _bar(ax, strip.reach_low, strip.reach_high, y + 0.17, look.BLUE, "where the control can bring it")
+        ax.plot([strip.best], [y - 0.17], "|", color=look.INK, markersize=9, zorder=4, linewidth=0, label="its best")
+    ax.set_yticks([len(strips) - 1.0 - k for k in range(len(strips))], [strip.label for strip in strips])
+    ax.set_ylim(-0.6, len(strips) - 0.4)
+    ax.tick_params(axis="y", length=0)
+
+
+def _forbidden(ax: Axes, strip: Strip, y: float, left: float, right: float) -> None:
+    for edge, end in ((strip.low, left), (strip.high, right)):
+        if np.isfinite(edge):
+            ax.fill_betweenx(
+                [y - 0.42, y + 0.42],
+                edge,
+                end,
+                facecolor=look.MIST,
+                edgecolor="#C4C4C4",
+                hatch="////",
+                linewidth=0,
+                zorder=0,
+                label="forbidden",
+            )
+            ax.plot([edge, edge], [y - 0.42, y + 0.42], color=look.VERMILLION, linewidth=1.6, zorder=1, label="wall")
+
+
+def _bar(ax: Axes, low: float, high: float, y: float, colour: str, label: str) -> None:
+    """A bar, or a dot where there is nothing to it."""
+    look_of: dict[str, Any] = {"color": colour, "zorder": 3}
+    if high - low > 0:
+        ax.barh([y], [high - low], left=[low], height=BAR, linewidth=0, label=label, **look_of)
+    elif colour == look.BLUE:
+        ax.plot([low], [y], "o", markersize=5.5, markeredgewidth=0, **look_of)
+
+
+def _view(strips: Sequence[Strip]) -> tuple[float, float]:
+    values: Array = np.array(
+        [
+            value
+            for strip in strips
+            for value in (
+                strip.low,
+                strip.high,
+                strip.reach_low,
+                strip.reach_high,
+                strip.best - strip.push_low,
+                strip.best + strip.push_high,
+            )
+        ]
+    )
+    shown = values[np.isfinite(values)]
+    room = 0.08 * max(float(shown.max() - shown.min()), 1e-9)
+    return float(shown.min()) - room, float(shown.max()) + room

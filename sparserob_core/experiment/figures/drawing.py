@@ -1,0 +1,173 @@
+"""From a solved experiment to its figures: the nominal trajectory, the worst-case tube around it, and what constrains
+them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.sets.sets import Equality
+from sparserob_core.control.transcription.record import Transcription
+from sparserob_core.control.transcription.transcribe import prepare
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.directory.adversary import adversaries
+from sparserob_core.experiment.directory.finished import read_arrays, read_finished
+from sparserob_core.experiment.directory.sparsity import sparsity
+from sparserob_core.experiment.figures.figure_data import FigureData, Wall
+from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.events import RoundFinished
+
+if TYPE_CHECKING:
+    from sparserob_core.experiment.assemble import Experiment
+
+TIMES = 400
+PARAMETERS = 27
+
+
+def draw_experiment(
+    experiment: Experiment,
+    theta: Array,
+    active_times: Array,
+    history: Sequence[RoundFinished],
+    directory: Path,
+    cost: float | None,
+    worst: Mapping[str, Array],
+) -> list[Path]:
+    """Draw the figures of a decision ``theta (m, N)`` into ``directory/figures``; raises `InputError` when there is
+    nothing to draw.
+
+    ``worst``: the arrays of `adversaries`, empty when there is no constraint to be driven against.
+    """
+    from sparserob_core.experiment.figures.adversary_figure import write_adversary
+    from sparserob_core.experiment.figures.run_figures import write_figures
+
+    data = figure_data(experiment, theta, active_times, history, cost)
+    files = write_figures(directory / "figures", data)
+    for kind in ("pdf", "png") if worst else ():
+        files.append(directory / "figures" / f"adversary.{kind}")
+        write_adversary(files[-1], worst, data)
+    return files
+
+
+def figure_data(
+    experiment: Experiment, theta: Array, active_times: Array, history: Sequence[RoundFinished], cost: float | None
+) -> FigureData:
+    """What figures of a decision ``theta (m, N)`` show; raises `InputError` when the program is no control problem."""
+    problem, control, disturbance = experiment.problem, experiment.control, experiment.disturbance
+    if problem is None or control is None or disturbance is None:
+        raise InputError("figures: they are for control problems; this is a semi-infinite program of another kind")
+    return _data(experiment, problem, prepare(problem, control, disturbance), theta, active_times, history, cost)
+
+
+def draw_run(directory: Path) -> list[Path]:
+    """Draw the figures of a run directory again; raises `InputError` when it is none, or holds no control."""
+    finished = read_finished(directory)
+    trace = read_arrays(directory / "trace.npz")
+    rounds = [
+        RoundFinished(**{name: trace[name][row].item() for name in trace}) for row in range(len(trace.get("round", ())))
+    ]
+    return draw_experiment(
+        finished.experiment,
+        finished.theta,
+        active_times(finished.solution),
+        rounds,
+        directory,
+        finished.summary["cost"],
+        adversaries(finished.experiment, finished.theta),
+    )
+
+
+def active_times(solution: Mapping[str, Array]) -> Array:
+    """The times of the imposed constraints that carry a multiplier, from ``solution.npz``."""
+    return np.unique(solution["times"][solution["multipliers"] > 0])
+
+
+def _data(
+    experiment: Experiment,
+    problem: OptimalControlProblem,
+    model: Transcription,
+    theta: Array,
+    active_times: Array,
+    history: Sequence[RoundFinished],
+    cost: float | None,
+) -> FigureData:
+    control, dictionary = model.pieces(theta), model.control
+    axes = np.eye(problem.system.controls)
+    shown = _shown(model.response.grid.breakpoints.size)
+    tolerance = experiment.loaded.config.method.options.get("tolerance")
+    state, lower, upper = _tube(model, control, shown)
+    return FigureData(
+        title=experiment.title,
+        breakpoints=dictionary.breakpoints,
+        control=control,
+        control_lower=-problem.control.support(-axes),
+        control_upper=problem.control.support(axes),
+        times=model.response.grid.breakpoints[shown],
+        state=state,
+        tube_lower=lower,
+        tube_upper=upper,
+        walls=list(_walls(problem)),
+        active_times=active_times,
+        history=history,
+        active_fraction=sparsity(control, dictionary.breakpoints).active_fraction,
+        cost=cost,
+        tolerance=tolerance if isinstance(tolerance, float) else None,
+    )
+
+
+def _shown(count: int) -> np.ndarray[Any, np.dtype[np.intp]]:
+    return np.unique(np.linspace(0, count - 1, min(count, TIMES + 1)).round().astype(int))
+
+
+def _tube(
+    model: Transcription, control: Array, shown: np.ndarray[Any, np.dtype[np.intp]]
+) -> tuple[Array, Array, Array]:
+    """Nominal state and worst case from both sides, ``(d, T)`` each, over a lattice of parameters."""
+    lattice, _ = model.parameters.lattice()
+    if model.functionals.disturbance is not None and len(lattice) > PARAMETERS:
+        lattice = lattice[np.unique(np.linspace(0, len(lattice) - 1, PARAMETERS).round().astype(int))]
+    paths = model.response.states(control, lattice)[:, shown]
+    count, instants, states = paths.shape
+    times = np.tile(model.response.grid.breakpoints[shown], count)
+    at = np.repeat(lattice, instants, axis=0)
+    lower, upper = np.empty((states, instants)), np.empty((states, instants))
+    for state in range(states):
+        direction = np.tile(np.eye(states)[state], (times.size, 1))
+        above, below = (
+            model.functionals.offsets(times, side * direction, at).reshape(count, instants) for side in (1.0, -1.0)
+        )
+        upper[state] = (paths[:, :, state] + above).max(axis=0)
+        lower[state] = (paths[:, :, state] - below).min(axis=0)
+    return paths[len(lattice) // 2].T, lower, upper
+
+
+def _walls(problem: OptimalControlProblem) -> Iterator[Wall]:
+    end = problem.horizon
+    for entry in problem.path:
+        if isinstance(entry, PathConstraint):
+            yield from _sides(entry.set, entry.start, end if entry.stop is None else entry.stop)
+    for terminal in problem.terminal:
+        if isinstance(terminal, Equality):
+            yield from (
+                Wall(
+                    state=int(state),
+                    lower=float(terminal.values[state]),
+                    upper=float(terminal.values[state]),
+                    start=end,
+                    end=end,
+                )
+                for state in terminal.fixed
+            )
+        else:
+            yield from _sides(terminal, end, end)
+
+
+def _sides(bounds: ConvexSet, start: float, end: float) -> Iterator[Wall]:
+    axes = np.eye(bounds.dimension)
+    for state, (lower, upper) in enumerate(zip(-bounds.support(-axes), bounds.support(axes), strict=True)):
+        if np.isfinite(lower) or np.isfinite(upper):
+            yield Wall(state=state, lower=float(lower), upper=float(upper), start=start, end=end)

@@ -1,0 +1,80 @@
+"""What the figures of a run show, as one plain record."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.events import RoundFinished
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wall:
+    """One state component must stay in ``[lower, upper]`` for ``start <= t <= end``; ``start == end`` is a terminal
+    constraint."""
+
+    state: int
+    lower: float = -np.inf
+    upper: float = np.inf
+    start: float
+    end: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FigureData:
+    """A solved control problem, ready to be drawn.
+
+    ``breakpoints (K+1,)`` with the control ``(m, K)`` on the pieces and its bounds ``(m,)`` (infinite: none);
+    ``times (T,)`` with the nominal ``state (d, T)`` and the worst case ``tube_lower``, ``tube_upper`` ``(d, T)`` over
+    every disturbance and parameter; ``walls`` the path and terminal constraints on single components; ``active_times``
+    the times of the imposed constraints that carry a multiplier; ``history`` the rounds of the method. ``tolerance`` is
+    the relative gap that was asked for.
+    """
+
+    title: str
+    breakpoints: Array
+    control: Array
+    control_lower: Array
+    control_upper: Array
+    times: Array
+    state: Array
+    tube_lower: Array
+    tube_upper: Array
+    walls: Sequence[Wall] = ()
+    active_times: Array = field(default_factory=lambda: np.empty(0))
+    history: Sequence[RoundFinished] = ()
+    active_fraction: float | None = None
+    cost: float | None = None
+    tolerance: float | None = None
+    control_names: Sequence[str] = ()
+    state_names: Sequence[str] = ()
+    time_unit: str = ""
+
+    def __post_init__(self) -> None:
+        pieces, instants = self.breakpoints.size - 1, self.times.size
+        if self.control.ndim != 2 or self.control.shape[1] != pieces:
+            raise InputError(f"control: expected (m, {pieces}) for {pieces} pieces, got {self.control.shape}")
+        for name in ("state", "tube_lower", "tube_upper"):
+            shape = getattr(self, name).shape
+            if shape != (self.state.shape[0], instants):
+                raise InputError(f"{name}: expected (d, {instants}) for {instants} times, got {shape}")
+
+    def control_label(self, channel: int) -> str:
+        """The axis label of one control channel."""
+        return self.control_names[channel] if self.control_names else _symbol("u", channel, self.control.shape[0])
+
+    def state_label(self, component: int) -> str:
+        """The axis label of one state component."""
+        return self.state_names[component] if self.state_names else _symbol("x", component, self.state.shape[0])
+
+    def time_label(self) -> str:
+        """The label of the time axis."""
+        return f"time $t$ [{self.time_unit}]" if self.time_unit else "time $t$"
+
+
+def _symbol(letter: str, index: int, count: int) -> str:
+    return f"${letter}_{{{index + 1}}}(t)$" if count > 1 else f"${letter}(t)$"

@@ -1,0 +1,265 @@
+"""The three figures of a run: the control, the worst-case tube of every state, and the two bounds that meet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sparserob_core.experiment.figures import style as look
+from sparserob_core.experiment.figures.figure_data import FigureData, Wall
+from sparserob_core.experiment.figures.style import panels, require_matplotlib, save, style
+from sparserob_core.sip.result import relative_gap
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from sparserob_core.sip.convex_set import Array
+
+
+def write_figures(directory: Path, data: FigureData) -> list[Path]:
+    """Draw ``control``, ``states`` and, when there is a history, ``convergence`` into ``directory``, each as PDF and
+    PNG.
+
+    Returns the files. Raises `InputError` when matplotlib is missing.
+    """
+    require_matplotlib()
+    with style():
+        files = save(draw_control(data), directory, "control") + save(draw_states(data), directory, "states")
+        if data.history:
+            files += save(draw_convergence(data), directory, "convergence")
+    return files
+
+
+def draw_control(data: FigureData) -> Figure:
+    """Every channel as steps between its bounds; ticks below the axis mark the times of the active constraints."""
+    figure, axes = panels(len(data.control), 1.9, extra=0.5)
+    for channel, ax in enumerate(axes):
+        steps = data.control[channel]
+        ax.axhline(0.0, color=look.GREY, linewidth=0.6, zorder=1)
+        ax.stairs(steps, data.breakpoints, baseline=0.0, fill=True, color=look.SKY, alpha=0.35, linewidth=0, zorder=2)
+        ax.stairs(steps, data.breakpoints, baseline=None, color=look.BLUE, linewidth=1.5, zorder=3, label="control")
+        _bounds(ax, float(data.control_lower[channel]), float(data.control_upper[channel]), steps)
+        _rug(ax, data.active_times)
+        ax.set_ylabel(data.control_label(channel))
+    draw_time_axis(axes[-1], data)
+    _title(axes[0], data.title, _summary(data))
+    draw_legend(figure, axes)
+    return figure
+
+
+def draw_states(data: FigureData) -> Figure:
+    """Every state with its worst-case tube; what the constraints forbid is hatched, the terminal set is a bracket."""
+    figure, axes = panels(len(data.state), 1.9, extra=0.2)
+    for component, ax in enumerate(axes):
+        ax.fill_between(
+            data.times,
+            data.tube_lower[component],
+            data.tube_upper[component],
+            color=look.SKY,
+            alpha=0.45,
+            linewidth=0,
+            zorder=2,
+            label="worst case",
+        )
+        for edge in (data.tube_lower[component], data.tube_upper[component]):
+            ax.plot(data.times, edge, color=look.SKY, linewidth=0.8, zorder=2)
+        ax.plot(data.times, data.state[component], color=look.BLUE, linewidth=1.5, zorder=3, label="nominal")
+        walls = [wall for wall in data.walls if wall.state == component]
+        ax.set_ylim(*_limits(data, component, walls))
+        draw_walls(ax, walls)
+        _rug(ax, data.active_times)
+        ax.set_ylabel(data.state_label(component))
+    draw_time_axis(axes[-1], data)
+    axes[0].set_title(data.title)
+    draw_legend(figure, axes)
+    return figure
+
+
+def draw_convergence(data: FigureData) -> Figure:
+    """Both bounds against the rounds, and below them the violation and the gap of each lower bound to the best upper
+    bound, on a logarithmic axis."""
+    from matplotlib.ticker import MaxNLocator
+
+    figure, (bounds, gaps) = panels(2, 1.9, extra=0.2)
+    rounds = np.arange(1.0, len(data.history) + 1)
+    lower = np.array([entry.lower_bound for entry in data.history])
+    upper = np.array([entry.upper_bound for entry in data.history])
+    best = float(upper.min())
+    _draw_bounds(bounds, rounds, lower, upper, best)
+    _draw_gaps(gaps, rounds, np.array([relative_gap(bound, best) for bound in lower]), data)
+    bounds.set_title(data.title)
+    gaps.set_xlim(0.6, len(data.history) + 0.4)
+    gaps.xaxis.set_major_locator(MaxNLocator(integer=True))
+    _stages(bounds, gaps, [entry.epsilon for entry in data.history])
+    for ax in (bounds, gaps):
+        ax.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
+    return figure
+
+
+def _draw_bounds(ax: Axes, rounds: Array, lower: Array, upper: Array, best: float) -> None:
+    shown = np.isfinite(lower)
+    if np.isfinite(best):
+        ax.fill_between(rounds[shown], lower[shown], best, color=look.MIST, linewidth=0, zorder=1)
+        ax.axhline(best, color=look.VERMILLION, linewidth=0.9, zorder=2)
+    _series(ax, rounds, upper, look.VERMILLION, "v", "upper bound")
+    _series(ax, rounds, lower, look.BLUE, "^", "lower bound")
+    ax.set_ylabel("cost $J$")
+
+
+def _draw_gaps(ax: Axes, rounds: Array, gap: Array, data: FigureData) -> None:
+    violation = np.array([entry.violation for entry in data.history])
+    ax.set_yscale("log")
+    ax.set_ylim(*_decades(np.concatenate([violation, gap, [data.tolerance or np.nan]])))
+    _series(ax, rounds, _positive(violation), look.ORANGE, "s", "worst violation")
+    _series(ax, rounds, _positive(gap), look.GREEN, "o", "relative gap")
+    if data.tolerance is not None:
+        ax.axhline(data.tolerance, color=look.PURPLE, linewidth=0.9, linestyle=(0, (5, 3)), label="tolerance")
+    ax.set_xlabel("round")
+
+
+def _title(ax: Axes, title: str, summary: str) -> None:
+    ax.set_title(title, pad=20 if summary else 8)
+    ax.text(0.0, 1.045, summary, transform=ax.transAxes, fontsize=9.5, color=look.GREY)
+
+
+def _summary(data: FigureData) -> str:
+    parts = [] if data.cost is None else [f"$J$ = {data.cost:.6g}"]
+    if data.active_fraction is not None:
+        parts.append(f"active {100 * data.active_fraction:.1f} % of the time")
+    return "  ·  ".join(parts)
+
+
+def _bounds(ax: Axes, lower: float, upper: float, steps: Array) -> None:
+    finite = [bound for bound in (lower, upper) if np.isfinite(bound)]
+    for bound in finite:
+        ax.axhline(bound, color=look.VERMILLION, linewidth=0.9, linestyle=(0, (5, 3)), zorder=1, label="control bound")
+    low, high = min([*finite, float(steps.min()), 0.0]), max([*finite, float(steps.max()), 0.0])
+    margin = 0.12 * max(high - low, 1e-9)
+    ax.set_ylim(low - margin, high + margin)
+
+
+def _rug(ax: Axes, times: Array) -> None:
+    if len(times):
+        ax.plot(
+            times,
+            np.zeros(len(times)),
+            "^",
+            color=look.PURPLE,
+            markersize=6,
+            markeredgewidth=0,
+            clip_on=False,
+            zorder=5,
+            transform=ax.get_xaxis_transform(),
+            label="active constraint",
+        )
+
+
+def draw_time_axis(ax: Axes, data: FigureData) -> None:
+    """Limits and label of the time axis that the panels share."""
+    start, end = float(data.breakpoints[0]), float(data.breakpoints[-1])
+    ax.set_xlim(start, end + 0.012 * (end - start))
+    ax.set_xlabel(data.time_label())
+
+
+def _limits(data: FigureData, component: int, walls: list[Wall]) -> tuple[float, float]:
+    edges = [edge for wall in walls for edge in (wall.lower, wall.upper) if np.isfinite(edge)]
+    low = min([*edges, float(data.tube_lower[component].min())])
+    high = max([*edges, float(data.tube_upper[component].max())])
+    margin = 0.12 * max(high - low, 1e-9)
+    return low - margin, high + margin
+
+
+def draw_walls(ax: Axes, walls: Sequence[Wall]) -> None:
+    """Hatch what path constraints forbid within the axis' limits, and bracket terminal sets."""
+    for wall in walls:
+        _terminal(ax, wall) if wall.start == wall.end else _forbidden(ax, wall)
+
+
+def _forbidden(ax: Axes, wall: Wall) -> None:
+    low, high = ax.get_ylim()
+    for edge, outside in ((wall.lower, low), (wall.upper, high)):
+        if np.isfinite(edge):
+            ax.fill_between(
+                [wall.start, wall.end],
+                edge,
+                outside,
+                facecolor=look.MIST,
+                edgecolor="#C4C4C4",
+                hatch="////",
+                linewidth=0,
+                zorder=0,
+                label="forbidden",
+            )
+            ax.plot([wall.start, wall.end], [edge, edge], color=look.GREY, linewidth=1.0, zorder=1)
+
+
+def _terminal(ax: Axes, wall: Wall) -> None:
+    low, high = ax.get_ylim()
+    lower, upper = max(wall.lower, low), min(wall.upper, high)
+    ax.plot(
+        [wall.end, wall.end],
+        [lower, upper],
+        color=look.VERMILLION,
+        linewidth=3.0,
+        solid_capstyle="butt",
+        clip_on=False,
+        zorder=4,
+        label="terminal set",
+    )
+    for edge in (wall.lower, wall.upper):
+        if np.isfinite(edge):
+            ax.plot(
+                wall.end,
+                edge,
+                marker=0,
+                markersize=7,
+                markeredgewidth=2.0,
+                color=look.VERMILLION,
+                clip_on=False,
+                zorder=4,
+            )
+
+
+def draw_legend(figure: Figure, axes: list[Axes]) -> None:
+    """One legend below all panels."""
+    entries = {label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    figure.legend(
+        entries.values(),
+        entries.keys(),
+        loc="outside lower center",
+        ncols=len(entries) if len("".join(entries)) <= 64 else 3,
+        columnspacing=1.6,
+        handlelength=1.4,
+        handletextpad=0.6,
+    )
+
+
+def _series(ax: Axes, rounds: Array, values: Array, colour: str, marker: str, label: str) -> None:
+    shown = np.isfinite(values)
+    ax.plot(
+        rounds[shown], values[shown], color=colour, marker=marker, markersize=4.5, linewidth=1.2, label=label, zorder=3
+    )
+
+
+def _positive(values: Array) -> Array:
+    return np.where(values > 0, values, np.nan)
+
+
+def _decades(values: Array) -> tuple[float, float]:
+    """Whole decades around the positive values, so that a single value still has an axis."""
+    shown = values[np.isfinite(values) & (values > 0)]
+    if not shown.size:
+        return 1e-8, 1.0
+    return 10.0 ** np.floor(np.log10(shown.min()) - 0.3), 10.0 ** np.ceil(np.log10(shown.max()) + 0.3)
+
+
+def _stages(bounds: Axes, gaps: Axes, epsilons: list[float]) -> None:
+    changes = [k + 0.5 for k in range(1, len(epsilons)) if epsilons[k] != epsilons[k - 1]]
+    for ax in (bounds, gaps):
+        for k, place in enumerate(changes):
+            label = r"$\varepsilon$ reduced" if k == 0 and ax is gaps else None
+            ax.axvline(place, color=look.GREY, linewidth=0.6, linestyle=":", zorder=0, label=label)

@@ -1,0 +1,116 @@
+"""How the figures look: one palette that every eye can tell apart, one typeface, one way to a file."""
+
+from __future__ import annotations
+
+import os
+from contextlib import AbstractContextManager
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sparserob_core.errors import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Okabe and Ito (2008), "Color universal design".
+BLUE, SKY, VERMILLION, ORANGE, GREEN, PURPLE = "#0072B2", "#56B4E9", "#D55E00", "#E69F00", "#009E73", "#CC79A7"
+INK, GREY, MIST = "#222222", "#7A7A7A", "#E9E9E9"
+WIDTH = 6.2
+"""Width of every figure in inches: a text column at full size."""
+
+KINDS: dict[str, dict[str, Any]] = {
+    ".png": {"dpi": 200, "metadata": {"Software": None}},
+    ".pdf": {"metadata": {"CreationDate": None, "Creator": None, "Producer": None}},
+    ".svg": {"metadata": {"Date": None, "Creator": None}},
+}
+"""Kinds of files, by their endings, and what is left out of them so that the same figure gives the same bytes."""
+
+_STYLE: dict[str, Any] = {
+    "font.family": "STIXGeneral",
+    "mathtext.fontset": "stix",
+    "font.size": 10.5,
+    "axes.titlesize": 11.5,
+    "axes.titlelocation": "left",
+    "axes.titlepad": 8,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": GREY,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "xtick.color": GREY,
+    "ytick.color": GREY,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "xtick.major.width": 0.7,
+    "ytick.major.width": 0.7,
+    "text.color": INK,
+    "legend.frameon": False,
+    "legend.fontsize": 9.5,
+    "lines.solid_capstyle": "butt",
+    "hatch.linewidth": 0.4,
+    "pdf.fonttype": 42,
+}
+
+
+def style() -> AbstractContextManager[None]:
+    """The settings of every figure, for the time of a ``with`` block; the user's own settings stay as they are."""
+    from matplotlib.style import context
+
+    return context(_STYLE)
+
+
+def panels(rows: int, height: float, *, extra: float = 0.0) -> tuple[Figure, list[Axes]]:
+    """A figure of ``rows`` panels of ``height`` inches above one another on a common axis; ``extra`` inches are for
+    legends."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(WIDTH, rows * height + 0.75 + extra), layout="constrained")
+    axes = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
+    return figure, list(axes)
+
+
+def save(figure: Figure, directory: Path, name: str) -> list[Path]:
+    """Write ``name.pdf`` (vector) and ``name.png`` (200 dots per inch); the same figure gives the same bytes."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    FigureCanvasAgg(figure)
+    directory.mkdir(parents=True, exist_ok=True)
+    files = [directory / f"{name}.pdf", directory / f"{name}.png"]
+    figure.savefig(files[0], metadata={"CreationDate": None, "Creator": None, "Producer": None})
+    figure.savefig(files[1], dpi=200, metadata={"Software": None})
+    return files
+
+
+def require_writable(file: Path) -> None:
+    """Raise `InputError` unless the ending of the file is a kind of figure, its folder can be written to, and
+    matplotlib is there."""
+    if file.suffix.lower() not in KINDS:
+        raise InputError(f"{file}: expected a file that ends in {', '.join(KINDS)}, got {file.suffix or 'no ending'}")
+    folder = next(parent for parent in file.absolute().parents if parent.exists())
+    if file.is_dir() or not folder.is_dir() or not os.access(folder, os.W_OK):
+        raise InputError(f"{file}: cannot be written there; expected a file in a folder that can be written to")
+    require_matplotlib()
+
+
+def write_figure(file: Path, figure: Figure) -> None:
+    """Write a figure whole into a file whose ending is its kind; raises `InputError` when it cannot be written."""
+    stream, kind = BytesIO(), file.suffix.lower()
+    figure.savefig(stream, format=kind[1:], **KINDS[kind])
+    temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        temporary.write_bytes(stream.getvalue())
+        temporary.replace(file)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise InputError(f"{file}: cannot be written: {error.strerror}") from error
+
+
+def require_matplotlib() -> None:
+    """Raise `InputError` with the way to install it when matplotlib is missing."""
+    from importlib.util import find_spec
+
+    if find_spec("matplotlib") is None:
+        raise InputError("figures: matplotlib is not installed; `pip install sparserob[figures]` brings it")

@@ -1,0 +1,1 @@
+"""The set of initial states from which a problem is feasible."""

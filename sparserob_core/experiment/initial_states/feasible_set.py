@@ -1,0 +1,194 @@
+"""The record of a set of feasible initial states: two polygons, one within and one around it, and costs between."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, final
+
+import numpy as np
+import numpy.typing as npt
+
+from sparserob_core.control.studies.polygon_approximation import inside, polygon_area
+from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.result import Status
+
+ROUNDING = 1e-12  # of a bound
+ON_EDGE = 1e-9  # of the polygon's size, a distance that is on the edge
+
+
+@final
+@dataclass(frozen=True, eq=False, kw_only=True)
+class InitialStates:
+    """The convex set of initial states from which some control satisfies every constraint, in the plane of the states
+    ``states`` (from 0).
+
+    ``inner (k, 2)`` and ``outer (k', 2)``: vertices, anticlockwise, of a polygon proven to lie within the set and of
+    one proven to contain it, in the units of the states. ``controls (k, m, K)``: a control for each vertex of
+    ``inner``; between them, convex combinations serve. ``directions (n, 2)`` with ``bounds (n,)``: half-planes
+    ``d'x <= bound`` that contain the set, and ``reached (n,)``: what proven points reach. ``points (v, 2)`` with
+    ``costs (v,)``: initial states and the cost of a proven control from each, and ``lower_bounds (v,)`` of its optimum.
+    ``origin (d,)``: the config's initial state; the coordinates that are not in the plane are as there. ``path``:
+    sections of the path sets that hold at time 0. ``limit``: the bound on the coordinates where one was asked for, and
+    ``cut`` whether it cuts the set. ``status``: ``certified`` (the polygons differ by at most a thousandth of the
+    area), ``verified`` (by more), ``infeasible`` (the set is empty, proven) or ``undecided`` (no point is proven).
+    """
+
+    title: str
+    states: tuple[int, int]
+    status: Status
+    message: str
+    inner: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    outer: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    controls: Array = field(default_factory=lambda: np.zeros((0, 0, 0)), repr=False)
+    directions: Array = field(default_factory=lambda: np.zeros((0, 2)), repr=False)
+    bounds: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+    reached: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+    points: Array = field(default_factory=lambda: np.zeros((0, 2)), repr=False)
+    costs: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+    lower_bounds: Array = field(default_factory=lambda: np.zeros(0), repr=False)
+    origin: Array = field(default_factory=lambda: np.zeros(0))
+    path: Sequence[Array] = field(default=(), repr=False)
+    limit: float | None = None
+    cut: bool = False
+    remarks: Sequence[str] = ()
+    programs: int = 0
+    seconds: float = 0.0
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """The two coordinates, such as ``x1(0)``."""
+        return f"x{self.states[0] + 1}(0)", f"x{self.states[1] + 1}(0)"
+
+    @property
+    def start(self) -> Array:
+        """The config's own initial state in the plane, ``(2,)``."""
+        return np.asarray(self.origin[list(self.states)])
+
+    @property
+    def inner_area(self) -> float:
+        """The area of the inner polygon."""
+        return polygon_area(self.inner)
+
+    @property
+    def outer_area(self) -> float:
+        """The area of the outer polygon."""
+        return polygon_area(self.outer)
+
+    @property
+    def gap(self) -> float:
+        """``(outer - inner) / outer`` of the areas; nan where the outer polygon has none."""
+        return 1.0 - self.inner_area / self.outer_area if self.outer_area > 0.0 else np.nan
+
+    def where(self, point: npt.ArrayLike) -> Literal["inside", "outside", "open"]:
+        """Whether a point ``(2,)`` is proven to be in the set, proven not to be, or between the polygons."""
+        x = _point(point)
+        if (
+            self.directions @ x > self.bounds + ROUNDING * np.maximum(1.0, np.abs(self.bounds))
+        ).any() or not self.outer.shape[0]:
+            return "outside"
+        return "inside" if self.inner.shape[0] > 2 and bool(inside(self.inner, x[None])[0]) else "open"
+
+    def cost(self, point: npt.ArrayLike) -> float:
+        """A proven upper bound of the optimal cost from a point ``(2,)``: the optimal cost is convex, so the least
+        combination of measured costs that has the point as its mean is one (a linear program); infinite outside of the
+        measured points."""
+        weights = _combination(self.points, _point(point), self.costs)
+        return np.inf if weights is None else float(weights @ self.costs)
+
+    def control(self, point: npt.ArrayLike) -> Array:
+        """A control ``(m, K)`` that is proven for the initial state at a point ``(2,)`` of the inner polygon; raises
+        `InputError` outside."""
+        x = _point(point)
+        weights = _combination(self.inner, x, np.zeros(self.inner.shape[0]))
+        if weights is None:
+            raise InputError(f"point: expected one in the inner polygon, got {x.tolist()}")
+        return np.asarray(np.tensordot(weights, self.controls, axes=1))
+
+    def summary(self) -> dict[str, Any]:
+        """``initial_states.json``."""
+        return {
+            "title": self.title,
+            "status": self.status,
+            "message": self.message,
+            "states": [state + 1 for state in self.states],
+            "inner_area": self.inner_area,
+            "outer_area": self.outer_area,
+            "gap": self.gap,
+            "inner": self.inner,
+            "outer": self.outer,
+            "initial_state": self.origin,
+            "initial_state_is": self.where(self.start),
+            "directions": len(self.bounds),
+            "values": len(self.costs),
+            "least_cost": self.costs.min(initial=np.inf),
+            "greatest_cost": self.costs.max(initial=-np.inf),
+            "limit": self.limit,
+            "cut": self.cut,
+            "remarks": list(self.remarks),
+            "programs": self.programs,
+            "seconds": self.seconds,
+        }
+
+    def arrays(self) -> Mapping[str, Array]:
+        """``initial_states.npz``."""
+        names = (
+            "inner",
+            "outer",
+            "controls",
+            "directions",
+            "bounds",
+            "reached",
+            "points",
+            "costs",
+            "lower_bounds",
+            "origin",
+        )
+        return {name: getattr(self, name) for name in names}
+
+    def rows(self) -> list[tuple[str, str]]:
+        """What a user wants to know, as rows of a table."""
+        rows = [("status", f"{self.status}: {self.message}")]
+        if self.outer.shape[0]:
+            rows += [
+                ("coordinates", " and ".join(self.names)),
+                ("area", f"at least {self.inner_area:.6g}, at most {self.outer_area:.6g}"),
+                *(
+                    (name, f"from {low:.6g} to {high:.6g}")
+                    for name, low, high in zip(self.names, self.outer.min(axis=0), self.outer.max(axis=0), strict=True)
+                ),
+                ("directions", str(len(self.bounds))),
+            ]
+            rows += (
+                [("costs", f"{len(self.costs)}, from {self.costs.min():.6g} to {self.costs.max():.6g}")]
+                if self.costs.size
+                else []
+            )
+            text = {"inside": "feasible, proven", "outside": "infeasible, proven", "open": "between the polygons"}[
+                self.where(self.start)
+            ]
+            rows += [("the config's own", f"({self.start[0]:.6g}, {self.start[1]:.6g}): {text}")]
+        return [*rows, ("seconds", f"{self.seconds:.3f}")]
+
+
+def _point(point: npt.ArrayLike) -> Array:
+    try:
+        x = np.asarray(point, dtype=float)
+    except (TypeError, ValueError):
+        x = np.zeros(0)
+    if x.shape != (2,) or not np.isfinite(x).all():
+        raise InputError(f"point: expected two finite numbers, got {point!r}")
+    return x
+
+
+def _combination(points: Array, x: Array, costs: Array) -> Array | None:
+    """The cheapest weights ``(k,)``, at least 0 and of sum 1, with ``weights @ points = x``; ``None`` when there are
+    none."""
+    from scipy.optimize import linprog
+
+    if not points.shape[0]:
+        return None
+    size = float(np.abs(points).max()) or 1.0
+    found = linprog(costs, A_eq=np.vstack([points.T / size, np.ones(points.shape[0])]), b_eq=np.append(x / size, 1.0))
+    return np.asarray(found.x) if found.status == 0 and np.abs(found.x @ points - x).max() <= ON_EDGE * size else None

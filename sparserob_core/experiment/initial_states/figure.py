@@ -1,0 +1,171 @@
+"""The picture of a set of feasible initial states: between its two polygons the boundary, inside the least cost as
+colour."""
+
+from __future__ import annotations
+
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.figures import style as look
+from sparserob_core.experiment.figures.style import require_matplotlib, style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.figure import Figure
+
+    from sparserob_core.experiment.initial_states.feasible_set import InitialStates
+    from sparserob_core.sip.convex_set import Array
+
+LEVELS = 12  # bands of colour, about
+COLOURS = "viridis"  # perceptually uniform, and one for eyes that see fewer colours (Smith and van der Walt 2015)
+MARGIN = 0.07  # of the set's extent, around it
+HEIGHT = 5.3
+REACH = 0.35  # of the set's extent: an initial state that is no further away than this is in the picture
+FLAT = 1e-6  # of its greatest extent, the least of a set that is drawn as one with interior
+
+
+def write_initial_states(file: Path, found: InitialStates) -> None:
+    """Draw into a file .png, whole; the same set gives the same bytes. Raises `InputError` when matplotlib is missing,
+    when there is nothing to draw, and when the file cannot be written."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    require_matplotlib()
+    if not found.outer.shape[0]:
+        raise InputError(f"{file}: nothing to draw; the set is empty")
+    stream = BytesIO()
+    with style():
+        figure = draw_initial_states(found)
+        FigureCanvasAgg(figure)
+        figure.savefig(stream, format="png", dpi=200, metadata={"Software": None})
+    temporary = file.with_name(f".{file.name}.tmp")
+    try:
+        temporary.write_bytes(stream.getvalue())
+        temporary.replace(file)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise InputError(f"{file}: cannot be written: {error.strerror}") from error
+
+
+def draw_initial_states(found: InitialStates) -> Figure:
+    """The set with its inner boundary solid and its outer one dashed, the path sets at time 0, and the config's own
+    initial state."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(look.WIDTH, HEIGHT), layout="constrained")
+    ax = figure.subplots()
+    low, high = found.outer.min(axis=0), found.outer.max(axis=0)
+    extent = np.maximum(high - low, 0.05 * (high - low).max() + np.finfo(float).tiny)
+    near = (found.start >= low - REACH * extent).all() and (found.start <= high + REACH * extent).all()
+    if near:
+        low, high = np.minimum(low, found.start), np.maximum(high, found.start)
+    middle, half = (low + high) / 2, np.maximum(high - low, extent) * (0.5 + MARGIN)
+    ax.set_xlim(middle[0] - half[0], middle[0] + half[0])
+    ax.set_ylim(middle[1] - half[1], middle[1] + half[1])
+    if (found.outer.max(axis=0) - found.outer.min(axis=0)).min() > FLAT * extent.max() and found.inner.shape[0] > 2:
+        _costs(figure, ax, found)
+    elif found.costs.size:
+        _bar(
+            figure, ax, ax.scatter(found.points[:, 0], found.points[:, 1], c=found.costs, cmap=COLOURS, s=36, zorder=7)
+        )
+    _boundaries(ax, found)
+    if near:
+        ax.plot(
+            *found.start,
+            marker="o",
+            markersize=6.5,
+            markerfacecolor="white",
+            markeredgecolor=look.VERMILLION,
+            markeredgewidth=1.8,
+            linestyle="",
+            zorder=7,
+            clip_on=False,
+            label="the config's initial state",
+        )
+    ax.set_title(found.title)
+    ax.set_xlabel(f"$x_{{{found.states[0] + 1}}}(0)$")
+    ax.set_ylabel(f"$x_{{{found.states[1] + 1}}}(0)$")
+    figure.legend(
+        *ax.get_legend_handles_labels(),
+        loc="outside lower left",
+        ncols=2,
+        columnspacing=1.8,
+        handlelength=2.2,
+        labelspacing=0.35,
+    )
+    return figure
+
+
+def _costs(figure: Figure, ax: Axes, found: InitialStates) -> None:
+    """Bands of the largest convex function below the measured costs: between them it lies above the optimal cost, which
+    is convex too."""
+    from matplotlib.patches import Polygon
+    from matplotlib.ticker import MaxNLocator
+    from matplotlib.tri import Triangulation
+
+    inside = Polygon(found.inner, closed=True, facecolor=look.MIST, edgecolor="none", zorder=1)
+    ax.add_patch(inside)
+    if found.costs.size < 4 or np.ptp(found.costs) <= 0.0:
+        return
+    triangles = envelope(found.points, found.costs)
+    top = float(found.costs.max())
+    levels = MaxNLocator(LEVELS).tick_values(float(found.costs.min()), top)
+    mesh = Triangulation(found.points[:, 0], found.points[:, 1], triangles)
+    bands = ax.tricontourf(mesh, found.costs, levels=levels, cmap=COLOURS, zorder=2)
+    lines = ax.tricontour(mesh, found.costs, levels=levels[1:-1], colors="white", linewidths=0.5, alpha=0.7, zorder=3)
+    for drawn in (bands, lines):
+        drawn.set_clip_path(inside)
+    _bar(figure, ax, bands)
+
+
+def _bar(figure: Figure, ax: Axes, coloured: ScalarMappable) -> None:
+    bar = figure.colorbar(coloured, ax=ax, pad=0.02, aspect=28)
+    bar.set_label("cost $J$ of a proven control")
+    bar.outline.set_linewidth(0.0)
+    bar.ax.tick_params(length=0)
+
+
+def envelope(points: Array, costs: Array) -> np.ndarray:
+    """The triangles ``(t, 3)`` of the lower convex envelope of costs ``(v,)`` at points ``(v, 2)``."""
+    from scipy.spatial import ConvexHull
+
+    low, extent = points.min(axis=0), np.ptp(points, axis=0)
+    lifted = np.hstack([(points - low) / extent, (costs / np.ptp(costs))[:, None]])
+    above = [*lifted[:, :2].mean(axis=0), lifted[:, 2].max() + 1.0]
+    hull = ConvexHull(np.vstack([lifted, above]), qhull_options="Qt")
+    downward = hull.equations[:, 2] < -1e-12
+    return np.asarray(hull.simplices[downward & (hull.simplices < points.shape[0]).all(axis=1)])
+
+
+def _boundaries(ax: Axes, found: InitialStates) -> None:
+    (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
+    seen = [
+        polygon for polygon in found.path if ((polygon > [left, bottom]) & (polygon < [right, top])).all(axis=1).any()
+    ]
+    for number, polygon in enumerate(seen):
+        ax.plot(
+            *_closed(polygon),
+            color=look.GREY,
+            linewidth=1.1,
+            linestyle=(0, (1, 1.4)),
+            zorder=4,
+            label="path set at time 0" if not number else None,
+        )
+    ax.plot(
+        *_closed(found.outer),
+        color=look.VERMILLION,
+        linewidth=1.1,
+        linestyle=(0, (5, 2.5)),
+        zorder=5,
+        label="infeasible outside, proven",
+    )
+    if found.inner.shape[0]:
+        ax.plot(*_closed(found.inner), color=look.INK, linewidth=1.4, zorder=6, label="feasible inside, proven")
+
+
+def _closed(vertices: Array) -> Array:
+    return np.vstack([vertices, vertices[:1]]).T

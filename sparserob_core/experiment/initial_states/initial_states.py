@@ -1,0 +1,148 @@
+"""The set of feasible initial states of an experiment, in the plane of two of its states, with the cost from each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.sets.sets import Equality
+from sparserob_core.control.studies.initial_states import InitialPlane, check_states
+from sparserob_core.control.transcription.transcribe import prepare
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.assemble import assemble, name_of, tools_of
+from sparserob_core.experiment.config.load import Loaded, load_config
+from sparserob_core.experiment.config.reader import write_yaml
+from sparserob_core.experiment.directory.artefacts import RunDirectory, create_directory
+from sparserob_core.experiment.figures.style import require_matplotlib
+from sparserob_core.experiment.initial_states.feasible_set import InitialStates
+from sparserob_core.experiment.initial_states.search import Search, Tell
+from sparserob_core.experiment.initial_states.section import section
+from sparserob_core.sip.convex_set import Array
+
+__all__ = ["InitialStates", "initial_states"]
+FAR = 1e4  # times the numbers in the problem: a coordinate that may be as large as this is called unbounded
+
+
+def initial_states(
+    config: str | Path | Mapping[str, Any],
+    overrides: Mapping[str, object] | Iterable[str] | None = None,
+    states: Sequence[int] = (0, 1),
+    *,
+    directions: int = 32,
+    values: int = 15,
+    about: Sequence[float] | None = None,
+    within: float | None = None,
+    out: str | Path | None = None,
+    tell: Tell = lambda line: None,
+) -> InitialStates:
+    """The initial states from which an experiment is feasible: what ``sparserob initial-states CONFIG key=value ...``
+    does.
+
+    ``states``: the two coordinates that are free, counted from 0; the others are those of the config's initial state,
+    or of ``about (d,)``. ``directions``: support functions asked for at most, at least 4. ``values``: costs are
+    measured on a lattice of so many points each way, 0 for none. ``within``: only coordinates of at most this size are
+    looked at; needed where the set is unbounded. ``out``: a new or empty directory for the config,
+    ``initial_states.json``, ``.npz`` and ``.png``. ``tell`` hears of progress. Raises `InputError` when an argument or
+    the config is at fault, and when the set is unbounded.
+    """
+    _whole("directions", directions, 4)
+    _whole("values", values, 0)
+    limit = _limit(within)
+    if out is not None:
+        require_matplotlib()
+    loaded = load_config(config, overrides)
+    experiment = assemble(loaded)
+    if experiment.problem is None or experiment.control is None or experiment.disturbance is None:
+        raise InputError("problem: expected a control problem, which has an initial state, got a semi-infinite program")
+    problem = (
+        experiment.problem
+        if about is None
+        else replace(experiment.problem, initial_state=_about(about, experiment.problem))
+    )
+    pair = check_states(states, problem.system.states)
+    directory = None if out is None else create_directory(out, name_of(loaded), loaded.config.digest())
+    if directory is not None:
+        directory.write_text(
+            "config.yaml",
+            write_yaml(loaded.config.plain(), "The experiment whose feasible initial states were sought."),
+        )
+    size = _far(problem) if limit is None else limit
+    plane = InitialPlane(
+        prepare(problem, experiment.control, experiment.disturbance), pair, np.zeros(2), np.full(2, size)
+    )
+    found = Search(plane, tools_of(loaded), _tolerance(loaded), tell, limit).states(
+        experiment.title, directions, values
+    )
+    found = replace(found, path=_path(problem, found))
+    if directory is not None:
+        _write(directory, found)
+    return found
+
+
+def _limit(within: object) -> float | None:
+    if within is None:
+        return None
+    if (
+        isinstance(within, bool)
+        or not isinstance(within, int | float | np.integer | np.floating)
+        or not 0.0 < within < np.inf
+    ):
+        raise InputError(f"within: expected a positive number, got {within!r}")
+    return float(within)
+
+
+def _far(problem: OptimalControlProblem) -> float:
+    """A size beyond which a coordinate counts as unbounded."""
+    flat = [entry.set.halfspaces() for entry in problem.path if isinstance(entry, PathConstraint)]
+    flat += [end.halfspaces() for end in problem.terminal if not isinstance(end, Equality)]
+    sizes = [
+        float((np.abs(h) / np.linalg.norm(H, axis=1)).max())
+        for H, h in (sides for sides in flat if sides is not None)
+        if h.size
+    ]
+    sizes += [float(np.abs(end.values[end.fixed]).max()) for end in problem.terminal if isinstance(end, Equality)]
+    return FAR * max([1.0, float(np.abs(np.asarray(problem.initial_state)).max()), *sizes])
+
+
+def _about(about: Sequence[float], problem: OptimalControlProblem) -> Array:
+    try:
+        state = np.asarray(about, dtype=float)
+    except (TypeError, ValueError):
+        state = np.zeros(0)
+    if state.shape != (problem.system.states,) or not np.isfinite(state).all():
+        raise InputError(f"about: expected {problem.system.states} finite numbers, one per state, got {about!r}")
+    return state
+
+
+def _tolerance(loaded: Loaded) -> float:
+    """The relative gap that the config asks for, where its method has one."""
+    return float(loaded.config.method.options.get("tolerance") or 1e-7)
+
+
+def _path(problem: OptimalControlProblem, found: InitialStates) -> tuple[Array, ...]:
+    """The sections of the path sets that hold at time 0."""
+    if not found.outer.shape[0]:
+        return ()
+    middle = (found.inner if found.inner.shape[0] else found.outer).mean(axis=0)
+    sets = [entry.set for entry in problem.path if isinstance(entry, PathConstraint) and entry.start == 0.0]
+    view = 10.0 * float(np.abs(found.outer - middle).max())
+    return tuple(section(one, found.origin, found.states, middle, view) for one in sets)
+
+
+def _whole(name: str, value: object, least: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise InputError(f"{name}: expected a whole number of at least {least}, got {value!r}")
+
+
+def _write(directory: RunDirectory, found: InitialStates) -> None:
+    from sparserob_core.experiment.initial_states.figure import write_initial_states
+
+    directory.write_json("initial_states.json", found.summary())
+    directory.write_arrays("initial_states.npz", found.arrays())
+    if found.outer.shape[0]:
+        write_initial_states(directory.path / "initial_states.png", found)

@@ -1,0 +1,222 @@
+"""The search behind the feasible initial states: the plane fitted to the set, its boundary from both sides, and costs
+inside."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+from typing import Any, TypeAlias, final
+
+import numpy as np
+
+from sparserob_core.control.studies.initial_states import InitialPlane
+from sparserob_core.control.studies.polygon_approximation import (
+    AXES,
+    Support,
+    inner_polygon,
+    inside,
+    outer_polygon,
+    polygon_area,
+    sandwich,
+)
+from sparserob_core.errors import InputError, SolverError
+from sparserob_core.experiment.initial_states.feasible_set import InitialStates
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.evidence import Cut
+from sparserob_core.sip.method import Tools
+from sparserob_core.sip.methods.exchange import Exchange
+from sparserob_core.sip.result import Result
+
+Tell: TypeAlias = Callable[[str], None]
+ROOM = 1.1  # the box of coordinates, relative to what is proven to contain the set: its sides must not matter
+FRAMES = 4  # boxes at most, each fitted to the set by the last one
+SLIVER = 1e-9  # of the box in area: a set without interior
+THINNEST = 1e-10  # of the first box, the last: the set may have no interior
+CLOSED = 1e-3  # of the area: a difference of the polygons that is called none
+ASIDE = 1e-3  # how far costs are measured within the vertices, where no control has any room
+# relative to rows that hold the initial state in units of the box: of no use
+AMOUNT = re.compile(r" \(one is violated by at least [^)]*\)")
+PROVEN = ("certified", "verified")
+
+
+@final
+@dataclass(eq=False)
+class Search:
+    """One search: the plane, the cuts that each direction needed, and the controls of the points found."""
+
+    plane: InitialPlane
+    tools: Tools
+    tolerance: float
+    tell: Tell
+    within: float | None
+    cuts: dict[tuple[float, ...], Sequence[Cut]] = field(default_factory=dict)
+    controls: dict[bytes, Array] = field(default_factory=dict)
+    remarks: list[str] = field(default_factory=list)
+    programs: int = 0
+    started: float = field(default_factory=time.perf_counter)
+
+    def states(self, title: str, directions: int, values: int) -> InitialStates:
+        origin = np.asarray(self.plane.model.problem.initial_state, dtype=float)
+        bare = InitialStates(
+            title=title, states=self.plane.states, status="undecided", message="", origin=origin, limit=self.within
+        )
+        limit, framed = float(self.plane.radius[0]), self._framed()
+        if isinstance(framed, Result):
+            message = (
+                f"no initial state of this plane, up to {limit:.4g} in size, is feasible:"
+                f" {AMOUNT.sub('', framed.message)}"
+            )
+            return self._finished(bare, status="infeasible", message=message)
+        self.tell(f"direction {len(framed)} of {directions}")
+        supports = sandwich(self._ask, framed, directions, 0.1 * CLOSED)
+        inner = inner_polygon(supports)
+        points, results = self._measured(inner, values)
+        found = replace(
+            self._polygons(bare, supports, inner),
+            points=self.plane.point(points),
+            costs=np.array([r.upper_bound for r in results]),
+            lower_bounds=np.array([r.lower_bound for r in results]),
+        )
+        if not inner.shape[0]:
+            return self._finished(
+                found, message="no initial state is proven feasible, and none in the outer polygon is proven infeasible"
+            )
+        size = polygon_area(outer_polygon(supports))
+        if size <= SLIVER:
+            return self._finished(found, status="certified", message="proven from both sides; the set has no interior")
+        share = 1.0 - polygon_area(inner) / size
+        return self._finished(
+            found,
+            status="certified" if share <= CLOSED else "verified",
+            message=f"between two polygons, both proven, that differ by {share:.2%} of the area",
+        )
+
+    def _polygons(self, bare: InitialStates, supports: Sequence[Support], inner: Array) -> InitialStates:
+        """The polygons and half-planes in the units of the states."""
+        plane, scaled = self.plane, np.array([s.direction for s in supports]) / self.plane.radius
+        norms = np.linalg.norm(scaled, axis=1)
+        normals, vertices, outer = scaled / norms[:, None], plane.point(inner), plane.point(outer_polygon(supports))
+        return replace(
+            bare,
+            inner=vertices,
+            outer=outer,
+            controls=np.array([self.controls[vertex.tobytes()] for vertex in inner]),
+            directions=normals,
+            bounds=np.array([s.bound for s in supports]) / norms + normals @ plane.centre,
+            reached=(normals @ vertices.T).max(axis=1, initial=-np.inf),
+            cut=self.within is not None and bool((np.abs(outer) >= self.within * (1.0 - SLIVER)).any()),
+        )
+
+    def _finished(self, found: InitialStates, **changes: Any) -> InitialStates:
+        return replace(
+            found,
+            remarks=tuple(self.remarks),
+            programs=self.programs,
+            seconds=time.perf_counter() - self.started,
+            **changes,
+        )
+
+    def _framed(self) -> list[Support] | Result:
+        """Fit the box of coordinates to the set; returns the supports along the axes, or the result that proves the set
+        empty."""
+        limit = self.plane.radius
+        least = THINNEST * limit
+        for number in range(FRAMES):
+            supports = []
+            for axis in AXES:
+                result = self._supported(axis)
+                if result.status == "infeasible":
+                    return result
+                if not np.isfinite(result.lower_bound):
+                    raise SolverError(f"the initial states could not be bounded: {result.message}")
+                supports.append(self._support(axis, result))
+            high, low = np.array([s.bound for s in supports[:2]]), -np.array([s.bound for s in supports[2:]])
+            if not number and self.within is None:
+                self._require_bounded(np.concatenate([high, -low]))
+            lower, upper = self.plane.point(low), self.plane.point(high)
+            fits = (high - low > 1.0) | (self.plane.radius <= least)
+            if number == FRAMES - 1 or (number and fits.all()):
+                return supports
+            middle, half = (lower + upper) / 2, np.maximum(ROOM * (upper - lower) / 2, least)
+            self.plane = self.plane.resized(np.maximum(middle - half, -limit), np.minimum(middle + half, limit))
+        raise AssertionError("the last frame returns")
+
+    def _require_bounded(self, bounds: Array) -> None:
+        free = np.flatnonzero(bounds > 0.999)
+        if free.size:
+            names = [f"x{self.plane.states[k % 2] + 1}(0) {'above' if k < 2 else 'below'}" for k in free]
+            raise InputError(
+                f"within: the set of feasible initial states has no bound on {', '.join(names)} up to"
+                f" {self.plane.radius[0]:.4g}; expected path or terminal sets that bound it, or a size of the plane to"
+                " look at, such as 10"
+            )
+
+    def _ask(self, direction: Array) -> Support:
+        support = self._support(direction, self._supported(direction))
+        self.tell(f"direction {len(self.cuts)}: {self.programs} relaxed programs")
+        return support
+
+    def _supported(self, direction: Array) -> Result:
+        near = sorted(self.cuts, key=lambda other: -float(np.dot(other, direction)))[:2]
+        known = {(cut.family, cut.row, cut.index.tobytes()): cut for other in near for cut in self.cuts[other]}
+        program = self.plane.support(direction, list(known.values()))
+        # The cost is linear and the point is all that is wanted: a regulariser of the control would only be in the way.
+        result = Exchange(tolerance=self.tolerance).solve(program, replace(self.tools, regulariser=None))
+        self.programs += result.counts.get("relaxed_programs", 0)
+        self.cuts[tuple(direction.tolist())] = result.indices or tuple(known.values())
+        return result
+
+    def _support(self, direction: Array, result: Result) -> Support:
+        bound, proven = float(np.abs(direction).sum()), result.status in PROVEN
+        # it is not: another direction has a point
+        bound = bound if result.status == "infeasible" else min(-result.lower_bound, bound)
+        point = None if result.decision is None else np.array(result.decision[-2:])
+        if point is not None and proven and result.decision is not None:
+            self.controls[point.tobytes()] = self.plane.model.pieces(result.decision[:-2])
+        if not proven:
+            self.remarks.append(
+                f"in the direction {np.round(direction, 4).tolist()} no point is proven: {result.message}"
+            )
+        return Support(direction, bound, point, proven)
+
+    def _measured(self, inner: Array, values: int) -> tuple[Array, list[Result]]:
+        """Costs on a lattice within the inner polygon, and beside its vertices."""
+        points, kept, results = _lattice(inner, values), [], []
+        for number, z in enumerate(points):
+            self.tell(f"cost {number + 1} of {len(points)}")
+            result = Exchange(tolerance=self.tolerance).solve(self.plane.at(z), self.tools)
+            self.programs += result.counts.get("relaxed_programs", 0)
+            if result.status in PROVEN:
+                kept.append(z)
+                results.append(result)
+        if len(kept) < len(points):
+            self.remarks.append(
+                f"{len(points) - len(kept)} of {len(points)} costs could not be proven and are left out"
+            )
+        return np.array(kept).reshape(-1, 2), results
+
+
+def _lattice(inner: Array, values: int) -> Array:
+    """The points of a lattice that lie in a polygon, and points all around its edge, moved inwards a little; without
+    interior, points on the segment."""
+    if not values or not inner.shape[0]:
+        return np.zeros((0, 2))
+    middle = inner.mean(axis=0)
+    corners = middle + (1.0 - ASIDE) * (inner - middle)
+    if polygon_area(inner) <= SLIVER:
+        ends = inner[[0, int(np.linalg.norm(inner - inner[0], axis=1).argmax())]]
+        return np.asarray(ends[0] + np.linspace(ASIDE, 1.0 - ASIDE, values)[:, None] * (ends[1] - ends[0]))
+    sides = [
+        np.linspace(low, high, values + 2)[1:-1] for low, high in zip(inner.min(axis=0), inner.max(axis=0), strict=True)
+    ]
+    lattice, step = np.array(list(product(*sides))), np.ptp(inner, axis=0) / (values + 1)
+    around = [
+        corner
+        + np.linspace(0.0, 1.0, int(np.ceil(np.abs((after - corner) / step).max())), endpoint=False)[:, None]
+        * (after - corner)
+        for corner, after in zip(corners, np.roll(corners, -1, axis=0), strict=True)
+    ]
+    return np.vstack([lattice[inside(corners, lattice)], *around])

@@ -1,0 +1,1 @@
+"""How much uncertainty a problem tolerates."""

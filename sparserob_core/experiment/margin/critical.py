@@ -1,0 +1,127 @@
+"""Where a scaled problem ceases to be feasible: one convex program where the factor enters linearly, a root of the
+slack where it does not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal, final
+
+import numpy as np
+
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.margin.scaling import Scaling
+from sparserob_core.sip.method import Tools
+from sparserob_core.sip.methods.exchange import Exchange
+from sparserob_core.sip.program import SemiInfiniteProgram
+from sparserob_core.sip.relaxed.parametric import Factored, extreme_program, slack_program
+
+ROOM = 1e3  # bounds of the slack, in units of the violation without control
+PROBES = 80  # factors at most at which the slack is computed
+
+
+@final
+@dataclass(frozen=True)
+class Critical:
+    """``found``: the critical factor is between ``good`` (seems feasible) and ``bad`` (seems not); ``always``,
+    ``never`` feasible; or ``unknown``."""
+
+    status: Literal["found", "always", "never", "unknown"]
+    good: float = np.nan
+    bad: float = np.nan
+    message: str = ""
+
+
+def critical_factor(
+    programs: Factored, scaling: Scaling, tools: Tools, width: float, tell: Callable[[str], None]
+) -> Critical:
+    """Find the critical factor to about ``width``, which is what ordinary runs then have to prove."""
+    if scaling.affine:
+        found = _by_one_program(programs, scaling, tools, width)
+        if found.status != "unknown" or not scaling.nested:
+            return found
+    return _by_slack(programs, scaling, tools, width, tell)
+
+
+def _by_one_program(programs: Factored, scaling: Scaling, tools: Tools, width: float) -> Critical:
+    """The factor as a decision variable: its two bounds meet at the critical factor."""
+    program = extreme_program(programs, scaling.sense, scaling.highest)
+    result = Exchange(max(0.05 * width, 1e-9)).solve(program, replace(tools, regulariser=None))
+    if result.status == "infeasible":
+        return Critical("never", message=result.message)
+    if result.decision is None or not np.isfinite(result.lower_bound):
+        return Critical("unknown", message=result.message)
+    good, bad = float(result.decision[-1]), abs(result.lower_bound)
+    if scaling.sense == "largest" and good >= (1.0 - 1e-6) * scaling.highest:
+        return Critical("always", good=scaling.highest)
+    if scaling.sense == "smallest" and good <= width:
+        return Critical("always", good=0.0)
+    return Critical(
+        "found", good, max(good, bad) if scaling.sense == "largest" else min(good, max(result.lower_bound, 0.0))
+    )
+
+
+def _by_slack(
+    programs: Factored, scaling: Scaling, tools: Tools, width: float, tell: Callable[[str], None]
+) -> Critical:
+    """A bracket of the factor at which the least relaxation that leaves something feasible changes its sign."""
+
+    def slack(factor: float) -> float:
+        value = _slack(programs, factor, tools)
+        tell(f"{scaling.of} at {factor:.9g}: {'feasible' if value <= 0 else 'infeasible'}")
+        return value
+
+    good, bad = (0.0, 1.0) if scaling.sense == "largest" else (scaling.highest, 0.0)
+    at_good = slack(good)
+    if at_good > 0.0:
+        return Critical("never")
+    at_bad = slack(bad)
+    while at_bad <= 0.0 and scaling.sense == "largest" and bad < scaling.highest:
+        good, at_good, bad = bad, at_bad, min(2.0 * bad, scaling.highest)
+        at_bad = slack(bad)
+    if at_bad <= 0.0:
+        return Critical("always", good=bad)
+    return _bracketed(slack, (good, at_good), (bad, at_bad), width)
+
+
+def _slack(programs: Factored, factor: float, tools: Tools) -> float:
+    """The least relaxation of the rows, infinite where the bounds or equalities cannot be met at all, or the system is
+    not defined."""
+    try:
+        program = programs.program(factor)
+        bounds = _room(program)
+        result = Exchange(1e-9).close(slack_program(program, *bounds), replace(tools, regulariser=None), lambda x: ())
+    except InputError:
+        if factor in (0.0, 1.0):
+            raise
+        return np.inf
+    return np.inf if result.decision is None else float(result.decision[-1])
+
+
+def _room(program: SemiInfiniteProgram) -> tuple[float, float]:
+    rest = np.zeros(program.n)
+    violations = [float(family.worst(rest).violations.max()) for family in program.families if family.worst is not None]
+    size = ROOM * (1.0 + max(map(abs, violations), default=0.0))
+    return -size, size
+
+
+def _bracketed(
+    slack: Callable[[float], float], good: tuple[float, float], bad: tuple[float, float], width: float
+) -> Critical:
+    """The rule of false position, aimed half a width beyond the root, towards the end that is further away; halving
+    when that stalls."""
+    stalled = 0
+    for _ in range(PROBES):
+        span = abs(bad[0] - good[0])
+        if span <= 0.5 * width:
+            break
+        (low, at_low), (high, at_high) = sorted([good, bad])
+        share = abs(at_low) / (abs(at_low) + abs(at_high)) if np.isfinite(at_low) and np.isfinite(at_high) else 0.5
+        share = 0.5 if stalled >= 2 or not 0.0 < share < 1.0 else share
+        aim = low + share * span
+        aim += 0.2 * width if aim - low < high - aim else -0.2 * width
+        aim = float(np.clip(aim, low + 0.1 * min(width, span), high - 0.1 * min(width, span)))
+        value = slack(aim)
+        good, bad = ((aim, value), bad) if value <= 0.0 else (good, (aim, value))
+        stalled = stalled + 1 if abs(bad[0] - good[0]) > 0.5 * span else 0
+    return Critical("found", good[0], bad[0])

@@ -1,0 +1,167 @@
+"""The picture of a margin: the cost against the factor, and where nothing is feasible."""
+
+from __future__ import annotations
+
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.figures import style as look
+from sparserob_core.experiment.margin.search import FEASIBLE, Margin
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+LABELS = {
+    "disturbance": "factor on the disturbance set",
+    "parameters": "factor on the set of parameters",
+    "initial_state": "factor on the initial state",
+    "control": "factor on the control set",
+}
+
+
+def write_margin_figure(file: Path, found: Margin) -> None:
+    """Draw the curve of a margin into a PNG file, 200 dots per inch, which is complete or not there.
+
+    Raises `InputError` when matplotlib is missing, and when the file cannot be written.
+    """
+    look.require_matplotlib()
+    stream = BytesIO()
+    with look.style():
+        draw_margin(found).savefig(stream, format="png", dpi=200, metadata={"Software": None})
+    unfinished = file.with_name(f".{file.name}.tmp")
+    try:
+        unfinished.write_bytes(stream.getvalue())
+        unfinished.replace(file)
+    except OSError as error:
+        raise InputError(f"{file}: cannot be written: {error.strerror}") from error
+
+
+def draw_margin(found: Margin) -> Figure:
+    """Both bounds of the cost at every point, joined by a chord where the cost is convex in the factor, by a band where
+    it is only monotone; what is proven infeasible is hatched; the upper axis counts in the problem's own unit."""
+    figure, (ax,) = look.panels(1, 2.9)
+    proven = [point for point in found.curve if point.status in FEASIBLE]
+    factors = np.array([point.factor for point in proven])
+    upper, lower = (np.array([getattr(point, name) for point in proven]) for name in ("upper_bound", "lower_bound"))
+    convex = not (found.of == "parameters" or found.of.endswith(".from"))
+    ax.fill_between(
+        *_band(factors, lower, upper, found.sense == "largest"),
+        color=look.SKY,
+        alpha=0.0 if convex else 0.35,
+        linewidth=0,
+        zorder=1,
+        label=None if convex else "cost between points, by monotony",
+    )
+    ax.plot(
+        factors,
+        upper,
+        color=look.BLUE,
+        linewidth=1.4 if convex else 0.0,
+        marker="v",
+        markersize=4.5,
+        zorder=3,
+        label="certified upper bound",
+    )
+    ax.plot(
+        factors,
+        lower,
+        color=look.ORANGE,
+        linewidth=0,
+        marker="^",
+        markersize=4.5,
+        zorder=4,
+        label="certified lower bound",
+    )
+    others = [point.factor for point in found.curve if point.status not in FEASIBLE]
+    ax.set_ylim(*_view(np.concatenate([upper, lower])))
+    if others:
+        ax.plot(
+            others,
+            np.full(len(others), ax.get_ylim()[0]),
+            "x",
+            color=look.VERMILLION,
+            clip_on=False,
+            zorder=5,
+            label="nothing proven feasible",
+        )
+    _forbid(ax, found, np.array([point.factor for point in found.curve]))
+    ax.set_ylabel("least cost $J$")
+    ax.set_xlabel(_label(found.of))
+    _unit_axis(ax, found)
+    ax.set_title(found.title, pad=8)
+    figure.legend(
+        *ax.get_legend_handles_labels(), loc="outside lower center", ncols=2, columnspacing=1.6, handlelength=1.6
+    )
+    return figure
+
+
+def _band(factors: Array, lower: Array, upper: Array, rising: bool) -> tuple[Array, Array, Array]:
+    """Between two points the cost is monotone, so it lies between the lower bound at one and the upper bound at the
+    other: a certified band."""
+    x = np.repeat(factors, 2)[1:-1]
+    below, above = (lower[:-1], upper[1:]) if rising else (lower[1:], upper[:-1])
+    return x, np.repeat(below, 2), np.repeat(above, 2)
+
+
+def _label(of: str) -> str:
+    if of.endswith(".from"):
+        return f"start of the window of {of.removesuffix('.from')} [unit of time]"
+    return LABELS.get(of, f"factor on the set {of}")
+
+
+def _forbid(ax: Axes, found: Margin, factors: Array) -> None:
+    """The proven infeasible side, as a hatched band behind its edge."""
+    low, high = float(factors.min()), float(factors.max())
+    room = 0.12 * max(high - low, 1e-9)
+    left, right = low - 0.03 * (high - low), high + 0.03 * (high - low)
+    if found.infeasible is not None:
+        edge, critical = found.infeasible.factor, (found.lower + found.upper) / 2
+        left, right = (left, edge + room) if found.sense == "largest" else (max(edge - room, 0.0), right)
+        beyond = (edge, right) if found.sense == "largest" else (left, edge)
+        ax.axvspan(
+            *beyond,
+            facecolor=look.MIST,
+            edgecolor="#C4C4C4",
+            hatch="////",
+            linewidth=0,
+            zorder=0,
+            label="proven infeasible",
+        )
+        ax.axvline(critical, color=look.VERMILLION, linewidth=1.1, zorder=1, label=f"critical factor {critical:.7g}")
+    ax.set_xlim(left, right)
+
+
+def _unit_axis(ax: Axes, found: Margin) -> None:
+    """A second axis in the unit of the problem, where that is a multiple of the factor."""
+    share = found.amounts[0] / found.lower if np.isfinite(found.lower) and found.lower > 0 else np.nan
+    straight = (
+        found.curve
+        and np.isfinite(share)
+        and all(abs(point.amount - share * point.factor) <= 1e-9 * (1 + abs(point.amount)) for point in found.curve)
+    )
+    if not straight or found.quantity == "start of the window":
+        return
+    above = ax.secondary_xaxis(
+        "top", functions=(lambda x: share * np.asarray(x, dtype=float), lambda y: np.asarray(y, dtype=float) / share)
+    )
+    above.set_xlabel(_mathematics(found.quantity))
+    above.spines["top"].set_visible(True)
+
+
+def _mathematics(quantity: str) -> str:
+    for plain, drawn in (("|w_i|", "$|w_i|$"), ("|u_i|", "$|u_i|$"), ("|x_i(0)|", "$|x_i(0)|$")):
+        quantity = quantity.replace(plain, drawn)
+    return quantity
+
+
+def _view(values: Array) -> tuple[float, float]:
+    shown = values[np.isfinite(values)]
+    low, high = (float(shown.min()), float(shown.max())) if shown.size else (0.0, 1.0)
+    spread = max(high - low, 0.05 * abs(high), 1e-9)
+    return low - 0.08 * spread, high + 0.1 * spread

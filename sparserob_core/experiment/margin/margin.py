@@ -1,0 +1,152 @@
+"""How much of something a problem bears: the critical factor, certified from both sides, and the cost on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.assemble import assemble, name_of, tools_of
+from sparserob_core.experiment.config.load import Loaded, load_config
+from sparserob_core.experiment.config.problems import LinearKeys
+from sparserob_core.experiment.config.reader import write_yaml
+from sparserob_core.experiment.directory.artefacts import RunDirectory, create_directory, finite
+from sparserob_core.experiment.margin.scaling import scaling
+from sparserob_core.experiment.margin.search import Margin, Point, Search, Tell
+from sparserob_core.sip.methods.exchange import Exchange
+from sparserob_core.sip.relaxed.parametric import Factored
+
+__all__ = ["Margin", "Point", "margin", "margin_rows", "summary_of_margin"]
+
+
+def margin(
+    config: str | Path | Mapping[str, Any],
+    of: str = "disturbance",
+    overrides: Mapping[str, object] | Iterable[str] | None = None,
+    *,
+    tolerance: float = 1e-6,
+    curve: int = 0,
+    out: str | Path | None = None,
+    write: bool = False,
+    tell: Tell = lambda line: None,
+) -> Margin:
+    """The margin of an experiment: what ``sparserob margin CONFIG key=value ... --of OF`` does.
+
+    ``of``: ``disturbance``, ``parameters`` or ``initial_state`` (the largest factor that is feasible; sets are scaled
+    about their centre), ``path.0``, ``terminal.0`` or ``control`` (the smallest), ``path.0.from`` (the earliest start
+    of a window, in the unit of time). ``tolerance``: how close the two sides are to be, relative to the factor, or to 1
+    if that is larger (for a window to its end). ``curve``: the cost at so many factors on the feasible side, each by a
+    run of its own. ``out``: a new or empty directory for ``margin.json`` and ``margin.png``; with ``write`` and none
+    given it is ``runs/NAME-margin/STAMP-HASH``. ``tell`` hears of progress. Raises `InputError` when an argument or the
+    config is at fault.
+    """
+    if not hasattr(tolerance, "__float__") or not 1e-9 <= tolerance <= 0.1:
+        raise InputError(f"tolerance: expected a number from 1e-9 to 0.1, got {tolerance!r}")
+    if not hasattr(curve, "__index__") or curve < 0 or curve == 1:
+        raise InputError(f"curve: expected a number of points, 0 for none or at least 2, got {curve!r}")
+    loaded = load_config(config, overrides)
+    search = _search(loaded, str(of), float(tolerance), tell)
+    directory = None if out is None and not write else _directory(out, loaded, search.scaling.of)
+    found = search.margin(int(curve))
+    return found if directory is None else _written(directory, found)
+
+
+def summary_of_margin(found: Margin) -> dict[str, Any]:
+    """``margin.json``: every field but the directory; numbers that are not finite become null."""
+    summary: dict[str, Any] = finite(asdict(replace(found, directory=None)))
+    return {name: value for name, value in summary.items() if name != "directory"}
+
+
+def margin_rows(found: Margin) -> list[tuple[str, str]]:
+    """What a user wants to know of a margin, as rows of a table."""
+    rows = [
+        ("status", f"{found.status}: {found.message}"),
+        (f"{found.sense} factor", _between(found.lower, found.upper)),
+        (found.quantity, _between(*found.amounts)),
+    ]
+    for name, point in (("proven feasible", found.feasible), ("proven infeasible", found.infeasible)):
+        if point is not None:
+            cost = f", cost {point.upper_bound:.9g}" if np.isfinite(point.upper_bound) else ""
+            rows.append((name, f"at {point.factor:.9g}: {point.status}{cost}"))
+    return [*rows, ("seconds", f"{found.seconds:.3f}")]
+
+
+def _between(lower: float, upper: float) -> str:
+    if np.isnan(lower) and np.isnan(upper):
+        return "none"
+    if np.isposinf(upper):
+        return f"more than {lower:.9g}"
+    return f"{lower:.9g} to {upper:.9g}" if lower != upper else f"{lower:.9g}"
+
+
+def _search(loaded: Loaded, of: str, tolerance: float, tell: Tell) -> Search:
+    from sparserob_core.control.transcription.transcribe import transcribe
+
+    experiment = assemble(loaded)
+    problem, control, disturbance = experiment.problem, experiment.control, experiment.disturbance
+    if problem is None or control is None:
+        raise InputError(
+            "config: expected a control problem, whose sets can be scaled, got a semi-infinite program of another kind"
+        )
+    chosen = scaling(problem, of, *_positions(loaded, problem))
+    programs = Factored(lambda factor: transcribe(chosen.at(factor), control=control, disturbance=disturbance))
+    width = tolerance * (chosen.highest if of.endswith(".from") else 1.0)
+    return Search(experiment.title, programs, chosen, _method(loaded), tools_of(loaded), width, tell)
+
+
+def _positions(loaded: Loaded, problem: OptimalControlProblem) -> tuple[list[list[int]], list[list[int]]]:
+    """For every entry of ``path`` and of ``terminal`` in the config, the sets of the problem that it became: none, one
+    or several."""
+    factory = loaded.registry.build("problem", loaded.config.problem.name, loaded.config.problem.options)
+    if not isinstance(factory, LinearKeys):
+        return [[i] for i in range(len(problem.path))], [[i] for i in range(len(problem.terminal))]
+    states = factory.system.build().states
+    members = [[_restricts(one) for one in item.members(f"path.{i}", states)] for i, item in enumerate(factory.path)]
+    ends = [[_restricts(one) for one in item.ends(f"terminal.{i}", states)] for i, item in enumerate(factory.terminal)]
+    return _counted(members), _counted(ends)
+
+
+def _restricts(one: Any) -> bool:
+    """Whether a set or an equality is more than the whole space: a problem drops those that are not."""
+    if hasattr(one, "fixed"):
+        return bool(one.fixed.size)
+    flat = one.halfspaces()
+    return flat is None or flat[1].size > 0
+
+
+def _counted(kept: Sequence[Sequence[bool]]) -> list[list[int]]:
+    numbers = iter(range(sum(map(sum, kept))))
+    return [[next(numbers) for keep in entry if keep] for entry in kept]
+
+
+def _method(loaded: Loaded) -> Exchange:
+    """The exchange of the config, or one with its defaults: a margin asks what is feasible, not how another method
+    fares."""
+    entry = loaded.config.method
+    built = loaded.registry.build("method", entry.name, entry.options)
+    return built if isinstance(built, Exchange) else Exchange()
+
+
+def _directory(out: str | Path | None, loaded: Loaded, of: str) -> RunDirectory:
+    directory = create_directory(out, f"{name_of(loaded)}-margin", loaded.config.digest())
+    directory.write_text(
+        "config.yaml", write_yaml(loaded.config.plain(), f"The experiment whose margin of {of} was sought.")
+    )
+    return directory
+
+
+def _written(directory: RunDirectory, found: Margin) -> Margin:
+    """The figure is an extra: where it cannot be drawn, the numbers are there all the same."""
+    directory.write_json("margin.json", summary_of_margin(found))
+    if found.curve:
+        from sparserob_core.experiment.margin.figure import write_margin_figure
+
+        with suppress(InputError):
+            write_margin_figure(directory.path / "margin.png", found)
+    return replace(found, directory=directory.path)

@@ -1,0 +1,267 @@
+"""What a margin varies: one set or window of a problem, as a function of a single number."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias, final
+
+import numpy as np
+
+from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Ellipsoid, Equality, NormBall, Polytope
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.plugins.messages import nearest
+from sparserob_core.sip.convex_set import Array
+
+Sense: TypeAlias = Literal["largest", "smallest"]
+LARGEST = 1e6  # factors beyond are not looked at
+MOST_UNCERTAIN = 1024.0  # the same for factors on a set of parameters, whose matrices change with them
+POINT = 1e-6  # the factor of a curved set that stands for 0: such a set has an interior
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Scaling:
+    """``at(factor)`` is the problem with ``of`` changed by the factor; ``at(1)`` is the problem as it was, except for a
+    window's start.
+
+    ``sense``: whether the *largest* or the *smallest* feasible factor is asked for. ``affine``: the right-hand sides
+    and bounds of the program are affine in the factor, and nothing else depends on it. Factors are in ``[0, highest]``;
+    ``amount(factor)`` is what it comes to of ``quantity``.
+    """
+
+    of: str
+    sense: Sense
+    at: Callable[[float], OptimalControlProblem]
+    quantity: str
+    amount: Callable[[float], float]
+    affine: bool = True
+    highest: float = LARGEST
+    nested: bool = True
+    """Whether a feasible factor makes every smaller (for the largest) or greater one (for the smallest) feasible
+    too."""
+
+
+def scaling(
+    problem: OptimalControlProblem, of: str, members: Sequence[Sequence[int]], ends: Sequence[Sequence[int]]
+) -> Scaling:
+    """The scaling named ``of``. ``members`` and ``ends``: for every entry of ``path`` and of ``terminal`` in a config,
+    its positions in the problem.
+
+    Raises `InputError` when there is no such thing to vary, with the nearest name, or when it cannot be scaled.
+    """
+    choices = dict(_choices(problem, members, ends))
+    if of in choices:
+        return choices[of]()
+    absent = {
+        "disturbance": problem.disturbance,
+        "parameters": problem.system.parameters,
+        "path": problem.path,
+        "terminal": problem.terminal,
+    }
+    part = of.split(".", maxsplit=1)[0]
+    if part in absent and not absent[part]:
+        raise InputError(
+            f"of: '{of}' cannot be varied, the problem has no {part}; expected one of {', '.join(sorted(choices))}"
+        )
+    raise InputError(f"of: expected what is to be varied, got '{of}'{nearest(of, choices)}")
+
+
+def _choices(
+    problem: OptimalControlProblem, members: Sequence[Sequence[int]], ends: Sequence[Sequence[int]]
+) -> Iterator[tuple[str, Callable[[], Scaling]]]:
+    if problem.disturbance is not None:
+        yield "disturbance", lambda: _disturbance(problem)
+    if problem.system.parameters is not None:
+        yield "parameters", lambda: _parameters(problem)
+    yield "initial_state", lambda: _initial_state(problem)
+    yield "control", lambda: _control(problem)
+    for i, positions in enumerate(members):
+        if positions:
+            yield f"path.{i}", lambda i=i, positions=positions: _path(problem, f"path.{i}", positions)  # type: ignore[misc]
+            yield f"path.{i}.from", lambda i=i, positions=positions: _window(problem, f"path.{i}.from", positions)  # type: ignore[misc]
+    for i, positions in enumerate(ends):
+        if positions:
+            yield f"terminal.{i}", lambda i=i, positions=positions: _terminal(problem, f"terminal.{i}", positions)  # type: ignore[misc]
+
+
+def _disturbance(problem: OptimalControlProblem) -> Scaling:
+    bound = problem.disturbance
+    assert bound is not None
+    resized = _resizing("disturbance", bound)
+    return Scaling(
+        "disturbance",
+        "largest",
+        lambda f: replace(problem, disturbance=resized(f)),
+        "largest |w_i|",
+        lambda f: _reach(resized(f)),
+    )
+
+
+def _parameters(problem: OptimalControlProblem) -> Scaling:
+    bound = problem.system.parameters
+    assert bound is not None
+    resized = _resizing("parameters", bound)
+    return Scaling(
+        "parameters",
+        "largest",
+        lambda f: replace(problem, system=replace(problem.system, parameters=resized(f))),
+        "largest half-width of a parameter",
+        _times(_half_width(bound)),
+        affine=False,
+        highest=MOST_UNCERTAIN,
+    )
+
+
+def _initial_state(problem: OptimalControlProblem) -> Scaling:
+    state = np.asarray(problem.initial_state, dtype=float)
+    if not state.any():
+        raise InputError("of: initial_state is the origin, which no factor moves; expected a state that is not 0")
+    return Scaling(
+        "initial_state",
+        "largest",
+        lambda f: replace(problem, initial_state=f * state),
+        "largest |x_i(0)|",
+        _times(float(np.abs(state).max())),
+        nested=False,
+    )
+
+
+def _control(problem: OptimalControlProblem) -> Scaling:
+    paths = _entries(problem)
+    named = [i for i, entry in enumerate(paths) if entry.name == "control"]
+    if named:  # where the rate is the control, the bounds of the control itself are constraints of the augmented state
+        return _path(problem, "control", named)
+    resized = _resizing("control", problem.control)
+    return Scaling(
+        "control",
+        "smallest",
+        lambda f: replace(problem, control=resized(f)),
+        "largest |u_i|",
+        lambda f: _reach(resized(f)),
+    )
+
+
+def _path(problem: OptimalControlProblem, of: str, positions: Sequence[int]) -> Scaling:
+    paths = _entries(problem)
+    resized = {i: _resizing(of, paths[i].set) for i in positions}
+    return Scaling(
+        of,
+        "smallest",
+        lambda f: replace(
+            problem,
+            path=[replace(entry, set=resized[i](f)) if i in resized else entry for i, entry in enumerate(paths)],
+        ),
+        "largest half-width",
+        _times(max(_half_width(paths[i].set) for i in positions)),
+    )
+
+
+def _terminal(problem: OptimalControlProblem, of: str, positions: Sequence[int]) -> Scaling:
+    ends = list(problem.terminal)
+    sets = {i: end for i in positions if not isinstance(end := ends[i], Equality)}
+    if len(sets) < len(positions):
+        raise InputError(f"of: {of} fixes final values, which no factor enlarges; expected a set")
+    resized = {i: _resizing(of, end) for i, end in sets.items()}
+    return Scaling(
+        of,
+        "smallest",
+        lambda f: replace(problem, terminal=[resized[i](f) if i in resized else end for i, end in enumerate(ends)]),
+        "largest half-width",
+        _times(max(map(_half_width, sets.values()))),
+    )
+
+
+def _window(problem: OptimalControlProblem, of: str, positions: Sequence[int]) -> Scaling:
+    paths = _entries(problem)
+    latest = min(problem.horizon if paths[i].stop is None else float(paths[i].stop or 0.0) for i in positions)
+    return Scaling(
+        of,
+        "smallest",
+        lambda start: replace(
+            problem, path=[replace(entry, start=start) if i in positions else entry for i, entry in enumerate(paths)]
+        ),
+        "start of the window",
+        _times(1.0),
+        affine=False,
+        highest=latest,
+    )
+
+
+def _entries(problem: OptimalControlProblem) -> list[PathConstraint]:
+    return [entry for entry in problem.path if isinstance(entry, PathConstraint)]
+
+
+def _resizing(of: str, bound: ConvexSet) -> Callable[[float], ConvexSet]:
+    """The set scaled by a factor about its centre; raises `InputError` for a single point, and for a set without a
+    centre."""
+    centre = centre_of(of, bound)
+    reach = bound.support(np.vstack([np.eye(bound.dimension), -np.eye(bound.dimension)]))
+    if not (np.isinf(reach) | (reach != np.concatenate([centre, -centre]))).any():
+        raise InputError(f"of: {of} is a single point, which no factor enlarges; expected a set with an extent")
+    return lambda factor: resized(bound, centre, factor)
+
+
+def centre_of(of: str, bound: ConvexSet) -> Array:
+    """What a set ``(d,)`` is scaled about: the middle of its bounding box where it is bounded, 0 where it is not; an
+    interior point of a polytope that does not hold that. Raises `InputError` when 0 is not inside a side that is free
+    on one side only."""
+    axes = np.eye(bound.dimension)
+    low, high = -bound.support(-axes), bound.support(axes)
+    bounded = np.isfinite(low) & np.isfinite(high)
+    middle = np.where(bounded, (np.where(bounded, low, 0.0) + np.where(bounded, high, 0.0)) / 2, 0.0)
+    if bound.violation(middle) <= 0.0:
+        return np.asarray(middle, dtype=float)
+    if isinstance(bound, Polytope) and bounded.all():
+        return bound.interior_point()
+    raise InputError(
+        f"of: {of} has no centre to be enlarged about: it is free on a side, and 0 is outside of it; give it bounds on"
+        " both sides"
+    )
+
+
+def resized(bound: ConvexSet, centre: Array, factor: float) -> ConvexSet:
+    """``centre + factor (bound - centre)``; a curved set stays curved, however small the factor."""
+    match bound:
+        case Box():
+            return Box(_moved(bound.lower, centre, factor), _moved(bound.upper, centre, factor))
+        case Polytope():
+            return Polytope(bound.H, bound.H @ centre + factor * (bound.h - bound.H @ centre))
+        case Ellipsoid():
+            return Ellipsoid(bound.centre, max(factor, POINT) ** 2 * bound.shape)
+        case NormBall():
+            return NormBall(
+                bound.p, max(factor, POINT if bound.halfspaces() is None else 0.0) * bound.radius, bound.centre
+            )
+        case Cylinder():
+            return Cylinder(resized(bound.base, centre[: bound.base.dimension], factor), bound.size)
+    raise InputError(
+        f"of: a set of the kind {type(bound).__name__} cannot be scaled; expected a box, a polytope, an ellipsoid or a"
+        " norm ball"
+    )
+
+
+def _moved(bounds: Array, centre: Array, factor: float) -> Array:
+    finite = np.isfinite(bounds)
+    return np.where(finite, centre + factor * (np.where(finite, bounds, 0.0) - centre), bounds)
+
+
+def _reach(bound: ConvexSet) -> float:
+    return float(bound.reach(np.eye(bound.dimension)).max())
+
+
+def _times(base: float) -> Callable[[float], float]:
+    return lambda factor: factor * base
+
+
+def _half_width(bound: ConvexSet) -> float:
+    """Of the widest side that is bounded; where a set is free on one side of every coordinate, the largest bound."""
+    axes = np.eye(bound.dimension)
+    sides = np.stack([bound.support(axes), bound.support(-axes)])
+    widths = sides.mean(axis=0)
+    return (
+        float(widths[np.isfinite(widths)].max(initial=0.0))
+        or float(np.abs(sides[np.isfinite(sides)]).max(initial=0.0))
+        or 1.0
+    )

@@ -1,0 +1,190 @@
+"""Both sides of a critical factor, each proven by an ordinary run, and the cost on the feasible side."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, TypeAlias, final
+
+import numpy as np
+
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.margin.critical import Critical, critical_factor
+from sparserob_core.experiment.margin.scaling import Scaling, Sense
+from sparserob_core.sip.method import Tools
+from sparserob_core.sip.methods.exchange import Exchange
+from sparserob_core.sip.relaxed.parametric import Factored
+from sparserob_core.sip.result import Status
+
+Tell: TypeAlias = Callable[[str], None]
+Answer: TypeAlias = Literal["certified", "unbounded", "infeasible", "undecided"]
+FEASIBLE: tuple[Status, ...] = ("certified", "verified")
+# how far from the critical factor a run is tried, in widths, until its answer is proven
+STEPS = (
+    0.25,
+    1.0,
+    4.0,
+    16.0,
+    64.0,
+)
+
+
+@final
+@dataclass(frozen=True)
+class Point:
+    """An ordinary run at one factor: what was proven of it, and the bounds of the cost (infinite where infeasible)."""
+
+    factor: float
+    amount: float
+    status: Status
+    message: str
+    lower_bound: float
+    upper_bound: float
+
+
+@final
+@dataclass(frozen=True)
+class Margin:
+    """The critical factor lies in ``[lower, upper]``.
+
+    Where the ``sense`` is *largest* (``disturbance``, ``parameters``, ``initial_state``) there is a proven feasible
+    control at ``lower``, and a checked Farkas certificate that there is none at ``upper``; where it is *smallest* (sets
+    that are enlarged, starts of windows) it is the other way round. ``feasible`` and ``infeasible`` are the two runs
+    that say so. ``quantity`` is what a factor comes to in the units of the problem: ``amounts`` of it at ``lower`` and
+    at ``upper``. ``status``: ``certified`` (both sides are proven); ``unbounded`` (feasible as far as was looked: up to
+    the factor ``lower``, or for the smallest down to 0); ``infeasible`` (at every factor; ``message`` says why);
+    ``undecided`` (a side could not be proven). ``curve``: runs on the feasible side, by factor. ``directory``: where it
+    was written to, if it was.
+    """
+
+    title: str
+    of: str
+    sense: Sense
+    quantity: str
+    status: Answer
+    message: str
+    lower: float
+    upper: float
+    amounts: tuple[float, float]
+    feasible: Point | None = None
+    infeasible: Point | None = None
+    curve: tuple[Point, ...] = ()
+    seconds: float = 0.0
+    directory: Path | None = None
+
+
+@final
+@dataclass(eq=False)
+class Search:
+    """One search. ``width``: how close the two sides are to be, relative to the factor if that is above 1."""
+
+    title: str
+    programs: Factored
+    scaling: Scaling
+    method: Exchange
+    tools: Tools
+    width: float
+    tell: Tell
+
+    def margin(self, count: int) -> Margin:
+        """The margin, with a curve of ``count`` points."""
+        started = time.perf_counter()
+        self.tell(f"looking for the {self.scaling.sense} factor of {self.scaling.of}")
+        found = critical_factor(self.programs, self.scaling, self.tools, self.width, self.tell)
+        status, message, feasible, infeasible = self._sides(found)
+        curve = self._curve(feasible, status, count) if feasible is not None else ()
+        inner, outer = feasible.factor if feasible else np.nan, infeasible.factor if infeasible else np.nan
+        if status == "unbounded":
+            outer = np.inf if self.scaling.sense == "largest" else 0.0
+        lower, upper = (inner, outer) if self.scaling.sense == "largest" else (outer, inner)
+        amounts = tuple(self.scaling.amount(f) if np.isfinite(f) else f for f in (lower, upper))
+        return Margin(
+            title=self.title,
+            of=self.scaling.of,
+            sense=self.scaling.sense,
+            quantity=self.scaling.quantity,
+            status=status,
+            message=message,
+            lower=lower,
+            upper=upper,
+            amounts=(amounts[0], amounts[1]),
+            feasible=feasible,
+            infeasible=infeasible,
+            curve=curve,
+            seconds=time.perf_counter() - started,
+        )
+
+    def _sides(self, found: Critical) -> tuple[Answer, str, Point | None, Point | None]:
+        largest = self.scaling.sense == "largest"
+        if found.status == "unknown":
+            return "undecided", f"no critical factor was found: {found.message}", None, None
+        if found.status == "never":
+            return self._never(found)
+        if found.status == "always":
+            feasible = self.run(found.good)
+            words = (
+                f"feasible at the factor {found.good:g} and at every smaller one"
+                if largest
+                else "feasible at the smallest there is"
+            )
+            proven = feasible.status in FEASIBLE
+            return ("unbounded" if proven else "undecided"), words if proven else feasible.message, feasible, None
+        outward = 1.0 if largest else -1.0
+        good, bad = self._proven(found.good, -outward, FEASIBLE), self._proven(found.bad, outward, ("infeasible",))
+        if good is None or bad is None:
+            return (
+                "undecided",
+                f"the critical factor seems to be {found.good:.9g}, but one side of it could not be proven",
+                good,
+                bad,
+            )
+        return "certified", f"beyond it: {bad.message}", good, bad
+
+    def _never(self, found: Critical) -> tuple[Answer, str, Point | None, Point | None]:
+        """Nothing is feasible: the run at the kindest factor says why."""
+        kindest = {"largest": 0.0, "smallest": self.scaling.highest}[self.scaling.sense] if self.scaling.nested else 1.0
+        refused = self.run(kindest)
+        if refused.status != "infeasible":
+            words = (
+                f"nothing seems to be feasible, but the run at the factor {kindest:g} is {refused.status}:"
+                f" {refused.message}"
+            )
+            return "undecided", words, None, None
+        at = f"even at {kindest:g} " if self.scaling.nested else ""
+        return "infeasible", f"{at}nothing is feasible: {refused.message}", None, refused
+
+    def _proven(self, factor: float, outward: float, wanted: tuple[Status, ...]) -> Point | None:
+        """The nearest run beside the critical factor that proves what is wanted of that side."""
+        width = self.width * (max(1.0, abs(factor)) if self.scaling.affine else 1.0)
+        for step in STEPS:
+            beside = float(np.clip(factor + outward * step * width, 0.0, self.scaling.highest))
+            point = self.run(beside)
+            if point.status in wanted:
+                return point
+        return None
+
+    def run(self, factor: float) -> Point:
+        """An ordinary run at a factor; a factor at which the problem is not defined fails."""
+        try:
+            result = self.method.solve(self.programs.program(factor), self.tools)
+        except InputError as error:
+            return Point(factor, self.scaling.amount(factor), "failed", str(error), -np.inf, np.inf)
+        self.tell(f"{self.scaling.of} at {factor:.9g}: {result.status}")
+        return Point(
+            factor, self.scaling.amount(factor), result.status, result.message, result.lower_bound, result.upper_bound
+        )
+
+    def _curve(self, feasible: Point, status: Answer, count: int) -> tuple[Point, ...]:
+        """Runs from the feasible side of the critical factor to no uncertainty, or to a set twice as large."""
+        if count == 0:
+            return ()
+        if self.scaling.sense == "largest":
+            ends = (0.0, 2.0 if status == "unbounded" else feasible.factor)
+        elif self.scaling.affine:
+            ends = (feasible.factor, max(1.0, 2.0 * feasible.factor))
+        else:
+            ends = (feasible.factor, self.scaling.highest)
+        factors = np.linspace(*ends, count)
+        return tuple(feasible if factor == feasible.factor else self.run(float(factor)) for factor in factors)

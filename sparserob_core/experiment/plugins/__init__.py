@@ -1,0 +1,1 @@
+"""Components by name: hooks, records, discovery, and the built-in ones."""

@@ -1,0 +1,164 @@
+"""What is wrong with an input, one sentence per key: pydantic's findings in the words of this project."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, TypeAlias, get_args
+
+from pydantic import BaseModel
+
+from sparserob_core.errors import SparseRobError
+
+if TYPE_CHECKING:
+    from pydantic import ValidationError
+
+Path: TypeAlias = tuple[str | int, ...]
+SHOWN = 60
+MUST_BE = {
+    "model_type": "a mapping",
+    "model_attributes_type": "a mapping",
+    "dict_type": "a mapping",
+    "list_type": "a list",
+    "tuple_type": "a list",
+    "string_type": "text",
+    "int_type": "a whole number",
+    "int_parsing": "a whole number",
+    "int_from_float": "a whole number",
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "bool_type": "true or false",
+    "bool_parsing": "true or false",
+    "finite_number": "a finite number",
+}
+
+
+@dataclass(frozen=True)
+class Complaint:
+    """``path`` of the key at fault, and the sentence about it."""
+
+    path: Path
+    message: str
+
+    def under(self, prefix: Path) -> Complaint:
+        """The same complaint about a value that sits at ``prefix``."""
+        return replace(self, path=(*prefix, *self.path))
+
+    def __str__(self) -> str:
+        return f"{dotted(self.path)}: {self.message}" if self.path else self.message
+
+
+def dotted(path: Path) -> str:
+    """``('path', 0, 'from')`` as ``path.0.from``."""
+    return ".".join(str(step) for step in path)
+
+
+def shown(value: object) -> str:
+    """A short text of a value."""
+    text = repr(value)
+    return text if len(text) <= SHOWN else text[: SHOWN - 3] + "..."
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """``; did you mean 'x'? (known: ...)``, with the nearest of the known names first."""
+    names = sorted(known)
+    if not names:
+        return "; there are none"
+    close = difflib.get_close_matches(str(name).lower(), names, n=2, cutoff=0.6)
+    guess = "; did you mean " + " or ".join(repr(match) for match in close) + "?" if close else ";"
+    return f"{guess} (known: {', '.join(names)})" if close else f"; known: {', '.join(names)}"
+
+
+def complaints(error: ValidationError, model: type[BaseModel], data: object) -> list[Complaint]:
+    """One complaint per key; what several members of a union say of one key is joined by *or*."""
+    found: dict[Path, list[str]] = {}
+    for item in error.errors(include_url=False):
+        path = visible(item["loc"], data, missing=item["type"] == "missing")
+        sentences = found.setdefault(path, [])
+        sentence = _sentence(dict(item), model)
+        if sentence not in sentences:
+            sentences.append(sentence)
+    return [Complaint(path, " or ".join(_without_repeated_got(sentences))) for path, sentences in found.items()]
+
+
+def visible(loc: Path, data: object, missing: bool = False) -> Path:
+    """The steps of ``loc`` that exist in the data: pydantic adds the names of union members."""
+    path: list[str | int] = []
+    for position, step in enumerate(loc):
+        last = position == len(loc) - 1
+        if isinstance(data, Mapping) and (step in data or (last and missing)):
+            data = data.get(step)
+        elif isinstance(data, list | tuple) and isinstance(step, int) and step < len(data):
+            data = data[step]
+        elif data is not None:
+            continue
+        path.append(step)
+    return tuple(path)
+
+
+def _sentence(item: dict[str, Any], model: type[BaseModel]) -> str:
+    match item["type"]:
+        case "missing":
+            return "missing, and it has no default"
+        case "extra_forbidden":
+            known = _known_keys(model, item["loc"][:-1])
+            return f"unknown key{nearest(str(item['loc'][-1]), known)}" if known else "unknown key; it has no options"
+        case "value_error":
+            cause = item.get("ctx", {}).get("error")
+            said = str(cause) if isinstance(cause, SparseRobError) else str(item["msg"]).removeprefix("Value error, ")
+            return said if "got" in said else f"{said} (got {shown(item['input'])})"
+        case kind if kind in MUST_BE:
+            return f"must be {MUST_BE[kind]} (got {shown(item['input'])})"
+        case _:
+            said = str(item["msg"]).replace("Input should", "should", 1).replace("should be", "must be", 1)
+            return f"{said} (got {shown(item['input'])})"
+
+
+def _without_repeated_got(sentences: list[str]) -> list[str]:
+    *first, last = sentences
+    tail = last[last.rfind(" (got ") :] if " (got " in last else ""
+    return [sentence.removesuffix(tail) for sentence in first] + [last]
+
+
+def _known_keys(model: type[BaseModel], loc: Path) -> set[str]:
+    models = {model}
+    for step in loc:
+        named = {inner for inner in models if inner.__name__ == step}
+        inner = {
+            found
+            for outer in models
+            for name, field in outer.model_fields.items()
+            if step in {name, field.alias}
+            for found in models_in(field.annotation)
+        }
+        models = named or inner or models
+    return {field.alias or name for found in models for name, field in found.model_fields.items()}
+
+
+def models_in(annotation: object) -> Iterator[type[BaseModel]]:
+    """Every pydantic model inside a type such as ``list[Window | None]``."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for argument in get_args(annotation):
+        yield from models_in(argument)
+
+
+def malformed(data: object, path: Path = (), above: tuple[int, ...] = ()) -> Iterator[Complaint]:
+    """Numbers that are not finite, keys that are not text, and lists that contain themselves."""
+    if id(data) in above:
+        yield Complaint(path, "contains itself; a config is a finite tree")
+    elif isinstance(data, float) and not math.isfinite(data):
+        yield Complaint(path, f"must be a finite number (got {data}); write null for a side that is free")
+    elif isinstance(data, Mapping):
+        for key, value in data.items():
+            if not isinstance(key, str):
+                yield Complaint((*path, str(key)), f"a key must be text (got {shown(key)})")
+            else:
+                yield from malformed(value, (*path, key), (*above, id(data)))
+    elif isinstance(data, list | tuple):
+        for position, value in enumerate(data):
+            yield from malformed(value, (*path, position), (*above, id(data)))
+    elif not isinstance(data, str | int | float | None):
+        yield Complaint(path, f"must be a number, a text, a list or a mapping (got {shown(data)})")

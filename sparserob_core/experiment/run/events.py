@@ -1,0 +1,145 @@
+"""What a run tells its observers, and how it tells them without being disturbed."""
+
+from __future__ import annotations
+
+import logging
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, final
+
+from sparserob_core.sip.events import EvaluationsFinished, Event, ProofProgress, RoundFinished
+
+if TYPE_CHECKING:
+    from sparserob_core.control.problem.problem import OptimalControlProblem
+    from sparserob_core.experiment.run.inspection import Inspection
+    from sparserob_core.sip.program import SemiInfiniteProgram
+    from sparserob_core.sip.result import Result
+
+__all__ = [
+    "Broadcast",
+    "EvaluationsFinished",
+    "Event",
+    "Observer",
+    "ProofProgress",
+    "RoundFinished",
+    "RunFinished",
+    "RunStarted",
+]
+
+logger = logging.getLogger("sparserob")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RunStarted(Event):
+    """A run begins: its title, its directory, what is to be solved, and whether the terminal is to be left alone
+    (``quiet``).
+
+    Always the first event. ``inspection`` answers what an observer wants to know beside the events, on a copy of its
+    own; ``None`` where there is none.
+    """
+
+    title: str
+    directory: Path | None
+    problem: OptimalControlProblem | None
+    program: SemiInfiniteProgram
+    quiet: bool = False
+    inspection: Inspection | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RunFinished(Event):
+    """A run is over, whether well or not; always the last event. ``result`` is ``None`` when it was interrupted or an
+    error ended it."""
+
+    status: str
+    message: str
+    seconds: float
+    result: Result | None = None
+
+
+class Observer(ABC):
+    """Watches a run. It hears `RunStarted` first and `RunFinished` last, each once, and in between whatever happens, on
+    the solver's thread: what takes long belongs into a thread or a process of its own, begun at `RunStarted`."""
+
+    @abstractmethod
+    def receive(self, event: Event) -> None:
+        """Take note of an event; ignore those of unknown type. Whatever this raises only detaches the observer."""
+
+    def close(self) -> None:  # noqa: B027  most hold nothing
+        """Let go of files, threads and the terminal: called once, after `RunFinished`, or when the observer is detached
+        before it."""
+
+
+@final
+class Broadcast:
+    """Passes every event on to every observer; one that raises is detached with one warning, and the run goes on.
+
+    Everybody who heard a run begin hears it end, once, and is closed; nobody hears anything after that. An interrupt
+    from the keyboard is not the observer's failure, and goes through, at the end of a run after all have heard it.
+    """
+
+    def __init__(self, observers: Iterable[tuple[str, Observer]]) -> None:
+        self._observers = [_Listener(name, observer) for name, observer in observers]
+
+    def __call__(self, event: Event) -> None:
+        last, interrupt = isinstance(event, RunFinished), None
+        for listener in tuple(self._observers):
+            try:
+                if not listener.hear(event):
+                    self._observers.remove(listener)
+            except KeyboardInterrupt as pressed:
+                if not last:
+                    raise
+                interrupt = pressed
+        if last:
+            self._observers.clear()
+        if interrupt is not None:
+            raise interrupt
+
+
+@final
+class _Listener:
+    """One observer of one run."""
+
+    def __init__(self, name: str, observer: Observer) -> None:
+        self.name, self.observer, self.began = name, observer, False
+
+    def hear(self, event: Event) -> bool:
+        """Whether the observer is to hear of further events."""
+        last = isinstance(event, RunFinished)
+        self.began |= isinstance(event, RunStarted)
+        try:
+            if self.began or not last:
+                self.observer.receive(event)
+        except (Exception, SystemExit) as error:  # noqa: BLE001  an observer must not hurt the run
+            self._warn(error)
+            self._close(quietly=True)
+            return False
+        finally:
+            if last:
+                self._close()
+        return not last
+
+    def _close(self, quietly: bool = False) -> None:
+        observer, self.observer = self.observer, _DEAF
+        try:
+            observer.close()
+        except (Exception, SystemExit) as error:  # noqa: BLE001  as above
+            if not quietly:
+                self._warn(error)
+
+    def _warn(self, error: BaseException) -> None:
+        logger.warning("observer '%s' is detached: %s: %s", self.name, type(error).__name__, error)
+
+
+@final
+class _Deaf(Observer):
+    """In the place of an observer that was closed."""
+
+    def receive(self, event: Event) -> None:
+        """Nothing."""
+
+
+_DEAF = _Deaf()

@@ -1,0 +1,135 @@
+"""What an observer may ask about the run that it watches, answered from objects of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.assemble import Experiment, assemble, tools_of
+from sparserob_core.sip.convex_set import Array, Box
+
+if TYPE_CHECKING:
+    from sparserob_core.control.problem.problem import OptimalControlProblem
+    from sparserob_core.experiment.config.load import Loaded
+    from sparserob_core.experiment.figures.figure_data import FigureData
+    from sparserob_core.sip.program import SemiInfiniteProgram
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class RelaxedValue:
+    """``g`` over tuples of indices: ``at`` maps ``slots (D, width)`` to a number, ``+inf`` where the relaxed program is
+    infeasible.
+
+    ``weights()`` are the multipliers of the constraints at every index ``(D,)`` in the last evaluation. ``slot`` is the
+    box ``(width,)`` of one index, ``names`` say what its coordinates are: ``t``, ``w1`` ..., ``p1`` ..., or ``xi1`` ...
+    """
+
+    at: Callable[[Array], float]
+    weights: Callable[[], Array]
+    slot: Box
+    names: tuple[str, ...]
+
+
+@final
+class Inspection:
+    """Questions about an experiment. Every answer comes from a program that was built anew, so that asking cannot
+    change what the method does; nothing is built before the first question."""
+
+    def __init__(self, loaded: Loaded) -> None:
+        self._loaded = loaded
+
+    @staticmethod
+    def read(directory: Path) -> Inspection:
+        """The same from the directory of a run, finished or not; raises `InputError` when it is none."""
+        from sparserob_core.experiment.config.load import load_config
+
+        if not (directory / "config.yaml").is_file():
+            raise InputError(f"{directory}: expected the directory of a run, got one without config.yaml")
+        return Inspection(load_config(directory / "config.yaml"))
+
+    @property
+    def config(self) -> Mapping[str, Any]:
+        """The resolved config, as mappings, lists, numbers and text."""
+        return self._loaded.config.plain()
+
+    @property
+    def program(self) -> SemiInfiniteProgram:
+        """The semi-infinite program."""
+        return self._experiment.program
+
+    @property
+    def problem(self) -> OptimalControlProblem | None:
+        """The control problem; ``None`` for a program of another kind."""
+        return self._experiment.problem
+
+    @property
+    def literal(self) -> bool:
+        """Whether an index of the method's tuples carries the coefficients of the disturbance."""
+        method = self._loaded.config.method
+        return method.name == "sparserob" and method.options.get("formulation") == "literal"
+
+    def picture(self, decision: Array, active_times: Array | None = None) -> FigureData:
+        """Control, nominal states, worst-case tube and walls at a decision ``(m N,)``; raises `InputError` for a
+        program that is no control problem."""
+        from sparserob_core.experiment.figures.drawing import figure_data
+
+        control = self._experiment.control
+        theta = decision if control is None else np.asarray(decision, dtype=float).reshape(-1, control.functions)
+        return figure_data(self._experiment, theta, np.empty(0) if active_times is None else active_times, (), None)
+
+    def worst_cases(self, decision: Array) -> dict[str, Array]:
+        """The worst parameter and disturbance of every state constraint at a decision, and the states that they cause,
+        as ``adversary.npz`` has them: ``names (f,)``, ``violations (f,)``, ``times (f,)``, ``state_times (T,)``,
+        ``states (f, d, T)``, ...; ``{}`` without any.
+        """
+        from sparserob_core.experiment.directory.adversary import adversaries
+
+        return adversaries(self._experiment, decision)
+
+    def relaxed_value(self, count: int, epsilon: float) -> RelaxedValue:
+        """``g(epsilon; .)`` over tuples of ``count`` indices in the method's formulation, by a relaxed program of its
+        own.
+
+        Raises `InputError` when there is no constraint family."""
+        from sparserob_core.sip.relaxed.relaxed import RelaxedProgram
+        from sparserob_core.sip.relaxed.tuples import TupleValue, imposed_program
+
+        program, tools = imposed_program(self.program, "literal" if self.literal else "reduced"), tools_of(self._loaded)
+        if not program.families:
+            raise InputError("families: expected at least one constraint family, got none")
+        value = TupleValue(program, RelaxedProgram(program, tools.solver, tools.regulariser), count)
+        value.epsilon = epsilon if tools.regulariser is not None and np.isfinite(epsilon) else 0.0
+        per_index = sum(family.rows(family.index_set.lower[np.newaxis])[1].shape[1] for family in program.families)
+
+        def weights() -> Array:
+            return np.bincount(value.imposed.positions // per_index, value.imposed.multipliers, count).astype(float)
+
+        return RelaxedValue(
+            lambda slots: value.at(np.asarray(slots, dtype=float).ravel()),
+            weights,
+            value.layout.slot,
+            self.names(value.layout.slot.dimension),
+        )
+
+    def names(self, width: int) -> tuple[str, ...]:
+        """What the ``width`` coordinates of one index are called: ``t``, ``w1`` ... (coefficients of the disturbance),
+        ``p1`` ..., ``z1`` ... (a direction), or ``xi1`` ... where there is no control problem."""
+        problem = self._experiment.problem
+        if problem is None:
+            return tuple(f"xi{k + 1}" for k in range(width))
+        parameters = tuple(f"p{k + 1}" for k in range(problem.system.parameter_count))
+        rest = width - 1 - len(parameters)
+        if self.literal:  # as LiteralConstraint has them: time, coefficients, then the rest of the reduced index
+            return ("t", *(f"w{k + 1}" for k in range(rest)), *parameters)
+        return ("t", *parameters, *(f"z{k + 1}" for k in range(rest)))
+
+    @cached_property
+    def _experiment(self) -> Experiment:
+        return assemble(self._loaded)

@@ -1,0 +1,105 @@
+"""What a run writes down: its rounds as they come, and the outcome, or how far it got."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from sparserob_core.errors import InputError, SparseRobError
+from sparserob_core.experiment.assemble import Experiment
+from sparserob_core.experiment.directory.adversary import FILE as ADVERSARY
+from sparserob_core.experiment.directory.adversary import adversaries
+from sparserob_core.experiment.directory.artefacts import RunDirectory, trace_columns
+from sparserob_core.experiment.directory.certificate import certificate
+from sparserob_core.experiment.directory.record import arrays_of, control_of, summary_of, versions
+from sparserob_core.experiment.directory.rounds import round_arrays
+from sparserob_core.experiment.run.events import Event, Observer, RoundFinished
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.result import Result
+
+
+@final
+class Journal(Observer):
+    """Keeps the rounds, so that a run that ends early leaves them, and writes everything down."""
+
+    def __init__(self, directory: RunDirectory, experiment: Experiment) -> None:
+        self.directory, self.experiment = directory, experiment
+        self.rounds: list[RoundFinished] = []
+
+    def receive(self, event: Event) -> None:
+        """Keep every round."""
+        if isinstance(event, RoundFinished):
+            self.rounds.append(event)
+
+    def record(self, result: Result) -> tuple[Array | None, dict[str, Any]]:
+        """Write ``result.json``; returns the control ``(m, K)`` and the contents."""
+        control = control_of(result, self.experiment.program, self.experiment.control)
+        config = self.experiment.loaded.config
+        summary = {
+            "title": self.experiment.title,
+            **summary_of(result, control, self.experiment.control),
+            "seed": config.seed,
+            "versions": versions(),
+            "config": config.digest(),
+        }
+        self.directory.write_json("result.json", summary)
+        return control, summary
+
+    def record_unfinished(self, message: str, seconds: float) -> None:
+        """Write how far a run got that ended early."""
+        last = self.rounds[-1] if self.rounds else None
+        result = Result(status="failed", message=message, history=tuple(self.rounds), seconds=seconds)
+        if last is not None:
+            result = replace(result, lower_bound=last.lower_bound, upper_bound=last.upper_bound, epsilon=last.epsilon)
+        try:
+            self.record(result)
+            self.directory.write_arrays("trace.npz", trace_columns(self.rounds))
+        except SparseRobError:
+            return  # the error that ended the run is the one to be told
+
+    def finish(self, result: Result, figures: bool) -> tuple[Array | None, dict[str, Any], Sequence[str]]:
+        """Write the outcome; returns the control ``(m, K)``, what ``result.json`` holds, and what could not be
+        drawn."""
+        experiment, write = self.experiment, self.directory
+        control, summary = self.record(result)
+        write.write_arrays("solution.npz", arrays_of(result, experiment.program, experiment.control, control))
+        rounds = self.rounds or list(result.history)
+        write.write_arrays("trace.npz", trace_columns(rounds))
+        kept = round_arrays(rounds)
+        if kept:
+            write.write_arrays("rounds.npz", kept)
+        proof = certificate(experiment, result)
+        if proof is not None:
+            write.write_json("certificate.json", proof)
+        if result.trace is not None:
+            write.write_arrays("evaluations.npz", result.trace.arrays())
+        worst = adversaries(experiment, np.asarray(result.decision)) if control is not None else {}
+        if worst:
+            write.write_arrays(ADVERSARY, worst)
+        return control, summary, _drawn(experiment, result, worst, write.path) if figures else ()
+
+
+def _drawn(experiment: Experiment, result: Result, worst: Mapping[str, Array], directory: Path) -> Sequence[str]:
+    """The figures are an extra: whatever goes wrong with them is a remark, and the run is as good as before."""
+    from sparserob_core.experiment.figures.clash import draw_clash
+    from sparserob_core.experiment.figures.drawing import draw_experiment
+
+    if experiment.problem is None or result.status == "failed":
+        return ()
+    try:
+        if result.status == "infeasible":
+            draw_clash(experiment, result, directory)
+        else:
+            active = np.array([cut.index[0] for cut in result.indices if cut.multiplier > 0])
+            draw_experiment(
+                experiment, np.asarray(result.decision), active, result.history, directory, result.cost, worst
+            )
+    except InputError as error:
+        return (str(error),)
+    except Exception as error:  # noqa: BLE001  as said above
+        return (f"the figures could not be drawn: {type(error).__name__}: {error}",)
+    return ()

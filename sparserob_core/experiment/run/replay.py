@@ -1,0 +1,175 @@
+"""A finished run as events once more, for whoever was not there: nothing is solved again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.directory.finished import UNFINISHED, read_arrays
+from sparserob_core.experiment.run.events import Event, RunFinished, RunStarted
+from sparserob_core.experiment.run.inspection import Inspection
+from sparserob_core.experiment.run.viewer import recorder
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.events import Batch, EvaluationsFinished, RoundFinished
+from sparserob_core.sip.evidence import Cut
+from sparserob_core.sip.result import MEANING, Result, SearchTrace
+
+if TYPE_CHECKING:
+    from sparserob_core.experiment.config.load import Loaded
+
+BATCHES = 100  # of the evaluations of a run
+PATIENCE = 60.0  # seconds that the landscape may take
+
+
+def replay(
+    directory: str | Path, *, save: str | Path | None = None, serve: bool = False, connect: str | None = None
+) -> Path:
+    """Send a finished run to the viewer of Rerun, as `watch` does: what ``sparserob replay RUN`` does. Returns the
+    run's directory.
+
+    What a run directory does not keep is missing: the controls of earlier rounds, and the tuples that were tried.
+    Raises `InputError` for a directory that holds no finished run.
+    """
+    path = Path(directory)
+    loaded, summary = _config(path), _summary(path)
+    play(
+        events(Inspection(loaded), str(summary.get("title") or path.name), path, stored(path, summary)),
+        save=save,
+        serve=serve,
+        connect=connect,
+    )
+    return path
+
+
+def play(told: Iterator[Event], *, save: str | Path | None, serve: bool, connect: str | None) -> None:
+    """Tell events to a recorder."""
+    observer = recorder(save, serve, connect, PATIENCE)
+    try:
+        for event in told:
+            observer.receive(event)
+    finally:
+        observer.close()
+
+
+def events(inspection: Inspection, title: str, directory: Path | None, result: Result) -> Iterator[Event]:
+    """What observers of a run with this result heard, as far as the result knows: searches and rounds in the order of
+    their seconds."""
+    yield RunStarted(
+        title=title,
+        directory=directory,
+        problem=inspection.problem,
+        program=inspection.program,
+        quiet=True,
+        inspection=inspection,
+    )
+    searches = [] if result.trace is None else list(_searches(result.trace))
+    for entry in result.history:
+        while searches and searches[0][0] <= entry.round:
+            yield searches.pop(0)[1]
+        yield entry
+    yield from (event for _, event in searches)
+    yield RunFinished(status=result.status, message=result.message, seconds=result.seconds, result=result)
+
+
+def stored(directory: Path, summary: Mapping[str, Any]) -> Result:
+    """The result that a run directory holds."""
+    solution, trace = read_arrays(directory / "solution.npz"), read_arrays(directory / "trace.npz")
+    history = tuple(_round(trace, row) for row in range(len(trace.get("round", ()))))
+    decision = solution.get("decision", np.zeros(0))
+    evaluations = read_arrays(directory / "evaluations.npz")
+    try:
+        return Result(
+            status=summary["status"],
+            message=str(summary["message"]),
+            decision=decision if decision.size else None,
+            cost=_number(summary, "cost"),
+            value=_number(summary, "value"),
+            epsilon=_number(summary, "epsilon"),
+            lower_bound=_number(summary, "lower_bound", -np.inf),
+            upper_bound=_number(summary, "upper_bound", np.inf),
+            indices=_cuts(solution),
+            history=history,
+            trace=SearchTrace.stored(evaluations) if evaluations else None,
+            seconds=_number(summary, "seconds", 0.0),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{directory}: expected the files of a run, got some that do not fit together: {error}"
+        ) from error
+
+
+def _config(directory: Path) -> Loaded:
+    from sparserob_core.experiment.config.load import load_config
+
+    for name in ("config.yaml", "result.json"):
+        if not (directory / name).is_file():
+            instead = f"one without {name}" if directory.is_dir() else "a file" if directory.exists() else "nothing"
+            raise InputError(f"{directory}: expected the directory of a run, got {instead}")
+    return load_config(directory / "config.yaml")
+
+
+def _summary(directory: Path) -> dict[str, Any]:
+    file = directory / "result.json"
+    try:
+        summary = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{file}: cannot be read: {error}") from None
+    if not isinstance(summary, dict) or summary.get("status") not in MEANING:
+        raise InputError(f"{file}: expected the result of a run, with a status")
+    if summary.get("message") == UNFINISHED:
+        raise InputError(f"{directory}: expected a finished run, got one that is still going on or was killed")
+    return summary
+
+
+def _number(summary: Mapping[str, Any], name: str, missing: float = np.nan) -> float:
+    return missing if summary.get(name) is None else float(summary[name])
+
+
+def _round(trace: Mapping[str, Array], row: int) -> RoundFinished:
+    return RoundFinished(
+        **{name: column[row].item() for name, column in trace.items() if name in RoundFinished.__dataclass_fields__}
+    )
+
+
+def _cuts(solution: Mapping[str, Array]) -> tuple[Cut, ...]:
+    if "families" not in solution:
+        return ()
+    columns = (solution[name] for name in ("families", "indices", "rows", "multipliers"))
+    return tuple(
+        Cut(str(family), index[np.isfinite(index)], int(row), float(multiplier))
+        for family, index, row, multiplier in zip(*columns, strict=True)
+    )
+
+
+def _searches(trace: SearchTrace) -> Iterator[tuple[int, EvaluationsFinished]]:
+    """Every search in batches, each with the number of its round; the points are not known any more."""
+    for outer in np.unique(trace.outer):
+        which = np.flatnonzero(trace.outer == outer)
+        values, seconds = trace.value[which], trace.seconds[which] - trace.seconds[which[0]]
+        best, done = np.maximum.accumulate(np.where(np.isnan(values), -np.inf, values)), 0
+        for part in np.array_split(np.arange(which.size), max(1, BATCHES * which.size // trace.outer.size)):
+            before = -np.inf if not done else float(best[done - 1])
+            moments = [(1, float(moment)) for moment in seconds[part]]
+            batch = Batch(
+                points=[np.empty((part.size, 0))], values=[values[part]], moments=moments, first=done, best=before
+            )
+            done = int(part[-1]) + 1
+            yield (
+                int(outer) + 1,
+                EvaluationsFinished(
+                    count=part.size,
+                    total=done,
+                    best_value=float(best[done - 1]),
+                    seconds=float(seconds[part[-1]]),
+                    budget=which.size,
+                    round=int(outer) + 1,
+                    epsilon=float(trace.epsilon[which[0]]),
+                    lower_bound=float(trace.bound[which[part[-1]]]),
+                    batch=batch,
+                ),
+            )

@@ -1,0 +1,139 @@
+"""The whole walk of an experiment, from a config to a directory that says what was proven."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, final
+
+from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.experiment.assemble import Experiment, assemble, build, name_of, tools_of
+from sparserob_core.experiment.config.load import Loaded, load_config
+from sparserob_core.experiment.config.reader import write_yaml
+from sparserob_core.experiment.directory.artefacts import create_directory
+from sparserob_core.experiment.directory.finished import UNFINISHED
+from sparserob_core.experiment.run.events import Broadcast, Event, Observer, RunFinished, RunStarted
+from sparserob_core.experiment.run.inspection import Inspection
+from sparserob_core.experiment.run.journal import Journal
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.method import Method, Tools
+from sparserob_core.sip.program import SemiInfiniteProgram
+from sparserob_core.sip.result import Result
+
+HEADING = "Complete and resolved. To repeat the run: sparserob run config.yaml"
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """A finished run. ``control (m, K)`` is ``None`` without a decision or for a program that is no control problem;
+    ``summary`` is what ``result.json`` holds; ``remarks`` say what could not be done beside the result."""
+
+    result: Result
+    directory: Path
+    experiment: Experiment
+    control: Array | None
+    summary: Mapping[str, Any]
+    remarks: Sequence[str] = ()
+
+    @property
+    def status(self) -> str:
+        """The status of the result."""
+        return self.result.status
+
+    @property
+    def problem(self) -> OptimalControlProblem | None:
+        """The control problem."""
+        return self.experiment.problem
+
+    @property
+    def program(self) -> SemiInfiniteProgram:
+        """The semi-infinite program that was solved."""
+        return self.experiment.program
+
+    def show(self, save: str | Path | None = None, *, serve: bool = False, connect: str | None = None) -> None:
+        """Show the run in the viewer of Rerun: a new one, one that listens at ``connect``, a browser (``serve``), or
+        later (``save``, a file).
+
+        Raises `InputError` where there is none, or no display."""
+        from sparserob_core.experiment.run.replay import events, play
+
+        inspection = Inspection(self.experiment.loaded)
+        play(
+            events(inspection, self.experiment.title, self.directory, self.result),
+            save=save,
+            serve=serve,
+            connect=connect,
+        )
+
+
+def run(
+    config: str | Path | Mapping[str, Any],
+    overrides: Mapping[str, object] | Iterable[str] | None = None,
+    out: str | Path | None = None,
+    *,
+    quiet: bool = False,
+    figures: bool = True,
+    observers: Iterable[Observer] = (),
+) -> Outcome:
+    """Run an experiment: what ``sparserob run CONFIG key=value ... --out OUT`` does.
+
+    ``config`` is a file or a mapping, ``overrides`` a mapping such as ``{"solver.name": "clarabel"}`` or texts
+    ``key=value``. ``observers`` watch beside those that the config names.
+    Raises `ConfigError` or another `InputError` before anything is solved. An error or an interrupt during the run
+    leaves a directory with the config, the rounds so far and the status ``failed``.
+    """
+    loaded = load_config(config, overrides)
+    experiment = assemble(loaded)
+    tools, watching = (
+        tools_of(loaded),
+        [*_observers(loaded), *((type(observer).__name__, observer) for observer in observers)],
+    )
+    method: Method = build(loaded, "method", loaded.config.method)
+    directory = create_directory(out, name_of(loaded), loaded.config.digest())
+    journal = Journal(directory, experiment)
+    broadcast = Broadcast([*watching, ("journal", journal)])
+    ending, started = RunFinished(status="failed", message=UNFINISHED, seconds=0.0), time.perf_counter()
+    try:
+        directory.write_text("config.yaml", write_yaml(loaded.config.plain(), HEADING))
+        journal.record(Result(status="failed", message=UNFINISHED))
+        broadcast(
+            RunStarted(
+                title=experiment.title,
+                directory=directory.path,
+                problem=experiment.problem,
+                program=experiment.program,
+                quiet=quiet,
+                inspection=Inspection(loaded),
+            )
+        )
+        result: Result = method.solve(experiment.program, _notifying(tools, broadcast))
+        ending = RunFinished(status=result.status, message=result.message, seconds=result.seconds, result=result)
+        control, summary, remarks = journal.finish(result, figures)
+        return Outcome(result, directory.path, experiment, control, summary, remarks)
+    except BaseException as error:
+        said = (
+            "interrupted from the keyboard"
+            if isinstance(error, KeyboardInterrupt)
+            else f"{type(error).__name__}: {error}"
+        )
+        ending = RunFinished(status="failed", message=said, seconds=time.perf_counter() - started)
+        error.add_note(f"what was done until then is in {directory.path}")
+        journal.record_unfinished(said, ending.seconds)
+        raise
+    finally:
+        broadcast(ending)
+
+
+def _notifying(tools: Tools, broadcast: Broadcast) -> Tools:
+    def notify(event: object) -> None:
+        if isinstance(event, Event):
+            broadcast(event)
+
+    return replace(tools, notify=notify)
+
+
+def _observers(loaded: Loaded) -> list[tuple[str, Observer]]:
+    return [(entry.name, build(loaded, "observer", entry)) for entry in loaded.config.observers]

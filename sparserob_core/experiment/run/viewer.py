@@ -1,0 +1,54 @@
+"""The recorder that a run is shown with: in a viewer, in a browser, or into a file for later."""
+
+from __future__ import annotations
+
+import os
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.plugins.registry import load_registry
+
+if TYPE_CHECKING:
+    from sparserob_core.experiment.run.events import Observer
+
+KEEP = 24 * 3600.0
+"""Seconds that a browser is served, unless somebody ends it."""
+
+
+def recorder(save: str | Path | None, serve: bool, connect: str | None, patience: float | None = None) -> Observer:
+    """The observer that records to a viewer, to a browser, to a listener or into a file; raises `InputError` where that
+    cannot be had."""
+    if find_spec("rerun_bindings") is None:
+        raise InputError("rerun: rerun-sdk is not installed; `pip install 'sparserob[rerun]'` brings it")
+    spawn = save is None and not serve and connect is None
+    if (
+        spawn
+        and sys.platform.startswith("linux")
+        and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    ):
+        raise InputError(
+            "there is no display for a viewer; --save FILE records for later, --serve shows it in a browser"
+        )
+    options: dict[str, object] = {"spawn": spawn, "serve": serve, "connect": connect, "keep": KEEP if serve else 0.0}
+    if save is not None:
+        options["save"] = str(_writable(Path(save)))
+    if patience is not None:
+        options["landscape"] = {"patience": patience}
+    observer: Observer = load_registry().build("observer", "rerun", options)
+    return observer
+
+
+def _writable(file: Path) -> Path:
+    """The absolute path of a file that can be written."""
+    path = file.absolute()
+    if path.is_dir():
+        raise InputError(f"save: expected a file, got the directory {file}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("ab"):
+            return path
+    except OSError as error:
+        raise InputError(f"save: {file} cannot be written to: {error.strerror}") from error

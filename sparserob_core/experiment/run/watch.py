@@ -1,0 +1,31 @@
+"""A run before one's eyes: with the viewer of Rerun, in a browser, or into a file for later."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from sparserob_core.experiment.run.run import Outcome, run
+from sparserob_core.experiment.run.viewer import recorder
+
+
+def watch(
+    config: str | Path | Mapping[str, Any],
+    overrides: Mapping[str, object] | Iterable[str] | None = None,
+    out: str | Path | None = None,
+    *,
+    save: str | Path | None = None,
+    serve: bool = False,
+    connect: str | None = None,
+    quiet: bool = False,
+    figures: bool = True,
+) -> Outcome:
+    """Run an experiment as `sparserob_core.run` does, and record it: what ``sparserob watch CONFIG key=value ...``
+    does.
+
+    A viewer is started, unless it is to be recorded into the file ``save``, shown in a browser of this machine
+    (``serve``), or sent to a viewer that listens at ``connect``. Raises `InputError` before anything is solved where
+    that cannot be had.
+    """
+    return run(config, overrides, out, quiet=quiet, figures=figures, observers=[recorder(save, serve, connect)])

@@ -1,0 +1,1 @@
+"""Sampled trajectories of a finished run beside its worst case."""

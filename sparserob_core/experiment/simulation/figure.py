@@ -1,0 +1,72 @@
+"""The figure of a simulation: sampled states inside the worst case."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sparserob_core.experiment.figures import style as look
+from sparserob_core.experiment.figures.adversary_figure import caption, draw_tube, finish_panel, write_adversary
+from sparserob_core.experiment.figures.drawing import active_times, figure_data
+from sparserob_core.experiment.figures.figure_data import FigureData
+from sparserob_core.experiment.figures.style import panels, style, write_figure
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from sparserob_core.experiment.directory.finished import FinishedRun
+    from sparserob_core.experiment.simulation.outcome import Simulation
+
+
+def write_simulation(
+    file: Path, simulation: Simulation, finished: FinishedRun, worst: Mapping[str, Array] | None = None
+) -> None:
+    """Draw a simulation over the worst case of its run into a file (.png, .pdf, .svg); ``worst``, adversaries, are
+    drawn instead when given.
+
+    Raises `InputError` when the file cannot be written.
+    """
+    data = figure_data(finished.experiment, finished.theta, active_times(finished.solution), (), None)
+    if worst is not None:
+        write_adversary(file, worst, data)
+        return
+    with style():
+        write_figure(file, draw_simulation(simulation, data))
+
+
+def draw_simulation(simulation: Simulation, data: FigureData) -> Figure:
+    """Every state: some sampled trajectories, the envelope of all of them, and around it the worst case that no sample
+    reached."""
+    figure, axes = panels(len(data.state), 1.9, extra=0.35)
+    for component, ax in enumerate(axes):
+        draw_tube(ax, data, component)
+        for number, path in enumerate(simulation.fan[:, component]):
+            ax.plot(
+                simulation.shown,
+                path,
+                color=look.BLUE,
+                linewidth=0.5,
+                alpha=0.35,
+                zorder=3,
+                label="sampled trajectories" if number == 0 else None,
+            )
+        for number, edge in enumerate((simulation.lower[component], simulation.upper[component])):
+            ax.plot(
+                simulation.shown,
+                edge,
+                color=look.INK,
+                linewidth=0.9,
+                linestyle=(0, (4, 2)),
+                zorder=4,
+                label=f"envelope of all {simulation.trajectories}" if number == 0 else None,
+            )
+        finish_panel(ax, data, component, (simulation.lower[component], simulation.upper[component]))
+    caption(figure, axes, data, f"{simulation.law}: {_said(simulation)}")
+    return figure
+
+
+def _said(simulation: Simulation) -> str:
+    rows = [simulation.any_violated or simulation.constraints[0]]
+    return f"{rows[0].violated} of {simulation.trajectories} trajectories violate a constraint; a sample is no proof"

@@ -1,0 +1,268 @@
+"""Simulate a finished run: random trajectories beside the worst case, or the worst cases themselves."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from sparserob_core.control.constraints.flat import INSIDE
+from sparserob_core.control.response.response import Response
+from sparserob_core.control.studies.laws import LawName, Uncertainty
+from sparserob_core.control.studies.simulate import fine_times, finer, trajectories_at_once, walk
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.directory.adversary import Scene, adversaries, attained, read_adversaries, replay, scene
+from sparserob_core.experiment.directory.artefacts import RunDirectory
+from sparserob_core.experiment.directory.finished import FinishedRun, read_finished
+from sparserob_core.experiment.plugins.messages import nearest
+from sparserob_core.experiment.simulation.census import Census
+from sparserob_core.experiment.simulation.outcome import (
+    ADVERSARY,
+    ANY,
+    LAWS,
+    ConstraintShare,
+    Simulation,
+    clopper_pearson,
+)
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from sparserob_core.experiment.run.run import Outcome
+
+TRAJECTORIES = 10_000
+FAN, SHOWN = 120, 400  # trajectories and times that are kept for drawing
+
+
+def simulate(
+    run: str | Path | Outcome,
+    trajectories: int | None = None,
+    law: str = "iid",
+    seed: int = 0,
+    *,
+    out: str | Path | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> Simulation:
+    """Propagate sampled trajectories of a finished run exactly: what ``sparserob simulate RUN`` does.
+
+    ``law`` is one of ``iid``, ``vertices``, ``slow``, ``neighbours``, or ``adversary``, which replays the worst case of
+    every constraint and takes no number of ``trajectories`` (10 000 otherwise). The result is written to
+    ``simulation-<law>.json`` in the run's directory, and drawn into the file ``out`` when given. ``tell`` receives a
+    line about the progress now and then. Raises `InputError` for a directory that is no finished run with a control, or
+    another argument at fault, before anything is written.
+    """
+    from sparserob_core.experiment.figures.style import require_writable
+    from sparserob_core.experiment.simulation.figure import write_simulation
+
+    count = _checked(law, trajectories, seed)
+    if out is not None:
+        require_writable(Path(out))
+    finished = read_finished(_directory(run))
+    place = scene(finished.experiment, finished.theta)
+    assert place is not None
+    if not place.constraints:
+        raise InputError(
+            f"{finished.directory}: there is no path or terminal constraint that a trajectory could violate"
+        )
+    started = time.perf_counter()
+    worst = adversaries(finished.experiment, finished.theta)
+    replayed: Mapping[str, Array] | None = None
+    if law == ADVERSARY:
+        replayed = read_adversaries(finished.directory, place) or worst
+        moments, states = replay(place, replayed)
+        replayed = {**replayed, "state_times": moments, "states": states}
+        found = _replayed(finished, place, replayed, started)
+    else:
+        found = _sampled(finished, place, worst, cast(LawName, law), count, seed, tell or (lambda line: None), started)
+    RunDirectory(finished.directory).write_json(f"simulation-{law}.json", found.summary())
+    if out is not None:
+        write_simulation(Path(out), found, finished, replayed)
+    return found
+
+
+def _sampled(
+    finished: FinishedRun,
+    place: Scene,
+    worst: Mapping[str, Array],
+    law: LawName,
+    count: int,
+    seed: int,
+    tell: Callable[[str], None],
+    started: float,
+) -> Simulation:
+    response, parameters = place.model.response, place.model.parameters
+    ends = [moment for constraint in place.constraints for moment in (constraint.start, constraint.stop)]
+    times = fine_times(response, parameters, np.concatenate([ends, worst.get("times", np.zeros(0))]))
+    fine = Response(response.system, finer(response.grid, times), response.initial_state)
+    shown = np.unique(np.linspace(0, times.size - 1, min(times.size, SHOWN)).round().astype(int))
+    known = tuple(worst[name] for name in ("times", "directions", "parameters"))
+    uncertainty = Uncertainty(place.model.functionals, parameters, place.constraints, (known[0], known[1], known[2]))
+    counts, crowd = (
+        [Census(constraint, times) for constraint in place.constraints],
+        _Crowd(shown, response.initial_state.size),
+    )
+    rng, block, done, out = np.random.default_rng(seed), trajectories_at_once(fine, parameters.count > 0), 0, 0
+    while done < count:
+        size = min(block, count - done)
+        disturbances, drawn = uncertainty.draw(law, size, rng)
+        for one in counts:
+            one.begin(size)
+        for position, state in enumerate(walk(fine, place.control, drawn, disturbances)):
+            crowd.meet(position, state)
+            for one in counts:
+                one.meet(position, state)
+        out += int(np.any([one.close() for one in counts], axis=0).sum())
+        done += size
+        tell(f"{done} of {count} trajectories")
+    shares = _shares(counts, worst, count)
+    return Simulation(
+        title=finished.experiment.title,
+        directory=finished.directory,
+        status=str(finished.summary["status"]),
+        law=law,
+        trajectories=count,
+        seed=seed,
+        times=times.size,
+        inside=INSIDE,
+        constraints=shares,
+        any_violated=_together(shares, out) if len(shares) > 1 else None,
+        shown=times[shown],
+        fan=crowd.fan(),
+        lower=crowd.lower,
+        upper=crowd.upper,
+        seconds=time.perf_counter() - started,
+    )
+
+
+class _Crowd:
+    """What is drawn of many trajectories: the first few, and the envelope of all, at some of the times."""
+
+    def __init__(self, shown: np.ndarray, states: int) -> None:
+        self._column = {int(position): column for column, position in enumerate(shown)}
+        self.lower, self.upper = np.full((states, shown.size), np.inf), np.full((states, shown.size), -np.inf)
+        self._first: list[Array] = []
+
+    def meet(self, position: int, state: Array) -> None:
+        """The states ``(d, n)`` at one of the times."""
+        column = self._column.get(position)
+        if column is None:
+            return
+        if len(self._first) < len(self._column):
+            self._first.append(state[:, :FAN].copy())
+        np.minimum(self.lower[:, column], state.min(axis=1), out=self.lower[:, column])
+        np.maximum(self.upper[:, column], state.max(axis=1), out=self.upper[:, column])
+
+    def fan(self) -> Array:
+        """The first few trajectories ``(n, d, S)``."""
+        return np.ascontiguousarray(np.stack(self._first).transpose(2, 1, 0))
+
+
+def _replayed(finished: FinishedRun, place: Scene, stored: Mapping[str, Array], started: float) -> Simulation:
+    times, states = stored["state_times"], stored["states"]
+    reached = attained(stored, times, states)
+    shares = []
+    for position, name in enumerate(stored["names"].tolist()):
+        tolerance = next(Census(one, times).tolerance for one in place.constraints if one.name == name)
+        violated = int(reached[position] > tolerance)
+        when = float(stored["times"][position])
+        shares.append(
+            ConstraintShare(
+                name=name,
+                violated=violated,
+                trajectories=1,
+                lower=np.nan,
+                upper=np.nan,
+                tolerance=tolerance,
+                largest=float(reached[position]),
+                time=when,
+                worst=float(stored["violations"][position]),
+                worst_time=when,
+                worst_parameter=stored["parameters"][position].tolist(),
+            )
+        )
+    shown = np.unique(np.linspace(0, times.size - 1, min(times.size, SHOWN)).round().astype(int))
+    return Simulation(
+        title=finished.experiment.title,
+        directory=finished.directory,
+        status=str(finished.summary["status"]),
+        law=ADVERSARY,
+        trajectories=len(shares),
+        seed=0,
+        times=times.size,
+        inside=INSIDE,
+        constraints=shares,
+        any_violated=None,
+        shown=times[shown],
+        fan=states[:, :, shown],
+        lower=states[:, :, shown].min(axis=0),
+        upper=states[:, :, shown].max(axis=0),
+        seconds=time.perf_counter() - started,
+    )
+
+
+def _shares(counts: Sequence[Census], worst: Mapping[str, Array], count: int) -> list[ConstraintShare]:
+    rows = {name: position for position, name in enumerate(worst["names"].tolist())} if worst else {}
+    shares = []
+    for one in counts:
+        row, (lower, upper) = rows.get(one.constraint.name), clopper_pearson(one.violated, count)
+        shares.append(
+            ConstraintShare(
+                name=one.constraint.name,
+                violated=one.violated,
+                trajectories=count,
+                lower=lower,
+                upper=upper,
+                tolerance=one.tolerance,
+                largest=one.largest,
+                time=one.time,
+                worst=np.nan if row is None else float(worst["violations"][row]),
+                worst_time=np.nan if row is None else float(worst["times"][row]),
+                worst_parameter=() if row is None else worst["parameters"][row].tolist(),
+            )
+        )
+    return shares
+
+
+def _together(shares: Sequence[ConstraintShare], violated: int) -> ConstraintShare:
+    """All constraints as one: a trajectory violates it when it violates any."""
+    seen, worst = max(shares, key=lambda one: one.largest), max(shares, key=lambda one: one.worst)
+    lower, upper = clopper_pearson(violated, seen.trajectories)
+    return ConstraintShare(
+        name=ANY,
+        violated=violated,
+        trajectories=seen.trajectories,
+        lower=lower,
+        upper=upper,
+        tolerance=seen.tolerance,
+        largest=seen.largest,
+        time=seen.time,
+        worst=worst.worst,
+        worst_time=worst.worst_time,
+        worst_parameter=worst.worst_parameter,
+    )
+
+
+def _checked(law: str, trajectories: int | None, seed: int) -> int:
+    if law not in LAWS:
+        raise InputError(f"law: there is none called {law!r}{nearest(str(law), LAWS)}")
+    if law == ADVERSARY and trajectories is not None:
+        raise InputError(
+            "trajectories: the law adversary replays one trajectory per constraint; expected no number, got"
+            f" {trajectories!r}"
+        )
+    for name, value, least in (
+        ("trajectories", TRAJECTORIES if trajectories is None else trajectories, 1),
+        ("seed", seed, 0),
+    ):
+        if isinstance(value, bool) or not hasattr(value, "__index__") or value < least:
+            raise InputError(f"{name}: expected a whole number, at least {least}, got {value!r}")
+    return int(TRAJECTORIES if trajectories is None else trajectories)
+
+
+def _directory(run: object) -> Path:
+    directory = getattr(run, "directory", run)
+    if not isinstance(directory, str | Path):
+        raise InputError(f"run: expected the directory of a run or what sr.run returned, got {type(run).__name__}")
+    return Path(directory)

@@ -1,0 +1,74 @@
+"""Tables for people: drawn on a terminal, plain columns anywhere else."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+
+def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print rows under column names; empty ``columns`` make a list of keys and values."""
+    if sys.stdout.isatty():
+        _draw(title, columns, rows)
+    else:
+        _write(title, columns, rows)
+
+
+def _draw(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    from rich.box import SIMPLE
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=Text(title), title_justify="left", title_style="bold", box=SIMPLE, show_header=bool(columns))
+    for position in range(len(rows[0]) if rows else len(columns)):
+        table.add_column(columns[position] if columns else "", overflow="fold", style="bold" if position == 0 else "")
+    for row in rows:
+        table.add_row(*(Text(cell) for cell in row))
+    Console().print(table)
+
+
+def _write(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    lines = [list(columns), *map(list, rows)] if columns else list(map(list, rows))
+    widths = [max(len(line[position]) for line in lines) for position in range(len(lines[0]))] if lines else []
+    text = [
+        title,
+        *(
+            "  " + "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
+            for line in lines
+        ),
+    ]
+    sys.stdout.write("\n".join(text) + "\n")
+
+
+def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What a user wants to know of a finished run, from the contents of ``result.json``."""
+    worst, sparsity, counts = summary["worst"], summary["sparsity"], summary["counts"]
+    rows = [
+        ("status", f"{summary['status']}: {summary['message']}"),
+        ("cost", _number(summary["cost"], ".9g")),
+        ("lower bound", _number(summary["lower_bound"], ".9g")),
+        ("upper bound", _number(summary["upper_bound"], ".9g")),
+        ("relative gap", _number(summary["gap"], ".2e")),
+        ("worst violation", _worst(worst)),
+        ("active indices", str(counts["active_indices"])),
+        ("rounds", str(counts["rounds"])),
+        ("share of time active", _number(sparsity["active_fraction"], ".1%")),
+        ("switches", _number(sparsity["switches"], "d")),
+        ("seconds", _number(summary["seconds"], ".3f")),
+    ]
+    return [(name, value) for name, value in rows if value != "unknown" or name in {"lower bound", "upper bound"}]
+
+
+def _number(value: Any, form: str) -> str:
+    return "unknown" if value is None else format(value, form)
+
+
+def _worst(worst: Mapping[str, Any]) -> str:
+    if worst["violation"] is None:
+        return "unknown"
+    at = "" if worst["time"] is None else f" at t = {worst['time']:.6g}"
+    if worst["parameter"]:
+        at += ", p = (" + ", ".join(f"{value:.6g}" for value in worst["parameter"]) + ")"
+    return f"{worst['violation']:.2e} in {worst['constraint']}{at}"

@@ -1,0 +1,175 @@
+"""Newton's method on the dual of a separable program: the number of unknowns is the number of rows, about ten."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
+from sparserob_core.sip.inner.duality import measure, minimisers
+from sparserob_core.sip.inner.repair import diagonal
+
+ITERATIONS = 60
+PATIENCE = 10
+SEARCH = 25
+TARGET = 1e-12
+
+
+class _Point(NamedTuple):
+    """Dual variables, the decision they imply, and the gradient ``M x - c`` of the dual there."""
+
+    dual: Array
+    x: Array
+    gradient: Array
+
+
+@dataclass(frozen=True)
+class _Dual:
+    """Concave, once differentiable and piecewise quadratic:
+    ``d(v) = -c'v + sum_k min_s weights_k |s| + 1/2 p_k s^2 + (q + M'v)_k s``."""
+
+    program: FiniteProgram
+    curvature: Array
+    M: Array
+    c: Array
+    signed: npt.NDArray[np.bool_]
+
+    def decision(self, slope: Array) -> Array:
+        """The minimising ``x (n,)`` of the Lagrangian whose linear part is ``slope (n,)``."""
+        program = self.program
+        return minimisers(program.weights, self.curvature, slope, program.lower, program.upper)
+
+    def at(self, dual: Array) -> _Point:
+        x = self.decision(self.program.q + dual @ self.M)
+        return _Point(dual, x, self.M @ x - self.c)
+
+    def error(self, point: _Point) -> float:
+        """The largest complementarity error ``|min(y_i, h_i - G_i x)|``, or ``|A_i x - b_i|``."""
+        natural = np.where(self.signed, np.minimum(point.dual, -point.gradient), point.gradient)
+        return float(np.abs(natural).max(initial=0.0))
+
+    def hessian(self, point: _Point) -> Array:
+        """Minus the generalised Hessian, damped so that duplicated and flat directions stay solvable."""
+        free = (point.x != 0) & (point.x > self.program.lower) & (point.x < self.program.upper)
+        rows = self.M[:, free]
+        hessian: Array = (rows / self.curvature[free]) @ rows.T
+        flat = hessian.diagonal() <= 1e-14 / self.curvature.max()
+        damping = (
+            1e-13 * float(hessian.trace()) + np.where(flat, np.linalg.norm(point.gradient), 0.0) + np.finfo(float).tiny
+        )
+        hessian[np.diag_indices_from(hessian)] += damping
+        return hessian
+
+
+def newton_solve(program: FiniteProgram, y0: Array, mu0: Array | None = None) -> FiniteSolution | None:
+    """The optimum of a program with identity image and a positive diagonal ``P``, from dual variables ``y0 (r,)``,
+    ``mu0 (e,)``.
+
+    Semismooth Newton (Qi and Sun 1993) on the dual, whose minimising ``x`` is explicit: a soft threshold and a clip per
+    entry. Converges in a finite number of steps, as the dual is piecewise quadratic, but from far away it may take too
+    many: then ``None``, as for a program of another structure.
+    """
+    curvature = diagonal(program.P, program.n) if program.S is None and program.P is not None else None
+    if curvature is None or not (curvature > 0).all() or y0.size != program.h.size:
+        return None
+    keep = np.isfinite(program.h)
+    M, c = np.vstack([program.G[keep], program.A]), np.concatenate([program.h[keep], program.b])
+    norms = np.sqrt(np.einsum("ij,ij->i", M, M))
+    norms[norms == 0] = 1.0
+    start = np.concatenate([np.maximum(y0[keep], 0.0), np.zeros(program.b.size) if mu0 is None else mu0]) * norms
+    dual = _Dual(program, curvature, M / norms[:, None], c / norms, np.arange(c.size) < int(keep.sum()))
+    try:
+        point = _ascend(dual, start)
+    except np.linalg.LinAlgError:
+        return None
+    if point is None:
+        return None
+    multipliers = point.dual / norms
+    y = np.zeros(program.h.size)
+    y[keep] = multipliers[: int(keep.sum())]
+    return measure(program, point.x, y, multipliers[int(keep.sum()) :], message="Newton")
+
+
+def _ascend(dual: _Dual, start: Array) -> _Point | None:
+    point = dual.at(start)
+    scale = 1.0 + float(np.abs(point.x).max(initial=0.0))
+    error = least = dual.error(point)
+    stalled = 0
+    for _ in range(ITERATIONS):
+        if error <= TARGET * scale:
+            return point
+        if not np.isfinite(error) or stalled > PATIENCE:
+            return None
+        hessian = dual.hessian(point)
+        target = _non_negative(hessian, point.gradient + hessian @ point.dual, dual.signed, point.dual > 0)
+        trial = dual.at(target)
+        if not dual.error(trial) < 0.5 * least:
+            step = target - point.dual
+            trial = dual.at(point.dual + _line_maximum(dual, point, step) * step)
+        point, error = trial, dual.error(trial)
+        stalled = 0 if error < 0.9 * least else stalled + 1
+        least = min(least, error)
+    return None
+
+
+def _non_negative(
+    hessian: Array, linear: Array, signed: npt.NDArray[np.bool_], support: npt.NDArray[np.bool_]
+) -> Array:
+    """argmin ``1/2 v'Hv - linear'v``, ``v >= 0`` where signed, by active sets from a first support (Lawson and Hanson
+    1974, chapter 23)."""
+    passive = support | ~signed
+    v = np.zeros(signed.size)
+    floor = 1e-13 * float(np.abs(linear).max(initial=0.0))
+    for _ in range(3 * signed.size + 10):
+        wanted = np.zeros_like(v)
+        wanted[passive] = np.linalg.solve(hessian[np.ix_(passive, passive)], linear[passive])
+        blocked = signed & passive & (wanted <= 0)
+        if blocked.any():
+            share = float((v[blocked] / (v[blocked] - wanted[blocked] + np.finfo(float).tiny)).min())
+            v = v + share * (wanted - v)
+            passive &= ~(blocked & (v <= 1e-15 * np.abs(wanted)))
+            v = np.where(passive, v, 0.0)
+            continue
+        v = wanted
+        pull = np.where(passive, -np.inf, linear - hessian @ v)
+        if not pull.max(initial=-np.inf) > floor:
+            break
+        passive[int(np.argmax(pull))] = True
+    return v
+
+
+def _line_maximum(dual: _Dual, point: _Point, step: Array) -> float:
+    """A feasible length at which the dual's derivative along ``step`` has fallen to a tenth, by bisection and false
+    position."""
+    slope, change, constant = dual.program.q + point.dual @ dual.M, step @ dual.M, float(dual.c @ step)
+    first = float(point.gradient @ step)
+    if not first > 0:
+        return 0.0
+    falling = dual.signed & (step < 0)
+    furthest = max(1.0, float((point.dual[falling] / -step[falling]).min(initial=np.inf)))
+    low, rising, high = 0.0, first, 1.0
+    for _ in range(SEARCH):
+        derivative = float(change @ dual.decision(slope + high * change)) - constant
+        if derivative <= 0.1 * first:
+            break
+        if high == furthest:
+            return high
+        low, rising, high = high, derivative, min(4.0 * high, furthest)
+    if derivative > 0:
+        return high
+    length, sinking = high, derivative
+    for _ in range(SEARCH):
+        if abs(derivative) <= 0.1 * first:
+            return length
+        if derivative > 0:
+            low, rising = length, derivative
+        else:
+            high, sinking = length, derivative
+        share = rising / (rising - sinking)
+        length = low + (high - low) * min(max(share, 0.1), 0.9)
+        derivative = float(change @ dual.decision(slope + length * change)) - constant
+    return low

@@ -1,0 +1,173 @@
+"""Lower bounds of a finite program that hold for *any* multipliers, however inaccurate the solver that offered them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
+from sparserob_core.sip.inner.image import onto_stationary
+from sparserob_core.sip.inner.repair import diagonal, repaired
+
+# Entries of a sum are evaluated with a relative error of at most this (Higham 2002, section 3.1, for sums of up to ~1e2
+# terms).
+ROUND_OFF = 1e-14
+
+
+@dataclass(frozen=True)
+class _Terms:
+    """``bound = constant + sum_k min weights_k |s| + 1/2 curvature_k s^2 + slope_k s`` over the bounds; ``noise (k,)``
+    of the slope."""
+
+    constant: float
+    slope: Array
+    noise: Array
+    weights: Array
+    curvature: Array | None
+    magnitude: float
+
+
+def dual_bound(program: FiniteProgram, y: Array, mu: Array, z: Array | None = None, at: Array | None = None) -> float:
+    """A lower bound of the program's value, by weak duality; ``-inf`` when these multipliers prove nothing.
+
+    ``y (r,)`` (negative entries count as 0) and ``mu (e,)`` multiply ``G x <= h`` and ``A x = b``. A diagonal ``P``
+    with ``S`` the identity is minimised entry by entry; any other ``P`` is replaced by its tangent at ``at (n,)``,
+    which lies below it. ``z (k,)`` is the multiplier of ``s = S x``; it is first moved onto
+    ``S'z + G'y + A'mu + q + P at = 0``, so any guess will do. An allowance for the round-off of this very evaluation is
+    subtracted. Where an unbounded variable asks for a slope of exactly 0, a slope within its own round-off counts as 0.
+    """
+    y = _usable(program, y)
+    bound = _bound(_terms(program, y, mu, z, at), program)
+    if bound > -np.inf:
+        return bound
+    better = repaired(program, y, mu, z, at)
+    if better is not None:
+        bound = _bound(_terms(program, *better), program)
+    if bound == -np.inf and not program.q.any():
+        return _shrunk_bound(program, y, mu, z, at)
+    return bound
+
+
+def farkas_bound(program: FiniteProgram, y: Array, mu: Array, z: Array | None = None) -> float:
+    """A lower bound of the infeasibility of the rows, after normalising ``sum_i y_i |G_i| + sum_i |mu_i| |A_i| = 1``.
+
+    Positive proves that no ``x`` within the bounds meets the rows (Farkas); the number bounds from below how far, in
+    the unit-norm scaling of `FiniteSolution.infeasibility`, they must be relaxed. Round-off, and what
+    `FiniteProgram.residual` forgives, is the caller's to compare with: see `farkas_margin`.
+    """
+    return farkas_margin(program, y, mu, z)[0]
+
+
+def farkas_margin(program: FiniteProgram, y: Array, mu: Array, z: Array | None = None) -> tuple[float, float]:
+    """`farkas_bound`, and the magnitude of the terms that cancelled in it."""
+    y = _usable(program, y)
+    total = float(y @ np.linalg.norm(program.G, axis=1) + np.abs(mu) @ np.linalg.norm(program.A, axis=1))
+    if not (np.isfinite(total) and total > 0):
+        return -np.inf, 0.0
+    y, mu, z = y / total, mu / total, None if z is None else z / total
+    flat = homogeneous(program)
+    terms = _terms(flat, y, mu, z, None)
+    bound = _bound(terms, flat)
+    if bound == -np.inf and (better := repaired(flat, y, mu, z, None)) is not None:
+        terms = _terms(flat, *better)
+        bound = _bound(terms, flat)
+    return bound, terms.magnitude
+
+
+def homogeneous(program: FiniteProgram) -> FiniteProgram:
+    """The same constraints without a cost."""
+    q, weights = np.zeros_like(program.q), np.zeros_like(program.weights)
+    return FiniteProgram(
+        q, weights, program.lower, program.upper, program.G, program.h, program.A, program.b, S=program.S
+    )
+
+
+def measure(
+    program: FiniteProgram, x: Array, y: Array, mu: Array, z: Array | None = None, message: str = ""
+) -> FiniteSolution:
+    """Everything that can be checked about a claim, as a `FiniteSolution` that nobody has judged yet (``failed``)."""
+    if program.S is None:
+        x = np.clip(x, program.lower, program.upper)
+    y = _usable(program, y)
+    value, residual = program.objective(x), program.residual(x)
+    lower = dual_bound(program, y, mu, z, at=x)
+    if z is None:
+        z = _stationary(program, y, mu, x)
+        z = -z if program.S is None else onto_stationary(program, np.zeros(program.weights.size), z)
+    return FiniteSolution("failed", x, value, lower, y, mu, z, residual, value - lower, message)
+
+
+def minimisers(weights: Array, curvature: Array | None, slope: Array, lower: Array, upper: Array) -> Array:
+    """The minimiser of ``weights |s| + 1/2 curvature s^2 + slope s`` over ``[lower, upper]``, entry by entry; may be
+    infinite."""
+    pull = -slope - np.clip(-slope, -weights, weights)
+    if curvature is None:
+        free = np.where(pull > 0, np.inf, np.where(pull < 0, -np.inf, 0.0))
+    else:
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            free = np.where(pull == 0, 0.0, pull / curvature)
+    return np.minimum(np.maximum(free, lower), upper)
+
+
+def _usable(program: FiniteProgram, y: Array) -> Array:
+    return np.where(np.isfinite(program.h), np.maximum(y, 0.0), 0.0)
+
+
+def _stationary(program: FiniteProgram, y: Array, mu: Array, at: Array | None) -> Array:
+    slope = program.q + y @ program.G + mu @ program.A
+    return slope if program.P is None or at is None else slope + program.P @ at
+
+
+def _terms(program: FiniteProgram, y: Array, mu: Array, z: Array | None, at: Array | None) -> _Terms:
+    finite = np.where(y > 0, program.h, 0.0)
+    constant = -float(y @ finite + mu @ program.b)
+    magnitude = float(y @ np.abs(finite) + np.abs(mu) @ np.abs(program.b))
+    noise = np.abs(program.q) + y @ np.abs(program.G) + np.abs(mu) @ np.abs(program.A)
+    curvature = diagonal(program.P, program.n) if program.S is None else None
+    slope = program.q + y @ program.G + mu @ program.A
+    if curvature is None and program.P is not None:
+        at = np.zeros(program.n) if at is None else at
+        bent = np.asarray(program.P @ at)
+        constant -= 0.5 * float(at @ bent)
+        magnitude += 0.5 * abs(float(at @ bent))
+        slope, noise = slope + bent, noise + abs(program.P) @ np.abs(at)
+    if program.P is None:
+        curvature = None
+    if program.S is None:
+        return _Terms(constant, slope, noise, program.weights, curvature, magnitude)
+    start = np.zeros(program.weights.size) if z is None else z
+    z = onto_stationary(program, start, slope)
+    return _Terms(constant, -z, np.abs(z) + np.abs(noise).max(initial=0.0), program.weights, None, magnitude)
+
+
+def _bound(terms: _Terms, program: FiniteProgram) -> float:
+    slope = terms.slope
+    if not (np.isfinite(terms.constant) and np.isfinite(slope).all()):
+        return -np.inf
+    s = minimisers(terms.weights, terms.curvature, slope, program.lower, program.upper)
+    away = ~np.isfinite(s)
+    if away.any():
+        if (np.abs(slope[away]) - terms.weights[away] > ROUND_OFF * 10 * terms.noise[away]).any():
+            return -np.inf
+        s = np.where(away, np.clip(0.0, program.lower, program.upper), s)
+    values = terms.weights * np.abs(s) + slope * s
+    if terms.curvature is not None:
+        values += 0.5 * terms.curvature * s * s
+    size = terms.magnitude + float(np.abs(s) @ (terms.noise + terms.weights))
+    return terms.constant + float(values.sum()) - ROUND_OFF * size
+
+
+def _shrunk_bound(program: FiniteProgram, y: Array, mu: Array, z: Array | None, at: Array | None) -> float:
+    """Without a linear cost, multipliers may be scaled towards 0 until every unbounded entry's slope is within its
+    weight."""
+    slope = _terms(program, y, mu, z, at).slope
+    unbounded = np.isinf(program.lower) & (slope > program.weights) | np.isinf(program.upper) & (
+        slope < -program.weights
+    )
+    with np.errstate(invalid="ignore"):
+        factor = float((program.weights[unbounded] / np.abs(slope[unbounded])).min(initial=1.0)) * (1 - ROUND_OFF)
+    factor = factor if np.isfinite(factor) and np.isfinite(slope).all() else 0.0
+    scaled = [None if v is None else factor * v for v in (z, at)]
+    return _bound(_terms(program, factor * y, factor * mu, *scaled), program)

@@ -1,0 +1,96 @@
+"""What depends on the image ``s = S x`` alone, remembered between programs that share it."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from functools import partial
+from typing import TYPE_CHECKING, TypeVar, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.finite import FiniteProgram
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_array
+
+Made = TypeVar("Made")
+
+
+class Memory:
+    """The last few things made from arrays, found again by the identity of those arrays (which it keeps alive)."""
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self._made: OrderedDict[Hashable, tuple[tuple[object, ...], object]] = OrderedDict()
+
+    def recall(self, sources: tuple[object, ...], key: Hashable, make: Callable[[], Made]) -> Made:
+        """What ``make`` returned for these very sources, or make it now."""
+        identity = (key, *map(id, sources))
+        if identity in self._made:
+            self._made.move_to_end(identity)
+            return cast(Made, self._made[identity][1])
+        made = make()
+        self._made[identity] = (sources, made)
+        if len(self._made) > self.size:
+            self._made.popitem(last=False)
+        return made
+
+
+HOLDS = 5
+CANCELLED = 1e-13
+_factors = Memory(12)
+
+
+def onto_stationary(program: FiniteProgram, z: Array, slope: Array) -> Array:
+    """A ``z (k,)`` near the given one with ``S'z + slope = 0`` to round-off, ``slope (n,)``; NaN where there is none.
+
+    Where an image is unbounded its multiplier may not exceed its weight: it is held there, and the others make up for
+    it.
+    """
+    S = program.S
+    if S is None:
+        return -slope
+    unbounded_above, unbounded_below = np.isposinf(program.upper), np.isneginf(program.lower)
+    held = (program.weights == 0) & unbounded_below & unbounded_above
+    moved = z
+    for _ in range(HOLDS):
+        if _stationary(S, moved, slope):
+            break
+        z = np.where(held, np.clip(z, -program.weights, program.weights), z)
+        project = _factors.recall((S,), held.tobytes(), partial(_projection, S, ~held))
+        moved = z - project(S.T @ z + slope)
+        moved = moved - project(S.T @ moved + slope)
+        limit = program.weights + CANCELLED * float(np.abs(moved).max(initial=0.0))
+        beyond = ~held & (unbounded_above & (moved > limit) | unbounded_below & (moved < -limit))
+        if not beyond.any():
+            break
+        z, held = moved, held | beyond
+    return moved if _stationary(S, moved, slope) else np.full_like(moved, np.nan)
+
+
+def _stationary(S: csc_array, z: Array, slope: Array) -> bool:
+    left, size = np.abs(S.T @ z + slope), np.abs(S).T @ np.abs(z) + np.abs(slope)
+    return bool((left <= CANCELLED * size.max(initial=0.0)).all())
+
+
+def _projection(S: csc_array, used: npt.NDArray[np.bool_]) -> Callable[[Array], Array]:
+    """``r -> S (S'S)^{-1} r`` on the used images."""
+    from scipy.sparse.linalg import splu
+
+    part = S[np.flatnonzero(used)].tocsc()
+    gram = (part.T @ part).tocsc()
+    try:
+        factor = splu(gram)
+    except RuntimeError:
+        return lambda residual: np.full(used.size, np.nan)
+    rows = np.flatnonzero(used)
+
+    def apply(residual: Array) -> Array:
+        step = np.zeros(used.size)
+        step[rows] = part @ factor.solve(residual)
+        return step
+
+    return apply

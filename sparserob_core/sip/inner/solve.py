@@ -1,0 +1,233 @@
+"""Solve a finite program, believing nothing that was not checked here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
+from sparserob_core.sip.inner.change_of_variables import straightened, unstraightened
+from sparserob_core.sip.inner.duality import farkas_margin, measure, minimisers
+from sparserob_core.sip.inner.elastic import elastic_program, unrelaxed
+from sparserob_core.sip.inner.proximal import polish
+from sparserob_core.sip.inner.repair import diagonal
+from sparserob_core.sip.inner.standard_form import Form, Recovered, standard_form
+from sparserob_core.sip.inner.vertex import vertex_multipliers
+from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
+
+# The accuracy that a solver is asked for, in multiples of the tolerance, in each form, until it is believed.
+ATTEMPTS: tuple[tuple[Form, float], ...] = (("split", 0.1), ("epigraph", 0.1), ("split", 1e-3), ("split", 10.0))
+
+
+@dataclass
+class _Case:
+    """One call of `solve_finite`: what was asked, the best unbelieved answer so far, and why each was not believed."""
+
+    program: FiniteProgram
+    solver: Solver
+    tolerance: float
+    attempts: list[str] = field(default_factory=list)
+    best: FiniteSolution | None = None
+    elastic: bool = False
+
+    def believes(self, solution: FiniteSolution) -> bool:
+        return solution.residual <= self.tolerance and solution.gap <= 10 * self.tolerance * cost_scale(
+            self.program, solution.value
+        )
+
+    def judge(self, solution: FiniteSolution, name: str) -> FiniteSolution | None:
+        """The solution as ``optimal`` if it is believed; otherwise note why not."""
+        if self.believes(solution):
+            return replace(
+                solution, status="optimal", attempts=tuple(self.attempts), message=f"{name}: {solution.message}"
+            )
+        if self.best is None or _badness(solution) < _badness(self.best):
+            self.best = solution
+        self.attempts.append(
+            f"{name}: {solution.message}; not believed: residual {solution.residual:.1e}, gap {solution.gap:.1e}"
+        )
+        return None
+
+
+def solve_finite(
+    program: FiniteProgram, solver: Solver, *, tolerance: float = 1e-9, guess: FiniteSolution | None = None
+) -> FiniteSolution:
+    """Solve, trying forms and accuracies until an answer is believed.
+
+    ``optimal`` is believed when `FiniteProgram.residual` is at most ``tolerance`` and the gap to the proven lower bound
+    at most ``10 tolerance`` times `cost_scale`; ``infeasible`` only with multipliers that prove it (Farkas 1902),
+    whatever the solver says. ``guess``: a solution of a program with the same numbers of rows; a separable program is
+    then first tried by Newton's method. Raises `InputError` when the program's shapes or numbers are at fault; a hard
+    program is ``failed``, never an exception.
+    """
+    program.validate()
+    case = _Case(program, solver, tolerance)
+    impossible = _contradiction(program, tolerance)
+    if impossible is not None:
+        return impossible
+    for solution in _cheap(case, guess):
+        believed = case.judge(solution, "without a solver")
+        if believed is not None:
+            return believed
+    case.attempts.clear()
+    easier = straightened(program)
+    answer = None if easier is None else _through(case, easier, guess)
+    return _tried(case) if answer is None else answer
+
+
+def _tried(case: _Case) -> FiniteSolution:
+    """Form after form, accuracy after accuracy."""
+    program = case.program
+    for form, factor in ATTEMPTS:
+        claim, answer = _ask(case, program, form, factor * case.tolerance)
+        proof = _proof(case, answer, "the solver's ray") if claim is not None and claim.status == "infeasible" else None
+        for solution in _candidates(case, answer) if proof is None else ():
+            believed = case.judge(solution, f"{form} form")
+            if believed is not None:
+                return believed
+        if proof is not None or form == ATTEMPTS[0][0] or (claim is not None and claim.status == "infeasible"):
+            proof = _elastic_proof(case, proof)
+        if proof is not None:
+            return proof
+    return _failed(case)
+
+
+def _through(case: _Case, easier: FiniteProgram, guess: FiniteSolution | None) -> FiniteSolution | None:
+    """The answer found in the coordinates of the image, checked in those of the program."""
+    program = case.program
+    start = guess if guess is None or guess.x.size != program.n else replace(guess, x=program.image(guess.x))
+    found = solve_finite(easier, case.solver, tolerance=case.tolerance, guess=start)
+    x = unstraightened(program, found.x)
+    if found.status == "infeasible":
+        return _proof(case, (x, found.y, found.mu, None), "the program in the coordinates of its image")
+    return case.judge(measure(program, x, found.y, found.mu, found.z, found.message), "straightened")
+
+
+def cost_scale(program: FiniteProgram, value: float) -> float:
+    """What a gap is relative to: the value, but no less than the largest cost coefficient, or 1 if that is larger."""
+    largest = max(float(program.weights.max(initial=0.0)), float(np.abs(program.q).max(initial=0.0)))
+    if program.P is not None:
+        largest = max(largest, float(np.abs(program.P.data).max(initial=0.0)))
+    return max(abs(value), min(1.0, largest or 1.0))
+
+
+def _cheap(case: _Case, guess: FiniteSolution | None) -> Iterator[FiniteSolution]:
+    """What needs no solver: the optimum without rows, and Newton's method from a guess."""
+    program = case.program
+    curvature = diagonal(program.P, program.n) if program.S is None else None
+    if curvature is not None:
+        x = minimisers(program.weights, curvature, program.q, program.lower, program.upper)
+        if np.isfinite(x).all() and program.residual(x) <= case.tolerance:
+            yield measure(program, x, np.zeros(program.h.size), np.zeros(program.b.size), message="no row is active")
+    if guess is not None:
+        found = polish(program, guess.x, guess.y, guess.mu)
+        if found is not None:
+            yield found
+
+
+def _ask(case: _Case, program: FiniteProgram, form: Form, accuracy: float) -> tuple[Claim | None, Recovered | None]:
+    """The solver's claim, and its numbers in terms of the program if they have the right shapes and are finite."""
+    qp, recover = standard_form(program, form)
+    try:
+        claim = case.solver.solve(qp, accuracy)
+    except Exception as error:  # noqa: BLE001  a foreign solver may raise anything; its failure must not be ours
+        case.attempts.append(f"{form} form: the solver raised {type(error).__name__}: {error}")
+        return None, None
+    if not _well_formed(claim, qp):
+        case.attempts.append(
+            f"{form} form: {claim.status}, {claim.message}; its arrays are not finite, or not of the right size"
+        )
+        return claim, None
+    return claim, recover(claim)
+
+
+def _well_formed(claim: Claim, qp: QuadraticProgram) -> bool:
+    pairs = ((claim.x, qp.q), (claim.z, qp.h), (claim.y, qp.b))
+    return all(np.shape(got) == want.shape and bool(np.isfinite(got).all()) for got, want in pairs)
+
+
+def _candidates(case: _Case, answer: Recovered | None) -> Iterator[FiniteSolution]:
+    """A claim polished, where the structure allows, and as it is."""
+    if answer is None:
+        return
+    program, (x, y, mu, z) = case.program, answer
+    polished = polish(program, x, y, mu)
+    if polished is not None:
+        yield polished
+        yield measure(
+            program, polished.x, *vertex_multipliers(program, polished.x, polished.y, polished.mu), message="its vertex"
+        )
+    yield measure(program, x, y, mu, z, message="claimed")
+
+
+def _elastic_proof(case: _Case, known: FiniteSolution | None) -> FiniteSolution | None:
+    """The sharpest proof of infeasibility, from the elastic program or already known; sought once."""
+    if case.elastic:
+        return known
+    case.elastic = True
+    relaxed = elastic_program(case.program)
+    forms: tuple[Form, ...] = ("split", "epigraph")
+    for form in forms if known is None else forms[:1]:
+        claim, answer = _ask(case, relaxed, form, 0.1 * case.tolerance)
+        proof = None if answer is None else _proof(case, unrelaxed(case.program, answer), "the elastic program")
+        if proof is not None and (known is None or proof.infeasibility > known.infeasibility):
+            return proof
+        if claim is not None and claim.status == "solved":
+            break
+    return known
+
+
+def _proof(case: _Case, answer: Recovered | None, source: str) -> FiniteSolution | None:
+    """The answer as ``infeasible``, if its multipliers prove that."""
+    if answer is None:
+        return None
+    program, (x, y, mu, z) = case.program, answer
+    bound, magnitude = farkas_margin(program, y, mu, z)
+    if not bound > case.tolerance * max(1.0, magnitude):
+        return None
+    measured = measure(program, x, y, mu, z)
+    message = (
+        f"infeasible: the rows must be relaxed by at least {bound:.6g} of their norm; proven by the multipliers of"
+        f" {source}"
+    )
+    return replace(measured, status="infeasible", message=message, attempts=tuple(case.attempts), infeasibility=bound)
+
+
+def _contradiction(program: FiniteProgram, tolerance: float) -> FiniteSolution | None:
+    """Bounds that cross, and rows without entries that ask for the impossible."""
+    y, mu, x = np.zeros(program.h.size), np.zeros(program.b.size), np.zeros(program.n)
+    crossed = program.lower - program.upper
+    if crossed.max(initial=0.0) > 0:
+        k = int(np.argmax(crossed))
+        reason, amount = (
+            f"the bounds of image entry {k} cross: {program.lower[k]} > {program.upper[k]}",
+            float(crossed[k]),
+        )
+    elif (short := ~program.G.any(axis=1) & (program.h < -tolerance)).any():
+        i = int(np.argmax(short))
+        y[i] = 1.0
+        reason, amount = f"row {i} has no entries and asks for 0 <= {program.h[i]}", np.inf
+    elif (short := ~program.A.any(axis=1) & (np.abs(program.b) > tolerance)).any():
+        i = int(np.argmax(short))
+        mu[i] = -np.sign(program.b[i])
+        reason, amount = f"equality {i} has no entries and asks for 0 = {program.b[i]}", np.inf
+    else:
+        return None
+    z = np.zeros(program.weights.size)
+    return FiniteSolution("infeasible", x, np.inf, np.inf, y, mu, z, np.inf, 0.0, f"infeasible: {reason}", (), amount)
+
+
+def _failed(case: _Case) -> FiniteSolution:
+    program = case.program
+    best = case.best
+    if best is None:
+        best = measure(program, np.zeros(program.n), np.zeros(program.h.size), np.zeros(program.b.size))
+    return replace(
+        best, status="failed", message="no attempt gave an answer that could be checked", attempts=tuple(case.attempts)
+    )
+
+
+def _badness(solution: FiniteSolution) -> float:
+    return solution.residual + max(solution.gap, 0.0)

@@ -1,0 +1,206 @@
+"""From an L1-quadratic program to the plain quadratic program that a solver accepts, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.finite import FiniteProgram
+from sparserob_core.sip.inner.image import Memory
+from sparserob_core.sip.inner.repair import diagonal
+from sparserob_core.sip.solver import Claim, QuadraticProgram
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_array
+
+Form: TypeAlias = Literal["split", "epigraph"]
+Recovered: TypeAlias = tuple[Array, Array, Array, Array | None]
+
+
+@dataclass(frozen=True, eq=False)
+class ImageModel:
+    """The image as ``s = T v + offset`` of variables ``lower <= v <= upper`` with cost ``cost'v`` and rows
+    ``R v <= 0``.
+
+    Column ``j`` of ``T`` has the single entry ``sign[j]`` (0 for an epigraph variable) in row ``entry[j]``.
+    """
+
+    entry: npt.NDArray[np.intp]
+    sign: Array
+    offset: Array
+    cost: Array
+    lower: Array
+    upper: Array
+    R: csc_array | None
+
+
+_models = Memory(16)
+
+
+def standard_form(
+    program: FiniteProgram, form: Form = "split"
+) -> tuple[QuadraticProgram, Callable[[Claim], Recovered]]:
+    """The program as a `QuadraticProgram`, and the way back from a claim to ``(x, y, mu, z)`` of the program (``z`` or
+    ``None``).
+
+    ``split``: weighted images are differences ``a - b`` of non-negative parts. ``epigraph``: they get ``t >= |s|``.
+    With ``S`` the identity ``x`` is substituted (a diagonal ``P`` is put on both parts, which are complementary at an
+    optimum, so that the split program stays strictly convex); otherwise ``S x = s`` are equality rows. The cost is
+    divided by its largest linear coefficient, rows by their norm; rows that hold nothing (zero, or with an infinite
+    right-hand side) are left out.
+    """
+    sources = (program.weights, program.lower, program.upper)
+    model = _models.recall(sources, (form, program.S is None), lambda: _model(program, form))
+    return _substituted(program, model) if program.S is None else _lifted(program, model)
+
+
+def _model(program: FiniteProgram, form: Form) -> ImageModel:
+    lower, upper, weights = program.lower, program.upper, program.weights
+    fixed = lower == upper
+    offset = np.where(fixed, lower, 0.0)
+    bent = ~fixed & (weights > 0)
+    if form == "epigraph":
+        return _epigraph(program, fixed, bent & (lower < 0) & (upper > 0), offset)
+    above, below = np.flatnonzero(bent & (upper > 0)), np.flatnonzero(bent & (lower < 0))
+    plain = np.flatnonzero(~fixed & (weights == 0))
+    entry = np.concatenate([above, below, plain])
+    sign = np.concatenate([np.ones(above.size), -np.ones(below.size), np.ones(plain.size)])
+    floor = np.concatenate([np.maximum(lower[above], 0.0), np.maximum(-upper[below], 0.0), lower[plain]])
+    ceiling = np.concatenate([upper[above], -lower[below], upper[plain]])
+    return ImageModel(entry, sign, offset, weights[entry], floor, ceiling, None)
+
+
+def _epigraph(
+    program: FiniteProgram, fixed: npt.NDArray[np.bool_], bent: npt.NDArray[np.bool_], offset: Array
+) -> ImageModel:
+    from scipy.sparse import csc_array
+
+    plain, kinks = np.flatnonzero(~fixed), np.flatnonzero(bent)
+    entry = np.concatenate([plain, kinks])
+    sign = np.concatenate([np.ones(plain.size), np.zeros(kinks.size)])
+    one_signed = np.where(bent, 0.0, np.where(program.lower >= 0, program.weights, -program.weights))
+    cost = np.concatenate([one_signed[plain], program.weights[kinks]])
+    floor = np.concatenate([program.lower[plain], np.zeros(kinks.size)])
+    ceiling = np.concatenate([program.upper[plain], np.full(kinks.size, np.inf)])
+    if not kinks.size:
+        return ImageModel(entry, sign, offset, cost, floor, ceiling, None)
+    rows, inside, tops = np.arange(kinks.size), np.searchsorted(plain, kinks), plain.size + np.arange(kinks.size)
+    data = np.repeat([1.0, -1.0, -1.0, -1.0], kinks.size) / np.sqrt(2.0)
+    places = (
+        np.concatenate([rows, rows, rows + kinks.size, rows + kinks.size]),
+        np.concatenate([inside, tops, inside, tops]),
+    )
+    return ImageModel(
+        entry, sign, offset, cost, floor, ceiling, csc_array((data, places), shape=(2 * kinks.size, entry.size))
+    )
+
+
+def _substituted(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticProgram, Callable[[Claim], Recovered]]:
+    """Variables ``v``; ``x = T v + offset``."""
+    from scipy.sparse import csc_array
+
+    curvature = diagonal(program.P, program.n)
+    q = program.q
+    if program.P is not None and curvature is None:
+        q = q + program.P @ model.offset
+    cost = model.cost + model.sign * q[model.entry]
+    kappa = _largest(cost) or _largest(curvature) or 1.0
+    if curvature is not None:
+        P = _diagonal_matrix(np.abs(model.sign) * curvature[model.entry] / kappa)
+    else:
+        T = csc_array((model.sign, (model.entry, np.arange(model.entry.size))), shape=(program.n, model.entry.size))
+        P = csc_array(T.T @ program.P @ T) / kappa
+    rows, h, keep, norms = _unit_rows(program.G, program.h, model)
+    equal, b, keep_equal, norms_equal = _unit_rows(program.A, program.b, model)
+    G = _stack(rows, model.R)
+    right = h if model.R is None else np.concatenate([h, np.zeros(model.R.shape[0])])
+    qp = QuadraticProgram(P, cost / kappa, G, right, _stack(equal, None), b, model.lower, model.upper)
+
+    def recover(claim: Claim) -> Recovered:
+        x = model.offset + np.bincount(model.entry, model.sign * claim.x, program.n)
+        y, mu = np.zeros(program.h.size), np.zeros(program.b.size)
+        y[keep] = claim.z[: h.size] * (kappa / norms)
+        mu[keep_equal] = claim.y * (kappa / norms_equal)
+        return x, y, mu, None
+
+    return qp, recover
+
+
+def _lifted(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticProgram, Callable[[Claim], Recovered]]:
+    """Variables ``(x, v)``; equality rows ``S x - T v = offset`` for every image that has a weight or a bound."""
+    from scipy.sparse import block_diag, csc_array, hstack, vstack
+
+    n, size, k = program.n, model.entry.size, program.weights.size
+    held = np.flatnonzero((program.weights > 0) | np.isfinite(program.lower) | np.isfinite(program.upper))
+    T = csc_array((model.sign, (model.entry, np.arange(size))), shape=(k, size))
+    link = hstack([program.S, -T], format="csr")[held]
+    whole = ImageModel(np.arange(n), np.ones(n), np.zeros(n), program.q, np.full(n, -np.inf), np.full(n, np.inf), None)
+    rows, h, keep, norms = _unit_rows(program.G, program.h, whole)
+    equal, b, keep_equal, norms_equal = _unit_rows(program.A, program.b, whole)
+    cost = np.concatenate([program.q, model.cost])
+    kappa = _largest(cost) or _largest(None if program.P is None else program.P.data) or 1.0
+    P = csc_array((n, n)) if program.P is None else program.P / kappa
+    P = block_diag([P, csc_array((size, size))], format="csc")
+    pad = csc_array((rows.shape[0], size))
+    G = hstack([csc_array(rows), pad], format="csc")
+    if model.R is not None:
+        G = vstack([G, hstack([csc_array((model.R.shape[0], n)), model.R])], format="csc")
+    A = vstack([hstack([csc_array(equal), csc_array((equal.shape[0], size))]), link], format="csc")
+    free = np.full(n, np.inf)
+    right = np.concatenate([h, np.zeros(G.shape[0] - h.size)])
+    qp = QuadraticProgram(
+        P,
+        cost / kappa,
+        G,
+        right,
+        A,
+        np.concatenate([b, model.offset[held]]),
+        np.concatenate([-free, model.lower]),
+        np.concatenate([free, model.upper]),
+    )
+
+    def recover(claim: Claim) -> Recovered:
+        y, mu, z = np.zeros(program.h.size), np.zeros(program.b.size), np.zeros(k)
+        y[keep] = claim.z[: h.size] * (kappa / norms)
+        mu[keep_equal] = claim.y[: b.size] * (kappa / norms_equal)
+        z[held] = claim.y[b.size :] * kappa
+        return claim.x[:n], y, mu, z
+
+    return qp, recover
+
+
+def _unit_rows(rows: Array, rhs: Array, model: ImageModel) -> tuple[Array, Array, npt.NDArray[np.intp], Array]:
+    """Rows over ``v`` and right-hand sides, divided by the norm of the row; which rows were kept, and their norms."""
+    moved = rhs - rows @ model.offset
+    block = rows[:, model.entry] * model.sign
+    norms = np.sqrt(np.einsum("ij,ij->i", block, block))
+    keep = np.flatnonzero((norms > 0) & np.isfinite(moved))
+    norms = norms[keep]
+    return block[keep] / norms[:, None], moved[keep] / norms, keep, norms
+
+
+def _stack(rows: Array, below: csc_array | None) -> csc_array:
+    from scipy.sparse import csc_array, vstack
+
+    across = rows.T
+    filled = across != 0
+    pointers = np.concatenate([[0], np.cumsum(filled.sum(axis=1))])
+    top = csc_array((across[filled], np.nonzero(filled)[1], pointers), shape=rows.shape)
+    return top if below is None else vstack([top, below], format="csc")
+
+
+def _diagonal_matrix(values: Array) -> csc_array:
+    from scipy.sparse import csc_array
+
+    places = np.flatnonzero(values)
+    pointers = np.concatenate([[0], np.cumsum(values != 0)])
+    return csc_array((values[places], places, pointers), shape=(values.size, values.size))
+
+
+def _largest(values: Array | None) -> float:
+    return 0.0 if values is None else float(np.abs(values).max(initial=0.0))

@@ -1,0 +1,1 @@
+"""The algorithms: exchange, the paper's search over tuples, and the baselines."""

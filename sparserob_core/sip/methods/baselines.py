@@ -1,0 +1,113 @@
+"""The two usual ways to deal with uncertainty, kept honest: their decisions are judged against every uncertainty, like
+any other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sparserob_core.errors import InputError
+from sparserob_core.sip.events import RoundFinished, retold
+from sparserob_core.sip.evidence import Proof
+from sparserob_core.sip.method import Method, Tools
+from sparserob_core.sip.methods.exchange import Exchange
+from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation
+from sparserob_core.sip.proof.branch_and_bound import TOLERANCE, prove
+from sparserob_core.sip.proof.verdict import verdict, witness, worst_of
+from sparserob_core.sip.result import Result
+from sparserob_core.sip.scenario_bound import scenario_bound
+from sparserob_core.sip.separation.separation import separate
+
+
+@dataclass(frozen=True)
+class Nominal(Method):
+    """Solve as if nothing were uncertain, to the relative gap ``tolerance``; then judge the decision against the
+    uncertainty."""
+
+    tolerance: float = 1e-7
+    rounds: int = 200
+
+    def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
+        return _judged(
+            program, _simplified(program, "nominal", lambda family: family.nominal), tools, self.tolerance, self.rounds
+        )
+
+
+@dataclass(frozen=True)
+class Scenario(Method):
+    """Impose the constraints for ``scenarios`` sampled uncertainties (Calafiore and Campi 2006); then judge the
+    decision against all of them.
+
+    Beside the worst violation stands what the scenario theory promises: the `ScenarioBound` of the result. A constraint
+    belongs to one scenario, so those that carry a multiplier are at least as many as the support constraints.
+    """
+
+    scenarios: int = 1000
+    tolerance: float = 1e-7
+    rounds: int = 200
+
+    def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
+        seed = int(tools.rng.integers(2**63))  # every family sees the same scenarios
+
+        def sampled(family: ConstraintFamily) -> ConstraintFamily | None:
+            return None if family.sample is None else family.sample(self.scenarios, np.random.default_rng(seed))
+
+        result = _judged(program, _simplified(program, "scenario", sampled), tools, self.tolerance, self.rounds)
+        if result.decision is None:
+            return result
+        bound = scenario_bound(self.scenarios, program.n, len(result.indices))
+        message = f"{result.message}; {bound.sentence}" if result.status in ("refuted", "undecided") else result.message
+        return replace(result, message=message, scenario_bound=bound)
+
+
+def _simplified(
+    program: SemiInfiniteProgram, method: str, simpler: Callable[[ConstraintFamily], ConstraintFamily | None]
+) -> SemiInfiniteProgram:
+    families = [simpler(family) for family in program.families]
+    missing = [family.name for family, simple in zip(program.families, families, strict=True) if simple is None]
+    if missing:
+        raise InputError(
+            f"method: {method} needs families that tell their uncertainty apart, which {', '.join(missing)} does not; "
+            "expected the method exchange"
+        )
+    return replace(program, families=[family for family in families if family is not None])
+
+
+def _judged(
+    program: SemiInfiniteProgram, simple: SemiInfiniteProgram, tools: Tools, tolerance: float, rounds: int
+) -> Result:
+    """Solve the simpler program, whose lower bound holds for the full one too, and say what its decision is worth in
+    the full one."""
+    notify = retold(tools.notify, RoundFinished, lambda event: replace(event, simplified=True))
+    result = Exchange(tolerance, rounds).close(simple, replace(tools, notify=notify), lambda x: ())
+    if result.decision is None:
+        return result
+    found = separate(program, result.decision, tools, TOLERANCE)
+    proofs = [
+        _worse(proof, family, separation)
+        for proof, (family, separation) in zip(prove(program, result.decision, tools.notify), found, strict=True)
+    ]
+    status, message = verdict(proofs, result.gap, tolerance)
+    return replace(
+        result,
+        status=status,
+        message=message,
+        proofs=tuple(proofs),
+        worst=witness(program, worst_of(found), proofs),
+        upper_bound=np.inf if status == "refuted" else result.cost,
+    )
+
+
+def _worse(proof: Proof, family: ConstraintFamily, found: Separation) -> Proof:
+    """A refutation ends at the first witness: of what is not proven, tell the worst that the separation finds."""
+    if (
+        proof.verdict == "proven"
+        or not found.violations.size
+        or found.violations[0] <= max(proof.violation, family.tolerance(TOLERANCE))
+    ):
+        return proof
+    return replace(
+        proof, verdict="refuted", violation=float(found.violations[0]), index=found.indices[0], row=int(found.rows[0])
+    )

@@ -1,0 +1,59 @@
+"""Of the constraints that cannot hold together, few enough to be read: none of them can be spared."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sparserob_core.sip.finite import FiniteSolution
+from sparserob_core.sip.inner.duality import farkas_bound, homogeneous, measure
+from sparserob_core.sip.proof.reasons import reasons
+from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
+
+
+def irreducible(relaxed: RelaxedProgram, rows: Rows, solution: FiniteSolution) -> tuple[Rows, FiniteSolution]:
+    """Rows that cannot hold together although all but any one of them can, with the multipliers that prove it.
+
+    One constraint that is impossible by itself, or two that leave nothing between them, where there are such
+    (`reasons`). Else the deletion filter (Chinneck and Dravnieks 1991): every row is left out once, the least important
+    first, and stays out if nothing is feasible without it either; a row that was needed stays needed when others leave.
+    A row whose absence could not be judged stays.
+    """
+    fixed = relaxed.program.finite.h.size
+    plain = _self_evident(relaxed, solution)
+    if plain is not None:
+        return plain
+    y = solution.y[fixed:]
+    support = np.flatnonzero(y > 0.0)
+    rows, y = rows.take(support), y[support]
+    needed = np.zeros(y.size, dtype=bool)
+    while not needed.all() and y.size > 1:
+        position = int(np.flatnonzero(~needed)[np.argmin(y[~needed])])
+        keep = np.arange(y.size) != position
+        without = relaxed.solve(rows.take(keep), 0.0)
+        if without.status != "infeasible":
+            needed[position] = True
+            continue
+        solution, y = without, without.y[fixed:]
+        rows, needed, positive = rows.take(keep), needed[keep], y > 0.0
+        rows, needed, y = rows.take(positive), needed[positive], y[positive]
+    return rows, replace(solution, y=np.concatenate([solution.y[:fixed], y]))
+
+
+def _self_evident(relaxed: RelaxedProgram, solution: FiniteSolution) -> tuple[Rows, FiniteSolution] | None:
+    """The rows of the first reason that needs no solver, if they are rows of this program."""
+    base = relaxed.program.finite
+    for reason in reasons(relaxed.program):
+        if relaxed.program.family(reason.rows.cuts[0].family).reduced is not None:
+            continue
+        y = np.concatenate([np.zeros(base.h.size), reason.multipliers])
+        finite = relaxed.finite(reason.rows.G, reason.rows.h, 0.0)
+        amount = farkas_bound(finite, y, np.zeros(base.b.size)) if reason.rows.G.any() else np.inf
+        if amount > relaxed.tolerance:
+            mu = np.zeros(base.b.size)
+            z = measure(homogeneous(finite), solution.x, y, mu).z
+            return reason.rows, replace(
+                solution, y=y, mu=mu, z=z, infeasibility=amount, message=f"infeasible: {reason.text}"
+            )
+    return None

@@ -1,0 +1,271 @@
+"""The relaxed program ``g``: the semi-infinite program with finitely many of its constraints."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.evidence import Cut, Dual
+from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
+from sparserob_core.sip.inner.duality import dual_bound
+from sparserob_core.sip.inner.image import onto_stationary
+from sparserob_core.sip.inner.solve import solve_finite
+from sparserob_core.sip.inner.vertex import vertex_multipliers
+from sparserob_core.sip.program import SemiInfiniteProgram
+from sparserob_core.sip.regulariser import ControlImage, Regulariser
+from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_array
+
+LAZY = 1e-9  # rows violated by less than this, relative to their norm, are not added
+ROUNDS = 200  # lazy additions at most within one evaluation
+ROUNDING = 1e-12  # of a row's numbers, from which its terms were computed; relative to the sum of their absolute values
+# of them, those that also drop the rows without a multiplier; later rows are only added, so that nothing can cycle
+DROPPING = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Imposed constraints ``G x <= h`` with where each came from: ``G (r, n)``, ``h (r,)``, ``cuts`` of length
+    ``r``."""
+
+    G: Array
+    h: Array
+    cuts: tuple[Cut, ...]
+
+    def take(self, keep: np.ndarray) -> Rows:
+        """The rows where the mask (or the positions) ``keep`` says so."""
+        positions = np.arange(self.h.size)[keep]
+        return Rows(self.G[positions], self.h[positions], tuple(self.cuts[i] for i in positions))
+
+    def joined(self, other: Rows) -> Rows:
+        """These rows and then the others."""
+        return Rows(np.vstack([self.G, other.G]), np.concatenate([self.h, other.h]), self.cuts + other.cuts)
+
+    @staticmethod
+    def none(n: int) -> Rows:
+        """No rows in ``n`` variables."""
+        return Rows(np.zeros((0, n)), np.zeros(0), ())
+
+
+def rows_at(program: SemiInfiniteProgram, family: str, indices: Array, rows: np.ndarray | None = None) -> Rows:
+    """The constraints of a family at indices ``(k, d)``: one row each when ``rows (k,)`` names it, else all of them."""
+    if not indices.shape[0]:
+        return Rows.none(program.n)
+    G, h = program.family(family).rows(indices)
+    count, per_index = h.shape
+    where, which = (
+        (np.arange(count), rows)
+        if rows is not None
+        else (np.repeat(np.arange(count), per_index), np.tile(np.arange(per_index), count))
+    )
+    cuts = tuple(Cut(family, indices[i], int(r)) for i, r in zip(where, which, strict=True))
+    return Rows(np.asarray(G[where, which], dtype=float), np.asarray(h[where, which], dtype=float), cuts)
+
+
+@dataclass(frozen=True, eq=False)
+class RelaxedSolution:
+    """``value`` of ``g`` (see `value_of`), its optimiser, the rows that were imposed, and the checked finite solution
+    with them."""
+
+    value: float
+    decision: Array
+    rows: Rows
+    finite: FiniteSolution
+
+    def multipliers(self) -> dict[tuple[str, bytes, int], float]:
+        """The multipliers of the imposed rows, by family, index and row."""
+        y = self.finite.y[self.finite.y.size - self.rows.h.size :]
+        return {_key(cut): float(m) for cut, m in zip(self.rows.cuts, y, strict=False)}
+
+
+@dataclass(frozen=True, eq=False)
+class Imposed:
+    """Which rows of a pool are imposed: their ``positions (k,)`` and ``multipliers (k,)``, and the solution these are
+    from, if any."""
+
+    positions: np.ndarray
+    multipliers: Array
+    solution: FiniteSolution | None = None
+
+
+def value_of(solution: FiniteSolution) -> float:
+    """``g``: ``+inf`` where proven infeasible; where no optimum was believed the proven lower bound, so never more than
+    the truth."""
+    return {"optimal": solution.value, "infeasible": np.inf}.get(solution.status, solution.lower_bound)
+
+
+def _key(cut: Cut) -> tuple[str, bytes, int]:
+    return cut.family, cut.index.tobytes(), cut.row
+
+
+def _most_violated(excess: Array, kinds: np.ndarray) -> np.ndarray:
+    """The position of the largest excess of every kind, where it is above `LAZY`."""
+    violated = np.flatnonzero(excess > LAZY)
+    order = violated[np.lexsort((-excess[violated], kinds[violated]))]
+    return np.asarray(order[np.flatnonzero(np.diff(kinds[order], prepend=-1))], dtype=int)
+
+
+class CountedSolver(Solver):
+    """A solver that counts its ``calls``: many relaxed programs are solved from the last one, without it."""
+
+    def __init__(self, solver: Solver) -> None:
+        self.solver, self.calls = solver, 0
+
+    def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
+        self.calls += 1
+        return self.solver.solve(program, accuracy)
+
+
+@dataclass(eq=False)
+class RelaxedProgram:
+    """``g(epsilon; indices)``: minimise ``J + epsilon rho`` over the finite constraints and the imposed indices.
+
+    It remembers the rows that were active and their multipliers, and starts from them at the next call.
+    """
+
+    program: SemiInfiniteProgram
+    solver: Solver
+    regulariser: Regulariser | None = None
+    tolerance: float = 1e-9
+    solves: int = 0
+    _terms: tuple[csc_array, Array] | None = None
+    _last: RelaxedSolution | None = None
+    _programs: dict[float, FiniteProgram] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.counted = CountedSolver(self.solver)
+        if self.regulariser is not None:
+            from scipy.sparse import csc_array, eye_array
+
+            base, images = self.program.finite, self.program.image_size
+            S = csc_array(eye_array(self.program.n)) if base.S is None else base.S[:images]
+            lengths = np.ones(images) if self.program.lengths is None else self.program.lengths
+            self._terms = self.regulariser.quadratic(ControlImage(csc_array(S), self.program.channels, lengths))
+
+    def solve(
+        self, rows: Rows, epsilon: float, margin: float = 0.0, guess: FiniteSolution | None = None
+    ) -> FiniteSolution:
+        """Solve with all of these rows at once, each tightened by ``margin`` times its norm; ``guess`` is a solution
+        with the same rows."""
+        norms = np.linalg.norm(rows.G, axis=1) if margin else 0.0
+        return self._solved(rows.G, rows.h - margin * norms, epsilon, guess)
+
+    def lower_bound(self, rows: Rows, solution: FiniteSolution) -> Dual:
+        """A lower bound of the *unregularised* semi-infinite program, from the multipliers of any solution with these
+        rows (weak duality).
+
+        Less an allowance for the rounding of the rows themselves; no multipliers at all are an offer too, and need
+        none.
+        """
+        plain = self.finite(rows.G, rows.h, 0.0)
+        offers = [
+            (np.zeros_like(solution.y), np.zeros_like(solution.mu), np.zeros_like(solution.z)),
+            (solution.y, solution.mu, solution.z),
+        ]
+        if plain.P is None and np.isfinite(solution.x).all():
+            offers.append((*vertex_multipliers(plain, solution.x, solution.y, solution.mu), solution.z))
+        bounds = [
+            dual_bound(plain, y, mu, z, at=solution.x) - self._rounding(plain, y, mu, solution.x) for y, mu, z in offers
+        ]
+        best = int(np.argmax(bounds))
+        return self.dual(rows, *offers[best], bounds[best])
+
+    def _rounding(self, plain: FiniteProgram, y: Array, mu: Array, x: Array) -> float:
+        size = np.where(np.isfinite(x), np.abs(x), 0.0)
+        used = (y > 0) & np.isfinite(plain.h)
+        total = y[used] @ (np.abs(plain.h[used]) + np.abs(plain.G[used]) @ size) + np.abs(mu) @ (
+            np.abs(plain.b) + np.abs(plain.A) @ size
+        )
+        return ROUNDING * float(total)
+
+    def dual(self, rows: Rows, y: Array, mu: Array, z: Array, bound: float) -> Dual:
+        """Multipliers of a program with these rows (and of its fixed rows, which come first in ``y``), as a record."""
+        own = y[y.size - rows.h.size :]
+        if self.program.finite.S is not None:
+            plain = self.finite(rows.G, rows.h, 0.0)
+            z = onto_stationary(plain, z, plain.q + y @ plain.G + mu @ plain.A)
+        cuts = tuple(replace(cut, multiplier=float(m)) for cut, m in zip(rows.cuts, own, strict=True) if m > 0.0)
+        return Dual(bound, cuts, mu, None if self.program.finite.S is None else z)
+
+    def evaluate(self, indices: Mapping[str, Array], epsilon: float) -> RelaxedSolution:
+        """``g`` at a tuple: per family the indices ``(k, d)``. Rows are imposed lazily: those active last time, then
+        what is violated."""
+        pool = Rows.none(self.program.n)
+        for family, points in indices.items():
+            pool = pool.joined(rows_at(self.program, family, points))
+        known = {} if self._last is None else self._last.multipliers()
+        start = [(i, y) for i, cut in enumerate(pool.cuts) if (y := known.get(_key(cut), 0.0)) > 0.0]
+        kinds = {kind: number for number, kind in enumerate(dict.fromkeys((cut.family, cut.row) for cut in pool.cuts))}
+        imposed = Imposed(
+            np.array([i for i, _ in start], dtype=int),
+            np.array([y for _, y in start]),
+            None if self._last is None else self._last.finite,
+        )
+        imposed, solution = self.lazily(
+            pool.G, pool.h, np.array([kinds[cut.family, cut.row] for cut in pool.cuts], dtype=int), epsilon, imposed
+        )
+        self._last = RelaxedSolution(value_of(solution), solution.x, pool.take(imposed.positions), solution)
+        return self._last
+
+    def lazily(
+        self, G: Array, h: Array, kinds: np.ndarray, epsilon: float, start: Imposed, norms: Array | None = None
+    ) -> tuple[Imposed, FiniteSolution]:
+        """Solve with all rows ``G x <= h`` by imposing few of them: those of ``start``, then the most violated of every
+        kind ``(r,)``, until no other is violated. Returns the rows imposed last, in terms of which the solution's
+        multipliers are."""
+        norms = np.maximum(np.linalg.norm(G, axis=1), np.finfo(float).tiny) if norms is None else norms
+        positions, guess = start.positions, self._guess(start)
+        for number in range(ROUNDS):
+            solution = self._solved(G[positions], h[positions], epsilon, guess)
+            multipliers = (
+                solution.y[solution.y.size - positions.size :]
+                if solution.y.size >= positions.size
+                else np.zeros(positions.size)
+            )
+            imposed = Imposed(positions, multipliers, solution)
+            if solution.status == "infeasible" or not np.isfinite(solution.x).all():
+                break
+            excess = (G @ solution.x - h) / norms
+            excess[positions] = -np.inf
+            fresh = _most_violated(excess, kinds)
+            if not fresh.size:
+                break
+            needed = (multipliers > 0.0) | (number > DROPPING)
+            positions = np.concatenate([positions[needed], fresh])
+            guess = self._guess(
+                Imposed(positions, np.concatenate([multipliers[needed], np.zeros(fresh.size)]), solution)
+            )
+        return imposed, solution
+
+    def _guess(self, start: Imposed) -> FiniteSolution | None:
+        """The solution that the imposed rows came with, with their multipliers."""
+        last = start.solution
+        if last is None or not np.isfinite(last.x).all():
+            return None
+        fixed = last.y[: self.program.finite.h.size]
+        return replace(last, y=np.concatenate([fixed, start.multipliers]))
+
+    def _solved(self, G: Array, h: Array, epsilon: float, guess: FiniteSolution | None) -> FiniteSolution:
+        self.solves += 1
+        return solve_finite(self.finite(G, h, epsilon), self.counted, tolerance=self.tolerance, guess=guess)
+
+    def finite(self, G: Array, h: Array, epsilon: float) -> FiniteProgram:
+        """The finite program with these rows."""
+        base = self._regularised(epsilon)
+        return replace(base, G=np.vstack([base.G, G]), h=np.concatenate([base.h, h]))
+
+    def _regularised(self, epsilon: float) -> FiniteProgram:
+        base = self.program.finite
+        if epsilon == 0.0 or self._terms is None:
+            return base
+        if epsilon not in self._programs:
+            P, q = self._terms
+            total = epsilon * P if base.P is None else base.P + epsilon * P
+            self._programs = {epsilon: replace(base, P=total.tocsc(), q=base.q + epsilon * q)}
+        return self._programs[epsilon]

@@ -1,0 +1,219 @@
+"""``g`` as a function of one long point: a tuple of indices, of which few change between two evaluations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.evidence import Cut
+from sparserob_core.sip.finite import FiniteSolution
+from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
+from sparserob_core.sip.relaxed.index_gradient import index_gradient
+from sparserob_core.sip.relaxed.relaxed import LAZY, Imposed, RelaxedProgram, Rows, value_of
+
+
+@dataclass(frozen=True, eq=False)
+class TupleLayout:
+    """How ``count`` indices make one point: index after index, each with the coordinates of the longest index of all
+    families.
+
+    Every index of the tuple imposes *all* families, each at the point of its own index set that is nearest to the first
+    of these coordinates: a path constraint at ``(t, Beta, p)``, a terminal one at ``(T, Beta, p)``, as in the paper.
+    Every index of every family is met, so the supremum of ``g`` over tuples is what it would be with an index set for
+    each.
+    """
+
+    families: Sequence[ConstraintFamily]
+    count: int
+
+    @cached_property
+    def slot(self) -> Box:
+        """The box ``(width,)`` of one index: the smallest around the index sets of all families."""
+        width = max((family.index_set.dimension for family in self.families), default=1)
+        lower, upper = np.full(width, np.inf), np.full(width, -np.inf)
+        for family in self.families:
+            size = family.index_set.dimension
+            lower[:size] = np.minimum(lower[:size], family.index_set.lower)
+            upper[:size] = np.maximum(upper[:size], family.index_set.upper)
+        return Box(np.where(np.isfinite(lower), lower, 0.0), np.where(np.isfinite(upper), upper, 0.0))
+
+    @cached_property
+    def domain(self) -> Box:
+        """The box of all tuples, ``(count width,)``."""
+        return Box(np.tile(self.slot.lower, self.count), np.tile(self.slot.upper, self.count))
+
+    def indices(self, family: ConstraintFamily, slots: Array) -> Array:
+        """The indices ``(k, d)`` at which a family is imposed by the indices ``(k, width)`` of a tuple."""
+        box = family.index_set
+        return np.clip(slots[:, : box.dimension], box.lower, box.upper)
+
+
+def imposed_program(program: SemiInfiniteProgram, formulation: Literal["reduced", "literal"]) -> SemiInfiniteProgram:
+    """The program whose families are indexed as the formulation says; raises `InputError` for a family that has no
+    literal one."""
+    return (
+        program
+        if formulation == "reduced"
+        else replace(program, families=[_literal(family) for family in program.families])
+    )
+
+
+def _literal(family: ConstraintFamily) -> ConstraintFamily:
+    if family.literal is None:
+        raise InputError(
+            f"formulation: literal needs families with a disturbance in their index, which {family.name} is not;"
+            " expected reduced"
+        )
+    return family.literal
+
+
+class TupleValue:
+    """``g(epsilon; xi^1, ..., xi^D)`` for points ``(k, D width)``; only the rows of indices that changed since the last
+    point are built.
+
+    Of the point before the last one the rows are kept too, so that a refused move costs nothing to take back, and where
+    the last optimum keeps the new rows, nothing is solved. ``epsilon`` may be changed
+    between evaluations. A value of ``+inf`` comes with a proof in `solution`.
+    """
+
+    def __init__(self, program: SemiInfiniteProgram, relaxed: RelaxedProgram, count: int) -> None:
+        self.layout, self.relaxed, self.program, self.epsilon = (
+            TupleLayout(program.families, count),
+            relaxed,
+            program,
+            0.0,
+        )
+        self.domain, self.block = self.layout.domain, self.layout.slot.dimension
+        self.slots = np.full((count, self.block), np.nan)
+        self.imposed, self.solution = Imposed(np.zeros(0, dtype=int), np.zeros(0)), _nothing(program.n)
+        self._solved_for = np.nan
+        first = [self._family_rows(family, self.layout.slot.lower[np.newaxis]) for family in program.families]
+        ends = np.cumsum([h.shape[1] for _, h in first], dtype=int)
+        self._columns = list(zip(program.families, ends - [h.shape[1] for _, h in first], ends, strict=True))
+        self._kinds = np.tile(np.arange(ends[-1] if first else 0), count)
+        self._G, self._h = (
+            np.zeros((count, self._kinds.size // count, program.n)),
+            np.zeros((count, self._kinds.size // count)),
+        )
+        self._norms = np.ones(self._h.shape)
+        self._before = _Before(np.zeros(0, dtype=int), self.slots[:0], self._G[:0], self._h[:0])
+
+    def __call__(self, points: Array) -> Array:
+        return np.array([self.at(point) for point in points])
+
+    def at(self, point: Array) -> float:
+        """``g`` at one point ``(D width,)``."""
+        changed = self._move(point.reshape(self.slots.shape))
+        if self._unmoved(changed):
+            return value_of(self.solution)
+        rows, self._solved_for = self._kinds.size, self.epsilon
+        self.imposed, self.solution = self.relaxed.lazily(
+            self._G.reshape(rows, -1),
+            self._h.reshape(rows),
+            self._kinds,
+            self.epsilon,
+            self.imposed,
+            self._norms.reshape(rows),
+        )
+        return value_of(self.solution)
+
+    def gradient(self, point: Array) -> Array:
+        """The gradient ``(D width,)`` of ``g`` where it has one: multiplier times derivative of the row in its index,
+        by the envelope theorem.
+
+        For a strictly convex program with unique multipliers (Bonnans and Shapiro 2000, theorem 4.24); at a kink it is
+        one of several.
+        """
+        if not np.array_equal(point.reshape(self.slots.shape), self.slots):
+            self.at(point)
+        slope = np.zeros(self.slots.shape)
+        slots, kinds = np.divmod(self.imposed.positions, self._h.shape[1])
+        for family, first, last in self._columns:
+            mine = (kinds >= first) & (kinds < last) & (self.imposed.multipliers > 0.0)
+            where, box = slots[mine], family.index_set
+            if not where.size:
+                continue
+            wanted = self.slots[where][:, : box.dimension]
+            indices = self.layout.indices(family, self.slots[where])
+            steps = (
+                index_gradient(family, self.solution.x, indices, kinds[mine] - first)
+                * self.imposed.multipliers[mine][:, np.newaxis]
+            )
+            np.add.at(slope[:, : box.dimension], where, np.where(wanted == indices, steps, 0.0))
+        return slope.ravel()
+
+    def rows(self) -> Rows:
+        """The rows that were imposed in the last evaluation, in the order of its multipliers."""
+        slots, kinds = np.divmod(self.imposed.positions, self._h.shape[1])
+        cuts = []
+        for slot, kind, multiplier in zip(slots, kinds, self.imposed.multipliers, strict=True):
+            family, first, _ = next(column for column in self._columns if column[1] <= kind < column[2])
+            index = self.layout.indices(family, self.slots[slot][np.newaxis])[0]
+            cuts.append(Cut(family.name, index, int(kind - first), float(multiplier)))
+        return Rows(self._G[slots, kinds], self._h[slots, kinds], tuple(cuts))
+
+    def _unmoved(self, changed: np.ndarray) -> bool:
+        """Whether the last optimum still is one: of its rows none has changed, and it keeps the changed ones."""
+        if self.solution.status != "optimal" or self._solved_for != self.epsilon:
+            return False
+        if np.isin(self.imposed.positions // self._h.shape[1], changed).any():
+            return False
+        return bool((self._G[changed] @ self.solution.x - self._h[changed] <= LAZY * self._norms[changed]).all())
+
+    def _move(self, slots: Array) -> np.ndarray:
+        """Bring the rows up to date with the indices ``(count, width)``; returns which of them changed."""
+        changed = np.flatnonzero((slots != self.slots).any(axis=1))
+        if not changed.size:
+            return changed
+        before = self._before
+        self._before = _Before(changed, self.slots[changed], self._G[changed], self._h[changed])
+        back, place = before.find(changed, slots[changed])
+        self._G[changed[back]], self._h[changed[back]] = before.G[place], before.h[place]
+        fresh = changed[~back]
+        for family, first, last in self._columns if fresh.size else ():
+            self._G[fresh, first:last], self._h[fresh, first:last] = self._family_rows(family, slots[fresh])
+        self._norms[changed] = np.maximum(np.linalg.norm(self._G[changed], axis=2), np.finfo(float).tiny)
+        self.slots[changed] = slots[changed]
+        return changed
+
+    def _family_rows(self, family: ConstraintFamily, slots: Array) -> tuple[Array, Array]:
+        indices = self.layout.indices(family, slots)
+        G, h = family.rows(indices)
+        if np.ndim(G) != 3 or np.shape(G)[::2] != (len(indices), self.program.n) or np.shape(G)[:2] != np.shape(h):
+            raise InputError(
+                f"family {family.name!r}: expected rows of shape ({len(indices)}, r, {self.program.n}) and right-hand"
+                f" sides ({len(indices)}, r), got {np.shape(G)} and {np.shape(h)}"
+            )
+        return G, h
+
+
+@dataclass(frozen=True, eq=False)
+class _Before:
+    """What the last change replaced: the indices ``changed (k,)`` of the tuple, sorted, with their coordinates and
+    rows."""
+
+    changed: np.ndarray
+    slots: Array
+    G: Array
+    h: Array
+
+    def find(self, changed: np.ndarray, slots: Array) -> tuple[np.ndarray, np.ndarray]:
+        """Which of the indices ``changed`` return to what they were ``(k,)``, and where that is kept."""
+        if not self.changed.size:
+            return np.zeros(changed.size, dtype=bool), np.zeros(0, dtype=int)
+        place = np.minimum(np.searchsorted(self.changed, changed), self.changed.size - 1)
+        back = (self.changed[place] == changed) & (self.slots[place] == slots).all(axis=1)
+        return back, place[back]
+
+
+def _nothing(n: int) -> FiniteSolution:
+    zero = np.zeros(n)
+    return FiniteSolution(
+        "failed", zero, np.nan, -np.inf, np.zeros(0), np.zeros(0), zero, np.inf, np.inf, "nothing was evaluated"
+    )

@@ -1,0 +1,90 @@
+"""What observers are told of one search: batches now and then, not one event for every evaluation."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.events import Batch, EvaluationsFinished, Notify, frozen
+
+SECONDS_BETWEEN_EVENTS = 0.05
+NUMBERS_BETWEEN_EVENTS = 2**21  # coordinates that wait to be told of
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """Where a search stands: its evaluations and budget, the best point ``(d,)`` with its value, coordinates per
+    index."""
+
+    evaluations: int
+    budget: int
+    best_value: float
+    best_point: Array
+    block: int
+
+
+@final
+class Notifier:
+    """Keeps the points that were not told of yet, without copying them, and where the walk stands."""
+
+    def __init__(self, notify: Notify, domain: Box) -> None:
+        self.notify, self.domain = notify, Box(frozen(domain.lower), frozen(domain.upper))
+        self.started = self.told_at = time.monotonic()
+        self.told, self.numbers, self.best = 0, 0, -np.inf
+        self.points: list[Array] = []
+        self.values: list[Array] = []
+        self.moments: list[tuple[int, float]] = []
+        self._noted: dict[str, int] = {}
+        self._origin: Array | None = None
+        self._last: Array | None = None
+        self._accepted: Array | None = None
+
+    @property
+    def due(self) -> bool:
+        """Whether it is time to tell of what has been collected."""
+        return time.monotonic() - self.told_at > SECONDS_BETWEEN_EVENTS or self.numbers > NUMBERS_BETWEEN_EVENTS
+
+    def add(self, points: Array, values: Array, moment: float) -> None:
+        """Collect points ``(k, d)`` and their values ``(k,)``, known ``moment`` seconds after the search began."""
+        self.points.append(points)
+        self.values.append(values)
+        self.moments.append((values.size, moment))
+        self.numbers += points.size
+        self._last = points[-1]
+
+    def note(self, scalars: Mapping[str, float]) -> None:
+        """Where a maximiser notes that it has accepted the last point, the walk stands there."""
+        if scalars.get("accepted"):
+            self._accepted = self._last
+
+    def publish(self, standing: Standing, notes: Mapping[str, Sequence[tuple[float, float]]]) -> None:
+        """One event for all that was collected; ``notes`` are those of the whole search."""
+        fresh = {
+            name: rows[self._noted.get(name, 0) :]
+            for name, rows in notes.items()
+            if len(rows) > self._noted.get(name, 0)
+        }
+        batch = Batch(self.points, self.values, self.moments, fresh, self.told, self.best, self._origin)
+        count, self.told, self.told_at = standing.evaluations - self.told, standing.evaluations, time.monotonic()
+        event = EvaluationsFinished(
+            count=count,
+            total=standing.evaluations,
+            best_value=standing.best_value,
+            seconds=self.told_at - self.started,
+            notes={name: rows[-1][1] for name, rows in notes.items()},
+            budget=standing.budget,
+            best_point=frozen(standing.best_point),
+            domain=self.domain,
+            block=standing.block,
+            batch=batch,
+        )
+        self.points, self.values, self.moments, self.numbers, self.best = [], [], [], 0, standing.best_value
+        self._noted = {name: len(rows) for name, rows in notes.items()}
+        self._origin = self._last if self._accepted is None else self._accepted
+        self.notify(event)

@@ -1,0 +1,277 @@
+"""A search for a maximum: the objective that keeps the accounts for a maximiser, and the search itself."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import TypeAlias
+
+import numpy as np
+
+from sparserob_core.errors import InputError, PluginError
+from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.events import Notify, silence
+from sparserob_core.sip.maximiser import EvaluationError, Maximiser, Report, SearchEnded, Trace
+from sparserob_core.sip.rules import Metropolis, Progress
+from sparserob_core.sip.search.notifier import Notifier, Standing
+
+Function: TypeAlias = Callable[[Array], object]
+
+KEPT_NUMBERS = 20_000_000  # coordinates in a trace; searches with more keep their values only
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """What is maximised: ``function`` maps points ``(k, d)`` of a bounded ``domain`` to ``k`` numbers.
+
+    ``gradient`` maps the point ``(d,)`` that was evaluated last to the gradient ``(d,)`` there; ``None`` if there is
+    none. ``block`` consecutive coordinates belong together (`Objective`). Raises `InputError` for an unbounded domain
+    or blocks that do not fill it.
+    """
+
+    function: Function
+    domain: Box
+    gradient: Callable[[Array], Array] | None = None
+    block: int = 1
+
+    def __post_init__(self) -> None:
+        domain = self.domain
+        if not (np.isfinite(domain.lower).all() and np.isfinite(domain.upper).all()):
+            raise InputError(
+                f"domain: expected a bounded box, got lower {domain.lower.tolist()}, upper {domain.upper.tolist()}"
+            )
+        if self.block < 1 or domain.dimension % self.block:
+            raise InputError(f"block: expected a divisor of the dimension {domain.dimension}, got {self.block!r}")
+
+
+@dataclass(frozen=True, eq=False)
+class Rules:
+    """What a search obeys beside its budget: when it stops (``SC2``), what a walk accepts (``SlCr``), and the share of
+    its budget that goes to a local method at the end."""
+
+    stop: Callable[[Progress], bool] | None = None
+    selection: Callable[[float, float, float, np.random.Generator], bool] = field(default_factory=Metropolis)
+    polish: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.polish < 1.0:
+            raise InputError(f"polish: expected a share of the budget, at least 0 and below 1, got {self.polish!r}")
+
+
+class CountedObjective:
+    """An `Objective` that keeps the accounts itself, so that a maximiser cannot misreport. Raises `InputError` for a
+    budget below 1."""
+
+    def __init__(self, target: Target, budget: int, rules: Rules | None = None, notify: Notify = silence) -> None:
+        if budget != int(budget) or budget < 1:
+            raise InputError(f"budget: expected a whole number of at least 1, got {budget!r}")
+        self.target, self.domain, self.block, self.budget = target, target.domain, target.block, int(budget)
+        self.rules: Rules | None = rules or Rules()
+        self.best_value, self.best_point = -np.inf, np.full(self.domain.dimension, np.nan)
+        self.evaluations = 0
+        self.ended: SearchEnded | EvaluationError | None = None
+        self._keeps = self.domain.dimension * self.budget <= KEPT_NUMBERS
+        self._points: list[Array] = []
+        self._values: list[Array] = []
+        self._seconds: list[tuple[int, float]] = []
+        self._improvements: list[tuple[int, float]] = []
+        self._notes: dict[str, list[tuple[float, float]]] = {}
+        self._notifier = None if notify is silence else Notifier(notify, target.domain)
+        self._started = time.monotonic()
+
+    @property
+    def remaining(self) -> int:
+        """Evaluations that are left."""
+        return self.budget - self.evaluations
+
+    @property
+    def differentiable(self) -> bool:
+        """See `Objective.differentiable`."""
+        return self.target.gradient is not None
+
+    def evaluate(self, points: Array) -> Array:
+        """See `Objective.evaluate`."""
+        if self.ended is not None:
+            raise self.ended
+        if self._notifier is not None and self._notifier.due:
+            self.tell()
+        asked = self._checked(points)
+        allowed = asked[: self.remaining]
+        values = np.empty(0)
+        if len(allowed):
+            values = self._values_at(allowed)
+            self._record(allowed, values)
+        if self.best_value == np.inf:
+            raise self._end(SearchEnded("a value of +inf was found, which nothing can exceed"))
+        if self._stopped():
+            raise self._end(SearchEnded("the stopping rule of the search says so"))
+        if len(allowed) < len(asked):
+            raise self._end(SearchEnded("the budget is spent"))
+        return values
+
+    def value_and_gradient(self, point: Array) -> tuple[float, Array]:
+        """See `Objective.value_and_gradient`."""
+        if self.target.gradient is None:
+            raise InputError("gradient: this objective offers none")
+        value = float(self.evaluate(np.asarray(point)[np.newaxis])[0])
+        slope = np.zeros(self.domain.dimension)
+        if np.isfinite(value):
+            slope = np.asarray(
+                self._called(self.target.gradient, np.array(point, dtype=float), slope.shape), dtype=float
+            )
+        return value, slope
+
+    def accepts(self, current: float, candidate: float, temperature: float, rng: np.random.Generator) -> bool:
+        """See `Objective.accepts`."""
+        return bool((self.rules or Rules()).selection(current, candidate, temperature, rng))
+
+    def note(self, **scalars: float) -> None:
+        """See `Objective.note`."""
+        for name, value in scalars.items():
+            self._notes.setdefault(name, []).append((self.evaluations, float(value)))
+        if self._notifier is not None:
+            self._notifier.note(scalars)
+
+    def go_on(self, budget: int) -> None:
+        """Open the search again, for its last part: up to ``budget`` evaluations in all, without a rule that stops
+        it."""
+        self.ended, self.budget, self.rules = None, budget, None
+
+    def seen(self) -> tuple[Array, Array]:
+        """Every evaluated point ``(n, d)`` and its value ``(n,)``; only the best one where all of them would be too
+        many."""
+        if not self._keeps:
+            return self.best_point[np.newaxis], np.array([self.best_value])
+        return np.concatenate([np.empty((0, self.domain.dimension)), *self._points]), np.concatenate(
+            [np.empty(0), *self._values]
+        )
+
+    def report(self, stopped: str, upper_bound: float = np.inf) -> Report:
+        """What has been found so far."""
+        points = self.seen()[0] if self._keeps else np.empty((0, self.domain.dimension))
+        values = np.concatenate([np.empty(0), *self._values])
+        seconds = np.repeat([moment for _, moment in self._seconds], [count for count, _ in self._seconds])
+        notes = {name: np.array(rows) for name, rows in self._notes.items()}
+        trace = Trace(points, values, np.maximum.accumulate(values), seconds, notes)
+        return Report(self.best_value, self.best_point, self.evaluations, upper_bound, trace, stopped)
+
+    def tell(self) -> None:
+        """Tell the observers of what was evaluated since they were told last."""
+        if self._notifier is not None and self.evaluations > self._notifier.told:
+            standing = Standing(self.evaluations, self.budget, self.best_value, self.best_point, self.block)
+            self._notifier.publish(standing, self._notes)
+
+    def _last_notes(self) -> dict[str, float]:
+        return {name: rows[-1][1] for name, rows in self._notes.items()}
+
+    def _stopped(self) -> bool:
+        stop = None if self.rules is None else self.rules.stop
+        return stop is not None and bool(
+            stop(Progress(self.evaluations, self.best_value, self._last_notes(), self._improvements))
+        )
+
+    def _checked(self, points: Array) -> Array:
+        asked = np.array(points, dtype=float)
+        if asked.ndim != 2 or asked.shape[1] != self.domain.dimension:
+            raise InputError(f"points: expected shape (k, {self.domain.dimension}), got {asked.shape}")
+        if not ((asked >= self.domain.lower).all() and (asked <= self.domain.upper).all()):
+            outside = ~((asked >= self.domain.lower) & (asked <= self.domain.upper)).all(axis=1)
+            raise InputError(
+                f"points: {asked[outside][0].tolist()} lies outside the domain, "
+                f"lower {self.domain.lower.tolist()}, upper {self.domain.upper.tolist()}"
+            )
+        return asked
+
+    def _end(self, reason: SearchEnded | EvaluationError) -> SearchEnded | EvaluationError:
+        self.ended = reason
+        return reason
+
+    def _values_at(self, points: Array) -> Array:
+        values = np.array(self._called(self.target.function, points.copy() if self._keeps else points, (len(points),)))
+        missing = np.isnan(values)
+        if missing.any():
+            values[missing] = -np.inf
+        return values
+
+    def _called(self, function: Function, argument: Array, shape: tuple[int, ...]) -> Array:
+        """What the user's function returns, of the right shape; whatever it raises ends the search."""
+        try:
+            values = np.asarray(function(argument), dtype=float)
+            if values.shape != shape:
+                raise ValueError(f"expected {shape[0]} numbers, got an array of shape {values.shape}")
+        except Exception as error:
+            best = (
+                f"the best of them {self.best_value:.9g} at {_shown(self.best_point)}"
+                if self.evaluations
+                else "none before"
+            )
+            reason = (
+                f"the function failed after {self.evaluations} evaluations ({best}): {type(error).__name__}: {error}"
+            )
+            raise self._end(EvaluationError(reason, self.report("the function failed"))) from error
+        return values
+
+    def _record(self, points: Array, values: Array) -> None:
+        if self._keeps:
+            self._points.append(points)
+        self._values.append(values.copy())
+        moment = time.monotonic() - self._started
+        self._seconds.append((values.size, moment))
+        if self._notifier is not None:
+            self._notifier.add(points, self._values[-1], moment)
+        top = int(values.argmax())
+        first = self.evaluations == 0
+        self.evaluations += len(values)
+        if values[top] > self.best_value or first:
+            self.best_value, self.best_point = float(values[top]), points[top].copy()
+            self._improvements.append((self.evaluations, self.best_value))
+
+
+def _shown(point: Array) -> str:
+    return str(point.tolist()) if point.size <= 12 else f"a point with {point.size} coordinates"
+
+
+def maximise(
+    target: Target,
+    maximiser: Maximiser,
+    budget: int,
+    rng: np.random.Generator,
+    rules: Rules | None = None,
+    notify: Notify = silence,
+) -> Report:
+    """Search for the maximum of a target with ``budget`` evaluations at most; the last share of them polishes what was
+    found.
+
+    An interrupt from the keyboard ends the search; the report says so. Raises `EvaluationError` when the function
+    raises or does not return numbers, `InputError` for a wrong budget, `PluginError` for an upper bound that an
+    evaluated value refutes.
+    """
+    rules = rules or Rules()
+    reserved = int(rules.polish * budget) if budget == int(budget) else 0
+    objective = CountedObjective(target, budget - reserved, rules, notify)
+    bound, stopped, interrupted = np.inf, "the maximiser found nothing left to gain", False
+    try:
+        try:
+            bound = float(maximiser.search(objective, rng))
+        except SearchEnded as end:
+            stopped = str(end)
+        if reserved and not isinstance(objective.ended, EvaluationError) and np.isfinite(objective.best_value):
+            objective.go_on(objective.evaluations + reserved)
+            stopped = f"{stopped}; then polished"
+            from sparserob_core.sip.search.local_search import polish
+
+            polish(objective, *objective.seen())
+    except SearchEnded:
+        pass
+    except KeyboardInterrupt:
+        stopped, interrupted = "interrupted from the keyboard", True
+    objective.tell()
+    if not bound >= objective.best_value:
+        name = type(maximiser).__name__
+        raise PluginError(
+            f"maximiser {name}: claims the upper bound {bound!r}, but the value {objective.best_value!r} was evaluated"
+        )
+    if isinstance(objective.ended, EvaluationError):
+        raise objective.ended
+    return replace(objective.report(stopped, bound), interrupted=interrupted)

@@ -1,0 +1,1 @@
+"""The most violated index of a constraint family."""

@@ -1,0 +1,192 @@
+"""Many local maxima at once: a trust region with finite differences, vectorised over the points that it improves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import combinations, product
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from sparserob_core.sip.convex_set import Array
+
+Rows: TypeAlias = npt.NDArray[Any]
+VectorFunction: TypeAlias = Callable[[Array], Array]
+
+STEPS = 80
+REACH = 2.0
+"""Longest step, in radii and per coordinate."""
+ACCURACY = 1e-14
+LARGEST_DIMENSION_WITH_CROSS_TERMS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Points ``(c, d)`` of the unit box, the row ``(c,)`` that each is about, its value ``(c,)``, and a radius
+    ``(c,)``."""
+
+    points: Array
+    rows: Rows
+    values: Array
+    radius: Array
+
+    def take(self, which: npt.NDArray[np.intp] | npt.NDArray[np.bool_]) -> Candidates:
+        """Some of them, by position or mask."""
+        return Candidates(self.points[which], self.rows[which], self.values[which], self.radius[which])
+
+    def join(self, other: Candidates) -> Candidates:
+        """These and the others."""
+        return Candidates(
+            np.concatenate([self.points, other.points]),
+            np.concatenate([self.rows, other.rows]),
+            np.concatenate([self.values, other.values]),
+            np.concatenate([self.radius, other.radius]),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Model:
+    """Quadratic models around ``middle (a, d)`` in units of the radius: value ``(a,)``, gradient ``(a, d)``, Hessian
+    ``(a, d, d)``."""
+
+    middle: Array
+    value: Array
+    gradient: Array
+    hessian: Array
+    spread: Array
+
+    def at(self, steps: Array) -> Array:
+        curved = np.einsum("ai,aij,aj->a", steps, self.hessian, steps)
+        return np.asarray(self.value + np.einsum("ai,ai->a", self.gradient, steps) + curved / 2, dtype=float)
+
+
+def refine(function: VectorFunction, candidates: Candidates) -> Candidates:
+    """Climb from every candidate to a local maximum of its row of ``function`` (points ``(k, d)`` of the unit box to
+    ``(k, r)``).
+
+    A quadratic model from finite differences is maximised over a trust region that stays inside the box, whose faces
+    are met exactly. The model is believed where it predicts and where its curvature does not depend on the radius;
+    elsewhere (kinks) the radius shrinks to a quarter around the best point. Values never get worse. A smooth row ends
+    within about 1e-14 of its local maximum, a kinked one within 1e-13, both relative to ``max(1, |value|)``.
+    """
+    count, dimension = candidates.points.shape
+    if dimension == 0 or count == 0:
+        return candidates
+    offsets = _stencil(dimension)
+    curvature = np.full((count, dimension), np.nan)
+    active = np.arange(count)
+    points, values, radius = candidates.points.copy(), candidates.values.copy(), candidates.radius.copy()
+    for _ in range(STEPS):
+        now = Candidates(points[active], candidates.rows[active], values[active], radius[active])
+        better, curved, done = _step(function, now, offsets, curvature[active])
+        points[active], values[active], radius[active], curvature[active] = (
+            better.points,
+            better.values,
+            better.radius,
+            curved,
+        )
+        active = active[~done]
+        if active.size == 0:
+            break
+    return replace(candidates, points=points, values=values, radius=radius)
+
+
+def _step(
+    function: VectorFunction, now: Candidates, offsets: Array, curvature: Array
+) -> tuple[Candidates, Array, npt.NDArray[np.bool_]]:
+    radius = np.minimum(now.radius, 0.5)[:, np.newaxis]
+    middle = np.clip(now.points, radius, 1 - radius)
+    stencil = _inside(middle[:, np.newaxis] + radius[:, np.newaxis] * offsets)
+    seen = _values(function, stencil, now.rows)
+    model = _fit(middle, seen, offsets)
+    steps = _climb(model, np.maximum(-REACH, -middle / radius), np.minimum(REACH, (1 - middle) / radius))
+    trial = _inside(middle + radius * steps)
+    reached = _values(function, trial[:, np.newaxis], now.rows)
+    scale = np.maximum(1.0, np.abs(now.values))
+    curved = np.einsum("aii->ai", model.hessian) / radius**2
+    change = np.abs(np.nan_to_num(curved - curvature, nan=np.inf, posinf=np.inf)).max(axis=1) * radius[:, 0] ** 2
+    smooth = (np.abs(reached[:, 0] - model.at(steps)) <= 0.05 * model.spread + ACCURACY * scale) & (
+        change <= 0.1 * model.spread
+    )
+    points, values = _best(
+        now, np.concatenate([stencil, trial[:, np.newaxis]], axis=1), np.concatenate([seen, reached], axis=1)
+    )
+    moved = np.abs(points - now.points).max(axis=1) > 0.75 * radius[:, 0]
+    shrink = np.where(moved, 1.0, np.where(smooth, 0.125, 1.0 / 4))
+    settled = smooth & (model.at(steps) - values <= ACCURACY * scale) & (values - now.values <= ACCURACY * scale)
+    done = settled | (model.spread <= 10 * ACCURACY * scale) | (radius[:, 0] < ACCURACY)
+    return Candidates(points, now.rows, values, radius[:, 0] * shrink), curved, done
+
+
+def _stencil(dimension: int) -> Array:
+    """The middle, one step either way along every coordinate, and the four corners of every pair of coordinates."""
+    unit = np.eye(dimension)
+    offsets = [np.zeros(dimension), *unit, *-unit]
+    if dimension <= LARGEST_DIMENSION_WITH_CROSS_TERMS:
+        offsets += [
+            a * unit[i] + b * unit[j]
+            for i, j in combinations(range(dimension), 2)
+            for a, b in product((1, -1), repeat=2)
+        ]
+    return np.array(offsets)
+
+
+def _inside(points: Array) -> Array:
+    """Into the unit box; what is within rounding of a face lies on it."""
+    points = np.where(points < 1e-15, 0.0, points)
+    return np.where(points > 1 - 1e-15, 1.0, points)
+
+
+def _values(function: VectorFunction, points: Array, rows: Rows) -> Array:
+    count, each, dimension = points.shape
+    values = function(points.reshape(count * each, dimension)).reshape(count, each, -1)
+    return np.take_along_axis(values, rows[:, np.newaxis, np.newaxis], axis=2)[:, :, 0]
+
+
+def _fit(middle: Array, seen: Array, offsets: Array) -> _Model:
+    count, dimension = middle.shape
+    finite = np.asarray(np.isfinite(seen).all(axis=1))
+    safe = np.where(finite[:, np.newaxis], seen, 0.0)
+    ahead, behind, centre = safe[:, 1 : 1 + dimension], safe[:, 1 + dimension : 1 + 2 * dimension], safe[:, :1]
+    hessian = np.zeros((count, dimension, dimension))
+    hessian[:, range(dimension), range(dimension)] = ahead + behind - 2 * centre
+    corners = (
+        safe[:, 1 + 2 * dimension :].reshape(count, -1, 4)
+        if len(offsets) > 1 + 2 * dimension
+        else np.empty((count, 0, 4))
+    )
+    for (i, j), four in zip(combinations(range(dimension), 2), np.moveaxis(corners, 1, 0), strict=False):
+        hessian[:, i, j] = hessian[:, j, i] = (four[:, 0] - four[:, 1] - four[:, 2] + four[:, 3]) / 4
+    spread = np.where(finite, safe.max(axis=1) - safe.min(axis=1), np.inf)
+    return _Model(middle, centre[:, 0], (ahead - behind) / 2, hessian, spread)
+
+
+def _climb(model: _Model, lower: Array, upper: Array) -> Array:
+    """Maximise the models over boxes: a Newton step with the curvature made concave, then coordinate ascent, exact for
+    one coordinate."""
+    dimension = lower.shape[1]
+    steps = np.zeros_like(lower)
+    if dimension > 1:
+        eigenvalues, vectors = np.linalg.eigh(model.hessian)
+        stiff = np.maximum(np.abs(eigenvalues), 1e-12 * np.abs(eigenvalues).max(axis=1, keepdims=True) + 1e-300)
+        along = np.einsum("aij,ai->aj", vectors, model.gradient) / stiff
+        steps = np.clip(np.einsum("aij,aj->ai", vectors, np.clip(along, -1e6, 1e6)), lower, upper)
+    for i in list(range(dimension)) * (1 if dimension == 1 else 4):
+        bend, low, high = model.hessian[:, i, i], lower[:, i], upper[:, i]
+        slope = model.gradient[:, i] + np.einsum("aj,aj->a", model.hessian[:, i], steps) - bend * steps[:, i]
+        ends = np.where((high - low) * (slope + bend / 2 * (high + low)) >= 0, high, low)
+        concave = bend < -1e-300
+        inner = np.clip(-slope / np.where(concave, bend, -1.0), low, high)
+        steps[:, i] = np.where(concave, inner, np.where((slope == 0) & (bend == 0), steps[:, i], ends))
+    return steps
+
+
+def _best(now: Candidates, points: Array, values: Array) -> tuple[Array, Array]:
+    top = np.argmax(values, axis=1)
+    each = np.arange(len(top))
+    better = values[each, top] > now.values
+    return np.where(better[:, np.newaxis], points[each, top], now.points), np.where(
+        better, values[each, top], now.values
+    )

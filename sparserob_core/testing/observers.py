@@ -1,0 +1,256 @@
+"""The contract of an observer: it hears whole runs, broken off or not, lets go of everything afterwards, and changes
+nothing."""
+
+from __future__ import annotations
+
+import io
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, final
+
+import numpy as np
+
+from sparserob_core.experiment.run.events import Event, Observer, RunFinished, RunStarted
+from sparserob_core.experiment.run.run import Outcome, run
+from sparserob_core.sip.convex_set import Box
+from sparserob_core.sip.events import Batch, EvaluationsFinished, ProofProgress, RoundFinished
+from sparserob_core.sip.program import SemiInfiniteProgram
+from sparserob_core.sip.result import Result
+
+CONFIG: Mapping[str, Any] = {
+    "title": "A double integrator",
+    "problem": {
+        "name": "linear",
+        "system": {"A": [[0, 1], [0, "p1"]], "B": [[0], [1]], "parameters": {"p1": [-0.1, 0.1]}},
+        "horizon": 2.0,
+        "initial_state": [1, 0],
+        "control": {"box": 1.0},
+        "disturbance": {"box": [0.01, 0.01]},
+        "path": [{"box": [2.0, None]}],
+        "terminal": [{"box": [0.5, 0.5]}],
+    },
+    "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 10}},
+    "observers": [],
+}
+SEARCH = {
+    "method": {"name": "sparserob", "indices": 4},
+    "maximiser": {"name": "simulated_annealing", "budget": 60},
+    "continuation": {"start": 1e-2, "factor": 0.1, "stop": 1e-3},
+}
+METHODS: Mapping[str, Mapping[str, Any]] = {
+    "exchange": {},
+    "sparserob": SEARCH,
+    "scenario": {"method": {"name": "scenario", "scenarios": 20}},
+    "infeasible": {"problem": {**CONFIG["problem"], "horizon": 0.5}},
+}
+BROKEN_OFF = (1, 2, 4)  # the events after which a run is interrupted: at once, and in the middle
+EVENTS = 300
+GRACE = 5.0  # seconds that an observer may take to end its threads
+ALLOWED = 2e-3  # seconds that an event may take on the solver's thread, the median of many
+
+
+@final
+class Heard(Observer):
+    """Passes everything on to the observer that is tested, and keeps what it heard and what went wrong."""
+
+    def __init__(self, observer: Observer, fails_at: int | None = None, failure: BaseException | None = None) -> None:
+        self.observer, self.fails_at, self.failure = observer, fails_at, failure
+        self.events: list[Event] = []
+        self.errors: list[Exception] = []
+        self.closed = 0
+
+    def receive(self, event: Event) -> None:
+        """Pass it on, then fail where that was asked for."""
+        self.events.append(event)
+        self._noting(lambda: self.observer.receive(event))
+        if self.failure is not None and len(self.events) - 1 == self.fails_at:
+            raise self.failure
+
+    def close(self) -> None:
+        """Pass it on."""
+        self.closed += 1
+        self._noting(self.observer.close)
+
+    def _noting(self, call: Any) -> None:
+        try:
+            call()
+        except Exception as error:
+            self.errors.append(error)
+            raise
+
+
+class ObserverContract(ABC):
+    """What every observer must keep: subclass it in a test module as ``class TestMine(ObserverContract)`` and give
+    ``create``.
+
+    The core keeps the order of events, detaches an observer that raises, and closes it; the contract checks that an
+    observer can live with that: no event is a surprise, a run may end at any of them, and afterwards nothing is left.
+    """
+
+    @abstractmethod
+    def create(self) -> Observer:
+        """A new observer."""
+
+    def watched(self, method: str, observer: Heard | None = None, quiet: bool = False) -> tuple[Outcome, Heard]:
+        """One run of `METHODS`, watched by a new observer or by the given one."""
+        heard = observer or Heard(self.create())
+        with TemporaryDirectory() as directory:
+            return (
+                run(
+                    {**CONFIG, **METHODS[method]},
+                    out=Path(directory) / "run",
+                    figures=False,
+                    quiet=quiet,
+                    observers=[heard],
+                ),
+                heard,
+            )
+
+    def test_it_hears_whole_runs_of_every_method(self) -> None:
+        kinds: set[type[Event]] = set()
+        for method in METHODS:
+            _, heard = self.watched(method)
+            assert not heard.errors, f"{method}: {heard.errors[0]!r}"
+            assert isinstance(heard.events[0], RunStarted)
+            assert isinstance(heard.events[-1], RunFinished)
+            assert heard.closed == 1
+            kinds |= {type(event) for event in heard.events}
+        assert kinds >= {RoundFinished, EvaluationsFinished, ProofProgress}, "not every event was there to be heard"
+
+    def test_the_run_is_the_same_with_and_without_it(self) -> None:
+        for method in METHODS:
+            watched, heard = self.watched(method)
+            alone, _ = self.watched(method, Heard(_Deaf()))
+            assert numbers(watched.result) == numbers(alone.result), f"{method}: the observer has changed the result"
+            assert not heard.errors
+
+    def test_it_ends_with_a_run_that_is_interrupted(self) -> None:
+        for count in BROKEN_OFF:
+            with nothing_left():
+                heard = Heard(self.create(), count, KeyboardInterrupt())
+                with suppress(KeyboardInterrupt):
+                    self.watched("sparserob", heard)
+                assert isinstance(heard.events[-1], RunFinished)
+                assert heard.events[-1].result is None
+                assert not heard.errors, f"interrupted after {count} events: {heard.errors[0]!r}"
+                assert heard.closed == 1
+
+    def test_it_lets_go_when_it_is_detached_before_the_end(self) -> None:
+        for count in (0, *BROKEN_OFF):
+            with nothing_left():
+                outcome, heard = self.watched(
+                    "sparserob", Heard(self.create(), count, RuntimeError("detached by the contract"))
+                )
+                assert len(heard.events) == count + 1
+                assert heard.closed == 1
+                assert not heard.errors, f"closed after {count} events: {heard.errors[0]!r}"
+                assert outcome.result.decision is not None
+
+    def test_nothing_of_it_is_left_after_a_run(self) -> None:
+        for method in METHODS:
+            with nothing_left():
+                self.watched(method)
+
+    def test_it_leaves_the_standard_output_alone_and_a_quiet_terminal_too(self) -> None:
+        for quiet in (False, True):
+            with redirect_stdout(io.StringIO()) as output, redirect_stderr(io.StringIO()) as errors:
+                self.watched("sparserob", quiet=quiet)
+            assert output.getvalue() == "", "the standard output belongs to the result"
+            assert not (quiet and errors.getvalue()), "a quiet run shows nothing"
+
+    def test_events_of_an_unknown_kind_and_in_an_unknown_order_are_ignored(self) -> None:
+        observer = self.create()
+        try:
+            for event in (_New(), *bare_events(), _New(), *bare_events()[-1:]):
+                observer.receive(event)
+        finally:
+            observer.close()
+
+    def test_a_program_that_is_no_control_problem_is_watched_too(self) -> None:
+        observer = self.create()
+        try:
+            for event in (started(), *bare_events()):
+                observer.receive(event)
+        finally:
+            observer.close()
+
+    def test_it_does_not_hold_up_the_solver(self) -> None:
+        observer, seconds = self.create(), []
+        observer.receive(started())
+        try:
+            for number in range(EVENTS):
+                event = bare_events()[2 if number % 3 else 0]
+                began = time.perf_counter()
+                observer.receive(event)
+                seconds.append(time.perf_counter() - began)
+            observer.receive(RunFinished(status="failed", message="broken off", seconds=1.0))
+        finally:
+            observer.close()
+        assert float(np.median(seconds)) < ALLOWED, f"an event takes {1e3 * float(np.median(seconds)):.1f} ms"
+
+
+@final
+class _New(Event):
+    """An event of a later version."""
+
+
+@final
+class _Deaf(Observer):
+    """Does nothing."""
+
+    def receive(self, event: Event) -> None:
+        """Nothing."""
+
+
+def started() -> RunStarted:
+    """The start of a run that is no control problem and has no directory."""
+    program = SemiInfiniteProgram(n=2, q=np.ones(2), lower=-1.0, upper=1.0)
+    return RunStarted(title="a program", directory=None, problem=None, program=program)
+
+
+def bare_events() -> Sequence[Event]:
+    """One event of every kind with as little in it as there may be, and the end of a run without a result."""
+    points, values = np.array([[0.5, 0.5], [0.25, 0.5]]), np.array([-np.inf, -1.0])
+    batch = Batch([points], [values], [(2, 0.1)], {"temperature": [(1, 2.0), (2, 1.0)]})
+    return (
+        RoundFinished(round=1, epsilon=0.0, lower_bound=-np.inf, upper_bound=np.inf, violation=-np.inf),
+        EvaluationsFinished(count=1, total=1, best_value=-np.inf),
+        EvaluationsFinished(
+            count=2,
+            total=2,
+            best_value=-1.0,
+            seconds=0.1,
+            notes={"temperature": 1.0},
+            budget=4,
+            best_point=points[1],
+            domain=Box(np.zeros(2), np.ones(2)),
+            family="above",
+            batch=batch,
+        ),
+        ProofProgress(family="above", cells=3, bound=np.inf),
+        RunFinished(status="failed", message="broken off", seconds=1.0),
+    )
+
+
+@contextmanager
+def nothing_left() -> Iterator[None]:
+    """Fails when more threads are alive afterwards than before."""
+    before = set(threading.enumerate())
+    yield
+    deadline = time.monotonic() + GRACE
+    while (left := set(threading.enumerate()) - before) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not left, f"still running: {', '.join(thread.name for thread in left)}"
+
+
+def numbers(result: Result) -> list[object]:
+    """Everything of a result that must not depend on who is watching."""
+    decision = None if result.decision is None else result.decision.tolist()
+    trace = [] if result.trace is None else result.trace.value.tolist()
+    rounds = [(one.lower_bound, one.upper_bound, one.violation, one.active_indices) for one in result.history]
+    return [result.status, result.message, decision, trace, rounds, result.lower_bound, result.upper_bound]

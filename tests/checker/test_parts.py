@@ -1,0 +1,368 @@
+"""Guards checker: the parts of the checker bound what they say they bound: against dense samples, and against the wing
+that solves."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from flint import arb, ctx
+
+import sparserob_core as sr
+from sparserob_core.checker.arithmetic.bernstein import highest
+from sparserob_core.checker.arithmetic.jets import Monomials, expanded
+from sparserob_core.checker.claims.duality import Duality
+from sparserob_core.checker.claims.subdivision import fill
+from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.reach.disturbance_support import Scene
+from sparserob_core.checker.reach.flow import Flow, stacked
+from sparserob_core.checker.reach.tube import Tube
+from sparserob_core.checker.sets.polynomials import linear_bound
+from sparserob_core.checker.sets.shapes import excess, facets, limit, member, support
+from sparserob_core.control.problem.expression import parse_matrix
+from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.response.response import merge_grids
+from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Ellipsoid, NormBall, Polytope
+from sparserob_core.control.transcription.transcribe import prepare, program_of
+
+from .plants import indicators, random_system, uniform, worst_case
+
+TRIANGLE = Polytope(np.array([[1.0, 1.0], [-1.0, 0.0], [0.0, -1.0]]), np.array([1.0, 0.5, 0.25]))
+TILTED = Ellipsoid(np.array([0.1, -0.2]), np.array([[0.5, 0.2], [0.2, 0.3]]))
+SETS: dict[str, ConvexSet] = {
+    "box": Box(np.array([-1.0, 0.2]), np.array([0.5, 0.7])),
+    "polytope": TRIANGLE,
+    "ellipsoid": TILTED,
+    **{f"{p}-norm": NormBall(p=p, radius=0.7, centre=np.array([0.3, -0.1])) for p in (1.0, 1.5, 2.0, 3.0, np.inf)},
+}
+SLOPED = {name: shape for name, shape in SETS.items() if name not in ("1.5-norm", "3.0-norm")}
+
+
+def exact(values):
+    return [arb(float(v)) for v in values]
+
+
+@pytest.mark.parametrize("shape", [(9,), (5, 4), (4, 3, 3)])
+def test_bernstein_bounds_are_above_every_sample_and_close_to_the_highest(shape):
+    rng = np.random.default_rng(1)
+    coefficients = rng.normal(size=(20, *shape))
+    symmetric = [False] + [True] * (len(shape) - 1)
+    axes = [np.linspace(-1.0 if both else 0.0, 1.0, 41) for both in symmetric]
+    sampled = coefficients
+    for axis, points in zip(range(len(shape)), axes, strict=True):
+        sampled = np.moveaxis(
+            np.tensordot(sampled, np.vander(points, shape[axis], increasing=True), axes=(axis + 1, 1)), -1, axis + 1
+        )
+    top = sampled.reshape(20, -1).max(axis=1)
+    for offset in (-1.0, 0.1):
+        limits = top + offset
+        found = np.array(
+            [highest(c[None], symmetric, np.zeros(1), limit)[0] for c, limit in zip(coefficients, limits, strict=True)]
+        )
+        assert (found >= top).all()
+        assert ((found <= limits) == (offset > 0)).all()
+
+
+def test_bernstein_bounds_add_the_errors_and_never_prove_what_is_not_finite():
+    one = np.array([[1.0, -1.0], [1.0, -1.0], [np.inf, -np.inf], [1e308, 1e308]])
+    found = highest(one, [False], np.array([0.0, 0.5, 0.0, 0.0]), 2.0)
+    assert found[0] == pytest.approx(1.0)
+    assert found[1] == pytest.approx(1.5)
+    assert not (found[2:] <= 2.0).any()
+    assert (highest(one[:1], [False], np.array([np.nan]), 2.0) > 2.0).all()
+
+
+@pytest.mark.parametrize("name", SLOPED)
+def test_a_linear_bound_is_above_the_support_on_its_range_and_sharp_at_a_point(name):
+    rng, shape = np.random.default_rng(2), SETS[name]
+    value = rng.normal(size=(200, 2))
+    for spread in (np.zeros((200, 2)), 10.0 ** rng.uniform(-9, 0.5, size=(200, 2))):
+        w, excess_ = linear_bound(shape, value, spread)
+        for corner in [*itertools.product((-1, 0, 1), repeat=2), *rng.uniform(-1, 1, size=(20, 2))]:
+            f = value + spread * np.array(corner)
+            assert (shape.support(f) <= np.einsum("kw,kw->k", w, f) + excess_ + 1e-15 * np.abs(f).sum(axis=1)).all()
+        if not spread.any():
+            assert np.abs(np.einsum("kw,kw->k", w, value) + excess_ - shape.support(value)).max() < 1e-12
+
+
+@pytest.mark.parametrize("thin", [1e-4, 1e-8, 1e-12, 1e-15])
+def test_a_linear_bound_of_a_thin_ellipsoid_loses_nothing_to_cancellation(thin):
+    rng, short = np.random.default_rng(0), 0.0
+    for _ in range(100):
+        turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+        S = (turn * np.array([1.0, 1e-2, thin])) @ turn.T
+        try:
+            shape = Ellipsoid(np.zeros(3), (S + S.T) / 2)
+        except sr.InputError:
+            continue
+        value = turn[:, 2]
+        w, over = linear_bound(shape, value[None], np.zeros((1, 3)))
+        with ctx.workprec(200):
+            bound = sum((a * b for a, b in zip(exact(w[0]), exact(value), strict=True)), arb(float(over[0])))
+            short = max(short, float((support(shape, exact(value)) - bound).upper()))
+    assert short <= 0.0
+
+
+def test_sets_without_a_linear_bound_are_left_unchecked():
+    with pytest.raises(Unchecked):
+        linear_bound(SETS["1.5-norm"], np.ones((1, 2)), np.zeros((1, 2)))
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_support_balls_hold_the_support_of_the_set(name):
+    rng, shape = np.random.default_rng(3), SETS[name]
+    for direction in [*rng.normal(size=(30, 2)), np.array([1.0, 0.0]), np.array([0.0, -1.0])]:
+        with ctx.workprec(96):
+            ball = support(shape, exact(direction))
+            cylinder = support(Cylinder(shape, 3), exact([*direction, 0.0]))
+        assert float(ball.rad()) < 1e-20
+        assert float(ball.mid()) == pytest.approx(float(shape.support(direction)), rel=1e-13, abs=1e-14)
+        assert cylinder.overlaps(ball)
+    with pytest.raises(Broken):
+        support(Cylinder(shape, 3), exact([1.0, 0.0, 1e-300]))
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_membership_is_proven_inside_and_never_outside(name):
+    shape, rng = SETS[name], np.random.default_rng(4)
+    middle = shape.interior_point()
+    for direction in rng.normal(size=(30, 2)):
+        edge = shape.support_point(direction[None])[0]
+        inside, outside = middle + (1 - 1e-9) * (edge - middle), middle + (1 + 1e-9) * (edge - middle)
+        assert member(shape, inside)
+        assert not member(shape, outside)
+        assert excess(shape, exact(inside)) == 0.0
+        assert 0.0 < excess(shape, exact(outside)) < 1e-8
+
+
+def test_a_point_that_cancels_is_not_said_to_be_inside():
+    blurred = arb(0, 1e-30)
+    for p in (1.5, 2.0, 3.0):
+        ball = NormBall(p=p, radius=1.0, centre=np.zeros(2))
+        assert excess(ball, [arb(5), blurred]) == pytest.approx(4.0)
+        assert excess(ball, [arb(0.5), blurred]) == 0.0
+
+
+def test_limits_of_flat_sets_are_what_their_facets_say():
+    for normal, height in facets(TRIANGLE) or []:
+        assert limit(TRIANGLE, normal) == height
+    with pytest.raises(Broken, match="not the normal of a facet"):
+        limit(TRIANGLE, np.array([1.0, 0.9]))
+    with pytest.raises(Broken, match="unbounded"):
+        limit(Box(np.array([-1.0, -np.inf]), np.array([1.0, np.inf])), np.array([1.0, 1e-300]))
+
+
+def plant(nu, spread):
+    """A damped oscillator, a parameter in ``A`` and one in ``B``, both also in ``E``."""
+    if not nu:
+        return random_system(np.random.default_rng(5), states=2, disturbances=2)
+    names = ("p1", "p2")[:nu]
+    entries = ["-2 + p1*cos(p1)", "-0.5"], ["1 + sin(p2)" if nu > 1 else "1"], ["1", "0.3*exp(p1)"]
+    A, B, E = (
+        parse_matrix(name, rows, names)
+        for name, rows in (("A", [["0", "1"], entries[0]]), ("B", [["0"], entries[1]]), ("E", [["1", "0"], entries[2]]))
+    )
+    return LinearSystem(A, B, E, parameters=Box(np.full(nu, -spread), np.full(nu, spread)), names=names)
+
+
+def tube_of(system, control, disturbance, bound, degree, theta, start):
+    grid = merge_grids(control.breakpoints, disturbance.breakpoints)
+    held = theta[
+        np.clip(np.searchsorted(control.breakpoints, grid.breakpoints[:-1], side="right") - 1, 0, control.pieces - 1)
+    ]
+    nu = system.parameter_count
+    box = system.parameters
+    centre, radius = (
+        (np.zeros(0), np.zeros(0)) if box is None else ((box.lower + box.upper) / 2, (box.upper - box.lower) / 2)
+    )
+    scene = Scene(
+        grid.breakpoints.tolist(),
+        [stacked([[arb(float(u))]]) for u in held],
+        start.tolist(),
+        bound,
+        disturbance.breakpoints[:-1].tolist(),
+    )
+    return (
+        Tube(Flow(system, tuple(centre.tolist()), tuple(radius.tolist()), degree if nu else 0), scene),
+        centre,
+        radius,
+    )
+
+
+@pytest.mark.parametrize("name", ["box", "polytope", "ellipsoid", "2.0-norm"])
+@pytest.mark.parametrize(
+    ("nu", "spread", "degree", "near"), [(0, 0.0, 0, 1e-8), (1, 0.05, 8, 1e-8), (2, 0.05, 6, 1e-8), (1, 0.8, 6, np.inf)]
+)
+def test_tubes_are_above_the_worst_case_and_not_far_above(nu, spread, degree, near, name):
+    rng, bound = np.random.default_rng(6), SETS[name]
+    system, start = plant(nu, spread), np.array([-1.0, 0.5])
+    control, disturbance = indicators([0.0, 0.3, 0.45, 1.1, 2.0]), uniform(5, 2.0)
+    theta = rng.uniform(-1, 1, size=control.pieces)
+    true = worst_case(system, control, disturbance, bound, initial_state=start)
+    with ctx.workprec(96):
+        tube, centre, radius = tube_of(system, control, disturbance, bound, degree, theta, start)
+        for piece, (a, b) in enumerate(itertools.pairwise(tube.scene.grid)):
+            a, b = a + 0.1 * (b - a), b - 0.75 * (b - a)
+            directions = rng.normal(size=(3, 2))
+            for direction, poly in zip(directions, tube.cells(piece, a, b, list(directions)), strict=True):
+                share, delta = rng.uniform(size=50), rng.uniform(-1, 1, size=(50, nu))
+                share[:2], delta[:8] = (0.0, 1.0), np.sign(delta[:8])
+                exponents = np.array(tube.flow.monomials.exponents, dtype=float).reshape(
+                    1, tube.flow.monomials.size, nu
+                )
+                powers = np.prod(delta[:, None, :] ** exponents, axis=2)
+                value = np.einsum(
+                    "kj,jm,km->k",
+                    np.vander(share, poly.coefficients.shape[0], increasing=True),
+                    poly.coefficients,
+                    powers,
+                )
+                where = a + share * (b - a), np.tile(direction, (50, 1)), centre + radius * delta
+                truth = true.values(theta, *where)
+                assert (truth <= value + poly.error + 1e-13).all()
+                assert poly.error - poly.kinks <= near
+                assert (value - poly.error <= truth + 1e-13 + 2 * poly.kinks).all()
+
+
+def test_the_remainder_is_needed_and_enough_on_a_wide_box():
+    """``x' = p x``, so ``x(1) = e^p``: what degree 2 leaves out on ``|p| <= 1`` is ``e - 2.5`` at most, and at least
+    that."""
+    system = LinearSystem(
+        parse_matrix("A", [["p1"]], ("p1",)), np.array([[1.0]]), parameters=Box(np.array([-1.0]), np.array([1.0]))
+    )
+    control = uniform(2, 1.0)
+    with ctx.workprec(96):
+        tube, _, _ = tube_of(system, control, control, None, 2, np.zeros(2), np.array([1.0]))
+        (poly,) = tube.cells(1, 1.0, 1.0, [np.array([1.0])])
+    assert poly.coefficients[0] == pytest.approx([1.0, 1.0, 0.5])
+    assert np.e - 2.5 <= poly.expansion < 1.0
+
+
+@pytest.mark.parametrize("nu", [0, 1, 2])
+def test_rows_of_the_dual_are_those_of_the_transcription(nu):
+    rng = np.random.default_rng(7)
+    control, disturbance = indicators([0.0, 0.3, 0.45, 1.1, 2.0]), uniform(5, 2.0)
+    problem = OptimalControlProblem(
+        system=plant(nu, 0.1),
+        horizon=2.0,
+        initial_state=np.array([-1.0, 0.5]),
+        control=Box(-np.ones(1), np.ones(1)),
+        disturbance=TRIANGLE,
+        path=[PathConstraint(Ellipsoid(np.zeros(2), np.eye(2)), 0.1, 1.9), PathConstraint(SETS["box"], 0.0, 2.0)],
+    )
+    family = program_of(prepare(problem, control, disturbance)).families[1]
+    dual = Duality(problem, control, disturbance.breakpoints[:-1].tolist())
+    for time in (0.0, 0.3, 0.7, 2.0):
+        parameter = rng.uniform(-0.1, 0.1, size=nu)
+        G, h = family.rows(np.concatenate([[time], parameter])[None])
+        for row, (normal, height) in enumerate(facets(SETS["box"]) or []):
+            with ctx.workprec(96):
+                found = dual.row(normal, time, parameter.tolist(), height)
+            mine = next(
+                r
+                for r in range(G.shape[1])
+                if np.allclose(
+                    [float(s[0].mid()) for s in found.slope] + [-float(found.constant.mid())],
+                    [*G[0, r], h[0, r]],
+                    rtol=0,
+                    atol=1e-12,
+                )
+            )
+            assert 0 <= mine < 4, row
+
+
+FUNCTIONS = [
+    "sin(p1)",
+    "cos(p1)",
+    "tan(p1)",
+    "exp(p1)",
+    "log(p1)",
+    "sqrt(p1)",
+    "tanh(p1)",
+    "1 / p1",
+    "p1 / (1 + p1**2)",
+    "p1**3",
+    "p1**2.5",
+    "2**p1",
+    "p1**p1",
+    "-p1 + 3*p1 - 1",
+    "1 / (2 - p1)**2",
+    "exp(-p1) * sin(3*p1)",
+    "p1**-2",
+]
+
+
+@pytest.mark.parametrize("text", FUNCTIONS)
+def test_jets_are_taylor_series_of_the_functions_of_expressions(text):
+    matrix = parse_matrix("A", [[text]], ("p1",))
+    system = LinearSystem(matrix, np.array([[1.0]]), parameters=Box(np.array([0.6]), np.array([0.8])), names=("p1",))
+    monomials, delta = Monomials(1, 8), np.linspace(-1, 1, 21)
+    with ctx.workprec(96):
+        series = [float(part[0, 0].mid()) for part in expanded(system, monomials, exact([0.7]), [0.01])["A"]]
+        wide = expanded(system, monomials, [arb(0.7, 0.1)], [0.1])["A"]
+        narrow = [expanded(system, monomials, exact([p]), [0.1])["A"] for p in (0.6001, 0.65, 0.7999)]
+    truth = matrix.evaluate((0.7 + 0.01 * delta)[:, None])[:, 0, 0]
+    assert np.abs(np.polyval(series[::-1], delta) - truth).max() < 1e-14 * max(1.0, np.abs(truth).max())
+    assert all(
+        wide[k][0, 0].overlaps(point[k][0, 0]) and wide[k][0, 0].rad() >= 0 for point in narrow for k in range(9)
+    )
+
+
+@pytest.mark.parametrize("text", ["1 / p1", "log(p1)", "sqrt(p1)", "tan(p1 + pi/2)", "p1**-1"])
+def test_a_singularity_on_a_cell_is_left_unchecked(text):
+    system = LinearSystem(
+        parse_matrix("A", [[text]], ("p1",)),
+        np.array([[1.0]]),
+        parameters=Box(np.array([0.6]), np.array([0.8])),
+        names=("p1",),
+    )
+    with ctx.workprec(96), pytest.raises(Unchecked):
+        expanded(system, Monomials(1, 2), [arb(0.1, 0.2)], [0.2])
+
+
+def cells(rows):
+    return tuple(np.array(corner, dtype=float) for corner in zip(*rows, strict=True))
+
+
+def test_cells_that_fill_a_box_are_accepted():
+    low, high = np.zeros(2), np.array([1.0, 3.0])
+    fill(*cells([([0, 0], [1, 3])]), low, high)
+    fill(*cells([([0, 0], [0.3, 3]), ([0.3, 0], [1, 1]), ([0.3, 1], [1, 3])]), low, high)
+    fill(*cells([([0.5], [0.5])]), np.array([0.5]), np.array([0.5]))
+    fill(*cells([([-0.0, 0.5], [1, 0.5])]), np.array([0.0, 0.5]), np.array([1.0, 0.5]))
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [([0, 0], [1, 1.5])],
+        [([0, 0], [0.5, 3]), ([np.nextafter(0.5, 1), 0], [1, 3])],
+        [([0, 0], [np.nextafter(0.5, 1), 3]), ([0.5, 0], [1, 3])],
+        [([0, 0], [1, 3]), ([0, 0], [1, 3])],
+        [([0, 0], [1, 3]), ([0.2, 0], [0.2, 3])],
+        [([0, 0], [1, 4])],
+        [([0, 0], [1, np.nan])],
+        [([0, 0], [np.inf, 3])],
+        [([1, 3], [0, 0])],
+        [([0, 0], [0, 3]), ([1, 0], [1, 3])],
+        [([0], [1])],
+    ],
+    ids=[
+        "half",
+        "a hole",
+        "an overlap",
+        "twice",
+        "flat inside",
+        "outside",
+        "nan",
+        "infinite",
+        "turned",
+        "flat only",
+        "narrow",
+    ],
+)
+def test_holes_and_overlaps_are_refused(rows):
+    with pytest.raises(Broken):
+        fill(*cells(rows), np.zeros(2), np.array([1.0, 3.0]))

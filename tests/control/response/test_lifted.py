@@ -1,0 +1,305 @@
+"""Guards control/response/lifted: taylor models of uncertain systems, and bounds of polynomials: they enclose what
+sampling finds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+
+from sparserob_core.control.enclosures.polynomial import polynomial_bound
+from sparserob_core.control.enclosures.taylor import TaylorSpace
+from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.response.disturbance_support import Push
+from sparserob_core.control.response.lifted import frozen, lift
+from sparserob_core.sip.convex_set import Box
+
+from .plants import indicators, simulated, uniform, worst_case
+
+HORIZON = 3.0
+
+
+def oscillator(p):
+    return np.array([[0 * p[0], 1 + 0 * p[0]], [-(p[0] ** 2), -0.1 + 0 * p[0]]])
+
+
+def family(entries):
+    """A function of ``p`` from a matrix of functions of ``p``."""
+    return lambda p: np.array([[entry(p) if callable(entry) else entry + 0 * p[0] for entry in row] for row in entries])
+
+
+SYSTEMS = {  # name: (A, B, E, centre, radius)
+    "stable": (
+        family([[lambda p: -1 + p[0], 0.5], [0.0, lambda p: -2 + p[1]]]),
+        np.ones((2, 1)),
+        np.eye(2),
+        [0.1, -0.2],
+        [0.3, 0.4],
+    ),
+    "oscillating": (oscillator, [[0.0], [1.0]], np.eye(2), [2.0], [0.3]),
+    "unstable": (
+        family([[lambda p: 0.8 + p[0], 1.0], [0.2, lambda p: 0.5 * p[0]]]),
+        np.ones((2, 1)),
+        np.eye(2),
+        [0.0],
+        [0.3],
+    ),
+    "sine": (
+        family([[0.0, 1.0], [lambda p: -np.sin(p[0]), lambda p: -0.2 * np.cos(p[0])]]),
+        np.ones((2, 1)),
+        np.eye(2),
+        [1.0],
+        [0.7],
+    ),
+    "defective": (
+        family([[lambda p: -1 + p[0], 1.0, 0.0], [0.0, lambda p: -1 + p[0], 1.0], [0.0, 0.0, -1.0]]),
+        [[0.0], [0.0], [1.0]],
+        np.eye(3)[:, :2],
+        [0.0],
+        [0.2],
+    ),
+    "integrators": (
+        np.array([[0.0, 1.0], [0.0, 0.0]]),
+        family([[0.0], [lambda p: 1 / (1 + p[0])]]),
+        family([[1.0, 0.0], [0.0, lambda p: p[0]]]),
+        [0.1],
+        [0.4],
+    ),
+    "everything": (
+        family([[lambda p: -0.5 + p[0] * p[1], 1.0], [lambda p: -(p[2] ** 2), lambda p: -0.3 + p[1]]]),
+        family([[lambda p: p[0]], [lambda p: 1 + p[1]]]),
+        family([[lambda p: 1 + p[2], 0.0], [lambda p: p[0], lambda p: np.exp(p[1])]]),
+        [0.0, 0.1, 1.5],
+        [0.3, 0.2, 0.2],
+    ),
+    "four": (
+        family([[lambda p: -0.5 + p[0], lambda p: 1 + p[1]], [lambda p: -2 + p[2], lambda p: -0.3 + p[3]]]),
+        np.ones((2, 1)),
+        family([[lambda p: 1 + p[0], 0.0], [0.0, lambda p: 1 + p[3]]]),
+        [0.0] * 4,
+        [0.2] * 4,
+    ),
+    "fast": (family([[lambda p: -12 + p[0], 2.0], [1.0, -0.5]]), np.ones((2, 1)), np.eye(2), [0.0], [1.0]),
+}
+GRIDS = {
+    "uniform": uniform(6, HORIZON),
+    "uneven": indicators([0.0, 0.4, 0.5, 1.6, HORIZON]),
+    "single": uniform(1, HORIZON),
+}
+
+
+def made(name, grid, scale=1.0, bound=None):
+    A, B, E, centre, radius = SYSTEMS[name]
+    centre, radius = np.array(centre), scale * np.array(radius)
+    system = LinearSystem(A, B, E, parameters=Box(centre - radius, centre + radius))
+    functionals = worst_case(system, GRIDS[grid], bound=bound, initial_state=np.arange(1.0, 1 + system.states))
+    return functionals, lift(system, functionals.response.grid, functionals.response.initial_state, centre, radius)
+
+
+def deltas(rng, nu):
+    return np.vstack([rng.uniform(-1, 1, (6, nu)), np.sign(rng.normal(size=(4, nu)))])
+
+
+@pytest.mark.parametrize("grid", sorted(GRIDS))
+@pytest.mark.parametrize("name", sorted(SYSTEMS))
+@pytest.mark.parametrize("scale", [1.0, 0.05])
+def test_the_taylor_model_of_the_state_encloses_every_trajectory_of_the_cell(name, grid, scale):
+    rng = np.random.default_rng(1)
+    functionals, lifted = made(name, grid, scale)
+    system, response = functionals.response.system, functionals.response
+    control = rng.normal(size=(1, GRIDS[grid].pieces))
+    nodes = lifted.nodes(control)
+    remainder = lifted.state_remainder(control)
+    _, _, _, centre, radius = SYSTEMS[name]
+    for delta in deltas(rng, lifted.space.nu):
+        p = np.array(centre) + scale * np.array(radius) * delta
+        A, B, _ = (matrix[0] for matrix in system.matrices(p[None]))
+        polynomial = np.einsum("a,lai->li", lifted.space.monomials(delta[None])[0], nodes)
+        for piece, stop in enumerate(response.grid.breakpoints[1:]):
+            truth = simulated(A, [(B, GRIDS[grid].breakpoints, control)], response.initial_state, stop, np.array([0.0]))
+            error = np.linalg.norm(np.linalg.solve(lifted.transform, truth) - polynomial[piece + 1])
+            assert error <= remainder[piece] * (1 + 1e-9) + 1e-11 * max(1.0, np.abs(truth).max()) * np.linalg.cond(
+                lifted.transform
+            )
+
+
+@pytest.mark.parametrize("name", sorted(SYSTEMS))
+def test_the_taylor_model_of_a_functional_encloses_it_over_the_cell(name):
+    rng = np.random.default_rng(2)
+    functionals, lifted = made(name, "uneven")
+    _, _, _, centre, radius = SYSTEMS[name]
+    direction = rng.normal(size=lifted.states)
+    nodes, remainder = lifted.row_nodes(direction), lifted.row_bounds(direction)[1]
+    for delta in deltas(rng, lifted.space.nu):
+        A = functionals.response.system.matrices((np.array(centre) + np.array(radius) * delta)[None])[0][0]
+        T = lifted.transform
+        for piece, stop in enumerate(lifted.fine.breakpoints[1:]):
+            truth = direction @ np.linalg.solve(T, expm(A * stop) @ T)
+            polynomial = lifted.space.monomials(delta[None])[0] @ nodes[piece + 1]
+            assert np.linalg.norm(truth - polynomial) <= remainder[piece] * (1 + 1e-9) + 1e-10 * max(
+                1.0, np.linalg.norm(truth)
+            )
+
+
+@pytest.mark.parametrize("name", sorted(SYSTEMS))
+@pytest.mark.parametrize("grid", sorted(GRIDS))
+def test_the_push_is_enclosed_over_the_cell(name, grid):
+    rng = np.random.default_rng(3)
+    functionals, lifted = made(name, grid, bound=Box([-0.1, -0.3], [0.2, 0.1]))
+    _, _, _, centre, radius = SYSTEMS[name]
+    directions = rng.normal(size=(2, lifted.states))
+    push = Push(lifted, functionals.disturbance, directions @ lifted.transform)
+    times = np.append(rng.uniform(0, HORIZON, 4), HORIZON)
+    coefficients, excess = push.at(times, np.zeros((times.size, 2, lifted.space.nu)))
+    neglected = push.neglected[:, functionals.response.grid.locate(times)].T
+    for delta in deltas(rng, lifted.space.nu):
+        p = np.array(centre) + np.array(radius) * delta
+        truth = functionals.profile(times, directions, p)
+        bound = coefficients @ lifted.space.monomials(delta[None])[0] + excess + neglected
+        assert (truth <= bound + 1e-10 * np.maximum(1.0, np.abs(truth))).all()
+
+
+@pytest.mark.parametrize("name", ["oscillating", "sine", "unstable"])
+def test_the_remainder_vanishes_with_the_cell(name):
+    """Degree 6 for one parameter: halving a small cell divides what is neglected by about ``2^7``."""
+    control = np.ones((1, 6))
+    sizes = []
+    for scale in (0.25, 0.125, 0.0625):
+        _, lifted = made(name, "uniform", scale)
+        sizes.append(lifted.state_remainder(control).max())
+    assert sizes[1] <= sizes[0] / 60
+    assert sizes[2] <= sizes[1] / 60
+
+
+@pytest.mark.parametrize("nu", [1, 4])
+def test_products_of_a_functional_and_an_uncertain_disturbance_matrix_are_enclosed(nu):
+    """``sigma = (1 + p) int_0^1 e^{0.3 q s} ds`` at the corner of the cell: terms above the degree of the models may
+    not be lost."""
+    system = LinearSystem(
+        lambda p: np.array([[0.3 * p[0]]]),
+        [[1.0]],
+        lambda p: np.array([[1 + p[-1]]]),
+        parameters=Box([-1.0] * nu, [1.0] * nu),
+    )
+    for rate in (1.0, 3.0, 10.0):
+        quick = LinearSystem(
+            lambda p, rate=rate: np.array([[rate * 0.3 * p[0]]]), [[1.0]], system.E, parameters=system.parameters
+        )
+        functionals = worst_case(quick, uniform(200, 1.0), bound=Box([1.0], [1.0]), initial_state=[0.0])
+        lifted = lift(quick, functionals.response.grid, np.zeros(1), np.zeros(nu), np.ones(nu))
+        push = Push(lifted, functionals.disturbance, lifted.transform)
+        coefficients, excess = push.at(np.array([1.0]), np.zeros((1, 1, nu)))
+        enclosed = coefficients[0, 0] @ lifted.space.monomials(np.ones((1, nu)))[0]
+        slack = excess[0, 0] + push.neglected[0, -1]
+        truth = 2 * np.expm1(0.3 * rate) / (0.3 * rate)
+        assert abs(truth - enclosed) <= slack * (1 + 1e-9) + 1e-12, (
+            f"rate {rate}: off by {truth - enclosed}, allowed {slack}"
+        )
+
+
+def test_what_is_neglected_counts_the_size_of_the_functions_of_an_l1_ball():
+    system = LinearSystem(lambda p: np.array([[3 * p[0]]]), [[1.0]], parameters=Box([-1.0], [1.0]))
+    large = Dictionary(np.array([0.0, 1.0]), np.array([[1000.0]]))
+    functionals = worst_case(system, uniform(100, 1.0), large, Box([-1.0], [1.0]), "l1_ball", [0.0])
+    lifted = lift(system, functionals.response.grid, np.zeros(1), np.zeros(1), np.ones(1))
+    push = Push(lifted, functionals.disturbance, lifted.transform)
+    coefficients, excess = push.at(np.array([1.0]), np.zeros((1, 1, 1)))
+    enclosed = coefficients[0, 0] @ lifted.space.monomials(np.ones((1, 1)))[0]
+    assert excess[0, 0] >= 0
+    # the same disturbance is the worst on the whole cell
+    assert abs(1000 * np.expm1(3) / 3 - enclosed) <= push.neglected[0, -1]
+
+
+def test_a_known_system_has_no_remainder():
+    system = LinearSystem([[0, 1], [-1, 0]], [[0.0], [1.0]])
+    functionals = worst_case(system, GRIDS["uniform"], bound=Box([-1, -1], [1, 1]), initial_state=[1.0, 0.0])
+    lifted = lift(system, functionals.response.grid, np.array([1.0, 0.0]), np.zeros(0), np.zeros(0))
+    assert not lifted.state_remainder(np.ones((1, 6))).any()
+    assert not Push(lifted, functionals.disturbance, np.eye(2)).neglected.any()
+    assert np.allclose(
+        lifted.nodes(np.ones((1, 6)))[:, 0], functionals.response.states(np.ones((1, 6)), np.zeros((1, 0)))[0]
+    )
+
+
+def test_a_frozen_system_is_the_system_at_that_parameter():
+    functionals, _ = made("everything", "uniform")
+    p = np.array([0.2, 0.1, 1.4])
+    lifted = frozen(functionals.response.system, functionals.response.grid, functionals.response.initial_state, p)
+    control = np.ones((1, 6))
+    assert np.allclose(lifted.nodes(control)[:, 0], functionals.response.states(control, p[None])[0], rtol=1e-12)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 10**6), nu=st.integers(1, 4), degree=st.integers(1, 4), sparse=st.booleans())
+def test_the_bound_of_a_polynomial_is_above_its_dense_maximum(seed, nu, degree, sparse):
+    rng = np.random.default_rng(seed)
+    space = TaylorSpace(nu, degree)
+    coefficients = rng.normal(size=(5, space.size)) * 0.4**space.degrees
+    if sparse:
+        coefficients *= rng.integers(0, 2, size=coefficients.shape)
+    points = np.vstack(
+        [
+            rng.uniform(-1, 1, (2000, nu)),
+            np.sign(rng.normal(size=(50, nu))),
+            np.clip(2 * rng.normal(size=(500, nu)), -1, 1),
+        ]
+    )
+    values = coefficients @ space.monomials(points).T
+    bound, spread = polynomial_bound(space, coefficients)
+    assert (bound >= values.max(axis=1) - 1e-12).all()
+    assert (spread >= 0).all()
+    assert spread.shape == (5, nu)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10**6), nu=st.integers(1, 3))
+def test_the_bound_of_a_concave_quadratic_with_its_top_inside_is_exact(seed, nu):
+    rng = np.random.default_rng(seed)
+    space = TaylorSpace(nu, 2)
+    factor = rng.normal(size=(nu, nu)) + 2 * np.eye(nu)
+    hessian, top = -factor @ factor.T, rng.uniform(-0.5, 0.5, nu)
+    coefficients = np.zeros(space.size)
+    unit = np.eye(nu, dtype=int)
+    gradient = -hessian @ top
+    for i in range(nu):
+        coefficients[space.index[tuple(unit[i])]] = gradient[i]
+        for j in range(i + 1):
+            coefficients[space.index[tuple(unit[i] + unit[j])]] = hessian[i, j] / (2 if i == j else 1)
+    bound, _ = polynomial_bound(space, coefficients[None])
+    # A coordinate may be monotone on the box only if its range says so, and the top is inside.
+    assert abs(bound[0] - -0.5 * top @ hessian @ top) <= 1e-10 * max(1.0, np.abs(hessian).max())
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_the_bound_of_a_quadratic_in_one_variable_is_exact(seed):
+    space = TaylorSpace(1, 2)
+    coefficients = np.random.default_rng(seed).normal(size=(50, 3))
+    values = coefficients @ space.monomials(np.linspace(-1, 1, 20001)[:, None]).T
+    bound, _ = polynomial_bound(space, coefficients)
+    assert (np.abs(bound - values.max(axis=1)) <= 1e-7).all()
+
+
+def test_the_bound_of_a_quadratic_converges_quadratically_as_its_box_shrinks():
+    rng = np.random.default_rng(0)
+    space = TaylorSpace(3, 2)
+    base = rng.normal(size=space.size)
+    points = rng.uniform(-1, 1, (20000, 3))
+    gaps = []
+    for radius in (1.0, 0.25, 1 / 16):
+        scaled = base * radius**space.degrees
+        gaps.append(
+            polynomial_bound(space, scaled[None])[0][0]
+            - (space.monomials(np.vstack([points, np.sign(points)])) @ scaled).max()
+        )
+    assert gaps[1] <= gaps[0] / 8 + 1e-12
+    assert gaps[2] <= gaps[1] / 8 + 1e-12
+
+
+def test_polynomials_without_variables_are_their_constants():
+    bound, spread = polynomial_bound(TaylorSpace(0, 0), np.array([[[1.0], [-2.0]]]))
+    assert bound.tolist() == [[1.0, -2.0]]
+    assert spread.shape == (1, 2, 0)

@@ -1,0 +1,121 @@
+"""Guards control/response/measurable: measurable disturbances: the limit from above of ever finer piecewise constant
+ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad
+from scipy.linalg import expm
+
+from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Polytope
+from sparserob_core.sip.convex_set import Box
+
+from .plants import indicators, random_system, uniform, worst_case
+
+HORIZON = 2.0
+UNEVEN = indicators([0.0, 0.3, 1.4, HORIZON])
+BOUNDS = {
+    "box": Box([-0.1, 0.05], [0.3, 0.2]),
+    "ellipsoid": Ellipsoid([0.1, 0.0], [[0.04, 0.01], [0.01, 0.09]]),
+    "triangle": Polytope([[1.0, 1.0], [-1.0, 0.2], [0.0, -1.0]], [0.3, 0.2, 0.1]),
+    "1-norm": NormBall(p=1.0, radius=0.3, dimension=2),
+}
+
+
+def by_quadrature(system, bound, direction, time, parameter=None):
+    """A midpoint sum of the support function, error about ``1e-7``."""
+    A, _, E = (matrix[0] for matrix in system.matrices(np.zeros((1, 0)) if parameter is None else parameter[None]))
+    count = 20000
+    step = time / count
+    row, flow = direction @ expm(A * step / 2), expm(A * step)
+    rows = np.empty((count, row.size))
+    for k in range(count):
+        rows[k] = row
+        row = row @ flow
+    return float(bound.support(rows @ E).sum() * step)
+
+
+@settings(max_examples=12, deadline=None)
+@given(seed=st.integers(0, 10**6), speed=st.sampled_from([1.0, 3.0]))
+def test_the_support_of_a_box_is_an_integral_of_moduli(seed, speed):
+    rng = np.random.default_rng(seed)
+    system, direction, time = random_system(rng, speed=speed), rng.normal(size=2), rng.uniform(0.1, HORIZON)
+    found = worst_case(system, uniform(40, HORIZON), bound=BOUNDS["box"], kind="measurable").offsets(
+        np.array([time]), direction[None], np.zeros((1, 0))
+    )
+    truth = by_quadrature(system, BOUNDS["box"], direction, time)
+    assert abs(found[0] - truth) <= 1e-6 * max(1.0, truth)
+
+
+@pytest.mark.parametrize("name", ["ellipsoid", "triangle", "1-norm"])
+def test_the_support_of_other_sets_is_an_integral_of_their_support(name):
+    rng = np.random.default_rng(2)
+    for _ in range(4):
+        system, direction, time = random_system(rng), rng.normal(size=2), rng.uniform(0.1, HORIZON)
+        functionals = worst_case(system, uniform(40, HORIZON), bound=BOUNDS[name], kind="measurable")
+        truth = by_quadrature(system, BOUNDS[name], direction, time)
+        assert abs(functionals.offsets(np.array([time]), direction[None], np.zeros((1, 0)))[0] - truth) <= 1e-5 * max(
+            1.0, truth
+        )
+
+
+@pytest.mark.parametrize("name", ["ellipsoid", "triangle"])
+def test_one_channel_that_changes_sign_inside_a_piece_is_integrated_across_its_kink(name):
+    """With one column of E the integrand is a modulus with a kink, whatever the set."""
+    system = LinearSystem([[0, 1], [-1, 0]], [[0.0], [1.0]], [[0.0], [1.0]])
+    bound = Ellipsoid([0.0], [[1.0]]) if name == "ellipsoid" else Polytope([[1.0], [-1.0]], [1.0, 1.0])
+    functionals = worst_case(system, uniform(3, 5.0), bound=bound, kind="measurable")
+    truth = quad(lambda s: abs(np.sin(s)), 0, 5.0, points=[np.pi])[0]
+    assert abs(functionals.offsets(np.array([5.0]), np.array([[1.0, 0.0]]), np.zeros((1, 0)))[0] - truth) <= 1e-8
+
+
+@pytest.mark.parametrize("pieces", [1, 2, 3, 5, 50])
+def test_a_fast_oscillator_on_coarse_pieces_is_integrated_across_every_root(pieces):
+    """``int_0^t |sin(omega s)| / omega ds``, with many roots and extrema inside one piece."""
+    omega = 7.0
+    system = LinearSystem([[0, 1], [-(omega**2), 0]], [[0.0], [1.0]], [[0.0], [1.0]])
+    functionals = worst_case(system, uniform(pieces, 4.0), bound=Box([-1.0], [1.0]), kind="measurable")
+    times = np.array([0.3, 1.0, 2.9, 4.0])
+    found = functionals.offsets(times, np.tile([1.0, 0.0], (4, 1)), np.zeros((4, 0)))
+    halves = np.floor(times * omega / np.pi)
+    truth = (2 * halves + 1 - np.cos(omega * times - np.pi * halves)) / omega**2
+    assert np.allclose(found, truth, rtol=0, atol=1e-10)
+
+
+@settings(max_examples=8, deadline=None)
+@given(seed=st.integers(0, 10**6), name=st.sampled_from(["box", "ellipsoid"]))
+def test_finer_piecewise_constant_disturbances_approach_the_measurable_ones_from_below(seed, name):
+    rng = np.random.default_rng(seed)
+    system, time, direction = random_system(rng), np.array([HORIZON]), rng.normal(size=(1, 2))
+    limit = worst_case(system, uniform(64, HORIZON), bound=BOUNDS[name], kind="measurable").offsets(
+        time, direction, np.zeros((1, 0))
+    )[0]
+    pushes = [
+        worst_case(system, UNEVEN, uniform(4**k, HORIZON), BOUNDS[name]).offsets(time, direction, np.zeros((1, 0)))[0]
+        for k in range(6)
+    ]
+    assert (np.diff(pushes) >= -1e-12).all()
+    assert pushes[-1] <= limit + 1e-8
+    assert limit - pushes[-1] <= 1e-3 * max(1.0, limit)
+    assert limit - pushes[-1] <= 0.3 * (limit - pushes[-3]) + 1e-9
+
+
+def test_times_and_parameters_may_be_mixed_freely():
+    rng = np.random.default_rng(4)
+    A0, A1 = rng.normal(size=(2, 2)), rng.normal(size=(2, 2))
+    system = LinearSystem(lambda p: A0 + p[0] * A1, np.ones((2, 1)), parameters=Box([-1.0], [1.0]))
+    functionals = worst_case(system, uniform(40, HORIZON), bound=BOUNDS["box"], kind="measurable")
+    times, directions, parameters = (
+        np.array([0.0, HORIZON, 1.3, 1.3, 0.7]),
+        rng.normal(size=(5, 2)),
+        rng.uniform(-1, 1, (5, 1)),
+    )
+    found = functionals.offsets(times, directions, parameters)
+    for k in range(1, 5):
+        truth = by_quadrature(system, BOUNDS["box"], directions[k], times[k], parameters[k])
+        assert abs(found[k] - truth) <= 1e-6 * max(1.0, truth)
+    assert found[0] == 0.0

@@ -1,0 +1,199 @@
+"""Guards control/sets/sets: sets: support functions, support points and half-spaces agree with one another and with a
+linear program."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import linprog
+
+from sparserob_core.control.sets.sets import (
+    Box,
+    Cylinder,
+    Ellipsoid,
+    Equality,
+    NormBall,
+    Polytope,
+    cylinder,
+    intersection,
+)
+from sparserob_core.errors import InputError
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def random_polytope(rng: np.random.Generator, d: int) -> Polytope:
+    """A bounded polytope: a box cut by random half-spaces through its inside."""
+    box = Box(-rng.uniform(0.5, 2, d), rng.uniform(0.5, 2, d))
+    H, h = box.halfspaces()
+    cuts = rng.normal(size=(4, d))
+    return Polytope(np.vstack([H, cuts]), np.append(h, rng.uniform(0.1, 2, 4)))
+
+
+def every_set(rng: np.random.Generator, d: int) -> list:
+    root = rng.normal(size=(d, d))
+    shape = root @ root.T + 0.1 * np.eye(d)
+    balls = [NormBall(p, rng.uniform(0.1, 2), centre=rng.normal(size=d)) for p in (1.0, 1.5, 2.0, 4.0, np.inf)]
+    return [
+        Box(-rng.uniform(0, 2, d), rng.uniform(0, 2, d)),
+        random_polytope(rng, d),
+        Ellipsoid(rng.normal(size=d), shape),
+        *balls,
+    ]
+
+
+@settings(max_examples=25, deadline=None)
+@given(seeds, st.integers(1, 4))
+def test_support_function_support_point_and_half_spaces_agree_with_a_linear_program(seed: int, d: int) -> None:
+    rng = np.random.default_rng(seed)
+    for member in every_set(rng, d):
+        directions = rng.normal(size=(3, d))
+        heights, points = member.support(directions), member.support_point(directions)
+        np.testing.assert_allclose((directions * points).sum(axis=1), heights, rtol=1e-9, atol=1e-9)
+        assert member.contains(points, 1e-8).all()
+        flat = member.halfspaces()
+        if flat is not None:
+            programs = [-linprog(-c, flat[0], flat[1], bounds=(None, None)).fun for c in directions]
+            np.testing.assert_allclose(heights, programs, rtol=1e-7, atol=1e-7)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seeds, st.integers(1, 4))
+def test_a_support_function_is_sublinear(seed: int, d: int) -> None:
+    rng = np.random.default_rng(seed)
+    for member in every_set(rng, d):
+        c, e = rng.normal(size=(2, 5, d))
+        assert (member.support(c + e) <= member.support(c) + member.support(e) + 1e-9).all()
+        np.testing.assert_allclose(member.support(2.5 * c), 2.5 * member.support(c), rtol=1e-9, atol=1e-9)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seeds, st.integers(1, 4))
+def test_violation_is_the_largest_excess_over_unit_normals(seed: int, d: int) -> None:
+    rng = np.random.default_rng(seed)
+    normals = rng.normal(size=(2000, d))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    for member in every_set(rng, d):
+        points = 3 * rng.normal(size=(6, d))
+        excess = (points @ normals.T - member.support(normals)).max(axis=1)
+        violation = member.violation(points)
+        if member.halfspaces() is None:
+            assert (violation >= excess - 1e-9).all()
+            if d <= 2:
+                np.testing.assert_allclose(violation[excess > 0], excess[excess > 0], rtol=1e-3, atol=1e-3)
+        assert (np.sign(violation[np.abs(excess) > 1e-3]) >= np.sign(excess[np.abs(excess) > 1e-3])).all()
+        assert member.contains(member.interior_point(), 1e-9)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seeds, st.integers(1, 4))
+def test_the_linearisation_excess_bounds_the_support_function_around_a_direction(seed: int, d: int) -> None:
+    rng = np.random.default_rng(seed)
+    for member in every_set(rng, d):
+        centre, spread = rng.normal(size=(3, d)), rng.uniform(0.01, 1.0) * rng.normal(size=(3, 2, d))
+        shifts = np.vstack([rng.uniform(-1, 1, (50, 2)), [[1, 1], [1, -1], [-1, 1], [-1, -1]]])
+        around = centre + np.einsum("sj,kjd->skd", shifts, spread)
+        truth = member.support(around) - (around * member.support_point(centre)).sum(axis=-1)
+        assert (truth.max(axis=0) <= member.linearisation_excess(centre, spread) + 1e-9).all()
+
+
+def test_the_linearisation_excess_of_a_round_set_is_of_second_order() -> None:
+    for member in (Ellipsoid(np.ones(2), np.diag([1.0, 4.0])), NormBall(2.0, 3.0, dimension=2)):
+        centre, spread = np.array([[1.0, 1.0]]), np.array([[[0.1, -0.3]]])
+        assert member.linearisation_excess(centre, spread / 10)[0] < member.linearisation_excess(centre, spread)[0] / 80
+
+
+@pytest.mark.parametrize("d", [1, 2, 3])
+def test_leading_axes_are_kept(d: int) -> None:
+    rng = np.random.default_rng(d)
+    directions = rng.normal(size=(4, 5, d))
+    for member in every_set(rng, d):
+        assert member.support(directions).shape == (4, 5)
+        assert member.support_point(directions).shape == (4, 5, d)
+        assert member.violation(directions).shape == (4, 5)
+        np.testing.assert_allclose(
+            member.support(directions)[2, 3], member.support(directions[2, 3][None])[0], rtol=1e-12
+        )
+
+
+def test_a_zero_direction_has_support_zero_and_a_point_of_the_set() -> None:
+    for member in every_set(np.random.default_rng(0), 2):
+        zero = np.zeros((1, 2))
+        assert member.support(zero) == pytest.approx(0.0)
+        assert member.contains(member.support_point(zero), 1e-9).all()
+
+
+def test_an_unbounded_polytope_has_infinite_support_where_it_is_unbounded() -> None:
+    wedge = Polytope(np.array([[-1.0, 0.0], [0.0, -1.0]]), np.array([1.0, 2.0]))
+    assert not wedge.is_bounded
+    np.testing.assert_array_equal(wedge.support(np.array([[1.0, 0.0], [-1.0, 0.0], [-1.0, -1.0]])), [np.inf, 1.0, 3.0])
+    assert np.isfinite(wedge.support_point(np.array([[1.0, 0.0]]))).all()
+
+
+def test_a_polytope_without_interior_still_has_its_support_function() -> None:
+    segment = Polytope(np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, 0.0], [-1.0, 0.0]]), np.array([1.0, -1.0, 1.0, 0.0]))
+    assert segment.vertices is None
+    np.testing.assert_allclose(segment.support(np.array([[0.0, 1.0], [1.0, 0.0]])), [1.0, 1.0], atol=1e-9)
+
+
+def test_the_vertices_of_a_cross_polytope_are_its_unit_vectors() -> None:
+    H, h = NormBall(1.0, 1.0, dimension=3).halfspaces() or (None, None)
+    vertices = Polytope(H, h).vertices
+    assert vertices is not None and vertices.shape == (6, 3)
+    np.testing.assert_allclose(np.sort(np.abs(vertices), axis=1), np.tile([0.0, 0.0, 1.0], (6, 1)), atol=1e-12)
+
+
+def test_boxes_intersect_in_a_box_flat_sets_in_a_polytope_and_curved_ones_stay_apart() -> None:
+    box, diamond, disc = Box(-np.ones(2), np.ones(2)), NormBall(1.0, 1.2, dimension=2), NormBall(2.0, 1.0, dimension=2)
+    smaller = intersection([box, Box(np.array([-2.0, 0.0]), np.array([0.5, 2.0]))])
+    assert isinstance(smaller, Box)
+    np.testing.assert_array_equal(smaller.upper, [0.5, 1.0])
+    both = intersection([box, diamond])
+    assert isinstance(both, Polytope)
+    assert both.support(np.array([[1.0, 1.0]]))[0] == pytest.approx(1.2)
+    assert intersection([box, disc]) == (box, disc)
+
+
+def test_a_cylinder_frees_the_other_coordinates() -> None:
+    rng = np.random.default_rng(5)
+    for base in every_set(rng, 2):
+        tall = cylinder(base, 3)
+        inside = np.append(base.interior_point(), 1e6)
+        assert tall.dimension == 3 and tall.contains(inside, 1e-9)
+        directions = rng.normal(size=(4, 2))
+        lifted = np.hstack([directions, np.zeros((4, 1))])
+        np.testing.assert_allclose(tall.support(lifted), base.support(directions), rtol=1e-7)
+        assert tall.support(np.array([[0.0, 0.0, 1.0]]))[0] == np.inf
+        if isinstance(tall, Cylinder):
+            np.testing.assert_array_equal(directions @ tall.normals, lifted)
+            np.testing.assert_allclose(tall.violation(lifted), base.violation(directions))
+
+
+def test_an_equality_measures_the_fixed_coordinates_only() -> None:
+    end = Equality(np.array([np.nan, 1.0]))
+    np.testing.assert_array_equal(end.fixed, [1])
+    np.testing.assert_allclose(end.violation(np.array([[9.0, 1.5], [0.0, 1.0]])), [0.5, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: Polytope(np.array([[1.0], [-1.0]]), np.array([-1.0, -1.0])), "polytope: empty"),
+        (lambda: Polytope(np.ones(2), np.ones(2)), "one row per half-space"),
+        (lambda: Polytope(np.ones((2, 2)), np.ones(3)), "polytope: h: expected 2 numbers, got 3"),
+        (lambda: Ellipsoid(np.zeros(2), np.array([[1.0, 2.0], [2.0, 1.0]])), "symmetric positive definite"),
+        (lambda: Ellipsoid(np.zeros(3), np.eye(2)), "ellipsoid: centre: expected 2 numbers, got 3"),
+        (lambda: NormBall(0.5, 1.0, dimension=2), "p must be at least 1"),
+        (lambda: NormBall(2.0, -1.0, dimension=2), "radius"),
+        (lambda: NormBall(2.0, 1.0), "expected a centre, or a dimension"),
+        (lambda: Box(np.array([1.0]), np.array([0.0])), "box: empty"),
+        (lambda: Equality(np.array([np.inf])), "finite numbers"),
+        (lambda: intersection([]), "at least one set"),
+        (lambda: intersection([Box(np.zeros(1), np.ones(1)), Box(np.full(1, 2.0), np.full(1, 3.0))]), "empty"),
+    ],
+)
+def test_a_set_that_is_none_says_what_was_expected(build, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        build()

@@ -1,0 +1,200 @@
+"""Guards experiment/cli: the command: statuses, messages without tracebacks, tables, and a start that costs nothing."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+Command = Callable[..., subprocess.CompletedProcess[str]]
+
+
+def test_a_run_prints_a_table_and_where_everything_is(config: Path, command: Command) -> None:
+    done = command("run", config, "--out", "out", "--no-figures")
+    assert done.returncode == 0, done.stderr
+    for name in (
+        "lower bound",
+        "upper bound",
+        "relative gap",
+        "worst violation",
+        "active indices",
+        "share of time active",
+        "switches",
+        "seconds",
+    ):
+        assert name in done.stdout
+    assert "written to out" in done.stdout
+    assert done.stderr == ""
+
+
+@pytest.mark.parametrize(
+    ("status", "expected"),
+    [("certified", 0), ("verified", 0), ("infeasible", 3), ("refuted", 4), ("undecided", 4), ("failed", 5)],
+)
+def test_the_exit_status_is_the_status_of_the_result(
+    config: Path, command: Command, status: str, expected: int
+) -> None:
+    done = command("run", config, f"method.status={status}", "--no-figures", "--quiet")
+    assert (done.returncode, done.stdout, done.stderr) == (expected, "", "")
+
+
+def test_json_is_the_file_and_nothing_else(config: Path, command: Command, tmp_path: Path) -> None:
+    done = command("run", config, "--json", "--out", "out", "--no-figures")
+    assert json.loads(done.stdout) == json.loads((tmp_path / "out" / "result.json").read_text())
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["run"],
+        ["run", "nothing.yaml"],
+        ["run", "."],
+        ["run", "small.yaml", "method.name=stubb"],
+        ["run", "small.yaml", "--uot", "x"],
+        ["run", "small.yaml", "--out", "small.yaml"],
+        ["run", "small.yaml", "--out", "."],
+        ["plugins", "piqpp"],
+        ["figures", "."],
+        ["walk"],
+        ["run", "small.yaml", "problem.horizon=0"],
+        ["run", "small.yaml", "problem.control.box=-1"],
+        ["run", "small.yaml", "rubbish"],
+    ],
+)
+def test_an_input_at_fault_is_status_2_one_message_and_no_traceback(
+    config: Path, command: Command, arguments: list[str]
+) -> None:
+    done = command(*arguments)
+    assert done.returncode == 2, done.stderr
+    assert done.stdout == ""
+    assert "Traceback" not in done.stderr
+    assert "rror" in done.stderr
+    assert not (config.parent / "runs").exists()
+
+
+def test_a_traceback_is_there_for_those_who_ask(config: Path, command: Command) -> None:
+    assert "Traceback" in command("run", config, "problem.horizon=0", SPARSEROB_DEBUG="1").stderr
+
+
+def test_a_fault_of_the_program_is_status_5_and_says_what_was_saved(config: Path, command: Command) -> None:
+    done = command("run", config, "method.fail=true", "--out", "out")
+    assert done.returncode == 5
+    assert "internal error: RuntimeError: the stub fell over" in done.stderr
+    assert "what was done until then is in out" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_leaves_a_readable_directory(config: Path, tmp_path: Path, number: int) -> None:
+    out = tmp_path / "out"
+    call = [
+        sys.executable,
+        "-m",
+        "sparserob_core",
+        "run",
+        str(config),
+        "method.wait=0.2",
+        "method.rounds=500",
+        "--out",
+        str(out),
+    ]
+    process = subprocess.Popen(call, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 60
+    while not (out / "result.json").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert json.loads((out / "result.json").read_text())["message"] == "the run has not finished"
+    time.sleep(0.5)
+    os.kill(process.pid, number)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert said.strip().startswith("error: interrupted")
+    assert f"what was done until then is in {out}" in said
+    result = json.loads((out / "result.json").read_text())
+    assert (result["status"], result["message"]) == ("failed", "interrupted from the keyboard")
+    assert sorted(path.name for path in out.iterdir()) == ["config.yaml", "result.json", "trace.npz"]
+
+
+def test_plugins_are_listed_with_who_brings_them(command: Command) -> None:
+    done = command("plugins")
+    assert done.returncode == 0
+    rows = [line.split()[:3] for line in done.stdout.splitlines()]
+    assert ["solver", "piqp", "piqp"] in rows
+    assert ["method", "exchange", "core"] in rows
+
+
+@pytest.mark.parametrize("name", ["piqp", "solver.piqp"])
+def test_a_plugin_is_described_by_its_options(command: Command, name: str) -> None:
+    done = command("plugins", name)
+    assert done.returncode == 0
+    assert "solver piqp" in done.stdout
+    assert done.stdout.splitlines()[1].split() == ["option", "type", "default", "range", "meaning"]
+
+
+def test_a_broken_plugin_is_told_beside_the_list(command: Command) -> None:
+    done = command("plugins", SPARSEROB_DISABLE_PLUGINS="piqp")
+    assert done.returncode == 0
+    assert " piqp " not in done.stdout
+
+
+def test_the_schema_describes_what_is_installed(command: Command) -> None:
+    jsonschema = pytest.importorskip("jsonschema")
+    done = command("schema")
+    schema = json.loads(done.stdout)
+    jsonschema.Draft202012Validator.check_schema(schema)
+    validator = jsonschema.Draft202012Validator(schema)
+    problem = {
+        "name": "linear",
+        "system": {"A": [[0]], "B": [[1]]},
+        "horizon": 1,
+        "initial_state": [1],
+        "control": {"box": 1},
+    }
+    assert validator.is_valid(
+        {"problem": problem, "solver": "piqp", "maximiser": {"name": "direct", "budget": 3}, "observers": []}
+    )
+    assert not validator.is_valid({"problem": problem, "solver": "piq"})
+    assert not validator.is_valid({"problem": problem, "sover": "piqp"})
+    assert not validator.is_valid({"problem": {**problem, "horizn": 1}})
+
+
+def test_every_config_of_the_repository_fits_the_schema_also_when_resolved(repository: Path, command: Command) -> None:
+    jsonschema = pytest.importorskip("jsonschema")
+    from sparserob_core.experiment.config.load import load_config
+
+    validator = jsonschema.Draft202012Validator(json.loads(command("schema").stdout))
+    configs = sorted((repository / "configs").glob("*.yaml"))
+    assert configs
+    for config in configs:
+        loaded = load_config(config)
+        validator.validate(loaded.source.data)
+        validator.validate(loaded.config.plain())
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["plugins"], ["run", "--help"]])
+def test_help_and_lists_import_neither_scipy_nor_a_solver(arguments: list[str]) -> None:
+    program = (
+        "import sys\nfrom sparserob_core.experiment.cli.main import _status\n"
+        f"_status({arguments!r})\nprint('heavy:', *sorted(name for name in sys.modules if '.' not in name))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split("heavy:")[-1].split())
+    assert not loaded & {"scipy", "qpsolvers", "piqp", "clarabel", "proxsuite", "rerun", "nevergrad", "matplotlib"}
+
+
+def test_a_reader_that_stops_reading_is_no_error(tmp_path: Path) -> None:
+    done = subprocess.run(
+        f"{sys.executable} -m sparserob_core plugins | head -n 1; exit ${{PIPESTATUS[0]}}",
+        shell=True,
+        executable="/bin/bash",
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")

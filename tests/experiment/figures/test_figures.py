@@ -1,0 +1,116 @@
+"""Guards experiment/figures: the figures of a run: complete, reproducible, and honest at the edges."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.figures.figure_data import FigureData, Wall
+from sparserob_core.experiment.figures.run_figures import draw_control, draw_convergence, draw_states, write_figures
+from sparserob_core.sip.events import RoundFinished
+
+
+@pytest.fixture
+def data() -> FigureData:
+    times = np.linspace(0.0, 2.0, 21)
+    state = np.stack([np.cos(times), -np.sin(times)])
+    bounds = [(-np.inf, np.inf, 0.3), (0.5, np.inf, 0.1), (0.99, 1.01, 1e-3), (1.0, 1.0, -1e-9)]
+    history = [
+        RoundFinished(round=k, epsilon=0.5**k, lower_bound=low, upper_bound=high, violation=worst)
+        for k, (low, high, worst) in enumerate(bounds)
+    ]
+    return FigureData(
+        title="Rotation",
+        breakpoints=np.linspace(0.0, 2.0, 5),
+        control=np.array([[0.0, 1.0, 0.0, -0.5], [0.0, 0.0, 0.2, 0.0]]),
+        control_lower=np.array([-1.0, -np.inf]),
+        control_upper=np.array([1.0, np.inf]),
+        times=times,
+        state=state,
+        tube_lower=state - 0.1,
+        tube_upper=state + 0.1,
+        history=history,
+        active_times=np.array([0.5, 2.0]),
+        tolerance=1e-6,
+        walls=[Wall(state=0, upper=1.2, start=0.0, end=2.0), Wall(state=1, lower=-1.5, upper=0.5, start=2.0, end=2.0)],
+    )
+
+
+def test_every_figure_is_written_as_a_vector_and_as_a_picture(data: FigureData, tmp_path: Path) -> None:
+    files = write_figures(tmp_path / "figures", data)
+    expected = {f"{name}.{kind}" for name in ("control", "states", "convergence") for kind in ("pdf", "png")}
+    assert {file.name for file in files} == expected
+    assert all(file.read_bytes()[:4] in (b"%PDF", b"\x89PNG") for file in files)
+
+
+def test_the_same_data_gives_the_same_bytes(data: FigureData, tmp_path: Path) -> None:
+    first, second = (write_figures(tmp_path / name, data) for name in ("first", "second"))
+    assert [file.read_bytes() for file in first] == [file.read_bytes() for file in second]
+
+
+def test_the_drawn_steps_are_the_control(data: FigureData) -> None:
+    for channel, axes in enumerate(draw_control(data).axes):
+        drawn = [patch for patch in axes.patches if patch.get_label() == "control"]
+        assert len(drawn) == 1
+        values, edges, _ = drawn[0].get_data()  # type: ignore[attr-defined]
+        assert np.array_equal(values, data.control[channel])
+        assert np.array_equal(edges, data.breakpoints)
+
+
+def test_walls_appear_only_in_the_panel_of_their_state(data: FigureData) -> None:
+    first, second = draw_states(data).axes
+    labels = [set(axes.get_legend_handles_labels()[1]) for axes in (first, second)]
+    assert "forbidden" in labels[0] and "forbidden" not in labels[1]
+    assert "terminal set" in labels[1] and "terminal set" not in labels[0]
+
+
+def test_the_view_contains_the_whole_tube_and_every_wall(data: FigureData) -> None:
+    for component, axes in enumerate(draw_states(data).axes):
+        low, high = axes.get_ylim()
+        edges = [
+            edge
+            for wall in data.walls
+            if wall.state == component
+            for edge in (wall.lower, wall.upper)
+            if np.isfinite(edge)
+        ]
+        assert low < min([*edges, data.tube_lower[component].min()])
+        assert high > max([*edges, data.tube_upper[component].max()])
+
+
+def test_bounds_that_are_not_known_yet_are_not_drawn(data: FigureData) -> None:
+    bounds, _ = draw_convergence(data).axes
+    drawn = {line.get_label(): len(line.get_xdata()) for line in bounds.get_lines()}  # type: ignore[arg-type]
+    assert drawn["lower bound"] == 3
+    assert drawn["upper bound"] == 2
+
+
+def test_a_run_that_ended_in_its_first_round_can_be_drawn(data: FigureData, tmp_path: Path) -> None:
+    only = replace(data, history=data.history[:1], tolerance=None, active_times=np.empty(0), walls=())
+    assert len(write_figures(tmp_path, only)) == 6
+
+
+def test_a_closed_gap_in_the_only_round_can_be_drawn(data: FigureData, tmp_path: Path) -> None:
+    assert len(write_figures(tmp_path, replace(data, history=data.history[-1:]))) == 6
+
+
+def test_a_run_without_rounds_has_no_convergence_figure(data: FigureData, tmp_path: Path) -> None:
+    assert {file.stem for file in write_figures(tmp_path, replace(data, history=()))} == {"control", "states"}
+
+
+def test_a_control_that_does_not_fit_its_pieces_is_refused(data: FigureData) -> None:
+    with pytest.raises(InputError, match=r"control: expected \(m, 4\)"):
+        replace(data, control=np.zeros((1, 3)))
+
+
+def test_a_missing_matplotlib_is_named_with_the_extra_that_brings_it(
+    data: FigureData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(InputError, match=r"sparserob\[figures\]"):
+        write_figures(tmp_path, data)

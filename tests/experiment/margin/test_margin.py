@@ -1,0 +1,226 @@
+"""Guards experiment/margin/margin: margins: closed forms, both sides proven, monotone curves, every kind, and bad
+input."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import sparserob_core as sr
+from sparserob_core.experiment.margin.margin import margin_rows
+
+DOUBLE_INTEGRATOR = {"A": [[0, 1], [0, 0]], "B": [[0], [1]]}
+
+
+def config(**problem: object) -> dict:
+    return {
+        "problem": {
+            "name": "linear",
+            "system": DOUBLE_INTEGRATOR,
+            "horizon": 2.0,
+            "initial_state": [1, 0],
+            "control": {"box": 1.0},
+            **problem,
+        },
+        "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 20}},
+        "observers": [],
+    }
+
+
+def assert_encloses(found: sr.Margin, exact: float, width: float = 4e-6) -> None:
+    assert found.status == "certified", found.message
+    assert found.lower - 1e-9 <= exact <= found.upper + 1e-9
+    assert found.upper - found.lower <= width * max(1.0, exact)
+    good, bad = (found.lower, found.upper) if found.sense == "largest" else (found.upper, found.lower)
+    assert (found.feasible.factor, found.infeasible.factor) == (good, bad)
+    assert found.feasible.status in ("certified", "verified")
+    assert found.infeasible.status == "infeasible"
+
+
+def test_a_disturbance_may_grow_until_it_fills_the_terminal_set():
+    """|w2| <= 0.1 moves x2(2) by 0.2, of 0.5 allowed; x1 is free: the factor is 2.5, |w| is 0.25."""
+    found = sr.margin(config(disturbance={"box": [0.0, 0.1]}, terminal=[{"box": [None, 0.5]}]), of="disturbance")
+    assert_encloses(found, 2.5)
+    assert np.allclose(found.amounts, 0.25, atol=1e-6)
+
+
+def test_a_disturbance_that_is_not_centred_grows_about_its_centre():
+    """w2 in [0, 0.2]: the middle 0.1 is met by the control, the rest 0.1 f moves x2(2) by 0.2 f."""
+    found = sr.margin(
+        config(disturbance={"box": {"lower": [0, 0], "upper": [0, 0.2]}}, terminal=[{"box": [None, 0.5]}]),
+        of="disturbance",
+    )
+    assert_encloses(found, 2.5)
+    assert np.allclose(found.amounts, 0.1 + 0.25, atol=1e-6)
+
+
+def test_the_smallest_terminal_set_is_as_wide_as_the_disturbance():
+    found = sr.margin(config(disturbance={"box": [0.0, 0.1]}, terminal=[{"box": [None, 0.5]}]), of="terminal.0")
+    assert_encloses(found, 0.4)
+    assert np.allclose(found.amounts, 0.2, atol=1e-6)
+
+
+def test_the_smallest_control_is_the_time_optimal_one():
+    """From (1, 0) to the origin in time 2 takes |u| <= 1 exactly: twice the bound, half the factor."""
+    assert_encloses(sr.margin(config(control={"box": 2.0}, terminal=[{"box": [1e-9, 1e-9]}]), of="control"), 0.5)
+
+
+def test_the_largest_initial_state_is_what_the_control_can_bring_back():
+    """x1(2) <= 0.5 from (f, 0): f - 2 <= 0.5."""
+    assert_encloses(sr.margin(config(terminal=[{"box": [0.5, None]}]), of="initial_state"), 2.5)
+
+
+def test_a_path_set_must_hold_the_initial_state():
+    assert_encloses(sr.margin(config(path=[{"box": [4.0, None]}]), of="path.0"), 0.25)
+
+
+def test_the_earliest_start_of_a_window_is_when_the_state_can_be_there():
+    """x1(t) = 1 - t^2 / 2 at best: |x1| <= 0.5 from t = 1 on."""
+    found = sr.margin(config(path=[{"box": [0.5, None], "from": 1.5}]), of="path.0.from")
+    assert_encloses(found, 1.0)
+    assert found.quantity == "start of the window"
+
+
+def test_uncertain_parameters_may_grow_until_a_coordinate_cannot_be_held():
+    """x' = p u from 1, |u| <= 1, |x(1)| <= 0.1, p in [1 - r, 1 + r]: with v in [0, 1] the integral of -u, 1 - (1 - r) v
+    <= 0.1 and (1 + r) v - 1 <= 0.1; v = 1 is the best, and leaves r <= 0.1."""
+    problem = {
+        "name": "linear",
+        "system": {"A": [[0]], "B": [["p"]], "parameters": {"p": [0.8, 1.2]}},
+        "horizon": 1.0,
+        "initial_state": 1.0,
+        "control": {"box": 1.0},
+        "terminal": [{"box": 0.1}],
+    }
+    dictionaries = {"control": {"name": "piecewise_constant", "pieces": 5}}
+    found = sr.margin({"problem": problem, "dictionaries": dictionaries, "observers": []}, of="parameters")
+    assert_encloses(found, 0.5)
+
+
+def test_the_cost_grows_with_the_uncertainty_and_is_bounded_from_both_sides_at_every_point():
+    found = sr.margin(
+        config(disturbance={"box": [0.0, 0.1]}, terminal=[{"box": [0.5, 0.5]}]), of="disturbance", curve=5
+    )
+    assert [point.factor for point in found.curve] == pytest.approx(np.linspace(0, found.lower, 5))
+    assert all(point.status == "certified" for point in found.curve)
+    assert all(point.upper_bound - point.lower_bound <= 2e-7 for point in found.curve)
+    costs = [point.upper_bound for point in found.curve]
+    assert costs == sorted(costs)
+    assert costs[-1] > costs[0] + 0.01
+    assert (np.diff(costs, 2) >= -1e-6).all()  # convex in the factor
+
+
+def test_wider_terminal_sets_bear_larger_disturbances():
+    factors = [
+        sr.margin(config(disturbance={"box": [0.0, 0.1]}, terminal=[{"box": [0.3, width]}])).lower
+        for width in (0.2, 0.3, 0.4)
+    ]
+    assert factors == sorted(factors)
+    assert factors[0] < factors[1]
+
+
+def test_what_is_infeasible_at_every_factor_is_said_with_the_reason():
+    found = sr.margin(config(disturbance={"box": 0.1}, path=[{"box": [0.7, None]}]))
+    assert found.status == "infeasible"
+    assert "even at 0 nothing is feasible" in found.message
+    assert "x1(0) = 1 is outside |x1| <= 0.7" in found.message
+    assert found.feasible is None
+    enlarged = sr.margin(config(path=[{"box": [0.7, None]}], terminal=[{"box": 0.3}]), of="terminal.0")
+    assert enlarged.status == "infeasible"
+
+
+def test_what_no_factor_makes_infeasible_is_unbounded():
+    found = sr.margin(config(disturbance={"box": [0.1, 0.0]}, terminal=[{"box": [None, 0.5]}]))
+    assert found.status == "unbounded"
+    assert found.lower == 1e6
+    assert found.upper == np.inf
+    assert found.feasible.status == "certified"
+
+
+@pytest.mark.parametrize(
+    ("of", "words"),
+    [
+        ("disturbence", "did you mean 'disturbance'"),
+        ("path.1", "did you mean 'path.0'"),
+        ("", "known: control"),
+        ("parameters", "no parameters"),
+        ("terminal.0", "no terminal"),
+    ],
+)
+def test_what_cannot_be_varied_names_the_nearest_or_what_is_missing(of, words):
+    with pytest.raises(sr.InputError, match=words):
+        sr.margin(config(disturbance={"box": 0.1}, path=[{"box": [4.0, None]}]), of=of)
+
+
+def test_a_config_without_a_disturbance_says_so():
+    with pytest.raises(sr.InputError, match="no disturbance"):
+        sr.margin(config(terminal=[{"box": 0.5}]))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"tolerance": 0.0}, "tolerance"),
+        ({"tolerance": float("nan")}, "tolerance"),
+        ({"curve": -1}, "curve"),
+        ({"curve": 1}, "curve"),
+    ],
+)
+def test_numbers_out_of_range_are_refused(options, words):
+    with pytest.raises(sr.InputError, match=words):
+        sr.margin(config(disturbance={"box": 0.1}), **options)
+
+
+def test_points_and_equalities_cannot_be_enlarged():
+    with pytest.raises(sr.InputError, match="single point"):
+        sr.margin(config(disturbance={"box": 0.0}))
+    with pytest.raises(sr.InputError, match="fixes final values"):
+        sr.margin(config(terminal=[{"equals": [0, 0]}]), of="terminal.0")
+
+
+def test_an_equality_stays_imposed_while_the_rest_is_varied():
+    """To the origin exactly, in time 2, from (f, 0): f <= 1."""
+    assert_encloses(sr.margin(config(terminal=[{"equals": [0, 0]}]), of="initial_state"), 1.0)
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        {"norm": {"p": 2, "radius": 0.1}},
+        {"ellipsoid": {"shape": 0.01}},
+        {"norm": {"p": 1, "radius": 0.1}},
+        {"polytope": {"H": [[1, 0], [-1, 0], [0, 1], [0, -1]], "h": 0.1}},
+    ],
+)
+def test_sets_of_every_kind_are_scaled(kind):
+    found = sr.margin(config(disturbance=kind, terminal=[{"box": [None, 0.5]}]))
+    assert_encloses(found, 2.5)
+
+
+def test_the_directory_holds_the_numbers_and_the_picture(tmp_path):
+    found = sr.margin(
+        config(disturbance={"box": [0.0, 0.1]}, terminal=[{"box": [None, 0.5]}]), curve=3, out=tmp_path / "out"
+    )
+    assert sorted(file.name for file in found.directory.iterdir()) == ["config.yaml", "margin.json", "margin.png"]
+    written = json.loads((tmp_path / "out" / "margin.json").read_text())
+    assert (written["status"], written["lower"], written["upper"]) == ("certified", found.lower, found.upper)
+    assert len(written["curve"]) == 3
+    assert ("status", f"certified: {found.message}") in margin_rows(found)
+    with pytest.raises(sr.InputError, match="new or an empty"):
+        sr.margin(config(disturbance={"box": 0.1}), out=tmp_path / "out")
+
+
+def test_the_command_ends_with_the_status_of_what_it_found(command, tmp_path):
+    file = tmp_path / "small.json"
+    file.write_text(json.dumps(config(disturbance={"box": [0.0, 0.1]}, terminal=[{"box": [None, 0.5]}])))
+    done = command("margin", file, "--curve", 0, "--json", "--out", "found")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["lower"] == pytest.approx(2.5, abs=1e-5)
+    done = command("margin", file, "problem.path=[{box: [0.5, null]}]", "--curve", 0)
+    assert done.returncode == 3, done.stderr
+    assert "even at 0 nothing is feasible" in done.stdout
+    done = command("margin", file, "--of", "disturbanse")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "did you mean 'disturbance'" in done.stderr

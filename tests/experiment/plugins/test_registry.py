@@ -1,0 +1,188 @@
+"""Guards experiment/plugins/registry: plugins: found, refused with a reason, and built from checked options."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+import sparserob_core as sr
+from sparserob_core.experiment.plugins import registry as discovery
+from sparserob_core.experiment.plugins.components import Registry
+
+GOOD = """
+import sparserob_core as sr
+
+class Weighted(sr.Regulariser, sr.Options):
+    weight: float = 1.0
+    '''How much.'''
+    def quadratic(self, image):
+        raise NotImplementedError
+
+@sr.hookimpl
+def sparserob_regularisers():
+    yield sr.RegulariserPlugin(name="mine", factory=Weighted, summary="Mine.")
+"""
+
+
+@pytest.fixture
+def plugin(tmp_path: Path) -> Callable[[str], Path]:
+    def write(text: str, name: str = "mine") -> Path:
+        file = tmp_path / f"{name}.py"
+        file.write_text(text)
+        return file
+
+    return write
+
+
+def load(*files: Path) -> Registry:
+    return sr.load_registry(files, entry_points=False)
+
+
+def test_the_framework_registers_its_own_components_like_anybody_else() -> None:
+    registry = load()
+    assert registry.names("method") == ["exchange", "nominal", "scenario", "sparserob"]
+    assert registry.get("problem", "linear").plugin == "core"
+    assert registry.names("solver") == []
+
+
+def test_every_installed_plugin_loads() -> None:
+    registry = sr.load_registry()
+    assert registry.failures == ()
+    assert {"piqp", "proxqp", "clarabel"} <= set(registry.names("solver"))
+
+
+def test_every_installed_component_has_a_summary_and_documented_options() -> None:
+    for record in sr.load_registry().records():
+        assert record.summary, record
+        for name, field in record.options_type().model_fields.items():
+            assert field.description, f"{record}: option {name} has no description"
+
+
+def test_one_file_is_a_plugin(plugin: Callable[[str], Path]) -> None:
+    registry = load(plugin(GOOD))
+    assert registry.get("regulariser", "mine").plugin == "mine"
+    assert registry.build("regulariser", "mine", {"weight": 2}).weight == 2.0
+
+
+def test_a_misspelt_option_names_the_nearest_one(plugin: Callable[[str], Path]) -> None:
+    with pytest.raises(
+        sr.InputError, match=r"regulariser mine: weigth: unknown key; did you mean 'weight'\? \(known: weight\)"
+    ):
+        load(plugin(GOOD)).build("regulariser", "mine", {"weigth": 2})
+
+
+def test_an_option_of_the_wrong_type_is_named_with_what_was_given(plugin: Callable[[str], Path]) -> None:
+    with pytest.raises(sr.InputError, match=r"regulariser mine: weight: must be a number \(got 'heavy'\)"):
+        load(plugin(GOOD)).build("regulariser", "mine", {"weight": "heavy"})
+
+
+def test_an_unknown_name_brings_the_nearest_known_names(plugin: Callable[[str], Path]) -> None:
+    with pytest.raises(sr.PluginError, match=r"no regulariser is named 'mime'; did you mean 'mine'\?"):
+        load(plugin(GOOD)).get("regulariser", "mime")
+
+
+def test_a_name_registered_twice_names_both_plugins(plugin: Callable[[str, str], Path]) -> None:
+    with pytest.raises(
+        sr.PluginError, match=r"regulariser 'mine' is registered twice, by plugin 'first' and by plugin 'second'"
+    ):
+        load(plugin(GOOD, "first"), plugin(GOOD, "second"))
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("import not_there_at_all", "No module named 'not_there_at_all'"),
+        ("def broken(:", "SyntaxError"),
+        (
+            GOOD.replace("def sparserob_regularisers", "def sparserob_regulariser"),
+            "did you mean 'sparserob_regularisers'",
+        ),
+        (GOOD.replace("@sr.hookimpl\n", ""), "not marked with @sparserob_core.hookimpl"),
+        (GOOD.replace("RegulariserPlugin", "SolverPlugin"), "expected records of type RegulariserPlugin"),
+        (GOOD.replace('name="mine"', 'name="My Plugin"'), "name must match"),
+        (GOOD.replace("factory=Weighted", "factory=3"), "factory must be a class or"),
+        (GOOD.replace("factory=Weighted", "factory=Weighted, options=int"), "options must be a subclass"),
+        ("x = 1", "it implements no hook"),
+    ],
+)
+def test_a_plugin_that_is_asked_for_and_broken_says_why(plugin: Callable[[str], Path], text: str, reason: str) -> None:
+    with pytest.raises(sr.PluginError, match="mine") as caught:
+        load(plugin(text))
+    assert reason in str(caught.value)
+
+
+def test_a_component_of_another_kind_is_refused(plugin: Callable[[str], Path]) -> None:
+    registry = load(plugin(GOOD.replace("class Weighted(sr.Regulariser, sr.Options)", "class Weighted(sr.Options)")))
+    with pytest.raises(sr.PluginError, match="built a Weighted, expected a Regulariser"):
+        registry.build("regulariser", "mine")
+
+
+def test_a_lazy_factory_is_imported_only_when_it_is_chosen(plugin: Callable[[str], Path]) -> None:
+    registry = load(plugin(GOOD.replace("factory=Weighted", 'factory="nowhere.to_be:Found"')))
+    assert registry.names("regulariser") == ["mine"]
+    with pytest.raises(sr.PluginError, match=r"cannot be loaded from 'nowhere.to_be:Found'"):
+        registry.build("regulariser", "mine")
+
+
+class Entry:
+    """An entry point of a distribution that does not exist."""
+
+    dist = None
+    value = "somewhere"
+
+    def __init__(self, name: str, load: Callable[[], object]) -> None:
+        self.name, self.load = name, load
+
+
+@pytest.fixture
+def entry_points(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    def use(*entries: Entry) -> None:
+        monkeypatch.setattr(metadata, "entry_points", lambda group: list(entries))
+        discovery._installed.cache_clear()
+
+    yield use
+    monkeypatch.undo()
+    discovery._installed.cache_clear()
+
+
+def broken() -> object:
+    raise ModuleNotFoundError("No module named 'gone'")
+
+
+def test_an_installed_plugin_that_fails_stops_nobody_and_is_named(entry_points: Callable[..., None]) -> None:
+    from types import ModuleType
+
+    good = ModuleType("good")
+    exec(GOOD, good.__dict__)
+    entry_points(Entry("zeta", lambda: good), Entry("alpha", broken))
+    registry = sr.load_registry()
+    assert registry.names("regulariser") == ["mine"]
+    assert [str(failure) for failure in registry.failures] == [
+        "plugin 'alpha (?, somewhere)' failed to load: ModuleNotFoundError: No module named 'gone'"
+    ]
+    with pytest.raises(
+        sr.PluginError, match=r"(?s)no solver is named 'piqp'.*note: plugin 'alpha .*No module named 'gone'"
+    ):
+        registry.get("solver", "piqp")
+
+
+def test_a_disabled_plugin_is_not_even_imported(
+    entry_points: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entry_points(Entry("alpha", broken))
+    monkeypatch.setenv("SPARSEROB_DISABLE_PLUGINS", "alpha, beta")
+    registry = sr.load_registry()
+    assert registry.failures == ()
+    with pytest.raises(sr.PluginError, match="plugin 'alpha' is disabled by SPARSEROB_DISABLE_PLUGINS"):
+        registry.get("solver", "piqp")
+
+
+@pytest.mark.parametrize("name", ["exchange", "nominal", "scenario"])
+def test_the_options_of_a_method_of_the_framework_are_its_fields(name: str) -> None:
+    registry = load()
+    method = registry.build("method", name)
+    defaults = registry.get("method", name).options_type()()
+    assert vars(method) == {key: getattr(defaults, key) for key in type(defaults).model_fields}

@@ -1,0 +1,200 @@
+"""Guards sip/relaxed/relaxed: the relaxed program ``g``: monotone in added indices, invariant under permutation, the
+same with lazy rows as with all of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import linprog
+
+import sparserob_core as sr
+from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows, rows_at
+
+EMPTY = np.zeros((0, 1))
+
+
+@pytest.fixture(scope="module")
+def piqp():
+    from sparserob_piqp import Piqp
+
+    return Piqp()
+
+
+@pytest.fixture(scope="module")
+def ridge():
+    from sparserob_regularisers import Ridge
+
+    return Ridge()
+
+
+def random_program(rng, n=5, equality=False):
+    """Two families of smooth rows, satisfied strictly by a known decision; bounds on every variable."""
+    inside = rng.uniform(-0.5, 0.5, n)
+    frequencies, phases = rng.uniform(0, 4, (2, n)), rng.uniform(0, 6, (2, n))
+
+    def rows(which):
+        def of(t):
+            G = np.cos(t * frequencies[which] + phases[which])[:, None, :]
+            return G, G @ inside + 0.2 + 0.2 * np.sin(3 * t) ** 2
+
+        return of
+
+    families = [
+        sr.ConstraintFamily(name=name, index_set=sr.Box([0.0], [2.0]), rows=rows(i)) for i, name in enumerate("ab")
+    ]
+    A = rng.normal(size=(1, n)) if equality else None
+    return sr.SemiInfiniteProgram(
+        n=n,
+        q=rng.normal(size=n),
+        weights=rng.uniform(0, 1, n),
+        lower=-1.0,
+        upper=1.0,
+        families=families,
+        A=A,
+        b=None if A is None else A @ inside,
+    )
+
+
+def by_linear_program(program, indices):
+    """The same finite program by HiGHS: ``x``, then ``s >= |x|``."""
+    G, h = zip(*[program.family(name).rows(points) for name, points in indices.items() if len(points)], strict=True)
+    G, h = np.concatenate([g.reshape(-1, program.n) for g in G]), np.concatenate([b.ravel() for b in h])
+    n, base, identity = program.n, program.finite, np.eye(program.n)
+    rows = np.vstack(
+        [np.hstack([G, np.zeros_like(G)]), np.hstack([identity, -identity]), np.hstack([-identity, -identity])]
+    )
+    equal = None if not base.b.size else np.hstack([base.A, np.zeros_like(base.A)])
+    return linprog(
+        np.concatenate([base.q, base.weights]),
+        rows,
+        np.concatenate([h, np.zeros(2 * n)]),
+        equal,
+        base.b if base.b.size else None,
+        bounds=[*zip(base.lower, base.upper, strict=True), *[(0, None)] * n],
+        method="highs",
+    )
+
+
+def points(rng, count):
+    return rng.uniform(0, 2, (count, 1))
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10**6), equality=st.booleans())
+def test_g_is_the_value_of_the_finite_linear_program(piqp, seed, equality):
+    rng = np.random.default_rng(seed)
+    program = random_program(rng, equality=equality)
+    indices = {"a": points(rng, 8), "b": points(rng, 5)}
+    truth = by_linear_program(program, indices)
+    found = RelaxedProgram(program, piqp).evaluate(indices, 0.0)
+    assert truth.status == 0
+    assert abs(found.value - truth.fun) <= 1e-7
+    assert found.finite.lower_bound <= truth.fun + 1e-9
+
+
+@settings(max_examples=12, deadline=None)
+@given(seed=st.integers(0, 10**6), epsilon=st.sampled_from([0.0, 1e-4, 1.0]))
+def test_g_never_decreases_when_indices_are_added(piqp, ridge, seed, epsilon):
+    rng = np.random.default_rng(seed)
+    program = random_program(rng)
+    relaxed = RelaxedProgram(program, piqp, ridge)
+    indices, last = {"a": points(rng, 1), "b": EMPTY}, -np.inf
+    for _ in range(5):
+        value = relaxed.evaluate(indices, epsilon).value
+        assert value >= last - 1e-8
+        last = value
+        indices = {name: np.vstack([old, points(rng, int(rng.integers(0, 4)))]) for name, old in indices.items()}
+
+
+@settings(max_examples=12, deadline=None)
+@given(seed=st.integers(0, 10**6), epsilon=st.sampled_from([0.0, 1e-3, 1.0]))
+def test_g_does_not_depend_on_the_order_of_its_indices_or_on_what_was_asked_before(piqp, ridge, seed, epsilon):
+    rng = np.random.default_rng(seed)
+    program = random_program(rng)
+    indices = {"a": points(rng, 9), "b": points(rng, 6)}
+    fresh = RelaxedProgram(program, piqp, ridge).evaluate(indices, epsilon).value
+    used = RelaxedProgram(program, piqp, ridge)
+    used.evaluate({"b": points(rng, 7), "a": points(rng, 3)}, 0.5)
+    shuffled = {name: rng.permutation(indices[name]) for name in ("b", "a")}
+    assert abs(used.evaluate(shuffled, epsilon).value - fresh) <= 2e-8
+    doubled = {name: np.vstack([at, at]) for name, at in indices.items()}
+    assert abs(used.evaluate(doubled, epsilon).value - fresh) <= 2e-8
+
+
+@settings(max_examples=12, deadline=None)
+@given(seed=st.integers(0, 10**6), epsilon=st.sampled_from([0.0, 1e-3]))
+def test_lazy_rows_give_what_all_rows_give(piqp, ridge, seed, epsilon):
+    rng = np.random.default_rng(seed)
+    program = random_program(rng)
+    indices = {"a": points(rng, 60), "b": points(rng, 40)}
+    relaxed = RelaxedProgram(program, piqp, ridge)
+    every = rows_at(program, "a", indices["a"]).joined(rows_at(program, "b", indices["b"]))
+    lazy, full = relaxed.evaluate(indices, epsilon), relaxed.solve(every, epsilon)
+    assert full.status == "optimal"
+    assert abs(lazy.value - full.value) <= 2e-8
+    assert (every.G @ lazy.decision - every.h).max() <= 1e-8
+    assert lazy.rows.h.size <= every.h.size
+
+
+def test_no_indices_are_the_finite_constraints_alone(piqp):
+    program = random_program(np.random.default_rng(0))
+    found = RelaxedProgram(program, piqp).evaluate({"a": EMPTY, "b": EMPTY}, 0.0)
+    base = program.finite
+    truth = np.minimum(0.0, base.weights - np.abs(base.q)).sum()
+    assert abs(found.value - truth) <= 1e-9
+    assert RelaxedProgram(program, piqp).evaluate({}, 0.0).value == found.value
+
+
+def test_indices_that_contradict_each_other_make_g_infinite_with_a_certificate(piqp):
+    family = sr.ConstraintFamily(
+        name="a", index_set=sr.Box([-1.0], [1.0]), rows=lambda t: (np.sign(t)[:, None, :], -np.ones((t.shape[0], 1)))
+    )
+    program = sr.SemiInfiniteProgram(n=1, q=np.ones(1), lower=-9.0, upper=9.0, families=[family])
+    found = RelaxedProgram(program, piqp).evaluate({"a": np.array([[-0.5], [0.5]])}, 0.0)
+    assert found.value == np.inf
+    assert found.finite.infeasibility > 0.5
+    assert np.isfinite(RelaxedProgram(program, piqp).evaluate({"a": np.array([[0.5]])}, 0.0).value)
+
+
+def test_a_tightened_program_is_feasible_with_the_margin_to_spare(piqp):
+    rng = np.random.default_rng(1)
+    program = random_program(rng)
+    relaxed = RelaxedProgram(program, piqp)
+    rows = rows_at(program, "a", points(rng, 30))
+    solution = relaxed.solve(rows, 0.0, margin=1e-4)
+    norms = np.linalg.norm(rows.G, axis=1)
+    assert ((rows.G @ solution.x - rows.h) / norms).max() <= -1e-4 + 1e-8
+    assert relaxed.lower_bound(rows, solution).bound <= relaxed.solve(rows, 0.0).value + 1e-10
+
+
+def test_the_lower_bound_holds_for_any_multipliers():
+    from dataclasses import replace
+
+    from sparserob_piqp import Piqp
+
+    rng = np.random.default_rng(2)
+    program = random_program(rng)
+    relaxed = RelaxedProgram(program, Piqp())
+    rows = rows_at(program, "a", points(rng, 10))
+    solution = relaxed.solve(rows, 0.0)
+    truth = by_linear_program(program, {"a": np.array([cut.index for cut in rows.cuts])}).fun
+    assert abs(relaxed.lower_bound(rows, solution).bound - truth) <= 1e-8
+    for _ in range(20):
+        wrong = replace(
+            solution,
+            y=solution.y + rng.normal(size=solution.y.size) * 10 ** rng.uniform(-8, 1),
+            x=solution.x + rng.normal(size=5),
+        )
+        assert relaxed.lower_bound(rows, wrong).bound <= truth + 1e-9
+
+
+def test_rows_remember_where_they_come_from():
+    program = random_program(np.random.default_rng(3))
+    at = np.array([[0.5], [1.5]])
+    rows = rows_at(program, "b", at)
+    assert [(cut.family, float(cut.index[0]), cut.row) for cut in rows.cuts] == [("b", 0.5, 0), ("b", 1.5, 0)]
+    both = Rows.none(5).joined(rows).take(np.array([False, True]))
+    assert both.cuts[0].index[0] == 1.5
+    assert np.array_equal(both.G[0], program.family("b").rows(at)[0][1, 0])

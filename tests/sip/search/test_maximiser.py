@@ -1,0 +1,147 @@
+"""Guards sip/search: the objective keeps the accounts, whatever a maximiser does; the report says how the search
+ended."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import sparserob_core as sr
+from sparserob_core.sip.search.search import CountedObjective, Target, maximise
+
+SQUARE = sr.Box([-1.0, -1.0], [1.0, 1.0])
+
+
+def hill(points):
+    return -((points - 0.25) ** 2).sum(axis=1)
+
+
+class Asking(sr.Maximiser):
+    """Asks for batches of the given sizes."""
+
+    def __init__(self, *sizes):
+        self.sizes = sizes
+
+    def search(self, objective, rng):
+        for size in self.sizes:
+            objective.note(size=size)
+            objective.evaluate(rng.uniform(-1, 1, (size, 2)))
+        return np.inf
+
+
+def search(maximiser, function=hill, budget=100):
+    return maximise(Target(function, SQUARE), maximiser, budget, np.random.default_rng(0))
+
+
+@given(budget=st.integers(1, 40), sizes=st.lists(st.integers(0, 30), min_size=1, max_size=6))
+def test_exactly_the_allowed_prefix_of_a_batch_is_evaluated(budget, sizes):
+    calls = []
+    report = search(Asking(*sizes), lambda points: calls.append(len(points)) or hill(points), budget)
+    assert report.evaluations == sum(calls) == min(budget, sum(sizes))
+    assert (report.stopped == "the budget is spent") == (sum(sizes) > budget)
+
+
+def test_the_best_point_and_the_running_best_belong_to_the_evaluated_values():
+    report = search(Asking(3, 1, 5))
+    assert report.best_value == report.trace.values.max() == report.trace.best[-1]
+    assert hill(report.best_point[np.newaxis])[0] == report.best_value
+    np.testing.assert_array_equal(report.trace.best, np.maximum.accumulate(hill(report.trace.points)))
+
+
+def test_notes_are_columns_against_the_number_of_evaluations():
+    np.testing.assert_array_equal(search(Asking(3, 1, 5)).trace.notes["size"], [[0, 3], [3, 1], [4, 5]])
+
+
+@pytest.mark.parametrize("point", [[1.0000001, 0.0], [np.nan, 0.0], [0.0, -np.inf]])
+def test_a_point_outside_the_domain_is_refused_and_not_counted(point):
+    objective = CountedObjective(Target(hill, SQUARE), 10)
+    with pytest.raises(sr.InputError, match="outside the domain"):
+        objective.evaluate(np.array([[0.0, 0.0], point]))
+    assert objective.evaluations == 0
+
+
+@pytest.mark.parametrize("points", [np.zeros(2), np.zeros((1, 3))])
+def test_points_of_the_wrong_shape_are_refused(points):
+    with pytest.raises(sr.InputError, match=r"expected shape \(k, 2\)"):
+        CountedObjective(Target(hill, SQUARE), 10).evaluate(points)
+
+
+def test_no_number_counts_as_minus_infinity():
+    objective = CountedObjective(Target(lambda points: np.where(points[:, 0] < 0, np.nan, 1.0), SQUARE), 10)
+    np.testing.assert_array_equal(objective.evaluate(np.array([[-0.5, 0.0], [0.5, 0.0]])), [-np.inf, 1.0])
+    assert objective.best_value == 1.0
+
+
+def test_plus_infinity_ends_the_search_at_its_point():
+    report = search(Asking(50, 50), lambda points: np.where(points[:, 0] > 0.5, np.inf, 0.0))
+    assert report.best_value == np.inf
+    assert report.best_point[0] > 0.5
+    assert report.evaluations == 50
+    assert "+inf" in report.stopped
+
+
+def test_a_function_may_scribble_on_its_points_without_harm():
+    def scribbling(points):
+        values = hill(points)
+        points[:] = np.nan
+        return values
+
+    assert np.isfinite(search(Asking(5), scribbling).trace.points).all()
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        lambda points: 1.0,
+        lambda points: np.zeros((len(points), 1)),
+        lambda points: ["a"] * len(points),
+        lambda points: None,
+    ],
+)
+def test_a_function_that_does_not_return_one_number_per_point_is_named_as_the_fault(answer):
+    with pytest.raises(sr.EvaluationError, match="the function failed after 0 evaluations"):
+        search(Asking(2), answer)
+
+
+def test_the_error_of_a_failing_function_carries_the_best_point_so_far():
+    def failing(points):
+        if len(points) == 3:
+            raise KeyError("gone")
+        return hill(points)
+
+    with pytest.raises(
+        sr.EvaluationError, match=r"after 5 evaluations \(the best of them .* KeyError: 'gone'"
+    ) as caught:
+        search(Asking(5, 3), failing)
+    assert caught.value.report.evaluations == 5
+    assert caught.value.report.best_value == hill(caught.value.report.best_point[np.newaxis])[0]
+
+
+def test_an_upper_bound_below_an_evaluated_value_is_refused():
+    class Lying(Asking):
+        def search(self, objective, rng):
+            super().search(objective, rng)
+            return objective.best_value - 1e-9
+
+    with pytest.raises(sr.PluginError, match="Lying: claims the upper bound"):
+        search(Lying(4))
+
+
+@pytest.mark.parametrize("budget", [0, -3, 2.5])
+def test_a_budget_that_is_no_positive_whole_number_is_refused(budget):
+    with pytest.raises(sr.InputError, match="budget"):
+        search(Asking(1), budget=budget)
+
+
+def test_an_unbounded_domain_is_refused():
+    with pytest.raises(sr.InputError, match="bounded box"):
+        CountedObjective(Target(hill, sr.Box([0.0], [np.inf])), 10)
+
+
+def test_observers_hear_of_every_evaluation_once():
+    events = []
+    maximise(Target(hill, SQUARE), Asking(3, 4), 100, np.random.default_rng(0), notify=events.append)
+    assert sum(event.count for event in events) == events[-1].total == 7
+    assert events[-1].notes == {"size": 4.0}
