@@ -13,7 +13,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.experiment.plugins.components import Registry
 from sparserob_core.experiment.plugins.registry import load_registry
 from sparserob_core.sip.convex_set import Array, Box
-from sparserob_core.sip.events import Event, silence
+from sparserob_core.sip.events import Event, ignore
 from sparserob_core.sip.maximiser import Maximiser, Report
 from sparserob_core.sip.method import Continuation, Method, Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
@@ -42,7 +42,7 @@ def solve(
     continuation: Continuation | Mapping[str, float] | None = None,
     budget: int = 2000,
     polish: float = 0.0,
-    notify: Notify = silence,
+    notify: Notify = ignore,
 ) -> Result:
     """Solve a semi-infinite program, or an optimal control problem on dictionaries, as ``sparserob run`` does, without
     files.
@@ -81,7 +81,7 @@ def maximise(
     seed: int = 0,
     polish: float = 0.0,
     gradient: Callable[[Array], Array] | None = None,
-    notify: Notify = silence,
+    notify: Notify = ignore,
     **options: object,
 ) -> Report:
     """Search for the maximum of ``f`` (points ``(k, d)`` to values ``(k,)``) over a box with the maximiser of that
@@ -179,8 +179,8 @@ def _with_tolerance(registry: Registry, method: object, tolerance: float | None)
 
 
 def _heard(notify: Notify) -> Callable[[Any], None]:
-    if notify is silence:
-        return silence
+    if notify is ignore:
+        return ignore
 
     def pass_on(event: object) -> None:
         if isinstance(event, Event):

@@ -201,8 +201,8 @@ def vertex_excess(vertices: Array, centre: Array, spread: Array, blocks: int = 4
         part = slice(start, start + blocks)
         heights = flat_centre[part] @ vertices.T
         best = heights.argmax(axis=1)
-        swing = flat_spread[part] @ vertices.T
-        swing = np.abs(swing - np.take_along_axis(swing, best[:, None, None], axis=2)).sum(axis=1)
-        gain = heights - np.take_along_axis(heights, best[:, None], axis=1) + swing
+        steepness = flat_spread[part] @ vertices.T
+        steepness = np.abs(steepness - np.take_along_axis(steepness, best[:, None, None], axis=2)).sum(axis=1)
+        gain = heights - np.take_along_axis(heights, best[:, None], axis=1) + steepness
         excess[part] = np.maximum(gain.max(axis=1), 0.0)
     return excess.reshape(centre.shape[:-1])

@@ -29,15 +29,15 @@ Notify: TypeAlias = Callable[[Event], None]
 T = TypeVar("T", bound=Event)
 
 
-def silence(event: Event) -> None:
+def ignore(event: Event) -> None:
     """The listener that hears nothing."""
 
 
-def retold(notify: Notify, kind: type[T], tell: Callable[[T], Event]) -> Notify:
+def forwarded(notify: Notify, kind: type[T], tell: Callable[[T], Event]) -> Notify:
     """A listener that passes on what it hears, events of one kind as ``tell`` completes them; silence remains
     silence."""
-    if notify is silence:
-        return silence
+    if notify is ignore:
+        return ignore
     return lambda event: notify(tell(event) if isinstance(event, kind) else event)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sparserob_core.sip.events import Notify, silence
+from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.maximiser import Maximiser
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.regulariser import Regulariser
@@ -44,7 +44,7 @@ class Tools:
     budget: int = 2000
     polish: float = 0.0
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
-    notify: Notify = silence
+    notify: Notify = ignore
 
 
 class Method(ABC):

@@ -47,7 +47,7 @@ class Explanation:
 
     Where it compares a quantity with a limit, also their words and numbers: ``quantity`` such as ``x1(5)``, what it may
     be (``bound``, such as ``|x1| <= 0.3``), its value ``free`` without decision and disturbance, ``sign`` -1 for a
-    lower limit, and how far the disturbance alone moves it towards the ``limit`` (``push``). ``where``: the parameter
+    lower limit, and how far the disturbance alone moves it towards the ``limit`` (``sigma``). ``where``: the parameter
     in words.
     """
 
@@ -59,7 +59,7 @@ class Explanation:
     bound: str = ""
     limit: float = np.nan
     free: float = np.nan
-    push: float = 0.0
+    sigma: float = 0.0
     sign: float = 1.0
     where: str = ""
     direction: Array | None = None

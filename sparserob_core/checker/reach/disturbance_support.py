@@ -74,7 +74,7 @@ class Table:
 
 @final
 @dataclass(eq=False)
-class Pushes:
+class DisturbanceSupports:
     """The functionals ``c'e^{A s}`` and their integrals over one box of parameters, remembered by duration and
     direction."""
 

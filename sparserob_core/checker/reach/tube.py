@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.series import Series, norm, upper
-from sparserob_core.checker.reach.disturbance_support import Pushes, Scene
+from sparserob_core.checker.reach.disturbance_support import DisturbanceSupports, Scene
 from sparserob_core.checker.reach.flow import Flow, held, in_time, stacked, up_to
 from sparserob_core.checker.sets.polynomials import OUTWARD, ROUNDING, Enclosed
 from sparserob_core.checker.sets.shapes import radius
@@ -114,15 +114,15 @@ class Tube:
 
         ticks = self.scene.ticks(start, stop)  # never shorter than the cell: a bound on a little more is a bound
         offset, length = arb(start) - arb(self.scene.grid[piece]), self.scene.duration(ticks)
-        state, push = self._state_part(piece, offset, ticks, directions), None
+        state, sigma = self._state_part(piece, offset, ticks, directions), None
         if self.scene.disturbance is not None and stop > 0.0:
-            push = [self.pushes.bound(start, ticks, c) for c in directions]
+            sigma = [self.sigmas.bound(start, ticks, c) for c in directions]
         rest = self._left_out(piece, offset, length, directions)
         answer = []
         for i in range(len(directions)):
             mid, rad, kinks = state[i].mid, float(state[i].rad.sum()), 0.0
-            if push is not None:
-                moved, off, kinks = push[i]
+            if sigma is not None:
+                moved, off, kinks = sigma[i]
                 rad += off + float(ROUNDING * (np.abs(mid) + np.abs(moved)).sum())
                 mid = mid + moved
             answer.append(Polynomial(mid, (rad + rest[i] + kinks) * OUTWARD, rest[i], kinks))
@@ -155,9 +155,9 @@ class Tube:
         return answer
 
     @cached_property
-    def pushes(self) -> Pushes:
+    def sigmas(self) -> DisturbanceSupports:
         """What the disturbance may add."""
-        return Pushes(self.flow, self.scene)
+        return DisturbanceSupports(self.flow, self.scene)
 
     def _left_out(self, piece: int, offset: arb, length: arb, directions: Sequence[Array]) -> list[float]:
         """Lagrange's remainder of the state and of what the disturbance adds, for every direction."""
@@ -185,17 +185,17 @@ class Tube:
                     )
                 )
             )
-            answer.append(float((size * last + self._pushed_out(size)).upper()) * OUTWARD)
+            answer.append(float((size * last + self._support_out(size)).upper()) * OUTWARD)
         return answer
 
-    def _pushed_out(self, size: arb) -> arb:
+    def _support_out(self, size: arb) -> arb:
         """The remainder of the disturbance's part up to the horizon, for a direction of that size."""
         from flint import arb
 
-        return arb(0) if self.scene.disturbance is None else size * self._pushed_per_size
+        return arb(0) if self.scene.disturbance is None else size * self._support_per_size
 
     @cached_property
-    def _pushed_per_size(self) -> arb:
+    def _support_per_size(self) -> arb:
         from flint import arb
 
         rest = self.flow.remainder

@@ -133,12 +133,12 @@ class CurvedConstraint:
             H = np.vstack([centre, np.diag(radius)[free]]) @ self.set.normals
             lifted = self._flat.lifted(low[:nu], high[:nu])
             joined = self._combination(lifted, free.size)
-            push = self.functionals.push(lifted, H, joined)
+            sigma = self.functionals.disturbance_support(lifted, H, joined)
             rhs, looseness = self._minorant(H, joined, nu)
             control = self.functionals.dictionary.control(x)
             cuts = self.parameters.cuts(low[:nu], high[:nu])
             remember(
-                self._cells, key, CellEnclosure(lifted, push, H, rhs, control, joined, looseness, cuts), CELLS_KEPT
+                self._cells, key, CellEnclosure(lifted, sigma, H, rhs, control, joined, looseness, cuts), CELLS_KEPT
             )
         return self._cells[key]
 

@@ -17,14 +17,14 @@ def explanation(
     direction, system = H[row], functionals.response.system
     sign = -1.0 if np.count_nonzero(direction) == 1 and direction.sum() < 0 else 1.0
     at = (np.array([time]), direction[None], parameter[None])
-    push = float(functionals.offsets(*at)[0])
-    free, limit = sign * float(functionals.rows(*at)[1][0] - push) + 0.0, sign * float(h[row])
+    sigma = float(functionals.offsets(*at)[0])
+    free, limit = sign * float(functionals.rows(*at)[1][0] - sigma) + 0.0, sign * float(h[row])
     quantity, where = (
         combination(sign * direction, f"({time:.6g})"),
         system.describe(parameter) if parameter.size else "",
     )
     remarks = [f"the initial state gives {free:.6g}"] if time <= 0 else []
-    remarks += [f"the disturbance alone moves it by {push:.4g}"] if push > 0 else []
+    remarks += [f"the disturbance alone moves it by {sigma:.4g}"] if sigma > 0 else []
     remarks += [f"at {where}"] if where else []
     text = f"{name}: {quantity} {'>=' if sign < 0 else '<='} {limit:.6g}"
     return Explanation(
@@ -36,7 +36,7 @@ def explanation(
         bound=_bound(sign * direction, limit, _opposite(H, h, row), sign),
         limit=limit,
         free=free,
-        push=push,
+        sigma=sigma,
         sign=sign,
         where=where,
         direction=direction,

@@ -11,11 +11,11 @@ import numpy as np
 from sparserob_core.control.constraints.explanation import explanation
 from sparserob_core.control.constraints.local_maxima import climb, local_maxima, step_out, vertices
 from sparserob_core.control.enclosures.cache import remember
-from sparserob_core.control.response.disturbance_support import Push
+from sparserob_core.control.response.disturbance_support import DisturbanceSupport
 from sparserob_core.control.response.enclosure import CELLS_KEPT, CellEnclosure, enclose
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.lifted import LiftedSystem, lift
-from sparserob_core.control.response.measurable import MeasurablePush
+from sparserob_core.control.response.measurable import MeasurableCellSupport
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.response import distinct_times, transitions
 from sparserob_core.sip.convex_set import Array, Box
@@ -159,18 +159,18 @@ class FlatConstraint:
                 self._cells,
                 key,
                 CellEnclosure(
-                    lifted, self._push(low, high), self.H, rhs, control, cuts=self.parameters.cuts(low, high)
+                    lifted, self._support_over(low, high), self.H, rhs, control, cuts=self.parameters.cuts(low, high)
                 ),
                 CELLS_KEPT,
             )
         return self._cells[key]
 
-    def _push(self, low: Array, high: Array) -> Push | MeasurablePush | None:
+    def _support_over(self, low: Array, high: Array) -> DisturbanceSupport | MeasurableCellSupport | None:
         lifted = self.lifted(low, high)
         key = low.tobytes() + high.tobytes()
-        if key not in self._pushes:
-            remember(self._pushes, key, self.functionals.push(lifted, self.H), CELLS_KEPT)
-        return self._pushes[key]
+        if key not in self._supports:
+            remember(self._supports, key, self.functionals.disturbance_support(lifted, self.H), CELLS_KEPT)
+        return self._supports[key]
 
     @cached_property
     def _cells(self) -> dict[bytes, CellEnclosure]:
@@ -181,7 +181,7 @@ class FlatConstraint:
         return {}
 
     @cached_property
-    def _pushes(self) -> dict[bytes, Push | MeasurablePush | None]:
+    def _supports(self) -> dict[bytes, DisturbanceSupport | MeasurableCellSupport | None]:
         return {}
 
     @cached_property

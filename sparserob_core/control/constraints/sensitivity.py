@@ -70,8 +70,8 @@ class Functional:
         drift = (self.free[:, :1] @ self.A)[:, 0] @ self.start + ((self.driven[:, :, 0] @ self.A) * force[:, :, 0]).sum(
             axis=(1, 2)
         )
-        push = (self.direction * force[np.arange(self.now.size), self.now, 0]).sum(axis=1)
-        return np.asarray(drift + push)[:, None]
+        sigma = (self.direction * force[np.arange(self.now.size), self.now, 0]).sum(axis=1)
+        return np.asarray(drift + sigma)[:, None]
 
     def in_parameters(self, force: Array) -> Array:
         """The derivatives ``(k, nu)`` of ``c'x(t)`` in the parameters, the inputs fixed."""
@@ -101,9 +101,9 @@ class Sensitivity:
     the support point of ``c``, across ``z``; 0 at ``z = 0``. Where the worst disturbance (or the support point) is not
     unique there is a kink too, and the derivative is that of one of them.
 
-    Measurable disturbances: the derivative in time is in closed form, ``h_W(E'e^{A't} c)`` for the push; those in
-    parameters and directions are differences of the push, two tables of integrals for each. Coordinates that cannot
-    move, as the time of a terminal constraint, have derivative 0.
+    Measurable disturbances: the derivative in time is in closed form, ``h_W(E'e^{A't} c)`` for the support function;
+    those in parameters and directions are differences of the support function, two tables of integrals for each.
+    Coordinates that cannot move, as the time of a terminal constraint, have derivative 0.
     """
 
     constraint: FlatConstraint | CurvedConstraint
@@ -140,8 +140,8 @@ class Sensitivity:
         force = at.force(self.constraint.functionals.on_grid(x), signals)
         in_time, in_parameters, states = at.in_time(force), at.in_parameters(force), at.states(force)
         if closed:
-            push = self._push_slopes(times[:, 0], parameters, at)
-            in_time, in_parameters, states = in_time + push[0], in_parameters + push[1], states + push[2]
+            sigma = self._sigma_slopes(times[:, 0], parameters, at)
+            in_time, in_parameters, states = in_time + sigma[0], in_parameters + sigma[1], states + sigma[2]
         in_parameters = self.constraint.parameters.pulled_back(points, in_parameters)
         if isinstance(self.constraint, CurvedConstraint):
             z = across(z, states - self.constraint.set.support_point(at.direction) @ self.constraint.set.normals.T)
@@ -189,7 +189,7 @@ class Sensitivity:
         entered[fresh, at.now[fresh]] = (trace[:, None] @ at.W[fresh, 0])[:, 0]
         return entered
 
-    def _push_slopes(self, times: Array, parameters: Array, at: Functional) -> tuple[Array, Array, Array]:
+    def _sigma_slopes(self, times: Array, parameters: Array, at: Functional) -> tuple[Array, Array, Array]:
         """What measurable disturbances add to the derivatives in time, parameters and directions."""
         support = self.constraint.functionals.measurable
         in_time = support.bound.support((at.free[:, :1] @ at.W[:, 0])[:, 0])[:, None]

@@ -41,13 +41,13 @@ def polynomial_bound(space: TaylorSpace, coefficients: Array) -> tuple[Array, Ar
     return bound.reshape(shape), spread.reshape(*shape, nu)
 
 
-def monotone_ends(space: TaylorSpace, coefficients: Array, swing: Array) -> Array:
+def monotone_ends(space: TaylorSpace, coefficients: Array, steepness: Array) -> Array:
     """The end, -1 or 1, of every variable in which polynomials ``(k, M)`` are monotone, whatever is added whose partial
-    derivatives are at most ``swing (k, nu)``; 0 for the other variables. ``(k, nu)``."""
+    derivatives are at most ``steepness (k, nu)``; 0 for the other variables. ``(k, nu)``."""
     if space.nu == 0 or space.degree == 0:
         return np.zeros((coefficients.shape[0], space.nu))
     gradient, hessian = quadratic_part(space, coefficients)
-    certain = np.abs(gradient) > np.abs(hessian).sum(axis=2) + _tail(space, coefficients)[1] + swing
+    certain = np.abs(gradient) > np.abs(hessian).sum(axis=2) + _tail(space, coefficients)[1] + steepness
     return np.where(certain, np.sign(gradient), 0.0)
 
 

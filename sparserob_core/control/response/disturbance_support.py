@@ -17,9 +17,9 @@ from sparserob_core.sip.convex_set import Array
 
 
 @dataclass(frozen=True, eq=False)
-class Push:
-    """The push ``sigma(t) = sum_b h_D(y_b(t))`` of functionals ``rows (r, d)`` (in the lifted system's coordinates)
-    over one cell.
+class DisturbanceSupport:
+    """The support function ``sigma(t) = sum_b h_D(y_b(t))`` of functionals ``rows (r, d)`` (in the lifted system's
+    coordinates) over one cell.
 
     ``y_b`` is a polynomial in the parameters; ``h_D(y_b)`` is its value at the worst disturbance of the cell's centre,
     plus an excess that is zero wherever that disturbance stays the worst on the whole cell.
@@ -30,13 +30,14 @@ class Push:
     rows: Array
     combination: Combination | None = None
 
-    def swing(self, times: Array) -> Array:
-        """How steep the push of *any* one disturbance can be in each parameter over the cell: ``(k, r, nu)``."""
+    def steepness(self, times: Array) -> Array:
+        """How steep the support function of *any* one disturbance can be in each parameter over the cell:
+        ``(k, r, nu)``."""
         return self._gathered(times, self._reaches) @ self._space.exponents
 
     def at(self, times: Array, ends: Array) -> tuple[Array, Array]:
-        """Taylor coefficients ``(k, r, M)`` of the push under the worst disturbance of a centre, and its excess
-        ``(k, r)``.
+        """Taylor coefficients ``(k, r, M)`` of the support function under the worst disturbance of a centre, and its
+        excess ``(k, r)``.
 
         ``ends (k, r, nu)``: parameters that are known to be at an end of the cell (-1 or 1); the centre is that of the
         face they leave.
@@ -99,7 +100,8 @@ class Push:
         """Sums over the blocks of a function of them: from blocks ``(k, r, M, nb, q)`` to parts ``(k, r, nb, j)``;
         returns ``(k, r, j)``.
 
-        ``rows (r, M d)``: the lifted functionals, the push's own unless given; ``plain``: leave them uncombined.
+        ``rows (r, M d)``: the lifted functionals, the support function's own unless given; ``plain``: leave them
+        uncombined.
         """
         start = self._lifted_rows if rows is None else rows
         combined = (lambda blocks: blocks) if plain else self._combined

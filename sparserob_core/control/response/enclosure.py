@@ -18,9 +18,9 @@ from sparserob_core.control.enclosures.combination import Combination
 from sparserob_core.control.enclosures.polynomial import distinct_patterns, face_matrix, monotone_ends, polynomial_bound
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.enclosures.valid_inequalities import Cuts
-from sparserob_core.control.response.disturbance_support import Push
+from sparserob_core.control.response.disturbance_support import DisturbanceSupport
 from sparserob_core.control.response.lifted import LiftedSystem, grown_less_one
-from sparserob_core.control.response.measurable import MeasurablePush
+from sparserob_core.control.response.measurable import MeasurableCellSupport
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.program import Enclosure
@@ -47,7 +47,7 @@ class CellEnclosure:
     """
 
     lifted: LiftedSystem
-    push: Push | MeasurablePush | None
+    sigma: DisturbanceSupport | MeasurableCellSupport | None
     H: Array
     rhs: Array
     control: Array
@@ -87,19 +87,19 @@ class CellEnclosure:
         if self.combination is not None:
             coefficients, space = self.combination.apply(coefficients), self.combination.space
         coefficients = coefficients - self.rhs
-        swing = (
+        steepness = (
             np.zeros((*coefficients.shape[:2], space.nu))
-            if self.push is None or not space.nu
-            else self.push.swing(times)
+            if self.sigma is None or not space.nu
+            else self.sigma.steepness(times)
         )
         coefficients, gain = self._cut_off(space, coefficients, times)
-        ends = self._better_ends(space, coefficients, swing)
+        ends = self._better_ends(space, coefficients, steepness)
         coefficients, excess = _on_faces(space, coefficients, ends), np.zeros(coefficients.shape[:2])
-        if self.push is not None:
-            pushed, excess = self.push.at(times, ends)
+        if self.sigma is not None:
+            pushed, excess = self.sigma.at(times, ends)
             coefficients = coefficients + pushed
         bound, spread = polynomial_bound(space, coefficients)
-        blame = np.where(ends == 0, swing, 0.0) + np.finfo(float).tiny
+        blame = np.where(ends == 0, steepness, 0.0) + np.finfo(float).tiny
         spread = spread if gain is None else gain
         return bound + excess, spread + excess[..., None] * blame / blame.sum(axis=2, keepdims=True)
 
@@ -108,17 +108,17 @@ class CellEnclosure:
         with them."""
         if self.cuts is None:
             return coefficients, None
-        pushed = 0.0 if self.push is None else self.push.at(times, np.zeros((*coefficients.shape[:2], space.nu)))[0]
+        pushed = 0.0 if self.sigma is None else self.sigma.at(times, np.zeros((*coefficients.shape[:2], space.nu)))[0]
         return self.cuts.lowered(space, coefficients, pushed)
 
     @staticmethod
-    def _better_ends(space: TaylorSpace, coefficients: Array, swing: Array) -> Array:
+    def _better_ends(space: TaylorSpace, coefficients: Array, steepness: Array) -> Array:
         """Parameters in which the violation is monotone over the cell, whatever the disturbance: their better ends,
         ``(k, r, nu)``."""
         if not space.nu:
-            return np.zeros(swing.shape)
-        return monotone_ends(space, coefficients.reshape(-1, space.size), swing.reshape(-1, space.nu)).reshape(
-            swing.shape
+            return np.zeros(steepness.shape)
+        return monotone_ends(space, coefficients.reshape(-1, space.size), steepness.reshape(-1, space.nu)).reshape(
+            steepness.shape
         )
 
     def _states(self, times: Array, pieces: np.ndarray) -> Array:
@@ -160,8 +160,8 @@ class CellEnclosure:
         by_row = np.abs(np.einsum("ri,kai->kra", self._rows, second.reshape(start.size, space.size, -1))).sum(axis=2)
         loose = np.sqrt(space.size) * np.linalg.norm(second, axis=1) * growth
         total = by_row + np.linalg.norm(self._rows, axis=1) * loose[:, None]
-        if self.push is not None:
-            total = total + self.push.curvature(start, width)
+        if self.sigma is not None:
+            total = total + self.sigma.curvature(start, width)
         answer: Array = total * (width**2 / 8)[:, None]
         return answer
 
@@ -205,7 +205,7 @@ class CellEnclosure:
         """What the Taylor models neglect, ``(r, L)``."""
         state = self.lifted.state_remainder(self.control)
         total = np.outer(np.linalg.norm(self._rows, axis=1), state)
-        return total if self.push is None else total + self.push.neglected
+        return total if self.sigma is None else total + self.sigma.neglected
 
 
 def _on_faces(space: TaylorSpace, coefficients: Array, ends: Array) -> Array:

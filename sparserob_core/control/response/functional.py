@@ -13,9 +13,9 @@ from sparserob_core.control.enclosures.combination import Combination
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.disturbance import DisturbanceModel
-from sparserob_core.control.response.disturbance_support import Push
+from sparserob_core.control.response.disturbance_support import DisturbanceSupport
 from sparserob_core.control.response.lifted import LiftedSystem, frozen
-from sparserob_core.control.response.measurable import MeasurablePush, MeasurableSupport
+from sparserob_core.control.response.measurable import MeasurableCellSupport, MeasurableSupport
 from sparserob_core.control.response.response import Response
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array, Box
@@ -117,22 +117,26 @@ class WorstCase:
             every = np.broadcast_to(parameter, (k * r, parameter.size))
             return self.offsets(np.repeat(times, r), np.tile(directions, (k, 1)), every).reshape(k, r)
         known = frozen(self.response.system, self.response.grid, self.response.initial_state, parameter)
-        return Push(known, model, directions).at(times, np.zeros((times.size, directions.shape[0], 0)))[0][:, :, 0]
+        return DisturbanceSupport(known, model, directions).at(times, np.zeros((times.size, directions.shape[0], 0)))[
+            0
+        ][:, :, 0]
 
-    def push(self, lifted: LiftedSystem, H: Array, joined: Combination | None = None) -> Push | MeasurablePush | None:
-        """The push of the disturbance on functionals ``H (r, d)`` over a cell; raises `NotEnclosable` where no bound of
-        it is proven."""
+    def disturbance_support(
+        self, lifted: LiftedSystem, H: Array, joined: Combination | None = None
+    ) -> DisturbanceSupport | MeasurableCellSupport | None:
+        """The support function of the disturbance on functionals ``H (r, d)`` over a cell; raises `NotEnclosable` where
+        no bound of it is proven."""
         model = self.disturbance
         if model is None:
             return None
         if model.kind != "measurable":
-            return Push(lifted, model, H @ lifted.transform, joined)
+            return DisturbanceSupport(lifted, model, H @ lifted.transform, joined)
         if lifted.space.nu or joined is not None:
             raise NotEnclosable(
                 "measurable disturbances are proven only for known systems and sets with flat sides; "
                 "expected disturbance_class piecewise_constant"
             )
-        return MeasurablePush(self.measurable, H)
+        return MeasurableCellSupport(self.measurable, H)
 
     def offsets(self, times: Array, directions: Array, parameters: Array) -> Array:
         """``sigma (k,)``: how far the worst disturbance alone pushes ``c'x(t)``."""

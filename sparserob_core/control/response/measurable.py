@@ -97,8 +97,9 @@ class MeasurableSupport:
 
 
 @dataclass(frozen=True, eq=False)
-class MeasurablePush:
-    """The push of measurable disturbances on functionals ``rows (r, d)`` of a *known* system, in the form of `Push`.
+class MeasurableCellSupport:
+    """The support function of measurable disturbances on functionals ``rows (r, d)`` of a *known* system, in the form
+    of `DisturbanceSupport`.
 
     ``sigma`` is an integral with a Lipschitz integrand, so its second derivative is bounded by that of the integrand's
     argument.
@@ -107,12 +108,12 @@ class MeasurablePush:
     support: MeasurableSupport
     rows: Array
 
-    def swing(self, times: Array) -> Array:
-        """No parameters, no swing: ``(k, r, 0)``."""
+    def steepness(self, times: Array) -> Array:
+        """No parameters, no steepness: ``(k, r, 0)``."""
         return np.zeros((times.size, self.rows.shape[0], 0))
 
     def at(self, times: Array, ends: Array) -> tuple[Array, Array]:
-        """The push ``(k, r, 1)`` and an excess of zero ``(k, r)``; ``ends (k, r, 0)``."""
+        """The support function ``(k, r, 1)`` and an excess of zero ``(k, r)``; ``ends (k, r, 0)``."""
         k, r = times.size, self.rows.shape[0]
         sigma = self.support(np.repeat(times, r), np.tile(self.rows, (k, 1)), np.zeros((k * r, 0)))
         return sigma.reshape(k, r, 1), np.zeros((k, r))

@@ -54,16 +54,16 @@ def walk(response: Response, control: Array, parameters: Array, disturbances: Ar
     flows, integrals = _transitions(A, lengths)
     state = np.repeat(response.initial_state[:, None], parameters.shape[0], axis=1)
     yield state
-    before, push = (-1, -1, -1), np.zeros(0)
+    before, sigma = (-1, -1, -1), np.zeros(0)
     for piece in range(grid.pieces):
         inputs = (int(which[piece]), int(grid.control_piece[piece]), int(grid.disturbance_piece[piece]))
         if inputs != before:
             drive = _times(B, control[:, inputs[1], None])
-            push, before = (
+            sigma, before = (
                 _times(integrals[inputs[0]], drive if signal is None else drive + _times(W, signal[inputs[2]])),
                 inputs,
             )
-        state = _times(flows[inputs[0]], state) + push
+        state = _times(flows[inputs[0]], state) + sigma
         yield state
 
 

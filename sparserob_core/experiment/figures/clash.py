@@ -40,14 +40,14 @@ class Strip:
     high: float
     reach_low: float
     reach_high: float
-    push_low: float
-    push_high: float
+    sigma_low: float
+    sigma_high: float
 
     @property
     def best(self) -> float:
         """Where the control does best to bring it: in the middle of what is allowed and possible once the disturbance
         has taken its part."""
-        low, high = self.low + self.push_low, self.high - self.push_high
+        low, high = self.low + self.sigma_low, self.high - self.sigma_high
         wanted = (low + high) / 2 if np.isfinite(low + high) else low if np.isfinite(low) else high
         wanted = float(np.clip(self.reach_low, low, high)) if low <= high and np.isinf(high - low) else wanted
         return float(np.clip(wanted, self.reach_low, self.reach_high))
@@ -72,7 +72,7 @@ def draw_clash(experiment: Experiment, result: Result, directory: Path) -> list[
         figure, axes = look.panels(1, 0.62 * len(strips) + 0.5, extra=0.35)
         _draw(axes[0], strips)
         alone = any(
-            strip.best - strip.push_low < strip.low or strip.best + strip.push_high > strip.high for strip in strips
+            strip.best - strip.sigma_low < strip.low or strip.best + strip.sigma_high > strip.high for strip in strips
         )
         axes[0].set_title(experiment.title, pad=8 if alone else 22)
         if not alone:
@@ -120,7 +120,7 @@ def _strip(program: SemiInfiniteProgram, family: ConstraintFamily, cut: Cut) -> 
     row = rows_at(_reduced(program, family), family.name, cut.index[None], np.array([cut.row])).G[0]
     towards, away = (float(least_of(program.finite, sign * row[None], np.zeros(1))[0]) for sign in (1.0, -1.0))
     reach = sorted([said.free + said.sign * towards, said.free - said.sign * away])
-    limits, pushes = {said.sign: said.limit}, {said.sign: said.push}
+    limits, sigmas = {said.sign: said.limit}, {said.sign: said.sigma}
     opposite = [
         j
         for j in range(h.shape[1])
@@ -129,7 +129,7 @@ def _strip(program: SemiInfiniteProgram, family: ConstraintFamily, cut: Cut) -> 
     others = [family.explain(cut.index, j) for j in opposite]
     for other in others:
         if other.quantity == said.quantity:
-            limits[other.sign], pushes[other.sign] = other.limit, other.push
+            limits[other.sign], sigmas[other.sign] = other.limit, other.sigma
     label = f"{said.quantity}\n{family.name}" + (f", {said.where}" if said.where and said.time else "")
     return Strip(
         label,
@@ -137,8 +137,8 @@ def _strip(program: SemiInfiniteProgram, family: ConstraintFamily, cut: Cut) -> 
         limits.get(1.0, np.inf),
         reach[0],
         reach[1],
-        pushes.get(-1.0, 0.0),
-        pushes.get(1.0, 0.0),
+        sigmas.get(-1.0, 0.0),
+        sigmas.get(1.0, 0.0),
     )
 
 
@@ -154,8 +154,8 @@ def _draw(ax: Axes, strips: Sequence[Strip]) -> None:
         _forbidden(ax, strip, y, left, right)
         _bar(
             ax,
-            strip.best - strip.push_low,
-            strip.best + strip.push_high,
+            strip.best - strip.sigma_low,
+            strip.best + strip.sigma_high,
             y - 0.17,
             look.ORANGE,
             "what the worst disturbance makes of its best",
@@ -203,8 +203,8 @@ def _view(strips: Sequence[Strip]) -> tuple[float, float]:
                 strip.high,
                 strip.reach_low,
                 strip.reach_high,
-                strip.best - strip.push_low,
-                strip.best + strip.push_high,
+                strip.best - strip.sigma_low,
+                strip.best + strip.sigma_high,
             )
         ]
     )

@@ -14,7 +14,7 @@ from sparserob_core.experiment.margin.scaling import Scaling
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.program import SemiInfiniteProgram
-from sparserob_core.sip.relaxed.parametric import Factored, extreme_program, slack_program
+from sparserob_core.sip.relaxed.parametric import ParametricProgram, extreme_program, slack_program
 
 ROOM = 1e3  # bounds of the slack, in units of the violation without control
 PROBES = 80  # factors at most at which the slack is computed
@@ -33,7 +33,7 @@ class Critical:
 
 
 def critical_factor(
-    programs: Factored, scaling: Scaling, tools: Tools, width: float, tell: Callable[[str], None]
+    programs: ParametricProgram, scaling: Scaling, tools: Tools, width: float, tell: Callable[[str], None]
 ) -> Critical:
     """Find the critical factor to about ``width``, which is what ordinary runs then have to prove."""
     if scaling.affine:
@@ -43,7 +43,7 @@ def critical_factor(
     return _by_slack(programs, scaling, tools, width, tell)
 
 
-def _by_one_program(programs: Factored, scaling: Scaling, tools: Tools, width: float) -> Critical:
+def _by_one_program(programs: ParametricProgram, scaling: Scaling, tools: Tools, width: float) -> Critical:
     """The factor as a decision variable: its two bounds meet at the critical factor."""
     program = extreme_program(programs, scaling.sense, scaling.highest)
     result = Exchange(max(0.05 * width, 1e-9)).solve(program, replace(tools, regulariser=None))
@@ -62,7 +62,7 @@ def _by_one_program(programs: Factored, scaling: Scaling, tools: Tools, width: f
 
 
 def _by_slack(
-    programs: Factored, scaling: Scaling, tools: Tools, width: float, tell: Callable[[str], None]
+    programs: ParametricProgram, scaling: Scaling, tools: Tools, width: float, tell: Callable[[str], None]
 ) -> Critical:
     """A bracket of the factor at which the least relaxation that leaves something feasible changes its sign."""
 
@@ -84,7 +84,7 @@ def _by_slack(
     return _bracketed(slack, (good, at_good), (bad, at_bad), width)
 
 
-def _slack(programs: Factored, factor: float, tools: Tools) -> float:
+def _slack(programs: ParametricProgram, factor: float, tools: Tools) -> float:
     """The least relaxation of the rows, infinite where the bounds or equalities cannot be met at all, or the system is
     not defined."""
     try:

@@ -20,7 +20,7 @@ from sparserob_core.experiment.directory.artefacts import RunDirectory, create_d
 from sparserob_core.experiment.margin.scaling import scaling
 from sparserob_core.experiment.margin.search import Margin, Point, Search, Tell
 from sparserob_core.sip.methods.exchange import Exchange
-from sparserob_core.sip.relaxed.parametric import Factored
+from sparserob_core.sip.relaxed.parametric import ParametricProgram
 
 __all__ = ["Margin", "Point", "margin", "margin_rows", "summary_of_margin"]
 
@@ -95,7 +95,7 @@ def _search(loaded: Loaded, of: str, tolerance: float, tell: Tell) -> Search:
             "config: expected a control problem, whose sets can be scaled, got a semi-infinite program of another kind"
         )
     chosen = scaling(problem, of, *_positions(loaded, problem))
-    programs = Factored(lambda factor: transcribe(chosen.at(factor), control=control, disturbance=disturbance))
+    programs = ParametricProgram(lambda factor: transcribe(chosen.at(factor), control=control, disturbance=disturbance))
     width = tolerance * (chosen.highest if of.endswith(".from") else 1.0)
     return Search(experiment.title, programs, chosen, _method(loaded), tools_of(loaded), width, tell)
 

@@ -15,7 +15,7 @@ from sparserob_core.experiment.margin.critical import Critical, critical_factor
 from sparserob_core.experiment.margin.scaling import Scaling, Sense
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.methods.exchange import Exchange
-from sparserob_core.sip.relaxed.parametric import Factored
+from sparserob_core.sip.relaxed.parametric import ParametricProgram
 from sparserob_core.sip.result import Status
 
 Tell: TypeAlias = Callable[[str], None]
@@ -81,7 +81,7 @@ class Search:
     """One search. ``width``: how close the two sides are to be, relative to the factor if that is above 1."""
 
     title: str
-    programs: Factored
+    programs: ParametricProgram
     scaling: Scaling
     method: Exchange
     tools: Tools

@@ -20,7 +20,7 @@ _inverses = Memory(4)
 _curvatures = Memory(4)
 
 
-def straightened(program: FiniteProgram) -> FiniteProgram | None:
+def in_new_variables(program: FiniteProgram) -> FiniteProgram | None:
     """The program in the coordinates ``s = S x``; ``None`` unless ``S`` is square and well conditioned and ``P``
     becomes diagonal.
 
@@ -38,8 +38,8 @@ def straightened(program: FiniteProgram) -> FiniteProgram | None:
     return replace(program, S=None, P=P, q=program.q @ inverse, G=program.G @ inverse, A=program.A @ inverse)
 
 
-def unstraightened(program: FiniteProgram, s: Array) -> Array:
-    """``x (n,)`` with ``S x = s``, for a program that could be straightened."""
+def from_new_variables(program: FiniteProgram, s: Array) -> Array:
+    """``x (n,)`` with ``S x = s``, for a program that has new variables."""
     S = program.S
     inverse = None if S is None else _inverses.recall((S,), None, partial(_inverse, S))
     return s if inverse is None else np.asarray(inverse @ s)

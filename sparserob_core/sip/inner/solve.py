@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
-from sparserob_core.sip.inner.change_of_variables import straightened, unstraightened
+from sparserob_core.sip.inner.change_of_variables import from_new_variables, in_new_variables
 from sparserob_core.sip.inner.duality import farkas_margin, measure, minimisers
 from sparserob_core.sip.inner.elastic import elastic_program, unrelaxed
 from sparserob_core.sip.inner.proximal import polish
@@ -72,7 +72,7 @@ def solve_finite(
         if believed is not None:
             return believed
     case.attempts.clear()
-    easier = straightened(program)
+    easier = in_new_variables(program)
     answer = None if easier is None else _through(case, easier, guess)
     return _tried(case) if answer is None else answer
 
@@ -99,10 +99,10 @@ def _through(case: _Case, easier: FiniteProgram, guess: FiniteSolution | None) -
     program = case.program
     start = guess if guess is None or guess.x.size != program.n else replace(guess, x=program.image(guess.x))
     found = solve_finite(easier, case.solver, tolerance=case.tolerance, guess=start)
-    x = unstraightened(program, found.x)
+    x = from_new_variables(program, found.x)
     if found.status == "infeasible":
         return _proof(case, (x, found.y, found.mu, None), "the program in the coordinates of its image")
-    return case.judge(measure(program, x, found.y, found.mu, found.z, found.message), "straightened")
+    return case.judge(measure(program, x, found.y, found.mu, found.z, found.message), "new variables")
 
 
 def cost_scale(program: FiniteProgram, value: float) -> float:

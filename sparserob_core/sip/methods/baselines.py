@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sparserob_core.errors import InputError
-from sparserob_core.sip.events import RoundFinished, retold
+from sparserob_core.sip.events import RoundFinished, forwarded
 from sparserob_core.sip.evidence import Proof
 from sparserob_core.sip.method import Method, Tools
 from sparserob_core.sip.methods.exchange import Exchange
@@ -80,7 +80,7 @@ def _judged(
 ) -> Result:
     """Solve the simpler program, whose lower bound holds for the full one too, and say what its decision is worth in
     the full one."""
-    notify = retold(tools.notify, RoundFinished, lambda event: replace(event, simplified=True))
+    notify = forwarded(tools.notify, RoundFinished, lambda event: replace(event, simplified=True))
     result = Exchange(tolerance, rounds).close(simple, replace(tools, notify=notify), lambda x: ())
     if result.decision is None:
         return result

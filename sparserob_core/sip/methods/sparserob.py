@@ -18,7 +18,7 @@ import numpy as np
 
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.events import EvaluationsFinished, RoundFinished, frozen, retold
+from sparserob_core.sip.events import EvaluationsFinished, RoundFinished, forwarded, frozen
 from sparserob_core.sip.evidence import NO_BOUND, Cut, Dual, Proof, Witness
 from sparserob_core.sip.maximiser import Maximiser, Objective, Report
 from sparserob_core.sip.method import Method, Tools
@@ -130,7 +130,7 @@ class _Run:
         rules = Rules(self.method.sc2, self.method.slcr or Metropolis(), self.tools.polish)
         target = Target(bounds, g.domain, g.gradient, g.block)
         assert self.tools.maximiser is not None
-        notify = retold(self.tools.notify, EvaluationsFinished, lambda event: self._completed(event, j, epsilon))
+        notify = forwarded(self.tools.notify, EvaluationsFinished, lambda event: self._completed(event, j, epsilon))
         report = maximise(target, _From(point, self.tools.maximiser), self.tools.budget, self.tools.rng, rules, notify)
         self._record(report, bounds, epsilon, j, began)
         if report.interrupted:

@@ -9,7 +9,7 @@ import numpy as np
 
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.events import Notify, ProofProgress, silence
+from sparserob_core.sip.events import Notify, ProofProgress, ignore
 from sparserob_core.sip.evidence import Proof
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
 
@@ -31,12 +31,12 @@ CLIMBED = (
 MOVES = 24  # steps of such a climb at most
 
 
-def prove(program: SemiInfiniteProgram, x: Array, notify: Notify = silence, cells: int = CELLS) -> tuple[Proof, ...]:
+def prove(program: SemiInfiniteProgram, x: Array, notify: Notify = ignore, cells: int = CELLS) -> tuple[Proof, ...]:
     """Prove or refute every family at ``x (n,)``, one `Proof` each."""
     return tuple(prove_family(family.reduced or family, x, notify, cells) for family in program.families)
 
 
-def prove_family(family: ConstraintFamily, x: Array, notify: Notify = silence, cells: int = CELLS) -> Proof:
+def prove_family(family: ConstraintFamily, x: Array, notify: Notify = ignore, cells: int = CELLS) -> Proof:
     """Bound the violation of one family over its whole index set.
 
     Cells whose enclosure is at most `TOLERANCE` are closed, the others halved; the centres of the worst are probed for

@@ -156,13 +156,13 @@ def sentence(kind: Kind, family: ConstraintFamily, rows: Rows, amount: float) ->
 
 
 def _beyond(name: str, one: Explanation) -> str:
-    reached = one.free + one.sign * one.push
-    pushed = f" under the worst disturbance, which moves it by {one.push:.4g}," if one.push > 0 else ""
+    reached = one.free + one.sign * one.sigma
+    pushed = f" under the worst disturbance, which moves it by {one.sigma:.4g}," if one.sigma > 0 else ""
     return f"{one.quantity} = {reached:.6g}{pushed} is outside {one.bound} ({name}), whatever the decision"
 
 
 def _between(name: str, one: Explanation, two: Explanation) -> str:
-    allowed, moved = (one.sign * one.limit + two.sign * two.limit) / 2, (one.push + two.push) / 2
+    allowed, moved = (one.sign * one.limit + two.sign * two.limit) / 2, (one.sigma + two.sigma) / 2
     if moved > 0:
         more, less = told_apart(moved, allowed)
         return f"the disturbance alone moves {one.quantity} by {more}, {_set(name)} allows {less}"
@@ -172,7 +172,7 @@ def _between(name: str, one: Explanation, two: Explanation) -> str:
 def _out_of_reach(name: str, one: Explanation, amount: float, needed: float) -> str:
     verb, pushed = (
         ("raise" if one.sign < 0 else "lower"),
-        f", {one.push:.4g} of it for the worst disturbance" if one.push > 0 else "",
+        f", {one.sigma:.4g} of it for the worst disturbance" if one.sigma > 0 else "",
     )
     if needed - amount < 0:
         return f"{one.text} is violated by at least {amount:.4g}, whatever the control"

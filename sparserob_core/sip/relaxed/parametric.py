@@ -18,7 +18,7 @@ KEPT = 4  # programs that are remembered, those asked for last
 
 
 @dataclass(frozen=True, eq=False)
-class Factored:
+class ParametricProgram:
     """Programs ``at(factor)`` that differ in right-hand sides and bounds only, which are affine in the factor for
     factors ``>= 0``."""
 
@@ -34,7 +34,9 @@ class Factored:
         return self._known[factor]
 
 
-def extreme_program(factored: Factored, sense: Literal["largest", "smallest"], cap: float) -> SemiInfiniteProgram:
+def extreme_program(
+    factored: ParametricProgram, sense: Literal["largest", "smallest"], cap: float
+) -> SemiInfiniteProgram:
     """The largest or the smallest factor in ``[0, cap]`` that leaves something feasible; the decision is
     ``(x, factor)``.
 
@@ -118,7 +120,7 @@ def _image(program: SemiInfiniteProgram) -> object:
     return block_diag([program.finite.S, [[1.0]]], format="csc")
 
 
-def _family(factored: Factored, one: ConstraintFamily, two: ConstraintFamily) -> ConstraintFamily:
+def _family(factored: ParametricProgram, one: ConstraintFamily, two: ConstraintFamily) -> ConstraintFamily:
     name = one.name
 
     def rows(indices: Array) -> tuple[Array, Array]:

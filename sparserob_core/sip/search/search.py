@@ -11,7 +11,7 @@ import numpy as np
 
 from sparserob_core.errors import InputError, PluginError
 from sparserob_core.sip.convex_set import Array, Box
-from sparserob_core.sip.events import Notify, silence
+from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.maximiser import EvaluationError, Maximiser, Report, SearchEnded, Trace
 from sparserob_core.sip.rules import Metropolis, Progress
 from sparserob_core.sip.search.notifier import Notifier, Standing
@@ -63,7 +63,7 @@ class CountedObjective:
     """An `Objective` that keeps the accounts itself, so that a maximiser cannot misreport. Raises `InputError` for a
     budget below 1."""
 
-    def __init__(self, target: Target, budget: int, rules: Rules | None = None, notify: Notify = silence) -> None:
+    def __init__(self, target: Target, budget: int, rules: Rules | None = None, notify: Notify = ignore) -> None:
         if budget != int(budget) or budget < 1:
             raise InputError(f"budget: expected a whole number of at least 1, got {budget!r}")
         self.target, self.domain, self.block, self.budget = target, target.domain, target.block, int(budget)
@@ -77,7 +77,7 @@ class CountedObjective:
         self._seconds: list[tuple[int, float]] = []
         self._improvements: list[tuple[int, float]] = []
         self._notes: dict[str, list[tuple[float, float]]] = {}
-        self._notifier = None if notify is silence else Notifier(notify, target.domain)
+        self._notifier = None if notify is ignore else Notifier(notify, target.domain)
         self._started = time.monotonic()
 
     @property
@@ -238,7 +238,7 @@ def maximise(
     budget: int,
     rng: np.random.Generator,
     rules: Rules | None = None,
-    notify: Notify = silence,
+    notify: Notify = ignore,
 ) -> Report:
     """Search for the maximum of a target with ``budget`` evaluations at most; the last share of them polishes what was
     found.

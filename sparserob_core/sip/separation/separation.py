@@ -8,7 +8,7 @@ import numpy as np
 
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.events import EvaluationsFinished, Notify, retold, silence
+from sparserob_core.sip.events import EvaluationsFinished, Notify, forwarded, ignore
 from sparserob_core.sip.maximiser import Maximiser
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation
@@ -31,7 +31,7 @@ def separate(
     (in round ``number``)."""
 
     def searched(family: ConstraintFamily) -> Separation:
-        notify = retold(
+        notify = forwarded(
             tools.notify, EvaluationsFinished, lambda event: replace(event, family=family.name, round=number)
         )
         return search_worst(family, x, tools.maximiser, tools.budget, tools.rng, threshold, tools.polish, notify)
@@ -47,7 +47,7 @@ def search_worst(
     rng: np.random.Generator,
     threshold: float = 1e-9,
     polish: float = 0.0,
-    notify: Notify = silence,
+    notify: Notify = ignore,
 ) -> Separation:
     """The largest local maxima of the violation of every row of ``family`` at the decision ``x (n,)``, at most 8 per
     row, worst first.

@@ -143,13 +143,13 @@ def test_finer_pieces_never_help_the_control():
     rng = np.random.default_rng(6)
     system = random_system(rng, speed=3.0)
     times, directions = rng.uniform(0, HORIZON, 20), rng.normal(size=(20, 2))
-    pushes = [
+    sigmas = [
         worst_case(system, COARSE, uniform(3 * 2**k, HORIZON), BOUNDS["box"]).offsets(
             times, directions, np.zeros((20, 0))
         )
         for k in range(6)
     ]
-    for coarser, finer in itertools.pairwise(pushes):
+    for coarser, finer in itertools.pairwise(sigmas):
         assert (finer >= coarser - 1e-12).all()
 
 

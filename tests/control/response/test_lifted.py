@@ -13,7 +13,7 @@ from sparserob_core.control.enclosures.polynomial import polynomial_bound
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.system import LinearSystem
-from sparserob_core.control.response.disturbance_support import Push
+from sparserob_core.control.response.disturbance_support import DisturbanceSupport
 from sparserob_core.control.response.lifted import frozen, lift
 from sparserob_core.sip.convex_set import Box
 
@@ -151,10 +151,10 @@ def test_the_push_is_enclosed_over_the_cell(name, grid):
     functionals, lifted = made(name, grid, bound=Box([-0.1, -0.3], [0.2, 0.1]))
     _, _, _, centre, radius = SYSTEMS[name]
     directions = rng.normal(size=(2, lifted.states))
-    push = Push(lifted, functionals.disturbance, directions @ lifted.transform)
+    sigma = DisturbanceSupport(lifted, functionals.disturbance, directions @ lifted.transform)
     times = np.append(rng.uniform(0, HORIZON, 4), HORIZON)
-    coefficients, excess = push.at(times, np.zeros((times.size, 2, lifted.space.nu)))
-    neglected = push.neglected[:, functionals.response.grid.locate(times)].T
+    coefficients, excess = sigma.at(times, np.zeros((times.size, 2, lifted.space.nu)))
+    neglected = sigma.neglected[:, functionals.response.grid.locate(times)].T
     for delta in deltas(rng, lifted.space.nu):
         p = np.array(centre) + np.array(radius) * delta
         truth = functionals.profile(times, directions, p)
@@ -190,10 +190,10 @@ def test_products_of_a_functional_and_an_uncertain_disturbance_matrix_are_enclos
         )
         functionals = worst_case(quick, uniform(200, 1.0), bound=Box([1.0], [1.0]), initial_state=[0.0])
         lifted = lift(quick, functionals.response.grid, np.zeros(1), np.zeros(nu), np.ones(nu))
-        push = Push(lifted, functionals.disturbance, lifted.transform)
-        coefficients, excess = push.at(np.array([1.0]), np.zeros((1, 1, nu)))
+        sigma = DisturbanceSupport(lifted, functionals.disturbance, lifted.transform)
+        coefficients, excess = sigma.at(np.array([1.0]), np.zeros((1, 1, nu)))
         enclosed = coefficients[0, 0] @ lifted.space.monomials(np.ones((1, nu)))[0]
-        slack = excess[0, 0] + push.neglected[0, -1]
+        slack = excess[0, 0] + sigma.neglected[0, -1]
         truth = 2 * np.expm1(0.3 * rate) / (0.3 * rate)
         assert abs(truth - enclosed) <= slack * (1 + 1e-9) + 1e-12, (
             f"rate {rate}: off by {truth - enclosed}, allowed {slack}"
@@ -205,12 +205,12 @@ def test_what_is_neglected_counts_the_size_of_the_functions_of_an_l1_ball():
     large = Dictionary(np.array([0.0, 1.0]), np.array([[1000.0]]))
     functionals = worst_case(system, uniform(100, 1.0), large, Box([-1.0], [1.0]), "l1_ball", [0.0])
     lifted = lift(system, functionals.response.grid, np.zeros(1), np.zeros(1), np.ones(1))
-    push = Push(lifted, functionals.disturbance, lifted.transform)
-    coefficients, excess = push.at(np.array([1.0]), np.zeros((1, 1, 1)))
+    sigma = DisturbanceSupport(lifted, functionals.disturbance, lifted.transform)
+    coefficients, excess = sigma.at(np.array([1.0]), np.zeros((1, 1, 1)))
     enclosed = coefficients[0, 0] @ lifted.space.monomials(np.ones((1, 1)))[0]
     assert excess[0, 0] >= 0
     # the same disturbance is the worst on the whole cell
-    assert abs(1000 * np.expm1(3) / 3 - enclosed) <= push.neglected[0, -1]
+    assert abs(1000 * np.expm1(3) / 3 - enclosed) <= sigma.neglected[0, -1]
 
 
 def test_a_known_system_has_no_remainder():
@@ -218,7 +218,7 @@ def test_a_known_system_has_no_remainder():
     functionals = worst_case(system, GRIDS["uniform"], bound=Box([-1, -1], [1, 1]), initial_state=[1.0, 0.0])
     lifted = lift(system, functionals.response.grid, np.array([1.0, 0.0]), np.zeros(0), np.zeros(0))
     assert not lifted.state_remainder(np.ones((1, 6))).any()
-    assert not Push(lifted, functionals.disturbance, np.eye(2)).neglected.any()
+    assert not DisturbanceSupport(lifted, functionals.disturbance, np.eye(2)).neglected.any()
     assert np.allclose(
         lifted.nodes(np.ones((1, 6)))[:, 0], functionals.response.states(np.ones((1, 6)), np.zeros((1, 0)))[0]
     )

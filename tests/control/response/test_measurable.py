@@ -94,14 +94,14 @@ def test_finer_piecewise_constant_disturbances_approach_the_measurable_ones_from
     limit = worst_case(system, uniform(64, HORIZON), bound=BOUNDS[name], kind="measurable").offsets(
         time, direction, np.zeros((1, 0))
     )[0]
-    pushes = [
+    sigmas = [
         worst_case(system, UNEVEN, uniform(4**k, HORIZON), BOUNDS[name]).offsets(time, direction, np.zeros((1, 0)))[0]
         for k in range(6)
     ]
-    assert (np.diff(pushes) >= -1e-12).all()
-    assert pushes[-1] <= limit + 1e-8
-    assert limit - pushes[-1] <= 1e-3 * max(1.0, limit)
-    assert limit - pushes[-1] <= 0.3 * (limit - pushes[-3]) + 1e-9
+    assert (np.diff(sigmas) >= -1e-12).all()
+    assert sigmas[-1] <= limit + 1e-8
+    assert limit - sigmas[-1] <= 1e-3 * max(1.0, limit)
+    assert limit - sigmas[-1] <= 0.3 * (limit - sigmas[-3]) + 1e-9
 
 
 def test_times_and_parameters_may_be_mixed_freely():

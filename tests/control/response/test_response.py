@@ -15,7 +15,7 @@ from scipy.linalg import expm
 from sparserob_core.control.enclosures.matrix_exponential import exponential
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.system import LinearSystem
-from sparserob_core.control.response.disturbance_support import Push
+from sparserob_core.control.response.disturbance_support import DisturbanceSupport
 from sparserob_core.control.response.lifted import lift
 from sparserob_core.control.response.response import Response, merge_grids, transitions
 from sparserob_core.sip.convex_set import Box
@@ -141,16 +141,16 @@ def test_the_push_by_age_equals_the_push_by_adjoints(seed, pieces, nu):
     rows = rng.normal(size=(3, 2))
     times = np.concatenate([functionals.response.grid.breakpoints, rng.uniform(0, HORIZON, 5)])
     ends = rng.integers(-1, 2, (times.size, 3, nu)).astype(float)
-    push = Push(lifted, functionals.disturbance, rows)
+    sigma = DisturbanceSupport(lifted, functionals.disturbance, rows)
     widths = rng.uniform(0, 1, times.size) * HORIZON / pieces
-    fast, steep, bent = push.at(times, ends), push.swing(times), push.curvature(times, widths)
-    with patch.object(Push, "_repeats", new=False):
-        push = Push(lifted, functionals.disturbance, rows)
-        slow = push.at(times, ends)
+    fast, steep, bent = sigma.at(times, ends), sigma.steepness(times), sigma.curvature(times, widths)
+    with patch.object(DisturbanceSupport, "_repeats", new=False):
+        sigma = DisturbanceSupport(lifted, functionals.disturbance, rows)
+        slow = sigma.at(times, ends)
         assert np.allclose(fast[0], slow[0], rtol=1e-9, atol=1e-11)
         assert np.allclose(fast[1], slow[1], rtol=1e-9, atol=1e-11)
-        assert np.allclose(steep, push.swing(times), rtol=1e-9, atol=1e-11)
-        assert np.allclose(bent, push.curvature(times, widths), rtol=1e-9, atol=1e-11)
+        assert np.allclose(steep, sigma.steepness(times), rtol=1e-9, atol=1e-11)
+        assert np.allclose(bent, sigma.curvature(times, widths), rtol=1e-9, atol=1e-11)
 
 
 @settings(max_examples=20, deadline=None)

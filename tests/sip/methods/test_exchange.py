@@ -239,7 +239,7 @@ def test_a_corridor_of_an_integrator_is_certified_although_its_path_has_kinks(op
 
 @pytest.mark.parametrize(("start", "push"), [([1.0], 0.0), ([1.0], 0.3), ([-1.0], 0.3)])
 @pytest.mark.parametrize("count", [5, 40])
-def test_an_initial_state_on_the_boundary_of_its_path_set_ends_with_an_answer(options, start, push, count):
+def test_an_initial_state_on_the_boundary_of_its_path_set_ends_with_an_answer(options, start, sigma, count):
     """No Slater point: the constraint at t = 0 holds with equality, whatever the control."""
     problem = control_problem(
         INTEGRATOR,
@@ -247,13 +247,13 @@ def test_an_initial_state_on_the_boundary_of_its_path_set_ends_with_an_answer(op
         start,
         path=[sr.Box([-1.0], [1.0])],
         terminal=[sr.Box([-0.5], [0.5])],
-        disturbance=sr.Box([-push], [push]) if push else None,
+        disturbance=sr.Box([-sigma], [sigma]) if sigma else None,
     )
     result = solved(problem, count, options)
     assert result.status in STATUSES, result.message
     assert result.message
-    assert abs(result.cost - (0.5 + push)) <= 1e-5
-    assert result.lower_bound <= 0.5 + push + 1e-9
+    assert abs(result.cost - (0.5 + sigma)) <= 1e-5
+    assert result.lower_bound <= 0.5 + sigma + 1e-9
     assert result.counts["rounds"] <= 60
 
 

@@ -131,7 +131,7 @@ def test_the_strips_of_the_figure_are_the_closed_forms(tmp_path):
     outcome = solved(tmp_path, disturbance={"box": [0.0, 0.3]}, terminal=[{"box": [None, 0.5]}])
     (strip,) = clash_strips(outcome.program, outcome.result)
     assert strip.label.startswith("x2(2)")
-    numbers = (strip.low, strip.high, strip.reach_low, strip.reach_high, strip.push_low, strip.push_high, strip.best)
+    numbers = (strip.low, strip.high, strip.reach_low, strip.reach_high, strip.sigma_low, strip.sigma_high, strip.best)
     assert np.allclose(numbers, (-0.5, 0.5, -2.0, 2.0, 0.6, 0.6, 0.0), atol=1e-12)
 
 
