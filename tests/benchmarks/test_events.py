@@ -19,7 +19,7 @@ from sparserob_core.experiment.assemble import assemble, tools_of
 from sparserob_core.experiment.config.load import load_config
 from sparserob_core.experiment.run.events import Broadcast, RunFinished, RunStarted
 from sparserob_core.sip.methods.sparserob import SparseRob
-from sparserob_core.sip.search.notifier import Telling
+from sparserob_core.sip.search.notifier import Notifier
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "experiment1_reduced.yaml"
 OVERRIDES = [
@@ -96,8 +96,8 @@ def test_telling_takes_less_than_a_hundredth_of_a_run(work, monkeypatch, capsys)
         return timed
 
     for name in ("add", "note", "tell"):
-        monkeypatch.setattr(Telling, name, clocked(getattr(Telling, name)))
-    monkeypatch.setattr(Telling, "due", property(clocked(Telling.due.fget)))
+        monkeypatch.setattr(Notifier, name, clocked(getattr(Notifier, name)))
+    monkeypatch.setattr(Notifier, "due", property(clocked(Notifier.due.fget)))
     start = time.perf_counter()
     count = sum(solved(*work, True, seed)[1].size for seed in range(TURNS))
     total = time.perf_counter() - start

@@ -17,8 +17,7 @@ import pytest
 from scipy import sparse
 
 import sparserob_core as sr
-
-from ..known_answers.independent import Problem, cost, gridded, sample, terminal_rows, worst_violation  # noqa: TID252
+from tests.support.independent import Problem, cost, gridded, sample, terminal_rows, worst_violation
 
 SIZES = (50, 250, 1000)
 SLOW = 2.0

@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
+from tests.support.functions import GARLAND_FLOOR, LANDSCAPES
 
-from ..known_answers.functions import GARLAND_FLOOR, LANDSCAPES  # noqa: TID252
 from .peers import ANNEALING, DLIB, OFTEN, PEERS, PYXAB, quietly
 
 pytestmark = pytest.mark.benchmark

@@ -14,8 +14,7 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.errors import SparseRobError
 from sparserob_core.experiment.check import Check, check
-
-from .tampering import CONFIG, FILES, KINDS, NONSENSICAL, forged
+from tests.support.tampering import CONFIG, FILES, KINDS, NONSENSICAL, forged
 
 SPRING: dict[str, Any] = {
     "name": "linear",

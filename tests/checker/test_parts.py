@@ -26,8 +26,7 @@ from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.response import merge_grids
 from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Ellipsoid, NormBall, Polytope
 from sparserob_core.control.transcription.transcribe import prepare, program_of
-
-from .plants import indicators, random_system, uniform, worst_case
+from tests.support.plants import indicators, random_system, uniform, worst_case
 
 TRIANGLE = Polytope(np.array([[1.0, 1.0], [-1.0, 0.0], [0.0, -1.0]]), np.array([1.0, 0.5, 0.25]))
 TILTED = Ellipsoid(np.array([0.1, -0.2]), np.array([[0.5, 0.2], [0.2, 0.3]]))

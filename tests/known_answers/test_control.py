@@ -11,8 +11,7 @@ import pytest
 from scipy.linalg import expm
 
 import sparserob_core as sr
-
-from .independent import Problem, enclosed_value, random_problem, sample, value
+from tests.support.independent import Problem, enclosed_value, random_problem, sample, value
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 SOLVERS = ["piqp", "proxqp", "clarabel"]

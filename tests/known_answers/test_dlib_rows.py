@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-
-from .functions import LANDSCAPES
+from tests.support.functions import LANDSCAPES
 
 EPSILONS = (0.1, 0.01, 1e-3, 1e-9)
 SEEDS = 24

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-
-from .independent import Problem, sample, value
+from tests.support.independent import Problem, sample, value
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-
-from .functions import GARLAND_FLOOR, LANDSCAPES
+from tests.support.functions import GARLAND_FLOOR, LANDSCAPES
 
 CAP = 1000
 LEVELS = (0.90, 0.95, 0.99)

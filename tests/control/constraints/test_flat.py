@@ -16,8 +16,7 @@ from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.sets.sets import Ellipsoid, Polytope
 from sparserob_core.sip.convex_set import Box
-
-from .plants import indicators, random_system, uniform, worst_case
+from tests.support.plants import indicators, random_system, uniform, worst_case
 
 HORIZON = 3.0
 GRIDS = {"uniform": uniform(12, HORIZON), "uneven": indicators([0.0, 0.4, 0.5, 1.0, 1.6, 2.2, HORIZON])}

@@ -21,8 +21,7 @@ from sparserob_core.control.transcription.transcribe import transcribe
 from sparserob_core.sip.convex_set import Box, ConvexSet
 from sparserob_core.sip.program import ConstraintFamily
 from sparserob_core.sip.relaxed.index_gradient import STEP, index_gradient
-
-from .plants import indicators, random_system, uniform, walsh
+from tests.support.plants import indicators, random_system, uniform, walsh
 
 HORIZON = 3.0
 GRIDS = {"uniform": uniform(12, HORIZON), "uneven": indicators([0.0, 0.4, 0.5, 1.0, 1.6, 2.2, HORIZON])}

@@ -21,8 +21,7 @@ from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Polytope
 from sparserob_core.sip.convex_set import Box
 from sparserob_core.sip.program import ConstraintFamily
 from sparserob_core.sip.proof.branch_and_bound import prove_family
-
-from .plants import uniform, worst_case
+from tests.support.plants import uniform, worst_case
 
 SETS = {
     "triangle": Polytope([[-1.0, 0.0], [0.0, -1.0], [1.0, 1.0]], [0.6, 0.6, 0.5]),

@@ -17,8 +17,7 @@ from sparserob_core.control.response.response import merge_grids
 from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Polytope
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Box
-
-from .plants import indicators, random_system, uniform, walsh, weight_on_piece, worst_case
+from tests.support.plants import indicators, random_system, uniform, walsh, weight_on_piece, worst_case
 
 HORIZON = 2.0
 TRIANGLE = Polytope([[1.0, 1.0], [-1.0, 0.2], [0.0, -1.0]], [0.3, 0.2, 0.1])

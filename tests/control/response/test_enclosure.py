@@ -14,8 +14,7 @@ from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Polytope
 from sparserob_core.sip.convex_set import Box
-
-from .plants import indicators, uniform, walsh, worst_case
+from tests.support.plants import indicators, uniform, walsh, worst_case
 
 HORIZON = 3.0
 GRIDS = {"uniform": uniform(6, HORIZON), "uneven": indicators([0.0, 0.4, 0.5, 1.6, HORIZON])}

@@ -16,8 +16,7 @@ from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.disturbance_support import DisturbanceSupport
 from sparserob_core.control.response.lifted import frozen, lift
 from sparserob_core.sip.convex_set import Box
-
-from .plants import indicators, simulated, uniform, worst_case
+from tests.support.plants import indicators, simulated, uniform, worst_case
 
 HORIZON = 3.0
 

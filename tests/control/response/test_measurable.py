@@ -13,8 +13,7 @@ from scipy.linalg import expm
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Polytope
 from sparserob_core.sip.convex_set import Box
-
-from .plants import indicators, random_system, uniform, worst_case
+from tests.support.plants import indicators, random_system, uniform, worst_case
 
 HORIZON = 2.0
 UNEVEN = indicators([0.0, 0.3, 1.4, HORIZON])

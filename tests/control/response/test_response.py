@@ -19,8 +19,7 @@ from sparserob_core.control.response.disturbance_support import DisturbanceSuppo
 from sparserob_core.control.response.lifted import lift
 from sparserob_core.control.response.response import Response, merge_grids, transitions
 from sparserob_core.sip.convex_set import Box
-
-from .plants import indicators, random_system, simulated, uniform, walsh, worst_case
+from tests.support.plants import indicators, random_system, simulated, uniform, walsh, worst_case
 
 HORIZON = 3.0
 UNEVEN = indicators([0.0, 0.2, 0.25, 1.1, 2.9, HORIZON])

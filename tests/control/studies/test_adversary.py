@@ -17,8 +17,7 @@ from sparserob_core.experiment.directory.adversary import FILE, adversaries, att
 from sparserob_core.experiment.directory.artefacts import RunDirectory
 from sparserob_core.experiment.figures.adversary_figure import draw_adversary
 from sparserob_core.experiment.figures.drawing import figure_data
-
-from .plants import indicators, uniform, walsh
+from tests.support.plants import indicators, uniform, walsh
 
 BOX = sr.Box([-0.1, -0.2], [0.1, 0.2])
 ROUND = sr.Ellipsoid([0.0, 0.0], [[0.02, 0.01], [0.01, 0.03]])

@@ -15,8 +15,7 @@ from sparserob_core.control.sets.sets import Ellipsoid, Equality, NormBall, Poly
 from sparserob_core.control.transcription.transcribe import transcribe
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Box
-
-from .plants import held, indicators, simulated, uniform, walsh
+from tests.support.plants import held, indicators, simulated, uniform, walsh
 
 HORIZON = 3.0
 UNEVEN = indicators([0.0, 0.2, 0.25, 1.1, HORIZON])

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.core.plants import uniform
 
 import sparserob_core as sr
 from sparserob_core.control.studies.initial_states import InitialPlane
@@ -29,6 +28,7 @@ from sparserob_core.control.studies.polygon_approximation import (
 from sparserob_core.control.transcription.transcribe import prepare
 from sparserob_core.experiment.initial_states.figure import draw_initial_states, envelope
 from sparserob_core.experiment.initial_states.section import section
+from tests.support.plants import uniform
 
 CART: dict[str, Any] = {
     "title": "A cart",

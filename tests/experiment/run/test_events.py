@@ -232,7 +232,7 @@ def test_nothing_is_collected_where_nobody_listens(monkeypatch: pytest.MonkeyPat
     def collected(*arguments: object) -> None:
         raise AssertionError("collected for nobody")
 
-    monkeypatch.setattr("sparserob_core.sip.search.notifier.Telling.__init__", collected)
+    monkeypatch.setattr("sparserob_core.sip.search.notifier.Notifier.__init__", collected)
     assert sr.maximise(lambda x: -x[:, 0], SQUARE, "random_search", budget=50).evaluations == 50
     with pytest.raises(AssertionError, match="for nobody"):
         sr.maximise(lambda x: -x[:, 0], SQUARE, "random_search", budget=50, notify=lambda event: None)

@@ -24,8 +24,7 @@ from sparserob_core.control.studies.simulate import fine_times, finer, walk
 from sparserob_core.control.transcription.state_constraints import state_constraints
 from sparserob_core.control.transcription.transcribe import prepare
 from sparserob_core.experiment.simulation.outcome import clopper_pearson
-
-from .plants import held, indicators, random_system, simulated, uniform, walsh
+from tests.support.plants import held, indicators, random_system, simulated, uniform, walsh
 
 LAWS = ("iid", "vertices", "slow", "neighbours")
 BOX = sr.Box([-0.1, -0.2], [0.1, 0.2])

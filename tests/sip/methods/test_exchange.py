@@ -237,7 +237,7 @@ def test_a_corridor_of_an_integrator_is_certified_although_its_path_has_kinks(op
         assert result.counts["rounds"] <= 20
 
 
-@pytest.mark.parametrize(("start", "push"), [([1.0], 0.0), ([1.0], 0.3), ([-1.0], 0.3)])
+@pytest.mark.parametrize(("start", "sigma"), [([1.0], 0.0), ([1.0], 0.3), ([-1.0], 0.3)])
 @pytest.mark.parametrize("count", [5, 40])
 def test_an_initial_state_on_the_boundary_of_its_path_set_ends_with_an_answer(options, start, sigma, count):
     """No Slater point: the constraint at t = 0 holds with equality, whatever the control."""

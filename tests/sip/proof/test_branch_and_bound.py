@@ -22,8 +22,7 @@ from sparserob_core.sip.method import Tools
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.program import ConstraintFamily, Enclosure
 from sparserob_core.sip.proof.branch_and_bound import prove_family
-
-from .plants import indicators, random_system, uniform, worst_case
+from tests.support.plants import indicators, random_system, uniform, worst_case
 
 HORIZON = 3.0
 GRIDS = {"uniform": uniform(12, HORIZON), "uneven": indicators([0.0, 0.4, 0.5, 1.0, 1.6, 2.2, HORIZON])}

@@ -15,8 +15,7 @@ from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Box
 from sparserob_core.sip.program import ConstraintFamily
 from sparserob_core.sip.proof.branch_and_bound import prove_family
-
-from .plants import uniform, worst_case
+from tests.support.plants import uniform, worst_case
 
 TRIANGLE = Polytope([[-1.0, 0.0], [0.0, -1.0], [1.0, 1.0]], [0.6, 0.6, 0.5])
 
