@@ -24,7 +24,15 @@ if TYPE_CHECKING:
     from sparserob_core.control.problem.dictionary import Dictionary, DictionaryFactory
     from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint, ProblemFactory
     from sparserob_core.control.problem.system import LinearSystem
-    from sparserob_core.control.sets.sets import Ellipsoid, Equality, NormBall, Polytope, cylinder, intersection
+    from sparserob_core.control.sets.sets import (
+        Ellipsoid,
+        Equality,
+        NormBall,
+        Polytope,
+        SetFactory,
+        cylinder,
+        intersection,
+    )
     from sparserob_core.control.transcription.transcribe import transcribe
     from sparserob_core.errors import ConfigError, InputError, PluginError, SolverError, SparseRobError
     from sparserob_core.experiment.check import Check, check
@@ -47,6 +55,7 @@ if TYPE_CHECKING:
         RegulariserPlugin,
         SchedulePlugin,
         SelectionPlugin,
+        SetPlugin,
         SolverPlugin,
     )
     from sparserob_core.experiment.plugins.registry import load_registry
@@ -140,7 +149,9 @@ __all__ = [
     "SelectionPlugin",
     "SemiInfiniteProgram",
     "Separation",
+    "SetFactory",
     "SetOptions",
+    "SetPlugin",
     "Simulation",
     "Solver",
     "SolverError",
@@ -181,7 +192,7 @@ _MODULES = {
     "sip.search.trust_region": "TrustRegion",
     "sip.events": "Batch EvaluationsFinished Event ProofProgress RoundFinished",
     "control.problem.dictionary": "Dictionary DictionaryFactory",
-    "control.sets.sets": "Ellipsoid Equality NormBall Polytope cylinder intersection",
+    "control.sets.sets": "Ellipsoid Equality NormBall Polytope SetFactory cylinder intersection",
     "control.problem.system": "LinearSystem",
     "control.problem.problem": "OptimalControlProblem PathConstraint ProblemFactory",
     "control.transcription.transcribe": "transcribe",
@@ -195,7 +206,7 @@ _MODULES = {
     "experiment.margin.margin": "Margin margin",
     "experiment.plugins.records": (
         "DictionaryPlugin InnerStopPlugin MaximiserPlugin MethodPlugin ObserverPlugin OuterStopPlugin ProblemPlugin "
-        "RegulariserPlugin SchedulePlugin SelectionPlugin SolverPlugin"
+        "RegulariserPlugin SchedulePlugin SelectionPlugin SetPlugin SolverPlugin"
     ),
     "experiment.config.problems": "LinearKeys LinearProblem",
     "experiment.plugins.hookspecs": "hookimpl",

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +15,32 @@ from sparserob_core.control.sets.polytope import Polytope
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
-__all__ = ["Box", "ConvexSet", "Cylinder", "Ellipsoid", "Equality", "NormBall", "Polytope", "cylinder", "intersection"]
+__all__ = [
+    "Box",
+    "ConvexSet",
+    "Cylinder",
+    "Ellipsoid",
+    "Equality",
+    "NormBall",
+    "Polytope",
+    "SetFactory",
+    "cylinder",
+    "intersection",
+]
+
+
+class SetFactory(ABC):
+    """A set that a config can name: its options are its fields.
+
+    ``shorthand``: the option that a bare number or list stands for, as in ``box: 0.5``; ``None`` where a mapping is
+    expected.
+    """
+
+    shorthand: ClassVar[str | None] = None
+
+    @abstractmethod
+    def build(self, dimension: int) -> ConvexSet:
+        """The set in ``dimension`` coordinates; raises `InputError` when the options do not describe one."""
 
 
 @dataclass(frozen=True, eq=False)

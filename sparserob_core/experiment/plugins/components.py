@@ -92,7 +92,7 @@ class Registry:
                 given[key], faults = self._spelt_out(part, entry)
                 wrong += [fault.under((key,)) for fault in faults]
         try:
-            checked = model.model_validate(given)
+            checked = model.model_validate(given, context={"registry": self})
         except ValidationError as error:
             return None, [*complaints(error, model, options), *wrong]
         return (None if wrong else checked), wrong

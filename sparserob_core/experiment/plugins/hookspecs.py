@@ -19,6 +19,7 @@ from sparserob_core.experiment.plugins.records import (
     RegulariserPlugin,
     SchedulePlugin,
     SelectionPlugin,
+    SetPlugin,
     SolverPlugin,
 )
 
@@ -40,6 +41,11 @@ class Hooks:
     @_specification
     def sparserob_problems(self) -> Iterable[ProblemPlugin]:
         """Problems: options in, an optimal control problem or a semi-infinite program out."""
+        return ()
+
+    @_specification
+    def sparserob_sets(self) -> Iterable[SetPlugin]:
+        """Convex sets, each under the key that a config writes it with."""
         return ()
 
     @_specification

@@ -145,6 +145,15 @@ class ProblemPlugin(Plugin):
 
 
 @final
+class SetPlugin(Plugin):
+    """A `SetFactory`: options in, a convex set out; its name is the key that a config writes it under."""
+
+    kind = "set"
+    hook = "sparserob_sets"
+    component = "sparserob_core.control.sets.sets:SetFactory"
+
+
+@final
 class SchedulePlugin(Plugin):
     """A `Schedule`: the next weight of the regulariser, the paper's ``Regu``."""
 
@@ -193,6 +202,7 @@ RECORDS: Mapping[str, type[Plugin]] = {
     record.kind: record
     for record in (
         ProblemPlugin,
+        SetPlugin,
         MethodPlugin,
         DictionaryPlugin,
         RegulariserPlugin,
