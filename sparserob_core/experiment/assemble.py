@@ -13,7 +13,7 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.config.load import Loaded
 from sparserob_core.experiment.solve import indicators
-from sparserob_core.sip.method import Continuation, Tools
+from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def tools_of(loaded: Loaded) -> Tools:
         solver=build(loaded, "solver", config.solver),
         maximiser=build(loaded, "maximiser", config.maximiser),
         regulariser=None if config.regulariser is None else build(loaded, "regulariser", config.regulariser),
-        continuation=Continuation(**config.continuation.model_dump()),
+        continuation=config.continuation,
         budget=config.maximiser.budget,
         polish=config.maximiser.polish,
         rng=np.random.default_rng(config.seed),

@@ -15,7 +15,7 @@ from sparserob_core.experiment.plugins.registry import load_registry
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.events import Event, ignore
 from sparserob_core.sip.maximiser import Maximiser, Report
-from sparserob_core.sip.method import Continuation, Method, Tools
+from sparserob_core.sip.method import GAP_TOLERANCE, Continuation, Method, Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.regulariser import Regulariser
 from sparserob_core.sip.result import Result
@@ -35,7 +35,7 @@ def solve(
     maximiser: Choice | Maximiser = "direct",
     regulariser: Choice | Regulariser | None = "default",
     *,
-    tolerance: float | None = 1e-7,
+    tolerance: float | None = GAP_TOLERANCE,
     seed: int = 0,
     control: Choice | DictionaryFactory | Dictionary | None = None,
     disturbance: Choice | DictionaryFactory | Dictionary | None = None,
@@ -157,15 +157,12 @@ def _program(registry: Registry, problem: object, control: object, disturbance: 
 def _continuation(given: Mapping[str, float]) -> Continuation:
     from pydantic import ValidationError
 
-    from sparserob_core.experiment.config.run_config import ContinuationKeys
     from sparserob_core.experiment.plugins.messages import complaints
 
     try:
-        return Continuation(**ContinuationKeys.model_validate(dict(given)).model_dump())
+        return Continuation.model_validate(dict(given))
     except ValidationError as error:
-        raise InputError(
-            "\n".join(f"continuation.{item}" for item in complaints(error, ContinuationKeys, given))
-        ) from None
+        raise InputError("\n".join(f"continuation.{item}" for item in complaints(error, Continuation, given))) from None
 
 
 def _with_tolerance(registry: Registry, method: object, tolerance: float | None) -> object:

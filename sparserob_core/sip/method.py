@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
+from typing import final
 
 import numpy as np
+from pydantic import Field
 
+from sparserob_core.options import Options
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.maximiser import Maximiser
 from sparserob_core.sip.program import SemiInfiniteProgram
@@ -14,18 +17,28 @@ from sparserob_core.sip.regulariser import Regulariser
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.solver import Solver
 
+GAP_TOLERANCE = 1e-7  # relative gap at which the bounds have met, unless a method is told otherwise
 
-@dataclass(frozen=True)
-class Continuation:
-    """How the weight ``epsilon`` of the regulariser decreases: from ``start`` by ``factor`` down to ``stop`` at most
-    (the paper's ``Regu``), or until the cost ``J`` changes by no more than ``tolerance`` (relative) when it is reduced
-    again (``SC1``).
+
+@final
+class Continuation(Options):
+    """How the weight of the regulariser decreases.
+
+    The weight ``epsilon`` goes from ``start`` by ``factor`` (the paper's ``Regu``) down to ``stop`` at the latest, or
+    until the cost ``J`` changes by no more than ``tolerance`` when it is reduced again (``SC1``).
     """
 
-    start: float = 1.0
-    factor: float = 0.5
-    stop: float = 1e-6
-    tolerance: float = 1e-7
+    start: float = Field(default=1.0, gt=0.0)
+    """First weight."""
+
+    factor: float = Field(default=0.5, gt=0.0, lt=1.0)
+    """Each weight is this times the one before."""
+
+    stop: float = Field(default=1e-6, gt=0.0)
+    """Last weight at the latest."""
+
+    tolerance: float = Field(default=GAP_TOLERANCE, ge=0.0)
+    """Relative change of the cost below which a smaller weight changes nothing any more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +53,7 @@ class Tools:
     solver: Solver
     maximiser: Maximiser | None = None
     regulariser: Regulariser | None = None
-    continuation: Continuation = Continuation()
+    continuation: Continuation = field(default_factory=Continuation)
     budget: int = 2000
     polish: float = 0.0
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))

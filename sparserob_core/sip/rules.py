@@ -13,7 +13,9 @@ from math import exp
 from typing import final
 
 import numpy as np
+from pydantic import Field
 
+from sparserob_core.options import Options
 from sparserob_core.sip.convex_set import Array
 
 
@@ -82,34 +84,34 @@ class Selection(ABC):
 
 
 @final
-@dataclass(frozen=True)
-class Geometric(Schedule):
+class Geometric(Schedule, Options):
     """``factor`` times the weight before: the paper's ``2^-j`` times the first, for the factor 1/2."""
 
-    factor: float = 0.5
+    factor: float = Field(default=0.5, gt=0.0, lt=1.0)
+    """What the weight is multiplied by."""
 
     def __call__(self, epsilon: float, j: int) -> float:
         return self.factor * epsilon
 
 
 @final
-@dataclass(frozen=True)
-class Accelerating(Schedule):
+class Accelerating(Schedule, Options):
     """``factor^j`` times the weight before: the paper's ``Regu(epsilon, j) = 2^-j epsilon`` applied again and again."""
 
-    factor: float = 0.5
+    factor: float = Field(default=0.5, gt=0.0, lt=1.0)
+    """What the weight is multiplied by."""
 
     def __call__(self, epsilon: float, j: int) -> float:
         return self.factor**j * epsilon
 
 
 @final
-@dataclass(frozen=True)
-class OptimisersSettle(OuterStop):
+class OptimisersSettle(OuterStop, Options):
     """The norm of the difference of successive optimisers is at most ``tolerance``, relative to the norm of the last
     one or 1."""
 
-    tolerance: float = 1e-3
+    tolerance: float = Field(default=1e-3, ge=0.0)
+    """Norm of the difference of successive optimisers, relative to the last one's norm or 1."""
 
     def __call__(self, steps: Sequence[OuterStep]) -> bool:
         if len(steps) < 2:
@@ -119,11 +121,11 @@ class OptimisersSettle(OuterStop):
 
 
 @final
-@dataclass(frozen=True)
-class CostsSettle(OuterStop):
+class CostsSettle(OuterStop, Options):
     """The cost ``J`` of successive optimisers changes by at most ``tolerance``, relative to it or 1."""
 
-    tolerance: float = 1e-6
+    tolerance: float = Field(default=1e-6, ge=0.0)
+    """Difference of successive costs, relative to the last one or 1."""
 
     def __call__(self, steps: Sequence[OuterStep]) -> bool:
         return len(steps) >= 2 and abs(steps[-1].cost - steps[-2].cost) <= self.tolerance * max(
@@ -132,54 +134,55 @@ class CostsSettle(OuterStop):
 
 
 @final
-@dataclass(frozen=True)
-class Iterations(OuterStop):
+class Iterations(OuterStop, Options):
     """After ``count`` outer iterations."""
 
-    count: int = 10
+    count: int = Field(default=10, ge=1)
+    """Outer iterations."""
 
     def __call__(self, steps: Sequence[OuterStep]) -> bool:
         return len(steps) >= self.count
 
 
 @final
-@dataclass(frozen=True)
-class Evaluations(InnerStop):
+class Evaluations(InnerStop, Options):
     """After ``count`` evaluations; ``None``: when the budget is spent."""
 
-    count: int | None = None
+    count: int | None = Field(default=None, ge=1)
+    """Evaluations of one search; null: its budget."""
 
     def __call__(self, progress: Progress) -> bool:
         return self.count is not None and progress.evaluations >= self.count
 
 
 @final
-@dataclass(frozen=True)
-class TemperatureFloor(InnerStop):
+class TemperatureFloor(InnerStop, Options):
     """When the temperature that an annealing maximiser notes is at most ``floor``; other maximisers note none, and are
     not stopped."""
 
-    floor: float = 1e-6
+    floor: float = Field(default=1e-6, ge=0.0)
+    """Temperature at which an annealing maximiser stops."""
 
     def __call__(self, progress: Progress) -> bool:
         return progress.notes.get("temperature", np.inf) <= self.floor
 
 
 @final
-@dataclass(frozen=True)
-class Stalled(InnerStop):
+class Stalled(InnerStop, Options):
     """When the best value rose by no more than ``tolerance`` within the last ``window`` evaluations."""
 
-    window: int = 200
-    tolerance: float = 1e-9
+    window: int = Field(default=200, ge=1)
+    """Evaluations that are looked back upon."""
+
+    tolerance: float = Field(default=1e-9, ge=0.0)
+    """Rise of the best value within the window that is no rise."""
 
     def __call__(self, progress: Progress) -> bool:
         return progress.gain(self.window) <= self.tolerance
 
 
 @final
-@dataclass(frozen=True)
-class Metropolis(Selection):
+class Metropolis(Selection, Options):
     """Accept what is not worse, and what is worse by ``delta`` with probability ``exp(-delta / temperature)``
     (Metropolis et al. 1953)."""
 
@@ -190,8 +193,7 @@ class Metropolis(Selection):
 
 
 @final
-@dataclass(frozen=True)
-class Threshold(Selection):
+class Threshold(Selection, Options):
     """Accept what is worse by no more than the temperature (threshold accepting: Dueck and Scheuer 1990)."""
 
     def __call__(self, current: float, candidate: float, temperature: float, rng: np.random.Generator) -> bool:
@@ -199,8 +201,7 @@ class Threshold(Selection):
 
 
 @final
-@dataclass(frozen=True)
-class Improvement(Selection):
+class Improvement(Selection, Options):
     """Accept only what is not worse."""
 
     def __call__(self, current: float, candidate: float, temperature: float, rng: np.random.Generator) -> bool:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-from typing import Annotated, Any, final
+from typing import Any, final
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from sparserob_core.options import Options
+from sparserob_core.sip.method import Continuation
 
 
 class Entry(BaseModel):
@@ -49,23 +50,6 @@ class Dictionaries(Options):
 
 
 @final
-class ContinuationKeys(Options):
-    """How the weight of the regulariser decreases."""
-
-    start: float = Field(default=1.0, gt=0.0)
-    """First weight."""
-
-    factor: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
-    """Each weight is this times the one before."""
-
-    stop: float = Field(default=1e-6, gt=0.0)
-    """Last weight at the latest."""
-
-    tolerance: float = Field(default=1e-7, ge=0.0)
-    """Relative change of the cost below which a smaller weight changes nothing any more."""
-
-
-@final
 class RunConfig(Options):
     """A complete experiment. Every key but ``problem`` has a default."""
 
@@ -81,7 +65,7 @@ class RunConfig(Options):
     regulariser: Entry | None = Entry(name="ridge")
     """The strictly convex term that makes the optimiser unique; null for none."""
 
-    continuation: ContinuationKeys = ContinuationKeys()
+    continuation: Continuation = Continuation()
     """How the weight of the regulariser decreases."""
 
     method: Entry = Entry(name="exchange")

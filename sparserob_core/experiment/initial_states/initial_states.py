@@ -23,6 +23,7 @@ from sparserob_core.experiment.initial_states.feasible_set import InitialStates
 from sparserob_core.experiment.initial_states.search import Search, Tell
 from sparserob_core.experiment.initial_states.section import section
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.method import GAP_TOLERANCE
 
 __all__ = ["InitialStates", "initial_states"]
 FAR = 1e4  # times the numbers in the problem: a coordinate that may be as large as this is called unbounded
@@ -121,7 +122,7 @@ def _about(about: Sequence[float], problem: OptimalControlProblem) -> Array:
 
 def _tolerance(loaded: Loaded) -> float:
     """The relative gap that the config asks for, where its method has one."""
-    return float(loaded.config.method.options.get("tolerance") or 1e-7)
+    return float(loaded.config.method.options.get("tolerance") or GAP_TOLERANCE)
 
 
 def _path(problem: OptimalControlProblem, found: InitialStates) -> tuple[Array, ...]:

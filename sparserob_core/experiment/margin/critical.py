@@ -46,7 +46,7 @@ def critical_factor(
 def _by_one_program(programs: ParametricProgram, scaling: Scaling, tools: Tools, width: float) -> Critical:
     """The factor as a decision variable: its two bounds meet at the critical factor."""
     program = extreme_program(programs, scaling.sense, scaling.highest)
-    result = Exchange(max(0.05 * width, 1e-9)).solve(program, replace(tools, regulariser=None))
+    result = Exchange(tolerance=max(0.05 * width, 1e-9)).solve(program, replace(tools, regulariser=None))
     if result.status == "infeasible":
         return Critical("never", message=result.message)
     if result.decision is None or not np.isfinite(result.lower_bound):
@@ -90,7 +90,9 @@ def _slack(programs: ParametricProgram, factor: float, tools: Tools) -> float:
     try:
         program = programs.program(factor)
         bounds = _room(program)
-        result = Exchange(1e-9).close(slack_program(program, *bounds), replace(tools, regulariser=None), lambda x: ())
+        result = Exchange(tolerance=1e-9).close(
+            slack_program(program, *bounds), replace(tools, regulariser=None), lambda x: ()
+        )
     except InputError:
         if factor in (0.0, 1.0):
             raise

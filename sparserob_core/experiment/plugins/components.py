@@ -38,14 +38,16 @@ def parts(model: type[Options]) -> dict[str, str]:
 
 @final
 class Registry:
-    """Every registered component. ``failures``: the plugins that could not be used.
+    """Every registered component. ``failures``: the plugins that could not be used; ``hint``: what to add where a name
+    is unknown.
 
     Raises `PluginError` when two records of one kind share a name.
     """
 
     def __init__(
-        self, records: Iterable[Plugin], failures: Sequence[Failure] = (), disabled: Sequence[str] = ()
+        self, records: Iterable[Plugin], failures: Sequence[Failure] = (), disabled: Sequence[str] = (), hint: str = ""
     ) -> None:
+        self._hint = hint
         self.failures = tuple(failures)
         self._disabled = tuple(disabled)
         self._records: dict[str, dict[str, Plugin]] = {kind: {} for kind in RECORDS}
@@ -138,6 +140,5 @@ class Registry:
 
     def _notes(self) -> str:
         notes = [f"\n  note: {failure}" for failure in self.failures]
-        return "".join(
-            [*notes, *(f"\n  note: plugin '{plugin}' is disabled by {DISABLE}" for plugin in self._disabled)]
-        )
+        notes += [f"\n  note: plugin '{plugin}' is disabled by {DISABLE}" for plugin in self._disabled]
+        return "".join([*notes, f"\n  note: {self._hint}" if self._hint else ""])

@@ -7,12 +7,13 @@ import importlib.util
 import inspect
 import os
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 from importlib import metadata
 from pathlib import Path
 from types import ModuleType
+from typing import TypeAlias
 
 import pluggy
 
@@ -22,9 +23,30 @@ from sparserob_core.experiment.plugins.hookspecs import GROUP, Hooks, hookimpl
 from sparserob_core.experiment.plugins.messages import nearest
 from sparserob_core.experiment.plugins.records import RECORDS, Plugin
 
-__all__ = ["Hooks", "Registry", "hookimpl", "load_registry"]
+__all__ = ["Hooks", "Registry", "hookimpl", "load_own_registry", "load_registry"]
 
 HOOKS = {record.hook: record for record in RECORDS.values()}
+UNTRUSTED = (
+    "only the components that come with SparseRob are loaded here; --plugins FILE loads those of a file of yours"
+)
+
+Finder: TypeAlias = Callable[[Sequence[str]], list[metadata.EntryPoint]]
+
+
+OWN = "sparserob"  # the name of this distribution
+
+
+def load_own_registry(extra_paths: Iterable[str | Path] = ()) -> Registry:
+    """The components of this distribution, and of the files that the user himself names (``--plugins FILE``); nobody
+    else's code is imported.
+
+    For whatever judges or reads a directory that someone else may have written (``check``, ``simulate``, ``figures``,
+    ``replay``): a run directory is data, so the plugins that its config names are not loaded, and neither are the entry
+    points of other distributions. A component that is missing for that reason is an unknown name, and the message
+    says how to load it. A file of ``extra_paths`` that fails is a `PluginError`.
+    """
+    files = tuple(Path(path).resolve() for path in extra_paths)
+    return _load(files, _disabled(), _own_entry_points)
 
 
 def load_registry(extra_paths: Iterable[str | Path] = (), entry_points: bool = True) -> Registry:
@@ -34,22 +56,27 @@ def load_registry(extra_paths: Iterable[str | Path] = (), entry_points: bool = T
     asked for by name, so its failure is a `PluginError`. Plugins named in the environment variable
     ``SPARSEROB_DISABLE_PLUGINS`` (entry point or distribution, separated by commas) are not even imported.
     """
-    disabled = tuple(sorted({name.strip() for name in os.environ.get(DISABLE, "").split(",")} - {""}))
     files = tuple(Path(path).resolve() for path in extra_paths)
-    return _load(files, disabled, entry_points) if files or not entry_points else _installed(disabled)
+    if not entry_points:
+        return _load(files, _disabled(), lambda disabled: [])
+    return _load(files, _disabled(), _entry_points) if files else _installed(_disabled())
+
+
+def _disabled() -> tuple[str, ...]:
+    return tuple(sorted({name.strip() for name in os.environ.get(DISABLE, "").split(",")} - {""}))
 
 
 @cache
 def _installed(disabled: tuple[str, ...]) -> Registry:
-    return _load((), disabled, True)
+    return _load((), disabled, _entry_points)
 
 
-def _load(files: Sequence[Path], disabled: Sequence[str], installed: bool) -> Registry:
+def _load(files: Sequence[Path], disabled: Sequence[str], installed: Finder) -> Registry:
     from sparserob_core.experiment.plugins import builtin
 
     plugins: dict[str, ModuleType] = {"core": builtin}
     failures: list[Failure] = []
-    for entry in _entry_points(disabled) if installed else ():
+    for entry in installed(disabled):
         try:
             plugins.setdefault(entry.name, entry.load())
         except Exception as error:  # noqa: BLE001  a stranger's module may raise anything, and must not stop the others
@@ -68,7 +95,8 @@ def _load(files: Sequence[Path], disabled: Sequence[str], installed: bool) -> Re
     for failure in failures:
         if failure.plugin in asked_for:
             raise PluginError(str(failure))
-    return Registry(records, failures, disabled)
+    hint = UNTRUSTED if installed is _own_entry_points else ""
+    return Registry(records, failures, disabled, hint)
 
 
 def _entry_points(disabled: Sequence[str]) -> list[metadata.EntryPoint]:
@@ -78,6 +106,11 @@ def _entry_points(disabled: Sequence[str]) -> list[metadata.EntryPoint]:
         if not {entry.name, _distribution(entry)} & set(disabled)
     }
     return [found[name] for name in sorted(found)]
+
+
+def _own_entry_points(disabled: Sequence[str]) -> list[metadata.EntryPoint]:
+    own = (one for one in metadata.entry_points(group=GROUP) if _distribution(one) == OWN)
+    return sorted((one for one in own if not {one.name, OWN} & set(disabled)), key=lambda entry: entry.name)
 
 
 def _distribution(entry: metadata.EntryPoint) -> str:

@@ -4,14 +4,16 @@ any other."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
+from pydantic import Field
 
 from sparserob_core.errors import InputError
+from sparserob_core.options import Options
 from sparserob_core.sip.events import RoundFinished, forwarded
 from sparserob_core.sip.evidence import Proof
-from sparserob_core.sip.method import Method, Tools
+from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation
 from sparserob_core.sip.proof.branch_and_bound import TOLERANCE, prove
@@ -21,13 +23,15 @@ from sparserob_core.sip.scenario_bound import scenario_bound
 from sparserob_core.sip.separation.separation import separate
 
 
-@dataclass(frozen=True)
-class Nominal(Method):
+class Nominal(Method, Options):
     """Solve as if nothing were uncertain, to the relative gap ``tolerance``; then judge the decision against the
     uncertainty."""
 
-    tolerance: float = 1e-7
-    rounds: int = 200
+    tolerance: float = Field(default=GAP_TOLERANCE, gt=0.0, le=1.0)
+    """Relative gap at which the bounds have met."""
+
+    rounds: int = Field(default=200, ge=1)
+    """Rounds at most."""
 
     def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
         return _judged(
@@ -35,8 +39,7 @@ class Nominal(Method):
         )
 
 
-@dataclass(frozen=True)
-class Scenario(Method):
+class Scenario(Method, Options):
     """Impose the constraints for ``scenarios`` sampled uncertainties (Calafiore and Campi 2006); then judge the
     decision against all of them.
 
@@ -44,9 +47,14 @@ class Scenario(Method):
     belongs to one scenario, so those that carry a multiplier are at least as many as the support constraints.
     """
 
-    scenarios: int = 1000
-    tolerance: float = 1e-7
-    rounds: int = 200
+    tolerance: float = Field(default=GAP_TOLERANCE, gt=0.0, le=1.0)
+    """Relative gap at which the bounds have met."""
+
+    rounds: int = Field(default=200, ge=1)
+    """Rounds at most."""
+
+    scenarios: int = Field(default=1000, ge=1)
+    """How many uncertainties are sampled."""
 
     def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
         seed = int(tools.rng.integers(2**63))  # every family sees the same scenarios
@@ -81,7 +89,7 @@ def _judged(
     """Solve the simpler program, whose lower bound holds for the full one too, and say what its decision is worth in
     the full one."""
     notify = forwarded(tools.notify, RoundFinished, lambda event: replace(event, simplified=True))
-    result = Exchange(tolerance, rounds).close(simple, replace(tools, notify=notify), lambda x: ())
+    result = Exchange(tolerance=tolerance, rounds=rounds).close(simple, replace(tools, notify=notify), lambda x: ())
     if result.decision is None:
         return result
     found = separate(program, result.decision, tools, TOLERANCE)

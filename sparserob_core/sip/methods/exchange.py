@@ -14,13 +14,14 @@ from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 import numpy as np
+from pydantic import Field
 
-from sparserob_core.errors import InputError
+from sparserob_core.options import Options
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import RoundFinished, frozen
 from sparserob_core.sip.evidence import NO_BOUND, Cut, Dual, Proof, Witness
 from sparserob_core.sip.finite import FiniteSolution
-from sparserob_core.sip.method import Method, Tools
+from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation
 from sparserob_core.sip.proof.branch_and_bound import TOLERANCE, prove
 from sparserob_core.sip.proof.irreducible import irreducible
@@ -39,16 +40,14 @@ ALLOWED = TOLERANCE / 2  # a violation that the search may leave to the proof
 Prover: TypeAlias = Callable[[Array], Sequence[Proof]]
 
 
-@dataclass(frozen=True)
-class Exchange(Method):
+class Exchange(Method, Options):
     """Exchange of indices until the relative gap is at most ``tolerance``, in at most ``rounds`` rounds."""
 
-    tolerance: float = 1e-7
-    rounds: int = 200
+    tolerance: float = Field(default=GAP_TOLERANCE, gt=0.0, le=1.0)
+    """Relative gap at which the bounds have met."""
 
-    def __post_init__(self) -> None:
-        if self.rounds < 1:
-            raise InputError(f"rounds: expected at least 1, got {self.rounds}")
+    rounds: int = Field(default=200, ge=1)
+    """Rounds at most."""
 
     def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
         """`certified` when the gap is closed and every family is proven; infeasible, refuted or undecided otherwise,

@@ -10,18 +10,20 @@ like any other, and the lower bound comes from multipliers.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+from pydantic import Field, field_validator
 
 from sparserob_core.errors import InputError
+from sparserob_core.options import Options, part
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import EvaluationsFinished, RoundFinished, forwarded, frozen
 from sparserob_core.sip.evidence import NO_BOUND, Cut, Dual, Proof, Witness
 from sparserob_core.sip.maximiser import Maximiser, Objective, Report
-from sparserob_core.sip.method import Method, Tools
+from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.proof.branch_and_bound import prove
 from sparserob_core.sip.proof.irreducible import irreducible
@@ -29,13 +31,12 @@ from sparserob_core.sip.proof.verdict import clash, verdict, witness, worst_of
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
 from sparserob_core.sip.relaxed.tuples import TupleValue, imposed_program
 from sparserob_core.sip.result import Result, SearchTrace, Status, relative_gap
-from sparserob_core.sip.rules import Geometric, Metropolis, OptimisersSettle, OuterStep, Progress
+from sparserob_core.sip.rules import Geometric, Metropolis, OptimisersSettle, OuterStep
 from sparserob_core.sip.search.search import Rules, Target, maximise
 from sparserob_core.sip.separation.separation import separate
 
 
-@dataclass(frozen=True)
-class SparseRob(Method):
+class SparseRob(Method, Options):
     """Maximise ``g(epsilon; xi^1, ..., xi^D)`` for smaller and smaller ``epsilon``.
 
     ``formulation``: ``literal`` indices ``(t, Beta, p)`` as in the paper, or ``reduced`` ones ``(t, p)``, at which the
@@ -47,26 +48,34 @@ class SparseRob(Method):
     """
 
     formulation: Literal["reduced", "literal"] = "reduced"
-    indices: int | None = None
-    regu: Callable[[float, int], float] | None = None
-    sc1: Callable[[Sequence[OuterStep]], bool] | None = None
-    sc2: Callable[[Progress], bool] | None = None
-    slcr: Callable[[float, float, float, np.random.Generator], bool] | None = None
-    tolerance: float = 1e-7
+    """What an index is: (t, p), the worst disturbance in closed form; or the paper's (t, Beta, p)."""
 
-    def __post_init__(self) -> None:
-        if self.formulation not in ("reduced", "literal"):
-            raise InputError(f"formulation: expected reduced or literal, got {self.formulation!r}")
-        if self.indices is not None and (
-            isinstance(self.indices, bool) or self.indices != int(self.indices) or self.indices < 1
-        ):
-            raise InputError(f"indices: expected a whole number of at least 1, got {self.indices!r}")
-        for name in ("regu", "sc1", "sc2", "slcr"):
-            if getattr(self, name) is not None and not callable(getattr(self, name)):
-                raise InputError(
-                    f"{name}: expected the name of a rule, a mapping with a name, or a function, got"
-                    f" {getattr(self, name)!r}"
-                )
+    indices: int | None = Field(default=None, ge=1, strict=True)
+    """How many indices a tuple has; null: as many as there are decision variables (m N), which the theorem asks for."""
+
+    regu: Any = part("schedule")
+    """``Regu``: the next weight of the regulariser; null: the factor of ``continuation``."""
+
+    sc1: Any = part("outer_stop")
+    """``SC1``: when the outer iteration stops, at the last weight of ``continuation`` at the latest; null:
+    `optimisers_settle`."""
+
+    sc2: Any = part("inner_stop")
+    """``SC2``: when a search stops, at the maximiser's budget at the latest; null: only then."""
+
+    slcr: Any = part("selection")
+    """``SlCr``: whether a maximiser that walks accepts a candidate; null: `metropolis`."""
+
+    tolerance: float = Field(default=GAP_TOLERANCE, gt=0.0, le=1.0)
+    """Relative gap at which the bounds have met."""
+
+    @field_validator("regu", "sc1", "sc2", "slcr")
+    @classmethod
+    def _rule(cls, rule: object) -> object:
+        """A rule, a function, or what the registry makes a rule of."""
+        if rule is None or callable(rule) or (isinstance(rule, Mapping) and "name" in rule):
+            return rule
+        raise InputError(f"expected the name of a rule, a mapping with a name, or a function, got {rule!r}")
 
     def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
         """`certified`, `verified` or, as a rule, `refuted` with the uncertainty that breaks the decision; `infeasible`
@@ -100,7 +109,7 @@ class _Run:
         self.g = TupleValue(self.imposed, self.relaxed, self.method.indices or self.program.n)
 
     def solve(self) -> Result:
-        regu = self.method.regu or Geometric(self.tools.continuation.factor)
+        regu = self.method.regu or Geometric(factor=self.tools.continuation.factor)
         sc1 = self.method.sc1 or OptimisersSettle()
         epsilon = 0.0 if self.tools.regulariser is None else self.tools.continuation.start
         point = self.tools.rng.uniform(self.g.domain.lower, self.g.domain.upper)  # (t_0, Beta_0)

@@ -180,9 +180,26 @@ def test_a_disabled_plugin_is_not_even_imported(
         registry.get("solver", "piqp")
 
 
-@pytest.mark.parametrize("name", ["exchange", "nominal", "scenario"])
-def test_the_options_of_a_method_of_the_framework_are_its_fields(name: str) -> None:
+@pytest.mark.parametrize("name", ["exchange", "nominal", "scenario", "sparserob"])
+def test_a_method_of_the_framework_is_its_own_options(name: str) -> None:
     registry = load()
-    method = registry.build("method", name)
-    defaults = registry.get("method", name).options_type()()
-    assert vars(method) == {key: getattr(defaults, key) for key in type(defaults).model_fields}
+    assert isinstance(registry.build("method", name), registry.get("method", name).options_type())
+
+
+def test_a_constructor_names_the_option_at_fault() -> None:
+    with pytest.raises(sr.InputError, match=r"Continuation\.factor: .* less than 1, got 2\.0"):
+        sr.Continuation(factor=2.0)
+    with pytest.raises(sr.InputError, match="Continuation: expected keywords only, got 1 without a name"):
+        sr.Continuation(1.0)  # type: ignore[call-arg]
+
+
+def test_where_directories_of_others_are_read_only_this_distribution_is_imported(
+    entry_points: Callable[..., None], plugin: Callable[[str], Path]
+) -> None:
+    entry_points(Entry("alpha", broken), Entry("piqp", broken))
+    registry = discovery.load_own_registry()
+    assert registry.failures == ()
+    assert registry.names("method") == ["exchange", "nominal", "scenario", "sparserob"]
+    with pytest.raises(sr.PluginError, match="(?s)no regulariser is named 'mine'.*--plugins FILE"):
+        registry.get("regulariser", "mine")
+    assert discovery.load_own_registry([plugin(GOOD)]).names("regulariser") == ["mine"]

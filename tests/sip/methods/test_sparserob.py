@@ -11,7 +11,7 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.sip.rules import Progress
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 COARSE = {"observers": [], "dictionaries.control.pieces": 50, "dictionaries.disturbance.pieces": 50}
 
 

@@ -14,7 +14,7 @@ from sparserob_core.experiment.figures.clash import clash_strips, draw_clash
 from sparserob_core.sip.proof.irreducible import irreducible
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows, rows_at
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 DOUBLE_INTEGRATOR = {"A": [[0, 1], [0, 0]], "B": [[0], [1]]}
 
 
