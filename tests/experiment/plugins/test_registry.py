@@ -200,6 +200,6 @@ def test_where_directories_of_others_are_read_only_this_distribution_is_imported
     registry = discovery.load_own_registry()
     assert registry.failures == ()
     assert registry.names("method") == ["exchange", "nominal", "scenario", "sparserob"]
-    with pytest.raises(sr.PluginError, match="(?s)no regulariser is named 'mine'.*--plugins FILE"):
+    with pytest.raises(sr.PluginError, match=r"(?s)no regulariser is named 'mine'.*--plugins FILE"):
         registry.get("regulariser", "mine")
     assert discovery.load_own_registry([plugin(GOOD)]).names("regulariser") == ["mine"]
