@@ -6,6 +6,23 @@ expected, in one sentence: the command line prints that sentence and nothing els
 
 from __future__ import annotations
 
+from typing import Self, TypeAlias
+
+Path: TypeAlias = tuple[str | int, ...]
+"""The way to a value in a nested config: keys, and positions in lists."""
+
+
+def steps(path: str | Path) -> Path:
+    """``"path.0.from"`` as ``("path", 0, "from")``."""
+    if not isinstance(path, str):
+        return tuple(path)
+    return tuple(int(step) if step.isdigit() else step for step in path.split(".") if step)
+
+
+def dotted(path: Path) -> str:
+    """``("path", 0, "from")`` as ``"path.0.from"``."""
+    return ".".join(str(step) for step in path)
+
 
 class SparseRobError(Exception):
     """Base class. ``exit_status`` is what the command line returns for it."""
@@ -14,9 +31,33 @@ class SparseRobError(Exception):
 
 
 class InputError(SparseRobError, ValueError):
-    """An argument, array, option or file is at fault; the message names it and what was expected."""
+    """An argument, array, option or file is at fault.
+
+    ``path`` is the key or argument, as steps or with dots (``problem.path.0.box``); either ``message`` says what is
+    wrong with it, or ``expected`` and ``got`` do. Whoever passes the error on says where it sits with `under`; the
+    sentence is put together only when it is shown.
+    """
 
     exit_status = 2
+
+    def __init__(self, message: str = "", *, path: str | Path = (), expected: str = "", got: str = "") -> None:
+        super().__init__(message)
+        self.message, self.expected, self.got, self.path = message, expected, got, steps(path)
+
+    def under(self, *prefix: str | int) -> Self:
+        """The same error about a value that sits below ``prefix``; the error itself is changed, for raising again."""
+        self.path = tuple(step for part in prefix for step in steps(str(part))) + self.path
+        return self
+
+    @property
+    def sentence(self) -> str:
+        """What is wrong, without saying where."""
+        if self.expected:
+            return f"expected {self.expected}, got {self.got}" if self.got else f"expected {self.expected}"
+        return self.message
+
+    def __str__(self) -> str:
+        return f"{dotted(self.path)}: {self.sentence}" if self.path else self.sentence
 
 
 class ConfigError(InputError):

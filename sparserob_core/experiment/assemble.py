@@ -63,7 +63,7 @@ def described(loaded: Loaded) -> Described:
     try:
         problem = build(loaded, "problem", config.problem).build()
     except InputError as error:
-        raise loaded.blame(("problem",), error) from error
+        raise loaded.located(("problem",), error) from error
     if isinstance(problem, SemiInfiniteProgram):
         return Described(loaded, stated=problem)
     control = _dictionary(loaded, "control", config.dictionaries.control, problem.horizon)
@@ -84,7 +84,7 @@ def assemble(loaded: Loaded) -> Experiment:
     try:
         program = transcribe(parts.problem, control=parts.control, disturbance=parts.disturbance)
     except InputError as error:
-        raise loaded.blame(("problem",), error) from error
+        raise loaded.located(("problem",), error) from error
     return Experiment(loaded, program, parts.problem, parts.control, parts.disturbance)
 
 
@@ -108,7 +108,7 @@ def _dictionary(loaded: Loaded, which: str, entry: Entry, horizon: float) -> Dic
     try:
         dictionary: Dictionary = build(loaded, "dictionary", entry).build(horizon)
     except InputError as error:
-        raise loaded.blame(("dictionaries", which), error) from error
+        raise loaded.located(("dictionaries", which), error) from error
     return dictionary
 
 

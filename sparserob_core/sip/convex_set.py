@@ -116,15 +116,15 @@ def as_bound(name: str, value: object, size: int | None = None) -> Array:
     try:
         array = np.atleast_1d(np.asarray(value, dtype=float))
     except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: expected a number or a list of numbers, got {value!r}") from error
+        raise InputError(path=name, expected="a number or a list of numbers", got=f"{value!r}") from error
     if array.ndim != 1 or array.size == 0:
-        raise InputError(f"{name}: expected a list of numbers, got an array of shape {array.shape}")
+        raise InputError(path=name, expected="a list of numbers", got=f"an array of shape {array.shape}")
     if size is not None and array.size == 1:
         array = np.full(size, array[0])
     if size is not None and array.size != size:
-        raise InputError(f"{name}: expected {size} numbers, got {array.size}")
+        raise InputError(path=name, expected=f"{size} numbers", got=f"{array.size}")
     if np.isnan(array).any():
-        raise InputError(f"{name}: expected numbers, got NaN in {array.tolist()}")
+        raise InputError(path=name, expected="numbers", got=f"NaN in {array.tolist()}")
     return array
 
 
@@ -141,9 +141,9 @@ class Box(ConvexSet):
     def __post_init__(self) -> None:
         lower, upper = as_bound("lower", self.lower), as_bound("upper", self.upper)
         if lower.size != upper.size:
-            raise InputError(f"box: lower has {lower.size} numbers, upper has {upper.size}")
+            raise InputError(f"lower has {lower.size} numbers, upper has {upper.size}", path="box")
         if (lower > upper).any() or np.isposinf(lower).any() or np.isneginf(upper).any():
-            raise InputError(f"box: empty, lower {lower.tolist()} is above upper {upper.tolist()}")
+            raise InputError(f"empty, lower {lower.tolist()} is above upper {upper.tolist()}", path="box")
         object.__setattr__(self, "lower", lower)
         object.__setattr__(self, "upper", upper)
 

@@ -61,7 +61,7 @@ def test_the_rate_is_the_control_of_the_augmented_problem() -> None:
     ("changes", "message"),
     [
         ({"initial_control": [0, 0, 0]}, "initial_control: expected 2 numbers, one per control, got 3"),
-        ({"rate": {"box": [1, 2, 3]}}, r"rate\.box: half-widths: expected 2 numbers, got 3"),
+        ({"rate": {"box": [1, 2, 3]}}, r"rate\.box: expected 2 numbers, got 3"),
         ({"control": {"ellipsoid": {"shape": 1}}}, "control: expected a set with flat sides"),
         ({"rate": {}}, "expected a set"),
     ],

@@ -28,21 +28,23 @@ class Dictionary:
         breakpoints, values = _real("breakpoints", self.breakpoints), _real("values", self.values)
         if breakpoints.ndim != 1 or breakpoints.size < 2 or breakpoints[0] != 0.0 or (np.diff(breakpoints) <= 0).any():
             raise InputError(
-                f"dictionary: breakpoints must increase from 0, at least two of them, got {_short(breakpoints)}"
+                f"breakpoints must increase from 0, at least two of them, got {_short(breakpoints)}", path="dictionary"
             )
         if values.ndim != 2 or values.shape[0] == 0 or values.shape[1] != breakpoints.size - 1:
             raise InputError(
-                f"dictionary: values must have shape (functions, {breakpoints.size - 1}), got {values.shape}"
+                f"values must have shape (functions, {breakpoints.size - 1}), got {values.shape}", path="dictionary"
             )
         if values.shape[0] > values.shape[1]:
             raise InputError(
-                f"dictionary: {values.shape[0]} functions on {values.shape[1]} pieces; there can be at most as many "
-                "functions as pieces, or they are linearly dependent"
+                f"{values.shape[0]} functions on {values.shape[1]} pieces; there can be at most as many functions as"
+                " pieces, or they are linearly dependent",
+                path="dictionary",
             )
         if not _independent(values):
             raise InputError(
-                f"dictionary: the {values.shape[0]} functions must be linearly independent, "
-                f"their rank is {np.linalg.matrix_rank(values)}"
+                f"the {values.shape[0]} functions must be linearly independent, their rank is"
+                f" {np.linalg.matrix_rank(values)}",
+                path="dictionary",
             )
         object.__setattr__(self, "breakpoints", breakpoints)
         object.__setattr__(self, "values", values)
@@ -103,9 +105,9 @@ def _real(name: str, value: object) -> Array:
     try:
         array = np.array(value, dtype=float)
     except (TypeError, ValueError) as error:
-        raise InputError(f"dictionary: {name} must be an array of numbers") from error
+        raise InputError(f"{name} must be an array of numbers", path="dictionary") from error
     if not np.isfinite(array).all():
-        raise InputError(f"dictionary: {name} must be finite numbers")
+        raise InputError(f"{name} must be finite numbers", path="dictionary")
     return array
 
 

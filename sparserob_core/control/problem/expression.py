@@ -186,11 +186,21 @@ def parse_matrix(name: str, rows: Sequence[Sequence[str | float]], names: Sequen
     """A matrix of numbers and expressions, given row by row; ``name`` is for the errors (`InputError`)."""
     if not rows or not rows[0] or len({len(row) for row in rows}) > 1:
         raise InputError(
-            f"{name}: expected a matrix, rows of equal length, got rows of lengths {[len(row) for row in rows]}"
+            path=name, expected="a matrix, rows of equal length", got=f"rows of lengths {[len(row) for row in rows]}"
         )
-    try:
-        return ExpressionMatrix(
-            tuple(tuple(parse_expression(entry, names) for entry in row) for row in rows), tuple(names)
-        )
-    except InputError as error:
-        raise InputError(f"{name}: {error}") from error
+    entries: list[list[Expression]] = []
+    for i, row in enumerate(rows):
+        entries.append([])
+        for j, entry in enumerate(row):
+            try:
+                entries[i].append(_finite(parse_expression(entry, names)))
+            except InputError as error:
+                raise error.under(name, i, j) from None
+    return ExpressionMatrix(tuple(map(tuple, entries)), tuple(names))
+
+
+def _finite(expression: Expression) -> Expression:
+    """The same expression; raises `InputError` for a constant that is not a finite number."""
+    if not expression.names and not np.isfinite(expression({})):
+        raise InputError(f"expression {expression.text!r}: its value is not a finite number")
+    return expression

@@ -60,10 +60,10 @@ class OptimalControlProblem:
 
     def __post_init__(self) -> None:
         if not isinstance(self.system, LinearSystem):
-            raise InputError(f"system: expected a LinearSystem, got {type(self.system).__name__}")
+            raise InputError(path="system", expected="a LinearSystem", got=f"{type(self.system).__name__}")
         horizon = as_bound("horizon", self.horizon)
         if horizon.shape != (1,) or not 0.0 < horizon[0] < np.inf:
-            raise InputError(f"horizon: expected a positive, finite time, got {self.horizon!r}")
+            raise InputError(path="horizon", expected="a positive, finite time", got=f"{self.horizon!r}")
         self._set("horizon", float(horizon[0]))
         self._set("initial_state", self._state())
         self._set("weights", self._weights())
@@ -80,21 +80,26 @@ class OptimalControlProblem:
         d = self.system.states
         state = np.atleast_1d(as_bound("initial_state", self.initial_state))
         if state.size != d or not np.isfinite(state).all():
-            raise InputError(f"initial_state: expected {d} finite numbers, one per state, got {state.tolist()}")
+            raise InputError(
+                path="initial_state", expected=f"{d} finite numbers, one per state", got=f"{state.tolist()}"
+            )
         return state
 
     def _weights(self) -> Array:
         m = self.system.controls
         weights = as_bound("weights", 1.0 if self.weights is None else self.weights, m)
         if not ((weights > 0.0) & np.isfinite(weights)).all():
-            raise InputError(f"weights: expected {m} positive numbers, one per control, got {weights.tolist()}")
+            raise InputError(
+                path="weights", expected=f"{m} positive numbers, one per control", got=f"{weights.tolist()}"
+            )
         return weights
 
     def _check_disturbance(self) -> None:
         if self.disturbance_class not in get_args(DisturbanceClass):
             raise InputError(
-                f"disturbance_class: expected one of {', '.join(get_args(DisturbanceClass))}, got"
-                f" {self.disturbance_class!r}"
+                path="disturbance_class",
+                expected=f"one of {', '.join(get_args(DisturbanceClass))}",
+                got=f"{self.disturbance_class!r}",
             )
         if self.disturbance is None:
             return
@@ -102,7 +107,7 @@ class OptimalControlProblem:
         box = self.disturbance
         if self.disturbance_class == "l1_ball" and not (isinstance(box, Box) and np.array_equal(box.lower, -box.upper)):
             raise InputError(
-                "disturbance: the class l1_ball needs a box that is symmetric about the origin, such as box: 0.1"
+                "the class l1_ball needs a box that is symmetric about the origin, such as box: 0.1", path="disturbance"
             )
 
     def _windowed(self, where: str, entry: object) -> PathConstraint:
@@ -115,7 +120,9 @@ class OptimalControlProblem:
         start, stop = float(item.start), self.horizon if item.stop is None else float(item.stop)
         if not 0.0 <= start <= stop <= self.horizon:
             raise InputError(
-                f"{where}: expected 0 <= from <= to <= {self.horizon:g} (the horizon), got from {start:g} to {stop:g}"
+                path=where,
+                expected=f"0 <= from <= to <= {self.horizon:g} (the horizon)",
+                got=f"from {start:g} to {stop:g}",
             )
         return replace(item, start=start, stop=stop)
 
@@ -128,7 +135,9 @@ class OptimalControlProblem:
                 continue
             if item.dimension != self.system.states:
                 raise InputError(
-                    f"terminal.{i}: expected {self.system.states} values, one per state, got {item.dimension}"
+                    path=f"terminal.{i}",
+                    expected=f"{self.system.states} values, one per state",
+                    got=f"{item.dimension}",
                 )
             kept += [item] if item.fixed.size else []
         return kept
@@ -146,23 +155,25 @@ def _listed(name: str, value: object) -> list[object]:
     if isinstance(value, ConvexSet | PathConstraint | Equality):
         return [value]
     if not isinstance(value, Sequence):
-        raise InputError(f"{name}: expected a list of sets, got {type(value).__name__}")
+        raise InputError(path=name, expected="a list of sets", got=f"{type(value).__name__}")
     return list(value)
 
 
 def _checked_set(name: str, value: object, dimension: int, of: str, bounded: bool = False) -> ConvexSet:
     if isinstance(value, Equality):
-        raise InputError(f"{name}: an equality is allowed in terminal only")
+        raise InputError("an equality is allowed in terminal only", path=name)
     if not isinstance(value, ConvexSet):
         raise InputError(
-            f"{name}: expected a convex set, such as Box, Polytope or Ellipsoid, got {type(value).__name__}"
+            path=name, expected="a convex set, such as Box, Polytope or Ellipsoid", got=f"{type(value).__name__}"
         )
     if value.dimension != dimension:
         raise InputError(
-            f"{name}: expected a set of dimension {dimension}, the number of {of}, got dimension {value.dimension}"
+            path=name,
+            expected=f"a set of dimension {dimension}, the number of {of}",
+            got=f"dimension {value.dimension}",
         )
     if bounded and not value.is_bounded:
-        raise InputError(f"{name}: the set must be bounded")
+        raise InputError("the set must be bounded", path=name)
     return value
 
 

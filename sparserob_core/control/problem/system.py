@@ -42,11 +42,11 @@ class LinearSystem:
             object.__setattr__(self, name, self._matrix(name, getattr(self, name)))
         d, columns = self._shape("A")
         if d != columns:
-            raise InputError(f"system: A must be square, got shape {(d, columns)}")
+            raise InputError(f"A must be square, got shape {(d, columns)}", path="system")
         object.__setattr__(self, "E", np.eye(d) if self.E is None else self._matrix("E", self.E))
         for name in ("B", "E"):
             if self._shape(name)[0] != d:
-                raise InputError(f"system: {name} must have {d} rows, as A has, got shape {self._shape(name)}")
+                raise InputError(f"{name} must have {d} rows, as A has, got shape {self._shape(name)}", path="system")
         self.matrices(self._probes())
 
     @property
@@ -74,7 +74,9 @@ class LinearSystem:
         are not finite."""
         points = np.asarray(parameters, dtype=float)
         if points.ndim != 2 or points.shape[1] != self.parameter_count:
-            raise InputError(f"system: parameters must have shape (k, {self.parameter_count}), got {points.shape}")
+            raise InputError(
+                f"parameters must have shape (k, {self.parameter_count}), got {points.shape}", path="system"
+            )
         A, B, E = (self._values(name, points) for name in ("A", "B", "E"))
         return A, B, E
 
@@ -101,11 +103,13 @@ class LinearSystem:
 
     def _check_parameters(self) -> None:
         if self.parameters is not None and not self.parameters.is_bounded:
-            raise InputError("system: the set of parameters must be bounded")
+            raise InputError("the set of parameters must be bounded", path="system")
         names = tuple(self.names) or tuple(f"p{i + 1}" for i in range(self.parameter_count))
         if len(names) != self.parameter_count:
             raise InputError(
-                f"system: expected {self.parameter_count} parameter names, got {len(names)}: {', '.join(names)}"
+                path="system",
+                expected=f"{self.parameter_count} parameter names",
+                got=f"{len(names)}: {', '.join(names)}",
             )
         object.__setattr__(self, "names", names)
 
@@ -116,23 +120,28 @@ class LinearSystem:
             )
         if callable(value):
             if self.parameters is None:
-                raise InputError(f"system: {name} is a function of the parameters, but no set of parameters is given")
+                raise InputError(
+                    f"{name} is a function of the parameters, but no set of parameters is given", path="system"
+                )
             return value
         try:
             array = np.array(value, dtype=float)
         except (TypeError, ValueError) as error:
             raise InputError(
-                f"system: {name} must be a matrix of numbers or a function of the parameters, got {value!r}"
+                f"{name} must be a matrix of numbers or a function of the parameters, got {value!r}", path="system"
             ) from error
         if array.ndim != 2 or array.size == 0 or not np.isfinite(array).all():
-            raise InputError(f"system: {name} must be a matrix of finite numbers, rows by columns, got {_seen(array)}")
+            raise InputError(
+                f"{name} must be a matrix of finite numbers, rows by columns, got {_seen(array)}", path="system"
+            )
         return array
 
     def _known_names(self, name: str, matrix: ExpressionMatrix) -> ExpressionMatrix:
         if matrix.names != tuple(self.names):
             raise InputError(
-                f"system: the expressions of {name} are in the parameters {', '.join(matrix.names)}, "
-                f"the system has {', '.join(self.names) or 'none'}"
+                f"the expressions of {name} are in the parameters {', '.join(matrix.names)}, the system has"
+                f" {', '.join(self.names) or 'none'}",
+                path="system",
             )
         return matrix
 
@@ -149,7 +158,7 @@ class LinearSystem:
             value = np.asarray(self._called(name, self._probes()[0]))
             if value.ndim != 2 or value.size == 0:
                 raise InputError(
-                    f"system: the function {name} must return a matrix, rows by columns, got {_seen(value)}"
+                    f"the function {name} must return a matrix, rows by columns, got {_seen(value)}", path="system"
                 )
             cache[name] = (value.shape[0], value.shape[1])
         return cache[name]
@@ -169,7 +178,9 @@ class LinearSystem:
             with np.errstate(all="ignore"):  # what is not finite is reported with its parameter
                 return np.asarray(function(parameter), dtype=float)
         except (TypeError, ValueError, ArithmeticError, IndexError, KeyError, AttributeError) as error:
-            raise InputError(f"system: the function {name} failed at {self.describe(parameter)}: {error}") from error
+            raise InputError(
+                f"the function {name} failed at {self.describe(parameter)}: {error}", path="system"
+            ) from error
 
     def _values(self, name: str, points: Array) -> Array:
         entry, shape = self._entry(name), self._shape(name)
@@ -181,11 +192,13 @@ class LinearSystem:
             rows = [self._called(name, point) for point in points]
             other = next((row.shape for row in rows if row.shape != shape), None)
             if other is not None:
-                raise InputError(f"system: the function {name} must always return shape {shape}, got {other}")
+                raise InputError(f"the function {name} must always return shape {shape}, got {other}", path="system")
             values = np.array(rows).reshape(len(points), *shape)
         finite = np.isfinite(values).all(axis=(1, 2))
         if not finite.all():
-            raise InputError(f"system: {name} is not finite at {self.describe(points[np.flatnonzero(~finite)[0]])}")
+            raise InputError(
+                f"{name} is not finite at {self.describe(points[np.flatnonzero(~finite)[0]])}", path="system"
+            )
         return values
 
     def _enclosed(self, name: str, space: TaylorSpace, p: npt.NDArray[np.object_]) -> tuple[Array, Array]:

@@ -109,7 +109,7 @@ def disturbance_model(kind: str, bound: ConvexSet, dictionary: Dictionary, grid:
         return DisturbanceModel("measurable", bound, bound, grid, starts=np.arange(grid.pieces))
     if kind == "l1_ball":
         if not isinstance(bound, Box) or not np.array_equal(bound.lower, -bound.upper):
-            raise InputError("disturbance_class: l1_ball needs a disturbance box that is symmetric about 0")
+            raise InputError("l1_ball needs a disturbance box that is symmetric about 0", path="disturbance_class")
         ball = NormBall(p=1.0, radius=1.0, dimension=dictionary.values.shape[0])
         return DisturbanceModel("l1_ball", ball, bound, grid, functions=on_grid, scale=bound.upper)
     merged = dictionary.merged()
@@ -123,8 +123,9 @@ def disturbance_model(kind: str, bound: ConvexSet, dictionary: Dictionary, grid:
     flat = bound.halfspaces()
     if flat is None:
         raise InputError(
-            "dictionaries.disturbance: fewer functions than pieces needs a disturbance set with flat sides "
-            f"(box, polytope, 1-norm or inf-norm), got {type(bound).__name__}"
+            "fewer functions than pieces needs a disturbance set with flat sides (box, polytope, 1-norm or inf-norm),"
+            f" got {type(bound).__name__}",
+            path="dictionaries.disturbance",
         )
     H, h = flat
     rows = np.einsum("ri,jk->krij", H, merged.values).reshape(-1, H.shape[1] * merged.values.shape[0])

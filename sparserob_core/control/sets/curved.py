@@ -31,12 +31,14 @@ class Ellipsoid(ConvexSet):
         try:
             shape = np.atleast_2d(np.array(self.shape, dtype=float))
         except (TypeError, ValueError) as error:
-            raise InputError("ellipsoid: shape must be a square matrix of numbers") from error
+            raise InputError("shape must be a square matrix of numbers", path="ellipsoid") from error
         if shape.ndim != 2 or shape.shape[0] != shape.shape[1] or not np.isfinite(shape).all():
-            raise InputError(f"ellipsoid: shape must be a square matrix of finite numbers, got shape {shape.shape}")
+            raise InputError(
+                f"shape must be a square matrix of finite numbers, got shape {shape.shape}", path="ellipsoid"
+            )
         if not np.allclose(shape, shape.T, rtol=1e-12, atol=0.0) or np.linalg.eigvalsh(shape)[0] <= 0.0:
-            raise InputError(f"ellipsoid: shape must be symmetric positive definite, got {shape.tolist()}")
-        object.__setattr__(self, "centre", _finite("ellipsoid: centre", self.centre, shape.shape[0]))
+            raise InputError(f"shape must be symmetric positive definite, got {shape.tolist()}", path="ellipsoid")
+        object.__setattr__(self, "centre", _finite("ellipsoid.centre", self.centre, shape.shape[0]))
         object.__setattr__(self, "shape", shape)
 
     @property
@@ -104,14 +106,14 @@ class NormBall(ConvexSet):
         self, p: float, radius: float, centre: npt.ArrayLike | None = None, dimension: int | None = None
     ) -> None:
         if not float(p) >= 1.0:
-            raise InputError(f"norm ball: p must be at least 1 (inf for the maximum norm), got {p!r}")
+            raise InputError(path="norm.p", expected="a number of at least 1 (inf for the maximum norm)", got=repr(p))
         if not 0.0 <= float(radius) < np.inf:
-            raise InputError(f"norm ball: radius must be a finite number, at least 0, got {radius!r}")
+            raise InputError(path="norm.radius", expected="a finite number, at least 0", got=repr(radius))
         if centre is None and dimension is None:
-            raise InputError("norm ball: expected a centre, or a dimension for a ball about the origin")
+            raise InputError(path="norm", expected="a centre, or a dimension for a ball about the origin")
         if dimension is not None and dimension < 1:
-            raise InputError(f"norm ball: dimension must be at least 1, got {dimension}")
-        middle = np.zeros(dimension or 0) if centre is None else _finite("norm ball: centre", centre, dimension)
+            raise InputError(path="norm.dimension", expected="at least 1", got=str(dimension))
+        middle = np.zeros(dimension or 0) if centre is None else _finite("norm.centre", centre, dimension)
         object.__setattr__(self, "p", float(p))
         object.__setattr__(self, "radius", float(radius))
         object.__setattr__(self, "centre", middle)
@@ -228,7 +230,7 @@ def _shrunk(z: Array, multiplier: Array, power: float) -> Array:
 def _finite(name: str, value: object, size: int | None) -> Array:
     numbers = as_bound(name, value, size)
     if not np.isfinite(numbers).all():
-        raise InputError(f"{name}: expected finite numbers, got {numbers.tolist()}")
+        raise InputError(path=name, expected="finite numbers", got=f"{numbers.tolist()}")
     return numbers
 
 

@@ -28,24 +28,25 @@ class Polytope(ConvexSet):
         try:
             H = np.array(self.H, dtype=float)
         except (TypeError, ValueError) as error:
-            raise InputError("polytope: H must be a matrix of numbers, one row per half-space") from error
+            raise InputError("H must be a matrix of numbers, one row per half-space", path="polytope") from error
         if H.ndim != 2 or H.size == 0 or not np.isfinite(H).all():
             raise InputError(
-                f"polytope: H must be a matrix of finite numbers, one row per half-space, got shape {H.shape}"
+                f"H must be a matrix of finite numbers, one row per half-space, got shape {H.shape}", path="polytope"
             )
-        h = as_bound("polytope: h", self.h, H.shape[0])
+        h = as_bound("polytope.h", self.h, H.shape[0])
         if np.isneginf(h).any():
-            raise InputError("polytope: h must not be -inf")
+            raise InputError("h must not be -inf", path="polytope")
         zero = ~H.any(axis=1)
         if (h[zero] < 0).any():
             raise InputError(
-                f"polytope: empty, row {int(np.flatnonzero(zero & (h < 0))[0])} of H is zero and its h is negative"
+                f"empty, row {int(np.flatnonzero(zero & (h < 0))[0])} of H is zero and its h is negative",
+                path="polytope",
             )
         keep = ~zero & np.isfinite(h)
         object.__setattr__(self, "H", H[keep])
         object.__setattr__(self, "h", h[keep])
         if self.chebyshev[1] < -1e-9 * max(1.0, float(np.abs(self.h).max(initial=0.0))):
-            raise InputError("polytope: empty, no point satisfies every row of H x <= h")
+            raise InputError("empty, no point satisfies every row of H x <= h", path="polytope")
 
     @property
     def dimension(self) -> int:
@@ -72,7 +73,7 @@ class Polytope(ConvexSet):
             bounds=[(None, None)] * d + [(None, cap)],
         )
         if answer.status != 0:
-            raise InputError(f"polytope: could not decide whether it is empty ({answer.message})")
+            raise InputError(f"could not decide whether it is empty ({answer.message})", path="polytope")
         return np.asarray(answer.x[:-1]), float(answer.x[-1])
 
     def interior_point(self) -> Array:

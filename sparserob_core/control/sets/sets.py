@@ -57,9 +57,13 @@ class Equality:
         try:
             values = np.atleast_1d(np.array(self.values, dtype=float))
         except (TypeError, ValueError) as error:
-            raise InputError(f"equality: expected a list of numbers, null where free, got {self.values!r}") from error
+            raise InputError(
+                path="equality", expected="a list of numbers, null where free", got=f"{self.values!r}"
+            ) from error
         if values.ndim != 1 or values.size == 0 or np.isinf(values).any():
-            raise InputError(f"equality: expected a list of finite numbers, null where free, got {values.tolist()}")
+            raise InputError(
+                path="equality", expected="a list of finite numbers, null where free", got=f"{values.tolist()}"
+            )
         object.__setattr__(self, "values", values)
 
     @property
@@ -92,9 +96,9 @@ def intersection(sets: Sequence[ConvexSet]) -> ConvexSet | tuple[ConvexSet, ...]
     Raises `InputError` when there is no member, dimensions differ, or a flat intersection is empty.
     """
     if not sets:
-        raise InputError("intersection: expected at least one set")
+        raise InputError("expected at least one set", path="intersection")
     if len({member.dimension for member in sets}) > 1:
-        raise InputError(f"intersection: dimensions differ, {[member.dimension for member in sets]}")
+        raise InputError(f"dimensions differ, {[member.dimension for member in sets]}", path="intersection")
     if len(sets) == 1:
         return sets[0]
     boxes = [member for member in sets if isinstance(member, Box)]
@@ -145,7 +149,9 @@ def cylinder(base: ConvexSet, size: int) -> ConvexSet:
     below ``b``."""
     free = size - base.dimension
     if free < 0:
-        raise InputError(f"cylinder: size must be at least {base.dimension}, the dimension of its base, got {size}")
+        raise InputError(
+            f"size must be at least {base.dimension}, the dimension of its base, got {size}", path="cylinder"
+        )
     if isinstance(base, Box):
         return Box(np.append(base.lower, np.full(free, -np.inf)), np.append(base.upper, np.full(free, np.inf)))
     flat = base.halfspaces()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path as File
@@ -11,12 +10,12 @@ from typing import Any, final
 
 from pydantic import ValidationError
 
-from sparserob_core.errors import ConfigError, InputError, PluginError
+from sparserob_core.errors import ConfigError, InputError, Path, PluginError, dotted
 from sparserob_core.experiment.config.overrides import Override, apply_override, parse_overrides
 from sparserob_core.experiment.config.reader import Source, read_source, read_value
 from sparserob_core.experiment.config.run_config import SLOTS, MaximiserEntry, RunConfig
 from sparserob_core.experiment.plugins.components import Registry
-from sparserob_core.experiment.plugins.messages import Complaint, Path, complaints, malformed
+from sparserob_core.experiment.plugins.messages import Complaint, complaints, malformed
 from sparserob_core.experiment.plugins.registry import load_registry
 
 KEPT = {*MaximiserEntry.model_fields} - {"name"}  # keys of a maximiser that are the framework's own
@@ -32,16 +31,15 @@ class Loaded:
     source: Source
     overrides: tuple[Override, ...] = ()
 
-    def blame(self, slot: Path, error: InputError) -> ConfigError:
-        """The same error with the place of the key that it is about: what building a component found wrong with its
-        options."""
-        head, colon, tail = str(error).partition(": ")
-        path = slot
-        if colon and re.fullmatch(r"\w+(\.\w+|\[\d+\])*", head):
-            below = tuple(int(step) if step.isdigit() else step for step in re.findall(r"\w+", head))
-            if _at(self.config.plain(), (*slot, *below)) is not None:
-                path, head = (*slot, *below), ""
-        message = tail if not head else str(error)
+    def located(self, slot: Path, error: InputError) -> ConfigError:
+        """The same error with the place of the key that it is about: what building the component at ``slot`` found
+        wrong with its options."""
+        plain = self.config.plain()
+        path, rest = (*slot, *error.path), list[str | int]()
+        while len(path) > len(slot) and _at(plain, path) is None:
+            rest.insert(0, path[-1])
+            path = path[:-1]
+        message = f"{dotted(tuple(rest))}: {error.sentence}" if rest else error.sentence
         return ConfigError(_line(self.source, self.overrides, Complaint(path, message)))
 
 

@@ -61,5 +61,5 @@ def broadcast(name: str, value: float | Sequence[float | None], dimension: int, 
     if not isinstance(value, Sequence):
         return np.full(dimension, float(value))
     if len(value) not in (1, dimension):
-        raise InputError(f"{name}: expected {count(dimension)}, got {len(value)}")
+        raise InputError(path=name, expected=f"{count(dimension)}", got=f"{len(value)}")
     return np.full(dimension, [free if item is None else float(item) for item in value])

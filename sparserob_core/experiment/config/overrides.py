@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sparserob_core.errors import ConfigError
-from sparserob_core.experiment.plugins.messages import Path, dotted, shown
+from sparserob_core.errors import ConfigError, Path, dotted
+from sparserob_core.experiment.plugins.messages import shown
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from sparserob_core.options import Options
 
 def _entry(value: object) -> object:
     if isinstance(value, bool) or not isinstance(value, int | float | str | np.number):
-        raise InputError(f"expected a number or an expression in the parameters such as '-2 + p1', got {value!r}")
+        raise InputError(expected="a number or an expression in the parameters such as '-2 + p1'", got=f"{value!r}")
     return value
 
 
@@ -30,7 +30,7 @@ Entry: TypeAlias = Annotated[float | str, BeforeValidator(_entry)]
 
 def _interval(value: object) -> object:
     if not isinstance(value, list | tuple) or len(value) != 2:
-        raise InputError(f"expected an interval [lower, upper], got {value!r}")
+        raise InputError(expected="an interval [lower, upper]", got=f"{value!r}")
     return value
 
 
@@ -87,11 +87,12 @@ class SystemOptions(Options):
         for name in given:
             if not name.isidentifier() or keyword.iskeyword(name) or name in CONSTANTS or name in FUNCTIONS:
                 raise InputError(
-                    f"system.parameters: {name!r} cannot name a parameter; expected letters, digits and underscores, "
-                    f"and not one of {', '.join([*CONSTANTS, *FUNCTIONS])}"
+                    f"{name!r} cannot name a parameter; expected letters, digits and underscores, and not one of"
+                    f" {', '.join([*CONSTANTS, *FUNCTIONS])}",
+                    path="system.parameters",
                 )
         if len(set(given)) < len(given):
-            raise InputError(f"system.parameters.names: a name occurs twice, got {', '.join(given)}")
+            raise InputError(f"a name occurs twice, got {', '.join(given)}", path="system.parameters.names")
         return tuple(given)
 
     def build(self) -> LinearSystem:
@@ -100,11 +101,12 @@ class SystemOptions(Options):
         d = len(self.A)
         for key, rows in (("A", self.A), ("B", self.B), ("E", self.E)):
             if rows is not None and len(rows) != d:
-                raise InputError(f"system.{key}: expected {d} rows, as A has, got {len(rows)}")
+                raise InputError(path=f"system.{key}", expected=f"{d} rows, as A has", got=f"{len(rows)}")
         if any(len(row) != d for row in self.A):
             raise InputError(
-                f"system.A: expected a square matrix, {d} numbers in each of its {d} rows, got"
-                f" {[len(row) for row in self.A]}"
+                path="system.A",
+                expected=f"a square matrix, {d} numbers in each of its {d} rows",
+                got=f"{[len(row) for row in self.A]}",
             )
         A, B = parse_matrix("system.A", self.A, names), parse_matrix("system.B", self.B, names)
         E = None if self.E is None else parse_matrix("system.E", self.E, names)
@@ -118,7 +120,9 @@ class SystemOptions(Options):
         for name, (lower, upper) in self.parameters.items():
             if lower > upper:
                 raise InputError(
-                    f"system.parameters.{name}: expected [lower, upper] with lower <= upper, got [{lower:g}, {upper:g}]"
+                    path=f"system.parameters.{name}",
+                    expected="[lower, upper] with lower <= upper",
+                    got=f"[{lower:g}, {upper:g}]",
                 )
         return Box(*np.array(list(self.parameters.values())).T)
 
@@ -155,7 +159,7 @@ class LinearKeys(ProblemFactory, Options):
         """Initial state, one number per state; raises `InputError`."""
         given = self.initial_state if isinstance(self.initial_state, list) else [self.initial_state] * states
         if len(given) != states:
-            raise InputError(f"initial_state: expected {states} numbers, one per state, got {len(given)}")
+            raise InputError(path="initial_state", expected=f"{states} numbers, one per state", got=f"{len(given)}")
         return given
 
     def noise(self, system: LinearSystem) -> ConvexSet | None:
@@ -169,8 +173,9 @@ class LinearKeys(ProblemFactory, Options):
             stop = self.horizon if item.stop is None else item.stop
             if not item.start <= stop <= self.horizon:
                 raise InputError(
-                    f"path.{i}: expected from <= to <= {self.horizon:g} (the horizon), got from {item.start:g} to"
-                    f" {stop:g}"
+                    path=f"path.{i}",
+                    expected=f"from <= to <= {self.horizon:g} (the horizon)",
+                    got=f"from {item.start:g} to {stop:g}",
                 )
             found += [PathConstraint(member, item.start, stop) for member in item.members(f"path.{i}", states)]
         return found

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path as File
 from typing import TYPE_CHECKING, Any, final
 
-from sparserob_core.errors import ConfigError
-from sparserob_core.experiment.plugins.messages import Path
+from sparserob_core.errors import ConfigError, Path
 
 if TYPE_CHECKING:
     from ruamel.yaml import YAML

@@ -117,7 +117,7 @@ class SetOptions(Sparse):
     @model_validator(mode="after")
     def _not_empty(self) -> SetOptions:
         if not self._given():
-            raise InputError(f"expected a set: {', '.join(self._kinds())}, got none of them")
+            raise InputError(expected=f"a set: {', '.join(self._kinds())}", got="none of them")
         return self
 
     def _kinds(self) -> tuple[str, ...]:
@@ -142,29 +142,30 @@ class SetOptions(Sparse):
             try:
                 member = builders[kind](dimension)
             except InputError as error:
-                raise InputError(f"{where}.{kind}: {str(error).removeprefix(f'{kind}: ')}") from error
+                raise error.under(where, *(() if error.path[:1] == (kind,) else (kind,))) from None
             if member.dimension != dimension:
-                raise InputError(f"{where}.{kind}: expected {count(dimension)}, got {member.dimension}")
+                raise InputError(path=f"{where}.{kind}", expected=f"{count(dimension)}", got=f"{member.dimension}")
             found.append(member)
         return found
 
     def build(self, where: str, dimension: int) -> ConvexSet:
         """The intersection of all keys as one set; raises `InputError` when it is curved and not a single key."""
+        members = self.members(where, dimension)
         try:
-            joined = intersection(self.members(where, dimension))
+            joined = intersection(members)
         except InputError as error:
-            raise error if str(error).startswith(where) else InputError(f"{where}: {error}") from error
+            raise error.under(where) from None
         if isinstance(joined, tuple):
             raise InputError(
-                f"{where}: a curved set cannot be intersected except in path and terminal, got"
-                f" {' and '.join(self._given())}"
+                f"a curved set cannot be intersected except in path and terminal, got {' and '.join(self._given())}",
+                path=where,
             )
         return joined
 
     def _box(self, dimension: int) -> Box:
         if isinstance(self.box, Bounds):
             return self.box.build(dimension)
-        half = free_bound("half-widths", self.box, dimension, np.inf)
+        half = free_bound("", self.box, dimension, np.inf)
         if (half < 0).any():
             raise InputError(
                 f"half-widths must be at least 0, got {half.tolist()}; write {{lower: ..., upper: ...}} for other boxes"
@@ -222,7 +223,7 @@ class TerminalOptions(SetOptions):
         if self.equals is not None:
             if len(self.equals) != dimension:
                 raise InputError(
-                    f"{where}.equals: expected {count(dimension)}, null where free, got {len(self.equals)}"
+                    path=f"{where}.equals", expected=f"{count(dimension)}, null where free", got=f"{len(self.equals)}"
                 )
             found.append(Equality(np.array([np.nan if value is None else value for value in self.equals])))
         return found

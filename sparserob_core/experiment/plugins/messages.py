@@ -6,16 +6,15 @@ import difflib
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeAlias, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 from pydantic import BaseModel
 
-from sparserob_core.errors import SparseRobError
+from sparserob_core.errors import InputError, Path, dotted
 
 if TYPE_CHECKING:
     from pydantic import ValidationError
 
-Path: TypeAlias = tuple[str | int, ...]
 SHOWN = 60
 MUST_BE = {
     "model_type": "a mapping",
@@ -48,11 +47,6 @@ class Complaint:
 
     def __str__(self) -> str:
         return f"{dotted(self.path)}: {self.message}" if self.path else self.message
-
-
-def dotted(path: Path) -> str:
-    """``('path', 0, 'from')`` as ``path.0.from``."""
-    return ".".join(str(step) for step in path)
 
 
 def shown(value: object) -> str:
@@ -107,8 +101,8 @@ def _sentence(item: dict[str, Any], model: type[BaseModel]) -> str:
             return f"unknown key{nearest(str(item['loc'][-1]), known)}" if known else "unknown key; it has no options"
         case "value_error":
             cause = item.get("ctx", {}).get("error")
-            said = str(cause) if isinstance(cause, SparseRobError) else str(item["msg"]).removeprefix("Value error, ")
-            return said if "got" in said else f"{said} (got {shown(item['input'])})"
+            got = isinstance(cause, InputError) and cause.got
+            return str(cause) if got else f"{cause} (got {shown(item['input'])})"
         case kind if kind in MUST_BE:
             return f"must be {MUST_BE[kind]} (got {shown(item['input'])})"
         case _:

@@ -107,5 +107,5 @@ def test_a_matrix_evaluates_at_many_parameters() -> None:
 def test_a_ragged_matrix_names_itself() -> None:
     with pytest.raises(InputError, match=r"system\.A: expected a matrix"):
         parse_matrix("system.A", [[1, 2], [3]], ())
-    with pytest.raises(InputError, match=r"system\.B: expression 'q': unknown name"):
+    with pytest.raises(InputError, match=r"system\.B\.\d\.\d: expression 'q': unknown name"):
         parse_matrix("system.B", [["q"]], ())

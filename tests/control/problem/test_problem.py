@@ -155,13 +155,13 @@ def test_the_options_survive_being_written_and_read() -> None:
     [
         ({"control": {"box": "abc"}}, r"half-width, a list of half-widths \(null where free\), or \{lower"),
         ({"control": {}}, "expected a set: box, polytope, ellipsoid, norm"),
-        ({"control": {"box": [1, 2]}}, r"control\.box: half-widths: expected 1 number, got 2"),
+        ({"control": {"box": [1, 2]}}, r"control\.box: expected 1 number, got 2"),
         ({"control": {"box": -1}}, "half-widths must be at least 0"),
         ({"control": {"box": [None]}}, "control: the set must be bounded"),
         ({"control": {"box": 1, "ellipsoid": {"shape": 1}}}, "curved set cannot be intersected"),
         ({"initial_state": [1, 2, 3]}, "initial_state: expected 2 numbers, one per state, got 3"),
         ({"path": [{"box": 1}, {"box": 1, "from": 6}]}, r"path\.1: expected from <= to <= 5"),
-        ({"path": [{"box": 1}, {"box": [1, 2, 3]}]}, r"path\.1\.box: half-widths: expected 2 numbers, got 3"),
+        ({"path": [{"box": 1}, {"box": [1, 2, 3]}]}, r"path\.1\.box: expected 2 numbers, got 3"),
         ({"terminal": [{"equals": [0]}]}, r"terminal\.0\.equals: expected 2 numbers"),
         (
             {"terminal": [{"ellipsoid": {"shape": [[1, 2], [2, 1]]}}]},
@@ -176,7 +176,7 @@ def test_the_options_survive_being_written_and_read() -> None:
         ({"system": {"A": [[0]], "B": [[1], [2]]}}, r"system\.B: expected 1 rows, as A has"),
         (
             {"system": {"A": [["a"]], "B": [[1]]}},
-            r"system\.A: expression 'a': unknown name 'a'; known parameters: none",
+            r"system\.A\.0\.0: expression 'a': unknown name 'a'; known parameters: none",
         ),
         (
             {"system": {"A": [["1/a"]], "B": [[1]], "parameters": {"a": [0, 1]}}, "initial_state": 0},

@@ -182,10 +182,10 @@ def test_an_equality_measures_the_fixed_coordinates_only() -> None:
     [
         (lambda: Polytope(np.array([[1.0], [-1.0]]), np.array([-1.0, -1.0])), "polytope: empty"),
         (lambda: Polytope(np.ones(2), np.ones(2)), "one row per half-space"),
-        (lambda: Polytope(np.ones((2, 2)), np.ones(3)), "polytope: h: expected 2 numbers, got 3"),
+        (lambda: Polytope(np.ones((2, 2)), np.ones(3)), "polytope.h: expected 2 numbers, got 3"),
         (lambda: Ellipsoid(np.zeros(2), np.array([[1.0, 2.0], [2.0, 1.0]])), "symmetric positive definite"),
-        (lambda: Ellipsoid(np.zeros(3), np.eye(2)), "ellipsoid: centre: expected 2 numbers, got 3"),
-        (lambda: NormBall(0.5, 1.0, dimension=2), "p must be at least 1"),
+        (lambda: Ellipsoid(np.zeros(3), np.eye(2)), "ellipsoid.centre: expected 2 numbers, got 3"),
+        (lambda: NormBall(0.5, 1.0, dimension=2), "norm.p: expected a number of at least 1"),
         (lambda: NormBall(2.0, -1.0, dimension=2), "radius"),
         (lambda: NormBall(2.0, 1.0), "expected a centre, or a dimension"),
         (lambda: Box(np.array([1.0]), np.array([0.0])), "box: empty"),
