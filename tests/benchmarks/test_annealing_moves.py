@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,8 +19,9 @@ from sparserob_core.experiment.assemble import assemble
 from sparserob_core.experiment.config.load import load_config
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram
 from sparserob_core.sip.relaxed.tuples import TupleValue
+from tests.support.places import CONFIGS
 
-CONFIG = Path(__file__).resolve().parents[2] / "configs" / "experiment1_repaired.yaml"
+CONFIG = CONFIGS / "experiment1_repaired.yaml"
 MOVES = 400
 
 

@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 import sparserob_core as sr
-
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+from tests.support.places import CONFIGS
 
 pytestmark = pytest.mark.benchmark
 

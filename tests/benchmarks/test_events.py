@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,8 +19,9 @@ from sparserob_core.experiment.config.load import load_config
 from sparserob_core.experiment.run.events import Broadcast, RunFinished, RunStarted
 from sparserob_core.sip.methods.sparserob import SparseRob
 from sparserob_core.sip.search.notifier import Notifier
+from tests.support.places import CONFIGS
 
-CONFIG = Path(__file__).resolve().parents[2] / "configs" / "experiment1_reduced.yaml"
+CONFIG = CONFIGS / "experiment1_reduced.yaml"
 OVERRIDES = [
     "dictionaries.control.pieces=100",
     "dictionaries.disturbance.pieces=100",

@@ -14,13 +14,14 @@ from pathlib import Path
 import pytest
 
 import sparserob_core as sr
+from tests.support.places import CONFIGS
 
 psutil = pytest.importorskip(
     "psutil", reason="the memory of another process is read with psutil, which comes with rerun-sdk"
 )
 pytest.importorskip("rerun", reason="a recording needs the extra rerun")
 
-CONFIG = Path(__file__).resolve().parents[2] / "configs" / "experiment1_reduced.yaml"
+CONFIG = CONFIGS / "experiment1_reduced.yaml"
 EVALUATIONS, TURNS = 10_000, 2
 SEARCH = {
     "maximiser.name": "simulated_annealing",

@@ -8,14 +8,13 @@ disturbance of 500 numbers.
 from __future__ import annotations
 
 from importlib.util import find_spec
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import sparserob_core as sr
+from tests.support.places import CONFIGS
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 EVALUATIONS = (50, 200, 2000)
 SEEDS = {"reduced": 3, "literal": 1}
 MAXIMISERS = (

@@ -4,7 +4,6 @@ programs."""
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +11,8 @@ from scipy.linalg import expm
 
 import sparserob_core as sr
 from tests.support.independent import Problem, enclosed_value, random_problem, sample, value
+from tests.support.places import CONFIGS
 
-CONFIGS = Path(__file__).parents[2] / "configs"
 SOLVERS = ["piqp", "proxqp", "clarabel"]
 DOUBLE_INTEGRATOR = {"A": [[0, 1], [0, 0]], "B": [[0], [1]]}
 OSCILLATOR = {"A": [[0, 1], [-1, 0]], "B": [[0], [1]]}

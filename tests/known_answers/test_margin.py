@@ -4,15 +4,13 @@ with the package."""
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import sparserob_core as sr
 from tests.support.independent import Problem, sample, value
-
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+from tests.support.places import CONFIGS
 
 
 def experiment_1(bound: float) -> Problem:

@@ -3,16 +3,14 @@ the worst one."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 import sparserob_core as sr
 from sparserob_core.control.constraints.samples import sample_disturbances
 from sparserob_core.control.transcription.transcribe import prepare
+from tests.support.places import CONFIGS
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 TRAJECTORIES = 10_000
 
 

@@ -17,10 +17,10 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.experiment.cli.main import main
+from tests.support.places import CONFIGS
 
 pytest.importorskip("rerun", reason="a recording needs the extra rerun")
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 SEARCH = {
     "dictionaries.control.pieces": 20,
     "dictionaries.disturbance.pieces": 20,
@@ -160,13 +160,13 @@ def test_the_signals_are_the_control_and_the_tube_of_the_figures(exchanged: sr.O
 def test_the_control_acts_just_where_the_push_of_the_active_constraints_leaves_the_band(exchanged: sr.Outcome) -> None:
     from sparserob_rerun.switching import Switching
 
-    sigma = Switching(exchanged.program).sigma(exchanged.result.indices, None)
-    assert sigma is not None and exchanged.control is not None
+    push = Switching(exchanged.program).push(exchanged.result.indices, None)
+    assert push is not None and exchanged.control is not None
     acts = np.abs(exchanged.control) > 1e-6
     assert acts.any() and not acts.all()
-    assert (np.abs(sigma[acts]) > 1.0 - 1e-4).all()
-    assert (np.abs(sigma[~acts]) < 1.0 + 1e-4).all()
-    assert (np.sign(sigma[acts]) == np.sign(exchanged.control[acts])).all()
+    assert (np.abs(push[acts]) > 1.0 - 1e-4).all()
+    assert (np.abs(push[~acts]) < 1.0 + 1e-4).all()
+    assert (np.sign(push[acts]) == np.sign(exchanged.control[acts])).all()
 
 
 def test_the_landscape_is_g_and_decided_by_its_anchor_alone() -> None:

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 import sparserob_core as sr
-
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+from tests.support.places import CONFIGS
 
 # status, and the cost J where a closed form or an independent linear program knows it (relative tolerance beside it)
 EXPECTED: dict[str, tuple[str, float | None, float]] = {

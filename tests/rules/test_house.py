@@ -18,7 +18,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.support.places import ROOT
+
 CORE = sorted((ROOT / "sparserob_core").rglob("*.py"))
 PLUGINS = sorted((ROOT / "plugins").glob("sparserob_*/**/*.py"))
 WRITTEN = ("*.md", "docs/**/*.md", "configs/*", "tests/**/*.py", "Makefile", "pyproject.toml")

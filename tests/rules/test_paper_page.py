@@ -6,11 +6,11 @@ from __future__ import annotations
 import json
 import re
 import sys
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.support.places import ROOT
+
 DOCS = ROOT / "docs"
 NUMBERS = json.loads((DOCS / "paper" / "numbers.json").read_text())
 RELATIVE, ABSOLUTE = 0.02, 2e-3  # of numbers that depend on what a solver of another version rounds differently

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import inspect
 import runpy
-from pathlib import Path
 
 import click
 
@@ -14,8 +13,7 @@ from sparserob_core.experiment.cli.main import commands
 from sparserob_core.experiment.config.option_rows import option_rows
 from sparserob_core.experiment.plugins.registry import HOOKS
 from sparserob_core.sip.result import MEANING
-
-ROOT = Path(__file__).resolve().parents[2]
+from tests.support.places import ROOT
 
 
 def test_the_generated_pages_are_up_to_date() -> None:

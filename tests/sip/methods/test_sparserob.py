@@ -3,15 +3,13 @@ can be replaced."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 import sparserob_core as sr
 from sparserob_core.sip.rules import Progress
+from tests.support.places import CONFIGS
 
-CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 COARSE = {"observers": [], "dictionaries.control.pieces": 50, "dictionaries.disturbance.pieces": 50}
 
 

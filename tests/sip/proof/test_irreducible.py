@@ -13,8 +13,8 @@ import sparserob_core as sr
 from sparserob_core.experiment.figures.clash import clash_strips, draw_clash
 from sparserob_core.sip.proof.irreducible import irreducible
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows, rows_at
+from tests.support.places import CONFIGS
 
-CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 DOUBLE_INTEGRATOR = {"A": [[0, 1], [0, 0]], "B": [[0], [1]]}
 
 
