@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     )
     from sparserob_core.control.transcription.transcribe import transcribe
     from sparserob_core.errors import ConfigError, InputError, PluginError, SolverError, SparseRobError
-    from sparserob_core.experiment.check import Check, check
+    from sparserob_core.experiment.check.check import Check, check
     from sparserob_core.experiment.comparison.compare import compare
     from sparserob_core.experiment.comparison.comparison import Comparison
     from sparserob_core.experiment.config.problems import LinearKeys, LinearProblem
@@ -196,7 +196,7 @@ _MODULES = {
     "control.problem.system": "LinearSystem",
     "control.problem.problem": "OptimalControlProblem PathConstraint ProblemFactory",
     "control.transcription.transcribe": "transcribe",
-    "experiment.check": "Check check",
+    "experiment.check.check": "Check check",
     "experiment.comparison.compare": "compare",
     "experiment.comparison.comparison": "Comparison",
     "experiment.run.events": "Observer RunFinished RunStarted",

@@ -13,7 +13,7 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.errors import SparseRobError
-from sparserob_core.experiment.check import Check, check
+from sparserob_core.experiment.check.check import Check, check
 from tests.support.tampering import CONFIG, FILES, KINDS, NONSENSICAL, forged
 
 SPRING: dict[str, Any] = {

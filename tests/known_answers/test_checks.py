@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.experiment.check import check
+from sparserob_core.experiment.check.check import check
 
 SPRING: dict[str, Any] = {
     "name": "linear",

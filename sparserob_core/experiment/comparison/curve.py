@@ -7,13 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, final
-from zipfile import BadZipFile
 
 import numpy as np
 
 from sparserob_core.errors import ConfigError, InputError
 from sparserob_core.experiment.config.reader import read_source
-from sparserob_core.experiment.directory.finished import read_summary
+from sparserob_core.experiment.directory.finished import read_arrays, stored_run
 from sparserob_core.sip.convex_set import Array
 
 WITHOUT_CURVE = frozenset({"failed", "infeasible"})
@@ -58,16 +57,7 @@ class Curve:
 
 def read_curve(directory: Path) -> Curve:
     """Read a run directory; raises `InputError` when it is none, or a file of it cannot be understood."""
-    for name in ("config.yaml", "result.json"):
-        if not (directory / name).is_file():
-            raise InputError(
-                f"{directory}: expected the directory of a run, got one without {name}"
-                if directory.is_dir()
-                else (
-                    f"{directory}: expected the directory of a run, got {'a file' if directory.exists() else 'nothing'}"
-                )
-            )
-    summary, config = read_summary(directory / "result.json"), _config(directory / "config.yaml")
+    summary, config = stored_run(directory).summary, _config(directory / "config.yaml")
     counts, worst = _mapping(summary, "counts"), _mapping(summary, "worst")
     status, searched = str(summary["status"]), (directory / SEARCH[0]).is_file()
     spent, lower = _number(counts, "evaluations" if searched else "relaxed_programs"), _number(summary, "lower_bound")
@@ -106,13 +96,13 @@ def _points(directory: Path, searched: bool) -> tuple[Array, Array, Array]:
 
 
 def _columns(file: Path, names: tuple[str, ...]) -> list[Array]:
-    try:
-        with np.load(file, allow_pickle=False) as stored:
-            columns = [np.asarray(stored[name], dtype=float) for name in names]
-    except FileNotFoundError:
-        raise InputError(f"{file}: there is no such file; expected one, for the run has finished") from None
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile, AttributeError) as error:
-        raise InputError(f"{file}: cannot be read: {error}") from None
+    if not file.is_file():
+        raise InputError(f"{file}: there is no such file; expected one, for the run has finished")
+    stored = read_arrays(file)
+    missing = [name for name in names if name not in stored or stored[name].dtype.kind not in "fiu"]
+    if missing:
+        raise InputError(f"{file}: expected {', '.join(names)} as columns of numbers, got no {', '.join(missing)}")
+    columns = [np.asarray(stored[name], dtype=float) for name in names]
     if any(column.shape != columns[0].shape or column.ndim != 1 or np.isnan(column).any() for column in columns):
         raise InputError(f"{file}: expected {', '.join(names)} as columns of one length without nan")
     return columns

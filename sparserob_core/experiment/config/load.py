@@ -44,10 +44,14 @@ class Loaded:
 
 
 def load_config(
-    config: str | File | Mapping[str, Any], overrides: Mapping[str, object] | Iterable[str] | None = None
+    config: str | File | Mapping[str, Any],
+    overrides: Mapping[str, object] | Iterable[str] | None = None,
+    known: Registry | None = None,
 ) -> Loaded:
     """Read a config, apply the overrides, and check every key of it against the installed plugins.
 
+    ``known``: the components that there are, for a config that somebody else has left. No plugin that the config names
+    is loaded then; a component that is not known stands as it is, and is refused by its name where it is built.
     Raises `ConfigError`: one line for each key at fault, ``file:line:column: key.path: what is wrong (got ...)``.
     """
     given = read_source(config)
@@ -61,8 +65,8 @@ def load_config(
         apply_override(data, change)
         _spell_out(data)
     wrong = list(malformed(data))
-    registry = _registry(data, given, changes)
-    resolved, more = _checked(data, registry)
+    registry = _registry(data, given, changes) if known is None else known
+    resolved, more = _checked(data, registry, strangers=known is not None)
     if wrong or more or resolved is None:
         raise _refusal(given, changes, wrong or more)
     if not resolved.title:
@@ -100,7 +104,7 @@ def _registry(data: dict[str, Any], source: Source, changes: tuple[Override, ...
         raise ConfigError(_line(source, changes, Complaint(("plugins",), str(error)))) from error
 
 
-def _checked(data: dict[str, Any], registry: Registry) -> tuple[RunConfig | None, list[Complaint]]:
+def _checked(data: dict[str, Any], registry: Registry, strangers: bool) -> tuple[RunConfig | None, list[Complaint]]:
     wrong: list[Complaint] = []
     checked: RunConfig | None = None
     try:
@@ -112,6 +116,8 @@ def _checked(data: dict[str, Any], registry: Registry) -> tuple[RunConfig | None
         options = {
             key: value for key, value in entry.items() if key != "name" and not (kind == "maximiser" and key in KEPT)
         }
+        if strangers and entry["name"] not in registry.names(kind):
+            continue
         try:
             typed, faults = registry.check(kind, entry["name"], options)
         except PluginError as error:

@@ -94,7 +94,12 @@ class RunConfig(Options):
 
     def digest(self) -> str:
         """Eight hexadecimal digits that change when the config does."""
-        return hashlib.sha256(json.dumps(self.plain(), sort_keys=True).encode()).hexdigest()[:8]
+        return digest(self.plain())
+
+
+def digest(plain: object) -> str:
+    """The digest of a resolved config, from its mappings, lists, numbers and text."""
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:8]
 
 
 SLOTS = {

@@ -1,55 +1,155 @@
-"""A finished run, read back from its directory: the experiment built again, and the control that was returned."""
+"""What a run directory holds, read back as data: the one reader of its files.
+
+Nothing that a directory names is executed: its config is checked against the components of this distribution and of
+the plugin files that the user names himself (`read_config`), arrays are plain numbers and text (`read_arrays`).
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
-from zipfile import BadZipFile
+from zipfile import BadZipFile, ZipFile
+from zlib import error as ZlibError
 
 import numpy as np
 
 from sparserob_core.errors import InputError
+from sparserob_core.experiment.directory.rounds import with_decisions
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.events import RoundFinished
+from sparserob_core.sip.result import MEANING
 
 if TYPE_CHECKING:
     from sparserob_core.experiment.assemble import Experiment
-
+    from sparserob_core.experiment.config.load import Loaded
 
 UNFINISHED = "the run has not finished"
+NUMBERS = ("cost", "value", "epsilon", "lower_bound", "upper_bound", "gap", "seconds")
+LARGEST = 2**31
+"""Bytes of arrays in one file, at most: no run writes as many, and a small file can pretend to hold any number."""
+SIMPLE = {"int": "iu", "float": "fiu", "str": "U", "bool": "b"}
+"""Types of the fields of a round that a column of ``trace.npz`` can hold, and the kinds of numpy that serve."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class StoredRun:
+    """The files of a run directory, each read when it is first asked for.
+
+    Every property raises `InputError` that names the file when it is missing, cannot be read, or does not fit.
+    """
+
+    directory: Path
+
+    @cached_property
+    def summary(self) -> dict[str, Any]:
+        """``result.json``."""
+        return read_summary(self.directory / "result.json")
+
+    @cached_property
+    def solution(self) -> dict[str, Array]:
+        """``solution.npz``; empty where there is none."""
+        return self.arrays("solution.npz")
+
+    @cached_property
+    def history(self) -> tuple[RoundFinished, ...]:
+        """The rounds: ``trace.npz``, with the decisions and the cuts that ``rounds.npz`` keeps of them. Columns that
+        are no field of `RoundFinished` are passed over: a later version may write more of them."""
+        file, trace = self.directory / "trace.npz", self.arrays("trace.npz")
+        plain = {name: kind for name, kind in RoundFinished.__annotations__.items() if kind in SIMPLE}
+        columns = {name: trace[name] for name in plain if name in trace}
+        count = len(columns["round"]) if columns.get("round", np.zeros(())).ndim else 0
+        for name, column in columns.items():
+            if column.shape != (count,) or column.dtype.kind not in SIMPLE[plain[name]]:
+                raise InputError(
+                    f"{file}: {name}: expected one entry of type {plain[name]} for each of {count} rounds, "
+                    f"got {column.dtype} of shape {column.shape}"
+                )
+        try:
+            rounds = [
+                RoundFinished(**{name: column[row].item() for name, column in columns.items()}) for row in range(count)
+            ]
+            return with_decisions(rounds, self.arrays("rounds.npz"))
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            raise InputError(f"{self.directory}: trace.npz and rounds.npz do not fit together: {error}") from None
+
+    def arrays(self, name: str) -> dict[str, Array]:
+        """The arrays of one of its ``.npz`` files; none when there is no such file."""
+        return read_arrays(self.directory / name)
+
+    def config(self, plugins: Iterable[str | Path] = ()) -> Loaded:
+        """``config.yaml``, see `read_config`."""
+        return read_config(self.directory, plugins)
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class FinishedRun:
-    """A run directory: its ``experiment``, the decision ``theta (m, N)``, ``summary`` (``result.json``) and
-    ``solution`` (``solution.npz``)."""
+    """A run directory: its ``experiment``, the decision ``theta (m, N)``, ``summary`` (``result.json``), ``solution``
+    (``solution.npz``), and the files themselves (``stored``)."""
 
-    directory: Path
+    stored: StoredRun
     experiment: Experiment
     theta: Array
-    summary: Mapping[str, Any]
-    solution: Mapping[str, Array]
+
+    @property
+    def directory(self) -> Path:
+        """Where it is."""
+        return self.stored.directory
+
+    @property
+    def summary(self) -> Mapping[str, Any]:
+        """``result.json``."""
+        return self.stored.summary
+
+    @property
+    def solution(self) -> Mapping[str, Array]:
+        """``solution.npz``."""
+        return self.stored.solution
 
 
-def read_finished(directory: Path) -> FinishedRun:
-    """Read a run directory; raises `InputError` when it is none, holds no control, or a file of it cannot be
-    understood."""
-    from sparserob_core.experiment.assemble import assemble
-    from sparserob_core.experiment.config.load import load_config
-
+def stored_run(directory: str | Path) -> StoredRun:
+    """The run in a directory; raises `InputError` when there is none."""
+    path = Path(directory)
     for name in ("config.yaml", "result.json"):
-        if not (directory / name).is_file():
-            raise InputError(f"{directory}: expected the directory of a run, got {_instead(directory, name)}")
-    summary = read_summary(directory / "result.json")
-    solution = read_arrays(directory / "solution.npz")
+        if not (path / name).is_file():
+            instead = f"one without {name}" if path.is_dir() else "a file" if path.exists() else "nothing"
+            raise InputError(f"{path}: expected the directory of a run, got {instead}")
+    return StoredRun(path)
+
+
+def read_config(directory: Path, plugins: Iterable[str | Path] = ()) -> Loaded:
+    """The config of a run directory, checked, as data: the components are those of this distribution and of the files
+    ``plugins``, which the user names, whatever the config says; another one is refused by its name when it is built.
+
+    Raises `InputError` when it cannot be understood.
+    """
+    from sparserob_core.experiment.config.load import load_config
+    from sparserob_core.experiment.plugins.registry import load_own_registry
+
+    if not (directory / "config.yaml").is_file():
+        stored_run(directory)
+    return load_config(directory / "config.yaml", known=load_own_registry(plugins))
+
+
+def read_finished(
+    directory: Path, plugins: Iterable[str | Path] = (), experiment: Experiment | None = None
+) -> FinishedRun:
+    """Read a run directory and build its experiment again, unless ``experiment`` is at hand; raises `InputError` when
+    it is none, holds no control, or a file of it cannot be understood. ``plugins`` as in `read_config`."""
+    from sparserob_core.experiment.assemble import assemble
+
+    stored = stored_run(directory)
+    summary, solution = stored.summary, stored.solution
     if "theta" not in solution:
         raise InputError(
-            f"{directory}: there is no control in it; the status is '{summary['status']}': {summary.get('message')}"
+            f"{directory}: there is no control in it; the status is '{summary['status']}': {summary['message']}"
         )
-    experiment = assemble(load_config(directory / "config.yaml"))
+    experiment = experiment or assemble(stored.config(plugins))
     if experiment.problem is None or experiment.control is None:
         raise InputError(
             f"{directory}: expected the run of a control problem, got one of another semi-infinite program"
@@ -60,7 +160,7 @@ def read_finished(directory: Path) -> FinishedRun:
             f"{directory / 'solution.npz'}: theta: expected finite numbers of shape {shape}, as config.yaml says, "
             f"got {theta.dtype} of shape {theta.shape}" + ("" if theta.shape != shape else " that are not all finite")
         )
-    return FinishedRun(directory, experiment, theta, summary, solution)
+    return FinishedRun(stored, experiment, theta)
 
 
 def read_arrays(file: Path) -> dict[str, Array]:
@@ -68,22 +168,58 @@ def read_arrays(file: Path) -> dict[str, Array]:
     if not file.is_file():
         return {}
     try:
+        with ZipFile(file) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+        if size > LARGEST:
+            raise InputError(f"{file}: cannot be read: expected arrays of at most {LARGEST} bytes in all, got {size}")
         with np.load(file, allow_pickle=False) as stored:
-            return {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile, AttributeError) as error:
-        raise InputError(f"{file}: cannot be read: {error}") from None
+            arrays = {name: stored[name] for name in stored.files}
+    except InputError:
+        raise
+    except (BadZipFile, EOFError):
+        raise InputError(
+            f"{file}: cannot be read: expected arrays in the format .npz, got something else, or a part of it"
+        ) from None
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read: {error.strerror or 'it is damaged'}") from None
+    except (ValueError, KeyError, AttributeError, TypeError, NotImplementedError, MemoryError, ZlibError, RuntimeError):
+        raise InputError(
+            f"{file}: cannot be read: expected arrays of numbers and text in the format .npz, got others"
+        ) from None
+    if any(not isinstance(array, np.ndarray) for array in arrays.values()):
+        raise InputError(
+            f"{file}: cannot be read: expected arrays of numbers and text in the format .npz, got other entries"
+        )
+    return arrays
+
+
+def read_json(file: Path) -> dict[str, Any]:
+    """The contents of a JSON file; raises `InputError` when it cannot be read, or is no object."""
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{file}: cannot be read: expected JSON: {error}") from None
+    if not isinstance(data, dict):
+        raise InputError(f"{file}: expected a JSON object, got {type(data).__name__}")
+    return data
 
 
 def read_summary(file: Path) -> dict[str, Any]:
     """The contents of ``result.json``; raises `InputError` when it is not the result of a run."""
-    try:
-        summary = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file}: cannot be read: {error}") from None
-    if not isinstance(summary, dict) or "status" not in summary:
-        raise InputError(f"{file}: expected the result of a run, with a status")
+    summary = read_json(file)
+    status = summary.get("status")
+    if not isinstance(status, str) or status not in MEANING:
+        raise InputError(f"{file}: expected the result of a run, with a status ({', '.join(MEANING)}), got {status!r}")
+    for name in NUMBERS:
+        value = summary.setdefault(name)
+        if value is not None and (isinstance(value, bool) or not isinstance(value, int | float)):
+            raise InputError(f"{file}: {name}: expected a number or null, got {value!r}")
+    for name in ("title", "message"):
+        if not isinstance(summary.setdefault(name, ""), str):
+            raise InputError(f"{file}: {name}: expected text, got {summary[name]!r}")
+    for name in ("worst", "sparsity", "counts"):
+        if not isinstance(summary.setdefault(name, {}), dict):
+            raise InputError(f"{file}: {name}: expected an object, got {summary[name]!r}")
     return summary
-
-
-def _instead(directory: Path, missing: str) -> str:
-    return f"one without {missing}" if directory.is_dir() else "a file" if directory.exists() else "nothing"

@@ -3,7 +3,7 @@ them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,7 @@ from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.transcribe import prepare
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.directory.adversary import adversaries
-from sparserob_core.experiment.directory.finished import read_arrays, read_finished
+from sparserob_core.experiment.directory.finished import read_finished
 from sparserob_core.experiment.directory.sparsity import sparsity
 from sparserob_core.experiment.figures.figure_data import FigureData, Wall
 from sparserob_core.sip.convex_set import Array, ConvexSet
@@ -63,18 +63,17 @@ def figure_data(
     return _data(experiment, problem, prepare(problem, control, disturbance), theta, active_times, history, cost)
 
 
-def draw_run(directory: Path) -> list[Path]:
-    """Draw the figures of a run directory again; raises `InputError` when it is none, or holds no control."""
-    finished = read_finished(directory)
-    trace = read_arrays(directory / "trace.npz")
-    rounds = [
-        RoundFinished(**{name: trace[name][row].item() for name in trace}) for row in range(len(trace.get("round", ())))
-    ]
+def draw_run(directory: Path, plugins: Iterable[str | Path] = ()) -> list[Path]:
+    """Draw the figures of a run directory again; raises `InputError` when it is none, or holds no control.
+
+    ``plugins``: files that offer what the run was made with; the directory itself is data, and no plugin that it names
+    is loaded."""
+    finished = read_finished(directory, plugins)
     return draw_experiment(
         finished.experiment,
         finished.theta,
         active_times(finished.solution),
-        rounds,
+        finished.stored.history,
         directory,
         finished.summary["cost"],
         adversaries(finished.experiment, finished.theta),

@@ -48,11 +48,9 @@ class Inspection:
     @staticmethod
     def read(directory: Path) -> Inspection:
         """The same from the directory of a run, finished or not; raises `InputError` when it is none."""
-        from sparserob_core.experiment.config.load import load_config
+        from sparserob_core.experiment.directory.finished import read_config
 
-        if not (directory / "config.yaml").is_file():
-            raise InputError(f"{directory}: expected the directory of a run, got one without config.yaml")
-        return Inspection(load_config(directory / "config.yaml"))
+        return Inspection(read_config(directory))
 
     @property
     def config(self) -> Mapping[str, Any]:

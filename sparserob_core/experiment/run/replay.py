@@ -2,48 +2,49 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.directory.finished import UNFINISHED, read_arrays
+from sparserob_core.experiment.directory.finished import UNFINISHED, StoredRun, stored_run
 from sparserob_core.experiment.run.events import Event, RunFinished, RunStarted
 from sparserob_core.experiment.run.inspection import Inspection
 from sparserob_core.experiment.run.viewer import recorder
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.events import Batch, EvaluationsFinished, RoundFinished
+from sparserob_core.sip.events import Batch, EvaluationsFinished
 from sparserob_core.sip.evidence import Cut
-from sparserob_core.sip.result import MEANING, Result, SearchTrace
-
-if TYPE_CHECKING:
-    from sparserob_core.experiment.config.load import Loaded
+from sparserob_core.sip.result import Result, SearchTrace
 
 BATCHES = 100  # of the evaluations of a run
 PATIENCE = 60.0  # seconds that the landscape may take
 
 
 def replay(
-    directory: str | Path, *, save: str | Path | None = None, serve: bool = False, connect: str | None = None
+    directory: str | Path,
+    *,
+    save: str | Path | None = None,
+    serve: bool = False,
+    connect: str | None = None,
+    plugins: Iterable[str | Path] = (),
 ) -> Path:
     """Send a finished run to the viewer of Rerun, as `watch` does: what ``sparserob replay RUN`` does. Returns the
     run's directory.
 
-    What a run directory does not keep is missing: the controls of earlier rounds, and the tuples that were tried.
-    Raises `InputError` for a directory that holds no finished run.
+    The controls of all rounds come from ``rounds.npz``, the evaluations of g from ``evaluations.npz``; of the searches
+    for violated constraints a run directory keeps nothing. ``plugins``: files that offer what the run was made with;
+    the directory itself is data, and no plugin that it names is loaded. Raises `InputError` for a directory that holds
+    no finished run.
     """
-    path = Path(directory)
-    loaded, summary = _config(path), _summary(path)
-    play(
-        events(Inspection(loaded), str(summary.get("title") or path.name), path, stored(path, summary)),
-        save=save,
-        serve=serve,
-        connect=connect,
-    )
-    return path
+    run = stored_run(directory)
+    if run.summary["message"] == UNFINISHED:
+        raise InputError(f"{directory}: expected a finished run, got one that is still going on or was killed")
+    title = run.summary["title"] or run.directory.name
+    inspection, result = Inspection(run.config(plugins)), stored_result(run)
+    play(events(inspection, title, run.directory, result), save=save, serve=serve, connect=connect)
+    return run.directory
 
 
 def play(told: Iterator[Event], *, save: str | Path | None, serve: bool, connect: str | None) -> None:
@@ -76,16 +77,14 @@ def events(inspection: Inspection, title: str, directory: Path | None, result: R
     yield RunFinished(status=result.status, message=result.message, seconds=result.seconds, result=result)
 
 
-def stored(directory: Path, summary: Mapping[str, Any]) -> Result:
+def stored_result(run: StoredRun) -> Result:
     """The result that a run directory holds."""
-    solution, trace = read_arrays(directory / "solution.npz"), read_arrays(directory / "trace.npz")
-    history = tuple(_round(trace, row) for row in range(len(trace.get("round", ()))))
+    summary, solution, evaluations = run.summary, run.solution, run.arrays("evaluations.npz")
     decision = solution.get("decision", np.zeros(0))
-    evaluations = read_arrays(directory / "evaluations.npz")
     try:
         return Result(
             status=summary["status"],
-            message=str(summary["message"]),
+            message=summary["message"],
             decision=decision if decision.size else None,
             cost=_number(summary, "cost"),
             value=_number(summary, "value"),
@@ -93,47 +92,18 @@ def stored(directory: Path, summary: Mapping[str, Any]) -> Result:
             lower_bound=_number(summary, "lower_bound", -np.inf),
             upper_bound=_number(summary, "upper_bound", np.inf),
             indices=_cuts(solution),
-            history=history,
+            history=run.history,
             trace=SearchTrace.stored(evaluations) if evaluations else None,
             seconds=_number(summary, "seconds", 0.0),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
-            f"{directory}: expected the files of a run, got some that do not fit together: {error}"
+            f"{run.directory}: expected the files of a run, got some that do not fit together: {error}"
         ) from error
-
-
-def _config(directory: Path) -> Loaded:
-    from sparserob_core.experiment.config.load import load_config
-
-    for name in ("config.yaml", "result.json"):
-        if not (directory / name).is_file():
-            instead = f"one without {name}" if directory.is_dir() else "a file" if directory.exists() else "nothing"
-            raise InputError(f"{directory}: expected the directory of a run, got {instead}")
-    return load_config(directory / "config.yaml")
-
-
-def _summary(directory: Path) -> dict[str, Any]:
-    file = directory / "result.json"
-    try:
-        summary = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file}: cannot be read: {error}") from None
-    if not isinstance(summary, dict) or summary.get("status") not in MEANING:
-        raise InputError(f"{file}: expected the result of a run, with a status")
-    if summary.get("message") == UNFINISHED:
-        raise InputError(f"{directory}: expected a finished run, got one that is still going on or was killed")
-    return summary
 
 
 def _number(summary: Mapping[str, Any], name: str, missing: float = np.nan) -> float:
     return missing if summary.get(name) is None else float(summary[name])
-
-
-def _round(trace: Mapping[str, Array], row: int) -> RoundFinished:
-    return RoundFinished(
-        **{name: column[row].item() for name, column in trace.items() if name in RoundFinished.__dataclass_fields__}
-    )
 
 
 def _cuts(solution: Mapping[str, Array]) -> tuple[Cut, ...]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.plugins.registry import load_registry
+from sparserob_core.experiment.plugins.registry import load_own_registry
 
 if TYPE_CHECKING:
     from sparserob_core.experiment.run.events import Observer
@@ -37,7 +37,7 @@ def recorder(save: str | Path | None, serve: bool, connect: str | None, patience
         options["save"] = str(_writable(Path(save)))
     if patience is not None:
         options["landscape"] = {"patience": patience}
-    observer: Observer = load_registry().build("observer", "rerun", options)
+    observer: Observer = load_own_registry().build("observer", "rerun", options)
     return observer
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -43,6 +43,7 @@ def simulate(
     seed: int = 0,
     *,
     out: str | Path | None = None,
+    plugins: Iterable[str | Path] = (),
     tell: Callable[[str], None] | None = None,
 ) -> Simulation:
     """Propagate sampled trajectories of a finished run exactly: what ``sparserob simulate RUN`` does.
@@ -50,8 +51,9 @@ def simulate(
     ``law`` is one of ``iid``, ``vertices``, ``slow``, ``neighbours``, or ``adversary``, which replays the worst case of
     every constraint and takes no number of ``trajectories`` (10 000 otherwise). The result is written to
     ``simulation-<law>.json`` in the run's directory, and drawn into the file ``out`` when given. ``tell`` receives a
-    line about the progress now and then. Raises `InputError` for a directory that is no finished run with a control, or
-    another argument at fault, before anything is written.
+    line about the progress now and then. ``plugins``: files that offer what the run was made with; the directory itself
+    is data, and no plugin that it names is loaded. Raises `InputError` for a directory that is no finished run with a
+    control, or another argument at fault, before anything is written.
     """
     from sparserob_core.experiment.figures.style import require_writable
     from sparserob_core.experiment.simulation.figure import write_simulation
@@ -59,7 +61,7 @@ def simulate(
     count = _checked(law, trajectories, seed)
     if out is not None:
         require_writable(Path(out))
-    finished = read_finished(_directory(run))
+    finished = read_finished(_directory(run), plugins, getattr(run, "experiment", None))
     place = scene(finished.experiment, finished.theta)
     assert place is not None
     if not place.constraints:

@@ -12,7 +12,14 @@ from sparserob_core.experiment.terminal.printing import EXIT, print_json
 @click.command()
 @click.argument("directory", metavar="RUN", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print the verdicts as JSON instead of the table.")
-def check(directory: Path, as_json: bool) -> int:
+@click.option(
+    "--plugins",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="A plugin file that RUN was made with. RUN is data: no plugin that it names is loaded. Repeatable.",
+)
+def check(directory: Path, as_json: bool, plugins: tuple[Path, ...]) -> int:
     """Verify a finished run: every claim of its certificate, derived anew.
 
     Reads RUN/config.yaml and RUN/certificate.json, computes every bound again in ball arithmetic, and shares no code
@@ -22,10 +29,10 @@ def check(directory: Path, as_json: bool) -> int:
     """
     from dataclasses import asdict
 
-    from sparserob_core.experiment.check import check as verify
+    from sparserob_core.experiment.check.check import check as verify
     from sparserob_core.experiment.terminal.table import print_table
 
-    found = verify(directory)
+    found = verify(directory, plugins)
     if as_json:
         print_json(
             {

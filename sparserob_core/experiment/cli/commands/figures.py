@@ -9,10 +9,17 @@ import click
 
 @click.command()
 @click.argument("directory", metavar="RUN", type=click.Path(path_type=Path))
-def figures(directory: Path) -> int:
+@click.option(
+    "--plugins",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="A plugin file that RUN was made with. RUN is data: no plugin that it names is loaded. Repeatable.",
+)
+def figures(directory: Path, plugins: tuple[Path, ...]) -> int:
     """Draw the figures of a finished run again, into RUN/figures."""
     from sparserob_core.experiment.figures.drawing import draw_run
 
-    for file in draw_run(directory):
+    for file in draw_run(directory, plugins):
         click.echo(str(file))
     return 0

@@ -14,15 +14,22 @@ import click
 )
 @click.option("--serve", is_flag=True, help="Show it in a browser of this machine, until Ctrl-C.")
 @click.option("--connect", metavar="ADDRESS", help="Send it to a viewer that listens there, such as 127.0.0.1:9876.")
-def replay(directory: Path, save: Path | None, serve: bool, connect: str | None) -> int:
+@click.option(
+    "--plugins",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="A plugin file that RUN was made with. RUN is data: no plugin that it names is loaded. Repeatable.",
+)
+def replay(directory: Path, save: Path | None, serve: bool, connect: str | None, plugins: tuple[Path, ...]) -> int:
     """Show the finished run RUN in the viewer of Rerun; nothing is solved again.
 
-    An optional extra: pip install 'sparserob[rerun]'. Controls of earlier rounds are only in a recording that was made
-    during the run.
+    An optional extra: pip install 'sparserob[rerun]'. The controls of all rounds come from RUN/rounds.npz; the searches
+    for violated constraints are only in a recording that was made during the run.
     """
     from sparserob_core.experiment.run.replay import replay as replay_run
 
-    replay_run(directory, save=save, serve=serve, connect=connect)
+    replay_run(directory, save=save, serve=serve, connect=connect, plugins=plugins)
     if save is not None:
         click.echo(f"recorded into {save}")
     return 0

@@ -33,7 +33,22 @@ PATIENCE = 2.0  # seconds of silence
     type=click.Path(path_type=Path),
     help="Draw the trajectories into this file, which ends in .png, .pdf or .svg.",
 )
-def simulate(directory: Path, trajectories: int | None, law: str, seed: int, as_json: bool, out: Path | None) -> int:
+@click.option(
+    "--plugins",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="A plugin file that RUN was made with. RUN is data: no plugin that it names is loaded. Repeatable.",
+)
+def simulate(
+    directory: Path,
+    trajectories: int | None,
+    law: str,
+    seed: int,
+    as_json: bool,
+    out: Path | None,
+    plugins: tuple[Path, ...],
+) -> int:
     """Propagate random trajectories of the finished run RUN exactly, and count how many violate each constraint.
 
     Writes RUN/simulation-LAW.json. A sample is no proof: the table sets beside it the worst case, which random signals
@@ -53,7 +68,7 @@ def simulate(directory: Path, trajectories: int | None, law: str, seed: int, as_
             sys.stderr.write(f"\r{line}\033[K")
 
     try:
-        found = propagate(directory, trajectories, law, seed, out=out, tell=tell)
+        found = propagate(directory, trajectories, law, seed, out=out, plugins=plugins, tell=tell)
     finally:
         if not silent:
             sys.stderr.write("\r\033[K")

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import time
-import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
-from typing import Any, final
-from zipfile import BadZipFile
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
 from sparserob_core.checker.outcome import Claim
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.errors import InputError
+from sparserob_core.experiment.config.run_config import digest
+from sparserob_core.experiment.directory.finished import StoredRun, read_json, stored_run
+
+if TYPE_CHECKING:
+    from sparserob_core.experiment.config.load import Loaded
 
 STATUS = {"holds": 0, "not checked": 1, "fails": 2}
 
@@ -37,58 +38,50 @@ class Check:
         return ("verified", "undecided", "refuted")[worst]
 
 
-def check(directory: str | Path) -> Check:
+def check(directory: str | Path, plugins: Iterable[str | Path] = ()) -> Check:
     """Verify the run in ``directory``: its certificate against its config in ball arithmetic, ``result.json`` and
     ``solution.npz`` against both.
 
-    Nothing is solved, and nothing of what solved it is used. Raises `InputError` when the directory is not that of a
+    Nothing is solved, and nothing of what solved it is used. ``plugins``: files that offer the problem or a dictionary
+    where these are no part of this distribution; the directory itself is data, and no plugin that it names is loaded.
+    Raises `InputError` when the directory is not that of a
     finished run with a certificate.
     """
     from sparserob_core.checker.claims.case import Case
     from sparserob_core.checker.claims.claims import check as derive
     from sparserob_core.experiment.assemble import described, gap_tolerance
-    from sparserob_core.experiment.config.load import load_config
 
-    path, started = Path(directory), time.perf_counter()
-    data, summary = _read(path, "certificate.json"), _read(path, "result.json")
-    experiment = described(load_config(path / "config.yaml"))
+    started, stored = time.perf_counter(), stored_run(directory)
+    path = stored.directory
+    if not (path / "certificate.json").is_file():
+        raise InputError(f"{path}: expected the directory of a finished run, got one without certificate.json")
+    data, summary = read_json(path / "certificate.json"), read_json(path / "result.json")
+    experiment = described(stored.config(plugins))
     if experiment.problem is None or experiment.control is None or experiment.disturbance is None:
         raise InputError(
             f"{path}: expected the run of a control problem; certificates of other programs cannot be checked"
         )
     case = Case(experiment.problem, experiment.control, experiment.disturbance, data)
     claims = [
-        _config(experiment.loaded.config.digest(), data, summary),
+        _config(experiment.loaded, data, summary),
         *derive(case, gap_tolerance(experiment.loaded)),
         _result(data, summary),
-        _solution(path, data, experiment.control),
+        _solution(stored, data, experiment.control),
     ]
     return Check(experiment.loaded.config.title or path.name, tuple(claims), time.perf_counter() - started)
 
 
-def _read(path: Path, name: str) -> dict[str, Any]:
-    try:
-        data = json.loads((path / name).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(
-            f"{path}: expected the directory of a finished run, got one whose {name} cannot be read: {error.strerror}"
-        ) from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path / name}: expected JSON: {error}") from error
-    if not isinstance(data, dict):
-        raise InputError(f"{path / name}: expected a JSON object, got {type(data).__name__}")
-    return data
-
-
-def _config(digest: str, data: Mapping[str, Any], summary: Mapping[str, Any]) -> Claim:
-    if data.get("config") != digest or summary.get("config") != digest:
+def _config(loaded: Loaded, data: Mapping[str, Any], summary: Mapping[str, Any]) -> Claim:
+    """An earlier version had fewer keys: the digest is of the config as it is read today, or as it is written."""
+    found, written = loaded.config.digest(), digest(loaded.source.data)
+    if data.get("config") not in (found, written) or summary.get("config") != data.get("config"):
         return Claim(
             "config",
             "fails",
-            f"config.yaml is {digest}, the certificate is about {data.get('config')!r}, "
+            f"config.yaml is {found}, the certificate is about {data.get('config')!r}, "
             f"result.json about {summary.get('config')!r}",
         )
-    return Claim("config", "holds", f"the certificate is about this config ({digest})")
+    return Claim("config", "holds", f"the certificate is about this config ({data['config']})")
 
 
 def _result(data: Mapping[str, Any], summary: Mapping[str, Any]) -> Claim:
@@ -118,21 +111,24 @@ def _gap(summary: Mapping[str, Any]) -> list[str]:
     return [] if abs(gap - derived) <= 1e-12 else [f"gap is {gap!r}, not {derived!r}"]
 
 
-def _solution(path: Path, data: Mapping[str, Any], dictionary: Dictionary) -> Claim:
+def _solution(stored: StoredRun, data: Mapping[str, Any], dictionary: Dictionary) -> Claim:
     """``solution.npz`` must hold the certificate's decision."""
     if data.get("decision") is None:
         return Claim("solution.npz", "holds", "there is no decision")
     try:
-        with np.load(BytesIO((path / "solution.npz").read_bytes()), allow_pickle=False) as stored:
-            theta, control, breakpoints = stored["theta"], stored["control"], stored["breakpoints"]
+        theta, control, breakpoints = (stored.solution[name] for name in ("theta", "control", "breakpoints"))
         decision = np.array(data["decision"], dtype=float)
         same = (
             np.array_equal(theta, decision)
             and np.array_equal(breakpoints, dictionary.breakpoints)
             and np.allclose(control, decision @ dictionary.values, rtol=0.0, atol=1e-12)
         )
-    except (OSError, EOFError, ValueError, KeyError, TypeError, OverflowError, BadZipFile, zlib.error) as error:
+    except InputError as error:
         return Claim("solution.npz", "fails", f"it cannot be read: {error}")
+    except KeyError as error:
+        return Claim("solution.npz", "fails", f"it holds no array {error}")
+    except (ValueError, TypeError, OverflowError):
+        return Claim("solution.npz", "fails", "its control and the certificate's are no arrays of one shape")
     if not same:
         return Claim("solution.npz", "fails", "its control is not the certificate's")
     return Claim("solution.npz", "holds", "it holds the certificate's control")
