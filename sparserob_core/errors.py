@@ -69,8 +69,15 @@ class NotEnclosable(InputError):
     supported."""
 
 
-class PluginError(InputError):
-    """A plugin is missing, broken, or registered twice."""
+class PluginError(SparseRobError):
+    """A plugin or one of its components is at fault: its code raised, or returned what its kind must not return. The
+    message names the component, its kind, and the plugin with its file or distribution."""
+
+
+class UnknownPluginError(PluginError, InputError):
+    """A component or a plugin is unknown, not installed, disabled, or registered twice."""
+
+    exit_status = 2
 
 
 class SolverError(SparseRobError):

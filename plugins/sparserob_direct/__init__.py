@@ -14,7 +14,7 @@ class Direct(sr.Maximiser, sr.Options):
     """Dividing rectangles (Jones, Perttunen and Stuckman 1993), with the local bias of Gablonsky and Kelley (2001)
     unless switched off.
 
-    Deterministic: the generator is not used. It proves no upper bound, unless every side of the box has length zero.
+    Deterministic: the generator is not used. It proves no upper bound.
     """
 
     eps: float = Field(default=1e-8, ge=0.0, le=1.0)
@@ -27,16 +27,11 @@ class Direct(sr.Maximiser, sr.Options):
         """See `sparserob_core.Maximiser`."""
         from scipy.optimize import Bounds, direct
 
-        lower, upper = objective.domain.lower, objective.domain.upper
-        free = lower < upper
-        if not free.any():
-            return float(objective.evaluate(lower[np.newaxis])[0])
-        descent = _Descent(objective, free)
         # An iteration takes two evaluations at least, so only the budget ends the search; scipy allocates memory for
         # maxiter.
         direct(
-            descent,
-            Bounds(lower[free], upper[free]),
+            _Descent(objective),
+            Bounds(objective.domain.lower, objective.domain.upper),
             eps=self.eps,
             maxfun=objective.remaining,
             maxiter=objective.remaining + 1,
@@ -48,22 +43,20 @@ class Direct(sr.Maximiser, sr.Options):
 
 
 class _Descent:
-    """The negated objective at one point, in the coordinates that can move.
+    """The negated objective at one point.
 
     scipy finishes its iteration beyond ``maxfun``, and averages values: once the budget is spent, and where the
     objective is ``-inf``, it is told the worst finite value that was seen.
     """
 
-    def __init__(self, objective: sr.Objective, free: np.ndarray) -> None:
-        self.objective, self.free = objective, free
-        self.point, self.worst = objective.domain.lower.copy(), -np.inf
+    def __init__(self, objective: sr.Objective) -> None:
+        self.objective, self.worst = objective, -np.inf
 
-    def __call__(self, moved: np.ndarray) -> float:
+    def __call__(self, point: np.ndarray) -> float:
         domain = self.objective.domain
         if not self.objective.remaining:
             return self._substitute()
-        self.point[self.free] = np.clip(moved, domain.lower[self.free], domain.upper[self.free])
-        value = -float(self.objective.evaluate(self.point[np.newaxis])[0])
+        value = -float(self.objective.evaluate(np.clip(point, domain.lower, domain.upper)[np.newaxis])[0])
         if np.isinf(value):
             return self._substitute()
         self.worst = max(self.worst, value)

@@ -21,7 +21,7 @@ class DualAnnealing(sr.Maximiser, sr.Options):
     has moved. Its visiting distribution narrows with the temperature and has moves of one coordinate, so Belisle's
     condition (1992) does not hold; ``simulated_annealing`` keeps it. It chooses by its own acceptance, whatever
     selection rule the method was given. In a space of tuples every other step changes every block. It proves no upper
-    bound, unless every side of the box has length zero.
+    bound.
     """
 
     initial_temp: float = Field(default=5230.0, gt=0.01, le=5e4)
@@ -44,17 +44,14 @@ class DualAnnealing(sr.Maximiser, sr.Options):
         from scipy.optimize import dual_annealing
 
         lower, upper = objective.domain.lower, objective.domain.upper
-        free = lower < upper
-        if not free.any():
-            return float(objective.evaluate(lower[np.newaxis])[0])
-        start = objective.best_point[free] if objective.evaluations else None
+        start = objective.best_point if objective.evaluations else None
         # scipy renamed the argument (1.15), and knows no end but a count of its iterations: the objective ends the
         # search.
         seeded: dict[str, Any] = {"rng" if "rng" in inspect.signature(dual_annealing).parameters else "seed": rng}
         while objective.remaining:
             dual_annealing(
-                _Energy(objective, free),
-                list(zip(lower[free], upper[free], strict=True)),
+                _Energy(objective),
+                list(zip(lower, upper, strict=True)),
                 maxiter=objective.remaining + 1,
                 initial_temp=self.initial_temp,
                 restart_temp_ratio=self.restart_temp_ratio,
@@ -68,17 +65,15 @@ class DualAnnealing(sr.Maximiser, sr.Options):
 
 
 class _Energy:
-    """The negated objective at one point, in the coordinates that can move; where the objective is ``-inf``, which
+    """The negated objective at one point; where the objective is ``-inf``, which
     scipy's differences cannot rank, the worst finite value that was seen."""
 
-    def __init__(self, objective: sr.Objective, free: np.ndarray) -> None:
-        self.objective, self.free = objective, free
-        self.lower, self.upper = objective.domain.lower[free], objective.domain.upper[free]
-        self.point, self.worst = objective.domain.lower.copy(), -np.inf
+    def __init__(self, objective: sr.Objective) -> None:
+        self.objective, self.worst = objective, -np.inf
 
-    def __call__(self, moved: np.ndarray) -> float:
-        self.point[self.free] = np.clip(moved, self.lower, self.upper)
-        value = -float(self.objective.evaluate(self.point[np.newaxis])[0])
+    def __call__(self, point: np.ndarray) -> float:
+        domain = self.objective.domain
+        value = -float(self.objective.evaluate(np.clip(point, domain.lower, domain.upper)[np.newaxis])[0])
         if np.isinf(value):
             return self.worst if np.isfinite(self.worst) else 0.0
         self.worst = max(self.worst, value)

@@ -37,11 +37,7 @@ class GradientAscent(sr.Maximiser, sr.Options):
 
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
         """See `sparserob_core.Maximiser`."""
-        lower, upper = objective.domain.lower, objective.domain.upper
-        free = lower < upper
-        if not free.any():
-            return float(objective.evaluate(lower[np.newaxis])[0])
-        climb = _Climb(objective, free)
+        climb = _Climb(objective)
         start = objective.best_point if objective.evaluations else climb.uniform(rng)
         while objective.remaining:
             climb.run(start, self.steps)
@@ -50,16 +46,16 @@ class GradientAscent(sr.Maximiser, sr.Options):
 
 
 class _Climb:
-    """Ascents in the coordinates ``s (f,)`` of ``[0, SCALE]`` that can move."""
+    """Ascents in the coordinates ``s (d,)`` of ``[0, SCALE]``."""
 
-    def __init__(self, objective: sr.Objective, free: np.ndarray) -> None:
-        self.objective, self.free, self.domain = objective, np.flatnonzero(free), objective.domain
-        self.width = (objective.domain.upper - objective.domain.lower)[free]
+    def __init__(self, objective: sr.Objective) -> None:
+        self.objective, self.domain = objective, objective.domain
+        self.width = objective.domain.upper - objective.domain.lower
         self.slope, self.at, self.worst, self.ascent = np.zeros(objective.domain.dimension), np.zeros(0), np.inf, 0
 
     def uniform(self, rng: np.random.Generator) -> sr.Array:
         """A uniform point of the box."""
-        return self.place(SCALE * rng.random(self.free.size))
+        return self.place(SCALE * rng.random(self.width.size))
 
     def redrawn(self, rng: np.random.Generator) -> sr.Array:
         """The best point, with the blocks anew in which the last gradient there was zero."""
@@ -73,16 +69,14 @@ class _Climb:
 
     def place(self, scaled: sr.Array) -> sr.Array:
         """The point of the box."""
-        point = self.domain.lower.copy()
-        point[self.free] += scaled / SCALE * self.width
-        return np.clip(point, self.domain.lower, self.domain.upper)
+        return np.clip(self.domain.lower + scaled / SCALE * self.width, self.domain.lower, self.domain.upper)
 
     def run(self, start: sr.Array, steps: int) -> None:
         """One ascent; a value of ``-inf`` is shown to the local method as the worst that was seen."""
         from scipy.optimize import minimize
 
         self.ascent += 1
-        scaled = np.clip((start - self.domain.lower)[self.free] / self.width, 0.0, 1.0) * SCALE
+        scaled = np.clip((start - self.domain.lower) / self.width, 0.0, 1.0) * SCALE
         minimize(
             self.descent,
             scaled,
@@ -102,22 +96,18 @@ class _Climb:
             self.worst = min(self.worst, value)
         if np.array_equal(point, self.objective.best_point):
             self.slope, self.at = slope, point
-        self.objective.note(ascent=self.ascent, slope=float(np.abs(slope[self.free] * self.width).max()))
+        self.objective.note(ascent=self.ascent, slope=float(np.abs(slope * self.width).max()))
         shown = value if np.isfinite(value) else (self.worst if np.isfinite(self.worst) else 0.0)
-        return -shown, -slope[self.free] * self.width / SCALE
+        return -shown, -slope * self.width / SCALE
 
     def differences(self, point: sr.Array) -> tuple[float, sr.Array]:
         """One-sided differences, inwards, in batches that fit into memory; 0 where a value is not finite."""
         value, slope = float(self.objective.evaluate(point[np.newaxis])[0]), np.zeros(point.size)
-        inside = point[self.free] + STEP * self.width <= self.domain.upper[self.free]
-        moved = np.clip(
-            point[self.free] + np.where(inside, STEP, -STEP) * self.width,
-            self.domain.lower[self.free],
-            self.domain.upper[self.free],
-        )
+        inside = point + STEP * self.width <= self.domain.upper
+        moved = np.clip(point + np.where(inside, STEP, -STEP) * self.width, self.domain.lower, self.domain.upper)
         batch = max(1, NUMBERS // point.size)
-        for first in range(0, self.free.size if np.isfinite(value) else 0, batch):
-            axes = self.free[first : first + batch]
+        for first in range(0, point.size if np.isfinite(value) else 0, batch):
+            axes = np.arange(first, min(first + batch, point.size))
             beside = np.repeat(point[np.newaxis], axes.size, axis=0)
             beside[np.arange(axes.size), axes] = moved[first : first + batch]
             values, run = self.objective.evaluate(beside), moved[first : first + batch] - point[axes]

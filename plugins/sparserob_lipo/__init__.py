@@ -40,8 +40,6 @@ class Lipo(sr.Maximiser, sr.Options):
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
         """See `sparserob_core.Maximiser`."""
         walk = Walk(objective, rng, uniform_scale=True)
-        if not walk.dimension:
-            return float(objective.evaluate(objective.domain.lower[np.newaxis])[0])
         if self.constant is None:
             while objective.remaining:
                 walk.explore()
@@ -64,7 +62,7 @@ class AdaLipo(sr.Maximiser, sr.Options):
 
     Consistent for every Lipschitz function because ``exploration > 0`` (proven there), however the other candidates are
     drawn: as in `Lipo` in turn from the whole box and from ever smaller boxes around the best point, 1024 at most, then
-    one of a high bound. It proves no upper bound, unless every side of the box has length zero. Values of ``-inf`` take
+    one of a high bound. It proves no upper bound. Values of ``-inf`` take
     no part in the slopes.
 
     In high dimension: nearly nothing is excluded, and the search tends to pure random search. A function that is not
@@ -83,8 +81,6 @@ class AdaLipo(sr.Maximiser, sr.Options):
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
         """See `sparserob_core.Maximiser`."""
         walk = Walk(objective, rng, uniform_scale=False)
-        if not walk.dimension:
-            return float(objective.evaluate(objective.domain.lower[np.newaxis])[0])
         ratio = math.log1p(self.growth or 0.01 / walk.dimension)
         while objective.remaining:
             constant = _on_grid(walk.evaluated.slope, ratio)

@@ -21,7 +21,7 @@ WORK: Final = 2**31  # differences of coordinates that the candidates of one eva
 
 
 class Walk:
-    """Evaluates one point after the other, in coordinates ``z = (x - lower) / scale`` of the sides that have a length.
+    """Evaluates one point after the other, in coordinates ``z = (x - lower) / scale``.
 
     ``scale`` is the length of the longest side, or ``(d,)`` that of each: then ``z`` lies in the unit cube. Values of
     ``-inf`` are counted, and take no part in slopes and exclusions.
@@ -29,19 +29,14 @@ class Walk:
 
     def __init__(self, objective: sr.Objective, rng: np.random.Generator, uniform_scale: bool) -> None:
         self.objective, self.rng = objective, rng
-        self.moving = np.flatnonzero(objective.domain.lower < objective.domain.upper)
-        self.lower, self.upper = objective.domain.lower[self.moving], objective.domain.upper[self.moving]
+        self.lower, self.upper = objective.domain.lower, objective.domain.upper
+        self.dimension = objective.domain.dimension
         self.sides = self.upper - self.lower
-        self.scale = np.full_like(self.sides, self.sides.max(initial=0.0)) if uniform_scale else self.sides
-        self.evaluated = Evaluated(max(1, self.moving.size), objective.remaining + 1)
+        self.scale = np.full_like(self.sides, self.sides.max()) if uniform_scale else self.sides
+        self.evaluated = Evaluated(self.dimension, objective.remaining + 1)
         self.undefined, self.drawn, self.rejected, self._last, self._skipped = 0, 0, 0, FEWEST, 0
         if objective.evaluations and np.isfinite(objective.best_value):
-            self.evaluated.add(self._scaled(objective.best_point[self.moving]), objective.best_value)
-
-    @property
-    def dimension(self) -> int:
-        """How many coordinates can move."""
-        return int(self.moving.size)
+            self.evaluated.add(self._scaled(objective.best_point), objective.best_value)
 
     def explore(self) -> None:
         """Evaluate a uniform point."""
@@ -100,11 +95,9 @@ class Walk:
         scaled: np.ndarray = (points - self.lower) / self.scale
         return scaled
 
-    def _evaluate(self, moved: np.ndarray) -> None:
-        point = self.objective.domain.lower.copy()
-        point[self.moving] = moved
+    def _evaluate(self, point: np.ndarray) -> None:
         value = float(self.objective.evaluate(point[np.newaxis])[0])
         if np.isfinite(value):
-            self.evaluated.add(self._scaled(moved), value)
+            self.evaluated.add(self._scaled(point), value)
         else:
             self.undefined += 1

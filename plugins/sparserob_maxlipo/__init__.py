@@ -51,11 +51,7 @@ class MaxLIPO(sr.Maximiser, sr.Options):
 
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
         """See `sparserob_core.Maximiser`."""
-        domain = objective.domain
-        free = domain.lower < domain.upper
-        if not free.any():
-            return float(objective.evaluate(domain.lower[np.newaxis])[0])
-        walk = _Walk(objective, free, rng)
+        walk = _Walk(objective, rng)
         walk.begin()
         waited = 0
         while objective.remaining:
@@ -69,12 +65,11 @@ class MaxLIPO(sr.Maximiser, sr.Options):
 
 
 class _Walk:
-    """One search: what was evaluated, in the unit box of the coordinates that can move, and the two kinds of step."""
+    """One search: what was evaluated, in the unit box, and the two kinds of step."""
 
-    def __init__(self, objective: sr.Objective, free: np.ndarray, rng: np.random.Generator) -> None:
-        self.objective, self.free, self.rng = objective, free, rng
-        self.blocks = np.flatnonzero(free) // objective.block
-        self.dimension = int(free.sum())
+    def __init__(self, objective: sr.Objective, rng: np.random.Generator) -> None:
+        self.objective, self.rng, self.dimension = objective, rng, objective.domain.dimension
+        self.blocks = np.arange(self.dimension) // objective.block
         self.slopes, self.ceiling = Slopes(self.dimension, objective.remaining + 1), Ceiling()
         self.ascents, self.reach = Ascents(self.slopes), 0.1
 
@@ -82,7 +77,7 @@ class _Walk:
         """The centre, or what an earlier search has found, then uniform points up to ``max(3, d)``, at most thirty."""
         domain, objective = self.objective.domain, self.objective
         if objective.evaluations and np.isfinite(objective.best_value):
-            unit = (objective.best_point - domain.lower)[self.free] / (domain.upper - domain.lower)[self.free]
+            unit = (objective.best_point - domain.lower) / (domain.upper - domain.lower)
             self.slopes.add(np.clip(unit, 0.0, 1.0), objective.best_value)
         else:
             self.evaluate(np.full(self.dimension, 0.5))
@@ -91,8 +86,7 @@ class _Walk:
 
     def evaluate(self, unit: np.ndarray) -> float:
         domain = self.objective.domain
-        point = domain.lower.copy()
-        point[self.free] = domain.lower[self.free] + unit * (domain.upper - domain.lower)[self.free]
+        point = domain.lower + unit * (domain.upper - domain.lower)
         value = float(self.objective.evaluate(np.clip(point, domain.lower, domain.upper)[np.newaxis])[0])
         self.slopes.add(unit, value)
         return value

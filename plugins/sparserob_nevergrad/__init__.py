@@ -49,13 +49,10 @@ class Nevergrad(sr.Maximiser, sr.Options):
             for key, name in (("optimiser", self.optimiser), ("fallback", self.fallback))
             if name
         ]
-        domain = objective.domain
-        if not (domain.lower < domain.upper).any():
-            return float(objective.evaluate(domain.lower[np.newaxis])[0])
         walk = _Walk(objective, rng)
         for name, following in zip(names, [*names[1:], None], strict=True):
             try:
-                walk.run(Guarded(registry[name], walk.free.size, objective.remaining, rng))
+                walk.run(Guarded(registry[name], objective.domain.dimension, objective.remaining, rng))
             except Failed as failure:
                 reason = (
                     f"nevergrad's {name} failed after {objective.evaluations} evaluations ({failure}); the search "
@@ -70,16 +67,13 @@ class Nevergrad(sr.Maximiser, sr.Options):
 
 
 class _Walk:
-    """The points and losses so far, in the unit box of the coordinates that can move."""
+    """The points and losses so far, in the unit box."""
 
     def __init__(self, objective: sr.Objective, rng: np.random.Generator) -> None:
-        domain = objective.domain
-        self.objective, self.free = objective, np.flatnonzero(domain.lower < domain.upper)
-        self.lower, self.upper = domain.lower[self.free], domain.upper[self.free]
-        self.point = domain.lower.copy()
+        self.objective, self.lower, self.upper = objective, objective.domain.lower, objective.domain.upper
         self.told: list[tuple[np.ndarray, float]] = []
         if objective.evaluations:
-            self.told.append((self._unit(objective.best_point[self.free]), _loss(objective.best_value)))
+            self.told.append((self._unit(objective.best_point), _loss(objective.best_value)))
 
     def run(self, optimiser: Guarded) -> None:
         """Ask, evaluate and tell until the budget is spent; raises `Failed` when the optimiser does."""
@@ -88,8 +82,8 @@ class _Walk:
             loss = None
             while self.objective.remaining:
                 unit = optimiser.next(loss)
-                self.point[self.free] = np.clip(self.lower + unit * (self.upper - self.lower), self.lower, self.upper)
-                value = float(self.objective.evaluate(self.point[np.newaxis])[0])
+                point = np.clip(self.lower + unit * (self.upper - self.lower), self.lower, self.upper)
+                value = float(self.objective.evaluate(point[np.newaxis])[0])
                 loss = _loss(value)
                 self.told.append((unit, loss))
                 self.objective.note(spread=self._spread(unit))
@@ -100,7 +94,7 @@ class _Walk:
         return np.asarray(np.clip((moved - self.lower) / (self.upper - self.lower), 0.0, 1.0))
 
     def _spread(self, unit: np.ndarray) -> float:
-        return float(np.sqrt(np.mean((unit - self._unit(self.objective.best_point[self.free])) ** 2)))
+        return float(np.sqrt(np.mean((unit - self._unit(self.objective.best_point)) ** 2)))
 
 
 def _loss(value: float) -> float:

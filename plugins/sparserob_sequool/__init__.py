@@ -22,7 +22,7 @@ class SequOOL(sr.Maximiser, sr.Options):
     The box is a tree of cells; to *open* a cell is to cut it into thirds across one coordinate and to evaluate the
     centres of the two outer ones (the middle one inherits its value). The root is opened, and at each depth
     ``h = 1, ..., hmax`` the ``floor(hmax / h)`` best cells, or all when there are fewer. Across depth ``h`` the cut is
-    across coordinate ``h`` modulo the number of those that can move. Of equal values the earlier cell is opened first
+    across coordinate ``h`` modulo the number of coordinates. Of equal values the earlier cell is opened first
     (children in the order left, right, centre), so that the search is deterministic: the generator is not used. All
     cells of one depth are evaluated in one batch.
 
@@ -32,8 +32,7 @@ class SequOOL(sr.Maximiser, sr.Options):
 
     Guarantee (proven there): no smoothness has to be known. If ``f(x) >= f* - nu rho^h`` holds on the cell of depth
     ``h`` around one maximiser, the regret falls exponentially in ``n / log n`` where the near-optimality dimension
-    ``d'`` is 0, and like ``(n / log n)^(-1/d')`` up to logarithms otherwise. No upper bound of the maximum is proven,
-    unless every side of the box has length zero.
+    ``d'`` is 0, and like ``(n / log n)^(-1/d')`` up to logarithms otherwise. No upper bound of the maximum is proven.
 
     In high dimension: a coordinate is cut only once in every ``d`` depths, so ``rho`` is about ``3^(-1/d)``;
     coordinates from ``hmax + 1`` on stay at the centre of the box for good (``hmax`` is about 140 for 1000
@@ -49,12 +48,8 @@ class SequOOL(sr.Maximiser, sr.Options):
 
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
         """See `sparserob_core.Maximiser`."""
-        domain = objective.domain
-        moving = np.flatnonzero(domain.lower < domain.upper)
-        if not moving.size:
-            return float(objective.evaluate(domain.lower[np.newaxis])[0])
         hmax = _paper(self.openings) if self.openings else _fill(objective.remaining)
-        _Tree(objective, moving[: hmax + 1], moving.size).grow(_schedule(hmax))
+        _Tree(objective, hmax + 1).grow(_schedule(hmax))
         return float("inf")
 
 
@@ -62,9 +57,10 @@ class _Tree:
     """The cells of one depth that can still be opened: centres ``(k, c)`` in the coordinates that are ever cut, and
     values ``(k,)``, best first."""
 
-    def __init__(self, objective: sr.Objective, cut: np.ndarray, period: int) -> None:
+    def __init__(self, objective: sr.Objective, depths: int) -> None:
         domain = objective.domain
-        self.objective, self.cut, self.period = objective, cut, period
+        self.objective, self.period = objective, domain.dimension
+        cut = self.cut = np.arange(min(depths, self.period))
         self.root = np.clip(0.5 * domain.lower + 0.5 * domain.upper, domain.lower, domain.upper)
         self.lower, self.upper = domain.lower[cut], domain.upper[cut]
         # how far the children of the next cut stand off

@@ -111,8 +111,6 @@ class SimulatedAnnealing(sr.Maximiser, sr.Options):
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
         """See `sparserob_core.Maximiser`."""
         moves = Moves(self, objective, rng)
-        if not moves.free.size:
-            return float(objective.evaluate(objective.domain.lower[np.newaxis])[0])
         start = first_temperature(self, self._sampled(objective, moves)[1])
         lowest, point, value = start * self.cooling_range, objective.best_point, objective.best_value
         for cycle in range(self.restarts + 1):

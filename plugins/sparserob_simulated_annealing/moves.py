@@ -32,7 +32,6 @@ class Moves:
         self.options, self.rng, self.lower, self.upper = options, rng, domain.lower, domain.upper
         self.dimension, self.widths = domain.dimension, domain.upper - domain.lower
         self.block = objective.block if objective.block < self.dimension else 1
-        self.free = np.flatnonzero(self.widths > 0.0)
         self.places = self.block if self.block > 1 else self.dimension
         each = options.adapt == "coordinate" and self.places * VISITS <= objective.remaining
         self.several = self.places if each else 1
@@ -64,7 +63,7 @@ class Moves:
         moved = current.copy()
         kind = next(self.uniforms)
         coarse = next(self.uniforms) < self.options.coarse
-        if kind < self.until_one or self.free.size == 1:
+        if kind < self.until_one or self.dimension == 1:
             self._one(moved, coarse)
         elif self.block > 1:
             self._blocks(moved, "few" if kind < self.until_few else "full", coarse)
@@ -113,8 +112,7 @@ class Moves:
                 self._shift_part(moved, part, self.factors[kind], coarse)
 
     def _random_coordinate(self) -> int:
-        drawn = int(next(self.uniforms) * self.free.size)
-        return drawn if self.free.size == self.dimension else int(self.free[drawn])
+        return int(next(self.uniforms) * self.dimension)
 
     def _shift(self, moved: np.ndarray, at: int, scale: float) -> None:
         """Move one coordinate, in place."""
@@ -146,8 +144,7 @@ class Moves:
         outside = (shifted < lower) | (shifted > upper)
         if outside.any():
             low, width = lower[outside], widths[outside]
-            period = np.where(width > 0.0, 2.0 * width, 1.0)
-            shifted[outside] = low + (width - np.abs(width - (shifted[outside] - low) % period))
+            shifted[outside] = low + (width - np.abs(width - (shifted[outside] - low) % (2.0 * width)))
         moved[part] = np.clip(shifted, lower, upper)
 
 

@@ -20,18 +20,34 @@ class SearchEnded(Exception):
 class Objective(Protocol):
     """What a maximiser is handed: a box, a batched function that counts, and a place for notes.
 
-    ``best_value`` is ``-inf`` and ``best_point`` is NaN before the first evaluation; when there was one
-    (``evaluations > 0``), the best point is a good one to start from. ``block`` consecutive coordinates belong
-    together: 1, or the coordinates of one index where points are tuples of indices; to change one block at a time is
-    then cheap. A maximiser reads, and never writes, the attributes.
+    The box has at least one coordinate, and ``lower < upper`` in every one: coordinates with a single value are not
+    shown, and where none can move no maximiser is asked.
     """
 
-    domain: Box
-    budget: int
-    evaluations: int
-    block: int
-    best_point: Array
-    best_value: float
+    @property
+    def domain(self) -> Box:
+        """Where the function is defined, ``d`` coordinates."""
+
+    @property
+    def block(self) -> int:
+        """How many consecutive coordinates belong together: 1, or the coordinates of one index where points are tuples
+        of indices; to change one block at a time is then cheap."""
+
+    @property
+    def budget(self) -> int:
+        """Evaluations that the search may spend in all."""
+
+    @property
+    def evaluations(self) -> int:
+        """Evaluations so far."""
+
+    @property
+    def best_point(self) -> Array:
+        """The best point so far ``(d,)``, a good one to start from; NaN while ``evaluations`` is 0."""
+
+    @property
+    def best_value(self) -> float:
+        """The best value so far; ``-inf`` while ``evaluations`` is 0."""
 
     @property
     def differentiable(self) -> bool:
@@ -44,7 +60,7 @@ class Objective(Protocol):
     def evaluate(self, points: Array) -> Array:
         """Values ``(k,)`` at points ``(k, d)``; NaN comes back as ``-inf``.
 
-        A point outside the domain raises `InputError`. With fewer than ``k`` evaluations left, the first ``remaining``
+        A point outside the domain raises `PluginError`. With fewer than ``k`` evaluations left, the first ``remaining``
         points are evaluated, recorded, and the search is ended; so it is by a value of ``+inf``: both raise
         `SearchEnded`, which is not to be caught.
         """

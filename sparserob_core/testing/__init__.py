@@ -125,6 +125,11 @@ class MaximiserContract(ABC):
             assert (report.trace.points >= lower).all()
             assert (report.trace.points <= upper).all()
 
+    def test_a_coordinate_with_a_single_value_changes_nothing(self) -> None:
+        box = Box(np.insert(PLANE.lower, 1, 7.0), np.insert(PLANE.upper, 1, 7.0))
+        wide, plain = self.search(lambda points: ripples(points[:, [0, 2]]), box), self.search(ripples)
+        assert wide.trace.points[:, [0, 2]].tolist() == plain.trace.points.tolist()
+
     def test_the_box_is_left_as_it_was(self) -> None:
         domain = Box(PLANE.lower.copy(), PLANE.upper.copy())
         self.search(ripples, domain)

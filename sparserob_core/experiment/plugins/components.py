@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
-from sparserob_core.errors import InputError, PluginError
+from sparserob_core.errors import InputError, UnknownPluginError
 from sparserob_core.experiment.plugins.messages import Complaint, complaints, nearest, shown
 from sparserob_core.experiment.plugins.records import RECORDS, Plugin, record_type
 from sparserob_core.options import Options
@@ -41,7 +41,7 @@ class Registry:
     """Every registered component. ``failures``: the plugins that could not be used; ``hint``: what to add where a name
     is unknown.
 
-    Raises `PluginError` when two records of one kind share a name.
+    Raises `UnknownPluginError` when two records of one kind share a name.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class Registry:
         known = self._records[record.kind]
         if record.name in known:
             first, second = known[record.name].plugin, record.plugin
-            raise PluginError(
+            raise UnknownPluginError(
                 f"{record} is registered twice, by plugin '{first}' and by plugin '{second}'; "
                 f"disable one of them, for example {DISABLE}={second}"
             )
@@ -75,11 +75,12 @@ class Registry:
                 yield self._records[kind][name]
 
     def get(self, kind: str, name: str) -> Plugin:
-        """The record of that name; raises `PluginError` with the nearest known names and every plugin that failed."""
+        """The record of that name; raises `UnknownPluginError` with the nearest known names and every plugin that
+        failed."""
         known = self._records[record_type(kind).kind]
         if name in known:
             return known[name]
-        raise PluginError(f"no {kind} is named '{name}'{nearest(name, known)}{self._notes()}")
+        raise UnknownPluginError(f"no {kind} is named '{name}'{nearest(name, known)}{self._notes()}")
 
     def check(self, kind: str, name: str, options: Mapping[str, object]) -> tuple[Options | None, list[Complaint]]:
         """The typed options, or what is wrong with them. An option that is itself a component is spelt out with its own
@@ -113,7 +114,7 @@ class Registry:
             ]
         try:
             checked, wrong = self.check(kind, name, options)
-        except PluginError as error:
+        except UnknownPluginError as error:
             return entry, [Complaint(("name",) if isinstance(entry, Mapping) else (), str(error))]
         return (entry if checked is None else {"name": name, **checked.model_dump(mode="json", by_alias=True)}), wrong
 
@@ -130,12 +131,14 @@ class Registry:
         return self.get(kind, name).create(checked.model_copy(update=inner))
 
     def find(self, name: str) -> list[Plugin]:
-        """The records called ``name``, or ``kind.name``; raises `PluginError` with the nearest names when there are
-        none."""
+        """The records called ``name``, or ``kind.name``; raises `UnknownPluginError` with the nearest names when there
+        are none."""
         found = [record for record in self.records() if name in {record.name, f"{record.kind}.{record.name}"}]
         if not found:
             known = {record.name for record in self.records()}
-            raise PluginError(f"no component is named '{name}'{nearest(name.rpartition('.')[2], known)}{self._notes()}")
+            raise UnknownPluginError(
+                f"no component is named '{name}'{nearest(name.rpartition('.')[2], known)}{self._notes()}"
+            )
         return found
 
     def _notes(self) -> str:

@@ -22,7 +22,7 @@ from sparserob_core.options import Options, part
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import EvaluationsFinished, RoundFinished, forwarded, frozen
 from sparserob_core.sip.evidence import NO_BOUND, Cut, Dual, Proof, Witness
-from sparserob_core.sip.maximiser import Maximiser, Objective, Report
+from sparserob_core.sip.maximiser import Report
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.proof.branch_and_bound import prove
@@ -140,7 +140,7 @@ class _Run:
         target = Target(bounds, g.domain, g.gradient, g.block)
         assert self.tools.maximiser is not None
         notify = forwarded(self.tools.notify, EvaluationsFinished, lambda event: self._completed(event, j, epsilon))
-        report = maximise(target, _From(point, self.tools.maximiser), self.tools.budget, self.tools.rng, rules, notify)
+        report = maximise(target, self.tools.maximiser, self.tools.budget, self.tools.rng, rules, notify, point)
         self._record(report, bounds, epsilon, j, began)
         if report.interrupted:
             raise KeyboardInterrupt
@@ -264,17 +264,6 @@ class _Bounds:
             run.improve(run.relaxed.lower_bound(run.g.rows(), run.g.solution))
         self.proven.append(run.lower)
         return value
-
-
-class _From(Maximiser):
-    """A maximiser that finds one point evaluated already: the first tuple, or the best of the iteration before."""
-
-    def __init__(self, point: Array, maximiser: Maximiser) -> None:
-        self.point, self.maximiser = point, maximiser
-
-    def search(self, objective: Objective, rng: np.random.Generator) -> float:
-        objective.evaluate(self.point[np.newaxis])
-        return self.maximiser.search(objective, rng)
 
 
 def _change(before: Sequence[Cut], now: Sequence[Cut]) -> tuple[tuple[Cut, ...], tuple[Cut, ...]]:

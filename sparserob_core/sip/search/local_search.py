@@ -23,13 +23,13 @@ def polish(objective: Objective, points: Array, values: Array) -> None:
     """Climb from the best of the evaluated ``points (k, d)`` with ``values (k,)`` until the budget is spent or nothing
     is left to gain.
 
-    With gradients: L-BFGS-B (Byrd, Lu, Nocedal and Zhu 1995) first. Then, up to 30 coordinates that can move, the
+    With gradients: L-BFGS-B (Byrd, Lu, Nocedal and Zhu 1995) first. Then, up to 30 coordinates, the
     derivative-free `TrustRegion`; beyond, a compass search that moves one coordinate, hence one block, at a time.
     Starts are the best points, then the next best that lie apart; one that its recent progress cannot bring to the top
     is given up. Nothing is done without a finite value.
     """
     finite = np.isfinite(values)
-    if not finite.any() or not (objective.domain.lower < objective.domain.upper).any():
+    if not finite.any():
         return
     order = np.flatnonzero(finite)[np.argsort(-values[finite], kind="stable")][:CONSIDERED]
     seen = _Seen(objective, points[order], values[order])
@@ -42,16 +42,14 @@ def polish(objective: Objective, points: Array, values: Array) -> None:
 
 
 class _Seen:
-    """The evaluated points in the unit box of the coordinates that can move, and a function that adds to them."""
+    """The evaluated points in the unit box, and a function that adds to them."""
 
     def __init__(self, objective: Objective, points: Array, values: Array) -> None:
         self.objective = objective
-        lower, upper = objective.domain.lower, objective.domain.upper
-        self.free = lower < upper
-        self.lower, self.width = lower[self.free], (upper - lower)[self.free]
-        self.dimension = int(self.lower.size)
-        self.blocks = np.flatnonzero(self.free) // objective.block
-        self.points = np.clip((points[:, self.free] - self.lower) / self.width, 0.0, 1.0)
+        self.lower, self.width = objective.domain.lower, objective.domain.upper - objective.domain.lower
+        self.dimension = objective.domain.dimension
+        self.blocks = np.arange(self.dimension) // objective.block
+        self.points = np.clip((points - self.lower) / self.width, 0.0, 1.0)
         self.values = values.copy()
 
     def starts(self) -> Array:
@@ -82,10 +80,7 @@ class _Seen:
 
     def place(self, point: Array) -> Array:
         """The point of the domain."""
-        domain = self.objective.domain
-        placed = domain.lower.copy()
-        placed[self.free] = self.lower + point * self.width
-        return np.clip(placed, domain.lower, domain.upper)
+        return np.clip(self.lower + point * self.width, self.lower, self.objective.domain.upper)
 
     def evaluate(self, point: Array) -> float:
         value = float(self.objective.evaluate(self.place(point)[np.newaxis])[0])
@@ -95,7 +90,7 @@ class _Seen:
     def with_gradient(self, point: Array) -> tuple[float, Array]:
         value, gradient = self.objective.value_and_gradient(self.place(point))
         self._add(point, value)
-        return value, gradient[self.free] * self.width
+        return value, gradient * self.width
 
     def _add(self, point: Array, value: float) -> None:
         if self.dimension <= MODELLED or value > self.values.max():

@@ -9,11 +9,12 @@ from typing import TypeAlias
 
 import numpy as np
 
-from sparserob_core.errors import InputError, PluginError
+from sparserob_core.errors import InputError, PluginError, SparseRobError
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.events import Notify, ignore
-from sparserob_core.sip.maximiser import EvaluationError, Maximiser, Report, SearchEnded, Trace
+from sparserob_core.sip.maximiser import EvaluationError, Maximiser, Objective, Report, SearchEnded, Trace
 from sparserob_core.sip.rules import Metropolis, Progress
+from sparserob_core.sip.search.moving import Moving
 from sparserob_core.sip.search.notifier import Notifier, Standing
 
 Function: TypeAlias = Callable[[Array], object]
@@ -61,12 +62,20 @@ class Rules:
 
 class CountedObjective:
     """An `Objective` that keeps the accounts itself, so that a maximiser cannot misreport. Raises `InputError` for a
-    budget below 1."""
+    budget below 1. ``asker``: who searches, for messages."""
 
-    def __init__(self, target: Target, budget: int, rules: Rules | None = None, notify: Notify = ignore) -> None:
+    def __init__(
+        self,
+        target: Target,
+        budget: int,
+        rules: Rules | None = None,
+        notify: Notify = ignore,
+        asker: str = "the maximiser",
+    ) -> None:
         if budget != int(budget) or budget < 1:
             raise InputError(f"budget: expected a whole number of at least 1, got {budget!r}")
         self.target, self.domain, self.block, self.budget = target, target.domain, target.block, int(budget)
+        self.asker = asker
         self.rules: Rules | None = rules or Rules()
         self.best_value, self.best_point = -np.inf, np.full(self.domain.dimension, np.nan)
         self.evaluations = 0
@@ -174,12 +183,12 @@ class CountedObjective:
     def _checked(self, points: Array) -> Array:
         asked = np.array(points, dtype=float)
         if asked.ndim != 2 or asked.shape[1] != self.domain.dimension:
-            raise InputError(f"points: expected shape (k, {self.domain.dimension}), got {asked.shape}")
+            raise PluginError(f"{self.asker}: points: expected shape (k, {self.domain.dimension}), got {asked.shape}")
         if not ((asked >= self.domain.lower).all() and (asked <= self.domain.upper).all()):
             outside = ~((asked >= self.domain.lower) & (asked <= self.domain.upper)).all(axis=1)
-            raise InputError(
-                f"points: {asked[outside][0].tolist()} lies outside the domain, "
-                f"lower {self.domain.lower.tolist()}, upper {self.domain.upper.tolist()}"
+            raise PluginError(
+                f"{self.asker}: points: {_shown(asked[outside][0])} lies outside the domain, "
+                f"lower {_shown(self.domain.lower)}, upper {_shown(self.domain.upper)}"
             )
         return asked
 
@@ -200,7 +209,9 @@ class CountedObjective:
             values = np.asarray(function(argument), dtype=float)
             if values.shape != shape:
                 raise ValueError(f"expected {shape[0]} numbers, got an array of shape {values.shape}")
-        except Exception as error:
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
             best = (
                 f"the best of them {self.best_value:.9g} at {_shown(self.best_point)}"
                 if self.evaluations
@@ -239,39 +250,73 @@ def maximise(
     rng: np.random.Generator,
     rules: Rules | None = None,
     notify: Notify = ignore,
+    start: Array | None = None,
 ) -> Report:
     """Search for the maximum of a target with ``budget`` evaluations at most; the last share of them polishes what was
     found.
 
-    An interrupt from the keyboard ends the search; the report says so. Raises `EvaluationError` when the function
-    raises or does not return numbers, `InputError` for a wrong budget, `PluginError` for an upper bound that an
-    evaluated value refutes.
+    The maximiser sees the coordinates that can move, and is not asked where none can: the value at the only point is
+    then the maximum. ``start (d,)`` is evaluated before it begins. An interrupt from the keyboard ends the search; the
+    report says so. Raises `EvaluationError` when the function raises or does not return numbers, `InputError` for a
+    wrong budget, `PluginError` for a maximiser that raises, leaves the domain, or claims an upper bound that is no
+    number or that an evaluated value refutes.
     """
     rules = rules or Rules()
+    name = str(getattr(maximiser, "origin", f"maximiser {type(maximiser).__name__}"))
+    moves = np.flatnonzero(target.domain.lower < target.domain.upper)
     reserved = int(rules.polish * budget) if budget == int(budget) else 0
-    objective = CountedObjective(target, budget - reserved, rules, notify)
+    objective = CountedObjective(target, budget - reserved, rules, notify, name)
+    shown = objective if moves.size in (0, target.domain.dimension) else Moving(objective, moves, name)
     bound, stopped, interrupted = np.inf, "the maximiser found nothing left to gain", False
     try:
         try:
-            bound = float(maximiser.search(objective, rng))
+            if start is not None:
+                objective.evaluate(start[np.newaxis])
+            bound = _bound(maximiser, name, shown, rng) if moves.size else _only_value(objective)
         except SearchEnded as end:
             stopped = str(end)
-        if reserved and not isinstance(objective.ended, EvaluationError) and np.isfinite(objective.best_value):
+        if (
+            reserved
+            and moves.size
+            and not isinstance(objective.ended, EvaluationError)
+            and np.isfinite(objective.best_value)
+        ):
             objective.go_on(objective.evaluations + reserved)
             stopped = f"{stopped}; then polished"
             from sparserob_core.sip.search.local_search import polish
 
-            polish(objective, *objective.seen())
+            points, values = objective.seen()
+            polish(shown, points[:, moves], values)
     except SearchEnded:
         pass
     except KeyboardInterrupt:
         stopped, interrupted = "interrupted from the keyboard", True
     objective.tell()
     if not bound >= objective.best_value:
-        name = type(maximiser).__name__
         raise PluginError(
-            f"maximiser {name}: claims the upper bound {bound!r}, but the value {objective.best_value!r} was evaluated"
+            f"{name}: claims the upper bound {bound!r}, but the value {objective.best_value!r} was evaluated"
         )
     if isinstance(objective.ended, EvaluationError):
-        raise objective.ended
+        fault = objective.ended.__cause__
+        raise fault if isinstance(fault, PluginError) else objective.ended
     return replace(objective.report(stopped, bound), interrupted=interrupted)
+
+
+def _bound(maximiser: Maximiser, name: str, objective: Objective, rng: np.random.Generator) -> float:
+    """The upper bound that a maximiser claims; what it raises, other than an error of this project, is its fault."""
+    try:
+        claimed: object = maximiser.search(objective, rng)
+    except (SearchEnded, SparseRobError, KeyboardInterrupt):
+        raise
+    except BaseException as error:
+        raise PluginError(f"{name}: search raised {type(error).__name__}: {error}") from error
+    if isinstance(claimed, bool) or not isinstance(claimed, int | float | np.integer | np.floating):
+        raise PluginError(f"{name}: search returned {claimed!r}, expected an upper bound, a number or inf")
+    return float(claimed)
+
+
+def _only_value(objective: CountedObjective) -> float:
+    """The value at the only point of a domain in which nothing moves."""
+    if objective.evaluations:
+        return objective.best_value
+    return float(objective.evaluate(objective.domain.lower[np.newaxis])[0])

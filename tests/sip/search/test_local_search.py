@@ -145,9 +145,9 @@ def test_the_budget_is_never_exceeded_and_nothing_leaves_the_box(budget, dimensi
 
 def test_a_side_without_length_stays_where_it_is():
     box = sr.Box([-1.0, 0.7, -1.0], [1.0, 0.7, 1.0])
-    report = polished(cone, box)
+    report = sr.maximise(cone, box, "random_search", budget=400, polish=0.5)
     assert report.best_point == pytest.approx([0.31, 0.7, 0.31], abs=1e-6)
-    assert polished(cone, sr.Box([0.7, 0.7], [0.7, 0.7])).evaluations == 0
+    assert sr.maximise(cone, sr.Box([0.7, 0.7], [0.7, 0.7]), budget=9, polish=0.5).evaluations == 1
 
 
 def test_without_a_finite_value_there_is_nothing_to_polish():

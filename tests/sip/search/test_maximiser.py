@@ -57,14 +57,14 @@ def test_notes_are_columns_against_the_number_of_evaluations():
 @pytest.mark.parametrize("point", [[1.0000001, 0.0], [np.nan, 0.0], [0.0, -np.inf]])
 def test_a_point_outside_the_domain_is_refused_and_not_counted(point):
     objective = CountedObjective(Target(hill, SQUARE), 10)
-    with pytest.raises(sr.InputError, match="outside the domain"):
+    with pytest.raises(sr.PluginError, match="outside the domain"):
         objective.evaluate(np.array([[0.0, 0.0], point]))
     assert objective.evaluations == 0
 
 
 @pytest.mark.parametrize("points", [np.zeros(2), np.zeros((1, 3))])
 def test_points_of_the_wrong_shape_are_refused(points):
-    with pytest.raises(sr.InputError, match=r"expected shape \(k, 2\)"):
+    with pytest.raises(sr.PluginError, match=r"expected shape \(k, 2\)"):
         CountedObjective(Target(hill, SQUARE), 10).evaluate(points)
 
 

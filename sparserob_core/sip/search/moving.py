@@ -1,0 +1,93 @@
+"""What a maximiser is handed: the objective in the coordinates that can move."""
+
+from __future__ import annotations
+
+from typing import final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sparserob_core.errors import PluginError
+from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.maximiser import Objective
+
+
+@final
+class Moving:
+    """The `Objective` of a search as a function of the coordinates ``moves`` ``(c,)``, ``c >= 1``, of a point ``(d,)``;
+    each of the others keeps its only value.
+
+    Its ``domain`` has ``lower < upper`` everywhere, so that no maximiser sees a degenerate box. The accounts stay with
+    the search, in full coordinates. ``block``: where the same coordinates of every index can move, as many as these
+    are; otherwise 1. ``asker``: who searches, for messages.
+    """
+
+    def __init__(self, objective: Objective, moves: NDArray[np.intp], asker: str) -> None:
+        self._objective, self._moves, self._asker = objective, moves, asker
+        self._fixed = objective.domain.lower.copy()
+        self.domain = Box(objective.domain.lower[moves], objective.domain.upper[moves])
+        self.block = _block(objective.block, moves, objective.domain.dimension)
+
+    @property
+    def budget(self) -> int:
+        """See `Objective`."""
+        return self._objective.budget
+
+    @property
+    def evaluations(self) -> int:
+        """See `Objective`."""
+        return self._objective.evaluations
+
+    @property
+    def remaining(self) -> int:
+        """See `Objective.remaining`."""
+        return self._objective.remaining
+
+    @property
+    def best_point(self) -> Array:
+        """See `Objective`; ``(c,)``."""
+        best: Array = self._objective.best_point[self._moves]
+        return best
+
+    @property
+    def best_value(self) -> float:
+        """See `Objective`."""
+        return self._objective.best_value
+
+    @property
+    def differentiable(self) -> bool:
+        """See `Objective.differentiable`."""
+        return self._objective.differentiable
+
+    def evaluate(self, points: Array) -> Array:
+        """See `Objective.evaluate`; points ``(k, c)``."""
+        return self._objective.evaluate(self._placed(points))
+
+    def value_and_gradient(self, point: Array) -> tuple[float, Array]:
+        """See `Objective.value_and_gradient`; point and gradient ``(c,)``."""
+        value, gradient = self._objective.value_and_gradient(self._placed(np.asarray(point)[np.newaxis])[0])
+        return value, gradient[self._moves]
+
+    def accepts(self, current: float, candidate: float, temperature: float, rng: np.random.Generator) -> bool:
+        """See `Objective.accepts`."""
+        return self._objective.accepts(current, candidate, temperature, rng)
+
+    def note(self, **scalars: float) -> None:
+        """See `Objective.note`."""
+        self._objective.note(**scalars)
+
+    def _placed(self, points: Array) -> Array:
+        moved = np.asarray(points, dtype=float)
+        if moved.ndim != 2 or moved.shape[1] != self._moves.size:
+            raise PluginError(f"{self._asker}: points: expected shape (k, {self._moves.size}), got {moved.shape}")
+        full = np.repeat(self._fixed[np.newaxis], len(moved), axis=0)
+        full[:, self._moves] = moved
+        return full
+
+
+def _block(block: int, moves: NDArray[np.intp], dimension: int) -> int:
+    """How many coordinates of each index can move, where these are the same in every index; otherwise 1."""
+    free = np.zeros(dimension, dtype=bool)
+    free[moves] = True
+    of_index = free.reshape(-1, block)
+    return int(of_index[0].sum()) if (of_index == of_index[0]).all() else 1
