@@ -105,6 +105,18 @@ class ConvexSet(ABC):
         return np.eye(self.dimension)
 
     @property
+    def frame(self) -> Array:
+        """Rows ``N (b, d)`` that span what `normals` span, in whose coordinates ``c = z N`` the set is about round: it
+        reaches about as far along every ``z`` of the same length. In other units of the set ``z`` stays the same."""
+        axes = self.normals
+        width = self.support(axes) + self.support(-axes)
+        return few_digits(axes / np.where((width > 0.0) & np.isfinite(width), width / 2.0, 1.0)[:, None])
+
+    def in_units(self, units: Array) -> ConvexSet:
+        """The set of all ``x / units`` for ``x`` in this one; ``units (d,)`` positive. Exact for powers of two."""
+        return SetInUnits(self, np.asarray(units, dtype=float))
+
+    @property
     def is_bounded(self) -> bool:
         """Whether the support function is finite in every direction."""
         axes = np.eye(self.dimension)
@@ -190,6 +202,64 @@ class Box(ConvexSet):
     @property
     def is_bounded(self) -> bool:
         return bool(np.isfinite(self.lower).all() and np.isfinite(self.upper).all())
+
+    def in_units(self, units: Array) -> Box:
+        return Box(self.lower / units, self.upper / units)
+
+
+@dataclass(frozen=True, eq=False)
+class SetInUnits(ConvexSet):
+    """``{x / units : x in base}``: any set in other units ``(d,)``. Made by `ConvexSet.in_units`."""
+
+    base: ConvexSet
+    units: Array
+
+    @property
+    def dimension(self) -> int:
+        return self.base.dimension
+
+    def support(self, directions: Array) -> Array:
+        return self.base.support(np.asarray(directions, dtype=float) / self.units)
+
+    def support_point(self, directions: Array) -> Array:
+        return self.base.support_point(np.asarray(directions, dtype=float) / self.units) / self.units
+
+    def halfspaces(self) -> tuple[Array, Array] | None:
+        flat = self.base.halfspaces()
+        return None if flat is None else (flat[0] * self.units, flat[1])
+
+    def linearisation_excess(self, centre: Array, spread: Array) -> Array:
+        return self.base.linearisation_excess(np.asarray(centre) / self.units, np.asarray(spread) / self.units)
+
+    def support_minorant(self, centre: Array, spread: Array) -> tuple[float, Array, Array]:
+        return self.base.support_minorant(np.asarray(centre) / self.units, np.asarray(spread) / self.units)
+
+    def violation(self, points: Array) -> Array:
+        """Of the right sign, and at most the distance: that of the base in its largest unit."""
+        excess: Array = self.base.violation(np.asarray(points) * self.units) / self.units.max()
+        return excess
+
+    def interior_point(self) -> Array:
+        return self.base.interior_point() / self.units
+
+    @property
+    def frame(self) -> Array:
+        return self.base.frame * self.units
+
+    @property
+    def is_bounded(self) -> bool:
+        return self.base.is_bounded
+
+    def in_units(self, units: Array) -> ConvexSet:
+        return SetInUnits(self.base, self.units * units)
+
+
+def few_digits(matrix: Array) -> Array:
+    """A matrix ``(b, d)`` with the entries of each column rounded to 24 binary digits of its largest: what ``z`` with
+    as few digits makes of it is exact, and units that are powers of two pass through."""
+    _, exponents = np.frexp(np.abs(matrix).max(axis=0))
+    grid = np.ldexp(1.0, exponents - 24)
+    return np.asarray(np.rint(matrix / grid) * grid)
 
 
 def vertex_excess(vertices: Array, centre: Array, spread: Array, blocks: int = 4096) -> Array:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import TypeAlias, final
 
 import numpy as np
 import numpy.typing as npt
@@ -92,6 +92,23 @@ class LinearSystem:
         p[:] = space.variables(centre, radius)
         A, B, E = (self._enclosed(name, space, p) for name in ("A", "B", "E"))
         return *A, *B, *E
+
+    def in_units(self, A: Array, B: Array, E: Array, parameters: Array) -> LinearSystem:
+        """The system whose matrices are ``A``, ``B``, ``E`` times these factors, entry by entry, and whose parameter is
+        this one's divided by ``parameters (nu,)``; exact for powers of two."""
+        if self.parameters is None:
+            ours = [matrix[0] for matrix in self.matrices(np.zeros((1, 0)))]
+            return LinearSystem(ours[0] * A, ours[1] * B, ours[2] * E)
+        return SystemInUnits(
+            self.A,
+            self.B,
+            self.E,
+            self.parameters.in_units(parameters),
+            self.names,
+            base=self,
+            factors={"A": A, "B": B, "E": E},
+            units=parameters,
+        )
 
     def describe(self, parameter: Array) -> str:
         """A parameter vector in words, such as ``p1 = 0.1, p2 = -0.1``."""
@@ -230,6 +247,40 @@ class LinearSystem:
                     f"system: the function {name} returned {type(model).__name__} for an entry, expected a number"
                 )
         return coefficients, remainder
+
+
+@final
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SystemInUnits(LinearSystem):
+    """An uncertain system in other units: ``base`` at parameters times ``units (nu,)``, its matrices times
+    ``factors``."""
+
+    base: LinearSystem
+    factors: Mapping[str, Array]
+    units: Array
+
+    def __post_init__(self) -> None:
+        pass  # the base was checked
+
+    def describe(self, parameter: Array) -> str:
+        return self.base.describe(parameter * self.units)
+
+    def in_units(self, A: Array, B: Array, E: Array, parameters: Array) -> LinearSystem:
+        mine = self.factors
+        return self.base.in_units(A * mine["A"], B * mine["B"], E * mine["E"], parameters * self.units)
+
+    def _shape(self, name: str) -> tuple[int, int]:
+        return self.base._shape(name)
+
+    def _values(self, name: str, points: Array) -> Array:
+        return self.base._values(name, points * self.units) * self.factors[name]
+
+    def taylor(
+        self, space: TaylorSpace, centre: Array, radius: Array
+    ) -> tuple[Array, Array, Array, Array, Array, Array]:
+        found = self.base.taylor(space, centre * self.units, radius * self.units)
+        every = [part * self.factors[name] for name, part in zip("AABBEE", found, strict=True)]
+        return every[0], every[1], every[2], every[3], every[4], every[5]
 
 
 def _seen(array: npt.NDArray[np.float64]) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.errors import InputError
-from sparserob_core.sip.convex_set import Array, Box, ConvexSet, as_bound, vertex_excess
+from sparserob_core.sip.convex_set import Array, Box, ConvexSet, as_bound, few_digits, vertex_excess
 
 _SIGN_DIMENSIONS = 10
 _BISECTIONS = 60
@@ -36,7 +36,7 @@ class Ellipsoid(ConvexSet):
             raise InputError(
                 f"shape must be a square matrix of finite numbers, got shape {shape.shape}", path="ellipsoid"
             )
-        if not np.allclose(shape, shape.T, rtol=1e-12, atol=0.0) or np.linalg.eigvalsh(shape)[0] <= 0.0:
+        if not np.allclose(shape, shape.T, rtol=1e-12, atol=0.0) or not _positive(shape):
             raise InputError(f"shape must be symmetric positive definite, got {shape.tolist()}", path="ellipsoid")
         object.__setattr__(self, "centre", _finite("ellipsoid.centre", self.centre, shape.shape[0]))
         object.__setattr__(self, "shape", shape)
@@ -49,6 +49,14 @@ class Ellipsoid(ConvexSet):
     def factor(self) -> Array:
         """Lower triangular ``L (d, d)`` with ``L L' = shape``."""
         return np.asarray(np.linalg.cholesky(self.shape), dtype=float)
+
+    @cached_property
+    def frame(self) -> Array:
+        """``L^-1``, but for its last digits: the support function about the centre is the 2-norm of ``z``."""
+        return few_digits(np.asarray(np.linalg.solve(self.factor, np.eye(self.dimension)), dtype=float))
+
+    def in_units(self, units: Array) -> Ellipsoid:
+        return Ellipsoid(self.centre / units, self.shape / np.outer(units, units))
 
     def support(self, directions: Array) -> Array:
         directions = np.asarray(directions, dtype=float)
@@ -203,6 +211,25 @@ class NormBall(ConvexSet):
 
     def interior_point(self) -> Array:
         return self.centre.copy()
+
+    @property
+    def frame(self) -> Array:
+        return few_digits(np.eye(self.dimension) / (self.radius or 1.0))
+
+    def in_units(self, units: Array) -> ConvexSet:
+        if (units == units[0]).all():
+            return NormBall(self.p, self.radius / units[0], self.centre / units)
+        if self.p == np.inf:
+            return Box((self.centre - self.radius) / units, (self.centre + self.radius) / units)
+        if self.p == 2.0 and self.radius > 0.0:
+            return Ellipsoid(self.centre / units, np.diag((self.radius / units) ** 2))
+        return super().in_units(units)
+
+
+def _positive(shape: Array) -> bool:
+    """Whether a symmetric matrix is positive definite, judged with unit diagonal."""
+    sizes = np.sqrt(np.maximum(np.diag(shape), 0.0))
+    return bool((sizes > 0.0).all() and np.linalg.eigvalsh(shape / np.outer(sizes, sizes))[0] > 0.0)
 
 
 def _round_excess(centre: Array, spread: Array) -> Array:

@@ -12,6 +12,8 @@ from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound, vertex_exc
 
 _VERTEX_DIMENSIONS = 6
 _VERTEX_ROWS = 200
+_SWEEPS = 12
+_ORDINARY = 10  # binary orders of magnitude between which rows and columns are left as they are
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +47,7 @@ class Polytope(ConvexSet):
         keep = ~zero & np.isfinite(h)
         object.__setattr__(self, "H", H[keep])
         object.__setattr__(self, "h", h[keep])
-        if self.chebyshev[1] < -1e-9 * max(1.0, float(np.abs(self.h).max(initial=0.0))):
+        if self.chebyshev[1] < -1e-9 * max(1.0, float(np.abs(self._balanced[1]).max(initial=0.0))):
             raise InputError("empty, no point satisfies every row of H x <= h", path="polytope")
 
     @property
@@ -55,26 +57,52 @@ class Polytope(ConvexSet):
     def halfspaces(self) -> tuple[Array, Array]:
         return self.H, self.h
 
+    def in_units(self, units: Array) -> Polytope:
+        """The set of all ``x / units``, every row divided by a power of two so that its largest entry is about 1."""
+        H = self.H * units
+        sizes = np.abs(H).max(axis=1, initial=0.0)
+        factors = np.ldexp(1.0, -np.frexp(np.where(sizes > 0.0, sizes, 1.0))[1])
+        return Polytope(H * factors[:, None], self.h * factors)
+
+    @cached_property
+    def _balanced(self) -> tuple[Array, Array, Array]:
+        """``(H', h', units)`` with ``{x : H x <= h} = {units * y : H' y <= h'}``: rows and columns of very different
+        sizes are divided by powers of two, the means of their entries' logarithms (Curtis and Reid 1972), so that a
+        linear program over them means the same whatever their units."""
+        with np.errstate(divide="ignore"):
+            entries = np.log2(np.abs(np.column_stack([self.H, self.h])))
+        there = np.isfinite(entries)
+        sizes, columns = np.where(there, entries, 0.0), np.zeros(self.dimension + 1)
+        for _ in range(_SWEEPS):
+            rows = -np.where(there, sizes + columns, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1)
+            columns = -np.where(there, sizes + rows[:, None], 0.0).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
+            columns[-1] = 0.0  # the right-hand sides have no unit of their own
+        exponents = np.rint(np.concatenate([rows, columns[:-1]])).astype(int)
+        if np.abs(exponents).max(initial=0) <= _ORDINARY:
+            return self.H, self.h, np.ones(self.dimension)
+        factors, units = np.ldexp(1.0, exponents[: rows.size]), np.ldexp(1.0, exponents[rows.size :])
+        return self.H * factors[:, None] * units, self.h * factors, units
+
     @cached_property
     def chebyshev(self) -> tuple[Array, float]:
-        """Centre ``(d,)`` and radius of a largest ball in the set; the radius is capped, negative when the set is
-        empty."""
+        """Centre ``(d,)`` and radius of a largest ball in the set (in balanced coordinates, where the sizes of its rows
+        or columns are far apart); the radius is capped, negative when the set is empty."""
         from scipy.optimize import linprog
 
-        rows, d = self.H.shape
+        (rows, d), (H, h, units) = self.H.shape, self._balanced
         if rows == 0:
             return np.zeros(d), np.inf
-        cap = 1.0 + float(np.abs(self.h).max())
-        norms = np.linalg.norm(self.H, axis=1)
+        cap = 1.0 + float(np.abs(h).max())
+        norms = np.linalg.norm(H, axis=1)
         answer = linprog(
             np.append(np.zeros(d), -1.0),
-            np.column_stack([self.H, norms]),
-            self.h,
+            np.column_stack([H, norms]),
+            h,
             bounds=[(None, None)] * d + [(None, cap)],
         )
         if answer.status != 0:
             raise InputError(f"could not decide whether it is empty ({answer.message})", path="polytope")
-        return np.asarray(answer.x[:-1]), float(answer.x[-1])
+        return np.asarray(answer.x[:-1]) * units, float(answer.x[-1])
 
     def interior_point(self) -> Array:
         return self.chebyshev[0].copy()
@@ -94,20 +122,22 @@ class Polytope(ConvexSet):
         if d == 1:
             slopes, ends = self.H[:, 0], self.h / self.H[:, 0]
             return np.array([[ends[slopes < 0].max()], [ends[slopes > 0].min()]])
-        centre, radius = self.chebyshev
+        (centre, radius), (H, h, units) = self.chebyshev, self._balanced
+        centre = centre / units
         if radius <= 1e-9 * (1.0 + float(np.abs(centre).max())):
             return None
         from scipy.spatial import HalfspaceIntersection, QhullError
 
         try:
-            found = HalfspaceIntersection(np.column_stack([self.H, -self.h]), centre)
+            found = HalfspaceIntersection(np.column_stack([H, -h]), centre)
         except QhullError:
             return None
-        return self._polished(found.intersections, found.dual_facets)
+        return self._polished(found.intersections, found.dual_facets) * units
 
     def _polished(self, points: Array, facets: list[list[int]]) -> Array:
         """Vertices solved for from their active rows: what qhull returns has passed through a dual space."""
-        vertices = [np.linalg.lstsq(self.H[rows], self.h[rows], rcond=None)[0] for rows in facets]
+        H, h, _ = self._balanced
+        vertices = [np.linalg.lstsq(H[rows], h[rows], rcond=None)[0] for rows in facets]
         exact = np.where(np.isfinite(vertices), vertices, points)
         _, first = np.unique(np.round(exact, 12), axis=0, return_index=True)
         return exact[np.sort(first)]
@@ -137,12 +167,14 @@ class Polytope(ConvexSet):
         """Support function and a maximiser by a linear program; ``(inf, some point)`` when unbounded."""
         from scipy.optimize import linprog
 
-        size = float(np.abs(direction).max())
+        H, h, units = self._balanced
+        scaled = direction * units
+        size = float(np.abs(scaled).max())
         if size == 0.0:
             return 0.0, self.interior_point()
-        if self.h.size == 0:
+        if h.size == 0:
             return np.inf, self.interior_point()
-        answer = linprog(-direction / size, self.H, self.h, bounds=(None, None))
+        answer = linprog(-scaled / size, H, h, bounds=(None, None))
         if answer.status != 0:
             return np.inf, self.interior_point()
-        return float(direction @ answer.x), np.asarray(answer.x)
+        return float(scaled @ answer.x), np.asarray(answer.x) * units

@@ -84,6 +84,10 @@ class Equality:
         )
         return deviation
 
+    def in_units(self, units: Array) -> Equality:
+        """The same values as ``values / units``, ``(d,)`` each."""
+        return Equality(self.values / units)
+
     def contains(self, points: Array, tolerance: float = 1e-9) -> npt.NDArray[np.bool_]:
         """Whether points ``(..., d)`` deviate by at most the absolute ``tolerance``."""
         inside: npt.NDArray[np.bool_] = np.asarray(self.violation(points) <= tolerance)
@@ -125,6 +129,14 @@ class Cylinder(ConvexSet):
     @property
     def normals(self) -> Array:
         return np.eye(self.base.dimension, self.size)
+
+    @property
+    def frame(self) -> Array:
+        own = self.base.frame
+        return np.hstack([own, np.zeros((own.shape[0], self.size - own.shape[1]))])
+
+    def in_units(self, units: Array) -> Cylinder:
+        return Cylinder(self.base.in_units(units[: self.base.dimension]), self.size)
 
     def support(self, directions: Array) -> Array:
         directions = np.asarray(directions, dtype=float)

@@ -1,0 +1,68 @@
+"""Units of a control problem, and the same problem in other ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import final
+
+import numpy as np
+
+from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.sip.convex_set import Array
+
+OFFSET = 0.26535897932384626  # irrational: numbers that people choose are not at the edge between two powers of two
+
+
+def power_of_two(sizes: Array) -> Array:
+    """The power of two by which each of ``sizes (...,)`` divided is between 0.6 and 1.21; 1 where the size is 0 or
+    infinite. A size that is multiplied by a power of two gives exactly that multiple."""
+    usable = np.isfinite(sizes) & (sizes > 0.0)
+    mantissa, exponent = np.frexp(np.where(usable, sizes, 1.0))  # in [1/2, 1)
+    lower = np.log2(mantissa) < OFFSET - 1.0
+    return np.where(usable, np.ldexp(1.0, exponent - lower), 1.0)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Units:
+    """What one of each quantity is in the user's: ``time``, ``states (d,)``, ``controls (m,)``,
+    ``disturbances (mw,)``, ``parameters (nu,)``, ``cost``. Powers of two, so that nothing is rounded."""
+
+    time: float
+    states: Array
+    controls: Array
+    disturbances: Array
+    parameters: Array
+    cost: float
+
+    def of_dictionary(self, dictionary: Dictionary) -> Dictionary:
+        """The same functions of a time in these units."""
+        return Dictionary(dictionary.breakpoints / self.time, dictionary.values)
+
+    def of_problem(self, problem: OptimalControlProblem) -> OptimalControlProblem:
+        """The same problem with every number in these units."""
+        return OptimalControlProblem(
+            system=self.of_system(problem.system),
+            horizon=problem.horizon / self.time,
+            initial_state=np.asarray(problem.initial_state) / self.states,
+            control=problem.control.in_units(self.controls),
+            weights=np.asarray(problem.weights) * self.controls * self.time / self.cost,
+            disturbance=None if problem.disturbance is None else problem.disturbance.in_units(self.disturbances),
+            disturbance_class=problem.disturbance_class,
+            path=[self._window(entry) for entry in problem.path if isinstance(entry, PathConstraint)],
+            terminal=[end.in_units(self.states) for end in problem.terminal],
+            title=problem.title,
+        )
+
+    def _window(self, entry: PathConstraint) -> PathConstraint:
+        stop = None if entry.stop is None else entry.stop / self.time
+        return replace(entry, set=entry.set.in_units(self.states), start=entry.start / self.time, stop=stop)
+
+    def of_system(self, system: LinearSystem) -> LinearSystem:
+        """``x' = A x + B u + E w`` with all of it in these units."""
+        rate = self.time / self.states[:, None]
+        return system.in_units(
+            rate * self.states, rate * self.controls, rate * self.disturbances[: system.disturbances], self.parameters
+        )
