@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from sparserob_core.errors import InputError
 
@@ -26,7 +27,51 @@ class Checked(ModelMetaclass):
             raise InputError("\n".join(_sentences(cls.__name__, error))) from None
 
 
-class Options(BaseModel, metaclass=Checked):
+class Exact(BaseModel):
+    """A model that takes no truth value and no text for a number: ``true`` is not 1, and ``"5"`` is not 5."""
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _no_disguise(cls, value: object, info: ValidationInfo) -> object:
+        allowed = set(_types(cls.model_fields[str(info.field_name)].annotation))
+        several = isinstance(value, list | tuple)
+        if {int, float} & allowed and not {Any, object} & allowed and (several or not {list, tuple} & allowed):
+            for scalar in _scalars(value):
+                true_or_false = isinstance(scalar, bool) and bool not in allowed
+                if true_or_false or (isinstance(scalar, str) and str not in allowed and _reads_as_number(scalar)):
+                    raise InputError("must be a number" if not several else "every entry must be a number")
+        return value
+
+
+def _reads_as_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False  # what it is instead, the field itself says
+    return True
+
+
+def _types(annotation: object) -> Iterator[object]:
+    """Every type inside an annotation such as ``list[float | None]``; a literal counts as the types of its values."""
+    parts = get_args(annotation)
+    if parts:
+        yield get_origin(annotation)
+    else:
+        yield type(annotation) if isinstance(annotation, str | bool | int | float) else annotation
+    for part in parts:
+        yield from _types(part)
+
+
+def _scalars(value: object) -> Iterator[object]:
+    """What is inside nested lists; mappings have fields, and checks, of their own."""
+    if isinstance(value, list | tuple):
+        for item in value:
+            yield from _scalars(item)
+    elif not isinstance(value, Mapping):
+        yield value
+
+
+class Options(Exact, metaclass=Checked):
     """Base class of every component's options.
 
     A component may *be* its options (``class Ridge(Regulariser, Options)``): its fields are then the

@@ -124,8 +124,10 @@ class ConvexSet(ABC):
 
 
 def as_bound(name: str, value: object, size: int | None = None) -> Array:
-    """A bound vector from a number or a sequence; NaN is refused, infinities are kept."""
+    """A bound vector from a number or a sequence; NaN, texts and truth values are refused, infinities are kept."""
     try:
+        if np.asarray(value).dtype.kind in "bSU":
+            raise TypeError("no numbers")
         array = np.atleast_1d(np.asarray(value, dtype=float))
     except (TypeError, ValueError) as error:
         raise InputError(path=name, expected="a number or a list of numbers", got=f"{value!r}") from error

@@ -119,6 +119,13 @@ class LinearSystem:
         return entry
 
     def _check_parameters(self) -> None:
+        given: object = self.parameters
+        if not isinstance(given, ConvexSet | None):
+            raise InputError(
+                path="system.parameters",
+                expected="a convex set, such as Box([-0.1], [0.1]), or None; C and D of a plant have no place here",
+                got=f"{type(given).__name__}",
+            )
         if self.parameters is not None and not self.parameters.is_bounded:
             raise InputError("the set of parameters must be bounded", path="system")
         names = tuple(self.names) or tuple(f"p{i + 1}" for i in range(self.parameter_count))

@@ -7,6 +7,7 @@ import json
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path as File
 from typing import TYPE_CHECKING, Any, final
 
@@ -15,24 +16,37 @@ from sparserob_core.errors import ConfigError, Path
 if TYPE_CHECKING:
     from ruamel.yaml import YAML
 
+LARGEST = 1_000_000  # bytes of a config; large data belongs in a plugin that makes it
+MOST_VALUES = 200_000  # values of a config, where an alias counts as all that it stands for
+
 __all__ = ["Source", "read_source", "read_value", "write_yaml"]
 
 
 @final
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Source:
-    """A config as it was given: its ``data``, and where each key of it stands. ``name`` is the file as the user wrote
-    it."""
+    """A config as it was given: its ``data``, and its ``text``, which says where each key of it stands. ``name`` is the
+    file as the user wrote it."""
 
     name: str
     folder: File
     data: dict[str, Any]
-    marks: object = None
+    text: str = ""
+
+    @cached_property
+    def marks(self) -> object:
+        """The data with the line and the column of every key; ``None`` where these are unknown."""
+        from ruamel.yaml.error import YAMLError
+
+        try:
+            return _yaml("rt").load(self.text) if self.text else None
+        except (YAMLError, ValueError):
+            return None
 
     def where(self, path: Path) -> str:
         """``file:line:column`` of the key, or of the nearest one above it that was written."""
         line, column = self.position(path)
-        return self.name if self.marks is None else f"{self.name}:{line + 1}:{column + 1}"
+        return self.name if not self.text else f"{self.name}:{line + 1}:{column + 1}"
 
     def position(self, path: Path) -> tuple[int, int]:
         """Line and column of the same, counted from 0; ``(0, 0)`` where positions are unknown."""
@@ -54,7 +68,7 @@ def read_source(config: str | File | Mapping[str, Any]) -> Source:
         return Source("config", File.cwd(), _plain(config))
     file = File(config)
     text = _text(file)
-    data, marks = _parsed(file, text)
+    data = _parsed(file, text)
     if data is None:
         raise ConfigError(f"{file}: the file is empty; expected at least the key 'problem'")
     if not isinstance(data, dict):
@@ -62,17 +76,28 @@ def read_source(config: str | File | Mapping[str, Any]) -> Source:
             f"{file}: expected a mapping of keys to values, got"
             f" {'a list' if isinstance(data, list) else repr(data)[:60]}"
         )
-    return Source(str(file), file.resolve().parent, data, marks)
+    if _counted(data, {}) > MOST_VALUES:
+        raise ConfigError(
+            f"{file}: expected at most {MOST_VALUES} values, aliases counted as what they stand for, got more"
+        )
+    return Source(str(file), file.resolve().parent, data, "" if file.suffix == ".toml" else text)
 
 
 def read_value(text: str) -> object:
     """The value of an override, as YAML."""
-    from ruamel.yaml.error import MarkedYAMLError
+    from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
+    if len(text) > LARGEST:
+        raise ConfigError(f"override value {text[:40]!r}...: expected at most {LARGEST} characters, got {len(text)}")
     try:
-        return _yaml("safe").load(text)
+        value = _yaml("safe").load(text)
     except MarkedYAMLError as error:
         raise ConfigError(f"override value {text!r}: {_problem(error)}") from error
+    except (YAMLError, RecursionError) as error:
+        raise ConfigError(f"override value {text[:60]!r}: not valid YAML: {type(error).__name__}") from None
+    if _counted(value, {}) > MOST_VALUES:
+        raise ConfigError(f"override value {text[:40]!r}...: expected at most {MOST_VALUES} values, got more")
+    return value
 
 
 def write_yaml(data: Mapping[str, Any], heading: str = "") -> str:
@@ -97,6 +122,9 @@ def _yaml(kind: str) -> YAML:
 
 def _text(file: File) -> str:
     try:
+        size = file.stat().st_size
+        if size > LARGEST:
+            raise ConfigError(f"{file}: expected at most {LARGEST} bytes, got {size}; a plugin can make large data")
         return file.read_bytes().decode("utf-8-sig")
     except FileNotFoundError:
         raise ConfigError(f"{file}: there is no such file") from None
@@ -110,21 +138,27 @@ def _text(file: File) -> str:
         raise ConfigError(f"{file}: cannot be read: {error.strerror}") from None
 
 
-def _parsed(file: File, text: str) -> tuple[Any, object]:
+def _parsed(file: File, text: str) -> Any:
     from ruamel.yaml.error import MarkedYAMLError, YAMLError
+    from ruamel.yaml.reader import ReaderError
 
     try:
         if file.suffix == ".toml":
-            return tomllib.loads(text), None
+            return tomllib.loads(text)
         if file.suffix == ".json":
-            return json.loads(text), _marks_of_json(text)
-        return _yaml("safe").load(text), _yaml("rt").load(text)
+            return json.loads(text)
+        return _yaml("safe").load(text)
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         at = f":{mark.line + 1}:{mark.column + 1}" if mark else ""
         raise ConfigError(f"{file}{at}: {_problem(error)}") from None
     except json.JSONDecodeError as error:
         raise ConfigError(f"{file}:{error.lineno}:{error.colno}: not valid JSON: {error.msg}") from None
+    except ReaderError as error:
+        before = text[: error.position]
+        line, column = before.count("\n") + 1, len(before) - before.rfind("\n")
+        said = f"the character U+{ord(text[error.position]):04X} is not allowed in a config"
+        raise ConfigError(f"{file}:{line}:{column}: {said}") from None
     except (YAMLError, tomllib.TOMLDecodeError) as error:
         raise ConfigError(f"{file}: {' '.join(str(error).split())}") from None
     except RecursionError:
@@ -133,13 +167,15 @@ def _parsed(file: File, text: str) -> tuple[Any, object]:
         raise ConfigError(f"{file}: {error}") from None
 
 
-def _marks_of_json(text: str) -> object:
-    from ruamel.yaml.error import YAMLError
-
-    try:
-        return _yaml("rt").load(text)
-    except (YAMLError, ValueError):
-        return None
+def _counted(data: object, known: dict[int, int]) -> int:
+    """How many values there are, those behind an alias as often as it is used; one that contains itself counts once."""
+    if not isinstance(data, Mapping | list):
+        return 1
+    if id(data) not in known:
+        known[id(data)] = 1
+        below = data.values() if isinstance(data, Mapping) else data
+        known[id(data)] = 1 + sum(_counted(value, known) for value in below)
+    return known[id(data)]
 
 
 def _problem(error: Any) -> str:

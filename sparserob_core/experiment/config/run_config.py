@@ -6,13 +6,13 @@ import hashlib
 import json
 from typing import Any, final
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import ConfigDict, Field
 
-from sparserob_core.options import Options
+from sparserob_core.options import Exact, Options
 from sparserob_core.sip.method import Continuation
 
 
-class Entry(BaseModel):
+class Entry(Exact):
     """A component by ``name``; the other keys are its options. A bare name stands for a component with its default
     options."""
 

@@ -50,8 +50,8 @@ class Complaint:
 
 
 def shown(value: object) -> str:
-    """A short text of a value."""
-    text = repr(value)
+    """A short text of a value, in the words of a config."""
+    text = {"None": "null", "True": "true", "False": "false"}.get(repr(value), repr(value))
     return text if len(text) <= SHOWN else text[: SHOWN - 3] + "..."
 
 
@@ -68,13 +68,23 @@ def nearest(name: str, known: Iterable[str]) -> str:
 def complaints(error: ValidationError, model: type[BaseModel], data: object) -> list[Complaint]:
     """One complaint per key; what several members of a union say of one key is joined by *or*."""
     found: dict[Path, list[str]] = {}
-    for item in error.errors(include_url=False):
+    items = error.errors(include_url=False)
+    misspelt = [item["loc"] for item in items if item["type"] == "extra_forbidden"]
+    for item in items:
+        if item["type"] == "missing" and any(_meant(loc, item["loc"]) for loc in misspelt):
+            continue  # the unknown key beside it says which one was meant
         path = visible(item["loc"], data, missing=item["type"] == "missing")
         sentences = found.setdefault(path, [])
         sentence = _sentence(dict(item), model)
         if sentence not in sentences:
             sentences.append(sentence)
     return [Complaint(path, " or ".join(_without_repeated_got(sentences))) for path, sentences in found.items()]
+
+
+def _meant(written: Path, missing: Path) -> bool:
+    """Whether an unknown key looks like the missing one beside it."""
+    near = difflib.get_close_matches(str(written[-1]).lower(), [str(missing[-1])], n=1, cutoff=0.6)
+    return written[:-1] == missing[:-1] and bool(near)
 
 
 def visible(loc: Path, data: object, missing: bool = False) -> Path:
@@ -103,6 +113,9 @@ def _sentence(item: dict[str, Any], model: type[BaseModel]) -> str:
             cause = item.get("ctx", {}).get("error")
             got = isinstance(cause, InputError) and cause.got
             return str(cause) if got else f"{cause} (got {shown(item['input'])})"
+        case "too_short":
+            least = item["ctx"]["min_length"]
+            return f"must have at least {least} {'entry' if least == 1 else 'entries'} (got {shown(item['input'])})"
         case kind if kind in MUST_BE:
             return f"must be {MUST_BE[kind]} (got {shown(item['input'])})"
         case _:
@@ -144,7 +157,8 @@ def malformed(data: object, path: Path = (), above: tuple[int, ...] = ()) -> Ite
     if id(data) in above:
         yield Complaint(path, "contains itself; a config is a finite tree")
     elif isinstance(data, float) and not math.isfinite(data):
-        yield Complaint(path, f"must be a finite number (got {data}); write null for a side that is free")
+        hint = "; write null for a side that is free" if {"box", "equals", "lower", "upper"} & set(path) else ""
+        yield Complaint(path, f"must be a finite number (got {data}){hint}")
     elif isinstance(data, Mapping):
         for key, value in data.items():
             if not isinstance(key, str):

@@ -194,3 +194,15 @@ def test_the_options_survive_being_written_and_read() -> None:
 def test_a_config_at_fault_names_the_key_and_what_was_expected(changes, message: str) -> None:
     with pytest.raises(InputError, match=message):
         linear(**changes)
+
+
+@pytest.mark.parametrize("horizon", [True, "5"])
+def test_truth_values_and_texts_are_no_numbers(horizon: object) -> None:
+    system = LinearSystem(np.zeros((1, 1)), np.ones((1, 1)))
+    with pytest.raises(InputError, match="horizon: expected a number"):
+        OptimalControlProblem(system=system, horizon=horizon, initial_state=[1.0], control=Box([-1.0], [1.0]))
+
+
+def test_a_state_space_model_spread_over_the_arguments_is_refused_in_words() -> None:
+    with pytest.raises(InputError, match=r"parameters: expected a convex set.*C and D"):
+        LinearSystem(np.zeros((1, 1)), np.ones((1, 1)), np.ones((1, 1)), np.zeros((1, 1)))

@@ -14,6 +14,10 @@ from sparserob_core.experiment.assemble import assemble
 from sparserob_core.experiment.config.load import load_config
 from sparserob_core.experiment.config.reader import read_value, write_yaml
 
+BILLION_LAUGHS = b"a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + b"".join(
+    f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n".encode() for i in range(1, 12)
+)
+
 
 def refusal(config: object, *overrides: str) -> str:
     """The message of the `ConfigError` that a config, or what is built from it, raises."""
@@ -33,7 +37,14 @@ def edited(config: Path, old: str, new: str) -> Path:
     ("old", "new", "place", "said"),
     [
         ("horizon: 2.0", "horizn: 2.0", ":7:3: problem.horizn:", "did you mean 'horizon'?"),
-        ("horizon: 2.0", "horizn: 2.0", ":2:1: problem.horizon:", "missing"),
+        ("horizon: 2.0", "", ":2:1: problem.horizon:", "missing"),
+        ("horizon: 2.0", "horizon: true", ":7:3: problem.horizon:", "must be a number (got true)"),
+        ("horizon: 2.0", "horizon: '2'", ":7:3: problem.horizon:", "must be a number (got '2')"),
+        ("horizon: 2.0", "horizon: null", ":7:3: problem.horizon:", "must be a number (got null)"),
+        ("horizon: 2.0", "horizon: 2.0 \0", ":7:16:", "the character U+0000 is not allowed"),
+        ("B: [[0], [1]]", "B: []", "problem.system.B", "must have at least 1 entry (got [])"),
+        ("B: [[0], [1]]", "B: [[0], [1/0]]", ":6:15: problem.system.B.1.0:", "its value is not a finite number"),
+        ("method: {name: stub}", "method: {name: stub}\nseed: true", ":14:1: seed:", "must be a number (got true)"),
         ("horizon: 2.0", "horizon: 0", ":7:3: problem.horizon:", "must be greater than 0 (got 0)"),
         ("horizon: 2.0", "horizon: -1e3", ":7:3: problem.horizon:", "must be greater than 0"),
         ("horizon: 2.0", "horizon: .nan", ":7:3: problem.horizon:", "must be a finite number (got nan)"),
@@ -109,6 +120,10 @@ def test_a_fault_is_told_with_its_place_its_key_and_what_was_expected(
     assert any(place in line and said in line for line in message.splitlines()), message
 
 
+def test_a_misspelt_key_is_told_once_and_not_as_missing_too(config: Path) -> None:
+    assert len(refusal(edited(config, "horizon: 2.0", "horizn: 2.0")).splitlines()) == 1
+
+
 def test_all_faults_are_told_at_once_in_the_order_of_the_file(config: Path) -> None:
     edited(config, "horizon: 2.0", "horizon: -2")
     edited(config, "pieces: 10", "pieces: ten")
@@ -138,6 +153,8 @@ def test_the_missing_problem_is_the_only_key_without_a_default(config: Path) -> 
         (b"title: \xff\n", "expected text in UTF-8, got the byte 0xff at 7"),
         (b"a: 1\n---\nb: 2\n", "not valid YAML"),
         (b"[" * 3000, "nested too deeply"),
+        (b"x: [" + b"1," * 5_000_000 + b"1]", "expected at most 1000000 bytes, got 10000006"),
+        (BILLION_LAUGHS, "expected at most 200000 values, aliases counted as what they stand for"),
     ],
 )
 def test_a_file_that_holds_no_config_gets_one_sentence(tmp_path: Path, content: bytes, said: str) -> None:
