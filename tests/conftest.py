@@ -6,10 +6,18 @@ import os
 from pathlib import Path
 
 import pytest
+
+os.environ["SPARSEROB_SHAPES"] = "1"  # before anything else of the package: shapes in annotations are checked here
+import sparserob_core.shapes
+
+del os.environ["SPARSEROB_SHAPES"]  # processes that a test starts run as a user's do
+
 from hypothesis import settings
 
 from tests.support.places import ROOT
 from tests.support.stub import command, config
+
+assert sparserob_core.shapes.CHECKED
 
 __all__ = ["command", "config"]
 

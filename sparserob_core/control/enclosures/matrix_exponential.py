@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array
 
 # 1 / k!; beyond degree 18 nothing is left on the unit ball (1 / 19! < 1e-17)
 COEFFICIENTS = 1.0 / np.cumprod([1.0, *range(1, 19)])
 
 
-def exponential(matrices: Array) -> Array:
-    """``e^A`` of matrices ``(..., d, d)``, by scaling and squaring of the Taylor polynomial of degree 18 (Moler and Van
+@shaped
+def exponential(matrices: Float[Array, "*k d d"]) -> Float[Array, "*k d d"]:
+    """``e^A`` of matrices, by scaling and squaring of the Taylor polynomial of degree 18 (Moler and Van
     Loan 2003, method 3).
 
     Matrix products only. `scipy.linalg.expm` solves a tiny linear system per matrix, for which a threaded LAPACK wakes

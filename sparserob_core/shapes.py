@@ -1,0 +1,48 @@
+"""Shapes of arrays in annotations: ``Float[Array, "k d"]`` has ``k`` rows of ``d`` numbers.
+
+One letter means one size throughout a signature. A function that is marked `shaped` has its arguments and its result
+checked by the tests, and by nobody else: jaxtyping costs as much to import as numpy, so that outside of the tests
+(``SPARSEROB_SHAPES`` unset) an annotation stands for a plain array, and `shaped` hands the function back.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+CHECKED = bool(os.environ.get("SPARSEROB_SHAPES"))
+F = TypeVar("F")
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+    def shaped(function: F) -> F:
+        """Mark a function whose annotations state shapes."""
+        return function
+
+elif CHECKED:
+    from beartype import beartype
+    from jaxtyping import Bool, Float, Int, jaxtyped
+
+    def shaped(function: Any) -> Any:
+        """Check the shapes in the annotations of a function whenever it is called."""
+        return jaxtyped(function, typechecker=beartype)
+
+else:
+
+    class _Plain:
+        """Stands for an array of any shape."""
+
+        def __class_getitem__(cls, item: object) -> type:
+            return np.ndarray
+
+    Bool = Float = Int = _Plain
+
+    def shaped(function: Any) -> Any:
+        """Mark a function whose annotations state shapes; nothing is checked."""
+        return function
+
+
+__all__ = ["Bool", "Float", "Int", "shaped"]
