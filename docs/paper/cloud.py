@@ -9,7 +9,6 @@ import numpy as np
 import sparserob_core as sr
 from sparserob_core.control.constraints.samples import sample_disturbances, sample_parameters
 from sparserob_core.control.transcription.record import Transcription
-from sparserob_core.control.transcription.transcribe import prepare
 
 TRAJECTORIES = 10_000
 SEED = 1
@@ -39,8 +38,7 @@ class Cloud:
 
 def model_of(outcome: sr.Outcome) -> Transcription:
     """The transcription of a run's problem."""
-    experiment = outcome.experiment
-    return prepare(experiment.problem, experiment.control, experiment.disturbance)
+    return outcome.experiment.transcription
 
 
 def cloud_of(outcome: sr.Outcome, count: int = TRAJECTORIES) -> Cloud:

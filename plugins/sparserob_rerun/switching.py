@@ -40,10 +40,10 @@ class Switching:
             return None
         total = np.zeros(program.n)
         for cut in cuts:
-            family, index = program.family(cut.family), np.asarray(cut.index)
-            if family.literal is not None and index.size != family.index_set.dimension:
-                family = family.literal
-            rows, _ = family.rows(index[np.newaxis])
+            family = program.formulated(cut.family, cut.formulation)
+            if family is None:  # the number of a sample does not tell its constraint
+                return None
+            rows, _ = family.rows(np.asarray(cut.index)[np.newaxis])
             total += cut.multiplier * rows[0, cut.row]
         if program.A is not None and mu is not None:
             total += mu @ np.atleast_2d(program.A)

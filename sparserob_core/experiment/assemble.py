@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
@@ -10,6 +11,7 @@ import numpy as np
 
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.config.load import Loaded
 from sparserob_core.experiment.solve import indicators
@@ -20,30 +22,17 @@ if TYPE_CHECKING:
     from sparserob_core.experiment.config.run_config import Entry
 
 
-@final
 @dataclass(frozen=True, eq=False)
-class Described:
-    """The records that a config describes: a control problem and its two dictionaries, or a program that was ``stated``
-    as it is."""
+class Experiment(ABC):
+    """What a config describes, built: a control problem with its transcription, or a program that was stated as it
+    is."""
 
     loaded: Loaded
-    problem: OptimalControlProblem | None = None
-    control: Dictionary | None = None
-    disturbance: Dictionary | None = None
-    stated: SemiInfiniteProgram | None = None
 
-
-@final
-@dataclass(frozen=True, eq=False)
-class Experiment:
-    """What a config describes, built: the program, and for a control problem the problem itself and its two
-    dictionaries."""
-
-    loaded: Loaded
-    program: SemiInfiniteProgram
-    problem: OptimalControlProblem | None = None
-    control: Dictionary | None = None
-    disturbance: Dictionary | None = None
+    @property
+    @abstractmethod
+    def program(self) -> SemiInfiniteProgram:
+        """The semi-infinite program."""
 
     @property
     def gap_tolerance(self) -> float | None:
@@ -56,36 +45,76 @@ class Experiment:
         return self.loaded.config.title or name_of(self.loaded)
 
 
-def described(loaded: Loaded) -> Described:
-    """Build the problem and the dictionaries of a checked config; raises `ConfigError` with the place of the key at
-    fault."""
-    config = loaded.config
-    try:
-        problem = build(loaded, "problem", config.problem).build()
-    except InputError as error:
-        raise loaded.located(("problem",), error) from error
-    if isinstance(problem, SemiInfiniteProgram):
-        return Described(loaded, stated=problem)
-    control = _dictionary(loaded, "control", config.dictionaries.control, problem.horizon)
-    entry = config.dictionaries.disturbance
-    disturbance = indicators(control) if entry is None else _dictionary(loaded, "disturbance", entry, problem.horizon)
-    return Described(loaded, problem, control, disturbance)
+@final
+@dataclass(frozen=True, eq=False)
+class ControlExperiment(Experiment):
+    """A control problem and what became of it."""
+
+    transcription: Transcription
+
+    @property
+    def program(self) -> SemiInfiniteProgram:
+        return self.transcription.program
+
+    @property
+    def problem(self) -> OptimalControlProblem:
+        """The control problem."""
+        return self.transcription.problem
+
+    @property
+    def control(self) -> Dictionary:
+        """The dictionary of the control."""
+        return self.transcription.control
+
+    @property
+    def disturbance(self) -> Dictionary:
+        """The dictionary of the disturbance."""
+        return self.transcription.disturbance
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class PlainExperiment(Experiment):
+    """A semi-infinite program that is no control problem."""
+
+    stated: SemiInfiniteProgram
+
+    @property
+    def program(self) -> SemiInfiniteProgram:
+        return self.stated
 
 
 def assemble(loaded: Loaded) -> Experiment:
     """Build what a checked config describes, and its program; raises `ConfigError` with the place of the key at
     fault."""
-    from sparserob_core.control.transcription.transcribe import transcribe
+    from sparserob_core.control.transcription.transcribe import prepare
 
-    parts = described(loaded)
-    if parts.stated is not None:
-        return Experiment(loaded, parts.stated)
-    assert parts.problem is not None and parts.control is not None
+    problem = problem_of(loaded)
+    if isinstance(problem, SemiInfiniteProgram):
+        return PlainExperiment(loaded, problem)
+    control, disturbance = dictionaries_of(loaded, problem.horizon)
     try:
-        program = transcribe(parts.problem, control=parts.control, disturbance=parts.disturbance)
+        return ControlExperiment(loaded, prepare(problem, control, disturbance))
     except InputError as error:
         raise loaded.located(("problem",), error) from error
-    return Experiment(loaded, program, parts.problem, parts.control, parts.disturbance)
+
+
+def problem_of(loaded: Loaded) -> OptimalControlProblem | SemiInfiniteProgram:
+    """The problem, or the program, that a checked config states; raises `ConfigError` with the place of the key at
+    fault."""
+    try:
+        problem: OptimalControlProblem | SemiInfiniteProgram = build(loaded, "problem", loaded.config.problem).build()
+    except InputError as error:
+        raise loaded.located(("problem",), error) from error
+    return problem
+
+
+def dictionaries_of(loaded: Loaded, horizon: float) -> tuple[Dictionary, Dictionary]:
+    """The dictionaries of control and disturbance of a checked config; raises `ConfigError` with the place of the key
+    at fault."""
+    control = _dictionary(loaded, "control", loaded.config.dictionaries.control, horizon)
+    entry = loaded.config.dictionaries.disturbance
+    return control, indicators(control) if entry is None else _dictionary(loaded, "disturbance", entry, horizon)
 
 
 def gap_tolerance(loaded: Loaded) -> float | None:

@@ -10,17 +10,19 @@ from typing import Literal
 import numpy as np
 
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.program import Formulation
 
 
 @dataclass(frozen=True, eq=False)
 class Cut:
     """One imposed constraint: row ``row`` of family ``family`` at ``index (d,)``, with its multiplier in the last
-    relaxed program."""
+    relaxed program. ``formulation`` says which form of the family the index belongs to."""
 
     family: str
     index: Array
     row: int
     multiplier: float = 0.0
+    formulation: Formulation = "reduced"
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +53,7 @@ class Witness:
     constraint: str
     index: Array
     row: int = 0
+    formulation: Formulation = "reduced"
     time: float | None = None
     parameter: Array | None = None
     disturbance: Array | None = field(default=None, repr=False)
@@ -62,7 +65,7 @@ class Proof:
     ``bound <= TOLERANCE``), ``refuted`` (``index``, ``row`` violate it by ``violation``) or ``undecided`` (``reason``).
 
     ``leaves``: the lower and upper corners ``(k, d)`` of the closed cells that prove it, a subdivision of the family's
-    ``cells``, in lexicographic order; ``None`` unless proven by branch and bound.
+    ``cells``, in lexicographic order; ``None`` unless proven by branch and bound. ``formulation`` is that of the index.
     """
 
     family: str
@@ -74,3 +77,4 @@ class Proof:
     cells: int = 0
     reason: str = ""
     leaves: tuple[Array, Array] | None = None
+    formulation: Formulation = "reduced"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
@@ -14,6 +14,11 @@ from sparserob_core.sip.finite import FiniteProgram
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
+
+
+Formulation: TypeAlias = Literal["reduced", "nominal", "literal", "sampled"]
+"""What an index of a family says. ``reduced``: everything but the uncertainty that is maximised in closed form;
+``nominal``: nothing of the uncertainty; ``literal``: all of it; ``sampled``: the number of a sample."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +84,8 @@ class ConstraintFamily:
     ``sample(count, rng)``  the same constraints for ``count`` sampled uncertainties only;
     ``literal``       the same constraints with an inner maximisation left to the index, and ``reduced``, from such a
         family, the way back;
+    ``formulation``   what its indices say (`Formulation`); a cut says it too, so that its index can be understood;
+    ``source``        what the family was made of: never looked at here, handed back to whoever made it;
     ``scale``         the size of the numbers that the constraint compares; where it is tiny, a violation is judged
         relative to it;
     ``explain(index (d,), row)``  the constraint in words and, for control problems, where it is (an `Explanation`).
@@ -97,6 +104,18 @@ class ConstraintFamily:
     reduced: ConstraintFamily | None = None
     explain: Callable[[Array, int], Explanation] | None = None
     scale: float = 1.0
+    formulation: Formulation = "reduced"
+    source: object = None
+
+    def formulated(self, formulation: Formulation) -> ConstraintFamily | None:
+        """The same constraints with the indices of another formulation; ``None`` where the family does not have it.
+
+        A family on which the uncertainty does not act is the same in all of them.
+        """
+        if formulation == self.formulation:
+            return self
+        forms = {"reduced": self.reduced, "nominal": self.nominal, "literal": self.literal}
+        return forms.get(formulation)
 
     def tolerance(self, level: float) -> float:
         """``level``, or less where the numbers of this constraint are below a thousandth: a millionth of them, at the
@@ -177,6 +196,10 @@ class SemiInfiniteProgram:
     def family(self, name: str) -> ConstraintFamily:
         """The family of that name."""
         return next(family for family in self.families if family.name == name)
+
+    def formulated(self, name: str, formulation: Formulation) -> ConstraintFamily | None:
+        """The family of that name whose indices are those of a formulation (`ConstraintFamily.formulated`)."""
+        return self.family(name).formulated(formulation)
 
     @property
     def cost_scale(self) -> float:

@@ -38,10 +38,11 @@ def test_the_proof_of_a_known_system_takes_no_longer_than_solving(
 
 def proof_seconds(outcome: sr.Outcome) -> float:
     """The proof of the decision on a program that has separated it before, as in a run, and remembers nothing else."""
+    from sparserob_core.experiment.assemble import ControlExperiment
     from sparserob_core.sip.proof.branch_and_bound import prove
 
     experiment = outcome.experiment
-    assert experiment.problem is not None and experiment.control is not None and outcome.result.decision is not None
+    assert isinstance(experiment, ControlExperiment) and outcome.result.decision is not None
     program = sr.transcribe(experiment.problem, control=experiment.control, disturbance=experiment.disturbance)
     for family in program.families:
         assert family.worst is not None

@@ -25,7 +25,7 @@ from sparserob_core.control.problem.problem import OptimalControlProblem, PathCo
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.response import merge_grids
 from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Ellipsoid, NormBall, Polytope
-from sparserob_core.control.transcription.transcribe import prepare, program_of
+from sparserob_core.control.transcription.transcribe import prepare
 from tests.support.plants import indicators, random_system, uniform, worst_case
 
 TRIANGLE = Polytope(np.array([[1.0, 1.0], [-1.0, 0.0], [0.0, -1.0]]), np.array([1.0, 0.5, 0.25]))
@@ -251,7 +251,7 @@ def test_rows_of_the_dual_are_those_of_the_transcription(nu):
         disturbance=TRIANGLE,
         path=[PathConstraint(Ellipsoid(np.zeros(2), np.eye(2)), 0.1, 1.9), PathConstraint(SETS["box"], 0.0, 2.0)],
     )
-    family = program_of(prepare(problem, control, disturbance)).families[1]
+    family = prepare(problem, control, disturbance).program.families[1]
     dual = Duality(problem, control, disturbance.breakpoints[:-1].tolist())
     for time in (0.0, 0.3, 0.7, 2.0):
         parameter = rng.uniform(-0.1, 0.1, size=nu)

@@ -8,7 +8,6 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.control.constraints.samples import sample_disturbances
-from sparserob_core.control.transcription.transcribe import prepare
 from tests.support.places import CONFIGS
 
 TRAJECTORIES = 10_000
@@ -17,13 +16,13 @@ TRAJECTORIES = 10_000
 @pytest.mark.slow
 def test_a_control_that_random_disturbances_hardly_ever_break_is_refuted_by_the_worst_one(tmp_path):
     outcome = sr.run(CONFIGS / "experiment1_paper.yaml", {"observers": []}, out=tmp_path / "run", figures=False)
-    result, experiment = outcome.result, outcome.experiment
+    result = outcome.result
     with np.load(outcome.directory / "solution.npz") as solution:
         assert solution["indices"].shape[1] == 501
     assert result.status == "refuted"
     assert result.worst.violation > 1.0
     assert np.abs(result.worst.disturbance).max() <= 0.4 + 1e-12
-    model = prepare(experiment.problem, experiment.control, experiment.disturbance)
+    model = outcome.experiment.transcription
     disturbances = sample_disturbances(model.functionals.disturbance, TRAJECTORIES, np.random.default_rng(1))
     states = model.response.states(model.pieces(result.decision), np.zeros((TRAJECTORIES, 0)), disturbances)
     times = model.response.grid.breakpoints

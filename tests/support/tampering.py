@@ -98,9 +98,9 @@ def _agree(files: Forgery, untouched: bool) -> None:
 
 def _solved(files: Forgery) -> None:
     """Write the certificate's decision to ``solution.npz``, where it is one."""
-    from sparserob_core.experiment.assemble import described
+    from sparserob_core.experiment.assemble import assemble
 
-    dictionary = described(load_config(files.directory / "config.yaml")).control
+    dictionary = assemble(load_config(files.directory / "config.yaml")).control
     try:
         theta = np.array(files.decision, dtype=float)
         control = theta @ dictionary.values

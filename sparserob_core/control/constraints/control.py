@@ -34,6 +34,7 @@ class ControlConstraint:
             worst=self.worst,
             gradient=self.gradient,
             explain=self.explain,
+            source=self,
         )
         return replace(family, nominal=family, sample=lambda count, rng: family, literal=family)
 

@@ -3,20 +3,25 @@ half-space."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import final
 
 import numpy as np
 
+from sparserob_core.control.constraints.explanation import explanation
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.local_maxima import climb, local_maxima, vertices
+from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.combination import Combination, combination
 from sparserob_core.control.response.enclosure import CELLS_KEPT, CellEnclosure, enclose
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.parameters import ParameterIndex
-from sparserob_core.control.sets.directions import faces, on_surface, sampled, unit
+from sparserob_core.control.sets.curved import Ellipsoid, NormBall
+from sparserob_core.control.sets.directions import across, faces, on_surface, sampled, unit
+from sparserob_core.control.sets.sets import Cylinder
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.program import Enclosure, Explanation, Separation
 
@@ -24,8 +29,9 @@ CANDIDATES = 24  # sampled maxima that are climbed from
 KEPT = 8  # separated constraints per round
 
 
+@final
 @dataclass(frozen=True, eq=False)
-class CurvedConstraint:
+class CurvedConstraint(StateConstraint):
     """``x(t)`` in a curved set for all ``t`` in ``[start, stop]``, ``p`` and ``w``: ``c'x(t) <= h(c)`` for every unit
     direction ``c``.
 
@@ -39,6 +45,11 @@ class CurvedConstraint:
     start: float
     stop: float
     parameters: ParameterIndex
+    shared: CurvedConstraint | None = field(default=None, repr=False)
+
+    @property
+    def sides(self) -> None:
+        """None: the set is curved."""
 
     @property
     def index_set(self) -> Box:
@@ -47,23 +58,14 @@ class CurvedConstraint:
 
     @property
     def scale(self) -> float:
-        """The size of the states that the constraint is about."""
         return self._flat.scale
 
-    def rows(self, indices: Array) -> tuple[Array, Array]:
-        """``G (k, 1, n)``, ``rhs (k, 1)`` at indices ``(k, 1 + nu + b)``."""
-        times, directions, parameters, rhs = self.functionals_at(indices)
-        G, offset = self.functionals.rows(times, directions, parameters)
-        return G[:, None], (rhs - offset)[:, None]
-
     def functionals_at(self, indices: Array) -> tuple[Array, Array, Array, Array]:
-        """Times, unit directions, parameters and right-hand sides of every index, ``(k, ...)``."""
         nu = self.parameters.count
         directions = unit(self.set, indices[:, 1 + nu :])
         return indices[:, 0], directions, self.parameters.clamp(indices[:, 1 : 1 + nu]), self.set.support(directions)
 
-    def violations(self, x: Array, indices: Array) -> Array:
-        """``row x - rhs``, ``(k,)``, without building rows."""
+    def violations(self, x: Array, indices: Array, rows: np.ndarray) -> Array:
         times, directions, parameters, rhs = self.functionals_at(indices)
         return self.functionals.values(x, times, directions, parameters) - rhs
 
@@ -92,7 +94,8 @@ class CurvedConstraint:
                 [inside[:, :1], self.parameters.clamp(inside[:, 1 : 1 + count]), on_surface(inside[:, 1 + count :])]
             )
 
-        indices, found = climb(lambda at, which: self.violations(x, at), points, step, project)
+        one = np.zeros(points.shape[0], dtype=int)
+        indices, found = climb(lambda at, which: self.violations(x, at, one[which]), points, step, project)
         order = _distinct(indices, found)[:KEPT]
         return Separation(indices[order], np.zeros(order.size, dtype=int), found[order])
 
@@ -114,15 +117,37 @@ class CurvedConstraint:
         return enclose(lower, upper, touched, nu, lambda low, high: self._cell(x, low, high))
 
     def explain(self, index: Array, row: int) -> Explanation:
-        """One constraint in words."""
         times, directions, parameters, rhs = self.functionals_at(index[None])
-        one = FlatConstraint(self.name, self.functionals, directions, rhs, self.start, self.stop, self.parameters)
-        words = one.explain(np.concatenate([times, parameters[0]]), 0)
-        return replace(words, text=f"{words.text} (a tangent of the {type(self.set).__name__.lower()})")
+        said = explanation(self.name, self.functionals, directions, rhs, 0, float(times[0]), parameters[0])
+        return replace(said, text=f"{said.text} (a tangent of the {type(self.set).__name__.lower()})")
 
     def nominal(self) -> CurvedConstraint:
-        """The same constraint without uncertainty."""
-        return replace(self, functionals=self.functionals.nominal(), parameters=ParameterIndex(None))
+        known = self.functionals.nominal()
+        return CurvedConstraint(self.name, known, self.set, self.start, self.stop, ParameterIndex(None))
+
+    def from_state(self, initial_state: Array) -> CurvedConstraint:
+        moved = self.functionals.from_state(initial_state)
+        return CurvedConstraint(
+            self.name, moved, self.set, self.start, self.stop, self.parameters, self._sharing or self
+        )
+
+    def directions(self, z: Array, rows: np.ndarray) -> tuple[Array, Array]:
+        normals = self.set.normals
+        return np.broadcast_to(normals, (rows.size, *normals.shape)), unit(self.set, z) @ normals.T
+
+    def turned(self, z: Array, directions: Array, states: Array) -> Array:
+        return across(z, states - self.set.support_point(directions) @ self.set.normals.T)
+
+    def outwardness(self, states: Array) -> Array:
+        return _outwardness(self.set, states.T)
+
+    def excess(self, states: Array) -> Array:
+        """The distance to the set outside, and inside the largest ``c'x - h(c)`` over sampled unit directions, which
+        never understates a margin."""
+        directions, points = unit(self.set, sampled(self._b)), states.T
+        tangent = (points @ directions.T - self.set.support(directions)).max(axis=1)
+        outside = self.set.violation(points)
+        return np.asarray(np.where(outside > 0.0, np.maximum(outside, tangent), tangent))
 
     def _cell(self, x: Array, low: Array, high: Array) -> CellEnclosure:
         key = x.tobytes() + low.tobytes() + high.tobytes()
@@ -166,7 +191,23 @@ class CurvedConstraint:
 
     @cached_property
     def _combinations(self) -> dict[int, Combination]:
-        return {}
+        return {} if self._sharing is None else self._sharing._combinations
+
+    @property
+    def _sharing(self) -> CurvedConstraint | None:
+        """The ``shared`` constraint where it is the same but for its initial state."""
+        given = self.shared
+        if given is None or (given.start, given.stop) != (self.start, self.stop):
+            return None
+        mine, other = self.functionals, given.functionals
+        same = (
+            given.set is self.set
+            and given.parameters is self.parameters
+            and mine.response.propagator is other.response.propagator
+            and mine.dictionary is other.dictionary
+            and mine.disturbance is other.disturbance
+        )
+        return given if same else None
 
     @cached_property
     def _cells(self) -> dict[bytes, CellEnclosure]:
@@ -179,10 +220,24 @@ class CurvedConstraint:
     @cached_property
     def _flat(self) -> FlatConstraint:
         """The half-spaces of the sampled directions: an outer polytope of the set, on which the search starts."""
+        if self._sharing is not None:
+            return self._sharing._flat.from_state(self.functionals.response.initial_state)
         H = unit(self.set, sampled(self._b))
         return FlatConstraint(
             self.name, self.functionals, H, self.set.support(H), self.start, self.stop, self.parameters
         )
+
+
+def _outwardness(convex: ConvexSet, points: Array) -> Array:
+    """A cheap measure ``(n,)`` of points ``(n, d)`` that is positive outside, negative inside, and grows outwards."""
+    if isinstance(convex, Cylinder):
+        return _outwardness(convex.base, points[:, : convex.base.dimension])
+    if isinstance(convex, Ellipsoid):
+        inverse = np.linalg.inv(convex.factor)
+        return np.asarray(np.linalg.norm(inverse @ (points - convex.centre).T, axis=0) - 1.0)
+    if isinstance(convex, NormBall):
+        return np.asarray(np.linalg.norm(points - convex.centre, ord=convex.p, axis=1) - convex.radius)
+    return convex.violation(points)
 
 
 def _distinct(indices: Array, found: Array) -> np.ndarray:

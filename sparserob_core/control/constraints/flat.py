@@ -3,13 +3,15 @@ and disturbances."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import final
 
 import numpy as np
 
 from sparserob_core.control.constraints.explanation import explanation
 from sparserob_core.control.constraints.local_maxima import climb, local_maxima, step_out, vertices
+from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.response.disturbance_support import DisturbanceSupport
 from sparserob_core.control.response.enclosure import CELLS_KEPT, CellEnclosure, enclose
@@ -17,7 +19,7 @@ from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.lifted import LiftedSystem, lift
 from sparserob_core.control.response.measurable import MeasurableCellSupport
 from sparserob_core.control.response.parameters import ParameterIndex
-from sparserob_core.control.response.response import distinct_times, transitions
+from sparserob_core.control.response.response import Response, distinct_times, transitions
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.program import Enclosure, Explanation, Separation
 
@@ -28,8 +30,87 @@ CLIMBED = 10  # of them, those that parameters are climbed for
 KEPT = 12  # separated constraints per row and round
 
 
+@final
 @dataclass(frozen=True, eq=False)
-class FlatConstraint:
+class Samples:
+    """What is remembered of ``H x(t) <= h`` in a window and does not depend on the initial state: sampled times and
+    parameters, and what the worst disturbance leaves there. ``H (r, d)``, ``h (r,)``."""
+
+    functionals: WorstCase
+    H: Array
+    h: Array
+    window: tuple[float, float]
+    parameters: ParameterIndex
+    _supports: dict[bytes, DisturbanceSupport | MeasurableCellSupport | None] = field(default_factory=dict, repr=False)
+
+    def serve(self, constraint: FlatConstraint) -> bool:
+        """Whether they are of this constraint, from whatever initial state."""
+        mine, other = self.functionals, constraint.functionals
+        return (
+            mine.response.propagator is other.response.propagator
+            and mine.dictionary is other.dictionary
+            and mine.disturbance is other.disturbance
+            and self.H is constraint.H
+            and self.h is constraint.h
+            and self.window == (constraint.start, constraint.stop)
+            and self.parameters is constraint.parameters
+        )
+
+    @cached_property
+    def times(self) -> Array:
+        """Sampled times: the window's ends, the breakpoints in it, and a few times in every piece, increasing."""
+        grid, (start, stop) = self._response.grid, self.window
+        pace = float(np.linalg.norm(self._response.steps(self.lattice[0]).A, axis=(1, 2)).max())
+        counts = np.clip(np.ceil(pace * grid.lengths / SMOOTH), INSIDE + 1, MOST_INSIDE).astype(int)
+        inside = np.concatenate(
+            [
+                np.linspace(left, right, count, endpoint=False)
+                for left, right, count in zip(grid.breakpoints[:-1], grid.breakpoints[1:], counts, strict=True)
+            ]
+        )
+        inside = inside[(inside > start) & (inside < stop)]
+        return distinct_times(np.concatenate([[start], inside, [stop]]), float(grid.breakpoints[-1]))
+
+    @cached_property
+    def lattice(self) -> tuple[Array, tuple[int, ...]]:
+        """Sampled parameters ``(v, nu)`` and the shape of their lattice."""
+        return self.parameters.lattice()
+
+    @cached_property
+    def margins(self) -> Array:
+        """``h - sigma`` on the lattice, ``(v, r, times)``: what the worst disturbance leaves of every side."""
+        points, _ = self.lattice
+        if self.functionals.disturbance is None:
+            return np.broadcast_to(self.h[None, :, None], (points.shape[0], self.h.size, self.times.size))
+        return self.h[None, :, None] - np.stack([self.functionals.profile(self.times, self.H, p).T for p in points])
+
+    @cached_property
+    def steps(self) -> tuple[np.ndarray, Array, Array]:
+        """The piece of every sampled time ``(times,)``, and the transitions from its start, ``(v, times, d, d)``
+        each."""
+        pieces = self._response.grid.locate(self.times)
+        distinct, which = self._response.grid.distinct(self.times - self._response.grid.breakpoints[pieces])
+        A = self._response.steps(self.lattice[0]).A
+        flow, driven = transitions(A[:, None], distinct[None])
+        return pieces, flow[:, which], driven[:, which]
+
+    def support_over(
+        self, lifted: LiftedSystem, low: Array, high: Array
+    ) -> DisturbanceSupport | MeasurableCellSupport | None:
+        """The support of the disturbance over a cell of parameters, remembered."""
+        key = low.tobytes() + high.tobytes()
+        if key not in self._supports:
+            remember(self._supports, key, self.functionals.disturbance_support(lifted, self.H), CELLS_KEPT)
+        return self._supports[key]
+
+    @property
+    def _response(self) -> Response:
+        return self.functionals.response
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class FlatConstraint(StateConstraint):
     """``H x(t) <= h`` for all ``t`` in ``[start, stop]``, ``p`` and ``w``; the index is ``(t, p)``.
 
     ``H (r, d)``, ``h (r,)``. A terminal constraint is the window ``[T, T]``.
@@ -42,6 +123,19 @@ class FlatConstraint:
     start: float
     stop: float
     parameters: ParameterIndex
+    shared: Samples | None = field(default=None, repr=False)
+
+    @cached_property
+    def samples(self) -> Samples:
+        """What does not depend on the initial state; the ``shared`` ones where they are of this constraint."""
+        if self.shared is not None and self.shared.serve(self):
+            return self.shared
+        return Samples(self.functionals, self.H, self.h, (self.start, self.stop), self.parameters)
+
+    @property
+    def sides(self) -> tuple[Array, Array]:
+        """``H``, ``h``."""
+        return self.H, self.h
 
     @property
     def index_set(self) -> Box:
@@ -52,25 +146,15 @@ class FlatConstraint:
 
     @property
     def scale(self) -> float:
-        """The size of the states that the constraint is about: its bounds, and the initial state."""
+        """The largest bound, or what the initial state gives."""
         return float(max(np.abs(self.h).max(), np.abs(self.H @ self.functionals.response.initial_state).max())) or 1.0
 
-    def rows(self, indices: Array) -> tuple[Array, Array]:
-        """``G (k, r, n)``, ``rhs (k, r)`` at indices ``(k, 1 + nu)``."""
-        times, directions, parameters, rhs = self.functionals_at(indices)
-        G, offset = self.functionals.rows(times, directions, parameters)
-        shape = (indices.shape[0], self.h.size)
-        return G.reshape(*shape, -1), (rhs - offset).reshape(shape)
-
     def functionals_at(self, indices: Array) -> tuple[Array, Array, Array, Array]:
-        """Times, directions, parameters and right-hand sides of all ``r`` constraints of every index, index by index:
-        ``(k r, ...)``."""
         parameters = np.repeat(self.parameters.clamp(indices[:, 1:]), self.h.size, axis=0)
         count = indices.shape[0]
         return np.repeat(indices[:, 0], self.h.size), np.tile(self.H, (count, 1)), parameters, np.tile(self.h, count)
 
     def violations(self, x: Array, indices: Array, rows: np.ndarray) -> Array:
-        """``row x - rhs`` for one row per index, ``(k,)``, without building rows."""
         parameters = self.parameters.clamp(indices[:, 1:])
         answer: Array = self.functionals.values(x, indices[:, 0], self.H[rows], parameters) - self.h[rows]
         return answer
@@ -104,14 +188,22 @@ class FlatConstraint:
         return Separation(indices[order], rows[order], found[order])
 
     def explain(self, index: Array, row: int) -> Explanation:
-        """One constraint in words: what is bounded, when, and what the uncertainty does to it."""
         time, parameter = float(index[0]), self.parameters.clamp(index[None, 1:])[0]
         return explanation(self.name, self.functionals, self.H, self.h, row, time, parameter)
 
     def nominal(self) -> FlatConstraint:
-        """The same constraint without uncertainty: a middle parameter, and no disturbance (or a middle one where none
-        is not admissible)."""
-        return replace(self, functionals=self.functionals.nominal(), parameters=ParameterIndex(None))
+        known = self.functionals.nominal()
+        return FlatConstraint(self.name, known, self.H, self.h, self.start, self.stop, ParameterIndex(None))
+
+    def from_state(self, initial_state: Array) -> FlatConstraint:
+        moved = self.functionals.from_state(initial_state)
+        return FlatConstraint(self.name, moved, self.H, self.h, self.start, self.stop, self.parameters, self.samples)
+
+    def directions(self, z: Array, rows: np.ndarray) -> tuple[Array, Array]:
+        return self.H[rows][:, None], np.ones((rows.size, 1))
+
+    def outwardness(self, states: Array) -> Array:
+        return np.asarray((self.H @ states - self.h[:, None]).max(axis=0))
 
     @property
     def cells(self) -> tuple[Array, Array]:
@@ -159,18 +251,16 @@ class FlatConstraint:
                 self._cells,
                 key,
                 CellEnclosure(
-                    lifted, self._support_over(low, high), self.H, rhs, control, cuts=self.parameters.cuts(low, high)
+                    lifted,
+                    self.samples.support_over(lifted, low, high),
+                    self.H,
+                    rhs,
+                    control,
+                    cuts=self.parameters.cuts(low, high),
                 ),
                 CELLS_KEPT,
             )
         return self._cells[key]
-
-    def _support_over(self, low: Array, high: Array) -> DisturbanceSupport | MeasurableCellSupport | None:
-        lifted = self.lifted(low, high)
-        key = low.tobytes() + high.tobytes()
-        if key not in self._supports:
-            remember(self._supports, key, self.functionals.disturbance_support(lifted, self.H), CELLS_KEPT)
-        return self._supports[key]
 
     @cached_property
     def _cells(self) -> dict[bytes, CellEnclosure]:
@@ -180,60 +270,29 @@ class FlatConstraint:
     def _lifted(self) -> dict[bytes, LiftedSystem]:
         return {}
 
-    @cached_property
-    def _supports(self) -> dict[bytes, DisturbanceSupport | MeasurableCellSupport | None]:
-        return {}
-
-    @cached_property
+    @property
     def times(self) -> Array:
-        """Sampled times: the window's ends, the breakpoints in it, and a few times in every piece, increasing."""
-        grid = self.functionals.response.grid
-        pace = float(np.linalg.norm(self.functionals.response.steps(self.lattice[0]).A, axis=(1, 2)).max())
-        counts = np.clip(np.ceil(pace * grid.lengths / SMOOTH), INSIDE + 1, MOST_INSIDE).astype(int)
-        inside = np.concatenate(
-            [
-                np.linspace(left, right, count, endpoint=False)
-                for left, right, count in zip(grid.breakpoints[:-1], grid.breakpoints[1:], counts, strict=True)
-            ]
-        )
-        inside = inside[(inside > self.start) & (inside < self.stop)]
-        return distinct_times(np.concatenate([[self.start], inside, [self.stop]]), float(grid.breakpoints[-1]))
+        """`Samples.times`."""
+        return self.samples.times
 
-    @cached_property
+    @property
     def lattice(self) -> tuple[Array, tuple[int, ...]]:
-        """Sampled parameters ``(v, nu)`` and the shape of their lattice."""
-        return self.parameters.lattice()
-
-    @cached_property
-    def _margins(self) -> Array:
-        """``h - sigma`` on the lattice, ``(v, r, times)``: what the worst disturbance leaves of every side."""
-        points, _ = self.lattice
-        if self.functionals.disturbance is None:
-            return np.broadcast_to(self.h[None, :, None], (points.shape[0], self.h.size, self.times.size))
-        return self.h[None, :, None] - np.stack([self.functionals.profile(self.times, self.H, p).T for p in points])
+        """`Samples.lattice`."""
+        return self.samples.lattice
 
     def on_lattice(self, x: Array) -> Array:
         """Violations ``(v, r, times)`` at every lattice point and sampled time."""
         response, points = self.functionals.response, self.lattice[0]
         control = self.functionals.dictionary.control(x)
         nodes = response.states(control, points)
-        pieces, flow, driven = self._sampling
+        pieces, flow, driven = self.samples.steps
         steps = response.steps(points)
         drive = np.einsum("vdm,ml->vld", steps.B, self.functionals.on_grid(x))
         states = np.einsum("vtij,vtj->vti", flow, nodes[:, pieces]) + np.einsum(
             "vtij,vtj->vti", driven, drive[:, pieces]
         )
-        answer: Array = np.einsum("ri,vti->vrt", self.H, states) - self._margins
+        answer: Array = np.einsum("ri,vti->vrt", self.H, states) - self.samples.margins
         return answer
-
-    @cached_property
-    def _sampling(self) -> tuple[np.ndarray, Array, Array]:
-        response = self.functionals.response
-        pieces = response.grid.locate(self.times)
-        distinct, which = response.grid.distinct(self.times - response.grid.breakpoints[pieces])
-        A = response.steps(self.lattice[0]).A
-        flow, driven = transitions(A[:, None], distinct[None])
-        return pieces, flow[:, which], driven[:, which]
 
     def _climbed(self, x: Array, indices: Array, rows: np.ndarray) -> tuple[Array, Array]:
         """Climb from every candidate ``(t, p)``; the set of parameters is never left."""

@@ -7,13 +7,12 @@ from functools import cached_property
 
 import numpy as np
 
-from sparserob_core.control.constraints.curved import CurvedConstraint
-from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.sensitivity import Sensitivity
+from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.sip.convex_set import Array, Box
-from sparserob_core.sip.program import ConstraintFamily, Separation
+from sparserob_core.sip.program import ConstraintFamily, Explanation, Separation
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +24,7 @@ class LiteralConstraint:
     reduced constraint, exactly.
     """
 
-    base: FlatConstraint | CurvedConstraint
+    base: StateConstraint
     disturbance: DisturbanceModel
 
     def family(self, reduced: ConstraintFamily) -> ConstraintFamily:
@@ -43,8 +42,15 @@ class LiteralConstraint:
             worst=self.worst,
             gradient=self.gradient,
             reduced=reduced,
-            explain=lambda index, row: self.base.explain(self._split(index[None])[0][0], row),
+            explain=self.explain,
+            scale=self.base.scale,
+            formulation="literal",
+            source=self.base,
         )
+
+    def explain(self, index: Array, row: int) -> Explanation:
+        """The reduced constraint at the time and the parameter of the index."""
+        return self.base.explain(self._split(index[None])[0][0], row)
 
     def rows(self, indices: Array) -> tuple[Array, Array]:
         """``G (k, r, n)``, ``rhs (k, r)`` at indices ``(k, 1 + beta + ...)``."""

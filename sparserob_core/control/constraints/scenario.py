@@ -8,8 +8,9 @@ from functools import cached_property
 
 import numpy as np
 
-from sparserob_core.control.constraints.flat import KEPT, FlatConstraint
+from sparserob_core.control.constraints.flat import KEPT
 from sparserob_core.control.constraints.local_maxima import local_maxima, vertices
+from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.response.response import SAME_TIME, Response, TimeGrid, distinct_times
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.program import ConstraintFamily, Separation
@@ -21,10 +22,13 @@ BLOCK = 2_000_000  # sampled violations that are held at once
 class ScenarioConstraint:
     """``H x(t) <= h`` for all times of a window and for ``S`` samples only; the index is ``(t, sample number)``.
 
-    ``disturbances (S, mw, L)`` on the pieces of the merged grid or ``None``; ``parameters (S, nu)``.
+    ``H (r, d)``, ``h (r,)`` are the sides of the constraint ``base``; ``disturbances (S, mw, L)`` on the pieces of the
+    merged grid or ``None``; ``parameters (S, nu)``.
     """
 
-    base: FlatConstraint
+    base: StateConstraint
+    H: Array
+    h: Array
     disturbances: Array | None
     parameters: Array
 
@@ -32,16 +36,24 @@ class ScenarioConstraint:
         """The constraint as a family."""
         last = float(self.parameters.shape[0] - 1)
         index_set = Box(np.array([self.base.start, 0.0]), np.array([self.base.stop, last]))
-        return ConstraintFamily(name=self.base.name, index_set=index_set, rows=self.rows, worst=self.worst)
+        return ConstraintFamily(
+            name=self.base.name,
+            index_set=index_set,
+            rows=self.rows,
+            worst=self.worst,
+            scale=self.base.scale,
+            formulation="sampled",
+            source=self.base,
+        )
 
     def rows(self, indices: Array) -> tuple[Array, Array]:
         """``G (k, r, n)``, ``rhs (k, r)`` at indices ``(k, 2)``."""
-        k, r = indices.shape[0], self.base.h.size
+        k, r = indices.shape[0], self.h.size
         which = np.repeat(np.rint(indices[:, 1]).astype(int), r)
-        times, directions = np.repeat(indices[:, 0], r), np.tile(self.base.H, (k, 1))
+        times, directions = np.repeat(indices[:, 0], r), np.tile(self.H, (k, 1))
         signals = None if self.disturbances is None else self.disturbances[which]
         G, offset = self.base.functionals.rows_under(times, directions, self.parameters[which], signals)
-        return G.reshape(k, r, -1), self.base.h - offset.reshape(k, r)
+        return G.reshape(k, r, -1), self.h - offset.reshape(k, r)
 
     def worst(self, x: Array) -> Separation:
         """Local maxima in time of the worst sample's violation, at the breakpoints and between them."""
@@ -60,7 +72,7 @@ class ScenarioConstraint:
         if self.parameters.shape[1] == 0:
             margins, sample = self._known
             undisturbed = self._states(x, slice(0, 1), None)[0]
-            return self.base.H @ undisturbed.T - margins, sample
+            return self.H @ undisturbed.T - margins, sample
         return self._maximum(lambda part: self._states(x, part, self.disturbances))
 
     @cached_property
@@ -68,8 +80,8 @@ class ScenarioConstraint:
         """For a known system: ``h - max_s H d_s(t)``, and the maximising samples; it does not depend on the
         decision."""
         if self.disturbances is None:
-            return np.repeat(self.base.h[:, None], self._times.size, axis=1), np.zeros(
-                (self.base.h.size, self._times.size), dtype=int
+            return np.repeat(self.h[:, None], self._times.size, axis=1), np.zeros(
+                (self.h.size, self._times.size), dtype=int
             )
         still = np.zeros(self.base.functionals.variables)
         rest = self._states(still, slice(0, 1), None)
@@ -78,11 +90,11 @@ class ScenarioConstraint:
 
     def _maximum(self, states: Callable[[slice], Array]) -> tuple[Array, np.ndarray]:
         """``max_s H x_s(t) - h`` over the samples, block by block, and where it is attained."""
-        samples, r, times = self.parameters.shape[0], self.base.h.size, self._times.size
+        samples, r, times = self.parameters.shape[0], self.h.size, self._times.size
         best, where = np.full((r, times), -np.inf), np.zeros((r, times), dtype=int)
         size = max(1, BLOCK // (r * times))
         for start in range(0, samples, size):
-            values = np.einsum("ri,sti->srt", self.base.H, states(slice(start, start + size))) - self.base.h[:, None]
+            values = np.einsum("ri,sti->srt", self.H, states(slice(start, start + size))) - self.h[:, None]
             top = values.argmax(axis=0)
             height = np.take_along_axis(values, top[None], axis=0)[0]
             where = np.where(height > best, start + top, where)

@@ -12,12 +12,10 @@ from functools import cached_property
 
 import numpy as np
 
-from sparserob_core.control.constraints.curved import CurvedConstraint
-from sparserob_core.control.constraints.flat import FlatConstraint
+from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.response.functional import CHUNK
 from sparserob_core.control.response.response import Response
 from sparserob_core.control.response.sensitivity_system import tangent
-from sparserob_core.control.sets.directions import across, unit
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.relaxed.index_gradient import differences
 
@@ -106,7 +104,7 @@ class Sensitivity:
     Coordinates that cannot move, as the time of a terminal constraint, have derivative 0.
     """
 
-    constraint: FlatConstraint | CurvedConstraint
+    constraint: StateConstraint
 
     def gradient(self, x: Array, indices: Array, rows: Array) -> Array:
         """The derivative ``(k, d)`` of ``row x - rhs`` at ``indices (k, d)``, one row of the family per index,
@@ -143,12 +141,11 @@ class Sensitivity:
             sigma = self._sigma_slopes(times[:, 0], parameters, at)
             in_time, in_parameters, states = in_time + sigma[0], in_parameters + sigma[1], states + sigma[2]
         in_parameters = self.constraint.parameters.pulled_back(points, in_parameters)
-        if isinstance(self.constraint, CurvedConstraint):
-            z = across(z, states - self.constraint.set.support_point(at.direction) @ self.constraint.set.normals.T)
-        return np.hstack([in_time, in_parameters, z]), weights
+        in_direction = self.constraint.turned(z, at.direction, states)
+        return np.hstack([in_time, in_parameters, in_direction]), weights
 
     def _functional(self, times: Array, parameters: Array, z: Array, rows: np.ndarray) -> Functional:
-        directions, shares = self._directions(z, rows)
+        directions, shares = self.constraint.directions(z, rows)
         (k, b, d), response = directions.shape, self._tangent
         blocks = response.initial_state.size // d
         larger = np.concatenate([directions, np.zeros((k, b, (blocks - 1) * d))], axis=2).reshape(k * b, -1)
@@ -165,12 +162,6 @@ class Sensitivity:
             W[::b].reshape(k, blocks, d, -1),
             self._pieces(times),
         )
-
-    def _directions(self, z: Array, rows: np.ndarray) -> tuple[Array, Array]:
-        if isinstance(self.constraint, FlatConstraint):
-            return self.constraint.H[rows][:, None], np.ones((rows.size, 1))
-        normals, direction = self.constraint.set.normals, unit(self.constraint.set, z)
-        return np.broadcast_to(normals, (rows.size, *normals.shape)), direction @ normals.T
 
     def _pieces(self, times: Array) -> np.ndarray:
         """The pieces on which the times are approached: from the left, but from the right at the start of the
@@ -199,8 +190,8 @@ class Sensitivity:
             in_parameters = differences(
                 lambda p, of: support(times[of], at.direction[of], p), parameters, box.lower, box.upper
             )
-        if isinstance(self.constraint, CurvedConstraint):
-            normals, wide = self.constraint.set.normals, np.full(at.shares.shape[1], 2.0)
+        if self.constraint.index_set.dimension > 1 + self._nu:
+            normals, wide = at.directions[0], np.full(at.shares.shape[1], 2.0)
             in_shares = differences(
                 lambda s, of: support(times[of], s @ normals, parameters[of]), at.shares, -wide, wide
             )

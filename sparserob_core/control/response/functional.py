@@ -4,7 +4,7 @@ cannot help."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -34,6 +34,13 @@ class WorstCase:
     response: Response
     dictionary: Dictionary
     disturbance: DisturbanceModel | None
+    shared: MeasurableSupport | None = field(default=None, repr=False)
+
+    def from_state(self, initial_state: Array) -> WorstCase:
+        """The functionals from another initial state ``(d,)``; what does not depend on it is shared."""
+        measurable = self.disturbance is not None and self.disturbance.kind == "measurable"
+        support = self.measurable if measurable else None
+        return WorstCase(self.response.from_state(initial_state), self.dictionary, self.disturbance, support)
 
     @property
     def variables(self) -> int:
@@ -158,8 +165,11 @@ class WorstCase:
 
     @cached_property
     def measurable(self) -> MeasurableSupport:
-        """The support of measurable disturbances."""
+        """The support of measurable disturbances; the ``shared`` one where it is of this system and set."""
         assert self.disturbance is not None
+        given = self.shared
+        if given and given.response.propagator is self.response.propagator and given.bound is self.disturbance.bound:
+            return given
         return MeasurableSupport(self.response, self.disturbance.bound)
 
     def on_decision(self, weights: Array) -> Array:

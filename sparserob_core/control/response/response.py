@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 
@@ -72,6 +73,9 @@ def merge_grids(control: Array, disturbance: Array) -> TimeGrid:
     return TimeGrid(points, np.searchsorted(control, middles) - 1, np.searchsorted(disturbance, middles) - 1)
 
 
+Propagate: TypeAlias = Callable[[Array, Array], tuple[Array, Array]]
+
+
 @dataclass(frozen=True, eq=False)
 class Steps:
     """Transition matrices over whole pieces: ``E (v, q, d, d)`` and ``F (v, q, d, d)`` for ``v`` parameters and ``q``
@@ -85,24 +89,26 @@ class Steps:
 
 
 @dataclass(frozen=True, eq=False)
-class Response:
-    """The responses of one system on one time grid; ``propagate`` takes the place of `transitions` for matrices with a
-    structure."""
+class Propagator:
+    """What the responses of one system on one time grid share, from whatever initial state: transition matrices, and
+    functionals as weights. ``propagate`` takes the place of `transitions` for matrices with a structure."""
 
     system: LinearSystem
     grid: TimeGrid
-    initial_state: Array
-    propagate: Callable[[Array, Array], tuple[Array, Array]] | None = None
+    propagate: Propagate | None = None
     _steps: dict[bytes, Steps] = field(default_factory=dict, repr=False)
 
-    def __post_init__(self) -> None:
+    @cached_property
+    def _which(self) -> np.ndarray:
+        """Which of the distinct lengths every piece has, ``(L,)``."""
         _, which = np.unique(np.round(self.grid.lengths / self.grid.breakpoints[-1], 13), return_inverse=True)
-        # means: the rounding must not add up
-        object.__setattr__(self, "_lengths", np.bincount(which, self.grid.lengths) / np.bincount(which))
-        object.__setattr__(self, "_which", which)
+        return which
 
-    _lengths: Array = field(init=False, repr=False)
-    _which: np.ndarray = field(init=False, repr=False)
+    @cached_property
+    def _lengths(self) -> Array:
+        """The distinct lengths ``(q,)``, as means: the rounding must not add up."""
+        means: Array = np.bincount(self._which, self.grid.lengths) / np.bincount(self._which)
+        return means
 
     def steps(self, parameters: Array) -> Steps:
         """Matrices and whole-piece transitions at parameters ``(v, nu)``; remembered for the last few calls."""
@@ -208,6 +214,59 @@ class Response:
             return steps.E[0, length], steps.F[0, length]
         return steps.E[which, length], steps.F[which, length]
 
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """The responses of one system on one time grid, from one initial state ``(d,)``.
+
+    What does not depend on the initial state is the ``propagator``, which responses from other initial states
+    (`from_state`) share.
+    """
+
+    system: LinearSystem
+    grid: TimeGrid
+    initial_state: Array
+    propagate: Propagate | None = None
+    shared: Propagator | None = field(default=None, repr=False)
+
+    @cached_property
+    def propagator(self) -> Propagator:
+        """Transition matrices and functionals; the ``shared`` ones where they are of this system on this grid."""
+        given = self.shared
+        if given and given.system is self.system and given.grid is self.grid and given.propagate is self.propagate:
+            return given
+        return Propagator(self.system, self.grid, self.propagate)
+
+    def from_state(self, initial_state: Array) -> Response:
+        """The responses of the same system from another initial state ``(d,)``."""
+        return Response(self.system, self.grid, initial_state, self.propagate, self.propagator)
+
+    def steps(self, parameters: Array) -> Steps:
+        """`Propagator.steps`."""
+        return self.propagator.steps(parameters)
+
+    def adjoint(self, times: Array, directions: Array, parameters: Array) -> tuple[Array, Array, Array, Array]:
+        """`Propagator.adjoint`."""
+        return self.propagator.adjoint(times, directions, parameters)
+
+    def flows(self, durations: Array) -> tuple[Array, Array]:
+        """`Propagator.flows`."""
+        return self.propagator.flows(durations)
+
+    @property
+    def uniform(self) -> bool:
+        """`Propagator.uniform`."""
+        return self.propagator.uniform
+
+    @property
+    def ages(self) -> Array:
+        """`Propagator.ages`."""
+        return self.propagator.ages
+
+    def length_of(self, piece: int) -> int:
+        """`Propagator.length_of`."""
+        return self.propagator.length_of(piece)
+
     def states(self, control: Array, parameters: Array, disturbance: Array | None = None) -> Array:
         """States ``(v, L+1, d)`` at the breakpoints of the grid.
 
@@ -227,7 +286,8 @@ class Response:
         path[:, 0] = self.initial_state
         shared = steps.E.shape[0] == 1
         for piece in range(self.grid.pieces):
-            E, F = steps.E[:, self._which[piece]], steps.F[:, self._which[piece]]
+            length = self.propagator.length_of(piece)
+            E, F = steps.E[:, length], steps.F[:, length]
             if shared:
                 path[:, piece + 1] = path[:, piece] @ E[0].T + drive[:, piece] @ F[0].T
             else:

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.response import transitions
-from sparserob_core.control.transcription.state_constraints import StateConstraint
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.program import ConstraintFamily
 
 PARTS = 4  # equal parts of every piece on which a measurable worst case is looked for
 HALVINGS = 40  # of a part across a switch of the worst disturbance
@@ -40,21 +39,18 @@ class Adversary:
     disturbance: Array | None
 
 
-def find_adversary(
-    functionals: WorstCase, constraint: StateConstraint, family: ConstraintFamily, decision: Array
-) -> Adversary | None:
-    """The `Adversary` of a family that ``constraint`` describes, at the largest violation that its separation finds;
-    ``None`` if it finds none."""
-    assert family.worst is not None
-    found = family.worst(decision)
+def find_adversary(constraint: StateConstraint, decision: Array) -> Adversary | None:
+    """The `Adversary` of a constraint, at the largest violation that its separation finds; ``None`` if it finds
+    none."""
+    found = constraint.worst(decision)
     if not found.violations.size:
         return None
     row = int(found.rows[0])
     times, directions, parameters, bounds = (part[row] for part in constraint.functionals_at(found.indices[:1]))
     time = float(times)
-    breakpoints, disturbance = worst_signal(functionals, time, directions, parameters)
+    breakpoints, disturbance = worst_signal(constraint.functionals, time, directions, parameters)
     return Adversary(
-        name=family.name,
+        name=constraint.name,
         row=row,
         time=time,
         direction=directions,

@@ -8,21 +8,16 @@ support functions are programs again.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
-from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, TypeAlias, final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.control.constraints.curved import CurvedConstraint
-from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.enclosures.cache import remember
-from sparserob_core.control.response.response import Response
 from sparserob_core.control.transcription.record import Transcription
-from sparserob_core.control.transcription.transcribe import program_of
-from sparserob_core.errors import InputError, NotEnclosable
+from sparserob_core.control.transcription.transcribe import from_state
+from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.program import ConstraintFamily, Enclosure, Explanation, SemiInfiniteProgram, Separation
@@ -32,7 +27,6 @@ if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
 PROGRAMS_KEPT = 4  # ordinary programs, each at one initial state, that are remembered
-StateConstraint: TypeAlias = FlatConstraint | CurvedConstraint
 
 
 @final
@@ -67,9 +61,9 @@ class InitialPlane:
         them."""
         key = z.tobytes()
         if key not in self._programs:
-            families = [_moved(family, self._state(z)) for family in self._base.families]
+            moved = from_state(self.centred, self._state(z)).program
             A, b = self._equalities(z)
-            remember(self._programs, key, replace(self._base, families=families, A=A, b=b), PROGRAMS_KEPT)
+            remember(self._programs, key, replace(moved, A=A, b=b), PROGRAMS_KEPT)
         return self._programs[key]
 
     def _equalities(self, z: Array) -> tuple[Array | None, Array | None]:
@@ -118,34 +112,29 @@ class InitialPlane:
     def _families(self) -> list[ConstraintFamily]:
         return [_Joined(self, family).family() for family in self._base.families]
 
-    def _state(self, z: Array) -> Array:
-        state = np.array(self.model.problem.initial_state, dtype=float)
-        state[list(self.states)] = self.point(z)
-        return state
-
     @cached_property
     def _base(self) -> SemiInfiniteProgram:
-        """The ordinary program at the centre, each of its families asked once, so that there is something to share."""
-        program = program_of(self._model(np.zeros(2)))
-        still = np.zeros(program.n)
-        for family in program.families:
-            if family.worst is not None:
-                family.worst(still)
-            if family.enclosure is not None and family.cells is not None:
-                with suppress(NotEnclosable):
-                    family.enclosure(still, family.cells[0][:1], family.cells[1][:1])
-        return program
+        """The ordinary program at the centre."""
+        return self.centred.program
 
     @cached_property
     def _columns(self) -> Array:
         """The columns ``(e, 2)`` of ``z`` in the equalities."""
-        b = [program_of(self._model(z)).b for z in (np.zeros(2), *np.eye(2))]
-        return np.zeros((0, 2)) if b[0] is None else np.stack([b[0] - np.asarray(moved) for moved in b[1:]], axis=1)
+        at_centre = self._base.b
+        if at_centre is None:
+            return np.zeros((0, 2))
+        moved = [from_state(self.model, self._state(z)).program.b for z in np.eye(2)]
+        return np.stack([at_centre - np.asarray(b) for b in moved], axis=1)
 
-    def _model(self, z: Array) -> Transcription:
-        state, functionals = self._state(z), copy(self.model.functionals)
-        object.__setattr__(functionals, "response", _from(functionals.response, state))
-        return replace(self.model, problem=replace(self.model.problem, initial_state=state), functionals=functionals)
+    @cached_property
+    def centred(self) -> Transcription:
+        """The problem from the centre of the plane."""
+        return from_state(self.model, self._state(np.zeros(2)))
+
+    def _state(self, z: Array) -> Array:
+        state = np.array(self.model.problem.initial_state, dtype=float)
+        state[list(self.states)] = self.point(z)
+        return state
 
 
 def check_states(states: object, count: int) -> tuple[int, int]:
@@ -178,16 +167,17 @@ class _Joined:
             enclosure=self.enclosure if offers else None,
             explain=self.explain,
             scale=self.base.scale,
+            source=self.base.source,
         )
 
     def rows(self, indices: Array) -> tuple[Array, Array]:
         """The rows at the centre, and two columns more: ``c'e^{A(p)t}`` at the two coordinates."""
         G, h = self.base.rows(indices)
-        owner = _owner(self.base)
-        if owner is None:
+        constraint = self.plane.centred.constraint(self.base)
+        if constraint is None:
             return np.concatenate([G, np.zeros((*G.shape[:2], 2))], axis=2), h
-        times, directions, parameters, _ = owner.functionals_at(indices)
-        free = owner.functionals.response.adjoint(times, directions, parameters)[0]
+        times, directions, parameters, _ = constraint.functionals_at(indices)
+        free = constraint.functionals.response.adjoint(times, directions, parameters)[0]
         columns = free[:, list(self.plane.states)] * self.plane.radius
         return np.concatenate([G, columns.reshape(*G.shape[:2], 2)], axis=2), h
 
@@ -211,53 +201,6 @@ class _Joined:
 
     def _at(self, x: Array) -> ConstraintFamily:
         return self.plane.at(x[-2:]).family(self.base.name)
-
-
-def _owner(family: ConstraintFamily) -> StateConstraint | None:
-    """The constraint on the state that a family is made of; ``None`` for one on the control."""
-    owner = getattr(family.rows, "__self__", None)
-    return owner if isinstance(owner, FlatConstraint | CurvedConstraint) else None
-
-
-def _moved(family: ConstraintFamily, state: Array) -> ConstraintFamily:
-    """The same family from another initial state."""
-    owner = _owner(family)
-    if owner is None:
-        return family
-    moved = _constraint_from(owner, state)
-    return replace(
-        family,
-        rows=moved.rows,
-        worst=moved.worst,
-        enclosure=moved.enclosure,
-        gradient=None,
-        nominal=None,
-        sample=None,
-        literal=None,
-        explain=moved.explain,
-        scale=moved.scale,
-    )
-
-
-def _constraint_from(constraint: StateConstraint, state: Array) -> StateConstraint:
-    """A copy with another initial state that keeps what was remembered of times, margins and pushes: none of it depends
-    on that state."""
-    moved = copy(constraint)
-    functionals = copy(constraint.functionals)
-    object.__setattr__(functionals, "response", _from(functionals.response, state))
-    object.__setattr__(moved, "functionals", functionals)
-    for dependent in ("_cells", "_lifted"):
-        vars(moved).pop(dependent, None)
-    if isinstance(constraint, CurvedConstraint):
-        vars(moved)["_flat"] = _constraint_from(constraint._flat, state)
-    return moved
-
-
-def _from(response: Response, state: Array) -> Response:
-    """A copy with another initial state; flows and steps do not depend on it."""
-    moved = copy(response)
-    object.__setattr__(moved, "initial_state", state)
-    return moved
 
 
 def _with_identity(S: csc_array | None) -> csc_array | None:

@@ -10,12 +10,12 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.sets.gauge import shares
 from sparserob_core.control.sets.sampling import extreme_points, uniform_points
-from sparserob_core.control.transcription.state_constraints import StateConstraint
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 LawName: TypeAlias = Literal["iid", "vertices", "slow", "neighbours"]

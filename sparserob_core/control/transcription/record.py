@@ -4,27 +4,48 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.response import Response
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.program import ConstraintFamily, Formulation, SemiInfiniteProgram
 
 
 @dataclass(frozen=True, eq=False)
 class Transcription:
-    """A problem on its dictionaries: what every family, simulation and figure is built from."""
+    """A problem on its dictionaries and the semi-infinite program that it became.
+
+    ``constraints`` are the path and terminal constraints, named and ordered as the families of the ``program``;
+    terminal equalities are not among them, they are rows of the program. ``functionals`` are what every family is built
+    from, ``formulation`` says what the indices of the families are.
+    """
 
     problem: OptimalControlProblem
     control: Dictionary
+    disturbance: Dictionary
     functionals: WorstCase
     parameters: ParameterIndex
+    constraints: tuple[StateConstraint, ...]
+    program: SemiInfiniteProgram
+    formulation: Formulation = "reduced"
 
     @property
     def response(self) -> Response:
+        """The responses of the system on the merged grid."""
         return self.functionals.response
 
     def pieces(self, theta: Array) -> Array:
-        """The control ``(m, K)`` on the pieces of its dictionary."""
+        """The control ``(m, K)`` on the pieces of its dictionary, of a decision ``theta (m, N)`` or ``(m N,)``."""
         return self.control.control(theta)
+
+    def family(self, constraint: StateConstraint) -> ConstraintFamily:
+        """The family of the program that was made of one of the constraints."""
+        return next(family for family in self.program.families if family.source is constraint)
+
+    def constraint(self, family: ConstraintFamily) -> StateConstraint | None:
+        """The constraint on the state that a family was made of, in any formulation; ``None`` for one on the
+        control."""
+        return next((one for one in self.constraints if one is family.source), None)

@@ -15,6 +15,7 @@ from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.config.run_config import digest
 from sparserob_core.experiment.directory.finished import StoredRun, read_json, stored_run
+from sparserob_core.sip.program import SemiInfiniteProgram
 
 if TYPE_CHECKING:
     from sparserob_core.experiment.config.load import Loaded
@@ -49,26 +50,28 @@ def check(directory: str | Path, plugins: Iterable[str | Path] = ()) -> Check:
     """
     from sparserob_core.checker.claims.case import Case
     from sparserob_core.checker.claims.claims import check as derive
-    from sparserob_core.experiment.assemble import described, gap_tolerance
+    from sparserob_core.experiment.assemble import dictionaries_of, gap_tolerance, problem_of
 
     started, stored = time.perf_counter(), stored_run(directory)
     path = stored.directory
     if not (path / "certificate.json").is_file():
         raise InputError(f"{path}: expected the directory of a finished run, got one without certificate.json")
     data, summary = read_json(path / "certificate.json"), read_json(path / "result.json")
-    experiment = described(stored.config(plugins))
-    if experiment.problem is None or experiment.control is None or experiment.disturbance is None:
+    loaded = stored.config(plugins)
+    problem = problem_of(loaded)
+    if isinstance(problem, SemiInfiniteProgram):
         raise InputError(
             f"{path}: expected the run of a control problem; certificates of other programs cannot be checked"
         )
-    case = Case(experiment.problem, experiment.control, experiment.disturbance, data)
+    control, disturbance = dictionaries_of(loaded, problem.horizon)
+    case = Case(problem, control, disturbance, data)
     claims = [
-        _config(experiment.loaded, data, summary),
-        *derive(case, gap_tolerance(experiment.loaded)),
+        _config(loaded, data, summary),
+        *derive(case, gap_tolerance(loaded)),
         _result(data, summary),
-        _solution(stored, data, experiment.control),
+        _solution(stored, data, control),
     ]
-    return Check(experiment.loaded.config.title or path.name, tuple(claims), time.perf_counter() - started)
+    return Check(loaded.config.title or path.name, tuple(claims), time.perf_counter() - started)
 
 
 def _config(loaded: Loaded, data: Mapping[str, Any], summary: Mapping[str, Any]) -> Claim:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, final
 
 import numpy as np
 
@@ -13,14 +11,10 @@ from sparserob_core.control.response.response import Response, TimeGrid
 from sparserob_core.control.studies.adversary import Adversary, find_adversary
 from sparserob_core.control.studies.simulate import fine_times, finer, walk
 from sparserob_core.control.transcription.record import Transcription
-from sparserob_core.control.transcription.state_constraints import StateConstraint, state_constraints
-from sparserob_core.control.transcription.transcribe import prepare
 from sparserob_core.errors import InputError
+from sparserob_core.experiment.assemble import ControlExperiment, Experiment
 from sparserob_core.experiment.directory.finished import read_arrays
 from sparserob_core.sip.convex_set import Array
-
-if TYPE_CHECKING:
-    from sparserob_core.experiment.assemble import Experiment
 
 FILE = "adversary.npz"
 SHAPES = {
@@ -36,30 +30,6 @@ SHAPES = {
 }
 
 
-@final
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """A control problem on its dictionaries with a decision ``theta`` raveled, and the constraints on single
-    trajectories."""
-
-    model: Transcription
-    theta: Array
-    constraints: Sequence[StateConstraint]
-
-    @property
-    def control(self) -> Array:
-        """The control ``(m, L)`` on the pieces of the merged grid."""
-        return self.model.functionals.on_grid(self.theta)
-
-
-def scene(experiment: Experiment, decision: Array) -> Scene | None:
-    """The scene of an experiment; ``None`` for a program that is no control problem."""
-    if experiment.problem is None or experiment.control is None or experiment.disturbance is None:
-        return None
-    model = prepare(experiment.problem, experiment.control, experiment.disturbance)
-    return Scene(model, np.asarray(decision, dtype=float).ravel(), state_constraints(model))
-
-
 def adversaries(experiment: Experiment, decision: Array) -> dict[str, Array]:
     """``adversary.npz``: the worst parameter and disturbance of every path and terminal constraint at a decision
     ``(m N,)`` or ``(m, N)``.
@@ -70,33 +40,29 @@ def adversaries(experiment: Experiment, decision: Array) -> dict[str, Array]:
     ``states (f, d, T)`` at ``state_times (T,)`` is what they do to the state. Nothing, ``{}``, for a program that is no
     control problem, or has no state constraint.
     """
-    place = scene(experiment, decision)
-    if place is None:
+    if not isinstance(experiment, ControlExperiment):
         return {}
-    functionals = place.model.functionals
-    families = [experiment.program.family(constraint.name) for constraint in place.constraints]
-    found = [
-        find_adversary(functionals, constraint, family, place.theta)
-        for constraint, family in zip(place.constraints, families, strict=True)
-    ]
+    model, theta = experiment.transcription, np.asarray(decision, dtype=float).ravel()
+    found = [find_adversary(constraint, theta) for constraint in model.constraints]
     kept = [one for one in found if one is not None]
     if not kept:
         return {}
-    arrays = _stacked(kept, place.model)
-    times, states = replay(place, arrays)
+    arrays = _stacked(kept, model)
+    times, states = replay(model, theta, arrays)
     return {**arrays, "state_times": times, "states": states}
 
 
-def replay(place: Scene, arrays: Mapping[str, Array]) -> tuple[Array, Array]:
-    """The state trajectories ``(f, d, T)`` that stored adversaries cause, at times ``(T,)``, their own among them."""
-    response = place.model.response
+def replay(model: Transcription, theta: Array, arrays: Mapping[str, Array]) -> tuple[Array, Array]:
+    """The state trajectories ``(f, d, T)`` that stored adversaries cause at a decision ``(m N,)``, at times ``(T,)``,
+    their own among them."""
+    response, control = model.response, model.functionals.on_grid(theta)
     breakpoints = arrays["breakpoints"]
     which = response.grid.locate((breakpoints[:-1] + breakpoints[1:]) / 2)
     grid = TimeGrid(breakpoints, which, which)
-    times = fine_times(Response(response.system, grid, response.initial_state), place.model.parameters, arrays["times"])
+    times = fine_times(Response(response.system, grid, response.initial_state), model.parameters, arrays["times"])
     fine = Response(response.system, finer(grid, times), response.initial_state)
     disturbances = arrays["disturbances"] if arrays["disturbances"].shape[1] else None
-    states = np.stack(list(walk(fine, place.control[:, which], arrays["parameters"], disturbances)))
+    states = np.stack(list(walk(fine, control[:, which], arrays["parameters"], disturbances)))
     return times, np.ascontiguousarray(states.transpose(2, 1, 0))
 
 
@@ -108,22 +74,19 @@ def attained(arrays: Mapping[str, Array], times: Array, states: Array) -> Array:
     return np.asarray((arrays["directions"] * reached).sum(axis=1) - arrays["bounds"])
 
 
-def read_adversaries(directory: Path, place: Scene) -> dict[str, Array]:
+def read_adversaries(directory: Path, model: Transcription) -> dict[str, Array]:
     """The adversaries that a run has stored, or none; raises `InputError` when the file does not fit the run."""
     file = directory / FILE
     arrays = read_arrays(file)
     if not arrays:
         return {}
-    _require_shapes(file, arrays, place)
-    if arrays["names"].tolist() != [
-        constraint.name for constraint in place.constraints if constraint.name in arrays["names"]
-    ]:
+    _require_shapes(file, arrays, model)
+    known = [constraint.name for constraint in model.constraints if constraint.name in arrays["names"]]
+    if arrays["names"].tolist() != known:
         raise InputError(f"{file}: names: expected constraints of the run, got {', '.join(map(str, arrays['names']))}")
     breakpoints, times = arrays["breakpoints"], arrays["times"]
     missing = [
-        time
-        for time in place.model.response.grid.breakpoints
-        if np.abs(breakpoints - time).min() > 1e-9 * breakpoints[-1]
+        time for time in model.response.grid.breakpoints if np.abs(breakpoints - time).min() > 1e-9 * breakpoints[-1]
     ]
     if (
         breakpoints[0] != 0.0
@@ -133,13 +96,13 @@ def read_adversaries(directory: Path, place: Scene) -> dict[str, Array]:
         or (times > breakpoints[-1]).any()
     ):
         raise InputError(
-            f"{file}: breakpoints, times: expected those of the run's grid, from 0 to {place.model.problem.horizon:g}"
+            f"{file}: breakpoints, times: expected those of the run's grid, from 0 to {model.problem.horizon:g}"
         )
     return arrays
 
 
-def _require_shapes(file: Path, arrays: Mapping[str, Array], place: Scene) -> None:
-    system = place.model.response.system
+def _require_shapes(file: Path, arrays: Mapping[str, Array], model: Transcription) -> None:
+    system = model.response.system
     missing = [name for name in SHAPES if name not in arrays]
     if missing:
         raise InputError(f"{file}: expected the arrays {', '.join(SHAPES)}, got none called {', '.join(missing)}")
@@ -149,7 +112,7 @@ def _require_shapes(file: Path, arrays: Mapping[str, Array], place: Scene) -> No
         "p": system.parameter_count,
         "b": arrays["breakpoints"].size,
         "l": arrays["breakpoints"].size - 1,
-        "w": 0 if place.model.functionals.disturbance is None else system.disturbances,
+        "w": 0 if model.functionals.disturbance is None else system.disturbances,
     }
     for name, letters in SHAPES.items():
         shape = tuple(sizes[letter] for letter in letters)

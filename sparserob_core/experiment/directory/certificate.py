@@ -4,21 +4,19 @@ it."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.sets.sets import Box, ConvexSet
 from sparserob_core.control.transcription.transcribe import slanted
+from sparserob_core.experiment.assemble import ControlExperiment, Experiment
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.evidence import Cut, Proof
-from sparserob_core.sip.program import Explanation, SemiInfiniteProgram
+from sparserob_core.sip.evidence import Proof
+from sparserob_core.sip.program import Explanation, Formulation, SemiInfiniteProgram
 from sparserob_core.sip.proof.branch_and_bound import TOLERANCE
 from sparserob_core.sip.result import Result
-
-if TYPE_CHECKING:
-    from sparserob_core.experiment.assemble import Experiment
 
 FORMAT = 1
 INWARDS = 1.0 - 1e-13  # points that must be in a curved set are drawn inwards by rounding
@@ -33,9 +31,9 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
     ``proof``: per constraint the cells ``[lower, upper]`` of (time, parameters, directions) on which it was shown.
     ``witness``: what refutes the decision.
     """
-    problem, program = experiment.problem, experiment.program
-    if problem is None or experiment.control is None or result.status == "failed":
+    if not isinstance(experiment, ControlExperiment) or result.status == "failed":
         return None
+    problem, program = experiment.problem, experiment.program
     theta = (
         None
         if result.decision is None
@@ -58,9 +56,10 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
 def _multipliers(problem: OptimalControlProblem, program: SemiInfiniteProgram, result: Result) -> dict[str, Any] | None:
     """``None`` unless every constraint can be told: a sampled one, of the scenario approach, cannot."""
     told = [
-        (cut, words)
+        (cut, said)
         for cut in result.dual.cuts
-        if (words := _explained(program, cut)) is not None and words.direction is not None
+        if (said := _explained(program, cut.family, cut.formulation, cut.index, cut.row)) is not None
+        and said.direction is not None
     ]
     if len(told) < len(result.dual.cuts) or result.dual.mu.size != program.finite.b.size:
         return None
@@ -68,12 +67,12 @@ def _multipliers(problem: OptimalControlProblem, program: SemiInfiniteProgram, r
         "constraints": [
             {
                 "constraint": cut.family,
-                "time": words.time,
-                "parameter": _parameter(problem, words),
-                "direction": _direction(words),
+                "time": said.time,
+                "parameter": _parameter(problem, said),
+                "direction": _direction(said),
                 "multiplier": cut.multiplier,
             }
-            for cut, words in told
+            for cut, said in told
         ],
         "equalities": result.dual.mu,
         "pieces": _on_pieces(problem, result.dual.z),
@@ -90,28 +89,15 @@ def _on_pieces(problem: OptimalControlProblem, z: Array | None) -> Array | None:
     return answer
 
 
-def _explained(program: SemiInfiniteProgram, cut: Cut) -> Explanation | None:
-    family = program.family(cut.family)
-    explain = family.explain
-    if explain is None:
-        return None
-    if cut.index.size == family.index_set.dimension:
-        return explain(cut.index, cut.row)
-    if (
-        family.nominal is not None
-        and family.nominal.explain is not None
-        and cut.index.size == family.nominal.index_set.dimension
-    ):
-        return family.nominal.explain(cut.index, cut.row)
-    literal = family.literal
-    return (
-        literal.explain(cut.index, cut.row)
-        if literal is not None and literal.explain and cut.index.size == literal.index_set.dimension
-        else None
-    )
+def _explained(
+    program: SemiInfiniteProgram, name: str, formulation: Formulation, at: Array, row: int
+) -> Explanation | None:
+    """The constraint in numbers; ``None`` for one whose index does not tell them, as the number of a sample."""
+    family = program.formulated(name, formulation)
+    return None if family is None or family.explain is None else family.explain(at, row)
 
 
-def _parameter(problem: OptimalControlProblem, words: Explanation) -> Array:
+def _parameter(problem: OptimalControlProblem, said: Explanation) -> Array:
     """The parameter of a constraint, certainly inside its set; the middle one for a constraint without uncertainty."""
     bound = problem.system.parameters
     if bound is None:
@@ -119,13 +105,13 @@ def _parameter(problem: OptimalControlProblem, words: Explanation) -> Array:
     middle = bound.interior_point()
     return (
         middle
-        if words.parameter is None or words.parameter.size == 0
-        else _inside(bound, np.asarray(words.parameter), middle)
+        if said.parameter is None or said.parameter.size == 0
+        else _inside(bound, np.asarray(said.parameter), middle)
     )
 
 
-def _direction(words: Explanation) -> Array | None:
-    return None if words.direction is None else words.direction + 0.0  # no negative zeros
+def _direction(said: Explanation) -> Array | None:
+    return None if said.direction is None else said.direction + 0.0  # no negative zeros
 
 
 def _inside(bound: ConvexSet, point: Array, middle: Array) -> Array:
@@ -142,18 +128,20 @@ def _cells(program: SemiInfiniteProgram, proof: Proof) -> dict[str, Any]:
 
 def _witness(problem: OptimalControlProblem, program: SemiInfiniteProgram, result: Result) -> dict[str, Any] | None:
     worst = result.worst
-    words = None if worst is None else _explained(program, Cut(worst.constraint, worst.index, worst.row))
-    if worst is None or words is None:
+    if worst is None:
         return None
-    signal: Sequence[Any] | Array | None = words.disturbance
+    said = _explained(program, worst.constraint, worst.formulation, worst.index, worst.row)
+    if said is None:
+        return None
+    signal: Sequence[Any] | Array | None = said.disturbance
     if signal is not None and problem.disturbance is not None:
         middle = problem.disturbance.interior_point()
         signal = np.array([_inside(problem.disturbance, column, middle) for column in np.asarray(signal).T]).T
     return {
         "constraint": worst.constraint,
-        "time": words.time,
-        "parameter": _parameter(problem, words),
-        "direction": _direction(words),
+        "time": said.time,
+        "parameter": _parameter(problem, said),
+        "direction": _direction(said),
         "disturbance": signal,
         "violation": worst.violation,
     }

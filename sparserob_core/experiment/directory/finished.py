@@ -18,13 +18,15 @@ from zlib import error as ZlibError
 import numpy as np
 
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.directory.rounds import with_decisions
+from sparserob_core.experiment.directory.rounds import FORMULATIONS, cuts_of, with_decisions
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import RoundFinished
+from sparserob_core.sip.evidence import Cut
+from sparserob_core.sip.program import Formulation
 from sparserob_core.sip.result import MEANING
 
 if TYPE_CHECKING:
-    from sparserob_core.experiment.assemble import Experiment
+    from sparserob_core.experiment.assemble import ControlExperiment, Experiment
     from sparserob_core.experiment.config.load import Loaded
 
 UNFINISHED = "the run has not finished"
@@ -73,9 +75,28 @@ class StoredRun:
             rounds = [
                 RoundFinished(**{name: column[row].item() for name, column in columns.items()}) for row in range(count)
             ]
-            return with_decisions(rounds, self.arrays("rounds.npz"))
+            arrays = self.arrays("rounds.npz")
+            return with_decisions(rounds, arrays, self._formulation(arrays))
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise InputError(f"{self.directory}: trace.npz and rounds.npz do not fit together: {error}") from None
+
+    @cached_property
+    def cuts(self) -> tuple[Cut, ...]:
+        """The imposed constraints that ``solution.npz`` holds."""
+        return cuts_of(self.solution, self._formulation(self.solution)) if "families" in self.solution else ()
+
+    def _formulation(self, arrays: Mapping[str, Array]) -> Formulation:
+        """What the indices of arrays say whose version did not write it down: it follows from the method."""
+        if not arrays or FORMULATIONS in arrays:
+            return "reduced"
+        from sparserob_core.experiment.config.reader import read_source
+
+        method = read_source(self.directory / "config.yaml").data.get("method")
+        entry = {"name": method} if isinstance(method, str) else method if isinstance(method, Mapping) else {}
+        if entry.get("name") == "sparserob":
+            return "literal" if entry.get("formulation") == "literal" else "reduced"
+        known: dict[object, Formulation] = {"nominal": "nominal", "scenario": "sampled"}
+        return known.get(entry.get("name"), "reduced")
 
     def arrays(self, name: str) -> dict[str, Array]:
         """The arrays of one of its ``.npz`` files; none when there is no such file."""
@@ -93,7 +114,7 @@ class FinishedRun:
     (``solution.npz``), and the files themselves (``stored``)."""
 
     stored: StoredRun
-    experiment: Experiment
+    experiment: ControlExperiment
     theta: Array
 
     @property
@@ -141,7 +162,7 @@ def read_finished(
 ) -> FinishedRun:
     """Read a run directory and build its experiment again, unless ``experiment`` is at hand; raises `InputError` when
     it is none, holds no control, or a file of it cannot be understood. ``plugins`` as in `read_config`."""
-    from sparserob_core.experiment.assemble import assemble
+    from sparserob_core.experiment.assemble import ControlExperiment, assemble
 
     stored = stored_run(directory)
     summary, solution = stored.summary, stored.solution
@@ -150,7 +171,7 @@ def read_finished(
             f"{directory}: there is no control in it; the status is '{summary['status']}': {summary['message']}"
         )
     experiment = experiment or assemble(stored.config(plugins))
-    if experiment.problem is None or experiment.control is None:
+    if not isinstance(experiment, ControlExperiment):
         raise InputError(
             f"{directory}: expected the run of a control problem, got one of another semi-infinite program"
         )

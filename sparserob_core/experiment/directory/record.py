@@ -70,8 +70,9 @@ def arrays_of(
     result: Result, program: SemiInfiniteProgram, dictionary: Dictionary | None, control: Array | None
 ) -> dict[str, Any]:
     """``solution.npz``: the decision, and for a control problem ``breakpoints``, ``control``, ``theta``; one row per
-    imposed index in ``times``, ``indices`` (padded with NaN where families differ in dimension), ``rows``, ``families``
-    and ``multipliers``; ``worst_disturbance (mw, pieces)`` where the worst constraint has one."""
+    imposed index in ``times``, ``indices`` (padded with NaN where families differ in dimension), ``rows``,
+    ``families``, ``formulations`` (what its index says) and ``multipliers``; ``worst_disturbance (mw, pieces)`` where
+    the worst constraint has one."""
     cuts = list(result.indices)
     width = max((np.size(cut.index) for cut in cuts), default=0)
     indices = np.full((len(cuts), width), np.nan)
@@ -83,6 +84,7 @@ def arrays_of(
         "indices": indices,
         "rows": np.array([cut.row for cut in cuts], dtype=int),
         "families": np.array([cut.family for cut in cuts], dtype=str),
+        "formulations": np.array([cut.formulation for cut in cuts], dtype=str),
         "multipliers": np.array([cut.multiplier for cut in cuts], dtype=float),
     }
     if dictionary is not None:

@@ -103,15 +103,15 @@ def clash_strips(program: SemiInfiniteProgram, result: Result) -> list[Strip]:
     )
     strips: dict[str, Strip] = {}
     for cut in cuts:
-        family = program.family(cut.family)
-        strip = _strip(program, family.reduced or family, cut)
+        family = program.formulated(cut.family, cut.formulation)
+        strip = None if family is None else _strip(program, family, cut)
         if strip is not None:
             strips.setdefault(strip.label, strip)
     return list(strips.values())[:SHOWN]
 
 
 def _strip(program: SemiInfiniteProgram, family: ConstraintFamily, cut: Cut) -> Strip | None:
-    if family.explain is None or cut.index.size != family.index_set.dimension:
+    if family.explain is None:
         return None
     said = family.explain(cut.index, cut.row)
     if not said.quantity:

@@ -5,24 +5,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
 from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.transcription.record import Transcription
-from sparserob_core.control.transcription.transcribe import prepare
 from sparserob_core.errors import InputError
+from sparserob_core.experiment.assemble import ControlExperiment, Experiment
 from sparserob_core.experiment.directory.adversary import adversaries
 from sparserob_core.experiment.directory.finished import read_finished
 from sparserob_core.experiment.directory.sparsity import sparsity
 from sparserob_core.experiment.figures.figure_data import FigureData, Wall
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.events import RoundFinished
-
-if TYPE_CHECKING:
-    from sparserob_core.experiment.assemble import Experiment
 
 TIMES = 400
 PARAMETERS = 27
@@ -57,10 +54,9 @@ def figure_data(
     experiment: Experiment, theta: Array, active_times: Array, history: Sequence[RoundFinished], cost: float | None
 ) -> FigureData:
     """What figures of a decision ``theta (m, N)`` show; raises `InputError` when the program is no control problem."""
-    problem, control, disturbance = experiment.problem, experiment.control, experiment.disturbance
-    if problem is None or control is None or disturbance is None:
+    if not isinstance(experiment, ControlExperiment):
         raise InputError("figures: they are for control problems; this is a semi-infinite program of another kind")
-    return _data(experiment, problem, prepare(problem, control, disturbance), theta, active_times, history, cost)
+    return _data(experiment, theta, active_times, history, cost)
 
 
 def draw_run(directory: Path, plugins: Iterable[str | Path] = ()) -> list[Path]:
@@ -86,14 +82,13 @@ def active_times(solution: Mapping[str, Array]) -> Array:
 
 
 def _data(
-    experiment: Experiment,
-    problem: OptimalControlProblem,
-    model: Transcription,
+    experiment: ControlExperiment,
     theta: Array,
     active_times: Array,
     history: Sequence[RoundFinished],
     cost: float | None,
 ) -> FigureData:
+    problem, model = experiment.problem, experiment.transcription
     control, dictionary = model.pieces(theta), model.control
     axes = np.eye(problem.system.controls)
     shown = _shown(model.response.grid.breakpoints.size)

@@ -12,9 +12,9 @@ import numpy as np
 from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
 from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.studies.initial_states import InitialPlane, check_states
-from sparserob_core.control.transcription.transcribe import prepare
+from sparserob_core.control.transcription.transcribe import from_state
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.assemble import assemble, name_of, tools_of
+from sparserob_core.experiment.assemble import ControlExperiment, assemble, name_of, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import RunDirectory, create_directory
@@ -58,13 +58,12 @@ def initial_states(
         require_matplotlib()
     loaded = load_config(config, overrides)
     experiment = assemble(loaded)
-    if experiment.problem is None or experiment.control is None or experiment.disturbance is None:
+    if not isinstance(experiment, ControlExperiment):
         raise InputError("problem: expected a control problem, which has an initial state, got a semi-infinite program")
-    problem = (
-        experiment.problem
-        if about is None
-        else replace(experiment.problem, initial_state=_about(about, experiment.problem))
-    )
+    model = experiment.transcription
+    if about is not None:
+        model = from_state(model, _about(about, model.problem))
+    problem = model.problem
     pair = check_states(states, problem.system.states)
     directory = None if out is None else create_directory(out, name_of(loaded), loaded.config.digest())
     if directory is not None:
@@ -73,9 +72,7 @@ def initial_states(
             write_yaml(loaded.config.plain(), "The experiment whose feasible initial states were sought."),
         )
     size = _far(problem) if limit is None else limit
-    plane = InitialPlane(
-        prepare(problem, experiment.control, experiment.disturbance), pair, np.zeros(2), np.full(2, size)
-    )
+    plane = InitialPlane(model, pair, np.zeros(2), np.full(2, size))
     found = Search(plane, tools_of(loaded), _tolerance(loaded), tell, limit).states(
         experiment.title, directions, values
     )

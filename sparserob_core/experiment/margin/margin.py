@@ -12,7 +12,7 @@ import numpy as np
 
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.assemble import assemble, name_of, tools_of
+from sparserob_core.experiment.assemble import ControlExperiment, assemble, name_of, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.problems import LinearKeys
 from sparserob_core.experiment.config.reader import write_yaml
@@ -89,11 +89,11 @@ def _search(loaded: Loaded, of: str, tolerance: float, tell: Tell) -> Search:
     from sparserob_core.control.transcription.transcribe import transcribe
 
     experiment = assemble(loaded)
-    problem, control, disturbance = experiment.problem, experiment.control, experiment.disturbance
-    if problem is None or control is None:
+    if not isinstance(experiment, ControlExperiment):
         raise InputError(
             "config: expected a control problem, whose sets can be scaled, got a semi-infinite program of another kind"
         )
+    problem, control, disturbance = experiment.problem, experiment.control, experiment.disturbance
     chosen = scaling(problem, of, *_positions(loaded, problem))
     programs = ParametricProgram(lambda factor: transcribe(chosen.at(factor), control=control, disturbance=disturbance))
     width = tolerance * (chosen.highest if of.endswith(".from") else 1.0)

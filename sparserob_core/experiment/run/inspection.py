@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.assemble import Experiment, assemble, tools_of
+from sparserob_core.experiment.assemble import ControlExperiment, Experiment, assemble, tools_of
 from sparserob_core.sip.convex_set import Array, Box
 
 if TYPE_CHECKING:
@@ -65,7 +65,8 @@ class Inspection:
     @property
     def problem(self) -> OptimalControlProblem | None:
         """The control problem; ``None`` for a program of another kind."""
-        return self._experiment.problem
+        experiment = self._experiment
+        return experiment.problem if isinstance(experiment, ControlExperiment) else None
 
     @property
     def literal(self) -> bool:
@@ -78,9 +79,10 @@ class Inspection:
         program that is no control problem."""
         from sparserob_core.experiment.figures.drawing import figure_data
 
-        control = self._experiment.control
-        theta = decision if control is None else np.asarray(decision, dtype=float).reshape(-1, control.functions)
-        return figure_data(self._experiment, theta, np.empty(0) if active_times is None else active_times, (), None)
+        experiment, theta = self._experiment, np.asarray(decision, dtype=float)
+        if isinstance(experiment, ControlExperiment):
+            theta = theta.reshape(-1, experiment.control.functions)
+        return figure_data(experiment, theta, np.empty(0) if active_times is None else active_times, (), None)
 
     def worst_cases(self, decision: Array) -> dict[str, Array]:
         """The worst parameter and disturbance of every state constraint at a decision, and the states that they cause,
@@ -119,7 +121,7 @@ class Inspection:
     def names(self, width: int) -> tuple[str, ...]:
         """What the ``width`` coordinates of one index are called: ``t``, ``w1`` ... (coefficients of the disturbance),
         ``p1`` ..., ``z1`` ... (a direction), or ``xi1`` ... where there is no control problem."""
-        problem = self._experiment.problem
+        problem = self.problem
         if problem is None:
             return tuple(f"xi{k + 1}" for k in range(width))
         parameters = tuple(f"p{k + 1}" for k in range(problem.system.parameter_count))

@@ -9,8 +9,9 @@ from typing import Any, final
 
 import numpy as np
 
+from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.errors import InputError, SparseRobError
-from sparserob_core.experiment.assemble import Experiment
+from sparserob_core.experiment.assemble import ControlExperiment, Experiment
 from sparserob_core.experiment.directory.adversary import FILE as ADVERSARY
 from sparserob_core.experiment.directory.adversary import adversaries
 from sparserob_core.experiment.directory.artefacts import RunDirectory, trace_columns
@@ -37,17 +38,21 @@ class Journal(Observer):
 
     def record(self, result: Result) -> tuple[Array | None, dict[str, Any]]:
         """Write ``result.json``; returns the control ``(m, K)`` and the contents."""
-        control = control_of(result, self.experiment.program, self.experiment.control)
+        control = control_of(result, self.experiment.program, self._dictionary)
         config = self.experiment.loaded.config
         summary = {
             "title": self.experiment.title,
-            **summary_of(result, control, self.experiment.control),
+            **summary_of(result, control, self._dictionary),
             "seed": config.seed,
             "versions": versions(),
             "config": config.digest(),
         }
         self.directory.write_json("result.json", summary)
         return control, summary
+
+    @property
+    def _dictionary(self) -> Dictionary | None:
+        return self.experiment.control if isinstance(self.experiment, ControlExperiment) else None
 
     def record_unfinished(self, message: str, seconds: float) -> None:
         """Write how far a run got that ended early."""
@@ -66,7 +71,7 @@ class Journal(Observer):
         drawn."""
         experiment, write = self.experiment, self.directory
         control, summary = self.record(result)
-        write.write_arrays("solution.npz", arrays_of(result, experiment.program, experiment.control, control))
+        write.write_arrays("solution.npz", arrays_of(result, experiment.program, self._dictionary, control))
         rounds = self.rounds or list(result.history)
         write.write_arrays("trace.npz", trace_columns(rounds))
         kept = round_arrays(rounds)
@@ -88,7 +93,7 @@ def _drawn(experiment: Experiment, result: Result, worst: Mapping[str, Array], d
     from sparserob_core.experiment.figures.clash import draw_clash
     from sparserob_core.experiment.figures.drawing import draw_experiment
 
-    if experiment.problem is None or result.status == "failed":
+    if not isinstance(experiment, ControlExperiment) or result.status == "failed":
         return ()
     try:
         if result.status == "infeasible":

@@ -13,9 +13,7 @@ from sparserob_core.experiment.directory.finished import UNFINISHED, StoredRun, 
 from sparserob_core.experiment.run.events import Event, RunFinished, RunStarted
 from sparserob_core.experiment.run.inspection import Inspection
 from sparserob_core.experiment.run.viewer import recorder
-from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Batch, EvaluationsFinished
-from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.result import Result, SearchTrace
 
 BATCHES = 100  # of the evaluations of a run
@@ -91,7 +89,7 @@ def stored_result(run: StoredRun) -> Result:
             epsilon=_number(summary, "epsilon"),
             lower_bound=_number(summary, "lower_bound", -np.inf),
             upper_bound=_number(summary, "upper_bound", np.inf),
-            indices=_cuts(solution),
+            indices=run.cuts,
             history=run.history,
             trace=SearchTrace.stored(evaluations) if evaluations else None,
             seconds=_number(summary, "seconds", 0.0),
@@ -104,16 +102,6 @@ def stored_result(run: StoredRun) -> Result:
 
 def _number(summary: Mapping[str, Any], name: str, missing: float = np.nan) -> float:
     return missing if summary.get(name) is None else float(summary[name])
-
-
-def _cuts(solution: Mapping[str, Array]) -> tuple[Cut, ...]:
-    if "families" not in solution:
-        return ()
-    columns = (solution[name] for name in ("families", "indices", "rows", "multipliers"))
-    return tuple(
-        Cut(str(family), index[np.isfinite(index)], int(row), float(multiplier))
-        for family, index, row, multiplier in zip(*columns, strict=True)
-    )
 
 
 def _searches(trace: SearchTrace) -> Iterator[tuple[int, EvaluationsFinished]]:

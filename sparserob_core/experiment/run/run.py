@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, final
 
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.experiment.assemble import Experiment, assemble, build, name_of, tools_of
+from sparserob_core.experiment.assemble import ControlExperiment, Experiment, assemble, build, name_of, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import create_directory
@@ -46,7 +46,7 @@ class Outcome:
     @property
     def problem(self) -> OptimalControlProblem | None:
         """The control problem."""
-        return self.experiment.problem
+        return self.experiment.problem if isinstance(self.experiment, ControlExperiment) else None
 
     @property
     def program(self) -> SemiInfiniteProgram:
@@ -103,7 +103,7 @@ def run(
             RunStarted(
                 title=experiment.title,
                 directory=directory.path,
-                problem=experiment.problem,
+                problem=experiment.problem if isinstance(experiment, ControlExperiment) else None,
                 program=experiment.program,
                 quiet=quiet,
                 inspection=Inspection(loaded),

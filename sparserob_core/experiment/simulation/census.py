@@ -6,13 +6,9 @@ from typing import final
 
 import numpy as np
 
-from sparserob_core.control.constraints.curved import CurvedConstraint
+from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.response.response import SAME_TIME
-from sparserob_core.control.sets.curved import Ellipsoid, NormBall
-from sparserob_core.control.sets.directions import sampled, unit
-from sparserob_core.control.sets.sets import Cylinder
-from sparserob_core.control.transcription.state_constraints import StateConstraint
-from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.proof.branch_and_bound import TOLERANCE
 
 
@@ -28,6 +24,7 @@ class Census:
     def __init__(self, constraint: StateConstraint, times: Array) -> None:
         slack = SAME_TIME * times[-1]
         self.constraint, self.times = constraint, times
+        self._is_curved = constraint.sides is None
         self.tolerance = TOLERANCE * min(1.0, 1e3 * constraint.scale)
         self._inside = (times >= constraint.start - slack) & (times <= constraint.stop + slack)
         self.violated, self.largest, self.time = 0, -np.inf, np.nan
@@ -41,47 +38,22 @@ class Census:
         """The states ``(d, n)`` at one of the times."""
         if not self._inside[position]:
             return
-        constraint = self.constraint
-        if isinstance(constraint, CurvedConstraint):
-            value = _outwardness(constraint.set, state.T)
-        else:
-            value = (constraint.H @ state - constraint.h[:, None]).max(axis=0)
+        value = self.constraint.outwardness(state)
         better = value > self._best
         if better.any():
             np.copyto(self._best, value, where=better)
             self._when[better] = position
-            if isinstance(constraint, CurvedConstraint):
+            if self._is_curved:
                 np.copyto(self._states, state, where=better)
 
     def close(self) -> np.ndarray:
         """Which trajectories of the block violate the constraint, ``(n,)``."""
         found = self._best
-        if isinstance(self.constraint, CurvedConstraint):
-            found = _distances(self.constraint.set, self._states.T)
+        if self._is_curved:  # outwardness grows outwards, but is no distance
+            found = self.constraint.excess(self._states)
         out = found > self.tolerance
         self.violated += int(out.sum())
         top = int(found.argmax())
         if found[top] > self.largest:
             self.largest, self.time = float(found[top]), float(self.times[self._when[top]])
         return out
-
-
-def _outwardness(convex: ConvexSet, points: Array) -> Array:
-    """A cheap measure ``(n,)`` of points ``(n, d)`` that is positive outside, negative inside, and grows outwards."""
-    if isinstance(convex, Cylinder):
-        return _outwardness(convex.base, points[:, : convex.base.dimension])
-    if isinstance(convex, Ellipsoid):
-        inverse = np.linalg.inv(convex.factor)
-        return np.asarray(np.linalg.norm(inverse @ (points - convex.centre).T, axis=0) - 1.0)
-    if isinstance(convex, NormBall):
-        return np.asarray(np.linalg.norm(points - convex.centre, ord=convex.p, axis=1) - convex.radius)
-    return convex.violation(points)
-
-
-def _distances(convex: ConvexSet, points: Array) -> Array:
-    """Distance to a curved set outside, and inside the largest ``c'x - h(c)`` over sampled unit directions,
-    ``(n,)``."""
-    directions = unit(convex, sampled(int(convex.normals.shape[0])))
-    tangent = (points @ directions.T - convex.support(directions)).max(axis=1)
-    outside = convex.violation(points)
-    return np.asarray(np.where(outside > 0.0, np.maximum(outside, tangent), tangent))

@@ -14,7 +14,7 @@ from sparserob_core.control.response.response import Response
 from sparserob_core.control.studies.laws import LawName, Uncertainty
 from sparserob_core.control.studies.simulate import fine_times, finer, trajectories_at_once, walk
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.directory.adversary import Scene, adversaries, attained, read_adversaries, replay, scene
+from sparserob_core.experiment.directory.adversary import adversaries, attained, read_adversaries, replay
 from sparserob_core.experiment.directory.artefacts import RunDirectory
 from sparserob_core.experiment.directory.finished import FinishedRun, read_finished
 from sparserob_core.experiment.plugins.messages import nearest
@@ -62,9 +62,8 @@ def simulate(
     if out is not None:
         require_writable(Path(out))
     finished = read_finished(_directory(run), plugins, getattr(run, "experiment", None))
-    place = scene(finished.experiment, finished.theta)
-    assert place is not None
-    if not place.constraints:
+    model = finished.experiment.transcription
+    if not model.constraints:
         raise InputError(
             f"{finished.directory}: there is no path or terminal constraint that a trajectory could violate"
         )
@@ -72,12 +71,12 @@ def simulate(
     worst = adversaries(finished.experiment, finished.theta)
     replayed: Mapping[str, Array] | None = None
     if law == ADVERSARY:
-        replayed = read_adversaries(finished.directory, place) or worst
-        moments, states = replay(place, replayed)
+        replayed = read_adversaries(finished.directory, model) or worst
+        moments, states = replay(model, finished.theta.ravel(), replayed)
         replayed = {**replayed, "state_times": moments, "states": states}
-        found = _replayed(finished, place, replayed, started)
+        found = _replayed(finished, replayed, started)
     else:
-        found = _sampled(finished, place, worst, cast(LawName, law), count, seed, tell or (lambda line: None), started)
+        found = _sampled(finished, worst, cast(LawName, law), count, seed, tell or (lambda line: None), started)
     RunDirectory(finished.directory).write_json(f"simulation-{law}.json", found.summary())
     if out is not None:
         write_simulation(Path(out), found, finished, replayed)
@@ -86,7 +85,6 @@ def simulate(
 
 def _sampled(
     finished: FinishedRun,
-    place: Scene,
     worst: Mapping[str, Array],
     law: LawName,
     count: int,
@@ -94,15 +92,17 @@ def _sampled(
     tell: Callable[[str], None],
     started: float,
 ) -> Simulation:
-    response, parameters = place.model.response, place.model.parameters
-    ends = [moment for constraint in place.constraints for moment in (constraint.start, constraint.stop)]
+    model = finished.experiment.transcription
+    response, parameters = model.response, model.parameters
+    control = model.functionals.on_grid(finished.theta.ravel())
+    ends = [moment for constraint in model.constraints for moment in (constraint.start, constraint.stop)]
     times = fine_times(response, parameters, np.concatenate([ends, worst.get("times", np.zeros(0))]))
     fine = Response(response.system, finer(response.grid, times), response.initial_state)
     shown = np.unique(np.linspace(0, times.size - 1, min(times.size, SHOWN)).round().astype(int))
     known = tuple(worst[name] for name in ("times", "directions", "parameters"))
-    uncertainty = Uncertainty(place.model.functionals, parameters, place.constraints, (known[0], known[1], known[2]))
+    uncertainty = Uncertainty(model.functionals, parameters, model.constraints, (known[0], known[1], known[2]))
     counts, crowd = (
-        [Census(constraint, times) for constraint in place.constraints],
+        [Census(constraint, times) for constraint in model.constraints],
         _Crowd(shown, response.initial_state.size),
     )
     rng, block, done, out = np.random.default_rng(seed), trajectories_at_once(fine, parameters.count > 0), 0, 0
@@ -111,7 +111,7 @@ def _sampled(
         disturbances, drawn = uncertainty.draw(law, size, rng)
         for one in counts:
             one.begin(size)
-        for position, state in enumerate(walk(fine, place.control, drawn, disturbances)):
+        for position, state in enumerate(walk(fine, control, drawn, disturbances)):
             crowd.meet(position, state)
             for one in counts:
                 one.meet(position, state)
@@ -161,12 +161,14 @@ class _Crowd:
         return np.ascontiguousarray(np.stack(self._first).transpose(2, 1, 0))
 
 
-def _replayed(finished: FinishedRun, place: Scene, stored: Mapping[str, Array], started: float) -> Simulation:
+def _replayed(finished: FinishedRun, stored: Mapping[str, Array], started: float) -> Simulation:
     times, states = stored["state_times"], stored["states"]
     reached = attained(stored, times, states)
     shares = []
     for position, name in enumerate(stored["names"].tolist()):
-        tolerance = next(Census(one, times).tolerance for one in place.constraints if one.name == name)
+        tolerance = next(
+            Census(one, times).tolerance for one in finished.experiment.transcription.constraints if one.name == name
+        )
         violated = int(reached[position] > tolerance)
         when = float(stored["times"][position])
         shares.append(

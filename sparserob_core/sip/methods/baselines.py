@@ -117,5 +117,10 @@ def _worse(proof: Proof, family: ConstraintFamily, found: Separation) -> Proof:
     ):
         return proof
     return replace(
-        proof, verdict="refuted", violation=float(found.violations[0]), index=found.indices[0], row=int(found.rows[0])
+        proof,
+        verdict="refuted",
+        violation=float(found.violations[0]),
+        index=found.indices[0],
+        row=int(found.rows[0]),
+        formulation=family.formulation,
     )

@@ -102,7 +102,9 @@ class _Run:
             witnesses = [
                 (p.index[None], np.array([p.row]), p.family)
                 for p in proofs
-                if p.verdict == "refuted" and p.index is not None
+                if p.verdict == "refuted"
+                and p.index is not None
+                and p.formulation == self.program.family(p.family).formulation
             ]
             if last or not self._exchange(solution, witnesses):
                 return self._finished(solution, worst, proofs)

@@ -33,7 +33,8 @@ MOVES = 24  # steps of such a climb at most
 
 def prove(program: SemiInfiniteProgram, x: Array, notify: Notify = ignore, cells: int = CELLS) -> tuple[Proof, ...]:
     """Prove or refute every family at ``x (n,)``, one `Proof` each."""
-    return tuple(prove_family(family.reduced or family, x, notify, cells) for family in program.families)
+    proven = (family.reduced or family for family in program.families)
+    return tuple(replace(prove_family(one, x, notify, cells), formulation=one.formulation) for one in proven)
 
 
 def prove_family(family: ConstraintFamily, x: Array, notify: Notify = ignore, cells: int = CELLS) -> Proof:

@@ -128,7 +128,10 @@ def _reason(
     multipliers: Array,
     amount: float | None = None,
 ) -> Reason:
-    cuts = tuple(Cut(family.name, indices[at], row, float(m)) for row, m in zip(which, multipliers, strict=True))
+    cuts = tuple(
+        Cut(family.name, indices[at], row, float(m), family.formulation)
+        for row, m in zip(which, multipliers, strict=True)
+    )
     rows = Rows(G[at, which], h[at, which], cuts)
     amount = float(-multipliers @ rows.h) if amount is None else amount
     return Reason(kind, rows, multipliers, amount, sentence(kind, family, rows, amount))

@@ -32,7 +32,7 @@ def verdict(proofs: Sequence[Proof], gap: float, tolerance: float) -> tuple[Stat
 def worst_of(separations: Sequence[tuple[ConstraintFamily, Separation]]) -> Witness:
     """The most violated constraint that the separations of all families have found."""
     found = [
-        Witness(float(s.violations[0]), family.name, s.indices[0], int(s.rows[0]))
+        Witness(float(s.violations[0]), family.name, s.indices[0], int(s.rows[0]), family.formulation)
         for family, s in separations
         if s.violations.size
     ]
@@ -42,18 +42,20 @@ def worst_of(separations: Sequence[tuple[ConstraintFamily, Separation]]) -> Witn
 def witness(program: SemiInfiniteProgram, searched: Witness, proofs: Sequence[Proof]) -> Witness:
     """The worst constraint that search or proof has met, explained."""
     found = [
-        Witness(proof.violation, proof.family, proof.index, proof.row) for proof in proofs if proof.index is not None
+        Witness(proof.violation, proof.family, proof.index, proof.row, proof.formulation)
+        for proof in proofs
+        if proof.index is not None
     ]
     return explained(program, max([searched, *found], key=lambda one: one.violation))
 
 
 def explained(program: SemiInfiniteProgram, bare: Witness) -> Witness:
     """A witness with time, parameter and disturbance filled in, where its family can tell them."""
-    explain = program.family(bare.constraint).explain if bare.constraint else None
-    if explain is None:
+    family = program.formulated(bare.constraint, bare.formulation) if bare.constraint else None
+    if family is None or family.explain is None:
         return bare
-    words = explain(bare.index, bare.row)
-    return replace(bare, time=words.time, parameter=words.parameter, disturbance=words.disturbance)
+    said = family.explain(bare.index, bare.row)
+    return replace(bare, time=said.time, parameter=said.parameter, disturbance=said.disturbance)
 
 
 def clash(program: SemiInfiniteProgram, rows: Rows, multipliers: Array, amount: float) -> tuple[str, Witness | None]:
@@ -116,18 +118,12 @@ def _together(program: SemiInfiniteProgram, rows: Rows, multipliers: Array, orde
 
 
 def _witness_at(program: SemiInfiniteProgram, cut: Cut, violation: float) -> Witness:
-    family = program.family(cut.family)
-    words = (family.reduced or family).explain
-    bare = Witness(violation, cut.family, cut.index, cut.row)
-    if words is None or cut.index.size != (family.reduced or family).index_set.dimension:
-        return explained(program, bare)
-    said = words(cut.index, cut.row)
-    return replace(bare, time=said.time, parameter=said.parameter, disturbance=said.disturbance)
+    return explained(program, Witness(violation, cut.family, cut.index, cut.row, cut.formulation))
 
 
 def _words(program: SemiInfiniteProgram, rows: Rows, i: int) -> str:
     cut = rows.cuts[i]
-    explain = program.family(cut.family).explain
-    if explain is None:
+    family = program.formulated(cut.family, cut.formulation)
+    if family is None or family.explain is None:
         return f"row {cut.row} of {cut.family} at {np.array2string(cut.index, precision=6)}"
-    return explain(cut.index, cut.row).text
+    return family.explain(cut.index, cut.row).text

@@ -57,14 +57,16 @@ def rows_at(program: SemiInfiniteProgram, family: str, indices: Array, rows: np.
     """The constraints of a family at indices ``(k, d)``: one row each when ``rows (k,)`` names it, else all of them."""
     if not indices.shape[0]:
         return Rows.none(program.n)
-    G, h = program.family(family).rows(indices)
+    constraints = program.family(family)
+    G, h = constraints.rows(indices)
     count, per_index = h.shape
     where, which = (
         (np.arange(count), rows)
         if rows is not None
         else (np.repeat(np.arange(count), per_index), np.tile(np.arange(per_index), count))
     )
-    cuts = tuple(Cut(family, indices[i], int(r)) for i, r in zip(where, which, strict=True))
+    form = constraints.formulation
+    cuts = tuple(Cut(family, indices[i], int(r), formulation=form) for i, r in zip(where, which, strict=True))
     return Rows(np.asarray(G[where, which], dtype=float), np.asarray(h[where, which], dtype=float), cuts)
 
 

@@ -155,7 +155,7 @@ class TupleValue:
         for slot, kind, multiplier in zip(slots, kinds, self.imposed.multipliers, strict=True):
             family, first, _ = next(column for column in self._columns if column[1] <= kind < column[2])
             index = self.layout.indices(family, self.slots[slot][np.newaxis])[0]
-            cuts.append(Cut(family.name, index, int(kind - first), float(multiplier)))
+            cuts.append(Cut(family.name, index, int(kind - first), float(multiplier), family.formulation))
         return Rows(self._G[slots, kinds], self._h[slots, kinds], tuple(cuts))
 
     def _unmoved(self, changed: np.ndarray) -> bool:

@@ -11,9 +11,9 @@ from scipy.linalg import expm
 
 import sparserob_core as sr
 from sparserob_core.control.studies.adversary import find_adversary, worst_signal
-from sparserob_core.control.transcription.state_constraints import state_constraints
-from sparserob_core.control.transcription.transcribe import prepare, program_of
-from sparserob_core.experiment.directory.adversary import FILE, adversaries, attained, scene
+from sparserob_core.control.transcription.transcribe import prepare
+from sparserob_core.experiment.assemble import PlainExperiment
+from sparserob_core.experiment.directory.adversary import FILE, adversaries, attained
 from sparserob_core.experiment.directory.artefacts import RunDirectory
 from sparserob_core.experiment.figures.adversary_figure import draw_adversary
 from sparserob_core.experiment.figures.drawing import figure_data
@@ -76,11 +76,11 @@ def reached(model, one, u):
 @pytest.mark.parametrize("name", CASES)
 def test_the_adversary_attains_the_worst_of_its_family(name, parameters):
     model = transcribed(*CASES[name], PARAMETERS[parameters])
-    program, u = program_of(model), np.random.default_rng(1).uniform(-1, 1, size=8)
-    constraints = state_constraints(model)
+    program, u = model.program, np.random.default_rng(1).uniform(-1, 1, size=8)
+    constraints = model.constraints
     assert [constraint.name for constraint in constraints] == [family.name for family in program.families]
     for constraint in constraints:
-        one = find_adversary(model.functionals, constraint, program.family(constraint.name), u)
+        one = find_adversary(constraint, u)
         assert one.violation == program.family(one.name).worst(u).violations[0]
         assert one.direction @ reached(model, one, u[None]) - one.bound == pytest.approx(one.violation, abs=1e-9)
         if one.disturbance is not None:
@@ -152,11 +152,8 @@ def test_the_arrays_say_everything_about_every_family(outcome):
 
 
 def test_a_program_that_is_no_control_problem_has_no_adversary(outcome):
-    from dataclasses import replace
-
-    bare = replace(outcome.experiment, problem=None, control=None, disturbance=None)
+    bare = PlainExperiment(outcome.experiment.loaded, outcome.program)
     assert adversaries(bare, np.zeros(3)) == {}
-    assert scene(bare, np.zeros(3)) is None
 
 
 def test_a_replay_attains_what_is_stored_and_shows_what_was_changed(outcome, command):

@@ -21,7 +21,6 @@ from sparserob_core.control.sets.sampling import extreme_points, uniform_points
 from sparserob_core.control.sets.sets import NormBall, Polytope
 from sparserob_core.control.studies.laws import Uncertainty, admissibility
 from sparserob_core.control.studies.simulate import fine_times, finer, walk
-from sparserob_core.control.transcription.state_constraints import state_constraints
 from sparserob_core.control.transcription.transcribe import prepare
 from sparserob_core.experiment.simulation.outcome import clopper_pearson
 from tests.support.plants import held, indicators, random_system, simulated, uniform, walsh
@@ -85,7 +84,7 @@ def uncertainty_of(model):
     middle = np.zeros((1, 0)) if model.parameters.set is None else model.parameters.set.interior_point()[None]
     assert middle.shape == (1, nu)
     return Uncertainty(
-        model.functionals, model.parameters, state_constraints(model), (np.array([2.0]), np.eye(2)[[0]], middle)
+        model.functionals, model.parameters, model.constraints, (np.array([2.0]), np.eye(2)[[0]], middle)
     )
 
 

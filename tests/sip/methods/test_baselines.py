@@ -135,11 +135,9 @@ def test_a_scenario_result_tells_the_bound_beside_the_worst_violation(tmp_path):
 
 def test_fresh_draws_break_the_scenario_decision_no_more_often_than_the_bound(tmp_path):
     from sparserob_core.control.constraints.samples import sample_disturbances
-    from sparserob_core.control.transcription.transcribe import prepare
 
     outcome = solved(PUSHED, {"name": "scenario", "scenarios": 300}, tmp_path)
-    experiment = outcome.experiment
-    model = prepare(experiment.problem, experiment.control, experiment.disturbance)
+    model = outcome.experiment.transcription
     drawn = sample_disturbances(model.functionals.disturbance, 5000, np.random.default_rng(5))
     states = model.response.states(model.pieces(outcome.result.decision), np.zeros((5000, 0)), drawn)
     share = np.mean((np.abs(states[:, -1]) > [0.5, 0.3]).any(axis=1))

@@ -1,0 +1,104 @@
+"""What every constraint on the state offers: to a program, to proofs, to studies of single trajectories."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+
+from sparserob_core.control.response.functional import WorstCase
+from sparserob_core.control.response.parameters import ParameterIndex
+from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.program import Enclosure, Explanation, Separation
+
+
+class StateConstraint(ABC):
+    """``c'x(t) <= h(c)`` for all ``t`` in ``[start, stop]``, parameters and disturbances, and for the normals ``c`` of
+    a convex set. A terminal constraint is the window ``[T, T]``.
+
+    An index is ``(t, p)``, followed by a direction ``z (b,)`` where the set is curved; at each there are ``r`` rows.
+    The disturbance is maximised in closed form (`WorstCase`), so the formulation is the reduced one.
+    """
+
+    name: str
+    functionals: WorstCase
+    start: float
+    stop: float
+    parameters: ParameterIndex
+
+    @property
+    @abstractmethod
+    def index_set(self) -> Box:
+        """The box of all indices."""
+
+    @property
+    @abstractmethod
+    def scale(self) -> float:
+        """The size of the states that the constraint is about."""
+
+    @property
+    @abstractmethod
+    def sides(self) -> tuple[Array, Array] | None:
+        """``H (r, d)``, ``h (r,)`` of a set with flat sides; ``None`` for a curved set."""
+
+    @abstractmethod
+    def functionals_at(self, indices: Array) -> tuple[Array, Array, Array, Array]:
+        """Times ``(k r,)``, directions ``(k r, d)``, parameters ``(k r, nu)`` and right-hand sides ``(k r,)`` of all
+        rows of every index ``(k, ...)``, index by index."""
+
+    @abstractmethod
+    def violations(self, x: Array, indices: Array, rows: np.ndarray) -> Array:
+        """``row x - rhs`` for one row per index, ``(k,)``, without building rows."""
+
+    @abstractmethod
+    def worst(self, x: Array) -> Separation:
+        """The largest local maxima of the violation over the index set."""
+
+    @property
+    @abstractmethod
+    def cells(self) -> tuple[Array, Array]:
+        """The lower and upper corners of cells that fill the index set and on which `enclosure` converges."""
+
+    @abstractmethod
+    def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
+        """Proven upper bounds of the violation on cells of the index set, each within one piece."""
+
+    @abstractmethod
+    def explain(self, index: Array, row: int) -> Explanation:
+        """One constraint for people: what is bounded, when, and what the uncertainty does to it."""
+
+    @abstractmethod
+    def nominal(self) -> StateConstraint:
+        """The same constraint without uncertainty: a middle parameter, and no disturbance (or a middle one where none
+        is not admissible)."""
+
+    @abstractmethod
+    def from_state(self, initial_state: Array) -> StateConstraint:
+        """The same constraint from another initial state ``(d,)``; what does not depend on it is shared."""
+
+    @abstractmethod
+    def directions(self, z: Array, rows: np.ndarray) -> tuple[Array, Array]:
+        """Directions ``(k, b, d)`` and shares ``(k, b)`` whose combinations are the normals ``(k, d)`` at one row
+        ``(k,)`` and direction ``z (k, b)`` each; ``b`` is 1 for a set with flat sides."""
+
+    def turned(self, z: Array, directions: Array, states: Array) -> Array:
+        """The derivative ``(k, b)`` of the violation in the direction ``z``, with the normals ``directions (k, d)`` and
+        ``states (k, b)``, the states along the directions of `directions`; nothing, ``(k, 0)``, for flat sides."""
+        return z
+
+    @abstractmethod
+    def outwardness(self, states: Array) -> Array:
+        """A cheap measure ``(n,)`` of states ``(d, n)``: positive outside the set, not positive inside, growing
+        outwards."""
+
+    def excess(self, states: Array) -> Array:
+        """By how much states ``(d, n)`` violate the constraint, ``(n,)``; negative: a margin. With flat sides the
+        `outwardness` itself."""
+        return self.outwardness(states)
+
+    def rows(self, indices: Array) -> tuple[Array, Array]:
+        """``G (k, r, n)``, ``rhs (k, r)`` at indices ``(k, ...)``."""
+        times, directions, parameters, rhs = self.functionals_at(indices)
+        G, offset = self.functionals.rows(times, directions, parameters)
+        shape = (indices.shape[0], times.size // max(1, indices.shape[0]))
+        return G.reshape(*shape, G.shape[1]), (rhs - offset).reshape(shape)
