@@ -1,9 +1,12 @@
-"""Convex sets as the framework sees them: a support function, a maximiser of it, and half-spaces when flat."""
+"""Convex sets as the framework sees them: a support function and a maximiser of it; everything else has a default that
+a set overrides where it knows better."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
@@ -13,12 +16,35 @@ from sparserob_core.errors import InputError
 
 Array: TypeAlias = npt.NDArray[np.float64]
 
+HALVINGS = 60
+RELATIVE = 1e-12  # accuracy of a gauge that is computed from the support function alone
+PIVOTS = 200  # support points asked for at most on the way to one boundary point
+SPIKE = 1e-12  # of the set's extent: half the thickness below which a set counts as one without interior
+TILT = 1e-14  # by which a ray is turned in the choice of pivots, so that no choice is a tie
+PLAIN = 3  # dimension up to which a set is sampled by rejection
+MIXING = 8  # steps of hit and run per dimension
+TRIES = 10_000  # points drawn per wanted point before rejection sampling gives up
+
+
+def bisect(
+    beyond: Callable[[Array], npt.NDArray[np.bool_]], low: Array, high: Array, halvings: int = HALVINGS
+) -> tuple[Array, Array]:
+    """Brackets ``(low, high)`` of the points at which ``beyond`` changes from false to true, one for every entry of the
+    two arrays; the last ``low`` was not beyond, the last ``high`` was, if that held at the start."""
+    for _ in range(halvings):
+        middle = 0.5 * (low + high)
+        out = beyond(middle)
+        low, high = np.where(out, low, middle), np.where(out, middle, high)
+    return low, high
+
 
 class ConvexSet(ABC):
     """A closed convex set, described by its support function ``h(c) = max {c'x : x in the set}`` (Rockafellar 1970,
     section 13).
 
-    Directions and points are arrays ``(..., d)``: any leading axes are kept, ``(k, d)`` gives ``(k,)``.
+    Directions and points are arrays ``(..., d)``: any leading axes are kept, ``(k, d)`` gives ``(k,)``. A new kind of
+    set is one class with the three abstract members; the others have defaults that are right for every set with an
+    interior, and a set overrides those that it can answer faster or more exactly.
     """
 
     @property
@@ -34,9 +60,54 @@ class ConvexSet(ABC):
     def support_point(self, directions: Array) -> Array:
         """A maximiser ``(k, d)`` of ``c'x`` for each direction ``(k, d)``; finite wherever the support function is."""
 
+    # What shape it is
+
+    @property
+    def kind(self) -> str:
+        """What a message calls the set."""
+        return type(self).__name__.lower()
+
+    @property
+    def is_box(self) -> bool:
+        """Whether the set is its own `bounding_box`."""
+        return False
+
     def halfspaces(self) -> tuple[Array, Array] | None:
         """``(H (r, d), h (r,))`` with the set ``= {x : H x <= h}``, or ``None`` for a curved set."""
         return None
+
+    def unit_ball_image(self) -> tuple[Array, Array] | None:
+        """``(m (d,), L (d, d))`` with the set ``= {m + L z : |z| <= 1}`` and ``L`` regular, or ``None`` for another
+        shape."""
+        return None
+
+    @property
+    def normals(self) -> Array:
+        """Orthonormal rows ``(b, d)`` that span every direction in which the support function is finite; here all of
+        them."""
+        return np.eye(self.dimension)
+
+    @property
+    def frame(self) -> Array:
+        """Rows ``N (b, d)`` that span what `normals` span, in whose coordinates ``c = z N`` the set is about round: it
+        reaches about as far along every ``z`` of the same length. In other units of the set ``z`` stays the same."""
+        axes = self.normals
+        width = self.support(axes) + self.support(-axes)
+        return few_digits(axes / np.where((width > 0.0) & np.isfinite(width), width / 2.0, 1.0)[:, None])
+
+    @property
+    def is_bounded(self) -> bool:
+        """Whether the support function is finite in every direction."""
+        axes = np.eye(self.dimension)
+        return bool(np.isfinite(self.support(np.vstack([axes, -axes]))).all())
+
+    # How large it is
+
+    def bounding_box(self) -> Box:
+        """The smallest box around the set, with infinite sides where the set has none."""
+        axes = np.eye(self.dimension)
+        upper = self.support(axes)
+        return Box(np.minimum(-self.support(-axes), upper), upper)
 
     def reach(self, directions: Array) -> Array:
         """``max {|c'x| : x in the set}`` of directions ``(..., d)``, as ``(...,)``."""
@@ -47,6 +118,198 @@ class ConvexSet(ABC):
     def radius_bound(self) -> float:
         """An upper bound of the 2-norm of any point: that of the corner of the bounding box."""
         return float(np.linalg.norm(self.reach(np.eye(self.dimension))))
+
+    def interior_point(self) -> Array:
+        """A point ``(d,)`` of the set, away from its boundary where the set allows; here the mean of support points."""
+        axes = np.eye(self.dimension)
+        centre: Array = self.support_point(np.vstack([axes, -axes])).mean(axis=0)
+        return centre
+
+    def middle(self) -> Array:
+        """What the set is scaled about, ``(d,)``: the middle of its bounding box, 0 along sides that are free; an
+        interior point where that is not in the set. Raises `InputError` where a side is free and 0 is not inside."""
+        box = self.bounding_box()
+        bounded = np.isfinite(box.lower) & np.isfinite(box.upper)
+        middle: Array = np.where(
+            bounded, (np.where(bounded, box.lower, 0.0) + np.where(bounded, box.upper, 0.0)) / 2, 0.0
+        )
+        if self.violation(middle) <= 0.0:
+            return middle
+        if bounded.all():
+            return self.interior_point()
+        raise InputError(
+            "it has no centre to be enlarged about: it is free on a side, and 0 is outside of it; give it bounds on"
+            " both sides",
+            path=self.kind,
+        )
+
+    def scaled(self, factor: float) -> ConvexSet:
+        """``m + factor (x - m)`` for all ``x`` in the set, ``m`` its `middle`; ``factor >= 0``."""
+        return Scaled(self, self.middle(), factor)
+
+    def in_units(self, units: Array) -> ConvexSet:
+        """The set of all ``x / units`` for ``x`` in this one; ``units (d,)`` positive. Exact for powers of two."""
+        return SetInUnits(self, np.asarray(units, dtype=float))
+
+    # Where its boundary is
+
+    def gauge(self, points: Array) -> Array:
+        """The Minkowski functional about the interior point: the least ``g (...,)`` for which
+        ``m + (x - m) / g`` is in the set, of points ``(..., d)``.
+
+        At most 1 inside, above 1 outside, ``inf`` where the set has no extent towards the point.
+        """
+        points = np.asarray(points, dtype=float)
+        middle = self.interior_point()
+        rays = points.reshape(-1, self.dimension) - middle
+        flat = self.halfspaces()
+        if flat is None:
+            sizes = self._boundary(np.broadcast_to(middle, rays.shape), rays)[0]
+        else:
+            # an interior point may be outside by rounding
+            sizes = ratios(rays @ flat[0].T, np.maximum(flat[1] - flat[0] @ middle, 0.0)).max(axis=1, initial=0.0)
+        return sizes.reshape(points.shape[:-1])
+
+    def normal(self, points: Array) -> Array:
+        """Outward normals ``(..., d)``, of any length, at points of the boundary ``(..., d)``; one of them at a
+        corner."""
+        points = np.asarray(points, dtype=float)
+        flat = self.halfspaces()
+        if flat is not None:
+            H, h = flat
+            steepest: Array = H[((points @ H.T - h) / np.linalg.norm(H, axis=1)).argmax(axis=-1)]
+            return steepest
+        middle = self.interior_point()
+        rays = points.reshape(-1, self.dimension) - middle
+        return self._boundary(np.broadcast_to(middle, rays.shape), rays)[1].reshape(points.shape)
+
+    def violation(self, points: Array) -> Array:
+        """How far outside (positive) or inside (negative) points ``(..., d)`` are: 0 on the boundary, never below
+        ``max {c'x - h(c) : |c| = 1}``.
+
+        For a flat set the maximum of ``c'x - h(c)`` over the unit normals of its half-spaces; ``-inf`` when there are
+        none. Here, for a curved set: outside, the distance to the boundary along the ray from the interior point;
+        inside, ``(gauge - 1)`` times the radius of a ball that is in the set.
+        """
+        points = np.asarray(points, dtype=float)
+        flat = self.halfspaces()
+        if flat is None:
+            gauge = self.gauge(points)
+            length = np.linalg.norm((points - self.interior_point()) @ self.normals.T, axis=-1)
+            inside = (gauge - 1.0) * self._inner_radius
+            return np.asarray(np.where(gauge > 1.0, length * (1.0 - 1.0 / np.maximum(gauge, 1.0)), inside))
+        H, h = flat
+        if h.size == 0:
+            return np.full(np.shape(points)[:-1], -np.inf)
+        norms = np.linalg.norm(H, axis=1)
+        excess: Array = (points @ (H / norms[:, None]).T - h / norms).max(axis=-1)
+        return excess
+
+    def contains(self, points: Array, tolerance: float = 1e-9) -> npt.NDArray[np.bool_]:
+        """Whether points ``(..., d)`` violate nothing by more than the absolute ``tolerance``."""
+        inside: npt.NDArray[np.bool_] = np.asarray(self.violation(points) <= tolerance)
+        return inside
+
+    def chord(self, points: Array, directions: Array) -> tuple[Array, Array]:
+        """``low (k,) <= 0 <= high (k,)`` such that ``point + s direction`` is in the set for ``low <= s <= high``, of
+        points of the set ``(k, d)`` and directions ``(k, d)``."""
+        flat = self.halfspaces()
+        if flat is None:
+            with np.errstate(divide="ignore"):
+                high, low = (1.0 / self._boundary(points, sign * directions)[0] for sign in (1.0, -1.0))
+            return -low, high
+        slopes, room = directions @ flat[0].T, np.maximum(flat[1] - points @ flat[0].T, 0.0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            reach = room / slopes
+        return (
+            np.where(slopes < 0, reach, -np.inf).max(axis=1, initial=-np.inf),
+            np.where(slopes > 0, reach, np.inf).min(axis=1, initial=np.inf),
+        )
+
+    def _boundary(self, origins: Array, rays: Array) -> tuple[Array, Array]:
+        """The gauge ``(k,)`` of ``rays (k, d)`` about points of the set ``origins (k, d)``, and a normal ``(k, d)``
+        where each ray leaves the set.
+
+        The gauge is ``min {sum lambda : r = sum lambda_i v_i, lambda >= 0}`` over points ``v_i`` of the set seen from
+        the origin: a linear program with a column for each of them. The dual solution of the chosen columns is a
+        direction, and its support point is the column to enter (column generation; Dantzig and Wolfe 1960). The answer
+        is at least the true gauge, so that the ray over its gauge is in the set, by less than `RELATIVE` of it where
+        `PIVOTS` suffice.
+        """
+        N = self.normals
+        widths = (self.support(N) + self.support(-N)) / 2
+        widths = np.where(widths > 0, widths, 1.0)[:, None]
+        into, back = N.T / widths.T, N / widths  # to coordinates in which the bounding box is a cube; of directions
+        origins, rays = origins @ into, rays @ into
+        k, b = rays.shape
+        lengths = np.linalg.norm(rays, axis=1)
+        turned = np.where(rays < 0, -1.0, 1.0)
+        tilted = rays / np.where(lengths > 0, lengths, 1.0)[:, None] + TILT * turned * (1.0 + np.arange(b) / 7.0)
+        # The first columns stand for the thickness that the set must at least have; none may be left in the end.
+        columns = SPIKE * turned[:, :, None] * np.eye(b)
+        made = np.ones((k, b), dtype=bool)
+        open_ = np.flatnonzero(lengths > 0)
+        for _ in range(PIVOTS):
+            chosen = columns[open_]
+            directions = np.linalg.solve(chosen, np.ones((open_.size, b, 1)))[..., 0]
+            entering = self.support_point(directions @ back) @ into - origins[open_]
+            better = (directions * entering).sum(axis=1) > 1.0 + RELATIVE
+            open_, chosen, entering = open_[better], chosen[better], entering[better]
+            if not open_.size:
+                break
+            sides = np.stack([tilted[open_], entering], axis=2)
+            share, slope = np.moveaxis(np.linalg.solve(np.swapaxes(chosen, 1, 2), sides), 2, 0)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                leaving = np.where(slope > 0, np.maximum(share, 0.0) / slope, np.inf).argmin(axis=1)
+            columns[open_, leaving] = entering
+            made[open_, leaving] = False
+        shares = np.linalg.solve(np.swapaxes(columns, 1, 2), rays[..., None])[..., 0]
+        sizes = np.where((made & (np.abs(shares) > 0)).any(axis=1), np.inf, np.abs(shares).sum(axis=1))
+        return np.where(lengths > 0, sizes, 0.0), np.linalg.solve(columns, np.ones((k, b, 1)))[..., 0] @ back
+
+    @cached_property
+    def _inner_radius(self) -> float:
+        """The radius of a ball about the interior point that is in the set: that of the polytope whose corners are
+        where the axes leave the set."""
+        axes = self.normals
+        rays = np.vstack([axes, -axes])
+        sizes = self._boundary(np.broadcast_to(self.interior_point(), rays.shape), rays)[0].reshape(2, -1).max(axis=0)
+        return float(1.0 / np.linalg.norm(sizes))
+
+    # What its points are, at random
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        """``count`` independent points ``(count, d)`` of a bounded set: uniform in up to three dimensions, unless the
+        set is too thin for rejection; else hit and run (Smith 1984) makes them uniform in the limit only."""
+        found = self._by_rejection(count, rng) if self.dimension <= PLAIN else None
+        return self._hit_and_run(count, rng) if found is None else found
+
+    def sample_extreme(self, count: int, rng: np.random.Generator) -> Array:
+        """``count`` random extreme points ``(count, d)`` of a bounded set: here the support points of directions that
+        are uniform on the sphere."""
+        return self.support_point(rng.normal(size=(count, self.dimension)))
+
+    def _by_rejection(self, count: int, rng: np.random.Generator) -> Array | None:
+        """The points of the bounding box that lie in the set; ``None`` where these are too few."""
+        box = self.bounding_box()
+        found, drawn = np.empty((0, self.dimension)), 0
+        while found.shape[0] < count:
+            points = rng.uniform(box.lower, box.upper, size=(max(64, count), self.dimension))
+            found = np.vstack([found, points[self.contains(points, 0.0)]])
+            drawn += points.shape[0]
+            if drawn > TRIES * (found.shape[0] + 1):
+                return None
+        return found[:count]
+
+    def _hit_and_run(self, count: int, rng: np.random.Generator) -> Array:
+        """One chain per point, all from the interior point; a chain that cannot move along a line stays where it is."""
+        points: Array = np.tile(self.interior_point(), (count, 1))
+        for _ in range(MIXING * self.dimension):
+            directions = rng.normal(size=points.shape)
+            points = points + rng.uniform(*self.chord(points, directions))[:, None] * directions
+        return points
+
+    # How its support function curves
 
     def linearisation_excess(self, centre: Array, spread: Array) -> Array:
         """How much the support function can exceed its linearisation at ``centre (..., d)``, over
@@ -71,56 +334,12 @@ class ConvexSet(ABC):
         point = self.support_point(centre[None])[0]
         return float(self.support(centre[None])[0]), spread @ point, np.zeros((spread.shape[0], spread.shape[0]))
 
-    def violation(self, points: Array) -> Array:
-        """``max {c'x - h(c) : |c| = 1}`` of points ``(..., d)``: how far outside (positive) or inside (negative) they
-        are.
 
-        For a flat set the maximum is over the normals of its half-spaces only; ``-inf`` when there are none.
-        """
-        flat = self.halfspaces()
-        if flat is None:
-            raise NotImplementedError(f"{type(self).__name__} has no half-spaces and must define its violation")
-        H, h = flat
-        if h.size == 0:
-            return np.full(np.shape(points)[:-1], -np.inf)
-        norms = np.linalg.norm(H, axis=1)
-        excess: Array = (np.asarray(points) @ (H / norms[:, None]).T - h / norms).max(axis=-1)
-        return excess
-
-    def contains(self, points: Array, tolerance: float = 1e-9) -> npt.NDArray[np.bool_]:
-        """Whether points ``(..., d)`` violate nothing by more than the absolute ``tolerance``."""
-        inside: npt.NDArray[np.bool_] = np.asarray(self.violation(points) <= tolerance)
-        return inside
-
-    def interior_point(self) -> Array:
-        """A point ``(d,)`` of the set, away from its boundary where the set allows; here the mean of support points."""
-        axes = np.eye(self.dimension)
-        centre: Array = self.support_point(np.vstack([axes, -axes])).mean(axis=0)
-        return centre
-
-    @property
-    def normals(self) -> Array:
-        """Orthonormal rows ``(b, d)`` that span every direction in which the support function is finite; here all of
-        them."""
-        return np.eye(self.dimension)
-
-    @property
-    def frame(self) -> Array:
-        """Rows ``N (b, d)`` that span what `normals` span, in whose coordinates ``c = z N`` the set is about round: it
-        reaches about as far along every ``z`` of the same length. In other units of the set ``z`` stays the same."""
-        axes = self.normals
-        width = self.support(axes) + self.support(-axes)
-        return few_digits(axes / np.where((width > 0.0) & np.isfinite(width), width / 2.0, 1.0)[:, None])
-
-    def in_units(self, units: Array) -> ConvexSet:
-        """The set of all ``x / units`` for ``x`` in this one; ``units (d,)`` positive. Exact for powers of two."""
-        return SetInUnits(self, np.asarray(units, dtype=float))
-
-    @property
-    def is_bounded(self) -> bool:
-        """Whether the support function is finite in every direction."""
-        axes = np.eye(self.dimension)
-        return bool(np.isfinite(self.support(np.vstack([axes, -axes]))).all())
+def ratios(sizes: Array, room: Array | float) -> Array:
+    """``size / room`` where the size is positive, ``inf`` where there is no room for it; 0 elsewhere."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shares: Array = np.where(sizes > 0, sizes / room, 0.0)
+    return shares
 
 
 def as_bound(name: str, value: object, size: int | None = None) -> Array:
@@ -196,6 +415,28 @@ class Box(ConvexSet):
         excess: Array = np.maximum(np.asarray(points) - self.upper, self.lower - np.asarray(points)).max(axis=-1)
         return excess
 
+    @property
+    def is_box(self) -> bool:
+        return True
+
+    def bounding_box(self) -> Box:
+        return self
+
+    def scaled(self, factor: float) -> Box:
+        middle = self.middle()
+        lower, upper = (
+            np.where(np.isfinite(side), middle + factor * (np.where(np.isfinite(side), side, 0.0) - middle), side)
+            for side in (self.lower, self.upper)
+        )
+        return Box(lower, upper)
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        return rng.uniform(self.lower, self.upper, size=(count, self.dimension))
+
+    def sample_extreme(self, count: int, rng: np.random.Generator) -> Array:
+        """Each corner equally likely."""
+        return np.where(rng.integers(0, 2, size=(count, self.dimension), dtype=np.int8) > 0, self.upper, self.lower)
+
     def interior_point(self) -> Array:
         lower = np.where(np.isfinite(self.lower), self.lower, np.minimum(self.upper, 1.0) - 1.0)
         upper = np.where(np.isfinite(self.upper), self.upper, np.maximum(self.lower, -1.0) + 1.0)
@@ -220,6 +461,10 @@ class SetInUnits(ConvexSet):
     def dimension(self) -> int:
         return self.base.dimension
 
+    @property
+    def kind(self) -> str:
+        return self.base.kind
+
     def support(self, directions: Array) -> Array:
         return self.base.support(np.asarray(directions, dtype=float) / self.units)
 
@@ -236,10 +481,11 @@ class SetInUnits(ConvexSet):
     def support_minorant(self, centre: Array, spread: Array) -> tuple[float, Array, Array]:
         return self.base.support_minorant(np.asarray(centre) / self.units, np.asarray(spread) / self.units)
 
-    def violation(self, points: Array) -> Array:
-        """Of the right sign, and at most the distance: that of the base in its largest unit."""
-        excess: Array = self.base.violation(np.asarray(points) * self.units) / self.units.max()
-        return excess
+    def gauge(self, points: Array) -> Array:
+        return self.base.gauge(np.asarray(points) * self.units)
+
+    def normal(self, points: Array) -> Array:
+        return self.base.normal(np.asarray(points) * self.units) * self.units
 
     def interior_point(self) -> Array:
         return self.base.interior_point() / self.units
@@ -262,6 +508,64 @@ def few_digits(matrix: Array) -> Array:
     _, exponents = np.frexp(np.abs(matrix).max(axis=0))
     grid = np.ldexp(1.0, exponents - 24)
     return np.asarray(np.rint(matrix / grid) * grid)
+
+
+@dataclass(frozen=True, eq=False)
+class Scaled(ConvexSet):
+    """``{about + factor (x - about) : x in base}``, ``about (d,)`` in the base and ``factor >= 0``; what
+    `ConvexSet.scaled` gives for a kind of set that does not scale itself."""
+
+    base: ConvexSet
+    about: Array
+    factor: float
+
+    @property
+    def dimension(self) -> int:
+        return self.base.dimension
+
+    @property
+    def kind(self) -> str:
+        return self.base.kind
+
+    @property
+    def normals(self) -> Array:
+        return self.base.normals
+
+    def support(self, directions: Array) -> Array:
+        directions, height = np.asarray(directions, dtype=float), self.base.support(directions)
+        finite = np.isfinite(height)
+        moved = self.factor * np.where(finite, height, 0.0) + (1.0 - self.factor) * (directions @ self.about)
+        return np.asarray(np.where(finite, moved, height))
+
+    def support_point(self, directions: Array) -> Array:
+        return self._moved(self.base.support_point(directions))
+
+    def halfspaces(self) -> tuple[Array, Array] | None:
+        flat = self.base.halfspaces()
+        if flat is None:
+            return None
+        offset = flat[0] @ self.about
+        return flat[0], offset + self.factor * (flat[1] - offset)
+
+    def interior_point(self) -> Array:
+        return self._moved(self.base.interior_point())
+
+    def middle(self) -> Array:
+        return self._moved(self.base.middle())
+
+    def in_units(self, units: Array) -> ConvexSet:
+        return Scaled(self.base.in_units(units), self.about / units, self.factor)
+
+    def linearisation_excess(self, centre: Array, spread: Array) -> Array:
+        return self.factor * self.base.linearisation_excess(centre, spread)
+
+    def support_minorant(self, centre: Array, spread: Array) -> tuple[float, Array, Array]:
+        value, gradient, hessian = self.base.support_minorant(centre, spread)
+        f, rest = self.factor, (1.0 - self.factor) * self.about
+        return f * value + float(centre @ rest), f * gradient + spread @ rest, f * hessian
+
+    def _moved(self, points: Array) -> Array:
+        return self.about + self.factor * (points - self.about)
 
 
 def vertex_excess(vertices: Array, centre: Array, spread: Array, blocks: int = 4096) -> Array:

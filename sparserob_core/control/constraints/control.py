@@ -79,7 +79,7 @@ class ControlConstraint:
     def explain(self, index: Array, row: int) -> Explanation:
         """One constraint in words."""
         return Explanation(
-            f"control: u({index[0]:.6g}) in the {type(self.set).__name__.lower()}",
+            f"control: u({index[0]:.6g}) in the {self.set.kind}",
             float(index[0]),
             direction=unit(self.set, index[None, 1:])[0],
         )

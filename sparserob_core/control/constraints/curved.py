@@ -19,9 +19,7 @@ from sparserob_core.control.response.enclosure import CELLS_KEPT, CellEnclosure,
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.parameters import ParameterIndex
-from sparserob_core.control.sets.curved import Ellipsoid, NormBall
 from sparserob_core.control.sets.directions import across, faces, on_surface, sampled, unit
-from sparserob_core.control.sets.sets import Cylinder
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.program import Enclosure, Explanation, Separation
 
@@ -119,7 +117,7 @@ class CurvedConstraint(StateConstraint):
     def explain(self, index: Array, row: int) -> Explanation:
         times, directions, parameters, rhs = self.functionals_at(index[None])
         said = explanation(self.name, self.functionals, directions, rhs, 0, float(times[0]), parameters[0])
-        return replace(said, text=f"{said.text} (a tangent of the {type(self.set).__name__.lower()})")
+        return replace(said, text=f"{said.text} (a tangent of the {self.set.kind})")
 
     def nominal(self) -> CurvedConstraint:
         known = self.functionals.nominal()
@@ -139,7 +137,8 @@ class CurvedConstraint(StateConstraint):
         return across(z, states - self.set.support_point(directions) @ self.set.normals.T)
 
     def outwardness(self, states: Array) -> Array:
-        return _outwardness(self.set, states.T)
+        sizes = self.set.gauge(states.T) - 1.0
+        return sizes if np.isfinite(sizes).all() else self.set.violation(states.T)
 
     def excess(self, states: Array) -> Array:
         """The distance to the set outside, and inside the largest ``c'x - h(c)`` over sampled unit directions, which
@@ -226,18 +225,6 @@ class CurvedConstraint(StateConstraint):
         return FlatConstraint(
             self.name, self.functionals, H, self.set.support(H), self.start, self.stop, self.parameters
         )
-
-
-def _outwardness(convex: ConvexSet, points: Array) -> Array:
-    """A cheap measure ``(n,)`` of points ``(n, d)`` that is positive outside, negative inside, and grows outwards."""
-    if isinstance(convex, Cylinder):
-        return _outwardness(convex.base, points[:, : convex.base.dimension])
-    if isinstance(convex, Ellipsoid):
-        inverse = np.linalg.inv(convex.factor)
-        return np.asarray(np.linalg.norm(inverse @ (points - convex.centre).T, axis=0) - 1.0)
-    if isinstance(convex, NormBall):
-        return np.asarray(np.linalg.norm(points - convex.centre, ord=convex.p, axis=1) - convex.radius)
-    return convex.violation(points)
 
 
 def _distinct(indices: Array, found: Array) -> np.ndarray:

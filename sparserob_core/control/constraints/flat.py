@@ -308,7 +308,7 @@ class FlatConstraint(StateConstraint):
 
         points, found = climb(evaluate, indices, radius, project)
         bound = self.parameters.set
-        if bound is None or isinstance(bound, Box):
+        if bound is None or bound.is_box:
             return points, found
         stepped, higher = step_out(evaluate, points, found, bound)
         moved = np.flatnonzero(higher > found)

@@ -16,8 +16,7 @@ import numpy as np
 
 from sparserob_core.control.enclosures.polynomial import polynomial_bound, quadratic_part
 from sparserob_core.control.enclosures.taylor import TaylorSpace
-from sparserob_core.control.sets.curved import Ellipsoid, NormBall
-from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.convex_set import Array, ConvexSet, bisect
 
 TOGETHER = 6  # cuts of one cell that are tried in all combinations; singly, beyond
 HALVINGS = 40  # of the interval of a trust region's multiplier
@@ -112,11 +111,12 @@ class Cuts:
         values, vectors = np.linalg.eigh(bend)
         along = np.abs(np.einsum("...ij,...i->...j", vectors, slope))
         low = np.maximum(values[..., -1], 0.0)
-        high = low + np.linalg.norm(slope, axis=-1)
-        for _ in range(HALVINGS):
-            middle = (low + high) / 2
-            outside = ((along / np.maximum(middle[..., None] - values, TINY)) ** 2).sum(axis=-1) > 1.0
-            low, high = np.where(outside, middle, low), np.where(outside, high, middle)
+        _, high = bisect(
+            lambda multiplier: ((along / np.maximum(multiplier[..., None] - values, TINY)) ** 2).sum(axis=-1) <= 1.0,
+            low,
+            low + np.linalg.norm(slope, axis=-1),
+            HALVINGS,
+        )
         return [high, local]
 
     @cached_property
@@ -128,15 +128,11 @@ class Cuts:
 def ball_of(convex: ConvexSet | None, centre: Array, radius: Array) -> tuple[Array, Array] | None:
     """A set that is the image of the unit ball, ``{p : |L^-1 (p - middle)| <= 1}``, in ``delta``: base and image of
     `Cuts`; else ``None``."""
-    if isinstance(convex, Ellipsoid):
-        factor = convex.factor
-    elif isinstance(convex, NormBall) and convex.p == 2.0 and convex.radius > 0.0:
-        factor = convex.radius * np.eye(convex.dimension)
-    else:
+    image = None if convex is None else convex.unit_ball_image()
+    if image is None or not (radius > 0.0).all():
         return None
-    if not (radius > 0.0).all():
-        return None
-    return np.asarray(np.linalg.solve(factor, centre - convex.centre), dtype=float), np.asarray(
+    middle, factor = image
+    return np.asarray(np.linalg.solve(factor, centre - middle), dtype=float), np.asarray(
         np.linalg.solve(factor, np.diag(radius)), dtype=float
     )
 

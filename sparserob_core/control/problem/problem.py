@@ -13,7 +13,7 @@ import numpy.typing as npt
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Equality
 from sparserob_core.errors import InputError
-from sparserob_core.sip.convex_set import Array, Box, ConvexSet, as_bound
+from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound
 
 if TYPE_CHECKING:
     from sparserob_core.sip.program import SemiInfiniteProgram
@@ -104,8 +104,9 @@ class OptimalControlProblem:
         if self.disturbance is None:
             return
         _checked_set("disturbance", self.disturbance, self.system.disturbances, "columns of E", bounded=True)
-        box = self.disturbance
-        if self.disturbance_class == "l1_ball" and not (isinstance(box, Box) and np.array_equal(box.lower, -box.upper)):
+        box = self.disturbance.bounding_box()
+        symmetric = self.disturbance.is_box and np.array_equal(box.lower, -box.upper)
+        if self.disturbance_class == "l1_ball" and not symmetric:
             raise InputError(
                 "the class l1_ball needs a box that is symmetric about the origin, such as box: 0.1", path="disturbance"
             )

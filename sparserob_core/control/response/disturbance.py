@@ -17,7 +17,7 @@ from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.response.response import TimeGrid
 from sparserob_core.control.sets.sets import NormBall, Polytope
 from sparserob_core.errors import InputError
-from sparserob_core.sip.convex_set import Array, Box, ConvexSet
+from sparserob_core.sip.convex_set import Array, ConvexSet
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,10 +108,11 @@ def disturbance_model(kind: str, bound: ConvexSet, dictionary: Dictionary, grid:
     if kind == "measurable":
         return DisturbanceModel("measurable", bound, bound, grid, starts=np.arange(grid.pieces))
     if kind == "l1_ball":
-        if not isinstance(bound, Box) or not np.array_equal(bound.lower, -bound.upper):
+        box = bound.bounding_box()
+        if not bound.is_box or not np.array_equal(box.lower, -box.upper):
             raise InputError("l1_ball needs a disturbance box that is symmetric about 0", path="disturbance_class")
         ball = NormBall(p=1.0, radius=1.0, dimension=dictionary.values.shape[0])
-        return DisturbanceModel("l1_ball", ball, bound, grid, functions=on_grid, scale=bound.upper)
+        return DisturbanceModel("l1_ball", ball, bound, grid, functions=on_grid, scale=box.upper)
     merged = dictionary.merged()
     if dictionary.is_complete:
         which = np.clip(
@@ -124,7 +125,7 @@ def disturbance_model(kind: str, bound: ConvexSet, dictionary: Dictionary, grid:
     if flat is None:
         raise InputError(
             "fewer functions than pieces needs a disturbance set with flat sides (box, polytope, 1-norm or inf-norm),"
-            f" got {type(bound).__name__}",
+            f" got {bound.kind}",
             path="dictionaries.disturbance",
         )
     H, h = flat

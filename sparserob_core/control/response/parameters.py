@@ -8,7 +8,6 @@ from itertools import product
 import numpy as np
 
 from sparserob_core.control.enclosures.valid_inequalities import Cuts, ball_of
-from sparserob_core.control.sets.gauge import outward, shares
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
 TOUCHING = 1e-12  # relative: a cell this close to the set meets it
@@ -29,18 +28,15 @@ class ParameterIndex:
     def box(self) -> Box:
         """The smallest box ``(nu,)`` around the set; only for ``count > 0``."""
         assert self.set is not None
-        if isinstance(self.set, Box):
-            return self.set
-        axes = np.eye(self.count)
-        return Box(-self.set.support(-axes), self.set.support(axes))
+        return self.set.bounding_box()
 
     def clamp(self, parameters: Array) -> Array:
         """Points ``(k, nu)`` of the box mapped onto the set: kept where inside, else drawn along the ray to an interior
         point."""
-        if self.set is None or isinstance(self.set, Box):
+        if self.set is None or self.set.is_box:
             return parameters
-        share, middle = shares(self.set, parameters)[:, None], self.set.interior_point()
-        return np.where(share == 1.0, parameters, middle + share * (parameters - middle))
+        size, middle = self.set.gauge(parameters)[:, None], self.set.interior_point()
+        return np.where(size <= 1.0, parameters, middle + (parameters - middle) / np.maximum(size, 1.0))
 
     def pulled_back(self, parameters: Array, slopes: Array) -> Array:
         """Derivatives ``(k, nu)`` in the points of the box, from derivatives ``slopes (k, nu)`` in what `clamp` makes
@@ -50,12 +46,12 @@ class ParameterIndex:
         ``v`` there, the derivative of ``s`` is ``-s v / v'(p - middle)``. Points of the set stay where they are; at a
         corner of the set one of its normals is taken.
         """
-        if self.set is None or isinstance(self.set, Box):
+        if self.set is None or self.set.is_box:
             return slopes
-        share, middle, result = shares(self.set, parameters), self.set.interior_point(), slopes.astype(float)
-        outside = np.flatnonzero(share < 1.0)
+        share, middle = 1.0 / np.maximum(self.set.gauge(parameters), 1.0), self.set.interior_point()
+        result, outside = slopes.astype(float), np.flatnonzero(share < 1.0)
         ray, before, kept = parameters[outside] - middle, result[outside], share[outside, None]
-        normals = outward(self.set, middle + kept * ray)
+        normals = self.set.normal(middle + kept * ray)
         across, along = (normals * ray).sum(axis=1, keepdims=True), (before * ray).sum(axis=1, keepdims=True)
         result[outside] = kept * (
             before - np.where(across > 0, along / np.where(across > 0, across, 1.0), 0.0) * normals
@@ -64,7 +60,7 @@ class ParameterIndex:
 
     def touches(self, lower: Array, upper: Array) -> np.ndarray:
         """Whether cells ``[lower, upper]`` (``(k, nu)``) may meet the set; ``False`` only when they provably do not."""
-        if self.set is None or isinstance(self.set, Box):
+        if self.set is None or self.set.is_box:
             return np.ones(lower.shape[0], dtype=bool)
         H, h = self._halfspaces(self.set, (lower + upper) / 2)
         smallest = np.minimum(H * lower[:, None], H * upper[:, None]).sum(axis=2)
@@ -73,7 +69,7 @@ class ParameterIndex:
     def cuts(self, low: Array, high: Array) -> Cuts | None:
         """What the set says about the parameters of a cell ``[low, high]``; ``None`` where all of the cell is in it, as
         far as can be told."""
-        if self.set is None or isinstance(self.set, Box):
+        if self.set is None or self.set.is_box:
             return None
         centre, radius = (low + high) / 2, (high - low) / 2
         ball, flat = ball_of(self.set, centre, radius), self.set.halfspaces() is not None
@@ -103,7 +99,7 @@ class ParameterIndex:
                 flat[1], (points.shape[0], flat[1].size)
             )
         middle = convex_set.interior_point()
-        normals = outward(convex_set, middle + shares(convex_set, points)[:, None] * (points - middle))
+        normals = convex_set.normal(middle + (points - middle) / np.maximum(convex_set.gauge(points), 1.0)[:, None])
         sizes = np.linalg.norm(normals, axis=1, keepdims=True)
         normals = normals / np.where(sizes > 0, sizes, 1.0)
         return normals[:, None], convex_set.support(normals)[:, None]

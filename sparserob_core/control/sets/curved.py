@@ -10,10 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.errors import InputError
-from sparserob_core.sip.convex_set import Array, Box, ConvexSet, as_bound, few_digits, vertex_excess
+from sparserob_core.sip.convex_set import Array, Box, ConvexSet, as_bound, bisect, few_digits, ratios, vertex_excess
 
 _SIGN_DIMENSIONS = 10
-_BISECTIONS = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,14 +83,39 @@ class Ellipsoid(ConvexSet):
         squares, axes = np.linalg.eigh(self.shape)
         z = np.abs((np.asarray(points, dtype=float) - self.centre) @ axes)
         gauge = np.sqrt((z**2 / squares).sum(axis=-1))
-        low, high = np.zeros(gauge.shape), np.sqrt(squares[-1]) * np.linalg.norm(z, axis=-1)
-        for _ in range(_BISECTIONS):  # the multiplier of the projection: |shape^(1/2) z / (shape + multiplier)| = 1
-            middle = 0.5 * (low + high)
-            outside = (squares * (z / (squares + middle[..., None])) ** 2).sum(axis=-1) > 1.0
-            low, high = np.where(outside, middle, low), np.where(outside, high, middle)
+        # The multiplier of the projection: |shape^(1/2) z / (shape + multiplier)| decreases to 1.
+        _, high = bisect(
+            lambda multiplier: (squares * (z / (squares + multiplier[..., None])) ** 2).sum(axis=-1) <= 1.0,
+            np.zeros(gauge.shape),
+            np.sqrt(squares[-1]) * np.linalg.norm(z, axis=-1),
+        )
         distance = np.linalg.norm(z * (high[..., None] / (squares + high[..., None])), axis=-1)
         excess: Array = np.where(gauge > 1.0, distance, (gauge - 1.0) * np.sqrt(squares[0]))
         return excess
+
+    def gauge(self, points: Array) -> Array:
+        return np.asarray(np.linalg.norm(self._solved(self.factor, points), axis=-1))
+
+    def normal(self, points: Array) -> Array:
+        return self._solved(self.shape, points)
+
+    def _solved(self, matrix: Array, points: Array) -> Array:
+        rays = np.asarray(points, dtype=float) - self.centre
+        return np.asarray(np.linalg.solve(matrix, rays.reshape(-1, self.dimension).T).T.reshape(rays.shape))
+
+    def unit_ball_image(self) -> tuple[Array, Array]:
+        return self.centre, self.factor
+
+    def scaled(self, factor: float) -> Ellipsoid:
+        """Raises `InputError` for the factor 0: an ellipsoid has an interior."""
+        return Ellipsoid(self.centre, factor**2 * self.shape)
+
+    def middle(self) -> Array:
+        return self.centre.copy()
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        """Uniform."""
+        return np.asarray(self.centre + _in_ball(2.0, self.dimension, count, rng) @ self.factor.T)
 
     def interior_point(self) -> Array:
         return self.centre.copy()
@@ -202,12 +226,41 @@ class NormBall(ConvexSet):
         """Euclidean projection of ``z >= 0`` on the unit ball: ``y_i + multiplier y_i^(p-1) = z_i``, and the multiplier
         gives norm 1."""
         power = self.p - 1.0
-        low, high = np.full(z.shape[:-1], -50.0), np.full(z.shape[:-1], 50.0)
-        for _ in range(_BISECTIONS):
-            middle = 0.5 * (low + high)
-            large = np.linalg.norm(_shrunk(z, np.exp(middle)[..., None], power), ord=self.p, axis=-1) > 1.0
-            low, high = np.where(large, middle, low), np.where(large, high, middle)
+        _, high = bisect(
+            lambda logarithm: (
+                np.linalg.norm(_shrunk(z, np.exp(logarithm)[..., None], power), ord=self.p, axis=-1) <= 1.0
+            ),
+            np.full(z.shape[:-1], -50.0),
+            np.full(z.shape[:-1], 50.0),
+        )
         return _shrunk(z, np.exp(high)[..., None], power)
+
+    def gauge(self, points: Array) -> Array:
+        return ratios(np.linalg.norm(np.asarray(points, dtype=float) - self.centre, ord=self.p, axis=-1), self.radius)
+
+    def normal(self, points: Array) -> Array:
+        if self.p == np.inf:
+            return super().normal(points)
+        z = (np.asarray(points, dtype=float) - self.centre) / (self.radius or 1.0)
+        return np.asarray(np.sign(z) * np.abs(z) ** (self.p - 1.0))
+
+    def unit_ball_image(self) -> tuple[Array, Array] | None:
+        return (self.centre, self.radius * np.eye(self.dimension)) if self.p == 2.0 and self.radius > 0.0 else None
+
+    def scaled(self, factor: float) -> NormBall:
+        return NormBall(self.p, factor * self.radius, self.centre)
+
+    def middle(self) -> Array:
+        return self.centre.copy()
+
+    def sample(self, count: int, rng: np.random.Generator) -> Array:
+        """Uniform."""
+        unit = (
+            rng.uniform(-1.0, 1.0, size=(count, self.dimension))
+            if self.p == np.inf
+            else _in_ball(self.p, self.dimension, count, rng)
+        )
+        return np.asarray(self.centre + self.radius * unit)
 
     def interior_point(self) -> Array:
         return self.centre.copy()
@@ -246,12 +299,14 @@ def _round_excess(centre: Array, spread: Array) -> Array:
 
 def _shrunk(z: Array, multiplier: Array, power: float) -> Array:
     """The root ``0 <= y <= z`` of ``y + multiplier y^power = z``, by bisection."""
-    low, high = np.zeros_like(z), z.copy()
-    for _ in range(_BISECTIONS):
-        middle = 0.5 * (low + high)
-        above = middle + multiplier * middle**power > z
-        low, high = np.where(above, low, middle), np.where(above, middle, high)
-    return high
+    return bisect(lambda y: y + multiplier * y**power > z, np.zeros_like(z), z.copy())[1]
+
+
+def _in_ball(p: float, dimension: int, count: int, rng: np.random.Generator) -> Array:
+    """Uniform in the unit ball of the ``p``-norm (Barthe, Guedon, Mendelson and Naor 2005, Theorem 1)."""
+    sizes = rng.gamma(1.0 / p, size=(count, dimension)) ** (1.0 / p)
+    norms = ((sizes**p).sum(axis=1, keepdims=True) + rng.exponential(size=(count, 1))) ** (1.0 / p)
+    return np.asarray(np.where(rng.integers(0, 2, size=(count, dimension), dtype=np.int8) > 0, sizes, -sizes) / norms)
 
 
 def _finite(name: str, value: object, size: int | None) -> Array:

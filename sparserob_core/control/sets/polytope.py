@@ -14,6 +14,7 @@ _VERTEX_DIMENSIONS = 6
 _VERTEX_ROWS = 200
 _SWEEPS = 12
 _ORDINARY = 10  # binary orders of magnitude between which rows and columns are left as they are
+_PROGRAMS = 96  # extreme points that are computed where the vertices are not known, one linear program each
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,6 +150,17 @@ class Polytope(ConvexSet):
             return highest
         flat = directions.reshape(-1, self.dimension)
         return np.array([self._maximise(c)[0] for c in flat]).reshape(directions.shape[:-1])
+
+    def scaled(self, factor: float) -> Polytope:
+        offset = self.H @ self.middle()
+        return Polytope(self.H, offset + factor * (self.h - offset))
+
+    def sample_extreme(self, count: int, rng: np.random.Generator) -> Array:
+        """Each vertex equally likely, as far as they are known."""
+        known = self.vertices
+        if known is None:
+            known = self.support_point(rng.normal(size=(min(count, _PROGRAMS), self.dimension)))
+        return np.asarray(known[rng.integers(0, known.shape[0], size=count)])
 
     def linearisation_excess(self, centre: Array, spread: Array) -> Array:
         if self.vertices is None:

@@ -105,8 +105,8 @@ def intersection(sets: Sequence[ConvexSet]) -> ConvexSet | tuple[ConvexSet, ...]
         raise InputError(f"dimensions differ, {[member.dimension for member in sets]}", path="intersection")
     if len(sets) == 1:
         return sets[0]
-    boxes = [member for member in sets if isinstance(member, Box)]
-    if len(boxes) == len(sets):
+    if all(member.is_box for member in sets):
+        boxes = [member.bounding_box() for member in sets]
         return Box(np.max([box.lower for box in boxes], axis=0), np.min([box.upper for box in boxes], axis=0))
     flats = [flat for member in sets if (flat := member.halfspaces()) is not None]
     if len(flats) < len(sets):
@@ -152,6 +152,12 @@ class Cylinder(ConvexSet):
     def violation(self, points: Array) -> Array:
         return self.base.violation(np.asarray(points)[..., : self.base.dimension])
 
+    def gauge(self, points: Array) -> Array:
+        return self.base.gauge(np.asarray(points)[..., : self.base.dimension])
+
+    def scaled(self, factor: float) -> Cylinder:
+        return Cylinder(self.base.scaled(factor), self.size)
+
     def interior_point(self) -> Array:
         return np.concatenate([self.base.interior_point(), np.zeros(self.size - self.base.dimension)])
 
@@ -164,8 +170,9 @@ def cylinder(base: ConvexSet, size: int) -> ConvexSet:
         raise InputError(
             f"size must be at least {base.dimension}, the dimension of its base, got {size}", path="cylinder"
         )
-    if isinstance(base, Box):
-        return Box(np.append(base.lower, np.full(free, -np.inf)), np.append(base.upper, np.full(free, np.inf)))
+    if base.is_box:
+        box = base.bounding_box()
+        return Box(np.append(box.lower, np.full(free, -np.inf)), np.append(box.upper, np.full(free, np.inf)))
     flat = base.halfspaces()
     if flat is None:
         return Cylinder(base, size)

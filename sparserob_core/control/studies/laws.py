@@ -14,8 +14,6 @@ from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
-from sparserob_core.control.sets.gauge import shares
-from sparserob_core.control.sets.sampling import extreme_points, uniform_points
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 LawName: TypeAlias = Literal["iid", "vertices", "slow", "neighbours"]
@@ -45,7 +43,7 @@ class Uncertainty:
         ``(count, nu)``."""
         if law == "neighbours":
             return self._neighbours(count, rng)
-        points = {"iid": uniform_points, "vertices": extreme_points, "slow": uniform_points}[law]
+        points = _extreme if law == "vertices" else _uniform
         parameters = np.zeros((count, 0)) if self.parameters.set is None else points(self.parameters.set, count, rng)
         model = self.functionals.disturbance
         if model is None:
@@ -66,7 +64,7 @@ class Uncertainty:
         knots = rng.integers(1, KNOTS + 1, size=count)
         for number in range(1, KNOTS + 1):
             here = np.flatnonzero(knots == number)
-            points = extreme_points(model.bound, here.size * number, rng).reshape(here.size, number, -1)
+            points = model.bound.sample_extreme(here.size * number, rng).reshape(here.size, number, -1)
             signal[here] = np.einsum("lk,nki->nli", _hats(middles, number), points)
         if model.starts is not None:
             return signal[:, model.starts]
@@ -82,7 +80,7 @@ class Uncertainty:
         parameters = bases[2][base]
         if self.parameters.set is not None:
             near = rng.uniform(0.0, NEAR, size=(count, 1))
-            parameters = parameters + near * (uniform_points(self.parameters.set, count, rng) - parameters)
+            parameters = parameters + near * (self.parameters.set.sample(count, rng) - parameters)
         model = self.functionals.disturbance
         if model is None:
             return None, parameters
@@ -93,7 +91,7 @@ class Uncertainty:
         step = drawn[..., None] * (
             np.ones((count, flips, 1)) if size > FLIPPED else rng.uniform(0.0, MIXED, size=(count, flips, 1))
         )
-        extreme = extreme_points(model.set, count * flips, rng).reshape(count, flips, -1)
+        extreme = model.set.sample_extreme(count * flips, rng).reshape(count, flips, -1)
         trajectory = np.arange(count)
         for flip in range(flips):
             place = which[:, flip]
@@ -147,6 +145,14 @@ def _every_block(
     return points(model.set, count * model.block_count, rng).reshape(count, model.block_count, -1)
 
 
+def _uniform(convex: ConvexSet, count: int, rng: np.random.Generator) -> Array:
+    return convex.sample(count, rng)
+
+
+def _extreme(convex: ConvexSet, count: int, rng: np.random.Generator) -> Array:
+    return convex.sample_extreme(count, rng)
+
+
 def _hats(places: Array, knots: int) -> Array:
     """Weights ``(l, knots)`` of linear interpolation at places in ``[0, 1]`` between equally spaced knots."""
     at = places * (knots - 1)
@@ -156,4 +162,4 @@ def _hats(places: Array, knots: int) -> Array:
 def _drawn_in(convex: ConvexSet, points: Array) -> Array:
     flat = points.reshape(-1, points.shape[-1])
     middle = convex.interior_point()
-    return (middle + shares(convex, flat)[:, None] * (flat - middle)).reshape(points.shape)
+    return (middle + (flat - middle) / np.maximum(convex.gauge(flat), 1.0)[:, None]).reshape(points.shape)

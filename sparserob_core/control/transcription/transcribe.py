@@ -25,7 +25,7 @@ from sparserob_core.control.response.response import SAME_TIME, Response, merge_
 from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError, NotEnclosable
-from sparserob_core.sip.convex_set import Array, Box, ConvexSet
+from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
 
 if TYPE_CHECKING:
@@ -155,14 +155,14 @@ def _image(problem: OptimalControlProblem, dictionary: Dictionary) -> tuple[csc_
     )
     weights: Array = np.kron(np.asarray(problem.weights, dtype=float), dictionary.lengths)
     values = csc_array(dictionary.values.T)
-    if isinstance(bound, Box) or bound.halfspaces() is None:
+    H, h = slanted(bound)
+    if not h.size:
         return (
             (None if dictionary.is_indicators else csc_array(kron(eye_array(channels), values))),
             lower,
             upper,
             weights,
         )
-    H, h = slanted(bound)
     S = csc_array(vstack([kron(eye_array(channels), values), kron(csc_array(H), values)]))
     extra = np.repeat(h, dictionary.pieces)
     return (

@@ -80,7 +80,7 @@ class _Walk:
 
     def _references(self, field: Mapping[str, Any], place: str) -> Iterator[tuple[str, str]]:
         for reference, member in self._members(field):
-            if reference and "properties" in member:
+            if reference and member.get("properties"):
                 yield reference, place
             elif member.get("type") == "array":
                 yield from self._references(member.get("items", {}), f"{place}.0")
@@ -90,6 +90,8 @@ class _Walk:
             return ", ".join(str(value) for value in member["enum"])
         if "const" in member:
             return str(member["const"])
+        if "kinds" in member:
+            return f"{member['kinds']}: one key per kind"
         if "component" in member:
             return f"{str(member['component']).replace('_', ' ')} by name, or with its options"
         kind = member.get("type")

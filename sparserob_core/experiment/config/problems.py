@@ -76,8 +76,8 @@ class SystemOptions(Options):
     """How the disturbance enters, one column per component of it; the identity unless given."""
 
     parameters: Parameters | None = None
-    """Intervals ``{name: [lower, upper]}``, or ``{names: [...], polytope: {H: ..., h: ...}}`` (also ellipsoid, norm);
-    none if known."""
+    """Intervals ``{name: [lower, upper]}``, or names and a set, as ``{names: [...], polytope: {H: ..., h: ...}}``; none
+    if known."""
 
     def names(self) -> tuple[str, ...]:
         """Names of the parameters; raises `InputError` when one cannot stand in an expression."""

@@ -8,6 +8,7 @@ from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import core_schema
 
 from sparserob_core.experiment.config.run_config import SLOTS, MaximiserEntry, RunConfig
+from sparserob_core.experiment.config.set_options import shorthand
 from sparserob_core.experiment.plugins.components import Registry
 from sparserob_core.experiment.plugins.components import parts as components
 from sparserob_core.experiment.plugins.records import Plugin
@@ -43,7 +44,32 @@ def config_schema(registry: Registry) -> dict[str, Any]:
     schema["properties"]["observers"]["items"] = _choice(registry, "observer", None, parts)
     for unused in ("Entry", "MaximiserEntry"):
         parts.pop(unused, None)
+    _add_kinds(registry, parts)
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "SparseRob config"}
+
+
+def _add_kinds(registry: Registry, parts: dict[str, Any]) -> None:
+    """Write out the models whose further keys are the registered components of a kind, as those of a set are."""
+    for holder in [part for part in parts.values() if "kinds" in part]:
+        kind = holder.pop("kinds")
+        for name in registry.names(kind):
+            record, place = registry.get(kind, name), f"{kind}.{name}"
+            if place not in parts:
+                entry = options_schema(record)
+                parts.update({f"{place}.{part}": value for part, value in entry.pop("$defs", {}).items()})
+                parts[place] = entry
+            short = shorthand(record)
+            forms = [*_alternatives(parts[place]["properties"][short])] if short else []
+            holder.setdefault("properties", {})[name] = {
+                "anyOf": [*forms, {"$ref": f"#/$defs/{place}"}, {"type": "null"}],
+                "default": None,
+                "description": record.summary,
+            }
+        holder["additionalProperties"] = False
+
+
+def _alternatives(field: dict[str, Any]) -> list[dict[str, Any]]:
+    return [form for form in field.get("anyOf", [field]) if form.get("type") != "null"]
 
 
 def _choice(registry: Registry, kind: str, default: str | None, parts: dict[str, Any]) -> dict[str, Any]:

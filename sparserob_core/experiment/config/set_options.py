@@ -1,146 +1,86 @@
-"""Sets as a config writes them: one key per kind of set, several keys make their intersection, ``null`` leaves a side
-free."""
+"""Sets as a config writes them: one key per kind of set, several keys make their intersection.
+
+Which kinds there are, the registry knows: every plugin of the kind ``set`` is a key.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Annotated, Literal, TypeAlias, final
+from collections.abc import Mapping
+from typing import Annotated, Any, final
 
 import numpy as np
-from pydantic import Field, Tag, model_validator
-
-from sparserob_core.control.sets.sets import Box, ConvexSet, Ellipsoid, Equality, NormBall, Polytope, intersection
-from sparserob_core.errors import InputError
-from sparserob_core.experiment.config.option_kinds import (
-    LIST,
-    NUMBER,
-    FreeNumbers,
-    Number,
-    OneOrMore,
-    OneOrMoreFree,
-    Sparse,
-    broadcast,
-    count,
-    free_bound,
-    one_of,
+from pydantic import (
+    Field,
+    PrivateAttr,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    ValidationInfo,
+    model_serializer,
+    model_validator,
 )
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from sparserob_core.control.sets.sets import ConvexSet, Equality, SetFactory, intersection
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.config.option_kinds import FreeNumbers, Sparse, count
+from sparserob_core.experiment.plugins.components import Registry
+from sparserob_core.experiment.plugins.messages import COMPLAINT, Complaint, nearest, shown
+from sparserob_core.experiment.plugins.records import Plugin, SetPlugin
+from sparserob_core.experiment.plugins.registry import load_registry
 from sparserob_core.options import Options
 
-
-@final
-class Bounds(Sparse):
-    """A box by its bounds; a number serves every coordinate, null and a missing side are free."""
-
-    lower: OneOrMoreFree | None = None
-    """Lower bounds."""
-
-    upper: OneOrMoreFree | None = None
-    """Upper bounds."""
-
-    def build(self, dimension: int) -> Box:
-        """The box."""
-        return Box(
-            free_bound("lower", self.lower, dimension, -np.inf), free_bound("upper", self.upper, dimension, np.inf)
-        )
+KIND = SetPlugin.kind
 
 
-@final
-class PolytopeOptions(Options):
-    """``H x <= h``."""
+class SetOptions(Sparse, extra="allow", json_schema_extra={"kinds": KIND}):
+    """A set: the key says which kind, its value is the kind's options; several keys make the intersection of theirs."""
 
-    H: list[list[float]] = Field(min_length=1)
-    """Normals, one row per half-space."""
-
-    h: OneOrMore
-    """Right-hand sides, one per row; a number serves every row."""
-
-
-@final
-class EllipsoidOptions(Options):
-    """``(x - centre)' shape^-1 (x - centre) <= 1``."""
-
-    centre: OneOrMore = 0.0
-    """Centre."""
-
-    shape: Annotated[
-        Number | Annotated[list[list[float]], Tag("matrix")],
-        one_of(
-            "a symmetric positive definite matrix, row by row, or a number for a multiple of the identity",
-            number=NUMBER,
-            matrix=LIST,
-        ),
-    ]
-    """Symmetric positive definite matrix; a number stands for that multiple of the identity, the square of a ball's
-    radius."""
-
-
-@final
-class NormOptions(Options):
-    """``|x - centre|_p <= radius``."""
-
-    p: Annotated[float, Field(ge=1.0)] | Literal["inf"]
-    """Exponent of the norm, at least 1, or ``inf`` for the largest absolute value."""
-
-    radius: float = Field(ge=0.0)
-    """Radius."""
-
-    centre: OneOrMore = 0.0
-    """Centre."""
-
-
-BoxSpec: TypeAlias = Annotated[
-    Number | FreeNumbers | Annotated[Bounds, Tag("bounds")],
-    one_of(
-        "a half-width, a list of half-widths (null where free), or {lower: ..., upper: ...}",
-        number=NUMBER,
-        list=LIST,
-        bounds=(Mapping, Bounds),
-    ),
-]
-
-
-class SetOptions(Sparse):
-    """A set; several keys make the intersection of theirs."""
-
-    box: BoxSpec | None = None
-    """``|x_i| <= box_i``, one number for all or a list with null where free; or ``{lower: ..., upper: ...}``."""
-
-    polytope: PolytopeOptions | None = None
-    """``{H: ..., h: ...}``: ``H x <= h``."""
-
-    ellipsoid: EllipsoidOptions | None = None
-    """``{centre: ..., shape: ...}``: ``(x - centre)' shape^-1 (x - centre) <= 1``."""
-
-    norm: NormOptions | None = None
-    """``{p: ..., radius: ..., centre: ...}``: ``|x - centre|_p <= radius``."""
+    _made: dict[str, SetFactory] = PrivateAttr(default_factory=dict)
 
     @model_validator(mode="after")
-    def _not_empty(self) -> SetOptions:
+    def _of_known_kinds(self, info: ValidationInfo) -> SetOptions:
+        """Check every key that is no field as a kind of set, with the registry of the context or the installed one."""
+        extra = self.__pydantic_extra__ or {}
+        registry: Registry = (info.context or {}).get("registry") or load_registry()
+        wrong: list[Complaint] = []
+        for key, value in list(extra.items()):
+            if value is None:
+                del extra[key]
+                continue
+            typed, faults = _checked(registry, key, value, self._keys())
+            wrong += [fault.under((key,)) for fault in faults]
+            if typed is not None:
+                extra[key] = typed
+                self._made[key] = registry.get(KIND, key).create(typed)  # type: ignore[assignment]
+        if wrong:
+            raise ValidationError.from_exception_data(type(self).__name__, [_detail(fault) for fault in wrong])
         if not self._given():
-            raise InputError(expected=f"a set: {', '.join(self._kinds())}", got="none of them")
+            raise InputError(expected=f"a set: {', '.join(registry.names(KIND))}", got="none of them")
         return self
 
-    def _kinds(self) -> tuple[str, ...]:
-        return ("box", "polytope", "ellipsoid", "norm")
+    @model_serializer(mode="wrap")
+    def _written(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """As a config writes it: without the keys that were left out, short where there is a short form."""
+        plain = {key: value for key, value in handler(self).items() if value is not None}
+        for key, value in (self.__pydantic_extra__ or {}).items():
+            short = getattr(type(value), "shorthand", None)
+            if key in plain and isinstance(plain[key], Mapping) and set(plain[key]) == {short}:
+                plain[key] = plain[key][short]
+        return plain
+
+    def _keys(self) -> set[str]:
+        return {field.alias or name for name, field in type(self).model_fields.items()}
 
     def _given(self) -> list[str]:
-        return [kind for kind in self._kinds() if getattr(self, kind) is not None]
+        return list(self.__pydantic_extra__ or {})
 
     def members(self, where: str, dimension: int) -> list[ConvexSet]:
-        """One set per key, in ``dimension`` coordinates; raises `InputError` that begins with the key below
-        ``where``."""
-        builders: dict[str, Callable[[int], ConvexSet]] = {
-            "box": self._box,
-            "polytope": self._polytope,
-            "ellipsoid": self._ellipsoid,
-            "norm": self._norm,
-        }
+        """One set per key, in ``dimension`` coordinates, in the order in which they are written; raises `InputError`
+        that begins with the key below ``where``."""
         found = []
-        for kind in self._given():
-            if kind not in builders:
-                continue
+        for kind, factory in self._made.items():
             try:
-                member = builders[kind](dimension)
+                member = factory.build(dimension)
             except InputError as error:
                 raise error.under(where, *(() if error.path[:1] == (kind,) else (kind,))) from None
             if member.dimension != dimension:
@@ -162,38 +102,26 @@ class SetOptions(Sparse):
             )
         return joined
 
-    def _box(self, dimension: int) -> Box:
-        if isinstance(self.box, Bounds):
-            return self.box.build(dimension)
-        half = free_bound("", self.box, dimension, np.inf)
-        if (half < 0).any():
-            raise InputError(
-                f"half-widths must be at least 0, got {half.tolist()}; write {{lower: ..., upper: ...}} for other boxes"
-            )
-        return Box(-half, half)
 
-    def _polytope(self, dimension: int) -> ConvexSet:
-        assert self.polytope is not None
-        if {len(row) for row in self.polytope.H} != {dimension}:
-            raise InputError(
-                f"every row of H must have {dimension} numbers, got rows of {[len(row) for row in self.polytope.H]}"
-            )
-        return Polytope(np.array(self.polytope.H), np.array(self.polytope.h))
+def _checked(registry: Registry, kind: str, value: object, keys: set[str]) -> tuple[Options | None, list[Complaint]]:
+    """The typed options of one kind of set, or what is wrong with them; ``keys`` are those that are no kinds."""
+    known = registry.names(KIND)
+    if kind not in known:
+        return None, [Complaint((), f"unknown key{nearest(kind, {*known, *keys})}")]
+    short = shorthand(registry.get(KIND, kind))
+    if not isinstance(value, Mapping) and short is None:
+        return None, [Complaint((), f"must be a mapping (got {shown(value)})")]
+    return registry.check(KIND, kind, value if isinstance(value, Mapping) else {str(short): value})
 
-    def _ellipsoid(self, dimension: int) -> ConvexSet:
-        assert self.ellipsoid is not None
-        shape = self.ellipsoid.shape
-        if not isinstance(shape, list):
-            return Ellipsoid(broadcast("centre", self.ellipsoid.centre, dimension), shape * np.eye(dimension))
-        if len(shape) != dimension or {len(row) for row in shape} != {dimension}:
-            raise InputError(
-                f"shape must have {dimension} rows of {dimension} numbers, got rows of {[len(row) for row in shape]}"
-            )
-        return Ellipsoid(broadcast("centre", self.ellipsoid.centre, dimension), np.array(shape))
 
-    def _norm(self, dimension: int) -> ConvexSet:
-        assert self.norm is not None
-        return NormBall(float(self.norm.p), self.norm.radius, broadcast("centre", self.norm.centre, dimension))
+def _detail(fault: Complaint) -> InitErrorDetails:
+    told = PydanticCustomError(COMPLAINT, "{said}", {"said": fault.message, "below": fault.path})
+    return InitErrorDetails(type=told, input=None)
+
+
+def shorthand(record: Plugin) -> str | None:
+    """The option that a bare number or list stands for; ``None`` where a kind of set has no short form."""
+    return getattr(record.options_type(), "shorthand", None)
 
 
 @final
@@ -214,8 +142,8 @@ class TerminalOptions(SetOptions):
     equals: Annotated[FreeNumbers, Field(min_length=1)] | None = None
     """Final values, one per state, null where free."""
 
-    def _kinds(self) -> tuple[str, ...]:
-        return (*super()._kinds(), "equals")
+    def _given(self) -> list[str]:
+        return super()._given() + ["equals"] * (self.equals is not None)
 
     def ends(self, where: str, dimension: int) -> list[ConvexSet | Equality]:
         """One set or equality per key; raises `InputError` that begins with the key below ``where``."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.sets.sets import Box, ConvexSet
+from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.control.transcription.transcribe import slanted
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment
 from sparserob_core.sip.convex_set import Array
@@ -115,8 +115,9 @@ def _direction(said: Explanation) -> Array | None:
 
 
 def _inside(bound: ConvexSet, point: Array, middle: Array) -> Array:
-    if isinstance(bound, Box):
-        return np.asarray(np.clip(point, bound.lower, bound.upper))
+    if bound.is_box:
+        box = bound.bounding_box()
+        return np.asarray(np.clip(point, box.lower, box.upper))
     answer: Array = middle + INWARDS * (point - middle)
     return answer
 

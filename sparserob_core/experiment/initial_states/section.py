@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.convex_set import Array, ConvexSet, bisect
 
 RAYS, HALVINGS = 360, 48
 
@@ -20,13 +20,13 @@ def section(value: ConvexSet, origin: Array, states: tuple[int, int], middle: Ar
     corners = _corners(value, origin, states, middle)
     angles = np.sort(np.concatenate([angles, np.arctan2(*(corners - middle).T[::-1])]))
     rays = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    low, high = np.zeros(angles.size), np.full(angles.size, view)
     points = np.tile(origin, (angles.size, 1))
-    for _ in range(HALVINGS):
-        length = (low + high) / 2
-        points[:, list(states)] = middle + length[:, None] * rays
-        within = value.contains(points, 0.0)
-        low, high = np.where(within, length, low), np.where(within, high, length)
+
+    def beyond(lengths: Array) -> np.ndarray:
+        points[:, list(states)] = middle + lengths[:, None] * rays
+        return ~value.contains(points, 0.0)
+
+    _, high = bisect(beyond, np.zeros(angles.size), np.full(angles.size, view), HALVINGS)
     return np.asarray(middle + high[:, None] * rays)
 
 

@@ -9,10 +9,9 @@ from typing import Literal, TypeAlias, final
 import numpy as np
 
 from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
-from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Ellipsoid, Equality, NormBall, Polytope
+from sparserob_core.control.sets.sets import ConvexSet, Equality
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.plugins.messages import nearest
-from sparserob_core.sip.convex_set import Array
 
 Sense: TypeAlias = Literal["largest", "smallest"]
 LARGEST = 1e6  # factors beyond are not looked at
@@ -194,57 +193,20 @@ def _entries(problem: OptimalControlProblem) -> list[PathConstraint]:
 
 
 def _resizing(of: str, bound: ConvexSet) -> Callable[[float], ConvexSet]:
-    """The set scaled by a factor about its centre; raises `InputError` for a single point, and for a set without a
-    centre."""
-    centre = centre_of(of, bound)
+    """The set scaled by a factor about its middle; raises `InputError` for a single point, and for a set without a
+    middle. A curved set stays curved, however small the factor."""
+    try:
+        middle = bound.middle()
+    except InputError as error:
+        raise InputError(
+            f"of: {of} has no centre to be enlarged about: it is free on a side, and 0 is outside of it; give it"
+            " bounds on both sides"
+        ) from error
     reach = bound.support(np.vstack([np.eye(bound.dimension), -np.eye(bound.dimension)]))
-    if not (np.isinf(reach) | (reach != np.concatenate([centre, -centre]))).any():
+    if not (np.isinf(reach) | (reach != np.concatenate([middle, -middle]))).any():
         raise InputError(f"of: {of} is a single point, which no factor enlarges; expected a set with an extent")
-    return lambda factor: resized(bound, centre, factor)
-
-
-def centre_of(of: str, bound: ConvexSet) -> Array:
-    """What a set ``(d,)`` is scaled about: the middle of its bounding box where it is bounded, 0 where it is not; an
-    interior point of a polytope that does not hold that. Raises `InputError` when 0 is not inside a side that is free
-    on one side only."""
-    axes = np.eye(bound.dimension)
-    low, high = -bound.support(-axes), bound.support(axes)
-    bounded = np.isfinite(low) & np.isfinite(high)
-    middle = np.where(bounded, (np.where(bounded, low, 0.0) + np.where(bounded, high, 0.0)) / 2, 0.0)
-    if bound.violation(middle) <= 0.0:
-        return np.asarray(middle, dtype=float)
-    if isinstance(bound, Polytope) and bounded.all():
-        return bound.interior_point()
-    raise InputError(
-        f"of: {of} has no centre to be enlarged about: it is free on a side, and 0 is outside of it; give it bounds on"
-        " both sides"
-    )
-
-
-def resized(bound: ConvexSet, centre: Array, factor: float) -> ConvexSet:
-    """``centre + factor (bound - centre)``; a curved set stays curved, however small the factor."""
-    match bound:
-        case Box():
-            return Box(_moved(bound.lower, centre, factor), _moved(bound.upper, centre, factor))
-        case Polytope():
-            return Polytope(bound.H, bound.H @ centre + factor * (bound.h - bound.H @ centre))
-        case Ellipsoid():
-            return Ellipsoid(bound.centre, max(factor, POINT) ** 2 * bound.shape)
-        case NormBall():
-            return NormBall(
-                bound.p, max(factor, POINT if bound.halfspaces() is None else 0.0) * bound.radius, bound.centre
-            )
-        case Cylinder():
-            return Cylinder(resized(bound.base, centre[: bound.base.dimension], factor), bound.size)
-    raise InputError(
-        f"of: a set of the kind {type(bound).__name__} cannot be scaled; expected a box, a polytope, an ellipsoid or a"
-        " norm ball"
-    )
-
-
-def _moved(bounds: Array, centre: Array, factor: float) -> Array:
-    finite = np.isfinite(bounds)
-    return np.where(finite, centre + factor * (np.where(finite, bounds, 0.0) - centre), bounds)
+    least = 0.0 if bound.halfspaces() is not None else POINT
+    return lambda factor: bound.scaled(max(factor, least))
 
 
 def _reach(bound: ConvexSet) -> float:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from pydantic import ValidationError
 
 SHOWN = 60
+COMPLAINT = "complaint"  # the type of an error whose message is already the sentence to be shown
 MUST_BE = {
     "model_type": "a mapping",
     "model_attributes_type": "a mapping",
@@ -74,6 +75,7 @@ def complaints(error: ValidationError, model: type[BaseModel], data: object) -> 
         if item["type"] == "missing" and any(_meant(loc, item["loc"]) for loc in misspelt):
             continue  # the unknown key beside it says which one was meant
         path = visible(item["loc"], data, missing=item["type"] == "missing")
+        path += tuple(item.get("ctx", {}).get("below", ())) if item["type"] == COMPLAINT else ()
         sentences = found.setdefault(path, [])
         sentence = _sentence(dict(item), model)
         if sentence not in sentences:
@@ -116,6 +118,8 @@ def _sentence(item: dict[str, Any], model: type[BaseModel]) -> str:
         case "too_short":
             least = item["ctx"]["min_length"]
             return f"must have at least {least} {'entry' if least == 1 else 'entries'} (got {shown(item['input'])})"
+        case kind if kind == COMPLAINT:
+            return str(item["msg"])
         case kind if kind in MUST_BE:
             return f"must be {MUST_BE[kind]} (got {shown(item['input'])})"
         case _:

@@ -154,7 +154,7 @@ def test_the_options_survive_being_written_and_read() -> None:
     ("changes", "message"),
     [
         ({"control": {"box": "abc"}}, r"half-width, a list of half-widths \(null where free\), or \{lower"),
-        ({"control": {}}, "expected a set: box, polytope, ellipsoid, norm"),
+        ({"control": {}}, "expected a set: box, ellipsoid, norm, polytope"),
         ({"control": {"box": [1, 2]}}, r"control\.box: expected 1 number, got 2"),
         ({"control": {"box": -1}}, "half-widths must be at least 0"),
         ({"control": {"box": [None]}}, "control: the set must be bounded"),

@@ -17,7 +17,6 @@ import sparserob_core as sr
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.response import Response
-from sparserob_core.control.sets.sampling import extreme_points, uniform_points
 from sparserob_core.control.sets.sets import NormBall, Polytope
 from sparserob_core.control.studies.laws import Uncertainty, admissibility
 from sparserob_core.control.studies.simulate import fine_times, finer, walk
@@ -167,7 +166,7 @@ def test_parameters_of_any_set_are_drawn_from_it(parameters, law):
     ids=["l1", "l3", "ellipsoid"],
 )
 def test_uniform_points_fill_a_ball_by_volume(convex):
-    points = uniform_points(convex, 8_000, np.random.default_rng(4))
+    points = convex.sample(8_000, np.random.default_rng(4))
     centre, d = convex.interior_point(), convex.dimension
     inside = convex.contains(centre + 2 ** (1 / d) * (points - centre), 0.0)  # a copy of half the volume
     assert convex.contains(points, 1e-12).all()
@@ -176,13 +175,13 @@ def test_uniform_points_fill_a_ball_by_volume(convex):
 
 def test_hit_and_run_finds_the_mean_and_the_spread_of_a_box():
     box = Polytope(np.vstack([np.eye(6), -np.eye(6)]), np.ones(12))
-    points = uniform_points(box, 20_000, np.random.default_rng(5))
+    points = box.sample(20_000, np.random.default_rng(5))
     assert np.abs(points.mean(axis=0)).max() < 0.03
     assert np.abs(points.var(axis=0) - 1 / 3).max() < 0.02
 
 
 def test_extreme_points_of_a_box_are_its_corners():
-    points = extreme_points(BOX, 200, np.random.default_rng(6))
+    points = BOX.sample_extreme(200, np.random.default_rng(6))
     assert len({tuple(point) for point in points}) == 4
     assert (np.abs(points) == BOX.upper).all()
 

@@ -1,0 +1,134 @@
+"""The kinds of sets whose mathematics is in the core, as a config writes them; the plugin ``sparserob_sets`` registers
+them."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Literal, TypeAlias, final
+
+import numpy as np
+from pydantic import Field, Tag, model_validator
+
+from sparserob_core.control.sets.sets import Box, Ellipsoid, NormBall, Polytope, SetFactory
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.config.option_kinds import (
+    LIST,
+    NUMBER,
+    FreeNumbers,
+    Number,
+    OneOrMore,
+    OneOrMoreFree,
+    Sparse,
+    broadcast,
+    free_bound,
+    one_of,
+)
+from sparserob_core.options import Options
+
+HalfWidths: TypeAlias = Annotated[
+    Number | FreeNumbers,
+    one_of(
+        "a half-width, a list of half-widths (null where free), or {lower: ..., upper: ...}", number=NUMBER, list=LIST
+    ),
+]
+
+
+@final
+class BoxFactory(SetFactory, Sparse):
+    """``lower <= x <= upper``, or ``|x_i| <= half_widths_i``."""
+
+    shorthand: ClassVar[str | None] = "half_widths"
+
+    half_widths: HalfWidths | None = None
+    """Half-widths about 0, a number for all or a list with null where free; ``box: 0.5`` is short for it."""
+
+    lower: OneOrMoreFree | None = None
+    """Lower bounds; a number serves every coordinate, null and a missing side are free."""
+
+    upper: OneOrMoreFree | None = None
+    """Upper bounds, likewise."""
+
+    @model_validator(mode="after")
+    def _one_way(self) -> BoxFactory:
+        if self.half_widths is not None and not (self.lower is None and self.upper is None):
+            raise InputError(expected="half_widths, or lower and upper", got="both")
+        return self
+
+    def build(self, dimension: int) -> Box:
+        """The box."""
+        if self.half_widths is None:
+            return Box(
+                free_bound("lower", self.lower, dimension, -np.inf), free_bound("upper", self.upper, dimension, np.inf)
+            )
+        half = free_bound("", self.half_widths, dimension, np.inf)
+        if (half < 0).any():
+            raise InputError(
+                f"half-widths must be at least 0, got {half.tolist()}; write {{lower: ..., upper: ...}} for other boxes"
+            )
+        return Box(-half, half)
+
+
+@final
+class PolytopeFactory(SetFactory, Options):
+    """``H x <= h``."""
+
+    H: list[list[float]] = Field(min_length=1)
+    """Normals, one row per half-space."""
+
+    h: OneOrMore
+    """Right-hand sides, one per row; a number serves every row."""
+
+    def build(self, dimension: int) -> Polytope:
+        """The polytope."""
+        if {len(row) for row in self.H} != {dimension}:
+            raise InputError(
+                f"every row of H must have {dimension} numbers, got rows of {[len(row) for row in self.H]}"
+            )
+        return Polytope(np.array(self.H), np.array(self.h))
+
+
+@final
+class EllipsoidFactory(SetFactory, Options):
+    """``(x - centre)' shape^-1 (x - centre) <= 1``."""
+
+    centre: OneOrMore = 0.0
+    """Centre."""
+
+    shape: Annotated[
+        Number | Annotated[list[list[float]], Tag("matrix")],
+        one_of(
+            "a symmetric positive definite matrix, row by row, or a number for a multiple of the identity",
+            number=NUMBER,
+            matrix=LIST,
+        ),
+    ]
+    """Symmetric positive definite matrix; a number stands for that multiple of the identity, the square of a ball's
+    radius."""
+
+    def build(self, dimension: int) -> Ellipsoid:
+        """The ellipsoid."""
+        if not isinstance(self.shape, list):
+            return Ellipsoid(broadcast("centre", self.centre, dimension), self.shape * np.eye(dimension))
+        if len(self.shape) != dimension or {len(row) for row in self.shape} != {dimension}:
+            raise InputError(
+                f"shape must have {dimension} rows of {dimension} numbers, got rows of"
+                f" {[len(row) for row in self.shape]}"
+            )
+        return Ellipsoid(broadcast("centre", self.centre, dimension), np.array(self.shape))
+
+
+@final
+class NormFactory(SetFactory, Options):
+    """``|x - centre|_p <= radius``."""
+
+    p: Annotated[float, Field(ge=1.0)] | Literal["inf"]
+    """Exponent of the norm, at least 1, or ``inf`` for the largest absolute value."""
+
+    radius: float = Field(ge=0.0)
+    """Radius."""
+
+    centre: OneOrMore = 0.0
+    """Centre."""
+
+    def build(self, dimension: int) -> NormBall:
+        """The ball."""
+        return NormBall(float(self.p), self.radius, broadcast("centre", self.centre, dimension))
