@@ -37,7 +37,7 @@ FILES = {
     ),
     "solution.npz": (
         "`breakpoints (K+1,)`, `control (m, K)`, `theta (m, N)`; of the imposed constraints `times`, `indices`, `rows`,"
-        " `families`, `multipliers`"
+        " `families`, `formulations`, `multipliers`"
     ),
     "evaluations.npz": (
         "for a method that searches, one entry per value of g: outer iteration, epsilon, value, proven lower bound,"

@@ -21,6 +21,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from sparserob_core.control.constraints.explanation import Witness
     from sparserob_core.control.problem.dictionary import Dictionary, DictionaryFactory
     from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint, ProblemFactory
     from sparserob_core.control.problem.system import LinearSystem
@@ -68,7 +69,7 @@ if TYPE_CHECKING:
     from sparserob_core.options import Options
     from sparserob_core.sip.convex_set import Array, Box, ConvexSet
     from sparserob_core.sip.events import Batch, EvaluationsFinished, Event, ProofProgress, RoundFinished
-    from sparserob_core.sip.evidence import Cut, Witness
+    from sparserob_core.sip.evidence import Cut
     from sparserob_core.sip.maximiser import EvaluationError, Maximiser, Objective, Report, SearchEnded, Trace
     from sparserob_core.sip.method import Continuation, Method, Tools
     from sparserob_core.sip.program import ConstraintFamily, Enclosure, SemiInfiniteProgram, Separation
@@ -187,10 +188,11 @@ _MODULES = {
     "sip.maximiser": "EvaluationError Maximiser Objective Report SearchEnded Trace",
     "sip.method": "Continuation Method Tools",
     "sip.result": "Result SearchTrace",
-    "sip.evidence": "Cut Witness",
+    "sip.evidence": "Cut",
     "sip.rules": "InnerStop OuterStep OuterStop Progress Schedule Selection",
     "sip.search.trust_region": "TrustRegion",
     "sip.events": "Batch EvaluationsFinished Event ProofProgress RoundFinished",
+    "control.constraints.explanation": "Witness",
     "control.problem.dictionary": "Dictionary DictionaryFactory",
     "control.sets.sets": "Ellipsoid Equality NormBall Polytope SetFactory cylinder intersection",
     "control.problem.system": "LinearSystem",

@@ -63,6 +63,6 @@ def verdict_lines(event: sr.RunFinished) -> list[str]:
     if result is not None and result.worst is not None:
         worst = result.worst
         side = "violated by" if worst.violation > 0 else "kept with a margin of"
-        at = "" if worst.time is None else f" at t = {worst.time:.5g}"
+        at = f" at t = {worst.time:.5g}" if isinstance(worst, sr.Witness) and worst.time is not None else ""
         lines.append(f"worst case: {worst.constraint} {side} {abs(worst.violation):.2e}{at}")
     return lines

@@ -1,11 +1,11 @@
-"""What supports a claim: imposed constraints with their multipliers, proofs over the continuum, and witnesses against
-it."""
+"""What supports a claim: imposed constraints with their multipliers, proofs over the continuum, and why nothing is
+feasible."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass
+from typing import Literal, final
 
 import numpy as np
 
@@ -41,22 +41,44 @@ class Dual:
 NO_BOUND = Dual(-np.inf, (), np.zeros(0))
 
 
+@final
 @dataclass(frozen=True, eq=False)
-class Witness:
-    """The worst constraint found: by how much it is violated (negative: satisfied with that margin), which one, and
-    where.
+class InfeasibleSubsystem:
+    """Why nothing is feasible, one sentence each: ``reasons`` that suffice alone, or else the ``members`` of an
+    irreducible infeasible subsystem (Chinneck and Dravnieks 1991), which cannot hold together.
 
-    ``time``, ``parameter`` and ``disturbance`` are filled for control problems; ``disturbance`` is ``(mw, pieces)``.
+    ``amount``: of the members one is violated by at least that many times the norm of its row; infinite where the
+    decision enters none of them. ``others``: how many reasons or members are not told. ``equalities``: whether the
+    program has some, which belong to every subsystem. ``demand``: what a weighted sum of the members asks for.
     """
 
-    violation: float
-    constraint: str
-    index: Array
-    row: int = 0
-    formulation: Formulation = "reduced"
-    time: float | None = None
-    parameter: Array | None = None
-    disturbance: Array | None = field(default=None, repr=False)
+    reasons: tuple[str, ...] = ()
+    members: tuple[str, ...] = ()
+    amount: float = np.inf
+    others: int = 0
+    equalities: bool = False
+    demand: str = ""
+    decides: str = "decision"
+
+    def sentence(self, amounts: bool = True) -> str:
+        """All of it for people; without ``amounts`` where the units of the rows mean nothing to them."""
+        if self.reasons:
+            count = len(self.reasons) + self.others
+            head = f"{count} separate reasons: " if count > 1 else ""
+            return head + "; ".join([*self.reasons, *([f"and {self.others} more"] if self.others else [])])
+        missed = amounts and np.isfinite(self.amount)
+        whatever = f"whatever the {self.decides}"
+        if not self.members:
+            what = "equalities" if self.equalities else "fixed constraints"
+            by = f": one is missed by at least {self.amount:.4g} times its norm" if missed else ""
+            return f"the {what} cannot be met within the bounds, {whatever}{by}"
+        if len(self.members) + self.others > 1:
+            head = "these cannot hold together, though all but any one of them can"
+        else:
+            head = "nothing meets this " + ("and the equalities" if self.equalities else "within the bounds")
+        by = f" (one is violated by at least {self.amount:.4g} times its norm, {whatever})" if missed else ""
+        named = "; ".join([*self.members, *([f"and {self.others} more"] if self.others else [])])
+        return f"{head}{by}: {named}" + (f"; {self.demand}" if self.demand else "")
 
 
 @dataclass(frozen=True, eq=False)

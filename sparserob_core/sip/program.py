@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias, final
 
 import numpy as np
 
@@ -46,28 +47,64 @@ class Enclosure:
 
 
 @dataclass(frozen=True, eq=False)
-class Explanation:
-    """One constraint in words (``text``), and its time, parameter ``(nu,)``, worst disturbance ``(mw, pieces)`` and
-    normal ``direction`` (of the state, or of the control) where it has them.
+class WorstConstraint:
+    """The worst constraint found: by how much it is violated (negative: satisfied with that margin), and which one it
+    is: row ``row`` of family ``constraint`` at ``index (d,)``, an index of that ``formulation``."""
 
-    Where it compares a quantity with a limit, also their words and numbers: ``quantity`` such as ``x1(5)``, what it may
-    be (``bound``, such as ``|x1| <= 0.3``), its value ``free`` without decision and disturbance, ``sign`` -1 for a
-    lower limit, and how far the disturbance alone moves it towards the ``limit`` (``sigma``). ``where``: the parameter
-    in words.
+    violation: float
+    constraint: str
+    index: Array
+    row: int = 0
+    formulation: Formulation = "reduced"
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation(ABC):
+    """One constraint for people: what it says (``text``), and the sentences that are asked for where nothing is
+    feasible.
+
+    Programs know no more of a constraint than its row; whoever states a family knows what it is about, and tells it in
+    a subclass. ``decides`` is what the field calls the decision.
     """
 
     text: str
-    time: float | None = None
-    parameter: Array | None = None
-    disturbance: Array | None = None
-    quantity: str = ""
-    bound: str = ""
-    limit: float = np.nan
-    free: float = np.nan
-    sigma: float = 0.0
-    sign: float = 1.0
-    where: str = ""
-    direction: Array | None = None
+    decides: ClassVar[str] = "decision"
+
+    @abstractmethod
+    def witness(self, worst: WorstConstraint) -> WorstConstraint:
+        """The worst constraint, which is this one, with what the field knows of it."""
+
+    def beyond(self, amount: float) -> str:
+        """No decision enters the constraint, and it is violated by ``amount``."""
+        return self.out_of_reach(amount, 0.0)
+
+    def apart(self, other: Explanation, share: float, amount: float) -> str:
+        """The decision enters this constraint and ``share`` times the ``other`` with opposite signs, and their sum is
+        violated by ``amount``."""
+        return (
+            f"{self.text} and {other.text} cannot hold: their sum is violated by at least {amount:.4g}, "
+            f"whatever the {self.decides}"
+        )
+
+    def out_of_reach(self, amount: float, needed: float) -> str:
+        """The constraint alone is violated by ``amount`` at least; it asks the decision to lower the left side by
+        ``needed``."""
+        return f"{self.text} cannot hold: it is violated by at least {amount:.4g}, whatever the {self.decides}"
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Unexplained(Explanation):
+    """A constraint of a family that does not explain itself."""
+
+    def witness(self, worst: WorstConstraint) -> WorstConstraint:
+        return worst
+
+
+def told_apart(one: float, two: float) -> tuple[str, str]:
+    """Two numbers with four digits, or as many as it takes to tell them apart."""
+    texts = [(f"{one:.{digits}g}", f"{two:.{digits}g}") for digits in range(4, 17)]
+    return next((pair for pair in texts if pair[0] != pair[1]), texts[-1])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -88,7 +125,7 @@ class ConstraintFamily:
     ``source``        what the family was made of: never looked at here, handed back to whoever made it;
     ``scale``         the size of the numbers that the constraint compares; where it is tiny, a violation is judged
         relative to it;
-    ``explain(index (d,), row)``  the constraint in words and, for control problems, where it is (an `Explanation`).
+    ``explain(index (d,), row)``  one constraint for people (an `Explanation`).
     """
 
     name: str
@@ -121,6 +158,12 @@ class ConstraintFamily:
         """``level``, or less where the numbers of this constraint are below a thousandth: a millionth of them, at the
         level 1e-9."""
         return level * min(1.0, 1e3 * self.scale)
+
+    def explanation(self, index: Array, row: int) -> Explanation:
+        """One constraint for people, by its number and index where the family does not explain itself."""
+        if self.explain is not None:
+            return self.explain(index, row)
+        return Unexplained(f"row {row} of {self.name} at {np.array2string(index, precision=6)}")
 
     def violations(self, x: Array, indices: Array) -> Array:
         """``rows(xi) x - rhs(xi)`` at indices ``(k, d)``, as ``(k, r)``; positive where violated."""

@@ -10,7 +10,8 @@ import numpy as np
 
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import RoundFinished
-from sparserob_core.sip.evidence import NO_BOUND, Cut, Dual, Proof, Witness
+from sparserob_core.sip.evidence import NO_BOUND, Cut, Dual, InfeasibleSubsystem, Proof
+from sparserob_core.sip.program import WorstConstraint
 
 if TYPE_CHECKING:
     from sparserob_core.sip.maximiser import Trace
@@ -120,7 +121,7 @@ class Result:
     epsilon: float = 0.0
     lower_bound: float = -np.inf
     upper_bound: float = np.inf
-    worst: Witness | None = None
+    worst: WorstConstraint | None = None
     indices: Sequence[Cut] = ()
     counts: Mapping[str, int] = field(default_factory=dict)
     history: Sequence[RoundFinished] = ()
@@ -128,6 +129,7 @@ class Result:
     dual: Dual = NO_BOUND
     proofs: Sequence[Proof] = ()
     scenario_bound: ScenarioBound | None = None
+    infeasible: InfeasibleSubsystem | None = None
     seconds: float = 0.0
 
     @property

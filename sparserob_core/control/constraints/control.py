@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.control.constraints.local_maxima import climb
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.sets.directions import across, on_surface, sampled, unit
@@ -77,12 +78,9 @@ class ControlConstraint:
         return Separation(indices, np.zeros(order.size, dtype=int), found[order], float(outside.max()))
 
     def explain(self, index: Array, row: int) -> Explanation:
-        """One constraint in words."""
-        return Explanation(
-            f"control: u({index[0]:.6g}) in the {self.set.kind}",
-            float(index[0]),
-            direction=unit(self.set, index[None, 1:])[0],
-        )
+        """One constraint for people."""
+        text = f"control: u({index[0]:.6g}) in the {self.set.kind}"
+        return TimedExplanation(text, "control", text, float(index[0]), unit(self.set, index[None, 1:])[0])
 
     def _piece(self, times: Array) -> np.ndarray:
         return np.clip(

@@ -117,7 +117,8 @@ class CurvedConstraint(StateConstraint):
     def explain(self, index: Array, row: int) -> Explanation:
         times, directions, parameters, rhs = self.functionals_at(index[None])
         said = explanation(self.name, self.functionals, directions, rhs, 0, float(times[0]), parameters[0])
-        return replace(said, text=f"{said.text} (a tangent of the {self.set.kind})")
+        tangent = f" (a tangent of the {self.set.kind})"
+        return replace(said, text=said.text + tangent, statement=said.statement + tangent)
 
     def nominal(self) -> CurvedConstraint:
         known = self.functionals.nominal()

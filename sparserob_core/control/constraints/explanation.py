@@ -1,17 +1,136 @@
-"""One constraint of the state in words and numbers."""
+"""One constraint of a control problem for people: what is bounded, when, and what the uncertainty does to it."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, final
 
 import numpy as np
 
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.program import Explanation
+from sparserob_core.sip.program import Explanation, WorstConstraint, told_apart
+
+SAME = 1e-12  # of the largest coefficient of a combination, one that is rounding
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Witness(WorstConstraint):
+    """The worst constraint of a control problem, with its ``time``, parameter ``(nu,)`` and worst disturbance
+    ``(mw, pieces)`` where it has them."""
+
+    time: float | None = None
+    parameter: Array | None = None
+    disturbance: Array | None = field(default=None, repr=False)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class TimedExplanation(Explanation):
+    """One constraint at a ``time`` and a parameter ``(nu,)``, with the worst disturbance ``(mw, pieces)`` there and the
+    normal ``direction`` (of the state, or of the control).
+
+    ``statement`` is what it asks for, ``text`` the same with remarks. A constraint on the state compares a ``quantity``
+    such as ``x1(5)`` with a ``limit``: ``bound`` is what the quantity may be (``|x1| <= 0.3``), ``free`` its value
+    without control and disturbance, ``sign`` -1 for a lower limit, ``sigma`` how far the disturbance alone moves it
+    towards the limit, ``where`` the parameter in words. ``constraint``: the name of the constraint.
+    """
+
+    decides: ClassVar[str] = "control"
+
+    constraint: str
+    statement: str
+    time: float
+    direction: Array
+    parameter: Array | None = None
+    disturbance: Array | None = None
+    quantity: str = ""
+    bound: str = ""
+    limit: float = np.nan
+    free: float = np.nan
+    sigma: float = 0.0
+    sign: float = 1.0
+    where: str = ""
+
+    def witness(self, worst: WorstConstraint) -> WorstConstraint:
+        return Witness(
+            worst.violation,
+            worst.constraint,
+            worst.index,
+            worst.row,
+            worst.formulation,
+            self.time,
+            self.parameter,
+            self.disturbance,
+        )
+
+    def from_any_state(self) -> TimedExplanation:
+        """The same where the initial state is free: at time 0 without what the given one says."""
+        return replace(self, text=self.statement) if self.time == 0.0 else self
+
+    def beyond(self, amount: float) -> str:
+        if not self.quantity:
+            return super().beyond(amount)
+        reached = self.free + self.sign * self.sigma
+        moved = f" under the worst disturbance, which moves it by {self.sigma:.4g}," if self.sigma > 0 else ""
+        return (
+            f"{self.quantity} = {reached:.6g}{moved} is outside {self.bound} ({self.constraint}), "
+            f"whatever the decision{self._at}"
+        )
+
+    def apart(self, other: Explanation, share: float, amount: float) -> str:
+        if not isinstance(other, TimedExplanation) or not (self.quantity and other.quantity):
+            return super().apart(other, share, amount)
+        rest = self.direction + share * other.direction
+        rest = np.where(np.abs(rest) <= SAME * np.abs(self.direction).max(), 0.0, rest)
+        allowed = self.sign * self.limit + share * other.sign * other.limit
+        moved = self.sigma + share * other.sigma
+        if rest.any():
+            return self._uncontrollable(other, rest, share, allowed, moved) + self._at
+        if moved > 0:
+            more, less = told_apart(moved / 2, allowed / 2)
+            return f"the disturbance alone moves {self.quantity} by {more}, {self._set} allows {less}{self._at}"
+        return f"{self.text} and {other.text} leave nothing between them{self._at}"
+
+    def _uncontrollable(self, other: TimedExplanation, rest: Array, share: float, allowed: float, moved: float) -> str:
+        """The control moves both quantities alike, so that it cannot change ``rest'x``, a combination of them."""
+        side = -1.0 if rest[np.flatnonzero(rest)[0]] < 0 else 1.0
+        free = self.sign * self.free + share * other.sign * other.free
+        most = "at least" if side < 0 else "at most"
+        taken = f" less {moved:.4g} for the worst disturbances" if moved > 0 and side > 0 else ""
+        taken = f" and {moved:.4g} more for the worst disturbances" if moved > 0 and side < 0 else taken
+        quantity = combination(side * rest, f"({self.time:.6g})")
+        return (
+            f"the control cannot move {quantity}, which is {side * free:.6g}, "
+            f"but {self.statement} and {other.statement} ask for {most} {side * allowed:.6g}{taken}"
+        )
+
+    def out_of_reach(self, amount: float, needed: float) -> str:
+        if not self.quantity:
+            return super().out_of_reach(amount, needed)
+        if needed - amount < 0:
+            return f"{self.text} is violated by at least {amount:.4g}, whatever the control{self._at}"
+        verb = "raise" if self.sign < 0 else "lower"
+        pushed = f", {self.sigma:.4g} of it for the worst disturbance" if self.sigma > 0 else ""
+        can, must = told_apart(needed - amount, needed)
+        return (
+            f"the control can {verb} {self.quantity} by at most {can}, and {must} is needed{pushed}: "
+            f"without control it is {self.free:.4g}, {self._set} asks for {self.bound}{self._at}"
+        )
+
+    @property
+    def _at(self) -> str:
+        return f", at {self.where}" if self.where and self.time else ""
+
+    @property
+    def _set(self) -> str:
+        return {"terminal": "the terminal set", "path": "the path set"}.get(self.constraint, self.constraint)
 
 
 def explanation(
     name: str, functionals: WorstCase, H: Array, h: Array, row: int, time: float, parameter: Array
-) -> Explanation:
+) -> TimedExplanation:
     """Row ``row`` of ``H x(t) <= h`` at a time and a parameter ``(nu,)``: what is bounded, when, and what the
     uncertainty does to it."""
     direction, system = H[row], functionals.response.system
@@ -26,10 +145,13 @@ def explanation(
     remarks = [f"the initial state gives {free:.6g}"] if time <= 0 else []
     remarks += [f"the disturbance alone moves it by {sigma:.4g}"] if sigma > 0 else []
     remarks += [f"at {where}"] if where else []
-    text = f"{name}: {quantity} {'>=' if sign < 0 else '<='} {limit:.6g}"
-    return Explanation(
-        f"{text} ({', '.join(remarks)})" if remarks else text,
+    statement = f"{name}: {quantity} {'>=' if sign < 0 else '<='} {limit:.6g}"
+    return TimedExplanation(
+        f"{statement} ({', '.join(remarks)})" if remarks else statement,
+        name,
+        statement,
         time,
+        direction,
         parameter,
         functionals.worst_disturbance(time, direction, parameter),
         quantity=quantity,
@@ -39,7 +161,6 @@ def explanation(
         sigma=sigma,
         sign=sign,
         where=where,
-        direction=direction,
     )
 
 

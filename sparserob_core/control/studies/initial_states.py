@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
+from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.transcribe import from_state
@@ -194,10 +195,9 @@ class _Joined:
         return enclosure(x[:-2], lower, upper)
 
     def explain(self, index: Array, row: int) -> Explanation:
-        """The constraint in words, without what the centre's initial state gives: it is free."""
-        assert self.base.explain is not None
-        words = self.base.explain(index, row)
-        return replace(words, text=words.text.partition(" (")[0]) if words.time == 0.0 else words
+        """The constraint for people, without what the centre's initial state gives: it is free."""
+        said = self.base.explanation(index, row)
+        return said.from_any_state() if isinstance(said, TimedExplanation) else said
 
     def _at(self, x: Array) -> ConstraintFamily:
         return self.plane.at(x[-2:]).family(self.base.name)

@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.control.transcription.transcribe import slanted
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Proof
-from sparserob_core.sip.program import Explanation, Formulation, SemiInfiniteProgram
+from sparserob_core.sip.program import Formulation, SemiInfiniteProgram
 from sparserob_core.sip.proof.branch_and_bound import TOLERANCE
 from sparserob_core.sip.result import Result
 
@@ -59,7 +60,6 @@ def _multipliers(problem: OptimalControlProblem, program: SemiInfiniteProgram, r
         (cut, said)
         for cut in result.dual.cuts
         if (said := _explained(program, cut.family, cut.formulation, cut.index, cut.row)) is not None
-        and said.direction is not None
     ]
     if len(told) < len(result.dual.cuts) or result.dual.mu.size != program.finite.b.size:
         return None
@@ -91,13 +91,14 @@ def _on_pieces(problem: OptimalControlProblem, z: Array | None) -> Array | None:
 
 def _explained(
     program: SemiInfiniteProgram, name: str, formulation: Formulation, at: Array, row: int
-) -> Explanation | None:
+) -> TimedExplanation | None:
     """The constraint in numbers; ``None`` for one whose index does not tell them, as the number of a sample."""
     family = program.formulated(name, formulation)
-    return None if family is None or family.explain is None else family.explain(at, row)
+    said = None if family is None else family.explanation(at, row)
+    return said if isinstance(said, TimedExplanation) else None
 
 
-def _parameter(problem: OptimalControlProblem, said: Explanation) -> Array:
+def _parameter(problem: OptimalControlProblem, said: TimedExplanation) -> Array:
     """The parameter of a constraint, certainly inside its set; the middle one for a constraint without uncertainty."""
     bound = problem.system.parameters
     if bound is None:
@@ -110,8 +111,8 @@ def _parameter(problem: OptimalControlProblem, said: Explanation) -> Array:
     )
 
 
-def _direction(said: Explanation) -> Array | None:
-    return None if said.direction is None else said.direction + 0.0  # no negative zeros
+def _direction(said: TimedExplanation) -> Array:
+    return said.direction + 0.0  # no negative zeros
 
 
 def _inside(bound: ConvexSet, point: Array, middle: Array) -> Array:

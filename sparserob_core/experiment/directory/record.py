@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from sparserob_core.control.constraints.explanation import Witness
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.experiment.directory.sparsity import sparsity
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.evidence import Witness
-from sparserob_core.sip.program import SemiInfiniteProgram
+from sparserob_core.sip.program import SemiInfiniteProgram, WorstConstraint
 from sparserob_core.sip.result import Result
 
 PACKAGES = ("sparserob", "numpy", "scipy", "piqp", "proxsuite", "clarabel")
@@ -46,14 +46,12 @@ def summary_of(result: Result, control: Array | None, dictionary: Dictionary | N
     }
 
 
-def _witness(worst: Witness | None) -> dict[str, Any]:
-    if worst is None:
-        return {"violation": None, "constraint": None, "time": None, "parameter": None}
+def _witness(worst: WorstConstraint | None) -> dict[str, Any]:
     return {
-        "violation": worst.violation,
-        "constraint": worst.constraint,
-        "time": worst.time,
-        "parameter": worst.parameter,
+        "violation": None if worst is None else worst.violation,
+        "constraint": None if worst is None else worst.constraint,
+        "time": worst.time if isinstance(worst, Witness) else None,
+        "parameter": worst.parameter if isinstance(worst, Witness) else None,
     }
 
 
@@ -89,7 +87,7 @@ def arrays_of(
     }
     if dictionary is not None:
         arrays["breakpoints"] = dictionary.breakpoints
-    if result.worst is not None and result.worst.disturbance is not None:
+    if isinstance(result.worst, Witness) and result.worst.disturbance is not None:
         arrays["worst_disturbance"] = result.worst.disturbance
     if control is not None and dictionary is not None:
         arrays |= {

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
+from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.figures import style as look
 from sparserob_core.sip.convex_set import Array
@@ -111,10 +112,8 @@ def clash_strips(program: SemiInfiniteProgram, result: Result) -> list[Strip]:
 
 
 def _strip(program: SemiInfiniteProgram, family: ConstraintFamily, cut: Cut) -> Strip | None:
-    if family.explain is None:
-        return None
-    said = family.explain(cut.index, cut.row)
-    if not said.quantity:
+    said = family.explanation(cut.index, cut.row)
+    if not isinstance(said, TimedExplanation) or not said.quantity:
         return None
     G, h = family.rows(cut.index[None])
     row = rows_at(_reduced(program, family), family.name, cut.index[None], np.array([cut.row])).G[0]
@@ -126,9 +125,9 @@ def _strip(program: SemiInfiniteProgram, family: ConstraintFamily, cut: Cut) -> 
         for j in range(h.shape[1])
         if j != cut.row and np.abs(G[0, j] + row).max() <= 1e-12 * np.abs(row).max(initial=1e-300)
     ]
-    others = [family.explain(cut.index, j) for j in opposite]
+    others = [family.explanation(cut.index, j) for j in opposite]
     for other in others:
-        if other.quantity == said.quantity:
+        if isinstance(other, TimedExplanation) and other.quantity == said.quantity:
             limits[other.sign], sigmas[other.sign] = other.limit, other.sigma
     label = f"{said.quantity}\n{family.name}" + (f", {said.where}" if said.where and said.time else "")
     return Strip(

@@ -3,7 +3,6 @@ inside."""
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -37,8 +36,6 @@ SLIVER = 1e-9  # of the box in area: a set without interior
 THINNEST = 1e-10  # of the first box, the last: the set may have no interior
 CLOSED = 1e-3  # of the area: a difference of the polygons that is called none
 ASIDE = 1e-3  # how far costs are measured within the vertices, where no control has any room
-# relative to rows that hold the initial state in units of the box: of no use
-AMOUNT = re.compile(r" \(one is violated by at least [^)]*\)")
 PROVEN = ("certified", "verified")
 
 
@@ -65,10 +62,9 @@ class Search:
         )
         limit, framed = float(self.plane.radius[0]), self._framed()
         if isinstance(framed, Result):
-            message = (
-                f"no initial state of this plane, up to {limit:.4g} in size, is feasible:"
-                f" {AMOUNT.sub('', framed.message)}"
-            )
+            # amounts would be relative to rows that hold the initial state in units of the box: of no use
+            why = framed.message if framed.infeasible is None else framed.infeasible.sentence(amounts=False)
+            message = f"no initial state of this plane, up to {limit:.4g} in size, is feasible: {why}"
             return self._finished(bare, status="infeasible", message=message)
         self.tell(f"direction {len(framed)} of {directions}")
         supports = sandwich(self._ask, framed, directions, 0.1 * CLOSED)

@@ -19,13 +19,13 @@ from pydantic import Field
 from sparserob_core.options import Options
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import RoundFinished, frozen
-from sparserob_core.sip.evidence import NO_BOUND, Cut, Dual, Proof, Witness
+from sparserob_core.sip.evidence import NO_BOUND, Cut, Dual, Proof
 from sparserob_core.sip.finite import FiniteSolution
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
-from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation
+from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation, WorstConstraint
 from sparserob_core.sip.proof.branch_and_bound import TOLERANCE, prove
 from sparserob_core.sip.proof.irreducible import irreducible
-from sparserob_core.sip.proof.verdict import clash, verdict, witness, worst_of
+from sparserob_core.sip.proof.verdict import infeasible_subsystem, verdict, witness, worst_of
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows, rows_at
 from sparserob_core.sip.result import Result, Status, relative_gap
 from sparserob_core.sip.separation.separation import separate
@@ -235,7 +235,7 @@ class _Run:
         self,
         number: int,
         solution: FiniteSolution,
-        worst: Witness,
+        worst: WorstConstraint,
         found: Sequence[tuple[ConstraintFamily, Separation]],
     ) -> None:
         cost, violated = self.program.cost(solution.x), any(_above(family, one)[1].size for family, one in found)
@@ -263,7 +263,7 @@ class _Run:
         self.history.append(event)
         self.tools.notify(event)
 
-    def _finished(self, solution: FiniteSolution, worst: Witness, proofs: Sequence[Proof]) -> Result:
+    def _finished(self, solution: FiniteSolution, worst: WorstConstraint, proofs: Sequence[Proof]) -> Result:
         cost = self.program.cost(solution.x)
         gap = self._gap(cost)
         status, message = verdict(proofs, gap, self.method.tolerance)
@@ -281,12 +281,14 @@ class _Run:
         if solution.status != "infeasible":
             return self._result("failed", "; ".join(solution.attempts) or solution.message, solution, np.nan, None)
         self.rows, solution = irreducible(self.relaxed, self.rows, solution)
-        message, worst = clash(self.program, self.rows, self._multipliers(solution), solution.infeasibility)
+        found, worst = infeasible_subsystem(
+            self.program, self.rows, self._multipliers(solution), solution.infeasibility
+        )
         self.dual = self.relaxed.dual(self.rows, solution.y, solution.mu, solution.z, solution.infeasibility)
-        return self._result("infeasible", message, solution, np.nan, worst)
+        return replace(self._result("infeasible", found.sentence(), solution, np.nan, worst), infeasible=found)
 
     def _result(
-        self, status: Status, message: str, solution: FiniteSolution, cost: float, worst: Witness | None
+        self, status: Status, message: str, solution: FiniteSolution, cost: float, worst: WorstConstraint | None
     ) -> Result:
         y = self._multipliers(solution) if solution.y.size >= self.rows.h.size else np.zeros(self.rows.h.size)
         cuts = tuple(replace(cut, multiplier=float(m)) for cut, m in zip(self.rows.cuts, y, strict=True) if m > 0.0)

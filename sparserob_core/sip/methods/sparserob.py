@@ -21,13 +21,13 @@ from sparserob_core.errors import InputError
 from sparserob_core.options import Options, part
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import EvaluationsFinished, RoundFinished, forwarded, frozen
-from sparserob_core.sip.evidence import NO_BOUND, Cut, Dual, Proof, Witness
+from sparserob_core.sip.evidence import NO_BOUND, Cut, Dual, Proof
 from sparserob_core.sip.maximiser import Report
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
-from sparserob_core.sip.program import SemiInfiniteProgram
+from sparserob_core.sip.program import SemiInfiniteProgram, WorstConstraint
 from sparserob_core.sip.proof.branch_and_bound import prove
 from sparserob_core.sip.proof.irreducible import irreducible
-from sparserob_core.sip.proof.verdict import clash, verdict, witness, worst_of
+from sparserob_core.sip.proof.verdict import infeasible_subsystem, verdict, witness, worst_of
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
 from sparserob_core.sip.relaxed.tuples import TupleValue, imposed_program
 from sparserob_core.sip.result import Result, SearchTrace, Status, relative_gap
@@ -186,7 +186,7 @@ class _Run:
         self.history.append(event)
         self.tools.notify(event)
 
-    def _worst(self) -> Witness:
+    def _worst(self) -> WorstConstraint:
         """The most violated constraint of the whole family, whatever the tuple."""
         return worst_of(separate(self.program, self.g.solution.x, self.tools))
 
@@ -211,13 +211,13 @@ class _Run:
             return self._result("failed", "; ".join(solution.attempts) or solution.message, rows, np.nan, epsilon, None)
         rows, solution = irreducible(self.relaxed, rows, solution)
         y = solution.y[solution.y.size - rows.h.size :]
-        message, worst = clash(self.imposed, rows, y, solution.infeasibility)
+        found, worst = infeasible_subsystem(self.imposed, rows, y, solution.infeasibility)
         self.dual = self.relaxed.dual(rows, solution.y, solution.mu, solution.z, solution.infeasibility)
         rows = replace(rows, cuts=tuple(replace(cut, multiplier=float(m)) for cut, m in zip(rows.cuts, y, strict=True)))
-        return self._result("infeasible", message, rows, np.nan, epsilon, worst)
+        return replace(self._result("infeasible", found.sentence(), rows, np.nan, epsilon, worst), infeasible=found)
 
     def _result(
-        self, status: Status, message: str, rows: Rows, cost: float, epsilon: float, worst: Witness | None
+        self, status: Status, message: str, rows: Rows, cost: float, epsilon: float, worst: WorstConstraint | None
     ) -> Result:
         cuts = tuple(cut for cut in rows.cuts if cut.multiplier > 0.0)
         trace = SearchTrace.joined(self.parts)

@@ -13,7 +13,7 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.finite import FiniteProgram
 from sparserob_core.sip.inner.duality import dual_bound
-from sparserob_core.sip.program import ConstraintFamily, Explanation, SemiInfiniteProgram
+from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
 from sparserob_core.sip.relaxed.relaxed import Rows
 
 Kind: TypeAlias = Literal["beyond every decision", "nothing between", "out of reach"]
@@ -134,63 +134,14 @@ def _reason(
     )
     rows = Rows(G[at, which], h[at, which], cuts)
     amount = float(-multipliers @ rows.h) if amount is None else amount
-    return Reason(kind, rows, multipliers, amount, sentence(kind, family, rows, amount))
+    return Reason(kind, rows, multipliers, amount, sentence(kind, family, rows, multipliers, amount))
 
 
-def sentence(kind: Kind, family: ConstraintFamily, rows: Rows, amount: float) -> str:
-    """The reason in words and numbers, as far as the family can tell them."""
-    if family.explain is None:
-        named = " and ".join(
-            f"row {cut.row} of {cut.family} at {np.array2string(cut.index, precision=6)}" for cut in rows.cuts
-        )
-        return (
-            f"{named} cannot hold: {'their sum' if len(rows.cuts) > 1 else 'it'} is violated by at least {amount:.4g},"
-            " whatever the decision"
-        )
-    words = [family.explain(cut.index, cut.row) for cut in rows.cuts]
-    if not words[0].quantity:
-        return f"{' and '.join(one.text for one in words)}: violated by at least {amount:.4g}, whatever the decision"
-    at = f", at {words[0].where}" if words[0].where and words[0].time else ""
+def sentence(kind: Kind, family: ConstraintFamily, rows: Rows, multipliers: Array, amount: float) -> str:
+    """The reason for people, as far as the family can tell it."""
+    told = [family.explanation(cut.index, cut.row) for cut in rows.cuts]
     if kind == "beyond every decision":
-        return _beyond(family.name, words[0]) + at
+        return told[0].beyond(amount)
     if kind == "nothing between":
-        return _between(family.name, words[0], words[1]) + at
-    return _out_of_reach(family.name, words[0], amount, -float(rows.h[0])) + at
-
-
-def _beyond(name: str, one: Explanation) -> str:
-    reached = one.free + one.sign * one.sigma
-    pushed = f" under the worst disturbance, which moves it by {one.sigma:.4g}," if one.sigma > 0 else ""
-    return f"{one.quantity} = {reached:.6g}{pushed} is outside {one.bound} ({name}), whatever the decision"
-
-
-def _between(name: str, one: Explanation, two: Explanation) -> str:
-    allowed, moved = (one.sign * one.limit + two.sign * two.limit) / 2, (one.sigma + two.sigma) / 2
-    if moved > 0:
-        more, less = told_apart(moved, allowed)
-        return f"the disturbance alone moves {one.quantity} by {more}, {_set(name)} allows {less}"
-    return f"{one.text} and {two.text} leave nothing between them"
-
-
-def _out_of_reach(name: str, one: Explanation, amount: float, needed: float) -> str:
-    verb, pushed = (
-        ("raise" if one.sign < 0 else "lower"),
-        f", {one.sigma:.4g} of it for the worst disturbance" if one.sigma > 0 else "",
-    )
-    if needed - amount < 0:
-        return f"{one.text} is violated by at least {amount:.4g}, whatever the control"
-    can, must = told_apart(needed - amount, needed)
-    return (
-        f"the control can {verb} {one.quantity} by at most {can}, and {must} is needed{pushed}: "
-        f"without control it is {one.free:.4g}, {_set(name)} asks for {one.bound}"
-    )
-
-
-def told_apart(one: float, two: float) -> tuple[str, str]:
-    """Two numbers with four digits, or as many as it takes to tell them apart."""
-    texts = [(f"{one:.{digits}g}", f"{two:.{digits}g}") for digits in range(4, 17)]
-    return next((pair for pair in texts if pair[0] != pair[1]), texts[-1])
-
-
-def _set(name: str) -> str:
-    return {"terminal": "the terminal set", "path": "the path set"}.get(name, name)
+        return told[0].apart(told[1], float(multipliers[1] / multipliers[0]), amount)
+    return told[0].out_of_reach(amount, -float(rows.h[0]))

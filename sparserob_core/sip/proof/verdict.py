@@ -8,13 +8,20 @@ from dataclasses import replace
 import numpy as np
 
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.evidence import Cut, Proof, Witness
-from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation
-from sparserob_core.sip.proof.reasons import least_of, reasons, sentence, told_apart
+from sparserob_core.sip.evidence import Cut, InfeasibleSubsystem, Proof
+from sparserob_core.sip.program import (
+    ConstraintFamily,
+    Explanation,
+    SemiInfiniteProgram,
+    Separation,
+    WorstConstraint,
+    told_apart,
+)
+from sparserob_core.sip.proof.reasons import least_of, reasons, sentence
 from sparserob_core.sip.relaxed.relaxed import Rows
 from sparserob_core.sip.result import MEANING, Status
 
-NAMED = 6  # reasons, or constraints of a clash, that are named; of the latter those with the largest multipliers
+NAMED = 6  # reasons, or members of an infeasible subsystem, that are named; of these those with the largest multipliers
 
 
 def verdict(proofs: Sequence[Proof], gap: float, tolerance: float) -> tuple[Status, str]:
@@ -29,101 +36,86 @@ def verdict(proofs: Sequence[Proof], gap: float, tolerance: float) -> tuple[Stat
     return status, f"{MEANING[status]} (gap {max(gap, 0.0):.1e})"
 
 
-def worst_of(separations: Sequence[tuple[ConstraintFamily, Separation]]) -> Witness:
+def worst_of(separations: Sequence[tuple[ConstraintFamily, Separation]]) -> WorstConstraint:
     """The most violated constraint that the separations of all families have found."""
     found = [
-        Witness(float(s.violations[0]), family.name, s.indices[0], int(s.rows[0]), family.formulation)
+        WorstConstraint(float(s.violations[0]), family.name, s.indices[0], int(s.rows[0]), family.formulation)
         for family, s in separations
         if s.violations.size
     ]
-    return max(found, key=lambda one: one.violation, default=Witness(-np.inf, "", np.zeros(0)))
+    return max(found, key=lambda one: one.violation, default=WorstConstraint(-np.inf, "", np.zeros(0)))
 
 
-def witness(program: SemiInfiniteProgram, searched: Witness, proofs: Sequence[Proof]) -> Witness:
+def witness(program: SemiInfiniteProgram, searched: WorstConstraint, proofs: Sequence[Proof]) -> WorstConstraint:
     """The worst constraint that search or proof has met, explained."""
     found = [
-        Witness(proof.violation, proof.family, proof.index, proof.row, proof.formulation)
+        WorstConstraint(proof.violation, proof.family, proof.index, proof.row, proof.formulation)
         for proof in proofs
         if proof.index is not None
     ]
     return explained(program, max([searched, *found], key=lambda one: one.violation))
 
 
-def explained(program: SemiInfiniteProgram, bare: Witness) -> Witness:
-    """A witness with time, parameter and disturbance filled in, where its family can tell them."""
+def explained(program: SemiInfiniteProgram, bare: WorstConstraint) -> WorstConstraint:
+    """The worst constraint with what its family knows of it."""
     family = program.formulated(bare.constraint, bare.formulation) if bare.constraint else None
-    if family is None or family.explain is None:
-        return bare
-    said = family.explain(bare.index, bare.row)
-    return replace(bare, time=said.time, parameter=said.parameter, disturbance=said.disturbance)
+    return bare if family is None else family.explanation(bare.index, bare.row).witness(bare)
 
 
-def clash(program: SemiInfiniteProgram, rows: Rows, multipliers: Array, amount: float) -> tuple[str, Witness | None]:
+def infeasible_subsystem(
+    program: SemiInfiniteProgram, rows: Rows, multipliers: Array, amount: float
+) -> tuple[InfeasibleSubsystem, WorstConstraint | None]:
     """Why nothing is feasible, from Farkas multipliers ``(r,)`` of ``rows``: every separate reason that needs no
-    solver, one sentence each; where there is none, the rows that cannot hold together, and what they ask of the
-    decision against what it can give.
+    solver; where there is none, the rows that cannot hold together, and what they ask of the decision against what it
+    can give. With it the constraint that matters most.
     """
-    found = reasons(program)
+    found, equalities = reasons(program), bool(program.finite.b.size)
     if found:
-        texts = [reason.text for reason in found[:NAMED]]
-        more = f"; and {len(found) - NAMED} more" if len(found) > NAMED else ""
-        cut, several = found[0].rows.cuts[0], f"{len(found)} separate reasons: "
-        return f"{several if len(found) > 1 else ''}{'; '.join(texts)}{more}", _witness_at(
-            program, cut, found[0].amount
-        )
+        texts = tuple(reason.text for reason in found[:NAMED])
+        told = InfeasibleSubsystem(reasons=texts, others=max(0, len(found) - NAMED))
+        return told, _worst_at(program, found[0].rows.cuts[0], found[0].amount)
     active = np.flatnonzero(multipliers > 0)
     if not active.size:
-        return (
-            (
-                "the equalities cannot be met within the bounds, whatever the decision: one is missed by at least"
-                f" {amount:.4g} times its norm"
-            ),
-            None,
-        )
+        return InfeasibleSubsystem(amount=amount, equalities=equalities), None
     order = active[np.argsort(-multipliers[active], kind="stable")]
-    witness = _witness_at(program, rows.cuts[order[0]], amount)
-    if active.size == 1 and not program.finite.b.size:
+    worst = _worst_at(program, rows.cuts[order[0]], amount)
+    if active.size == 1 and not equalities:
         i = int(order[0])
         family = program.family(rows.cuts[i].family)
         alone = float(least_of(program.finite, rows.G[[i]], rows.h[[i]])[0])
         if alone > 0:
-            return sentence("out of reach", family, rows.take(np.array([i])), alone), replace(witness, violation=alone)
-    return _together(program, rows, multipliers, order, amount), witness
+            text = sentence("out of reach", family, rows.take(np.array([i])), np.ones(1), alone)
+            return InfeasibleSubsystem(reasons=(text,)), replace(worst, violation=alone)
+    return _together(program, rows, multipliers, order, amount), worst
 
 
-def _together(program: SemiInfiniteProgram, rows: Rows, multipliers: Array, order: np.ndarray, amount: float) -> str:
-    """Several rows that clash: each by name, and the sum of them that proves it."""
-    named = "; ".join(_words(program, rows, int(i)) for i in order[:NAMED])
-    others = f"; and {order.size - NAMED} more" if order.size > NAMED else ""
-    head = (
-        "nothing meets this and the equalities"
-        if order.size == 1
-        else "these cannot hold together, though all but any one of them can"
-    )
+def _together(
+    program: SemiInfiniteProgram, rows: Rows, multipliers: Array, order: np.ndarray, amount: float
+) -> InfeasibleSubsystem:
+    """Several rows that cannot hold together: each by name, and the sum of them that proves it."""
+    told = [_explanation(program, rows.cuts[i]) for i in order[:NAMED]]
     y = multipliers / multipliers.max()
     asked = -float(y[order] @ rows.h[order])
     missing = float(least_of(program.finite, (y[order] @ rows.G[order])[None], np.array([-asked]))[0])
-    noun = "decision" if program.lengths is None else "control"
-    more, less = told_apart(asked, asked - missing)
-    sums = (
-        f"; weighted by {', '.join(f'{y[i]:.3g}' for i in order[:NAMED])}{', ...' if order.size > NAMED else ''} they"
-        f" ask the {noun} for {more}, and it can give at most {less}"
-        if missing > 0 and asked > 0
-        else ""
+    demand, decides = "", told[0].decides
+    if missing > 0 and asked > 0:
+        more, less = told_apart(asked, asked - missing)
+        weights = ", ".join(f"{y[i]:.3g}" for i in order[:NAMED]) + (", ..." if order.size > NAMED else "")
+        demand = f"weighted by {weights} they ask the {decides} for {more}, and it can give at most {less}"
+    return InfeasibleSubsystem(
+        members=tuple(one.text for one in told),
+        amount=amount,
+        others=max(0, order.size - NAMED),
+        equalities=bool(program.finite.b.size),
+        demand=demand,
+        decides=decides,
     )
-    return (
-        f"{head} (one is violated by at least {amount:.4g} times its norm, whatever the decision):"
-        f" {named}{others}{sums}"
-    )
 
 
-def _witness_at(program: SemiInfiniteProgram, cut: Cut, violation: float) -> Witness:
-    return explained(program, Witness(violation, cut.family, cut.index, cut.row, cut.formulation))
+def _worst_at(program: SemiInfiniteProgram, cut: Cut, violation: float) -> WorstConstraint:
+    return explained(program, WorstConstraint(violation, cut.family, cut.index, cut.row, cut.formulation))
 
 
-def _words(program: SemiInfiniteProgram, rows: Rows, i: int) -> str:
-    cut = rows.cuts[i]
-    family = program.formulated(cut.family, cut.formulation)
-    if family is None or family.explain is None:
-        return f"row {cut.row} of {cut.family} at {np.array2string(cut.index, precision=6)}"
-    return family.explain(cut.index, cut.row).text
+def _explanation(program: SemiInfiniteProgram, cut: Cut) -> Explanation:
+    family = program.formulated(cut.family, cut.formulation) or program.family(cut.family)
+    return family.explanation(cut.index, cut.row)

@@ -145,6 +145,8 @@ def _family(factored: ParametricProgram, one: ConstraintFamily, two: ConstraintF
         cells=one.cells,
         enclosure=enclosure if one.enclosure else None,
         explain=one.explain,
+        formulation=one.formulation,
+        source=one.source,
         scale=one.scale,
     )
 
@@ -164,6 +166,8 @@ def _relaxed(family: ConstraintFamily) -> ConstraintFamily:
         index_set=index_set,
         rows=rows,
         explain=family.explain,
+        formulation=family.formulation,
+        source=family.source,
         scale=family.scale,
         cells=family.cells,
         worst=None if family.worst is None else partial(worst, separation=family.worst),

@@ -11,6 +11,7 @@ from scipy.optimize import linprog
 
 import sparserob_core as sr
 from sparserob_core.experiment.figures.clash import clash_strips, draw_clash
+from sparserob_core.sip.evidence import InfeasibleSubsystem
 from sparserob_core.sip.proof.irreducible import irreducible
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows, rows_at
 from tests.support.places import CONFIGS
@@ -144,3 +145,40 @@ def test_the_figure_of_a_clash_is_drawn_and_only_for_an_infeasible_run(tmp_path)
     fine = solved(tmp_path / "fine", terminal=[{"box": [1.0, 1.0]}])
     with pytest.raises(sr.InputError, match="infeasible"):
         draw_clash(fine.experiment, fine.result, tmp_path)
+
+
+def test_two_states_that_the_control_moves_alike_are_named_as_the_combination_that_it_cannot_move(tmp_path):
+    """x1 - x2 stays 2 without disturbance, 1.8 is the most that |x1|, |x2| <= 0.9 leave, and the disturbances take 0.1
+    and 0.3 of it; no disturbance alone is too wide for either state."""
+    outcome = solved(
+        tmp_path,
+        system={"A": [[0, 0], [0, 0]], "B": [[1], [1]], "E": [[1, 0], [0, 3]]},
+        horizon=1.0,
+        initial_state=[1, -1],
+        control={"box": 5.0},
+        disturbance={"box": [0.1, 0.1]},
+        terminal=[{"box": [0.9, 0.9]}],
+    )
+    assert outcome.result.status == "infeasible"
+    assert outcome.result.message == (
+        "the control cannot move x1(1) - x2(1), which is 2, but terminal: x1(1) <= 0.9 and terminal: x2(1) >= -0.9 "
+        "ask for at most 1.8 less 0.4 for the worst disturbances"
+    )
+
+
+def test_sides_of_unequal_length_are_compared_in_the_units_of_the_first(tmp_path):
+    """2 x2 <= 1 and -x2 <= 0.5 are the slab |x2| <= 0.5, which a disturbance of 0.6 leaves."""
+    slab = {"polytope": {"H": [[0, 2], [0, -1]], "h": [1.0, 0.5]}}
+    message = solved(tmp_path, disturbance={"box": [0.0, 0.3]}, terminal=[slab]).result.message
+    assert "the disturbance alone moves 2 x2(2) by 1.2, the terminal set allows 1" in message
+
+
+@pytest.mark.parametrize("amount", [0.5, np.inf])
+@pytest.mark.parametrize("equalities", [True, False])
+@pytest.mark.parametrize("members", [(), ("one",), ("one", "two")])
+def test_no_sentence_speaks_of_equalities_where_there_are_none_or_of_an_infinite_amount(members, equalities, amount):
+    told = InfeasibleSubsystem(members=members, amount=amount, equalities=equalities).sentence()
+    assert ("equalities" in told) == (equalities and len(members) < 2)
+    assert "inf" not in told.replace("infeasible", "")
+    assert ("0.5 times its norm" in told) == (amount == 0.5)
+    assert "times its norm" not in InfeasibleSubsystem(members=members, amount=amount).sentence(amounts=False)
