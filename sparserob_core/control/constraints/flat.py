@@ -13,13 +13,14 @@ from sparserob_core.control.constraints.explanation import explanation
 from sparserob_core.control.constraints.local_maxima import climb, local_maxima, step_out, vertices
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.cache import remember
+from sparserob_core.control.enclosures.matrix_exponential import transitions
 from sparserob_core.control.response.disturbance_support import DisturbanceSupport
 from sparserob_core.control.response.enclosure import CELLS_KEPT, CellEnclosure, enclose
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.lifted import LiftedSystem, lift
 from sparserob_core.control.response.measurable import MeasurableCellSupport
 from sparserob_core.control.response.parameters import ParameterIndex
-from sparserob_core.control.response.response import Response, distinct_times, transitions
+from sparserob_core.control.response.response import Response, distinct_times
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.program import Enclosure, Explanation, Separation
 

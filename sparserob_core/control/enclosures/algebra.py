@@ -8,16 +8,11 @@ matrix of ``M^2`` blocks.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TypeAlias
-
 import numpy as np
 
-from sparserob_core.control.enclosures.matrix_exponential import COEFFICIENTS
+from sparserob_core.control.enclosures.matrix_exponential import COEFFICIENTS, Transitions
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.sip.convex_set import Array
-
-Transitions: TypeAlias = Callable[[Array, Array], tuple[Array, Array]]
 
 
 def lifted_matrix(space: TaylorSpace, coefficients: Array, rows: bool) -> Array:
@@ -30,9 +25,8 @@ def lifted_matrix(space: TaylorSpace, coefficients: Array, rows: bool) -> Array:
     return np.moveaxis(lifted, (0, 1), (-4, -2)).reshape(*coefficients.shape[:-3], size * d, size * d)
 
 
-def lifted_transitions(space: TaylorSpace, A: Array, rows: bool, transposed: bool = False) -> Transitions:
-    """`transitions` of the lifted matrix of ``A (M, d, d)``, or of its transpose; in the place of the function of that
-    name."""
+def lifted_transitions(space: TaylorSpace, A: Array, rows: bool) -> Transitions:
+    """`transitions` of the lifted matrix of ``A (M, d, d)``; in the place of the function of that name."""
 
     def of(matrix: Array, durations: Array) -> tuple[Array, Array]:
         shape = np.broadcast_shapes(matrix.shape[:-2], durations.shape)
@@ -40,8 +34,7 @@ def lifted_transitions(space: TaylorSpace, A: Array, rows: bool, transposed: boo
             lifted_matrix(space, part, rows)
             for part in flows_of(space, A, np.broadcast_to(durations, shape).reshape(-1))
         ]
-        both = [np.swapaxes(flow, -1, -2) if transposed else flow for flow in flows]
-        return both[0].reshape(*shape, *matrix.shape[-2:]), both[1].reshape(*shape, *matrix.shape[-2:])
+        return flows[0].reshape(*shape, *matrix.shape[-2:]), flows[1].reshape(*shape, *matrix.shape[-2:])
 
     return of
 
@@ -64,13 +57,9 @@ def exponential(space: TaylorSpace, polynomials: Array) -> Array:
     The sum over the coefficients of their 1-norms is a norm of the algebra, so the same scaling and the same degree
     serve.
     """
-    left, right, target = space.products
-    order = np.argsort(target, kind="stable")
-    left, right, starts = left[order], right[order], np.searchsorted(target[order], np.arange(space.size))
 
     def times(first: Array, second: Array) -> Array:
-        product: Array = np.add.reduceat(first[:, left] @ second[:, right], starts, axis=1)
-        return product
+        return multiplied(space, first, second)
 
     norms = np.abs(polynomials).sum(axis=-2).max(axis=-1).sum(axis=-1)
     squarings = np.maximum(0, np.ceil(np.log2(np.maximum(norms, np.finfo(float).tiny)))).astype(int)
@@ -85,3 +74,11 @@ def exponential(space: TaylorSpace, polynomials: Array) -> Array:
     for done in range(int(squarings.max(initial=0))):
         result = np.where((squarings > done)[:, None, None, None], times(result, result), result)
     return result
+
+
+def multiplied(space: TaylorSpace, first: Array, second: Array) -> Array:
+    """Products ``(k, M, d, d)`` of polynomials with matrix coefficients ``(k, M, d, d)``, truncated."""
+    left, right, target = space.products
+    order = np.argsort(target, kind="stable")
+    starts = np.searchsorted(target[order], np.arange(space.size))
+    return np.asarray(np.add.reduceat(first[:, left[order]] @ second[:, right[order]], starts, axis=1))

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeAlias
+
 import numpy as np
 
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array
+
+# From matrices ``(..., d, d)`` and durations ``(...)``, broadcast together, to their exponentials and the integrals.
+Transitions: TypeAlias = Callable[[Array, Array], tuple[Array, Array]]
 
 # 1 / k!; beyond degree 18 nothing is left on the unit ball (1 / 19! < 1e-17)
 COEFFICIENTS = 1.0 / np.cumprod([1.0, *range(1, 19)])
@@ -31,3 +37,15 @@ def exponential(matrices: Float[Array, "*k d d"]) -> Float[Array, "*k d d"]:
     for done in range(int(squarings.max(initial=0))):
         result = np.where((squarings > done)[..., None, None], result @ result, result)
     return result
+
+
+def transitions(A: Array, durations: Array) -> tuple[Array, Array]:
+    """``e^{A r}`` and ``int_0^r e^{A s} ds`` for matrices ``(..., d, d)`` and durations ``(...,)``, broadcast together:
+    both are blocks of one exponential of ``[[A, I], [0, 0]] r`` (Van Loan 1978, Theorem 1)."""
+    size = A.shape[-1]
+    shape = np.broadcast_shapes(A.shape[:-2], durations.shape)
+    block = np.zeros((*shape, 2 * size, 2 * size))
+    block[..., :size, :size] = A * durations[..., None, None]
+    block[..., :size, size:] = np.eye(size) * durations[..., None, None]
+    both = exponential(block)
+    return both[..., :size, :size], both[..., :size, size:]

@@ -9,10 +9,11 @@ from functools import cached_property, partial
 import numpy as np
 
 from sparserob_core.control.enclosures.combination import Combination
+from sparserob_core.control.enclosures.comparison import block_norms, product
 from sparserob_core.control.enclosures.polynomial import distinct_patterns, face_matrix
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.response.disturbance import DisturbanceModel
-from sparserob_core.control.response.lifted import KNOWN, LiftedSystem, grown, grown_less_one
+from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.sip.convex_set import Array
 
 
@@ -53,36 +54,51 @@ class DisturbanceSupport:
             coefficients[which == position], excess[which == position] = parts[mine][:, :-1], parts[mine][:, -1]
         return coefficients, excess
 
-    def curvature(self, start: Array, widths: Array) -> Array:
-        """Bounds ``(k, r)``, for times in ``[start, start + width]`` inside one piece, of the second time derivative of
-        what the blocks receive, summed over blocks and Taylor coefficients."""
-        matrix, norm, grid = self.lifted.row_matrix, self.lifted.norm, self.lifted.grid
-        bent = self._lifted_rows @ matrix @ matrix
-        sizes = self._gathered(start, self._reaches, bent, plain=True)
-        pieces = np.clip(np.searchsorted(grid.breakpoints, start, side="right") - 1, 0, grid.pieces - 1)
-        distinct, which = grid.distinct(start - grid.breakpoints[pieces])
-        fresh = np.linalg.norm(self._lifted_rows @ matrix @ self.lifted.backward.flows(distinct)[0], axis=2)[which]
-        growth = (norm * widths)[:, None]
-        along = np.linalg.norm(bent, axis=1) * self._total_gain[pieces + 1][:, None] * grown_less_one(growth)
-        return np.asarray(
-            sizes.sum(axis=2) + np.sqrt(self.lifted.space.size) * self._reach * (along + fresh * grown(growth))
+    def deviation(self, start: Array, widths: Array) -> Array:
+        """Bounds ``(k, r)``, for times in ``[start, start + width]`` inside one piece, of how far what the blocks
+        receive is from its chord, summed over blocks and Taylor coefficients.
+
+        A block that has ended receives ``y(r) = c e^{A r} z``, the one that lasts ``y' = c e^{A r} W``. The chord is
+        missed by at most ``width^2 / 8`` of the largest second derivative, and mode by mode by at most twice what it
+        moves: that bound serves fast modes, which have died away long before a cell is as short as they are.
+        """
+        lifted, grid, rows = self.lifted, self.lifted.grid, self._lifted_rows
+        matrix, comparison, starts = lifted.row_matrix, lifted.comparison, lifted.starts
+        sloping, bent = rows @ matrix, rows @ matrix @ matrix
+        sizes = self._gathered(start, self._reaches, bent, plain=True).sum(axis=2)
+        once, twice = (
+            block_norms(part.reshape(*part.shape[:-1], -1, lifted.states), starts).sum(axis=-2)
+            for part in (sloping, bent)
         )
+        pieces = np.clip(np.searchsorted(grid.breakpoints, start, side="right") - 1, 0, grid.pieces - 1)
+        moved = comparison.over(start - grid.breakpoints[pieces]).flow
+        reach = comparison.over(widths)
+        old, young = product(moved, self._gains[pieces][..., None]), product(moved, self._drive[:, None])
+        square = (widths**2 / 8)[:, None]
+        exact = square * (
+            sizes
+            + product(twice, product(reach.departure, old)[..., 0].T).T
+            + product(once, product(reach.peak, young)[..., 0].T).T
+        )
+        ended = np.minimum(
+            square * product(comparison.sizes @ comparison.sizes, product(reach.peak, old))[..., 0],
+            2.0 * product(comparison.sizes, product(reach.integral, old))[..., 0],
+        )
+        lasting = np.minimum(
+            square * product(comparison.sizes, product(reach.peak, young))[..., 0],
+            2.0 * product(reach.integral, young)[..., 0],
+        )
+        by_mode = product(block_norms(self.rows, starts), (ended + lasting).T).T
+        return np.asarray(np.minimum(exact, by_mode))
 
     @cached_property
     def neglected(self) -> Array:
-        """What the Taylor models neglect, at most, on every piece: ``(r, L)``."""
-        total = np.zeros((self.rows.shape[0], self.lifted.grid.pieces))
-        if self.lifted.space.nu == 0:
-            return total
-        lengths = self.lifted.fine.lengths
-        spilt = self.lifted.spilt(self.lifted.W) + self.lifted.slack_W
-        reach = self._reach + self.lifted.slack_W * self.disturbance.radius
-        for row, direction in enumerate(self.rows):
-            sizes, remainder = self.lifted.row_bounds(direction)
-            total[row] = np.cumsum((remainder * reach + sizes @ spilt * self.disturbance.radius) * lengths)[
-                self.lifted.ends[1:] - 1
-            ]
-        return total
+        """What the Taylor models leave out, at most, on every piece: ``(r, L)``."""
+        lifted, radius = self.lifted, self.disturbance.radius
+        sizes, remainder = lifted.row_bounds(self.rows)
+        spilt = lifted.spilt(_row_norms(lifted.W, lifted.starts)) + np.linalg.norm(lifted.slack_W, axis=1)
+        pushed = remainder @ self._drive + radius * np.einsum("rlaj,aj->rl", sizes, spilt)
+        return np.asarray(np.cumsum(pushed * lifted.fine.lengths, axis=1)[:, lifted.ends[1:] - 1])
 
     @property
     def _space(self) -> TaylorSpace:
@@ -114,7 +130,7 @@ class DisturbanceSupport:
         young = self._weights(start @ driven)[..., None, :]
         moved = np.einsum("rd,qde->qre", start, flow)
         old = np.moveaxis(
-            self._weights(np.einsum("qre,aef->qraf", moved, backward.ages[: int(pieces.max(initial=0))])), -2, -3
+            self._weights(np.einsum("qre,aef->qraf", moved, backward.kernel[: int(pieces.max(initial=0))])), -2, -3
         )
         parts = np.concatenate([of_blocks(combined(young)), of_blocks(combined(old))], axis=2)
         return np.asarray(np.cumsum(parts, axis=2)[which, :, pieces])
@@ -165,18 +181,23 @@ class DisturbanceSupport:
         return rows
 
     @cached_property
-    def _reach(self) -> float:
-        return self.disturbance.radius * float(np.linalg.norm(self.lifted.W, axis=(1, 2)).sum())
+    def _drive(self) -> Array:
+        """How much of every block of the coordinates any admissible disturbance drives, at most, ``(q,)``."""
+        norms = _row_norms(self.lifted.W, self.lifted.starts).sum(axis=0)
+        return np.asarray(self.disturbance.radius * (norms + np.linalg.norm(self.lifted.slack_W, axis=1)))
 
     @cached_property
-    def _total_gain(self) -> Array:
-        """``int_0^t |e^{R s}| ds`` at the breakpoints, bounded from above, ``(L+1,)``."""
-        grid, matrix = self.lifted.grid, self.lifted.row_matrix
-        steps = self.lifted.backward.steps(KNOWN)
-        powers = np.empty((grid.pieces, *matrix.shape))
-        powers[0] = np.eye(matrix.shape[0])
+    def _gains(self) -> Array:
+        """``int_0^t e^{M s} |W| ds`` for the comparison system at the breakpoints, ``(L, q)``: what any disturbance
+        until then can have made of every block."""
+        grid, gains = self.lifted.grid, np.zeros((self.lifted.grid.pieces, self.lifted.starts.size))
+        reach = self.lifted.comparison.over(grid.lengths)
         for piece in range(1, grid.pieces):
-            powers[piece] = powers[piece - 1] @ steps.E[0, self.lifted.backward.length_of(piece - 1)]
-        norms = np.linalg.norm(powers, axis=(1, 2))
-        rising = float(np.linalg.eigvalsh((matrix + matrix.T) / 2)[-1])
-        return np.concatenate([[0.0], np.cumsum(norms * grown(np.maximum(rising * grid.lengths, 0.0)) * grid.lengths)])
+            step = product(reach.flow[piece - 1], gains[piece - 1][:, None])
+            gains[piece] = (step + product(reach.integral[piece - 1], self._drive[:, None]))[:, 0]
+        return gains
+
+
+def _row_norms(coefficients: Array, starts: np.ndarray) -> Array:
+    """Norms ``(M, q)`` of the rows of every block of ``(M, d, mw)``."""
+    return np.asarray(np.sqrt(np.add.reduceat((coefficients**2).sum(axis=2), starts, axis=1)))

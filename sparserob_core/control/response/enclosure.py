@@ -1,9 +1,10 @@
 """Proven upper bounds of the worst-case violation on cells of times and parameters.
 
 On a cell ``[a, b]`` of times inside one piece of the grid, every Taylor coefficient of the state lies within
-``(b - a)^2 / 8 max |second derivative|`` of its chord, and a support function of a chord lies below the chord of the
-support functions. So the violation is at most the larger of its bounds at ``a`` and at ``b``, plus that curvature, plus
-what the Taylor models neglect.
+``(b - a)^2 / 8 max |second derivative|`` of its chord, and within twice of what it moves; and a support function of a
+chord lies below the chord of the support functions. So the violation is at most the larger of its bounds at ``a`` and
+at ``b``, plus that deviation, plus what the Taylor models leave out. The way to ``a`` is exact: only the length of the
+cell counts, not that of the piece.
 """
 
 from __future__ import annotations
@@ -15,11 +16,12 @@ from functools import cached_property
 import numpy as np
 
 from sparserob_core.control.enclosures.combination import Combination
+from sparserob_core.control.enclosures.comparison import block_norms, product
 from sparserob_core.control.enclosures.polynomial import distinct_patterns, face_matrix, monotone_ends, polynomial_bound
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.enclosures.valid_inequalities import Cuts
 from sparserob_core.control.response.disturbance_support import DisturbanceSupport
-from sparserob_core.control.response.lifted import LiftedSystem, grown_less_one
+from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.measurable import MeasurableCellSupport
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array
@@ -66,7 +68,7 @@ class CellEnclosure:
         ends, which = _ends(start, stop, pieces)
         bounds, spreads = self._at(*ends)
         left, right = bounds[which[: start.size]], bounds[which[start.size :]]
-        bend = self._curvature(start, stop, pieces)
+        bend = self._deviation(start, stop, pieces)
         neglected = self._neglected[:, pieces].T
         if self.combination is not None:  # the parts of one constraint, each with a factor of at most 1
             bend, neglected = bend.sum(axis=1, keepdims=True), neglected.sum(axis=1, keepdims=True)
@@ -150,24 +152,32 @@ class CellEnclosure:
             np.einsum("kij,kj->ki", flow[which], start) + np.einsum("kij,kj->ki", driven[which], self._drive[pieces])
         )
 
-    def _curvature(self, start: Array, stop: Array, pieces: np.ndarray) -> Array:
-        """``(b - a)^2 / 8`` times the largest second time derivative, summed over the Taylor coefficients,
-        ``(k, r)``."""
-        space, matrix, width = self.lifted.space, self.lifted.matrix, stop - start
+    def _deviation(self, start: Array, stop: Array, pieces: np.ndarray) -> Array:
+        """How far the state and the support function are from their chords on the cells, summed over the Taylor
+        coefficients, ``(k, r)``: by the second time derivative, or mode by mode by twice what it can move (as in
+        `DisturbanceSupport.deviation`)."""
+        lifted, width = self.lifted, stop - start
+        shape = (start.size, lifted.space.size, lifted.states)
         states = self._states(start, pieces).reshape(start.size, -1)
-        second = (states @ matrix.T + self._drive[pieces]) @ matrix.T
-        growth = grown_less_one(self.lifted.norm * width)
-        by_row = np.abs(np.einsum("ri,kai->kra", self._rows, second.reshape(start.size, space.size, -1))).sum(axis=2)
-        loose = np.sqrt(space.size) * np.linalg.norm(second, axis=1) * growth
-        total = by_row + np.linalg.norm(self._rows, axis=1) * loose[:, None]
-        if self.sigma is not None:
-            total = total + self.sigma.curvature(start, width)
-        answer: Array = total * (width**2 / 8)[:, None]
-        return answer
+        slopes = states @ lifted.matrix.T + self._drive[pieces]
+        bent = (slopes @ lifted.matrix.T).reshape(shape)
+        along = np.abs(np.einsum("ri,kai->kra", self._rows, bent)).sum(axis=2)
+        once, twice = (
+            block_norms(part.reshape(shape), lifted.starts).sum(axis=1)[..., None] for part in (slopes, bent)
+        )
+        reach, square, rows = lifted.comparison.over(width), (width**2 / 8)[:, None], self._row_norms
+        exact = square * (along + product(rows, product(reach.departure, twice)[..., 0].T).T)
+        by_mode = np.minimum(square * product(reach.peak, twice)[..., 0], 2.0 * product(reach.integral, once)[..., 0])
+        total = np.minimum(exact, product(rows, by_mode.T).T)
+        return np.asarray(total if self.sigma is None else total + self.sigma.deviation(start, width))
 
-    @property
+    @cached_property
     def _rows(self) -> Array:
         return self.H @ self.lifted.transform
+
+    @cached_property
+    def _row_norms(self) -> Array:
+        return block_norms(self._rows, self.lifted.starts)
 
     @cached_property
     def _nodes(self) -> Array:
@@ -203,8 +213,7 @@ class CellEnclosure:
     @cached_property
     def _neglected(self) -> Array:
         """What the Taylor models neglect, ``(r, L)``."""
-        state = self.lifted.state_remainder(self.control)
-        total = np.outer(np.linalg.norm(self._rows, axis=1), state)
+        total = product(self._row_norms, self.lifted.state_remainder(self.control).T)
         return total if self.sigma is None else total + self.sigma.neglected
 
 

@@ -143,7 +143,7 @@ class WorstCase:
                 "measurable disturbances are proven only for known systems and sets with flat sides; "
                 "expected disturbance_class piecewise_constant"
             )
-        return MeasurableCellSupport(self.measurable, H)
+        return MeasurableCellSupport(self.measurable, H, lifted)
 
     def offsets(self, times: Array, directions: Array, parameters: Array) -> Array:
         """``sigma (k,)``: how far the worst disturbance alone pushes ``c'x(t)``."""

@@ -2,44 +2,49 @@
 
 With ``p = centre + radius delta`` and ``A(p) = sum_g A_g delta^g + remainder``, the Taylor coefficients of the state in
 ``delta`` obey ``x_a' = sum_{g + b = a} A_g x_b + B_a u``: a known linear system of dimension ``d M``, propagated
-exactly. What the truncation at degree ``q`` neglects obeys the same equation with a small drive, and is bounded by
-Gronwall's inequality with the logarithmic norm (Dahlquist 1958). A known system is the case ``M = 1`` without any
-remainder.
+exactly. What the truncation at degree ``q`` neglects, and what was rounded on the way to coordinates in which the modes
+are apart, obeys the same equation with a small drive, and is bounded by Gronwall's inequality, mode by mode. A known
+system is the case ``M = 1`` without truncation.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from itertools import accumulate
 
 import numpy as np
 
-from sparserob_core.control.enclosures.algebra import lifted_matrix, lifted_transitions
+from sparserob_core.control.enclosures.algebra import flows_of, lifted_matrix, lifted_transitions, multiplied
 from sparserob_core.control.enclosures.cache import remember
-from sparserob_core.control.enclosures.matrix_exponential import exponential
+from sparserob_core.control.enclosures.comparison import (
+    Comparison,
+    block_norms,
+    block_sizes,
+    comparison_matrix,
+    finite,
+)
+from sparserob_core.control.enclosures.decoupling import Decoupling, decoupled, decoupled_transitions, identity
+from sparserob_core.control.enclosures.matrix_exponential import Transitions
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.response import Response, TimeGrid
 from sparserob_core.sip.convex_set import Array
 
 DEGREES = {0: 0, 1: 6, 2: 4, 3: 3}  # of the Taylor models, by the number of parameters; 2 beyond
-HUGE = 300.0  # a logarithm of a growth that is as good as infinite
 KNOWN = np.zeros((1, 0))
-WELL_CONDITIONED = 1e3
-# norm times length of the parts that pieces are cut into for what is neglected, and how many of a piece at most
-SHORT, MOST_CUTS = (
-    0.5,
-    64,
-)
+# growth of the comparison system times length of the parts that pieces are cut into for what is neglected, and how
+# many of a piece at most
+SHORT, MOST_CUTS = 0.5, 64
 PATHS_KEPT = 4
 
 
 @dataclass(frozen=True, eq=False)
 class LiftedSystem:
-    """The Taylor models of a system over the cell ``centre +- radius`` (``(nu,)`` each) on a time grid.
+    """The Taylor models of a system over the cell ``centre +- radius`` (``(nu,)`` each) on a time grid, in the
+    coordinates ``x = T z`` of a `Decoupling` with ``q`` blocks.
 
-    ``A (M, d, d)``, ``B (M, d, m)``, ``W (M, d, mw)`` are coefficients, ``slack_*`` norm bounds of their remainders.
+    ``A (M, d, d)``, ``B (M, d, m)``, ``W (M, d, mw)`` are coefficients; ``slack_A (q, q)``, ``slack_B (q, m)``,
+    ``slack_W (q, mw)``, ``slack_x (q,)`` bound, block by block, what they and ``initial_state`` leave out.
     """
 
     space: TaylorSpace
@@ -48,22 +53,32 @@ class LiftedSystem:
     A: Array
     B: Array
     W: Array
-    transform: Array
-    slack_A: float
-    slack_B: float
-    slack_W: float
+    decoupling: Decoupling
+    slack_A: Array
+    slack_B: Array
+    slack_W: Array
+    slack_x: Array
+
+    @property
+    def transform(self) -> Array:
+        """``T (d, d)``, with ``x = T z``."""
+        return self.decoupling.transform
+
+    @property
+    def starts(self) -> np.ndarray:
+        """Where the blocks of the coordinates begin, ``(q,)``."""
+        return self.decoupling.starts
 
     @property
     def states(self) -> int:
         return int(self.A.shape[1])
 
     @cached_property
-    def growth(self) -> float:
-        """An upper bound of the logarithmic norm of ``A(p)`` over the cell."""
-        symmetric = (self.A + np.swapaxes(self.A, 1, 2)) / 2
-        return float(
-            np.linalg.eigvalsh(symmetric[0])[-1] + np.linalg.norm(symmetric[1:], axis=(1, 2)).sum() + self.slack_A
-        )
+    def comparison(self) -> Comparison:
+        """Bounds of the lifted system: of its Taylor coefficients, the norms of every block summed over them."""
+        sizes = block_sizes(self.A, self.starts)
+        rest = sizes[1:].sum(axis=0) + self.slack_A
+        return Comparison(comparison_matrix(self.A[0], self.starts) + rest, sizes[0] + rest)
 
     @cached_property
     def norm(self) -> float:
@@ -88,13 +103,12 @@ class LiftedSystem:
 
     @cached_property
     def fine(self) -> TimeGrid:
-        """The grid with long pieces cut into equal parts: a norm bound over a part is only good if the system moves
+        """The grid with long pieces cut into equal parts: a norm bound over a part is only good if the modes grow
         little on it."""
-        counts, breaks = (
-            np.clip(np.ceil(self.norm * self.grid.lengths / SHORT), 1, MOST_CUTS).astype(int),
-            self.grid.breakpoints,
-        )
-        if not self.space.nu or counts.max() == 1:
+        growth = float(np.abs(np.linalg.eigvals(self.comparison.rising)).max())
+        counts = np.clip(np.ceil(growth * self.grid.lengths / SHORT), 1, MOST_CUTS).astype(int)
+        breaks = self.grid.breakpoints
+        if counts.max() == 1:
             return self.grid
         inner = [
             np.linspace(a, b, count, endpoint=False)
@@ -118,16 +132,32 @@ class LiftedSystem:
         start = np.zeros(self.matrix.shape[0])
         start[: self.states] = self.initial_state
         drive = self.B.reshape(-1, self.B.shape[2])
-        return Response(
-            LinearSystem(self.matrix, drive), self.fine, start, lifted_transitions(self.space, self.A, rows=False)
-        )
+        return Response(LinearSystem(self.matrix, drive), self.fine, start, self._propagate(rows=False))
 
     @cached_property
     def backward(self) -> Response:
         """The adjoint of the lifted system; its functionals are Taylor coefficients of ``c'e^{A(p) t}``."""
+        return self._adjoint_on(self.grid)
+
+    @cached_property
+    def _backward_fine(self) -> Response:
+        return self.backward if self.fine is self.grid else self._adjoint_on(self.fine)
+
+    def _adjoint_on(self, grid: TimeGrid) -> Response:
         size = self.row_matrix.shape[0]
-        propagate = lifted_transitions(self.space, self.A, rows=True)
-        return Response(LinearSystem(self.row_matrix, np.zeros((size, 1))), self.grid, np.zeros(size), propagate)
+        drive = LinearSystem(self.row_matrix, np.zeros((size, 1)))
+        return Response(drive, grid, np.zeros(size), self._propagate(rows=True))
+
+    def _propagate(self, rows: bool) -> Transitions:
+        """The exponentials of the lifted matrix: mode by mode where there is one coefficient, in the algebra of
+        polynomials otherwise."""
+        if self.space.nu:
+            return lifted_transitions(self.space, self.A, rows=rows)
+        return lambda matrix, durations: decoupled_transitions(
+            self.decoupling,
+            self.A[0],
+            np.broadcast_to(durations, np.broadcast_shapes(matrix.shape[:-2], durations.shape)),
+        )
 
     def nodes(self, control: Array) -> Array:
         """Taylor coefficients ``(L+1, M, d)`` of the state at the breakpoints, under ``control (m, K)``."""
@@ -135,16 +165,13 @@ class LiftedSystem:
         return answer
 
     def state_remainder(self, control: Array) -> Array:
-        """Norm bounds ``(L,)``, per piece, of the neglected part of the state."""
-        if self.space.nu == 0:
-            return np.zeros(self.grid.pieces)
+        """Norm bounds ``(L, q)``, per piece and block, of the part of the state that the Taylor models leave out."""
         inputs = control[:, self.fine.control_piece]
         driven = inputs.T @ self.forward.system.matrices(KNOWN)[1][0].T
-        neglected = self._neglected(
-            self._sizes(self._path(control), driven, self.matrix), np.abs(inputs).sum(axis=0) * self.slack_B
-        )
-        answer: Array = np.maximum.reduceat(neglected, self.ends[:-1])
-        return answer
+        sizes = self._sizes(self._path(control)[None], driven, rows=False)
+        drive = (self.slack_B @ np.abs(inputs)).T[None]
+        neglected = self._neglected(sizes, drive, self.slack_x[None], rows=False)[0]
+        return np.asarray(np.maximum.reduceat(neglected, self.ends[:-1], axis=0))
 
     def _path(self, control: Array) -> Array:
         """Taylor coefficients of the state at the breakpoints of the fine grid, remembered: all directions of a cell
@@ -159,130 +186,136 @@ class LiftedSystem:
     def _paths(self) -> dict[bytes, Array]:
         return {}
 
-    def row_bounds(self, direction: Array) -> tuple[Array, Array]:
-        """For the Taylor model of ``c'e^{A(p) s}``, read backwards from ``t``: norms ``(L', M)`` of its coefficients,
-        the largest on every piece of the fine grid, and norm bounds ``(L',)`` of its neglected part."""
-        sizes = self._sizes(self.row_nodes(direction), np.zeros(1), self.row_matrix.T)
-        return sizes, self._neglected(sizes, np.zeros(self.fine.pieces))
+    def row_bounds(self, directions: Array) -> tuple[Array, Array]:
+        """For the Taylor models of ``c'e^{A(p) s}`` of ``directions (r, d)``, read backwards from ``t``: block norms
+        ``(r, L', M, q)`` of their coefficients, the largest on every piece of the fine grid, and norm bounds
+        ``(r, L', q)`` of what they leave out."""
+        sizes = self._sizes(self.row_nodes(directions), np.zeros(1), rows=True)
+        still = np.zeros((1, 1, self.starts.size))
+        return sizes, self._neglected(sizes, still, np.zeros((1, self.starts.size)), rows=True)
 
-    def row_nodes(self, direction: Array) -> Array:
-        """Taylor coefficients ``(L'+1, M, d)`` of ``c'e^{A(p) s}`` at the breakpoints ``s`` of the fine grid."""
-        row = np.zeros(self.row_matrix.shape[0])
-        row[: self.states] = direction
-        still = np.zeros((1, int(self.grid.control_piece.max()) + 1))
-        path = replace(self._transposed, initial_state=row).states(still, KNOWN)
-        answer: Array = path[0].reshape(-1, self.space.size, self.states)
-        return answer
+    def row_nodes(self, directions: Array) -> Array:
+        """Taylor coefficients ``(r, L'+1, M, d)`` of ``c'e^{A(p) s}`` at the breakpoints ``s`` of the fine grid."""
+        response = self._backward_fine
+        steps, pieces = response.steps(KNOWN), self.fine.pieces
+        rows = np.zeros((pieces + 1, directions.shape[0], self.row_matrix.shape[0]))
+        rows[0, :, : self.states] = directions
+        for piece in range(pieces):
+            rows[piece + 1] = rows[piece] @ steps.Phi[0, response.length_of(piece)]
+        return np.moveaxis(rows, 0, 1).reshape(directions.shape[0], pieces + 1, self.space.size, self.states)
+
+    def _sizes(self, nodes: Array, driven: Array, rows: bool) -> Array:
+        """Block norms ``(r, L', M, q)`` of Taylor coefficients ``(r, L'+1, M, d)``, the largest on every fine piece.
+
+        The least of three bounds: what lies at its ends and how far it is from the chord between them; where it
+        starts and how far it can go from there; where it starts, and what is driven.
+        """
+        matrix = self.row_matrix.T if rows else self.matrix
+        lengths, shape = self.fine.lengths, (nodes.shape[0], nodes.shape[1] - 1, *nodes.shape[2:])
+
+        flat = nodes[:, :-1].reshape(*shape[:2], -1)
+        slopes = flat @ matrix.T + driven
+        bent = block_norms((slopes @ matrix.T).reshape(shape), self.starts)
+        ends = block_norms(nodes, self.starts)
+        integral, peak = self._majorants(lengths, rows)
+        pushed = block_norms(np.broadcast_to(driven, flat.shape).reshape(shape), self.starts)
+        moved = _applied(integral, block_norms(slopes.reshape(shape), self.starts))
+        chord = np.maximum(ends[:, :-1], ends[:, 1:]) + (lengths**2 / 8)[:, None, None] * _applied(peak, bent)
+        return np.minimum(
+            np.minimum(chord, ends[:, :-1] + moved), _applied(peak, ends[:, :-1]) + _applied(integral, pushed)
+        )
+
+    def _majorants(self, lengths: Array, rows: bool) -> tuple[Array, Array]:
+        """What bounds ``int |e^{lifted s}| ds`` and ``|e^{lifted r}|`` on every fine piece, coefficient by coefficient,
+        ``(L', M q, M q)``; as in `Comparison.over`."""
+        if rows not in self._majorised:
+            distinct, which = self.fine.distinct(lengths)
+            growths = block_sizes(self.A, self.starts)
+            growths[0] = comparison_matrix(self.A[0], self.starts)
+            rising = growths.copy()
+            rising[0] = np.where(np.eye(self.starts.size) > 0, np.maximum(growths[0], 0.0), growths[0])
+            if rows:
+                growths, rising = np.swapaxes(growths, 1, 2), np.swapaxes(rising, 1, 2)
+            with np.errstate(over="ignore", invalid="ignore"):
+                integral = finite(flows_of(self.space, growths, distinct)[1])
+                peak = finite(multiplied(self.space, np.broadcast_to(rising, integral.shape), integral))
+            peak[:, 0] += np.eye(self.starts.size)
+            both = (lifted_matrix(self.space, part, rows=False)[which] for part in (integral, peak))
+            self._majorised[rows] = (next(both), next(both))
+        return self._majorised[rows]
 
     @cached_property
-    def _transposed(self) -> Response:
-        """Rows as states; its transitions are shared by all of them."""
-        size = self.row_matrix.shape[0]
-        propagate = lifted_transitions(self.space, self.A, rows=True, transposed=True)
-        return Response(LinearSystem(self.row_matrix.T, np.zeros((size, 1))), self.fine, np.zeros(size), propagate)
+    def _majorised(self) -> dict[bool, tuple[Array, Array]]:
+        return {}
 
-    def _sizes(self, nodes: Array, driven: Array, matrix: Array) -> Array:
-        """Norms ``(L', M)`` of Taylor coefficients, the largest on every fine piece: at its ends, or between them, near
-        their chord."""
-        lengths = self.fine.lengths
-        second = ((nodes[:-1].reshape(lengths.size, -1) @ matrix.T + driven) @ matrix.T).reshape(
-            lengths.size, self.space.size, -1
+    def _neglected(self, sizes: Array, extra: Array, start: Array, rows: bool) -> Array:
+        """Gronwall: ``|e|' <= M |e| + residual`` block by block, ``(r, L', q)``, from ``|e(0)| <= start (r, q)``, with
+        the residual of the truncation bounded on every fine piece: ``sizes (r, L', M, q)`` of the coefficients, and
+        ``extra (r, L', q)``."""
+        spilt = self.spilt(block_sizes(self.A, self.starts)) + self.slack_A
+        residual = np.einsum("rlaj,aij->rli" if not rows else "rlai,aij->rlj", sizes, spilt) + extra
+        reach = self.comparison.over(self.fine.lengths)
+        flow, integral, peak = (
+            np.swapaxes(part, 1, 2) if rows else part for part in (reach.flow, reach.integral, reach.peak)
         )
-        norms = np.linalg.norm(nodes, axis=2)
-        return np.asarray(
-            np.maximum(norms[:-1], norms[1:])
-            + (lengths**2 / 8)[:, None] * (np.linalg.norm(second, axis=2) @ self._growths.T)
-        )
-
-    def _neglected(self, norms: Array, extra: Array) -> Array:
-        """Gronwall: ``|e|' <= growth |e| + residual``, with the residual of the truncation bounded on every fine
-        piece."""
-        lengths = self.fine.lengths
-        residual = norms @ self.spilt(self.A) + norms.sum(axis=1) * self.slack_A + extra
-        factor = grown(self.growth * lengths)
-        added = residual * (
-            grown_less_one(self.growth * lengths) / self.growth if abs(self.growth) > 1e-12 else lengths
-        )
-        bound = np.array(
-            list(
-                accumulate(
-                    zip(factor.tolist(), added.tolist(), strict=True),
-                    lambda b, step: b * step[0] + step[1],
-                    initial=0.0,
-                )
-            )
-        )
-        answer: Array = bound[:-1] * np.maximum(factor, 1.0) + np.maximum(added, residual * lengths)
-        return answer
-
-    @cached_property
-    def _growths(self) -> Array:
-        """``G (M, M)``: the norm of coefficient ``a`` of ``e^{lifted r} z`` is at most ``sum_b G_ab |z_b|``, ``r`` up
-        to the longest fine piece."""
-        left, right, target = self.space.products
-        sizes = np.zeros((self.space.size, self.space.size))
-        sizes[target, right] = np.linalg.norm(self.A, axis=(1, 2))[left]
-        exponent = sizes * self.fine.lengths.max()
-        return exponential(exponent) if exponent.max() < HUGE else np.full(sizes.shape, np.inf)
+        pushed = np.einsum("lij,rlj->rli", integral, residual)
+        bound, bounds = np.broadcast_to(start, pushed[:, 0].shape), np.empty((residual.shape[1], *pushed[:, 0].shape))
+        for piece in range(residual.shape[1]):
+            bounds[piece] = bound
+            bound = bound @ flow[piece].T + pushed[:, piece]
+        return np.asarray(np.einsum("lij,lrj->rli", peak, bounds) + pushed)
 
     def spilt(self, coefficients: Array) -> Array:
-        """For every monomial, the norms of those ``coefficients (M, ...)`` of a factor that push its product out of the
-        space, ``(M,)``."""
+        """For every monomial, the sum of those norms ``(M, ...)`` of the coefficients of a factor that push its product
+        out of the space, ``(M, ...)``."""
         leaves = self.space.degrees[:, None] + self.space.degrees[None, :] > self.space.degree
-        answer: Array = leaves @ np.linalg.norm(coefficients, axis=(1, 2))
-        return answer
+        return np.asarray(np.tensordot(leaves.astype(float), coefficients, axes=1))
 
 
-def grown(exponent: Array) -> Array:
-    """``e^x``, infinite where it is as good as that."""
-    return np.where(exponent > HUGE, np.inf, np.exp(np.minimum(exponent, HUGE)))
-
-
-def grown_less_one(exponent: Array) -> Array:
-    """``e^x - 1``, infinite where it is as good as that."""
-    return np.where(exponent > HUGE, np.inf, np.expm1(np.minimum(exponent, HUGE)))
+def _applied(matrices: Array, norms: Array) -> Array:
+    """Matrices of bounds ``(L', M q, M q)`` on block norms ``(r, L', M, q)``."""
+    return np.asarray(np.einsum("lij,rlj->rli", matrices, norms.reshape(*norms.shape[:2], -1)).reshape(norms.shape))
 
 
 def lift(system: LinearSystem, grid: TimeGrid, initial_state: Array, centre: Array, radius: Array) -> LiftedSystem:
-    """The lifted system over a cell, in the coordinates ``x = T z`` with ``T`` its `transform`; raises `NotEnclosable`
-    when it has none."""
+    """The lifted system over a cell, in the coordinates of `decoupled`; raises `NotEnclosable` when it has none."""
     space = _space(centre.size)
     A, slack_A, B, slack_B, W, slack_W = system.taylor(space, centre, radius)
-    T = _modal(A[0]) if centre.size else np.eye(A.shape[1])
-    inverse = np.linalg.inv(T)
-    norm = np.linalg.norm
+    basis = decoupled(A[0])
+    size, moved = np.abs(basis.inverse), basis.matrix(A)
+    coefficients, rounded = moved[0].copy(), moved[1].sum(axis=0)
+    coefficients[0] = basis.normal_form(moved[0][0])
+    rounded = rounded + np.abs(coefficients[0] - moved[0][0])
+    slack = (np.eye(size.shape[0]) + basis.defect) @ size
+    driven, state = [basis.vector(part) for part in (B, W)], basis.vector(initial_state[:, None])
     return LiftedSystem(
         space,
         grid,
-        inverse @ initial_state,
-        inverse @ A @ T,
-        inverse @ B,
-        inverse @ W,
-        T,
-        float(norm(inverse, 2) * norm(slack_A) * norm(T, 2)),
-        float(norm(inverse, 2) * norm(slack_B)),
-        float(norm(inverse, 2) * norm(slack_W)),
+        state[0][:, 0],
+        coefficients,
+        driven[0][0],
+        driven[1][0],
+        basis,
+        block_sizes(rounded + slack @ slack_A @ np.abs(basis.transform), basis.starts),
+        _row_sizes(driven[0][1].sum(axis=0) + slack @ slack_B, basis.starts),
+        _row_sizes(driven[1][1].sum(axis=0) + slack @ slack_W, basis.starts),
+        block_norms(state[1][:, 0], basis.starts),
     )
+
+
+def _row_sizes(entries: Array, starts: np.ndarray) -> Array:
+    """Norms ``(q, m)`` of the blocks of columns ``(d, m)``."""
+    return block_norms(entries.T, starts).T
 
 
 def frozen(system: LinearSystem, grid: TimeGrid, initial_state: Array, parameter: Array) -> LiftedSystem:
     """The system at one parameter, without any expansion."""
     A, B, W = system.matrices(parameter[None])
-    return LiftedSystem(_space(0), grid, initial_state, A, B, W, np.eye(A.shape[1]), 0.0, 0.0, 0.0)
-
-
-def _modal(A: Array) -> Array:
-    """Real modal coordinates, in which the logarithmic norm is the spectral abscissa; the identity where they are ill
-    conditioned."""
-    values, vectors = np.linalg.eig(A)
-    columns = [
-        part
-        for i, value in enumerate(values)
-        if value.imag >= 0
-        for part in ((vectors[:, i].real,) if value.imag == 0 else (vectors[:, i].real, vectors[:, i].imag))
-    ]
-    T = np.stack(columns, axis=1)
-    return T if np.linalg.cond(T) < WELL_CONDITIONED else np.eye(A.shape[0])
+    basis = identity(A.shape[1])
+    none_A, none_B, none_W = (np.zeros((A.shape[1], part.shape[2])) for part in (A, B, W))
+    return LiftedSystem(
+        _space(0), grid, initial_state, A, B, W, basis, none_A, none_B, none_W, slack_x=np.zeros(A.shape[1])
+    )
 
 
 _SPACES: dict[int, TaylorSpace] = {}

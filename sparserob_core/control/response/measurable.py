@@ -6,13 +6,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
-from sparserob_core.control.response.lifted import grown_less_one
-from sparserob_core.control.response.response import Response, transitions
+from sparserob_core.control.enclosures.comparison import block_norms, product
+from sparserob_core.control.enclosures.matrix_exponential import transitions
+from sparserob_core.control.response.lifted import LiftedSystem
+from sparserob_core.control.response.response import Response
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 LEGENDRE = np.polynomial.legendre.Legendre.basis(5)
@@ -21,6 +22,7 @@ NODES = np.concatenate([[-1.0], LEGENDRE.deriv().roots(), [1.0]])
 WEIGHTS = 1.0 / (15.0 * LEGENDRE(NODES) ** 2)
 ACCURACY = 1e-14  # of an integral over one interval, relative to the largest integrand times the horizon
 TABLES_KEPT = 64  # directions and parameters whose integrals are remembered
+MOST_SHORT = 4096  # intervals that one is cut into before any is halved
 HALVINGS = 48  # of an interval across a kink of the integrand: what is left of it is below rounding
 
 
@@ -63,10 +65,9 @@ class MeasurableSupport:
         """``int_0^length h(E' y(s)) ds`` from rows ``y(0) = starts (l, d)``: Gauss-Lobatto, halving what has not
         converged (kinks)."""
         A, W = both[:, : both.shape[0]], both[:, both.shape[0] :]
-        total, count = (
-            np.zeros(lengths.size),
-            max(1, int(np.ceil(float(np.linalg.norm(A, 2)) * lengths.max(initial=0.0)))),
-        )
+        total = np.zeros(lengths.size)
+        fastest = float(np.abs(np.linalg.eigvals(A)).max())
+        count = int(np.clip(np.ceil(fastest * lengths.max(initial=0.0)), 1, MOST_SHORT))
         owner = np.repeat(np.arange(lengths.size), count)  # short intervals, on which the quadrature is at home
         offsets = np.outer(lengths, np.arange(count) / count)
         starts = np.einsum("li,lqij->lqj", starts, transitions(A[None, None], offsets)[0]).reshape(-1, A.shape[0])
@@ -99,7 +100,7 @@ class MeasurableSupport:
 @dataclass(frozen=True, eq=False)
 class MeasurableCellSupport:
     """The support function of measurable disturbances on functionals ``rows (r, d)`` of a *known* system, in the form
-    of `DisturbanceSupport`.
+    of `DisturbanceSupport`; ``lifted`` is that system.
 
     ``sigma`` is an integral with a Lipschitz integrand, so its second derivative is bounded by that of the integrand's
     argument.
@@ -107,6 +108,7 @@ class MeasurableCellSupport:
 
     support: MeasurableSupport
     rows: Array
+    lifted: LiftedSystem
 
     def steepness(self, times: Array) -> Array:
         """No parameters, no steepness: ``(k, r, 0)``."""
@@ -118,20 +120,24 @@ class MeasurableCellSupport:
         sigma = self.support(np.repeat(times, r), np.tile(self.rows, (k, 1)), np.zeros((k * r, 0)))
         return sigma.reshape(k, r, 1), np.zeros((k, r))
 
-    def curvature(self, start: Array, widths: Array) -> Array:
-        """Bounds ``(k, r)`` of the integrand's slope ``h(E' A' e^{A' s} c)`` on ``[start, start + width]``."""
-        bound = self.support.bound
-        A, _, W = self.support.response.system.matrices(np.zeros((1, 0)))
-        slopes = np.einsum("ri,kij->krj", self.rows, transitions(A[0][None], start)[0] @ A[0])
-        ends = slopes @ W[0]
-        growth = grown_less_one(float(np.linalg.norm(A[0], 2)) * widths)[:, None]
-        return np.asarray(bound.reach(ends) + np.linalg.norm(slopes, axis=2) * growth * self._reach)
-
-    @cached_property
-    def _reach(self) -> float:
-        return self.support.bound.radius_bound * float(
-            np.linalg.norm(self.support.response.system.matrices(np.zeros((1, 0)))[2][0], 2)
+    def deviation(self, start: Array, widths: Array) -> Array:
+        """Bounds ``(k, r)`` of how far ``sigma`` is from its chord on ``[start, start + width]``: by the slope of
+        ``h(E' e^{A' s} c)``, or by twice its integral, mode by mode."""
+        bound, lifted, comparison = self.support.bound, self.lifted, self.lifted.comparison
+        rows, W = self.rows @ lifted.transform, lifted.W[0]
+        slopes = rows @ lifted.forward.flows(start)[0] @ lifted.A[0]  # (k, r, d)
+        reach = comparison.over(widths)
+        drive = np.linalg.norm(W, axis=1)
+        drive = bound.radius_bound * block_norms(drive, lifted.starts)
+        square = (widths**2 / 8)[:, None]
+        moved = product(block_norms(slopes, lifted.starts), product(reach.departure, drive[:, None]))[..., 0]
+        exact = square * (bound.reach(slopes @ W) + moved)
+        now = product(comparison.over(start).flow, drive[:, None])
+        by_mode = np.minimum(
+            square * product(comparison.sizes, product(reach.peak, now))[..., 0],
+            2.0 * product(reach.integral, now)[..., 0],
         )
+        return np.asarray(np.minimum(exact, product(block_norms(rows, lifted.starts), by_mode.T).T))
 
     @property
     def neglected(self) -> Array:

@@ -1,21 +1,20 @@
 """State responses by matrix exponentials: no time stepping, any times, any parameters, all vectorised.
 
 On every piece of the merged time grid the inputs are constant, so the state follows
-``x(tau_l + r) = e^{A r} x(tau_l) + F(r) (B u_l + E w_l)`` with ``F(r) = int_0^r e^{A s} ds``; both blocks come from one
-exponential of ``[[A, I], [0, 0]]`` (Van Loan 1978, Theorem 1).
+``x(tau_l + r) = Phi(r) x(tau_l) + Gamma(r) (B u_l + E w_l)`` with ``Phi(r) = e^{A r}`` and
+``Gamma(r) = int_0^r e^{A s} ds``; both are blocks of one exponential of ``[[A, I], [0, 0]]`` (Van Loan 1978, Theorem
+1).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TypeAlias
 
 import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
-from sparserob_core.control.enclosures.matrix_exponential import exponential
+from sparserob_core.control.enclosures.matrix_exponential import Transitions, transitions
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.sip.convex_set import Array
 
@@ -73,19 +72,21 @@ def merge_grids(control: Array, disturbance: Array) -> TimeGrid:
     return TimeGrid(points, np.searchsorted(control, middles) - 1, np.searchsorted(disturbance, middles) - 1)
 
 
-Propagate: TypeAlias = Callable[[Array, Array], tuple[Array, Array]]
-
-
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """Transition matrices over whole pieces: ``E (v, q, d, d)`` and ``F (v, q, d, d)`` for ``v`` parameters and ``q``
-    distinct lengths."""
+    """Matrices at ``v`` parameters and their transitions over whole pieces of ``q`` distinct lengths:
+    ``Phi = e^{A h}`` and ``Gamma = int_0^h e^{A s} ds``, ``(v, q, d, d)`` each."""
 
     A: Array
     B: Array
-    W: Array
     E: Array
-    F: Array
+    Phi: Array
+    Gamma: Array
+
+    @cached_property
+    def side_by_side(self) -> Array:
+        """``[Gamma, Phi] (v, q, d, 2 d)``: a row takes both in one product."""
+        return np.concatenate([self.Gamma, self.Phi], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +96,7 @@ class Propagator:
 
     system: LinearSystem
     grid: TimeGrid
-    propagate: Propagate | None = None
+    propagate: Transitions | None = None
     _steps: dict[bytes, Steps] = field(default_factory=dict, repr=False)
 
     @cached_property
@@ -115,9 +116,9 @@ class Propagator:
         # no parameters: any number of rows has the same bytes
         key = bytes(str(parameters.shape), "ascii") + parameters.tobytes()
         if key not in self._steps:
-            A, B, W = self.system.matrices(parameters)
-            E, F = self._transitions(A[:, None], self._lengths[None, :])
-            remember(self._steps, key, Steps(A, B, W, E, F), STEPS_KEPT)
+            A, B, E = self.system.matrices(parameters)
+            Phi, Gamma = self._transitions(A[:, None], self._lengths[None, :])
+            remember(self._steps, key, Steps(A, B, E, Phi, Gamma), STEPS_KEPT)
         return self._steps[key]
 
     def adjoint(self, times: Array, directions: Array, parameters: Array) -> tuple[Array, Array, Array, Array]:
@@ -125,7 +126,7 @@ class Propagator:
 
         ``times (k,)``, ``directions (k, d)``, ``parameters (k, nu)`` give ``free (k, d) = e^{A't} c``,
         ``gains (k, L, d) = int_{piece, s < t} e^{A'(t-s)} c ds``, and the input matrices ``B (k, d, m)``,
-        ``W (k, d, mw)`` at the parameters.
+        ``E (k, d, mw)`` at the parameters.
         """
         unique, which = _unique_rows(parameters)
         steps = self.steps(unique)
@@ -134,20 +135,22 @@ class Propagator:
             return self._adjoint_of_few(steps, times, directions, pieces)
         order = np.argsort(-pieces, kind="stable")
         within = np.clip(times - self.grid.breakpoints[pieces], 0.0, None)
-        partial_E, partial_F = self._partial(steps, which, within)
+        Phi, Gamma = self._partial(steps, which, within)
+        d = directions.shape[1]
         rows = np.ascontiguousarray(directions[order], dtype=float)[:, None, :]
-        gains = np.zeros((times.size, self.grid.pieces, directions.shape[1]))
-        gains[np.arange(times.size), pieces[order]] = (rows @ partial_F[order])[:, 0]
-        rows = rows @ partial_E[order]
+        gains = np.zeros((times.size, self.grid.pieces, d))
+        gains[np.arange(times.size), pieces[order]] = (rows @ Gamma[order])[:, 0]
+        rows = rows @ Phi[order]
         which, sorted_pieces = which[order], pieces[order]
+        known = steps.Phi.shape[0] == 1
         for piece in range(int(sorted_pieces[0]) - 1, -1, -1):
             active = int(np.searchsorted(-sorted_pieces, -piece))
-            E, F = self._whole(steps, piece, which[:active])
-            gains[:active, piece] = (rows[:active] @ F)[:, 0]
-            rows[:active] = rows[:active] @ E
+            over = steps.side_by_side[0 if known else which[:active], self._which[piece]]
+            both = rows[:active] @ over
+            gains[:active, piece], rows[:active] = both[:, 0, :d], both[..., d:]
         back = np.empty_like(order)
         back[order] = np.arange(order.size)
-        return rows[back, 0], gains[back], steps.B[which[back]], steps.W[which[back]]
+        return rows[back, 0], gains[back], steps.B[which[back]], steps.E[which[back]]
 
     def _adjoint_of_few(
         self, steps: Steps, times: Array, directions: Array, pieces: np.ndarray
@@ -155,22 +158,22 @@ class Propagator:
         """`adjoint` of a known system on equal pieces, without a loop over them: what a piece still gives depends on
         its age only."""
         count, last = np.zeros(times.size, dtype=int), int(pieces.max())
-        partial_E, partial_F = self._partial(steps, count, np.clip(times - self.grid.breakpoints[pieces], 0.0, None))
-        rows = np.einsum("kd,kde->ke", directions, partial_E)
+        Phi, Gamma = self._partial(steps, count, np.clip(times - self.grid.breakpoints[pieces], 0.0, None))
+        rows = np.einsum("kd,kde->ke", directions, Phi)
         gains = np.zeros((times.size, self.grid.pieces, directions.shape[1]))
         age = pieces[:, None] - 1 - np.arange(last)
         gains[:, :last] = np.where(
-            (age >= 0)[..., None], np.einsum("kd,klde->kle", rows, self.ages[np.maximum(age, 0)]), 0.0
+            (age >= 0)[..., None], np.einsum("kd,klde->kle", rows, self.kernel[np.maximum(age, 0)]), 0.0
         )
-        gains[np.arange(times.size), pieces] = np.einsum("kd,kde->ke", directions, partial_F)
+        gains[np.arange(times.size), pieces] = np.einsum("kd,kde->ke", directions, Gamma)
         free = np.einsum("kd,kde->ke", rows, self._powers[pieces])
-        return free, gains, np.repeat(steps.B, times.size, axis=0), np.repeat(steps.W, times.size, axis=0)
+        return free, gains, np.repeat(steps.B, times.size, axis=0), np.repeat(steps.E, times.size, axis=0)
 
     def _partial(self, steps: Steps, which: np.ndarray, within: Array) -> tuple[Array, Array]:
         horizon = self.grid.breakpoints[-1]
         distinct, inverse = np.unique(np.stack([which, np.round(within / horizon, 15)]), axis=1, return_inverse=True)
-        E, F = self._transitions(steps.A[distinct[0].astype(int)], distinct[1] * horizon)
-        return E[inverse.reshape(-1)], F[inverse.reshape(-1)]
+        Phi, Gamma = self._transitions(steps.A[distinct[0].astype(int)], distinct[1] * horizon)
+        return Phi[inverse.reshape(-1)], Gamma[inverse.reshape(-1)]
 
     @property
     def uniform(self) -> bool:
@@ -190,12 +193,12 @@ class Propagator:
         return self.flows(self.grid.breakpoints)[0]
 
     @cached_property
-    def ages(self) -> Array:
-        """``e^{A i h} F(h)`` for ``i = 0, ..., L - 1``, ``(L, d, d)``: what a piece of age ``i`` still gives; for a
-        known system and equal pieces."""
+    def kernel(self) -> Array:
+        """``e^{A i h} Gamma(h)`` for ``i = 0, ..., L - 1``, ``(L, d, d)``: what a piece of age ``i`` still gives; for a
+        known system and equal pieces, whose response is a convolution (a Toeplitz matrix) with this kernel."""
         steps = self.steps(np.zeros((1, 0)))
         powers = np.empty((self.grid.pieces, *steps.A.shape[1:]))
-        powers[0] = steps.F[0, 0]
+        powers[0] = steps.Gamma[0, 0]
         done = 1
         while done < powers.shape[0]:  # doubling: e^{A (done + i) h} = e^{A done h} e^{A i h}
             count = min(done, powers.shape[0] - done)
@@ -207,12 +210,6 @@ class Propagator:
     def length_of(self, piece: int) -> int:
         """Which of the distinct lengths, in the order of `Steps`, a piece has."""
         return int(self._which[piece])
-
-    def _whole(self, steps: Steps, piece: int, which: np.ndarray) -> tuple[Array, Array]:
-        length = self._which[piece]
-        if steps.E.shape[0] == 1:
-            return steps.E[0, length], steps.F[0, length]
-        return steps.E[which, length], steps.F[which, length]
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,7 +223,7 @@ class Response:
     system: LinearSystem
     grid: TimeGrid
     initial_state: Array
-    propagate: Propagate | None = None
+    propagate: Transitions | None = None
     shared: Propagator | None = field(default=None, repr=False)
 
     @cached_property
@@ -259,9 +256,9 @@ class Response:
         return self.propagator.uniform
 
     @property
-    def ages(self) -> Array:
-        """`Propagator.ages`."""
-        return self.propagator.ages
+    def kernel(self) -> Array:
+        """`Propagator.kernel`."""
+        return self.propagator.kernel
 
     def length_of(self, piece: int) -> int:
         """`Propagator.length_of`."""
@@ -279,32 +276,20 @@ class Response:
         if disturbance is not None:
             drive = drive + np.einsum(
                 "vdi,vil->vld",
-                np.broadcast_to(steps.W, (count, *steps.W.shape[1:])),
+                np.broadcast_to(steps.E, (count, *steps.E.shape[1:])),
                 disturbance[:, :, self.grid.disturbance_piece],
             )
         path = np.empty((count, self.grid.pieces + 1, self.initial_state.size))
         path[:, 0] = self.initial_state
-        shared = steps.E.shape[0] == 1
+        shared = steps.Phi.shape[0] == 1
         for piece in range(self.grid.pieces):
             length = self.propagator.length_of(piece)
-            E, F = steps.E[:, length], steps.F[:, length]
+            Phi, Gamma = steps.Phi[:, length], steps.Gamma[:, length]
             if shared:
-                path[:, piece + 1] = path[:, piece] @ E[0].T + drive[:, piece] @ F[0].T
+                path[:, piece + 1] = path[:, piece] @ Phi[0].T + drive[:, piece] @ Gamma[0].T
             else:
-                path[:, piece + 1] = (E @ path[:, piece, :, None] + F @ drive[:, piece, :, None])[..., 0]
+                path[:, piece + 1] = (Phi @ path[:, piece, :, None] + Gamma @ drive[:, piece, :, None])[..., 0]
         return path
-
-
-def transitions(A: Array, durations: Array) -> tuple[Array, Array]:
-    """``e^{A r}`` and ``int_0^r e^{A s} ds`` for matrices ``(..., d, d)`` and durations ``(...,)``, broadcast
-    together."""
-    size = A.shape[-1]
-    shape = np.broadcast_shapes(A.shape[:-2], durations.shape)
-    block = np.zeros((*shape, 2 * size, 2 * size))
-    block[..., :size, :size] = A * durations[..., None, None]
-    block[..., :size, size:] = np.eye(size) * durations[..., None, None]
-    both = exponential(block)
-    return both[..., :size, :size], both[..., :size, size:]
 
 
 def _unique_rows(parameters: Array) -> tuple[Array, np.ndarray]:

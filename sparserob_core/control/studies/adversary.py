@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from sparserob_core.control.constraints.state import StateConstraint
+from sparserob_core.control.enclosures.matrix_exponential import transitions
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.functional import WorstCase
-from sparserob_core.control.response.response import transitions
 from sparserob_core.sip.convex_set import Array
 
 PARTS = 4  # equal parts of every piece on which a measurable worst case is looked for

@@ -7,8 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from sparserob_core.control.constraints.flat import INSIDE, MOST_INSIDE, SMOOTH
+from sparserob_core.control.enclosures.matrix_exponential import transitions
 from sparserob_core.control.response.parameters import ParameterIndex
-from sparserob_core.control.response.response import Response, TimeGrid, distinct_times, transitions
+from sparserob_core.control.response.response import Response, TimeGrid, distinct_times
 from sparserob_core.sip.convex_set import Array
 
 HELD = 2_000_000  # numbers of signals, or of transition matrices, that are held at once

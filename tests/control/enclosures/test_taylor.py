@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparserob_core.control.enclosures.algebra import lifted_matrix, lifted_transitions
+from sparserob_core.control.enclosures.matrix_exponential import transitions
 from sparserob_core.control.enclosures.taylor import TaylorModel, TaylorSpace
 from sparserob_core.control.problem.expression import parse_expression
-from sparserob_core.control.response.response import transitions
 from sparserob_core.errors import NotEnclosable
 
 EXPRESSIONS = [

@@ -252,3 +252,46 @@ def test_cells_outside_the_set_of_parameters_are_closed():
     bounds = constraint.enclosure(rng.normal(size=6), lower, upper).bounds
     assert np.isfinite(bounds[0])
     assert bounds[1] == -np.inf
+
+
+STIFF = {
+    "chemistry": [[-1000.0, 990.0, 0.0], [0.0, -50.0, 49.0], [0.0, 0.0, -1.0]],
+    "servo": [[0.0, 1.0], [-1e6, -1000.0]],
+    "long oscillation": [[0.0, 40.0], [-160.0, -8.0]],
+    "a defective fast mode": [[-500.0, 500.0, 0.0], [0.0, -500.0, 1.0], [0.0, 0.0, -1.0]],
+    "unstable": [[6.0, 1.0], [0.5, -200.0]],
+}
+
+
+@pytest.mark.parametrize("kind", ["piecewise_constant", "measurable", "none"])
+@pytest.mark.parametrize("name", sorted(STIFF))
+def test_stiff_long_and_unstable_systems_are_enclosed_on_pieces_of_any_length(name, kind):
+    rng = np.random.default_rng(5)
+    A = np.array(STIFF[name])
+    system = LinearSystem(A, rng.normal(size=(A.shape[0], 1)), rng.normal(size=(A.shape[0], 2)))
+    bound = None if kind == "none" else BOUNDS["box"]
+    of = "measurable" if kind == "measurable" else "piecewise_constant"
+    constraint = constraint_of(rng, system, uniform(3, HORIZON), bound, kind=of)
+    x = rng.normal(size=3)
+    lower, upper = constraint.cells
+    for _ in range(
+        2 if kind == "measurable" else 6
+    ):  # cells at the beginning of every piece, where fast modes move, and the rest of it
+        middle = lower + 0.2 * (upper - lower)
+        check(constraint, x, rng, middle, upper, count=3 if kind == "measurable" else 100)
+        upper = middle
+
+
+@pytest.mark.parametrize("name", ["chemistry", "servo", "a defective fast mode"])
+def test_the_bound_of_a_cell_does_not_depend_on_the_length_of_its_piece(name):
+    """Where the fast modes have died away, a cell of a tenth of a second is bounded as if there were no fast mode."""
+    A = np.array(STIFF[name])
+    system = LinearSystem(A, np.ones((A.shape[0], 1)), np.eye(A.shape[0])[:, :2])
+    x = {}
+    for pieces in (1, 30):
+        rng = np.random.default_rng(6)
+        constraint = constraint_of(rng, system, uniform(pieces, HORIZON), None)
+        found = constraint.enclosure(np.ones(pieces), np.array([[1.2]]), np.array([[1.3]]))
+        truth = sampled_maximum(constraint, np.ones(pieces), np.array([1.2]), np.array([1.3]), rng)
+        x[pieces] = found.bounds[0] - truth
+        assert x[pieces] <= 0.01

@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from sparserob_core.control.enclosures.matrix_exponential import exponential
+from sparserob_core.control.enclosures.matrix_exponential import exponential, transitions
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.disturbance_support import DisturbanceSupport
 from sparserob_core.control.response.lifted import lift
-from sparserob_core.control.response.response import Response, merge_grids, transitions
+from sparserob_core.control.response.response import Response, merge_grids
 from sparserob_core.sip.convex_set import Box
 from tests.support.plants import indicators, random_system, simulated, uniform, walsh, worst_case
 
@@ -142,14 +142,14 @@ def test_the_push_by_age_equals_the_push_by_adjoints(seed, pieces, nu):
     ends = rng.integers(-1, 2, (times.size, 3, nu)).astype(float)
     sigma = DisturbanceSupport(lifted, functionals.disturbance, rows)
     widths = rng.uniform(0, 1, times.size) * HORIZON / pieces
-    fast, steep, bent = sigma.at(times, ends), sigma.steepness(times), sigma.curvature(times, widths)
+    fast, steep, bent = sigma.at(times, ends), sigma.steepness(times), sigma.deviation(times, widths)
     with patch.object(DisturbanceSupport, "_repeats", new=False):
         sigma = DisturbanceSupport(lifted, functionals.disturbance, rows)
         slow = sigma.at(times, ends)
         assert np.allclose(fast[0], slow[0], rtol=1e-9, atol=1e-11)
         assert np.allclose(fast[1], slow[1], rtol=1e-9, atol=1e-11)
         assert np.allclose(steep, sigma.steepness(times), rtol=1e-9, atol=1e-11)
-        assert np.allclose(bent, sigma.curvature(times, widths), rtol=1e-9, atol=1e-11)
+        assert np.allclose(bent, sigma.deviation(times, widths), rtol=1e-9, atol=1e-11)
 
 
 @settings(max_examples=20, deadline=None)
@@ -174,7 +174,7 @@ def test_ages_are_powers_of_the_transition():
     A = response.system.matrices(np.zeros((1, 0)))[0][0]
     _, F = transitions(A[None], np.array([2 / 11]))
     for age in range(11):
-        assert np.allclose(response.ages[age], expm(A * age * 2 / 11) @ F[0], rtol=1e-11, atol=1e-12)
+        assert np.allclose(response.kernel[age], expm(A * age * 2 / 11) @ F[0], rtol=1e-11, atol=1e-12)
 
 
 @pytest.mark.parametrize("pieces", [7, 999, 3001])

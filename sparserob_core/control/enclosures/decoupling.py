@@ -1,0 +1,231 @@
+"""Coordinates in which the modes of a matrix do not disturb each other, and the rounding of the way there.
+
+``x = T z`` brings ``A`` to ``D + R``: ``D`` is block diagonal, one *group* for every cluster of eigenvalues and
+quasi-triangular within a group (Bavely and Stewart 1979; Golub and Van Loan 2013, 7.6.3), and ``R`` is rounding, which
+is bounded and not dropped. The 1 by 1 and 2 by 2 *blocks* of ``D`` are real eigenvalues and normal rotations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from sparserob_core.control.enclosures.matrix_exponential import transitions
+from sparserob_core.sip.convex_set import Array
+
+WELL_CONDITIONED = 1e3
+EPSILON = float(np.finfo(float).eps)
+SEPARATED = (1e-6, 1e-4, 1e-2, 0.1, 0.5)  # of the largest eigenvalue: closer ones are tried in one group
+SWEEPS = 16  # of balancing
+
+
+@dataclass(frozen=True, eq=False)
+class Decoupling:
+    """``transform`` is ``T (d, d)``, ``inverse`` its inverse ``V`` as computed, ``defect (d, d)`` a bound of
+    ``|T^-1 - V|`` relative to it: ``|T^-1 y - V y| <= defect |V y|``.
+
+    ``starts (q,)``: where the blocks begin; ``groups (g,)``: where the groups begin (each a union of blocks).
+    """
+
+    transform: Array
+    inverse: Array
+    defect: Array
+    starts: np.ndarray
+    groups: np.ndarray
+
+    def normal_form(self, moved: Array) -> Array:
+        """``D (d, d)``: what ``T^-1 A T`` would be without rounding, from ``moved``, which it is with it.
+
+        Entries outside the groups and below the diagonal blocks are 0, and 2 by 2 blocks are ``[[a, b], [-b, a]]``.
+        """
+        if self.is_identity:
+            return moved.copy()
+        d = self.transform.shape[0]
+        block = np.searchsorted(self.starts, np.arange(d), side="right")
+        group = np.searchsorted(self.groups, np.arange(d), side="right")
+        D = np.where((group[:, None] == group) & (block[:, None] <= block), moved, 0.0)
+        for i in np.flatnonzero(np.diff(np.append(self.starts, d)) == 2):
+            at = self.starts[i]
+            rate, turn = (D[at, at] + D[at + 1, at + 1]) / 2, (D[at, at + 1] - D[at + 1, at]) / 2
+            D[at : at + 2, at : at + 2] = [[rate, turn], [-turn, rate]]
+        return D
+
+    def vector(self, columns: Array) -> tuple[Array, Array]:
+        """``V b`` for columns ``b (..., d, e)``, and a bound of ``|T^-1 b - V b|``, entry by entry."""
+        if self.is_identity:
+            return columns, np.zeros(columns.shape)
+        size = rounding(columns.shape[-2]) * (np.abs(self.inverse) @ np.abs(columns))
+        moved = self.inverse @ columns
+        return moved, size + self.defect @ (np.abs(moved) + size)
+
+    def matrix(self, A: Array) -> tuple[Array, Array]:
+        """``V A T`` for matrices ``A (..., d, d)``, and a bound of ``|T^-1 A T - V A T|``, entry by entry."""
+        if self.is_identity:
+            return A, np.zeros(A.shape)
+        size = rounding(2 * A.shape[-1]) * (np.abs(self.inverse) @ np.abs(A) @ np.abs(self.transform))
+        moved = self.inverse @ A @ self.transform
+        return moved, size + self.defect @ (np.abs(moved) + size)
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether nothing is transformed, and so nothing rounded."""
+        return not self.defect.any()
+
+
+def rounding(terms: int) -> float:
+    """``gamma_n`` with room for the few operations around a product (Higham 2002, section 3.1): the relative error of
+    a sum of ``n`` products is at most this, in the sum of their absolute values."""
+    return (terms + 4) * EPSILON
+
+
+def decoupled(A: Array) -> Decoupling:
+    """Coordinates for ``A (d, d)``: its modes where they are well conditioned, else clusters of them, at worst the
+    Schur form of all (whose transform is orthogonal after balancing)."""
+    d = A.shape[0]
+    if d == 1 or not np.isfinite(A).all():
+        return identity(d)
+    scale = _balance(A)
+    balanced = A * scale / scale[:, None]
+    for found in _candidates(balanced):
+        checked = _checked(scale[:, None] * found[0], *found[1:])
+        if checked is not None:
+            return checked
+    return identity(d)
+
+
+def identity(d: int) -> Decoupling:
+    """No change of coordinates, and every state a block of its own."""
+    return Decoupling(np.eye(d), np.eye(d), np.zeros((d, d)), np.arange(d), np.zeros(1, dtype=int))
+
+
+def _checked(T: Array, starts: np.ndarray, groups: np.ndarray) -> Decoupling | None:
+    """The decoupling with a bound of what is wrong with the inverse; ``None`` where it is no inverse."""
+    try:
+        V = np.asarray(np.linalg.inv(T), dtype=float)
+    except np.linalg.LinAlgError:
+        return None
+    d = T.shape[0]
+    residual = np.abs(V @ T - np.eye(d)) + rounding(d) * (np.abs(V) @ np.abs(T))
+    size = float(residual.sum(axis=1).max())
+    if not size < 0.5:
+        return None
+    # T^-1 = (I + S)^-1 V with |S| <= residual, and (I + S)^-1 - I is at most residual + residual^2 + ...
+    defect = residual + residual @ residual + size**3 / (1.0 - size)
+    return Decoupling(T, V, defect, starts, groups)
+
+
+def _candidates(A: Array) -> Iterator[tuple[Array, np.ndarray, np.ndarray]]:
+    """Transforms of a balanced matrix with the starts of their blocks and groups, the finest first."""
+    values, vectors = np.linalg.eig(A)
+    columns: list[Array] = []
+    starts: list[int] = []
+    for i in np.argsort(-values.real, kind="stable"):
+        if values[i].imag < 0:
+            continue
+        starts.append(len(columns))
+        parts = (vectors[:, i].real,) if values[i].imag == 0 else (vectors[:, i].real, vectors[:, i].imag)
+        columns += [part / np.linalg.norm(vectors[:, i]) for part in parts]
+    modal = np.stack(columns, axis=1)
+    if modal.shape[0] == modal.shape[1] and np.linalg.cond(modal) < WELL_CONDITIONED:
+        yield modal, np.array(starts), np.array(starts)
+    for closeness in SEPARATED:
+        clusters = _clusters(values, closeness * np.abs(values).max())
+        if len(clusters) == 1:
+            break
+        found = _grouped(A, values, clusters)
+        if found is not None and np.linalg.cond(found[0]) < WELL_CONDITIONED:
+            yield found
+    found = _grouped(A, values, [values])
+    if found is not None:
+        yield found
+
+
+def _clusters(values: np.ndarray, distance: float) -> list[np.ndarray]:
+    """Eigenvalues that are within ``distance`` of each other, in chains, conjugates always together."""
+    upper = np.where(values.imag < 0, values.conj(), values)
+    linked = np.abs(upper[:, None] - upper) <= distance
+    for _ in range(values.size):
+        linked = linked @ linked
+    labels = linked.argmax(axis=1)
+    return [values[labels == label] for label in np.unique(labels)]
+
+
+def _grouped(A: Array, values: np.ndarray, clusters: list[np.ndarray]) -> tuple[Array, np.ndarray, np.ndarray] | None:
+    """Orthonormal bases of the invariant subspaces of the clusters, side by side, from one Schur form each."""
+    from scipy.linalg import schur
+
+    bases, starts, groups, done = [], [], [], 0
+    others = len(clusters) > 1
+    for cluster in clusters:
+
+        def chosen(real: float, imaginary: float = 0.0, cluster: np.ndarray = cluster) -> bool:
+            value = complex(real, imaginary)
+            return bool(np.abs(cluster - value).min() <= np.abs(np.setdiff1d(values, cluster) - value).min())
+
+        form, basis = schur(A, output="real", sort=chosen)[:2] if others else schur(A, output="real")
+        count = cluster.size
+        if others and count < A.shape[0] and abs(form[count, count - 1]) > 0:
+            return None
+        basis = basis[:, :count].copy()
+        places, at = [], 0
+        while at < count:
+            places.append(done + at)
+            pair = at + 1 < count and form[at + 1, at] != 0
+            if pair:  # a rotation: equal off-diagonal entries make it normal
+                basis[:, at + 1] *= np.sqrt(abs(form[at + 1, at] / form[at, at + 1]))
+            at += 2 if pair else 1
+        bases.append(basis)
+        starts += places
+        groups.append(done)
+        done += count
+    if done != A.shape[0]:
+        return None
+    return np.hstack(bases), np.array(starts), np.array(groups)
+
+
+def _balance(A: Array) -> Array:
+    """Powers of two ``s (d,)`` such that rows and columns of ``A s_j / s_i`` are equally large (Osborne 1960)."""
+    size = np.abs(A - np.diag(np.diag(A)))
+    scale = np.ones(A.shape[0])
+    for _ in range(SWEEPS):
+        moved = False
+        for i in range(A.shape[0]):
+            row, column = float(size[i].sum()), float(size[:, i].sum())
+            if row > 0 and column > 0:
+                factor = 2.0 ** round(0.5 * np.log2(row / column))
+                if factor != 1.0:
+                    scale[i] *= factor
+                    size[:, i] *= factor
+                    size[i] /= factor
+                    moved = True
+        if not moved:
+            break
+    return scale
+
+
+def decoupled_transitions(decoupling: Decoupling, D: Array, durations: Array) -> tuple[Array, Array]:
+    """``e^{D r}`` and its integral for durations ``(...)``, ``(..., d, d)`` each, group by group: a fast mode does not
+    cost the slow ones their digits, as squaring a whole matrix would."""
+    d = D.shape[-1]
+    flow, driven = np.zeros((*durations.shape, d, d)), np.zeros((*durations.shape, d, d))
+    ends = np.append(decoupling.groups[1:], d)
+    for start, stop in zip(decoupling.groups, ends, strict=True):
+        part = slice(start, stop)
+        single = ((decoupling.starts >= start) & (decoupling.starts < stop)).sum() == 1
+        found = (_mode if single else transitions)(D[part, part], durations)
+        flow[..., part, part], driven[..., part, part] = found
+    return flow, driven
+
+
+def _mode(D: Array, durations: Array) -> tuple[Array, Array]:
+    """A real eigenvalue ``a``, or a rotation ``[[a, b], [-b, a]]``, which is the complex number ``a + ib``."""
+    rotates = D.shape[0] == 2
+    rate = complex(D[0, 0], D[0, 1]) if rotates else D[0, 0]
+    flow = np.exp(rate * durations)
+    driven = np.expm1(rate * durations) / rate if rate != 0 else durations
+    if not rotates:
+        return flow[..., None, None], driven[..., None, None]
+    flow, driven = (np.stack([z.real, z.imag, -z.imag, z.real], axis=-1) for z in (flow, driven))
+    return flow.reshape(*durations.shape, 2, 2), driven.reshape(*durations.shape, 2, 2)
