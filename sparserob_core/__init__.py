@@ -60,7 +60,7 @@ if TYPE_CHECKING:
         SolverPlugin,
     )
     from sparserob_core.experiment.plugins.registry import load_registry
-    from sparserob_core.experiment.run.events import Observer, RunFinished, RunStarted
+    from sparserob_core.experiment.run.events import Observer, RunFinished, RunStarted, StudyProgress
     from sparserob_core.experiment.run.inspection import Inspection, RelaxedValue
     from sparserob_core.experiment.run.run import Outcome, run
     from sparserob_core.experiment.simulation.outcome import ConstraintShare, Simulation
@@ -158,6 +158,7 @@ __all__ = [
     "SolverError",
     "SolverPlugin",
     "SparseRobError",
+    "StudyProgress",
     "Tools",
     "Trace",
     "TrustRegion",
@@ -201,7 +202,7 @@ _MODULES = {
     "experiment.check.check": "Check check",
     "experiment.comparison.compare": "compare",
     "experiment.comparison.comparison": "Comparison",
-    "experiment.run.events": "Observer RunFinished RunStarted",
+    "experiment.run.events": "StudyProgress Observer RunFinished RunStarted",
     "experiment.figures.figure_data": "FigureData Wall",
     "experiment.initial_states.initial_states": "InitialStates initial_states",
     "experiment.run.inspection": "Inspection RelaxedValue",

@@ -94,7 +94,8 @@ def _result(data: Mapping[str, Any], summary: Mapping[str, Any]) -> Claim:
     if status == "infeasible":
         wanted |= {"cost": None, "upper_bound": None}
     else:
-        wanted |= {"cost": data.get("cost"), "upper_bound": None if status == "refuted" else data.get("cost")}
+        proven = status in ("certified", "verified")
+        wanted |= {"cost": data.get("cost"), "upper_bound": data.get("cost") if proven else None}
     different = [
         f"{name} is {summary.get(name)!r}, not {value!r}"
         for name, value in wanted.items()

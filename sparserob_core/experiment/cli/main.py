@@ -21,38 +21,52 @@ from sparserob_core.experiment.cli.commands.run import run
 from sparserob_core.experiment.cli.commands.schema import schema
 from sparserob_core.experiment.cli.commands.simulate import simulate
 from sparserob_core.experiment.cli.commands.watch import watch
+from sparserob_core.experiment.cli.shell.process import INTERRUPTED, OutputError, drop_output, listen, open_streams
+from sparserob_core.experiment.terminal.printing import printable
 
-INTERRUPTED = 130
 DEBUG = "SPARSEROB_DEBUG"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command and exit; an error of the input is one message, never a traceback (unless SPARSEROB_DEBUG=1)."""
+    """Run the command and exit; an error of the input is one message, never a traceback (unless SPARSEROB_DEBUG=1).
+
+    Ctrl-C and SIGTERM end it with what is known by then, and the status 130; a second one ends it at once.
+    """
+    listen()
+    open_streams()
     sys.exit(_status(arguments))
 
 
 def _status(arguments: Sequence[str] | None) -> int:
     try:
-        return int(commands.main(args=arguments, prog_name="sparserob", standalone_mode=False) or 0)
+        status = int(commands.main(args=arguments, prog_name="sparserob", standalone_mode=False) or 0)
+        sys.stdout.flush()
+        return status
     except click.Abort as error:
-        return _end("interrupted", error.__cause__ or error, INTERRUPTED)
+        cause = error.__cause__ or error
+        return _end(str(cause) or "interrupted from the keyboard", cause, INTERRUPTED)
     except click.ClickException as error:
         error.show()
         return 2
     except SparseRobError as error:
+        if isinstance(error, OutputError):
+            drop_output()
         return _end(str(error), error, error.exit_status)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        drop_output()
         return 0
+    except MemoryError as error:
+        return _end("out of memory; fewer pieces, cells or trajectories need less", error, 5)
     except Exception as error:  # noqa: BLE001  the last resort: a fault of the program is told in one line too
-        return _end(f"internal error: {type(error).__name__}: {error}; {DEBUG}=1 shows where", error, 5)
+        said = f"{type(error).__name__}: {error}".removesuffix(": ")
+        return _end(f"internal error: {said}; {DEBUG}=1 shows where", error, 5)
 
 
 def _end(message: str, error: BaseException, status: int) -> int:
     if os.environ.get(DEBUG):
         raise error
     for line in (f"error: {message}", *getattr(error, "__notes__", ())):
-        click.echo(line, err=True)
+        click.echo(printable(line), err=True)
     return status
 
 

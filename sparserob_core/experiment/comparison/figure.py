@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from io import BytesIO
 from math import ceil
 from pathlib import Path
 from textwrap import fill
@@ -12,7 +11,7 @@ import numpy as np
 
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.figures import style as look
-from sparserob_core.experiment.figures.style import KINDS, require_matplotlib, style
+from sparserob_core.experiment.figures.style import require_matplotlib, require_writable, style, write_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,20 +36,12 @@ def write_comparison(file: Path, comparison: Comparison) -> None:
     Raises `InputError` for another ending, when no run has a curve, when matplotlib is missing, and when the file
     cannot be written.
     """
-    kind = file.suffix.lower()
-    if kind not in KINDS:
-        raise InputError(f"{file}: expected a file that ends in {', '.join(KINDS)}, got {kind or 'no ending'}")
+    require_writable(file)
     if not any(curve.bound.size for curve in comparison.curves):
         raise InputError(f"{file}: nothing to draw; no run has a lower bound to show")
     require_matplotlib()
-    stream = BytesIO()
     with style():
-        draw_comparison(comparison).savefig(stream, format=kind[1:], **KINDS[kind])
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes(stream.getvalue())
-    except OSError as error:
-        raise InputError(f"{file}: cannot be written: {error.strerror}") from error
+        write_figure(file, draw_comparison(comparison))
 
 
 def draw_comparison(comparison: Comparison) -> Figure:

@@ -1,4 +1,4 @@
-"""The directory that a run leaves: complete files under their final names, or none."""
+"""The directory that a run leaves: complete files under their final names, or none. The one writer of files."""
 
 from __future__ import annotations
 
@@ -10,25 +10,48 @@ from contextlib import suppress
 from datetime import UTC, datetime
 from io import BytesIO
 from pathlib import Path
-from typing import Any, final
+from typing import Any, Self, final
 
 import numpy as np
 
 from sparserob_core.errors import InputError, SparseRobError
+from sparserob_core.experiment.directory.lock import NAME as LOCK
+from sparserob_core.experiment.directory.lock import Lock
 from sparserob_core.sip.events import RoundFinished
+
+
+def write_whole(file: Path, content: bytes) -> None:
+    """Write a file whole, under a temporary name first, which is then replaced; raises `SparseRobError` when the disk
+    refuses."""
+    temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        temporary.write_bytes(content)
+        temporary.replace(file)
+    except OSError as error:
+        with suppress(OSError):
+            temporary.unlink()
+        raise SparseRobError(f"{file}: cannot be written: {error.strerror}; nothing of it was kept") from error
 
 
 @final
 class RunDirectory:
-    """Writes files whole: each under a temporary name first, then renamed. Raises `SparseRobError` when the disk
-    refuses."""
+    """Writes the files of a directory, each whole. One that `create_directory` made is locked until it is left: it is a
+    context manager."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, lock: Lock | None = None) -> None:
+        self.path, self._lock = path, lock
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._lock is not None:
+            self._lock.release()
 
     def write_text(self, name: str, text: str) -> None:
         """Write a text file in UTF-8."""
-        self._write(name, text.encode())
+        write_whole(self.path / name, text.encode())
 
     def write_json(self, name: str, data: Mapping[str, Any]) -> None:
         """Write strict JSON: numbers that are not finite become null."""
@@ -38,39 +61,39 @@ class RunDirectory:
         """Write a compressed ``.npz`` file."""
         stream = BytesIO()
         np.savez_compressed(stream, **{key: np.asarray(value) for key, value in arrays.items()})  # type: ignore[arg-type]
-        self._write(name, stream.getvalue())
-
-    def _write(self, name: str, content: bytes) -> None:
-        temporary = self.path / f".{name}.{os.getpid()}.tmp"
-        try:
-            temporary.write_bytes(content)
-            temporary.replace(self.path / name)
-        except OSError as error:
-            with suppress(OSError):
-                temporary.unlink()
-            raise SparseRobError(
-                f"{self.path / name}: cannot be written: {error.strerror}; nothing of it was kept"
-            ) from error
+        write_whole(self.path / name, stream.getvalue())
 
 
 def create_directory(out: str | Path | None, name: str, digest: str) -> RunDirectory:
-    """Make the directory of a run: ``out``, which must be new or empty, else ``runs/<name>/<UTC stamp>-<digest>``.
+    """Make the directory of a run: ``out``, which must be new or empty, else ``runs/<name>/<UTC stamp>-<digest>``; lock
+    it until it is left.
 
-    Raises `InputError` when it is neither, or cannot be written to.
+    Raises `InputError` when it is neither, when another run is writing into it, or when it cannot be written to.
     """
     path = Path(out) if out is not None else _stamped(name, digest)
+    lock = Lock(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
-        if any(path.iterdir()):
-            raise InputError(f"{path}: expected a new or an empty directory, got one that holds files")
-        probe = path / f".probe.{os.getpid()}.tmp"
-        probe.touch()
-        probe.unlink()
+        _require_empty(path, unless=lock.file)
+        lock.acquire()
+        try:
+            _require_empty(path)
+        except InputError:
+            lock.release()
+            raise
     except (FileExistsError, NotADirectoryError) as error:
         raise InputError(f"{path}: expected a directory, got a file") from error
     except OSError as error:
         raise InputError(f"{path}: cannot be written to: {error.strerror}") from error
-    return RunDirectory(path)
+    return RunDirectory(path, lock)
+
+
+def _require_empty(path: Path, unless: Path | None = None) -> None:
+    """Raise `InputError` when there are files but those of a lock, unless it has a lock, whose owner is to be named."""
+    if unless is not None and unless.exists():
+        return
+    if any(not file.name.startswith(LOCK) for file in path.iterdir()):
+        raise InputError(f"{path}: expected a new or an empty directory, got one that holds files")
 
 
 def _stamped(name: str, digest: str) -> Path:

@@ -16,6 +16,8 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.program import SemiInfiniteProgram, WorstConstraint
 from sparserob_core.sip.result import Result
 
+PROVEN = ("certified", "verified")
+"""Statuses with an upper bound: what is not proven of the constraints is no bound, whatever the search suggests."""
 PACKAGES = ("sparserob", "numpy", "scipy", "piqp", "proxsuite", "clarabel")
 
 
@@ -31,8 +33,8 @@ def summary_of(result: Result, control: Array | None, dictionary: Dictionary | N
         "value": result.value,
         "epsilon": result.epsilon,
         "lower_bound": result.lower_bound,
-        "upper_bound": result.upper_bound,
-        "gap": result.gap,
+        "upper_bound": result.upper_bound if result.status in PROVEN else None,
+        "gap": result.gap if result.status in PROVEN else None,
         "worst": _witness(result.worst),
         "sparsity": acting or {"active_fraction": None, "switches": None},
         "counts": {

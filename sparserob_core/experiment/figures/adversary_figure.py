@@ -12,7 +12,7 @@ import numpy as np
 from sparserob_core.experiment.figures import style as look
 from sparserob_core.experiment.figures.figure_data import FigureData
 from sparserob_core.experiment.figures.run_figures import draw_legend, draw_time_axis, draw_walls
-from sparserob_core.experiment.figures.style import panels, require_writable, style, write_figure
+from sparserob_core.experiment.figures.style import panels, require_matplotlib, style, write_figure
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -23,12 +23,12 @@ COLOURS = (look.BLUE, look.GREEN, look.PURPLE, look.ORANGE, look.INK)  # vermill
 DASHES: tuple[Any, ...] = ("solid", (0, (5, 2)), (0, (1.5, 1.5)))
 
 
-def write_adversary(file: Path, arrays: Mapping[str, Array], data: FigureData) -> None:
-    """Draw the contents of ``adversary.npz`` into a file (.png, .pdf, .svg); raises `InputError` when it cannot be
-    written."""
-    require_writable(file)
+def write_adversary(file: Path, arrays: Mapping[str, Array], data: FigureData) -> list[Path]:
+    """Draw the contents of ``adversary.npz`` into a file (.png, .pdf, .svg), or with another ending into two (see
+    `write_figure`); raises `InputError` when they cannot be written, and without matplotlib."""
+    require_matplotlib()
     with style():
-        write_figure(file, draw_adversary(arrays, data))
+        return write_figure(file, draw_adversary(arrays, data))
 
 
 def draw_adversary(arrays: Mapping[str, Array], data: FigureData) -> Figure:

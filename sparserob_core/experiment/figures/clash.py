@@ -91,7 +91,7 @@ def draw_clash(experiment: Experiment, result: Result, directory: Path) -> list[
         figure.legend(
             entries.values(), entries.keys(), loc="outside lower center", ncols=2, columnspacing=1.6, handlelength=1.6
         )
-        return look.save(figure, directory / "figures", "clash")
+        return look.write_figure(directory / "figures" / "clash", figure)
 
 
 def clash_strips(program: SemiInfiniteProgram, result: Result) -> list[Strip]:

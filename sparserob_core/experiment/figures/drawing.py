@@ -44,9 +44,8 @@ def draw_experiment(
 
     data = figure_data(experiment, theta, active_times, history, cost)
     files = write_figures(directory / "figures", data)
-    for kind in ("pdf", "png") if worst else ():
-        files.append(directory / "figures" / f"adversary.{kind}")
-        write_adversary(files[-1], worst, data)
+    if worst:
+        files += write_adversary(directory / "figures" / "adversary", worst, data)
     return files
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from sparserob_core.experiment.figures import style as look
 from sparserob_core.experiment.figures.figure_data import FigureData, Wall
-from sparserob_core.experiment.figures.style import panels, require_matplotlib, save, style
+from sparserob_core.experiment.figures.style import panels, require_matplotlib, style, write_figure
 from sparserob_core.sip.result import relative_gap
 
 if TYPE_CHECKING:
@@ -28,9 +28,10 @@ def write_figures(directory: Path, data: FigureData) -> list[Path]:
     """
     require_matplotlib()
     with style():
-        files = save(draw_control(data), directory, "control") + save(draw_states(data), directory, "states")
+        files = write_figure(directory / "control", draw_control(data))
+        files += write_figure(directory / "states", draw_states(data))
         if data.history:
-            files += save(draw_convergence(data), directory, "convergence")
+            files += write_figure(directory / "convergence", draw_convergence(data))
     return files
 
 

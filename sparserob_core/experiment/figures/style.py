@@ -8,7 +8,8 @@ from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sparserob_core.errors import InputError
+from sparserob_core.errors import InputError, SparseRobError
+from sparserob_core.experiment.directory.artefacts import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -71,46 +72,47 @@ def panels(rows: int, height: float, *, extra: float = 0.0) -> tuple[Figure, lis
     return figure, list(axes)
 
 
-def save(figure: Figure, directory: Path, name: str) -> list[Path]:
-    """Write ``name.pdf`` (vector) and ``name.png`` (200 dots per inch); the same figure gives the same bytes."""
+def write_figure(file: Path, figure: Figure) -> list[Path]:
+    """Write a figure, each file whole: into ``file`` when its ending is a kind of figure (.png, .pdf, .svg), else into
+    ``file.pdf`` (vector) and ``file.png`` (200 dots per inch). Returns the files; the same figure gives the same bytes.
+
+    Raises `InputError` when one cannot be written.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     FigureCanvasAgg(figure)
-    directory.mkdir(parents=True, exist_ok=True)
-    files = [directory / f"{name}.pdf", directory / f"{name}.png"]
-    figure.savefig(files[0], metadata={"CreationDate": None, "Creator": None, "Producer": None})
-    figure.savefig(files[1], dpi=200, metadata={"Software": None})
+    named = file.suffix.lower() in KINDS
+    files = [file] if named else [file.with_name(f"{file.name}{kind}") for kind in (".pdf", ".png")]
+    for one in files:
+        stream, kind = BytesIO(), one.suffix.lower()
+        figure.savefig(stream, format=kind[1:], **KINDS[kind])
+        try:
+            write_whole(one, stream.getvalue())
+        except SparseRobError as error:
+            raise InputError(str(error)) from error
     return files
 
 
 def require_writable(file: Path) -> None:
-    """Raise `InputError` unless the ending of the file is a kind of figure, its folder can be written to, and
-    matplotlib is there."""
+    """Raise `InputError` unless the ending of the file is a kind of figure and its folder can be written to."""
     if file.suffix.lower() not in KINDS:
         raise InputError(f"{file}: expected a file that ends in {', '.join(KINDS)}, got {file.suffix or 'no ending'}")
     folder = next(parent for parent in file.absolute().parents if parent.exists())
     if file.is_dir() or not folder.is_dir() or not os.access(folder, os.W_OK):
         raise InputError(f"{file}: cannot be written there; expected a file in a folder that can be written to")
-    require_matplotlib()
 
 
-def write_figure(file: Path, figure: Figure) -> None:
-    """Write a figure whole into a file whose ending is its kind; raises `InputError` when it cannot be written."""
-    stream, kind = BytesIO(), file.suffix.lower()
-    figure.savefig(stream, format=kind[1:], **KINDS[kind])
-    temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_bytes(stream.getvalue())
-        temporary.replace(file)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise InputError(f"{file}: cannot be written: {error.strerror}") from error
+def missing_matplotlib() -> str:
+    """What is to be said where matplotlib is missing, with the way to install it; empty where it is there.
+
+    A figure is an extra: commands say this beside their result, whose exit status is theirs."""
+    from importlib.util import find_spec
+
+    there = find_spec("matplotlib") is not None
+    return "" if there else "no figure: matplotlib is not installed; `pip install 'sparserob[figures]'` brings it"
 
 
 def require_matplotlib() -> None:
     """Raise `InputError` with the way to install it when matplotlib is missing."""
-    from importlib.util import find_spec
-
-    if find_spec("matplotlib") is None:
-        raise InputError("figures: matplotlib is not installed; `pip install sparserob[figures]` brings it")
+    if missing := missing_matplotlib():
+        raise InputError(missing)

@@ -3,7 +3,6 @@ colour."""
 
 from __future__ import annotations
 
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +10,7 @@ import numpy as np
 
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.figures import style as look
-from sparserob_core.experiment.figures.style import require_matplotlib, style
+from sparserob_core.experiment.figures.style import require_matplotlib, style, write_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,25 +29,13 @@ FLAT = 1e-6  # of its greatest extent, the least of a set that is drawn as one w
 
 
 def write_initial_states(file: Path, found: InitialStates) -> None:
-    """Draw into a file .png, whole; the same set gives the same bytes. Raises `InputError` when matplotlib is missing,
-    when there is nothing to draw, and when the file cannot be written."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
+    """Draw into a file (.png, .pdf, .svg), whole; the same set gives the same bytes. Raises `InputError` when
+    matplotlib is missing, when there is nothing to draw, and when the file cannot be written."""
     require_matplotlib()
     if not found.outer.shape[0]:
         raise InputError(f"{file}: nothing to draw; the set is empty")
-    stream = BytesIO()
     with style():
-        figure = draw_initial_states(found)
-        FigureCanvasAgg(figure)
-        figure.savefig(stream, format="png", dpi=200, metadata={"Software": None})
-    temporary = file.with_name(f".{file.name}.tmp")
-    try:
-        temporary.write_bytes(stream.getvalue())
-        temporary.replace(file)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise InputError(f"{file}: cannot be written: {error.strerror}") from error
+        write_figure(file, draw_initial_states(found))
 
 
 def draw_initial_states(found: InitialStates) -> Figure:

@@ -13,16 +13,16 @@ from sparserob_core.control.problem.problem import OptimalControlProblem, PathCo
 from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.studies.initial_states import InitialPlane, check_states
 from sparserob_core.control.transcription.transcribe import from_state
-from sparserob_core.errors import InputError
+from sparserob_core.errors import InputError, SparseRobError
 from sparserob_core.experiment.assemble import ControlExperiment, assemble, name_of, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import RunDirectory, create_directory
-from sparserob_core.experiment.figures.style import require_matplotlib
 from sparserob_core.experiment.initial_states.feasible_set import InitialStates
-from sparserob_core.experiment.initial_states.search import Search, Tell
+from sparserob_core.experiment.initial_states.search import Search
 from sparserob_core.experiment.initial_states.section import section
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.method import GAP_TOLERANCE
 
 __all__ = ["InitialStates", "initial_states"]
@@ -39,7 +39,7 @@ def initial_states(
     about: Sequence[float] | None = None,
     within: float | None = None,
     out: str | Path | None = None,
-    tell: Tell = lambda line: None,
+    notify: Notify = ignore,
 ) -> InitialStates:
     """The initial states from which an experiment is feasible: what ``sparserob initial-states CONFIG key=value ...``
     does.
@@ -48,14 +48,13 @@ def initial_states(
     or of ``about (d,)``. ``directions``: support functions asked for at most, at least 4. ``values``: costs are
     measured on a lattice of so many points each way, 0 for none. ``within``: only coordinates of at most this size are
     looked at; needed where the set is unbounded. ``out``: a new or empty directory for the config,
-    ``initial_states.json``, ``.npz`` and ``.png``. ``tell`` hears of progress. Raises `InputError` when an argument or
-    the config is at fault, and when the set is unbounded.
+    ``initial_states.json``, ``.npz`` and ``.png``. ``notify`` hears `StudyProgress`. An interrupt, once the
+    set is bounded, ends the search with what it has proven by then. Raises `InputError` when an argument or the config
+    is at fault, and when the set is unbounded.
     """
     _whole("directions", directions, 4)
     _whole("values", values, 0)
     limit = _limit(within)
-    if out is not None:
-        require_matplotlib()
     loaded = load_config(config, overrides)
     experiment = assemble(loaded)
     if not isinstance(experiment, ControlExperiment):
@@ -65,21 +64,20 @@ def initial_states(
         model = from_state(model, _about(about, model.problem))
     problem = model.problem
     pair = check_states(states, problem.system.states)
-    directory = None if out is None else create_directory(out, name_of(loaded), loaded.config.digest())
-    if directory is not None:
-        directory.write_text(
-            "config.yaml",
-            write_yaml(loaded.config.plain(), "The experiment whose feasible initial states were sought."),
-        )
     size = _far(problem) if limit is None else limit
     plane = InitialPlane(model, pair, np.zeros(2), np.full(2, size))
-    found = Search(plane, tools_of(loaded), _tolerance(loaded), tell, limit).states(
-        experiment.title, directions, values
-    )
-    found = replace(found, path=_path(problem, found))
-    if directory is not None:
-        _write(directory, found)
-    return found
+    search = Search(plane, tools_of(loaded), _tolerance(loaded), notify, limit)
+
+    def find() -> InitialStates:
+        found = search.states(experiment.title, directions, values)
+        return replace(found, path=_path(problem, found))
+
+    if out is None:
+        return find()
+    with create_directory(out, name_of(loaded), loaded.config.digest()) as directory:
+        heading = "The experiment whose feasible initial states were sought."
+        directory.write_text("config.yaml", write_yaml(loaded.config.plain(), heading))
+        return _written(directory, find())
 
 
 def _limit(within: object) -> float | None:
@@ -137,10 +135,15 @@ def _whole(name: str, value: object, least: int) -> None:
         raise InputError(f"{name}: expected a whole number of at least {least}, got {value!r}")
 
 
-def _write(directory: RunDirectory, found: InitialStates) -> None:
+def _written(directory: RunDirectory, found: InitialStates) -> InitialStates:
+    """The figure is an extra: where it cannot be drawn, the numbers are there all the same, with a remark."""
     from sparserob_core.experiment.initial_states.figure import write_initial_states
 
+    if found.outer.shape[0]:
+        try:
+            write_initial_states(directory.path / "initial_states.png", found)
+        except SparseRobError as error:
+            found = replace(found, remarks=(*found.remarks, str(error)))
     directory.write_json("initial_states.json", found.summary())
     directory.write_arrays("initial_states.npz", found.arrays())
-    if found.outer.shape[0]:
-        write_initial_states(directory.path / "initial_states.png", found)
+    return found

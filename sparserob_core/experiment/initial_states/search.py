@@ -4,10 +4,10 @@ inside."""
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import Any, TypeAlias, final
+from typing import Any, final
 
 import numpy as np
 
@@ -23,13 +23,14 @@ from sparserob_core.control.studies.polygon_approximation import (
 )
 from sparserob_core.errors import InputError, SolverError
 from sparserob_core.experiment.initial_states.feasible_set import InitialStates
+from sparserob_core.experiment.run.events import StudyProgress
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.events import Notify
 from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.result import Result
 
-Tell: TypeAlias = Callable[[str], None]
 ROOM = 1.1  # the box of coordinates, relative to what is proven to contain the set: its sides must not matter
 FRAMES = 4  # boxes at most, each fitted to the set by the last one
 SLIVER = 1e-9  # of the box in area: a set without interior
@@ -47,15 +48,19 @@ class Search:
     plane: InitialPlane
     tools: Tools
     tolerance: float
-    tell: Tell
+    notify: Notify
     within: float | None
     cuts: dict[tuple[float, ...], Sequence[Cut]] = field(default_factory=dict)
     controls: dict[bytes, Array] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
+    asked: list[Support] = field(default_factory=list)
+    interrupted: str = ""
     programs: int = 0
+    directions: int = 0
     started: float = field(default_factory=time.perf_counter)
 
     def states(self, title: str, directions: int, values: int) -> InitialStates:
+        self.directions = directions
         origin = np.asarray(self.plane.model.problem.initial_state, dtype=float)
         bare = InitialStates(
             title=title, states=self.plane.states, status="undecided", message="", origin=origin, limit=self.within
@@ -66,8 +71,12 @@ class Search:
             why = framed.message if framed.infeasible is None else framed.infeasible.sentence(amounts=False)
             message = f"no initial state of this plane, up to {limit:.4g} in size, is feasible: {why}"
             return self._finished(bare, status="infeasible", message=message)
-        self.tell(f"direction {len(framed)} of {directions}")
-        supports = sandwich(self._ask, framed, directions, 0.1 * CLOSED)
+        try:
+            self._tell("direction", len(framed), directions)
+            supports = sandwich(self._ask, framed, directions, 0.1 * CLOSED)
+        except KeyboardInterrupt as pressed:
+            self._interrupt(pressed)
+            supports = sorted([*framed, *self.asked], key=lambda one: float(np.arctan2(*one.direction[::-1])))
         inner = inner_polygon(supports)
         points, results = self._measured(inner, values)
         found = replace(
@@ -107,6 +116,8 @@ class Search:
         )
 
     def _finished(self, found: InitialStates, **changes: Any) -> InitialStates:
+        if self.interrupted:
+            changes["message"] = f"{changes['message']}; {self.interrupted}"
         return replace(
             found,
             remarks=tuple(self.remarks),
@@ -114,6 +125,13 @@ class Search:
             seconds=time.perf_counter() - self.started,
             **changes,
         )
+
+    def _tell(self, what: str, done: int, total: int) -> None:
+        self.notify(StudyProgress(text=f"{what} {done} of {total}", done=done, total=total))
+
+    def _interrupt(self, pressed: KeyboardInterrupt) -> None:
+        """Go on with what is known."""
+        self.interrupted = str(pressed) or "interrupted from the keyboard"
 
     def _framed(self) -> list[Support] | Result:
         """Fit the box of coordinates to the set; returns the supports along the axes, or the result that proves the set
@@ -152,7 +170,8 @@ class Search:
 
     def _ask(self, direction: Array) -> Support:
         support = self._support(direction, self._supported(direction))
-        self.tell(f"direction {len(self.cuts)}: {self.programs} relaxed programs")
+        self.asked.append(support)
+        self._tell("direction", len(self.asked) + len(AXES), self.directions)
         return support
 
     def _supported(self, direction: Array) -> Result:
@@ -180,10 +199,14 @@ class Search:
 
     def _measured(self, inner: Array, values: int) -> tuple[Array, list[Result]]:
         """Costs on a lattice within the inner polygon, and beside its vertices."""
-        points, kept, results = _lattice(inner, values), [], []
+        points, kept, results = _lattice(inner, 0 if self.interrupted else values), [], []
         for number, z in enumerate(points):
-            self.tell(f"cost {number + 1} of {len(points)}")
-            result = Exchange(tolerance=self.tolerance).solve(self.plane.at(z), self.tools)
+            try:
+                self._tell("cost", number + 1, len(points))
+                result = Exchange(tolerance=self.tolerance).solve(self.plane.at(z), self.tools)
+            except KeyboardInterrupt as pressed:
+                self._interrupt(pressed)
+                break
             self.programs += result.counts.get("relaxed_programs", 0)
             if result.status in PROVEN:
                 kept.append(z)

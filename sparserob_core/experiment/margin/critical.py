@@ -11,6 +11,8 @@ import numpy as np
 
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.margin.scaling import Scaling
+from sparserob_core.experiment.run.events import StudyProgress
+from sparserob_core.sip.events import Notify
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.program import SemiInfiniteProgram
@@ -33,14 +35,14 @@ class Critical:
 
 
 def critical_factor(
-    programs: ParametricProgram, scaling: Scaling, tools: Tools, width: float, tell: Callable[[str], None]
+    programs: ParametricProgram, scaling: Scaling, tools: Tools, width: float, notify: Notify
 ) -> Critical:
     """Find the critical factor to about ``width``, which is what ordinary runs then have to prove."""
     if scaling.affine:
         found = _by_one_program(programs, scaling, tools, width)
         if found.status != "unknown" or not scaling.nested:
             return found
-    return _by_slack(programs, scaling, tools, width, tell)
+    return _by_slack(programs, scaling, tools, width, notify)
 
 
 def _by_one_program(programs: ParametricProgram, scaling: Scaling, tools: Tools, width: float) -> Critical:
@@ -61,14 +63,13 @@ def _by_one_program(programs: ParametricProgram, scaling: Scaling, tools: Tools,
     )
 
 
-def _by_slack(
-    programs: ParametricProgram, scaling: Scaling, tools: Tools, width: float, tell: Callable[[str], None]
-) -> Critical:
+def _by_slack(programs: ParametricProgram, scaling: Scaling, tools: Tools, width: float, notify: Notify) -> Critical:
     """A bracket of the factor at which the least relaxation that leaves something feasible changes its sign."""
 
     def slack(factor: float) -> float:
         value = _slack(programs, factor, tools)
-        tell(f"{scaling.of} at {factor:.9g}: {'feasible' if value <= 0 else 'infeasible'}")
+        answer = "feasible" if value <= 0 else "infeasible"
+        notify(StudyProgress(text=f"{scaling.of} at {factor:.9g}: {answer}"))
         return value
 
     good, bad = (0.0, 1.0) if scaling.sense == "largest" else (scaling.highest, 0.0)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sparserob_core.errors import InputError
 from sparserob_core.experiment.figures import style as look
 from sparserob_core.experiment.margin.search import FEASIBLE, Margin
 from sparserob_core.sip.convex_set import Array
@@ -26,20 +24,13 @@ LABELS = {
 
 
 def write_margin_figure(file: Path, found: Margin) -> None:
-    """Draw the curve of a margin into a PNG file, 200 dots per inch, which is complete or not there.
+    """Draw the curve of a margin into a file (.png, .pdf, .svg), which is complete or not there.
 
     Raises `InputError` when matplotlib is missing, and when the file cannot be written.
     """
     look.require_matplotlib()
-    stream = BytesIO()
     with look.style():
-        draw_margin(found).savefig(stream, format="png", dpi=200, metadata={"Software": None})
-    unfinished = file.with_name(f".{file.name}.tmp")
-    try:
-        unfinished.write_bytes(stream.getvalue())
-        unfinished.replace(file)
-    except OSError as error:
-        raise InputError(f"{file}: cannot be written: {error.strerror}") from error
+        look.write_figure(file, draw_margin(found))
 
 
 def draw_margin(found: Margin) -> Figure:

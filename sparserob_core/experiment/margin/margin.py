@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -11,14 +10,15 @@ from typing import Any
 import numpy as np
 
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.errors import InputError
+from sparserob_core.errors import InputError, SparseRobError
 from sparserob_core.experiment.assemble import ControlExperiment, assemble, name_of, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.problems import LinearKeys
 from sparserob_core.experiment.config.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import RunDirectory, create_directory, finite
 from sparserob_core.experiment.margin.scaling import scaling
-from sparserob_core.experiment.margin.search import Margin, Point, Search, Tell
+from sparserob_core.experiment.margin.search import Margin, Point, Search
+from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.relaxed.parametric import ParametricProgram
 
@@ -34,7 +34,7 @@ def margin(
     curve: int = 0,
     out: str | Path | None = None,
     write: bool = False,
-    tell: Tell = lambda line: None,
+    notify: Notify = ignore,
 ) -> Margin:
     """The margin of an experiment: what ``sparserob margin CONFIG key=value ... --of OF`` does.
 
@@ -43,7 +43,8 @@ def margin(
     of a window, in the unit of time). ``tolerance``: how close the two sides are to be, relative to the factor, or to 1
     if that is larger (for a window to its end). ``curve``: the cost at so many factors on the feasible side, each by a
     run of its own. ``out``: a new or empty directory for ``margin.json`` and ``margin.png``; with ``write`` and none
-    given it is ``runs/NAME-margin/STAMP-HASH``. ``tell`` hears of progress. Raises `InputError` when an argument or the
+    given it is ``runs/NAME-margin/STAMP-HASH``. ``notify`` hears `StudyProgress`. An interrupt ends the search
+    with what it has proven by then, ``undecided``. Raises `InputError` when an argument or the
     config is at fault.
     """
     if not hasattr(tolerance, "__float__") or not 1e-9 <= tolerance <= 0.1:
@@ -51,10 +52,11 @@ def margin(
     if not hasattr(curve, "__index__") or curve < 0 or curve == 1:
         raise InputError(f"curve: expected a number of points, 0 for none or at least 2, got {curve!r}")
     loaded = load_config(config, overrides)
-    search = _search(loaded, str(of), float(tolerance), tell)
-    directory = None if out is None and not write else _directory(out, loaded, search.scaling.of)
-    found = search.margin(int(curve))
-    return found if directory is None else _written(directory, found)
+    search = _search(loaded, str(of), float(tolerance), notify)
+    if out is None and not write:
+        return search.margin(int(curve))
+    with _directory(out, loaded, search.scaling.of) as directory:
+        return _written(directory, search.margin(int(curve)))
 
 
 def summary_of_margin(found: Margin) -> dict[str, Any]:
@@ -85,7 +87,7 @@ def _between(lower: float, upper: float) -> str:
     return f"{lower:.9g} to {upper:.9g}" if lower != upper else f"{lower:.9g}"
 
 
-def _search(loaded: Loaded, of: str, tolerance: float, tell: Tell) -> Search:
+def _search(loaded: Loaded, of: str, tolerance: float, notify: Notify) -> Search:
     from sparserob_core.control.transcription.transcribe import transcribe
 
     experiment = assemble(loaded)
@@ -97,7 +99,7 @@ def _search(loaded: Loaded, of: str, tolerance: float, tell: Tell) -> Search:
     chosen = scaling(problem, of, *_positions(loaded, problem))
     programs = ParametricProgram(lambda factor: transcribe(chosen.at(factor), control=control, disturbance=disturbance))
     width = tolerance * (chosen.highest if of.endswith(".from") else 1.0)
-    return Search(experiment.title, programs, chosen, _method(loaded), tools_of(loaded), width, tell)
+    return Search(experiment.title, programs, chosen, _method(loaded), tools_of(loaded), width, notify)
 
 
 def _positions(loaded: Loaded, problem: OptimalControlProblem) -> tuple[list[list[int]], list[list[int]]]:
@@ -142,11 +144,13 @@ def _directory(out: str | Path | None, loaded: Loaded, of: str) -> RunDirectory:
 
 
 def _written(directory: RunDirectory, found: Margin) -> Margin:
-    """The figure is an extra: where it cannot be drawn, the numbers are there all the same."""
-    directory.write_json("margin.json", summary_of_margin(found))
-    if found.curve:
+    """The figure is an extra: where it cannot be drawn, the numbers are there all the same, with a remark."""
+    if len(found.curve) > 1:
         from sparserob_core.experiment.margin.figure import write_margin_figure
 
-        with suppress(InputError):
+        try:
             write_margin_figure(directory.path / "margin.png", found)
+        except SparseRobError as error:
+            found = replace(found, remarks=(*found.remarks, str(error)))
+    directory.write_json("margin.json", summary_of_margin(found))
     return replace(found, directory=directory.path)

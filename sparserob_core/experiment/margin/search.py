@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, TypeAlias, final
 
@@ -13,12 +12,13 @@ import numpy as np
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.margin.critical import Critical, critical_factor
 from sparserob_core.experiment.margin.scaling import Scaling, Sense
+from sparserob_core.experiment.run.events import StudyProgress
+from sparserob_core.sip.events import Notify
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.relaxed.parametric import ParametricProgram
 from sparserob_core.sip.result import Status
 
-Tell: TypeAlias = Callable[[str], None]
 Answer: TypeAlias = Literal["certified", "unbounded", "infeasible", "undecided"]
 FEASIBLE: tuple[Status, ...] = ("certified", "verified")
 # how far from the critical factor a run is tried, in widths, until its answer is proven
@@ -42,6 +42,10 @@ class Point:
     message: str
     lower_bound: float
     upper_bound: float
+
+
+Sides: TypeAlias = tuple[Answer, str, Point | None, Point | None]
+"""An answer, its message, and the runs that prove the feasible side and the other one."""
 
 
 @final
@@ -71,6 +75,7 @@ class Margin:
     feasible: Point | None = None
     infeasible: Point | None = None
     curve: tuple[Point, ...] = ()
+    remarks: tuple[str, ...] = ()
     seconds: float = 0.0
     directory: Path | None = None
 
@@ -86,15 +91,24 @@ class Search:
     method: Exchange
     tools: Tools
     width: float
-    tell: Tell
+    notify: Notify
+    points: list[Point] = field(default_factory=list)
 
     def margin(self, count: int) -> Margin:
         """The margin, with a curve of ``count`` points."""
-        started = time.perf_counter()
-        self.tell(f"looking for the {self.scaling.sense} factor of {self.scaling.of}")
-        found = critical_factor(self.programs, self.scaling, self.tools, self.width, self.tell)
-        status, message, feasible, infeasible = self._sides(found)
-        curve = self._curve(feasible, status, count) if feasible is not None else ()
+        started, curve = time.perf_counter(), tuple[Point, ...]()
+        sides: Sides | None = None
+        try:
+            self._tell(f"looking for the {self.scaling.sense} factor of {self.scaling.of}")
+            found = critical_factor(self.programs, self.scaling, self.tools, self.width, self.notify)
+            sides = self._sides(found)
+            feasible = sides[2]
+            curve = self._curve(feasible, sides[0], count) if feasible is not None else ()
+        except KeyboardInterrupt as pressed:
+            said = str(pressed) or "interrupted from the keyboard"
+            sides, known = self._known(said, sides)
+            curve = known if count else ()
+        status, message, feasible, infeasible = sides
         inner, outer = feasible.factor if feasible else np.nan, infeasible.factor if infeasible else np.nan
         if status == "unbounded":
             outer = np.inf if self.scaling.sense == "largest" else 0.0
@@ -116,7 +130,21 @@ class Search:
             seconds=time.perf_counter() - started,
         )
 
-    def _sides(self, found: Critical) -> tuple[Answer, str, Point | None, Point | None]:
+    def _tell(self, text: str) -> None:
+        self.notify(StudyProgress(text=text))
+
+    def _known(self, said: str, sides: Sides | None) -> tuple[Sides, tuple[Point, ...]]:
+        """What an interrupted search knows: both sides where they were proven before, else the runs nearest to each
+        other that prove one side each; and every proven run on the feasible side, as a curve."""
+        proven = sorted((one for one in self.points if one.status in FEASIBLE), key=lambda one: one.factor)
+        if sides is not None:
+            return (sides[0], f"{sides[1]}; the curve was {said}", *sides[2:]), tuple(proven)
+        refused = sorted((one for one in self.points if one.status == "infeasible"), key=lambda one: one.factor)
+        last, first = (-1, 0) if self.scaling.sense == "largest" else (0, -1)
+        feasible, infeasible = proven[last] if proven else None, refused[first] if refused else None
+        return ("undecided", f"{said} after {len(self.points)} runs", feasible, infeasible), tuple(proven)
+
+    def _sides(self, found: Critical) -> Sides:
         largest = self.scaling.sense == "largest"
         if found.status == "unknown":
             return "undecided", f"no critical factor was found: {found.message}", None, None
@@ -142,7 +170,7 @@ class Search:
             )
         return "certified", f"beyond it: {bad.message}", good, bad
 
-    def _never(self, found: Critical) -> tuple[Answer, str, Point | None, Point | None]:
+    def _never(self, found: Critical) -> Sides:
         """Nothing is feasible: the run at the kindest factor says why."""
         kindest = {"largest": 0.0, "smallest": self.scaling.highest}[self.scaling.sense] if self.scaling.nested else 1.0
         refused = self.run(kindest)
@@ -171,10 +199,11 @@ class Search:
             result = self.method.solve(self.programs.program(factor), self.tools)
         except InputError as error:
             return Point(factor, self.scaling.amount(factor), "failed", str(error), -np.inf, np.inf)
-        self.tell(f"{self.scaling.of} at {factor:.9g}: {result.status}")
-        return Point(
-            factor, self.scaling.amount(factor), result.status, result.message, result.lower_bound, result.upper_bound
-        )
+        self._tell(f"{self.scaling.of} at {factor:.9g}: {result.status}")
+        amount = self.scaling.amount(factor)
+        point = Point(factor, amount, result.status, result.message, result.lower_bound, result.upper_bound)
+        self.points.append(point)
+        return point
 
     def _curve(self, feasible: Point, status: Answer, count: int) -> tuple[Point, ...]:
         """Runs from the feasible side of the critical factor to no uncertainty, or to a set twice as large."""

@@ -26,6 +26,7 @@ __all__ = [
     "RoundFinished",
     "RunFinished",
     "RunStarted",
+    "StudyProgress",
 ]
 
 logger = logging.getLogger("sparserob")
@@ -57,6 +58,16 @@ class RunFinished(Event):
     message: str
     seconds: float
     result: Result | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StudyProgress(Event):
+    """A study of many programs or trajectories goes on (a margin, a set of initial states, a simulation): in words, and
+    as ``done`` of ``total`` steps (0: unknown)."""
+
+    text: str
+    done: int = 0
+    total: int = 0
 
 
 class Observer(ABC):

@@ -10,7 +10,7 @@ from typing import Any, final
 import numpy as np
 
 from sparserob_core.control.problem.dictionary import Dictionary
-from sparserob_core.errors import InputError, SparseRobError
+from sparserob_core.errors import SparseRobError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment
 from sparserob_core.experiment.directory.adversary import FILE as ADVERSARY
 from sparserob_core.experiment.directory.adversary import adversaries
@@ -54,21 +54,43 @@ class Journal(Observer):
     def _dictionary(self) -> Dictionary | None:
         return self.experiment.control if isinstance(self.experiment, ControlExperiment) else None
 
-    def record_unfinished(self, message: str, seconds: float) -> None:
+    def known(self, said: str, seconds: float) -> Result | None:
+        """What is known of a run whose method was interrupted: the decision of the last round, undecided; ``None``
+        where no round told of one."""
+        last = next((entry for entry in reversed(self.rounds) if entry.decision is not None), None)
+        if last is None:
+            return None
+        multipliers = last.multipliers if len(last.multipliers) == len(last.imposed) else np.zeros(len(last.imposed))
+        return replace(
+            self._unfinished(said, seconds),
+            status="undecided",
+            message=f"{said} after round {last.round}; nothing is proven of its control",
+            decision=last.decision,
+            cost=last.cost,
+            indices=[replace(cut, multiplier=float(y)) for cut, y in zip(last.imposed, multipliers, strict=True)],
+        )
+
+    def record_unfinished(self, said: str, seconds: float) -> None:
         """Write how far a run got that ended early."""
-        last = self.rounds[-1] if self.rounds else None
-        result = Result(status="failed", message=message, history=tuple(self.rounds), seconds=seconds)
-        if last is not None:
-            result = replace(result, lower_bound=last.lower_bound, upper_bound=last.upper_bound, epsilon=last.epsilon)
         try:
-            self.record(result)
+            self.record(self._unfinished(said, seconds))
             self.directory.write_arrays("trace.npz", trace_columns(self.rounds))
         except SparseRobError:
             return  # the error that ended the run is the one to be told
 
-    def finish(self, result: Result, figures: bool) -> tuple[Array | None, dict[str, Any], Sequence[str]]:
-        """Write the outcome; returns the control ``(m, K)``, what ``result.json`` holds, and what could not be
-        drawn."""
+    def _unfinished(self, said: str, seconds: float) -> Result:
+        result = Result(status="failed", message=said, history=tuple(self.rounds), seconds=seconds)
+        if not self.rounds:
+            return result
+        last = self.rounds[-1]
+        counts = {"relaxed_programs": last.relaxed_programs, "active_indices": last.active_indices}
+        return replace(result, lower_bound=last.lower_bound, epsilon=last.epsilon, counts=counts)
+
+    def finish(
+        self, result: Result, figures: bool, certify: bool = True
+    ) -> tuple[Array | None, dict[str, Any], Sequence[str]]:
+        """Write the outcome, with a certificate where the multipliers of its lower bound are known (``certify``);
+        returns the control ``(m, K)``, what ``result.json`` holds, and what could not be drawn."""
         experiment, write = self.experiment, self.directory
         control, summary = self.record(result)
         write.write_arrays("solution.npz", arrays_of(result, experiment.program, self._dictionary, control))
@@ -78,7 +100,7 @@ class Journal(Observer):
         if kept:
             write.write_arrays("rounds.npz", kept)
         proof = certificate(experiment, result)
-        if proof is not None:
+        if proof is not None and certify:
             write.write_json("certificate.json", proof)
         if result.trace is not None:
             write.write_arrays("evaluations.npz", result.trace.arrays())
@@ -103,7 +125,7 @@ def _drawn(experiment: Experiment, result: Result, worst: Mapping[str, Array], d
             draw_experiment(
                 experiment, np.asarray(result.decision), active, result.history, directory, result.cost, worst
             )
-    except InputError as error:
+    except SparseRobError as error:
         return (str(error),)
     except Exception as error:  # noqa: BLE001  as said above
         return (f"the figures could not be drawn: {type(error).__name__}: {error}",)

@@ -82,8 +82,10 @@ def run(
 
     ``config`` is a file or a mapping, ``overrides`` a mapping such as ``{"solver.name": "clarabel"}`` or texts
     ``key=value``. ``observers`` watch beside those that the config names.
-    Raises `ConfigError` or another `InputError` before anything is solved. An error or an interrupt during the run
-    leaves a directory with the config, the rounds so far and the status ``failed``.
+    Raises `ConfigError` or another `InputError` before anything is solved. An interrupt ends the method with what it
+    knows by then: the outcome is that of the last round, ``undecided`` unless more was proven. An error, or an
+    interrupt before there was a decision, leaves a directory with the config, the rounds so far and the status
+    ``failed``.
     """
     loaded = load_config(config, overrides)
     experiment = assemble(loaded)
@@ -92,39 +94,49 @@ def run(
         [*_observers(loaded), *((type(observer).__name__, observer) for observer in observers)],
     )
     method: Method = build(loaded, "method", loaded.config.method)
-    directory = create_directory(out, name_of(loaded), loaded.config.digest())
-    journal = Journal(directory, experiment)
-    broadcast = Broadcast([*watching, ("journal", journal)])
-    ending, started = RunFinished(status="failed", message=UNFINISHED, seconds=0.0), time.perf_counter()
-    try:
-        directory.write_text("config.yaml", write_yaml(loaded.config.plain(), HEADING))
-        journal.record(Result(status="failed", message=UNFINISHED))
-        broadcast(
-            RunStarted(
-                title=experiment.title,
-                directory=directory.path,
-                problem=experiment.problem if isinstance(experiment, ControlExperiment) else None,
-                program=experiment.program,
-                quiet=quiet,
-                inspection=Inspection(loaded),
+    with create_directory(out, name_of(loaded), loaded.config.digest()) as directory:
+        journal = Journal(directory, experiment)
+        broadcast = Broadcast([("journal", journal), *watching])
+        ending, started = RunFinished(status="failed", message=UNFINISHED, seconds=0.0), time.perf_counter()
+        result: Result | None = None
+        told = True
+        try:
+            directory.write_text("config.yaml", write_yaml(loaded.config.plain(), HEADING))
+            journal.record(Result(status="failed", message=UNFINISHED))
+            broadcast(
+                RunStarted(
+                    title=experiment.title,
+                    directory=directory.path,
+                    problem=experiment.problem if isinstance(experiment, ControlExperiment) else None,
+                    program=experiment.program,
+                    quiet=quiet,
+                    inspection=Inspection(loaded),
+                )
             )
-        )
-        result: Result = method.solve(experiment.program, _notifying(tools, broadcast))
-        ending = RunFinished(status=result.status, message=result.message, seconds=result.seconds, result=result)
-        control, summary, remarks = journal.finish(result, figures)
-        return Outcome(result, directory.path, experiment, control, summary, remarks)
-    except BaseException as error:
-        said = (
-            "interrupted from the keyboard"
-            if isinstance(error, KeyboardInterrupt)
-            else f"{type(error).__name__}: {error}"
-        )
-        ending = RunFinished(status="failed", message=said, seconds=time.perf_counter() - started)
-        error.add_note(f"what was done until then is in {directory.path}")
-        journal.record_unfinished(said, ending.seconds)
-        raise
-    finally:
-        broadcast(ending)
+            try:
+                result = method.solve(experiment.program, _notifying(tools, broadcast))
+            except KeyboardInterrupt as pressed:  # a method that does not return what it knows
+                result, told = journal.known(_said(pressed), time.perf_counter() - started), False
+                if result is None:
+                    raise
+            ending = RunFinished(status=result.status, message=result.message, seconds=result.seconds, result=result)
+            control, summary, remarks = journal.finish(result, figures=figures and told, certify=told)
+            return Outcome(result, directory.path, experiment, control, summary, remarks)
+        except BaseException as error:
+            error.add_note(f"what was done until then is in {directory.path}")
+            if result is None:
+                ending = RunFinished(status="failed", message=_said(error), seconds=time.perf_counter() - started)
+                journal.record_unfinished(ending.message, ending.seconds)
+            raise
+        finally:
+            broadcast(ending)
+
+
+def _said(error: BaseException) -> str:
+    """What ended a run that its method did not end; an interrupt says what it was, unless it is from the keyboard."""
+    if isinstance(error, KeyboardInterrupt):
+        return str(error) or "interrupted from the keyboard"
+    return f"{type(error).__name__}: {error}".removesuffix(": ")
 
 
 def _notifying(tools: Tools, broadcast: Broadcast) -> Tools:

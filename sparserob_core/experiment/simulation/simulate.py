@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -18,6 +18,7 @@ from sparserob_core.experiment.directory.adversary import adversaries, attained,
 from sparserob_core.experiment.directory.artefacts import RunDirectory
 from sparserob_core.experiment.directory.finished import FinishedRun, read_finished
 from sparserob_core.experiment.plugins.messages import nearest
+from sparserob_core.experiment.run.events import StudyProgress
 from sparserob_core.experiment.simulation.census import Census
 from sparserob_core.experiment.simulation.outcome import (
     ADVERSARY,
@@ -28,6 +29,7 @@ from sparserob_core.experiment.simulation.outcome import (
     clopper_pearson,
 )
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.events import Notify, ignore
 
 if TYPE_CHECKING:
     from sparserob_core.experiment.run.run import Outcome
@@ -44,23 +46,24 @@ def simulate(
     *,
     out: str | Path | None = None,
     plugins: Iterable[str | Path] = (),
-    tell: Callable[[str], None] | None = None,
+    notify: Notify = ignore,
 ) -> Simulation:
     """Propagate sampled trajectories of a finished run exactly: what ``sparserob simulate RUN`` does.
 
     ``law`` is one of ``iid``, ``vertices``, ``slow``, ``neighbours``, or ``adversary``, which replays the worst case of
     every constraint and takes no number of ``trajectories`` (10 000 otherwise). The result is written to
-    ``simulation-<law>.json`` in the run's directory, and drawn into the file ``out`` when given. ``tell`` receives a
-    line about the progress now and then. ``plugins``: files that offer what the run was made with; the directory itself
+    ``simulation-<law>.json`` in the run's directory, and drawn into the file ``out`` when given. ``notify`` hears
+    `StudyProgress`. ``plugins``: files that offer what the run was made with; the directory itself
     is data, and no plugin that it names is loaded. Raises `InputError` for a directory that is no finished run with a
     control, or another argument at fault, before anything is written.
     """
-    from sparserob_core.experiment.figures.style import require_writable
+    from sparserob_core.experiment.figures.style import require_matplotlib, require_writable
     from sparserob_core.experiment.simulation.figure import write_simulation
 
     count = _checked(law, trajectories, seed)
     if out is not None:
         require_writable(Path(out))
+        require_matplotlib()
     finished = read_finished(_directory(run), plugins, getattr(run, "experiment", None))
     model = finished.experiment.transcription
     if not model.constraints:
@@ -76,7 +79,7 @@ def simulate(
         replayed = {**replayed, "state_times": moments, "states": states}
         found = _replayed(finished, replayed, started)
     else:
-        found = _sampled(finished, worst, cast(LawName, law), count, seed, tell or (lambda line: None), started)
+        found = _sampled(finished, worst, cast(LawName, law), count, seed, notify, started)
     RunDirectory(finished.directory).write_json(f"simulation-{law}.json", found.summary())
     if out is not None:
         write_simulation(Path(out), found, finished, replayed)
@@ -89,7 +92,7 @@ def _sampled(
     law: LawName,
     count: int,
     seed: int,
-    tell: Callable[[str], None],
+    notify: Notify,
     started: float,
 ) -> Simulation:
     model = finished.experiment.transcription
@@ -117,7 +120,7 @@ def _sampled(
                 one.meet(position, state)
         out += int(np.any([one.close() for one in counts], axis=0).sum())
         done += size
-        tell(f"{done} of {count} trajectories")
+        notify(StudyProgress(text=f"{done} of {count} trajectories", done=done, total=count))
     shares = _shares(counts, worst, count)
     return Simulation(
         title=finished.experiment.title,

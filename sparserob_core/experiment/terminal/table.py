@@ -6,13 +6,16 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from sparserob_core.experiment.terminal.printing import printable
+
+KNOWN = {"lower bound", "upper bound", "relative gap"}
+"""What is told even where it is unknown."""
+
 
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Print rows under column names; empty ``columns`` make a list of keys and values."""
-    if sys.stdout.isatty():
-        _draw(title, columns, rows)
-    else:
-        _write(title, columns, rows)
+    show = _draw if sys.stdout.isatty() else _write
+    show(printable(title), columns, [[printable(cell).replace("\n", " ") for cell in row] for row in rows])
 
 
 def _draw(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
@@ -56,9 +59,9 @@ def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("rounds", str(counts["rounds"])),
         ("share of time active", _number(sparsity["active_fraction"], ".1%")),
         ("switches", _number(sparsity["switches"], "d")),
-        ("seconds", _number(summary["seconds"], ".3f")),
+        ("seconds", f"{_number(summary['seconds'], '.3f')} of the method, which solves and proves"),
     ]
-    return [(name, value) for name, value in rows if value != "unknown" or name in {"lower bound", "upper bound"}]
+    return [(name, value) for name, value in rows if value != "unknown" or name in KNOWN]
 
 
 def _number(value: Any, form: str) -> str:

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -89,36 +86,6 @@ def test_a_fault_of_the_program_is_status_5_and_says_what_was_saved(config: Path
     assert "internal error: RuntimeError: the stub fell over" in done.stderr
     assert "what was done until then is in out" in done.stderr
     assert "Traceback" not in done.stderr
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_run_leaves_a_readable_directory(config: Path, tmp_path: Path, number: int) -> None:
-    out = tmp_path / "out"
-    call = [
-        sys.executable,
-        "-m",
-        "sparserob_core",
-        "run",
-        str(config),
-        "method.wait=0.2",
-        "method.rounds=500",
-        "--out",
-        str(out),
-    ]
-    process = subprocess.Popen(call, stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 60
-    while not (out / "result.json").exists() and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert json.loads((out / "result.json").read_text())["message"] == "the run has not finished"
-    time.sleep(0.5)
-    os.kill(process.pid, number)
-    _, said = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert said.strip().startswith("error: interrupted")
-    assert f"what was done until then is in {out}" in said
-    result = json.loads((out / "result.json").read_text())
-    assert (result["status"], result["message"]) == ("failed", "interrupted from the keyboard")
-    assert sorted(path.name for path in out.iterdir()) == ["config.yaml", "result.json", "trace.npz"]
 
 
 def test_plugins_are_listed_with_who_brings_them(command: Command) -> None:

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from sparserob_core.experiment.terminal.printing import printable
+
 
 @click.command()
 @click.argument("runs", metavar="RUN...", nargs=-1, required=True, type=click.Path(path_type=Path))
@@ -26,12 +28,16 @@ def compare(runs: tuple[Path, ...], out: Path) -> int:
     from sparserob_core.experiment.comparison.compare import compare as read_runs
     from sparserob_core.experiment.comparison.compare import comparison_remarks, comparison_table
     from sparserob_core.experiment.comparison.figure import write_comparison
+    from sparserob_core.experiment.figures.style import missing_matplotlib, require_writable
     from sparserob_core.experiment.terminal.table import print_table
 
+    require_writable(out)
     comparison = read_runs(runs)
     print_table(comparison.title or "Comparison", *comparison_table(comparison))
     for line in comparison_remarks(comparison):
-        click.echo(line)
-    write_comparison(out, comparison)
-    click.echo(f"written to {out}")
+        click.echo(printable(line))
+    missing = missing_matplotlib()
+    if not missing:
+        write_comparison(out, comparison)
+    click.echo(missing or f"written to {out}")
     return 0

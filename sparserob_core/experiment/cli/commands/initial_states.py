@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import sys
-import time
 from pathlib import Path
-from typing import final
 
 import click
 
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.terminal.printing import EXIT, print_json
-
-PATIENCE = 2.0  # seconds of silence
+from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
+from sparserob_core.experiment.terminal.printing import EXIT, print_json, printable
 
 
 @click.command("initial-states")
@@ -71,12 +67,12 @@ def initial_states(
     Exit status: 0 the set is known from both sides, 2 the input is at fault, 3 it is empty, proven, 4 no point is
     proven, 130 interrupted.
     """
+    from sparserob_core.experiment.cli.shell.live_line import LiveLine
     from sparserob_core.experiment.directory.artefacts import finite
     from sparserob_core.experiment.initial_states.initial_states import initial_states as find
     from sparserob_core.experiment.terminal.table import print_table
 
-    line = _Line()
-    try:
+    with LiveLine() as line:
         found = find(
             config,
             overrides,
@@ -86,17 +82,15 @@ def initial_states(
             about=None if about is None else _numbers("about", about),
             within=within,
             out=out,
-            tell=line.show,
+            notify=line.hear,
         )
-    finally:
-        line.clear()
     if as_json:
         print_json(finite(found.summary()))
     else:
         print_table(found.title, (), found.rows())
         for remark in (*found.remarks, *([f"written to {out}"] if out is not None else [])):
-            click.echo(remark)
-    return EXIT[found.status]
+            click.echo(printable(remark))
+    return status_unless_interrupted(EXIT[found.status])
 
 
 def _numbers(name: str, text: str) -> list[float]:
@@ -108,20 +102,3 @@ def _numbers(name: str, text: str) -> list[float]:
         expected = "two different states, counted from 1, such as 1,2" if name == "states" else "numbers, such as 0,0.5"
         raise InputError(f"--{name}: expected {expected}, got {text!r}")
     return numbers
-
-
-@final
-class _Line:
-    """One live line on the standard error stream of a terminal, after some patience."""
-
-    def __init__(self) -> None:
-        self.started, self.shown = time.perf_counter(), False
-
-    def show(self, text: str) -> None:
-        if sys.stderr.isatty() and time.perf_counter() - self.started > PATIENCE:
-            click.echo(f"\r\x1b[K{text}", nl=False, err=True)
-            self.shown = True
-
-    def clear(self) -> None:
-        if self.shown:
-            click.echo("\r\x1b[K", nl=False, err=True)

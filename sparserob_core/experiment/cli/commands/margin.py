@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import sys
-import time
 from pathlib import Path
-from typing import final
 
 import click
 
-from sparserob_core.experiment.terminal.printing import print_json
+from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
+from sparserob_core.experiment.terminal.printing import print_json, printable
 
 EXIT = {"certified": 0, "unbounded": 0, "infeasible": 3, "undecided": 4}
-PATIENCE = 2.0  # seconds of silence
 
 
 @click.command()
@@ -56,35 +53,17 @@ def margin(
     Exit status: 0 both sides are proven, or no end was found as far as was looked; 2 the input is at fault, 3 nothing
     is feasible at any factor, 4 a side could not be proven, 130 interrupted.
     """
+    from sparserob_core.experiment.cli.shell.live_line import LiveLine
     from sparserob_core.experiment.margin.margin import margin as find
     from sparserob_core.experiment.margin.margin import margin_rows, summary_of_margin
     from sparserob_core.experiment.terminal.table import print_table
 
-    line = _Line()
-    try:
-        found = find(config, of, overrides, tolerance=tolerance, curve=curve, out=out, write=True, tell=line.show)
-    finally:
-        line.clear()
+    with LiveLine() as line:
+        found = find(config, of, overrides, tolerance=tolerance, curve=curve, out=out, write=True, notify=line.hear)
     if as_json:
         print_json(summary_of_margin(found))
     else:
         print_table(found.title, (), margin_rows(found))
-        click.echo(f"written to {found.directory}")
-    return EXIT[found.status]
-
-
-@final
-class _Line:
-    """One line of progress on a terminal, once the search has taken a while."""
-
-    def __init__(self) -> None:
-        self.started, self.shown = time.monotonic(), False
-
-    def show(self, text: str) -> None:
-        if sys.stderr.isatty() and time.monotonic() - self.started > PATIENCE:
-            click.echo(f"\r\x1b[2K{text}", nl=False, err=True)
-            self.shown = True
-
-    def clear(self) -> None:
-        if self.shown:
-            click.echo("\r\x1b[2K", nl=False, err=True)
+        for remark in (*found.remarks, f"written to {found.directory}"):
+            click.echo(printable(remark))
+    return status_unless_interrupted(EXIT[found.status])

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import signal
 from pathlib import Path
-from types import FrameType
 
 import click
 
-from sparserob_core.experiment.terminal.printing import EXIT, print_json
+from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
+from sparserob_core.experiment.terminal.printing import EXIT, print_json, printable
 
 
 @click.command()
@@ -30,7 +29,6 @@ def run(config: Path, overrides: tuple[str, ...], out: Path | None, quiet: bool,
     Exit status: 0 certified or verified, 2 the input is at fault, 3 infeasible, 4 refuted or undecided, 5 failed, 130
     interrupted.
     """
-    signal.signal(signal.SIGTERM, _interrupt)
     from sparserob_core.experiment.directory.artefacts import finite
     from sparserob_core.experiment.run.run import run as run_experiment
     from sparserob_core.experiment.terminal.table import print_table, result_rows
@@ -41,9 +39,5 @@ def run(config: Path, overrides: tuple[str, ...], out: Path | None, quiet: bool,
     elif not quiet:
         print_table(outcome.experiment.title, (), result_rows(finite(outcome.summary)))
         for line in (*outcome.remarks, f"written to {outcome.directory}"):
-            click.echo(line)
-    return EXIT[outcome.status]
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
+            click.echo(printable(line))
+    return status_unless_interrupted(EXIT[outcome.status])

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import sys
-import time
 from pathlib import Path
 
 import click
 
-from sparserob_core.experiment.terminal.printing import print_json
-
-PATIENCE = 2.0  # seconds of silence
+from sparserob_core.experiment.terminal.printing import print_json, printable
 
 
 @click.command()
@@ -57,29 +53,24 @@ def simulate(
     Exit status: 0, 2 the input is at fault, 4 a trajectory contradicts what the run claims to have proven, 130
     interrupted.
     """
+    from sparserob_core.experiment.cli.shell.live_line import LiveLine
     from sparserob_core.experiment.directory.artefacts import finite
+    from sparserob_core.experiment.figures.style import missing_matplotlib
     from sparserob_core.experiment.simulation.simulate import simulate as propagate
     from sparserob_core.experiment.terminal.table import print_table
 
-    started, silent = time.perf_counter(), not sys.stderr.isatty()
-
-    def tell(line: str) -> None:
-        if not silent and time.perf_counter() - started > PATIENCE:
-            sys.stderr.write(f"\r{line}\033[K")
-
-    try:
-        found = propagate(directory, trajectories, law, seed, out=out, plugins=plugins, tell=tell)
-    finally:
-        if not silent:
-            sys.stderr.write("\r\033[K")
+    missing = "" if out is None else missing_matplotlib()
+    picture = None if missing else out
+    with LiveLine() as line:
+        found = propagate(directory, trajectories, law, seed, out=picture, plugins=plugins, notify=line.hear)
     if as_json:
         print_json(finite(found.summary()))
     else:
         print_table(f"{found.title}: {found.law}", *found.table())
-        for line in (
+        for remark in (
             *found.remarks(),
-            *([] if out is None else [f"drawn into {out}"]),
+            *([missing] if missing else [] if out is None else [f"drawn into {out}"]),
             f"written to {found.directory / f'simulation-{found.law}.json'}",
         ):
-            click.echo(line)
+            click.echo(printable(remark))
     return 4 if found.contradicts else 0

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import click
 
-from sparserob_core.experiment.terminal.printing import EXIT
+from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
+from sparserob_core.experiment.terminal.printing import EXIT, printable
 
 
 @click.command()
@@ -47,5 +48,5 @@ def watch(
         f"written to {outcome.directory}",
         *([] if save is None else [f"recorded into {save}"]),
     ):
-        click.echo(line)
-    return EXIT[outcome.status]
+        click.echo(printable(line))
+    return EXIT[outcome.status] if serve else status_unless_interrupted(EXIT[outcome.status])

@@ -1,0 +1,46 @@
+"""One line of progress, for commands that take a while."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Self, final
+
+from sparserob_core.experiment.run.events import StudyProgress
+from sparserob_core.experiment.terminal.printing import printable
+from sparserob_core.sip.events import Event
+
+PATIENCE = 2.0  # seconds of silence
+RENEWED = 0.1  # seconds between two looks of the line on a terminal
+WRITTEN = 5.0  # seconds between two lines anywhere else
+
+
+@final
+class LiveLine:
+    """Shows what a study tells (`StudyProgress`) on the standard error stream, after some patience: on a terminal in
+    one line, which is renewed and disappears in the end; anywhere else in a plain line now and then."""
+
+    def __init__(self) -> None:
+        self._started = self._last = time.monotonic()
+        self._terminal, self._shown = sys.stderr.isatty(), False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._shown and self._terminal:
+            sys.stderr.write("\r\x1b[K")
+            sys.stderr.flush()
+
+    def hear(self, event: Event) -> None:
+        """What is handed to a study as ``notify``."""
+        now = time.monotonic()
+        pause = RENEWED if self._terminal else WRITTEN
+        if not isinstance(event, StudyProgress) or now - self._started < PATIENCE:
+            return
+        if self._shown and now - self._last < pause:
+            return
+        text = printable(event.text)
+        sys.stderr.write(f"\r\x1b[K{text}" if self._terminal else f"{text}\n")
+        sys.stderr.flush()
+        self._last, self._shown = now, True

@@ -1,0 +1,97 @@
+"""The command as a process: its signals, its standard streams."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
+from typing import final
+
+from sparserob_core.errors import SparseRobError
+
+INTERRUPTED = 130
+"""The exit status of a command that was interrupted, whatever it knew by then."""
+
+_caught: list[int] = []
+
+
+def listen() -> None:
+    """From now on Ctrl-C and SIGTERM raise `KeyboardInterrupt`, which says what it was unless it is from the keyboard.
+    A signal that is ignored, as Ctrl-C is in the background of a shell, stays ignored."""
+    with suppress(ValueError):  # not in the main thread
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, _hear)
+        if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
+            signal.signal(signal.SIGTERM, _hear)
+
+
+def status_unless_interrupted(status: int) -> int:
+    """The exit status of a command that has a result: its own, unless a signal has cut it short."""
+    return INTERRUPTED if _caught else status
+
+
+class OutputError(SparseRobError):
+    """The standard output takes nothing more: it is closed, or its disk is full."""
+
+
+@final
+class Output(io.TextIOWrapper):
+    """The standard output; where it cannot be written to, it says so as an `OutputError`. A reader that has stopped
+    reading is a `BrokenPipeError` as ever."""
+
+    def write(self, text: str) -> int:
+        with _told():
+            return super().write(text)
+
+    def flush(self) -> None:
+        with _told():
+            super().flush()
+
+
+@contextmanager
+def _told() -> Iterator[None]:
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        why = "it is closed" if error.errno == errno.EBADF else str(error.strerror)
+        raise OutputError(f"the standard output cannot be written: {why}") from error
+
+
+def open_streams() -> None:
+    """Give standard streams that are closed a descriptor, so that no file of a run gets theirs. What is written to a
+    closed output is an error; messages to a closed error stream are lost."""
+    for descriptor, mode in ((0, os.O_RDONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, mode)
+    if sys.stderr is None:
+        sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115
+    if sys.stdout is None:
+        sys.stdout = Output(open(1, "wb", closefd=False))  # noqa: SIM115
+    elif type(sys.stdout) is io.TextIOWrapper:
+        old = sys.stdout
+        sys.stdout = Output(
+            old.detach(),
+            encoding=old.encoding,
+            errors=old.errors,
+            line_buffering=old.line_buffering,
+            write_through=old.write_through,
+        )
+
+
+def drop_output() -> None:
+    """Let what is still to be written to the standard output go nowhere."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+
+
+def _hear(number: int, frame: FrameType | None) -> None:
+    _caught.append(number)
+    raise KeyboardInterrupt(*([] if number == signal.SIGINT else [f"interrupted by {signal.Signals(number).name}"]))

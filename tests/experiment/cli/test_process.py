@@ -1,0 +1,346 @@
+"""Guards experiment/cli/shell and directory/lock: signals end a command with what it knows, two runs never share a
+directory, and standard streams that take nothing are told of in one line."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sparserob_core as sr
+from sparserob_core.experiment.directory.artefacts import create_directory
+from sparserob_core.experiment.directory.lock import GUARD, NAME, Lock
+
+Command = Callable[..., subprocess.CompletedProcess[str]]
+
+TELLING = '''
+import time
+
+import numpy as np
+import sparserob_core as sr
+
+
+class Telling(sr.Method, sr.Options):
+    """Tells of rounds with their decisions for ever."""
+
+    def solve(self, program, tools):
+        number = 0
+        while True:
+            number += 1
+            tools.notify(sr.RoundFinished(round=number, epsilon=0.5, lower_bound=0.25, upper_bound=7.0, violation=0.1,
+                                          relaxed_programs=3 * number, cost=1.5, decision=np.full(program.n, 0.1)))
+            time.sleep(0.05)
+
+
+@sr.hookimpl
+def sparserob_methods():
+    yield sr.MethodPlugin(name="telling", factory=Telling, summary="Tells.")
+'''
+MARGIN = """\
+problem:
+  name: linear
+  system: {A: [[0, 1], [0, 0]], B: [[0], [1]]}
+  horizon: 2.0
+  initial_state: [1, 0]
+  control: {box: 1.5}
+  disturbance: {box: [0.02, 0.05]}
+  path: [{box: [1.1, 2.0]}]
+  terminal: [{box: [0.5, 0.6]}]
+dictionaries: {control: {name: piecewise_constant, pieces: 20}}
+"""
+
+
+@contextmanager
+def started(*arguments: object, cwd: Path) -> Iterator[subprocess.Popen[str]]:
+    """The command in a process of its own, which hears Ctrl-C also where the tests were started in the background, and
+    which is gone afterwards whatever happens."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "sparserob_core", *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=cwd,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+WORDS = {signal.SIGINT: "interrupted from the keyboard", signal.SIGTERM: "interrupted by SIGTERM"}
+
+
+@pytest.mark.parametrize("number", WORDS)
+def test_an_interrupted_run_without_a_decision_leaves_its_rounds(config: Path, tmp_path: Path, number: int) -> None:
+    out = tmp_path / "out"
+    with started("run", config, "method.wait=0.2", "method.rounds=500", "--out", out, cwd=tmp_path) as process:
+        wait_for((out / "result.json").exists)
+        assert json.loads((out / "result.json").read_text())["message"] == "the run has not finished"
+        time.sleep(0.5)
+        os.kill(process.pid, number)
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert said.strip().startswith(f"error: {WORDS[signal.Signals(number)]}")
+    assert f"what was done until then is in {out}" in said
+    result = json.loads((out / "result.json").read_text())
+    assert (result["status"], result["message"]) == ("failed", WORDS[signal.Signals(number)])
+    assert sorted(path.name for path in out.iterdir()) == ["config.yaml", "result.json", "trace.npz"]
+
+
+@pytest.mark.parametrize("number", WORDS)
+def test_an_interrupted_run_keeps_its_last_control_and_claims_nothing_of_it(
+    config: Path, tmp_path: Path, number: int
+) -> None:
+    (tmp_path / "telling.py").write_text(TELLING)
+    out = tmp_path / "out"
+    arguments = ("run", config, "method=telling", "plugins=[telling.py]", "--out", out)
+    with started(*arguments, cwd=tmp_path) as process:
+        wait_for((out / "result.json").exists)
+        time.sleep(1.0)
+        os.kill(process.pid, number)
+        table, said = process.communicate(timeout=60)
+    assert process.returncode == 130, said
+    assert f"undecided: {WORDS[signal.Signals(number)]} after round" in table
+    result = json.loads((out / "result.json").read_text())
+    assert (result["status"], result["cost"], result["lower_bound"]) == ("undecided", 1.5, 0.25)
+    assert (result["upper_bound"], result["gap"]) == (None, None)
+    assert result["counts"]["relaxed_programs"] == 3 * result["counts"]["rounds"] > 0
+    with np.load(out / "solution.npz") as solution:
+        assert (solution["control"] == 0.1).all()
+    files = sorted(path.name for path in out.iterdir())
+    assert [name for name in files if not name.startswith("adversary")] == [
+        "config.yaml",
+        "result.json",
+        "rounds.npz",
+        "solution.npz",
+        "trace.npz",
+    ]
+
+
+def test_a_signal_that_is_ignored_stays_ignored(config: Path, tmp_path: Path) -> None:
+    program = (
+        "import signal, sys\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\n"
+        "from sparserob_core.experiment.cli.shell.process import listen\nlisten()\n"
+        "assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN\n"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+class Press:
+    """Presses Ctrl-C at the study's progress of that number."""
+
+    def __init__(self, number: int) -> None:
+        self.number, self.heard = number, 0
+
+    def __call__(self, event: sr.Event) -> None:
+        self.heard += isinstance(event, sr.StudyProgress)
+        if self.heard == self.number:
+            raise KeyboardInterrupt
+
+
+def test_an_interrupted_margin_leaves_what_it_has_proven(tmp_path: Path) -> None:
+    file = tmp_path / "margin.yaml"
+    file.write_text(MARGIN)
+    whole, count = sr.margin(file, curve=0), Press(-1)
+    sr.margin(file, curve=0, notify=count)
+    for number in range(1, count.heard + 1):
+        found = sr.margin(file, curve=0, out=tmp_path / f"out{number}", notify=Press(number))
+        written = json.loads((tmp_path / f"out{number}" / "margin.json").read_text())
+        assert (written["status"], written["message"]) == (found.status, found.message)
+        assert found.status == "undecided"
+        assert "interrupted from the keyboard" in found.message
+        assert not found.lower > whole.upper  # what it claims is true: nan where it claims nothing
+        assert not found.upper < whole.lower
+
+
+def test_interrupted_initial_states_leave_true_polygons(tmp_path: Path) -> None:
+    file = tmp_path / "states.yaml"
+    file.write_text(MARGIN)
+    whole = sr.initial_states(file, directions=8, values=2)
+    for number in (2, 4, 7):
+        out = tmp_path / f"out{number}"
+        found = sr.initial_states(file, directions=8, values=2, out=out, notify=Press(number))
+        assert "interrupted from the keyboard" in found.message
+        assert (out / "initial_states.json").is_file()
+        assert found.inner_area <= whole.outer_area
+        assert found.outer_area >= whole.inner_area
+        for vertex in found.inner:
+            assert whole.where(vertex) != "outside"
+        for vertex in 0.99 * whole.inner + 0.01 * whole.inner.mean(axis=0):
+            assert found.where(vertex) != "outside"
+
+
+def test_of_two_runs_into_one_directory_the_second_ends_at_once(config: Path, tmp_path: Path, command: Command) -> None:
+    out = tmp_path / "out"
+    with started("run", config, "method.wait=0.2", "method.rounds=500", "--out", out, cwd=tmp_path) as process:
+        wait_for((out / "result.json").exists)
+        began = time.monotonic()
+        done = command("run", config, "--out", out)
+        assert time.monotonic() - began < 30
+        assert done.returncode == 2
+        assert f"another run is writing into it (process {process.pid} on {platform.node()})" in done.stderr
+        assert len(done.stderr.splitlines()) == 1
+        assert json.loads((out / "result.json").read_text())["message"] == "the run has not finished"
+
+
+def test_of_many_that_start_at_once_one_gets_the_directory(config: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    call = [sys.executable, "-m", "sparserob_core", "run", str(config), "--out", str(out), "--no-figures", "--quiet"]
+    processes = [subprocess.Popen(call, stderr=subprocess.PIPE, text=True) for _ in range(3)]
+    said = [process.communicate(timeout=120)[1] for process in processes]
+    assert sorted(process.returncode for process in processes) == [0, 2, 2], said
+    assert not (out / NAME).exists()
+
+
+def test_the_lock_is_gone_when_a_run_is_over_whatever_its_end(config: Path, tmp_path: Path) -> None:
+    sr.run(config, out=tmp_path / "well", quiet=True, figures=False)
+    with pytest.raises(RuntimeError):
+        sr.run(config, {"method.fail": True}, out=tmp_path / "ill", quiet=True)
+    assert not [*tmp_path.glob("*/.*")]
+
+
+def test_the_lock_of_a_dead_process_is_taken_over_and_that_of_another_host_is_not(tmp_path: Path) -> None:
+    dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, check=True)
+    lock = {"process": int(dead.stdout), "host": platform.node()}
+    (tmp_path / NAME).write_text(json.dumps(lock))
+    with create_directory(tmp_path, "demo", "0123abcd"):
+        assert json.loads((tmp_path / NAME).read_text())["process"] == os.getpid()
+    assert not [*tmp_path.iterdir()]
+    for held in ({**lock, "host": "elsewhere"}, {**lock, "process": os.getppid()}):
+        (tmp_path / NAME).write_text(json.dumps(held))
+        with pytest.raises(sr.InputError, match="another run is writing into it"):
+            create_directory(tmp_path, "demo", "0123abcd")
+        assert json.loads((tmp_path / NAME).read_text()) == held
+    (tmp_path / NAME).write_text("")
+    with pytest.raises(sr.InputError, match="whose number is not written yet"):
+        create_directory(tmp_path, "demo", "0123abcd")
+
+
+def test_of_two_that_find_a_dead_lock_only_one_takes_it_over(tmp_path: Path) -> None:
+    dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, check=True)
+    (tmp_path / NAME).write_text(json.dumps({"process": int(dead.stdout), "host": platform.node()}))
+    (tmp_path / GUARD).touch()
+    with pytest.raises(sr.InputError, match="another run is writing into it"):
+        Lock(tmp_path).acquire()
+    (tmp_path / GUARD).unlink()
+    Lock(tmp_path).acquire()
+    assert not (tmp_path / GUARD).exists()
+
+
+def test_what_a_dead_run_has_left_is_not_written_over(tmp_path: Path) -> None:
+    dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, check=True)
+    (tmp_path / NAME).write_text(json.dumps({"process": int(dead.stdout), "host": platform.node()}))
+    (tmp_path / "result.json").write_text("{}")
+    with pytest.raises(sr.InputError, match="expected a new or an empty directory, got one that holds files"):
+        create_directory(tmp_path, "demo", "0123abcd")
+    assert [path.name for path in tmp_path.iterdir()] == ["result.json"]
+
+
+@pytest.mark.parametrize(
+    ("redirection", "status", "said"),
+    [
+        (">&-", 5, "error: the standard output cannot be written: it is closed\n"),
+        (">/dev/full", 5, "error: the standard output cannot be written: No space left on device\n"),
+        ("2>&- >/dev/null", 0, ""),
+    ],
+)
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_an_output_that_takes_nothing_is_told_in_one_line(
+    redirection: str, status: int, said: str, unbuffered: str
+) -> None:
+    if "full" in redirection and not Path("/dev/full").exists():
+        pytest.skip("there is no /dev/full")
+    done = subprocess.run(
+        f"exec {sys.executable} -m sparserob_core plugins {redirection}",
+        shell=True,
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
+    )
+    assert (done.returncode, done.stderr) == (status, said)
+
+
+def test_a_quiet_run_needs_no_output(config: Path, tmp_path: Path) -> None:
+    done = subprocess.run(
+        f"exec {sys.executable} -m sparserob_core run {config} --out out --quiet --no-figures >&-",
+        shell=True,
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("error", ["MemoryError", "MemoryError('x')", "RuntimeError"])
+def test_no_message_ends_in_a_colon_without_words(config: Path, command: Command, tmp_path: Path, error: str) -> None:
+    stub = tmp_path / "stub.py"
+    stub.write_text(stub.read_text().replace('RuntimeError("the stub fell over")', error))
+    done = command("run", config, "method.fail=true", "--out", "out")
+    assert done.returncode == 5
+    assert ": ;" not in done.stderr
+    assert (": \n" not in done.stderr) and ("Traceback" not in done.stderr)
+
+
+def test_control_characters_of_a_title_do_not_reach_the_terminal(config: Path, command: Command) -> None:
+    done = command("run", config, "title='\"red \\e[31m and \\a\"'".replace("'", ""), "--out", "out", "--no-figures")
+    assert done.returncode == 0, done.stderr
+    assert "\x1b" not in done.stdout and "\a" not in done.stdout
+    assert "red \\x1b[31m and \\x07" in done.stdout
+    assert "\x1b" not in command("compare", "out").stdout
+
+
+@pytest.mark.parametrize(
+    "command_line", [["simulate", "out", "--trajectories", "3", "--out", "x.png"], ["compare", "out"]]
+)
+def test_a_missing_matplotlib_is_a_note_beside_the_result(
+    config: Path, command: Command, tmp_path: Path, command_line: list[str]
+) -> None:
+    blocked = tmp_path / "blocked" / "sitecustomize.py"
+    blocked.parent.mkdir()
+    blocked.write_text("import sys\nsys.modules['matplotlib'] = None\n")
+    path = os.pathsep.join([str(blocked.parent), os.environ.get("PYTHONPATH", "")])
+    file = tmp_path / "margin.yaml"
+    file.write_text(MARGIN)
+    note = "no figure: matplotlib is not installed; `pip install 'sparserob[figures]'` brings it"
+    done = command("run", file, "--out", "out", PYTHONPATH=path)
+    assert (done.returncode, note in done.stdout) == (0, True), done.stdout + done.stderr
+    done = command(*command_line, PYTHONPATH=path)
+    assert (done.returncode, note in done.stdout) == (0, True), done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(
+    "study", [("margin", "--curve", "2"), ("initial-states", "--directions", "4", "--values", "0")], ids=lambda a: a[0]
+)
+def test_a_study_without_matplotlib_has_a_note_and_its_own_status(
+    command: Command, tmp_path: Path, study: tuple[str, ...]
+) -> None:
+    blocked = tmp_path / "blocked" / "sitecustomize.py"
+    blocked.parent.mkdir()
+    blocked.write_text("import sys\nsys.modules['matplotlib'] = None\n")
+    path = os.pathsep.join([str(blocked.parent), os.environ.get("PYTHONPATH", "")])
+    file = tmp_path / "margin.yaml"
+    file.write_text(MARGIN)
+    done = command(study[0], file, *study[1:], "--out", "out", PYTHONPATH=path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "no figure: matplotlib is not installed; `pip install 'sparserob[figures]'` brings it" in done.stdout
