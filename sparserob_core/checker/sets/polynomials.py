@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.sets.shapes import boxed, corners
+from sparserob_core.checker.sets.shapes import boxed, corners, known
 from sparserob_core.control.sets.sets import Box, ConvexSet, Ellipsoid, NormBall, Polytope
 from sparserob_core.sip.convex_set import Array
 
@@ -50,6 +50,7 @@ def linear_bound(shape: ConvexSet, value: Array, spread: Array) -> tuple[Array, 
     ones the loss is of second order in ``spread``: in the norm of the set,
     ``|f| - f0'f / |f0| <= |f - f0|^2 / (2 (|f0| - |f - f0|))``.
     """
+    known(shape)
     shape = boxed(shape)
     if isinstance(shape, Box):
         w = np.where(value >= 0, shape.upper, shape.lower)

@@ -20,13 +20,24 @@ if TYPE_CHECKING:
     from flint import arb
 
 MOST_CORNERS = 20_000  # intersections of facets looked at when a polytope's corners are listed
+KINDS = (Box, Polytope, Ellipsoid, NormBall)  # the kinds whose definitions stand here, and cylinders over them
 MOST_SIGNS = 10  # dimension up to which a 1-norm ball is listed by its facets
 
 
+def known(shape: ConvexSet) -> None:
+    """Raise `Unchecked` for a kind of set whose data the checker cannot read: nothing that such a set says of itself is
+    believed, nor what a subclass of a known kind does."""
+    base = shape.base if type(shape) is Cylinder else shape
+    if type(base) not in KINDS:
+        raise Unchecked(f"the checker does not know sets of the kind {base.kind}")
+
+
 def facets(shape: ConvexSet) -> list[tuple[Array, arb]] | None:
-    """``c'x <= b`` for every facet, as ``(c (d,), b)``; ``None`` for a curved set."""
+    """``c'x <= b`` for every facet, as ``(c (d,), b)``; ``None`` for a curved set. Raises `Unchecked` for an unknown
+    kind."""
     from flint import arb
 
+    known(shape)
     if isinstance(shape, Box):
         axes = np.eye(shape.dimension)
         above = [(axes[i], arb(float(b))) for i, b in enumerate(shape.upper) if np.isfinite(b)]
@@ -55,6 +66,7 @@ def support(shape: ConvexSet, direction: Sequence[arb]) -> arb:
     """``h(c)``, ``c`` a vector of balls ``(d,)``; raises `Unchecked` where the set has no such formula here."""
     from flint import arb
 
+    known(shape)
     d = list(direction)
     if isinstance(shape, Box):
         return sum(
