@@ -6,6 +6,7 @@ Which kinds there are, the registry knows: every plugin of the kind ``set`` is a
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Annotated, Any, final
 
 import numpy as np
@@ -111,7 +112,10 @@ def _checked(registry: Registry, kind: str, value: object, keys: set[str]) -> tu
     short = shorthand(registry.get(KIND, kind))
     if not isinstance(value, Mapping) and short is None:
         return None, [Complaint((), f"must be a mapping (got {shown(value)})")]
-    return registry.check(KIND, kind, value if isinstance(value, Mapping) else {str(short): value})
+    if isinstance(value, Mapping):
+        return registry.check(KIND, kind, value)
+    typed, faults = registry.check(KIND, kind, {str(short): value})
+    return typed, [replace(fault, path=fault.path[1:]) if fault.path[:1] == (short,) else fault for fault in faults]
 
 
 def _detail(fault: Complaint) -> InitErrorDetails:
