@@ -18,7 +18,7 @@ Array: TypeAlias = npt.NDArray[np.float64]
 
 HALVINGS = 60
 RELATIVE = 1e-12  # accuracy of a gauge that is computed from the support function alone
-PIVOTS = 200  # support points asked for at most on the way to one boundary point
+PIVOTS = 500  # support points asked for at most on the way to one boundary point
 SPIKE = 1e-12  # of the set's extent: half the thickness below which a set counts as one without interior
 TILT = 1e-14  # by which a ray is turned in the choice of pivots, so that no choice is a tie
 PLAIN = 3  # dimension up to which a set is sampled by rejection
