@@ -1,4 +1,4 @@
-"""Kinds of sets beyond those of the core: zonotopes."""
+"""The kinds of sets that a config can name: four whose mathematics is in the core, and zonotopes."""
 
 from __future__ import annotations
 
@@ -7,10 +7,22 @@ from collections.abc import Iterator
 import sparserob_core as sr
 from sparserob_sets.zonotope import ZonotopeFactory
 
+KINDS = "sparserob_core.experiment.config.set_kinds"
+
 
 @sr.hookimpl
 def sparserob_sets() -> Iterator[sr.SetPlugin]:
-    """Zonotopes."""
+    """The shipped kinds of sets."""
+    yield sr.SetPlugin(name="box", factory=f"{KINDS}:BoxFactory", summary="Bounds on every coordinate.")
+    yield sr.SetPlugin(name="polytope", factory=f"{KINDS}:PolytopeFactory", summary="Half-spaces: H x <= h.")
+    yield sr.SetPlugin(
+        name="ellipsoid",
+        factory=f"{KINDS}:EllipsoidFactory",
+        summary="An ellipsoid: (x - centre)' shape^-1 (x - centre) <= 1.",
+    )
+    yield sr.SetPlugin(
+        name="norm", factory=f"{KINDS}:NormFactory", summary="A ball of a p-norm: |x - centre|_p <= radius."
+    )
     yield sr.SetPlugin(
         name="zonotope",
         factory=ZonotopeFactory,

@@ -12,11 +12,9 @@ from sparserob_core.experiment.plugins.records import (
     ProblemPlugin,
     SchedulePlugin,
     SelectionPlugin,
-    SetPlugin,
 )
 
 RULES = "sparserob_core.sip.rules"
-KINDS = "sparserob_core.experiment.config.set_kinds"
 
 
 @hookimpl
@@ -120,19 +118,4 @@ def sparserob_problems() -> Iterator[ProblemPlugin]:
         name="linear",
         factory="sparserob_core.experiment.config.problems:LinearProblem",
         summary="Sparse robust control of x' = A(p) x + B(p) u + E w from an initial state to a terminal set.",
-    )
-
-
-@hookimpl
-def sparserob_sets() -> Iterator[SetPlugin]:
-    """The kinds of sets whose mathematics is in the core."""
-    yield SetPlugin(name="box", factory=f"{KINDS}:BoxFactory", summary="Bounds on every coordinate.")
-    yield SetPlugin(name="polytope", factory=f"{KINDS}:PolytopeFactory", summary="Half-spaces: H x <= h.")
-    yield SetPlugin(
-        name="ellipsoid",
-        factory=f"{KINDS}:EllipsoidFactory",
-        summary="An ellipsoid: (x - centre)' shape^-1 (x - centre) <= 1.",
-    )
-    yield SetPlugin(
-        name="norm", factory=f"{KINDS}:NormFactory", summary="A ball of a p-norm: |x - centre|_p <= radius."
     )
