@@ -192,3 +192,14 @@ def test_a_zonotope_has_the_facets_that_its_generators_span():
     flat = sr.load_registry().build("set", "zonotope", {"generators": [[1, 1]]}).build(2)
     assert flat.halfspaces() is None
     assert flat.support(np.array([[1.0, -1.0], [1.0, 1.0]])) == pytest.approx([0.0, 2.0])
+
+
+def test_parameters_in_a_zonotope_give_the_answer_of_the_same_polytope(tmp_path):
+    system = {"A": [[0, 1], ["-1 + p1", "-0.2 + p2"]], "B": [[0], [1]]}
+    zonotope = {"zonotope": {"generators": [[0.05, 0.0], [0.03, 0.04]]}}
+    polytope = {"polytope": {"H": [[0, 1], [0, -1], [1, -0.75], [-1, 0.75]], "h": [0.04, 0.04, 0.05, 0.05]}}
+    found = [
+        cost(changed(system=system | {"parameters": {"names": ["p1", "p2"], **one}}, path=[]), tmp_path / name)
+        for name, one in (("zonotope", zonotope), ("polytope", polytope))
+    ]
+    assert found[0] == pytest.approx(found[1], rel=1e-6)
