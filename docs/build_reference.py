@@ -14,7 +14,7 @@ from sparserob_core.experiment.cli.main import commands
 from sparserob_core.experiment.config.option_rows import option_rows
 from sparserob_core.experiment.config.run_config import RunConfig
 from sparserob_core.experiment.config.schema import config_schema
-from sparserob_core.experiment.plugins.registry import Hooks
+from sparserob_core.experiment.plugins.hookspecs import HOOKS
 from sparserob_core.experiment.terminal.printing import EXIT
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -127,16 +127,13 @@ def _components() -> list[str]:
 
 
 def _hooks() -> list[str]:
-    hooks = [
-        (f"`{name}`", inspect.getdoc(function) or "")
-        for name, function in inspect.getmembers(Hooks, inspect.isfunction)
-    ]
+    hooks = [(f"`{name}`", inspect.getdoc(HOOKS[name]) or "") for name in sorted(HOOKS)]
     return [
         "## Hooks",
         "",
         "[extending.md](extending.md) shows how to implement them.",
         "",
-        *table(("hook", "yields"), hooks),
+        *table(("hook", "a component is"), hooks),
     ]
 
 

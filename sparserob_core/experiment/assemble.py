@@ -14,6 +14,7 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.config.load import Loaded
+from sparserob_core.experiment.plugins.guards import guarded
 from sparserob_core.experiment.solve import indicators
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
@@ -119,7 +120,8 @@ def dictionaries_of(loaded: Loaded, horizon: float) -> tuple[Dictionary, Diction
 
 def gap_tolerance(loaded: Loaded) -> float | None:
     """The relative gap that the config's method is to close; ``None`` for a method that has no such option."""
-    tolerance = getattr(build(loaded, "method", loaded.config.method), "tolerance", None)
+    entry = loaded.config.method
+    tolerance = getattr(loaded.registry.build("method", entry.name, entry.options), "tolerance", None)
     return None if tolerance is None else float(tolerance)
 
 
@@ -129,8 +131,9 @@ def name_of(loaded: Loaded) -> str:
 
 
 def build(loaded: Loaded, kind: str, entry: Entry) -> Any:
-    """The component that an entry of the config names."""
-    return loaded.registry.build(kind, entry.name, entry.options)
+    """The component that an entry of the config names, behind the check of its kind."""
+    component = loaded.registry.build(kind, entry.name, entry.options)
+    return guarded(component, loaded.registry.get(kind, entry.name).origin)
 
 
 def _dictionary(loaded: Loaded, which: str, entry: Entry, horizon: float) -> Dictionary:

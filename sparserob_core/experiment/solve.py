@@ -11,6 +11,7 @@ from sparserob_core.control.problem.dictionary import Dictionary, DictionaryFact
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.plugins.components import Registry
+from sparserob_core.experiment.plugins.guards import guarded, origin_of
 from sparserob_core.experiment.plugins.registry import load_registry
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.events import Event, ignore
@@ -113,13 +114,14 @@ def maximise(
 
 
 def component(registry: Registry, kind: str, choice: object, expected: type[Any]) -> Any:
-    """The component that a name, a mapping with a name, or the component itself stands for."""
+    """The component that a name, a mapping with a name, or the component itself stands for, behind the check of its
+    kind."""
     if isinstance(choice, expected):
-        return choice
-    if isinstance(choice, str):
-        return registry.build(kind, choice)
-    if isinstance(choice, Mapping) and isinstance(choice.get("name"), str):
-        return registry.build(kind, choice["name"], {key: value for key, value in choice.items() if key != "name"})
+        return guarded(choice, origin_of(kind, choice))
+    entry = {"name": choice} if isinstance(choice, str) else choice
+    if isinstance(entry, Mapping) and isinstance(name := entry.get("name"), str):
+        built = registry.build(kind, name, {key: value for key, value in entry.items() if key != "name"})
+        return guarded(built, registry.get(kind, name).origin)
     raise InputError(f"{kind}: expected a name, a mapping with a name, or a {expected.__name__}, got {choice!r}")
 
 

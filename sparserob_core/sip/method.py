@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import final
 
@@ -47,7 +49,7 @@ class Tools:
     solved.
 
     ``budget``: evaluations that one search of the maximiser may spend, of which the share ``polish`` goes to a local
-    method at its end.
+    method at its end. ``executor``: workers for programs that do not depend on one another; ``None``: solve them here.
     """
 
     solver: Solver
@@ -56,8 +58,17 @@ class Tools:
     continuation: Continuation = field(default_factory=Continuation)
     budget: int = 2000
     polish: float = 0.0
+    executor: Executor | None = None
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
     notify: Notify = ignore
+
+
+class ExecutorFactory(ABC):
+    """Opens the workers on which independent programs are solved."""
+
+    @abstractmethod
+    def open(self) -> AbstractContextManager[Executor]:
+        """Workers that live as long as the context; what is submitted to them can be pickled."""
 
 
 class Method(ABC):

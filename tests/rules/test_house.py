@@ -147,7 +147,7 @@ def test_a_plugin_of_this_repository_is_one_folder_and_one_line() -> None:
     project = (ROOT / "pyproject.toml").read_text()
     entries = set(tomllib.loads(project)["project"]["entry-points"]["sparserob"].values())
     folders = {path.name for path in (ROOT / "plugins").glob("sparserob_*") if path.is_dir()}
-    assert {entry.split(".")[0] for entry in entries} == folders | {"sparserob_core"}
+    assert {entry.split(".")[0] for entry in entries} == folders
     assert not {name: found for name in folders if (found := len(re.findall(rf"\b{name}\b", project))) != 1}
 
 

@@ -11,7 +11,7 @@ import click
 import sparserob_core as sr
 from sparserob_core.experiment.cli.main import commands
 from sparserob_core.experiment.config.option_rows import option_rows
-from sparserob_core.experiment.plugins.registry import HOOKS
+from sparserob_core.experiment.plugins.hookspecs import HOOKS
 from sparserob_core.sip.result import MEANING
 from tests.support.places import ROOT
 

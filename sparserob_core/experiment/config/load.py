@@ -10,7 +10,7 @@ from typing import Any, final
 
 from pydantic import ValidationError
 
-from sparserob_core.errors import ConfigError, InputError, Path, PluginError, dotted
+from sparserob_core.errors import ConfigError, InputError, Path, PluginError, UnknownPluginError, dotted
 from sparserob_core.experiment.config.overrides import Override, apply_override, parse_overrides
 from sparserob_core.experiment.config.reader import Source, read_source, read_value
 from sparserob_core.experiment.config.run_config import SLOTS, MaximiserEntry, RunConfig
@@ -75,10 +75,10 @@ def load_config(
 
 
 def _spell_out(data: dict[str, Any]) -> None:
-    for path, (_, default) in SLOTS.items():
+    for path, slot in SLOTS.items():
         holder = _at(data, path[:-1])
         if isinstance(holder, dict) and path[-1] in holder:
-            holder[path[-1]] = _entry(holder[path[-1]], default)
+            holder[path[-1]] = _entry(holder[path[-1]], slot.name)
     if isinstance(data.get("observers"), list):
         data["observers"] = [_entry(entry, None) for entry in data["observers"]]
 
@@ -101,7 +101,8 @@ def _registry(data: dict[str, Any], source: Source, changes: tuple[Override, ...
     try:
         return load_registry(data["plugins"])
     except PluginError as error:
-        raise ConfigError(_line(source, changes, Complaint(("plugins",), str(error)))) from error
+        said = _line(source, changes, Complaint(("plugins",), str(error)))
+        raise (ConfigError if isinstance(error, InputError) else PluginError)(said) from error
 
 
 def _checked(data: dict[str, Any], registry: Registry, strangers: bool) -> tuple[RunConfig | None, list[Complaint]]:
@@ -120,7 +121,7 @@ def _checked(data: dict[str, Any], registry: Registry, strangers: bool) -> tuple
             continue
         try:
             typed, faults = registry.check(kind, entry["name"], options)
-        except PluginError as error:
+        except UnknownPluginError as error:
             wrong.append(Complaint((*path, "name"), str(error)))
             continue
         wrong += [fault.under(path) for fault in faults]
@@ -130,7 +131,7 @@ def _checked(data: dict[str, Any], registry: Registry, strangers: bool) -> tuple
 
 
 def _entries(data: dict[str, Any]) -> Iterator[tuple[Path, str, dict[str, Any]]]:
-    slots: list[tuple[Path, str]] = [(path, kind) for path, (kind, _) in SLOTS.items()]
+    slots: list[tuple[Path, str]] = [(path, slot.kind) for path, slot in SLOTS.items()]
     observers = data.get("observers")
     slots += [
         (("observers", position), "observer")

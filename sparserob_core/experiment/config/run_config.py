@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from typing import Any, final
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, final
 
 from pydantic import ConfigDict, Field
 
@@ -28,6 +30,16 @@ class Entry(Exact):
 
 
 @final
+@dataclass(frozen=True)
+class Slot:
+    """Marks a key of the config that names one component of a ``kind``; ``name``: which one is meant where only options
+    are given."""
+
+    kind: str
+    name: str | None = None
+
+
+@final
 class MaximiserEntry(Entry):
     """A maximiser; the framework itself keeps its budget."""
 
@@ -38,14 +50,17 @@ class MaximiserEntry(Entry):
     """Share of the budget that goes to a local method, from the best points, at the end."""
 
 
+PIECES = Slot("dictionary", "piecewise_constant")
+
+
 @final
 class Dictionaries(Options):
     """In which functions the control and the disturbance are written."""
 
-    control: Entry = Entry.model_validate({"name": "piecewise_constant", "pieces": 100})
+    control: Annotated[Entry, PIECES] = Entry.model_validate({"name": "piecewise_constant", "pieces": 100})
     """Dictionary of the control; 100 equal pieces unless told otherwise."""
 
-    disturbance: Entry | None = None
+    disturbance: Annotated[Entry | None, PIECES] = None
     """Dictionary of the disturbance; null: one indicator function on each piece of the control's dictionary."""
 
 
@@ -56,25 +71,25 @@ class RunConfig(Options):
     title: str = ""
     """Title of the figures and tables; the file's name when empty."""
 
-    problem: Entry
+    problem: Annotated[Entry, Slot("problem")]
     """What is to be solved."""
 
     dictionaries: Dictionaries = Dictionaries()
     """In which functions the control and the disturbance are written."""
 
-    regulariser: Entry | None = Entry(name="ridge")
+    regulariser: Annotated[Entry | None, Slot("regulariser", "ridge")] = Entry(name="ridge")
     """The strictly convex term that makes the optimiser unique; null for none."""
 
     continuation: Continuation = Continuation()
     """How the weight of the regulariser decreases."""
 
-    method: Entry = Entry(name="exchange")
+    method: Annotated[Entry, Slot("method", "exchange")] = Entry(name="exchange")
     """How the semi-infinite program is solved."""
 
-    maximiser: MaximiserEntry = MaximiserEntry(name="direct")
+    maximiser: Annotated[MaximiserEntry, Slot("maximiser", "direct")] = MaximiserEntry(name="direct")
     """The global search, wherever a family of constraints has no closed form of its own."""
 
-    solver: Entry = Entry(name="piqp")
+    solver: Annotated[Entry, Slot("solver", "piqp")] = Entry(name="piqp")
     """The inner solver of quadratic programs."""
 
     observers: tuple[Entry, ...] = (Entry(name="progress"),)
@@ -102,14 +117,12 @@ def digest(plain: object) -> str:
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:8]
 
 
-SLOTS = {
-    ("problem",): ("problem", None),
-    ("dictionaries", "control"): ("dictionary", "piecewise_constant"),
-    ("dictionaries", "disturbance"): ("dictionary", "piecewise_constant"),
-    ("regulariser",): ("regulariser", "ridge"),
-    ("method",): ("method", "exchange"),
-    ("maximiser",): ("maximiser", "direct"),
-    ("solver",): ("solver", "piqp"),
-}
-"""Where a config names one component: its kind, and the name that is meant when only options are given. ``observers``
-is a list."""
+def _slots(model: type[Options], above: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Slot]]:
+    for name, field in model.model_fields.items():
+        yield from (((*above, name), mark) for mark in field.metadata if isinstance(mark, Slot))
+        if field.annotation is Dictionaries:
+            yield from _slots(Dictionaries, (*above, name))
+
+
+SLOTS: Mapping[tuple[str, ...], Slot] = dict(_slots(RunConfig))
+"""Where a config names one component. ``observers`` is a list."""

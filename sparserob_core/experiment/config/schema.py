@@ -31,10 +31,10 @@ def config_schema(registry: Registry) -> dict[str, Any]:
     """The JSON schema (draft 2020-12) of the whole config."""
     schema = RunConfig.model_json_schema(schema_generator=_Lenient)
     parts: dict[str, Any] = schema["$defs"]
-    for path, (kind, default) in SLOTS.items():
+    for path, slot in SLOTS.items():
         holder = schema if len(path) == 1 else parts["Dictionaries"]
         previous = holder["properties"][path[-1]]
-        choice = _choice(registry, kind, default, parts)
+        choice = _choice(registry, slot.kind, slot.name, parts)
         if any(option.get("type") == "null" for option in previous.get("anyOf", [])):
             choice["anyOf"].append({"type": "null"})
         holder["properties"][path[-1]] = {

@@ -25,8 +25,9 @@ from sparserob_core.control.sets.sets import ConvexSet, Equality, SetFactory, in
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.config.option_kinds import FreeNumbers, Sparse, count
 from sparserob_core.experiment.plugins.components import Registry
+from sparserob_core.experiment.plugins.hookspecs import SetPlugin
 from sparserob_core.experiment.plugins.messages import COMPLAINT, Complaint, nearest, shown
-from sparserob_core.experiment.plugins.records import Plugin, SetPlugin
+from sparserob_core.experiment.plugins.records import Plugin
 from sparserob_core.experiment.plugins.registry import load_registry
 from sparserob_core.options import Options
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from sparserob_core.experiment.plugins.hookspecs import hookimpl
-from sparserob_core.experiment.plugins.records import (
+from sparserob_core.experiment.plugins.hookspecs import (
     InnerStopPlugin,
     MethodPlugin,
     OuterStopPlugin,
     ProblemPlugin,
     SchedulePlugin,
     SelectionPlugin,
+    hookimpl,
 )
 
 RULES = "sparserob_core.sip.rules"

@@ -6,9 +6,12 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
-from sparserob_core.errors import InputError, UnknownPluginError
+from sparserob_core.errors import InputError, SparseRobError, UnknownPluginError
+from sparserob_core.experiment.plugins.blame import blaming
+from sparserob_core.experiment.plugins.guards import guarded
+from sparserob_core.experiment.plugins.hookspecs import record_type
 from sparserob_core.experiment.plugins.messages import Complaint, complaints, nearest, shown
-from sparserob_core.experiment.plugins.records import RECORDS, Plugin, record_type
+from sparserob_core.experiment.plugins.records import RECORDS, Plugin
 from sparserob_core.options import Options
 
 DISABLE = "SPARSEROB_DISABLE_PLUGINS"
@@ -87,7 +90,8 @@ class Registry:
         options."""
         from pydantic import ValidationError
 
-        model = self.get(kind, name).options_type()
+        record = self.get(kind, name)
+        model = record.options_type()
         given, wrong = dict(options), list[Complaint]()
         for key, part in parts(model).items():
             entry = given.get(key)
@@ -95,7 +99,8 @@ class Registry:
                 given[key], faults = self._spelt_out(part, entry)
                 wrong += [fault.under((key,)) for fault in faults]
         try:
-            checked = model.model_validate(given, context={"registry": self})
+            with blaming(record.origin, "checking its options", but=(SparseRobError, ValidationError)):
+                checked = model.model_validate(given, context={"registry": self})
         except ValidationError as error:
             return None, [*complaints(error, model, options), *wrong]
         return (None if wrong else checked), wrong
@@ -124,7 +129,10 @@ class Registry:
         if checked is None:
             raise InputError("\n".join(f"{kind} {name}: {complaint}" for complaint in wrong))
         inner = {
-            key: self.build(part, value["name"], {option: value[option] for option in value if option != "name"})
+            key: guarded(
+                self.build(part, value["name"], {option: value[option] for option in value if option != "name"}),
+                self.get(part, value["name"]).origin,
+            )
             for key, part in parts(type(checked)).items()
             if isinstance(value := getattr(checked, key), Mapping)
         }

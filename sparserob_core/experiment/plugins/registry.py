@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
-import importlib.util
 import inspect
 import os
-import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -17,15 +15,14 @@ from typing import TypeAlias
 
 import pluggy
 
-from sparserob_core.errors import PluginError
+from sparserob_core.errors import PluginError, UnknownPluginError
+from sparserob_core.experiment.plugins import files
+from sparserob_core.experiment.plugins.blame import blaming, shown
 from sparserob_core.experiment.plugins.components import DISABLE, Failure, Registry
-from sparserob_core.experiment.plugins.hookspecs import GROUP, Hooks, hookimpl
+from sparserob_core.experiment.plugins.hookspecs import GROUP, HOOKS, SPECIFICATIONS
 from sparserob_core.experiment.plugins.messages import nearest
-from sparserob_core.experiment.plugins.records import RECORDS, Plugin
+from sparserob_core.experiment.plugins.records import Plugin
 
-__all__ = ["Hooks", "Registry", "hookimpl", "load_own_registry", "load_registry"]
-
-HOOKS = {record.hook: record for record in RECORDS.values()}
 UNTRUSTED = (
     "only the components that come with SparseRob are loaded here; --plugins FILE loads those of a file of yours"
 )
@@ -45,8 +42,8 @@ def load_own_registry(extra_paths: Iterable[str | Path] = ()) -> Registry:
     points of other distributions. A component that is missing for that reason is an unknown name, and the message
     says how to load it. A file of ``extra_paths`` that fails is a `PluginError`.
     """
-    files = tuple(Path(path).resolve() for path in extra_paths)
-    return _load(files, _disabled(), _own_entry_points)
+    paths = tuple(Path(path).resolve() for path in extra_paths)
+    return _load(paths, _disabled(), _own_entry_points)
 
 
 def load_registry(extra_paths: Iterable[str | Path] = (), entry_points: bool = True) -> Registry:
@@ -56,10 +53,10 @@ def load_registry(extra_paths: Iterable[str | Path] = (), entry_points: bool = T
     asked for by name, so its failure is a `PluginError`. Plugins named in the environment variable
     ``SPARSEROB_DISABLE_PLUGINS`` (entry point or distribution, separated by commas) are not even imported.
     """
-    files = tuple(Path(path).resolve() for path in extra_paths)
+    paths = tuple(Path(path).resolve() for path in extra_paths)
     if not entry_points:
-        return _load(files, _disabled(), lambda disabled: [])
-    return _load(files, _disabled(), _entry_points) if files else _installed(_disabled())
+        return _load(paths, _disabled(), lambda disabled: [])
+    return _load(paths, _disabled(), _entry_points) if paths else _installed(_disabled())
 
 
 def _disabled() -> tuple[str, ...]:
@@ -71,41 +68,54 @@ def _installed(disabled: tuple[str, ...]) -> Registry:
     return _load((), disabled, _entry_points)
 
 
-def _load(files: Sequence[Path], disabled: Sequence[str], installed: Finder) -> Registry:
+@dataclass(frozen=True)
+class _Loaded:
+    """A plugin's module, its name, and its file or distribution."""
+
+    name: str
+    source: str
+    module: ModuleType
+
+
+def _load(paths: Sequence[Path], disabled: Sequence[str], installed: Finder) -> Registry:
     from sparserob_core.experiment.plugins import builtin
 
-    plugins: dict[str, ModuleType] = {"core": builtin}
-    failures: list[Failure] = []
+    found, failures = [_Loaded("core", "", builtin)], list[Failure]()
     for entry in installed(disabled):
-        try:
-            plugins.setdefault(entry.name, entry.load())
-        except Exception as error:  # noqa: BLE001  a stranger's module may raise anything, and must not stop the others
-            failures.append(Failure(_identity(entry), f"{type(error).__name__}: {error}"))
-    for file in files:
-        plugins[file.stem] = _module(file)
+        with _noted(failures, _identity(entry)):
+            module = entry.load()
+            if module is not builtin:
+                found.append(_Loaded(entry.name, _source(entry), module))
     records: list[Plugin] = []
-    for name, module in plugins.items():
-        try:
-            records += _records(name, module)
-        except Exception as error:  # noqa: BLE001  likewise
-            failures.append(
-                Failure(name, str(error) if isinstance(error, PluginError) else f"{type(error).__name__}: {error}")
-            )
-    asked_for = {file.stem for file in files}
-    for failure in failures:
-        if failure.plugin in asked_for:
-            raise PluginError(str(failure))
+    for plugin in found:
+        with _noted(failures, plugin.name):
+            records += list(_records(plugin))
+    for file in paths:  # asked for by name: a failure ends everything
+        records += _records(_Loaded(file.stem, str(file), _module(file)))
     hint = UNTRUSTED if installed is _own_entry_points else ""
     return Registry(records, failures, disabled, hint)
 
 
+@contextmanager
+def _noted(failures: list[Failure], plugin: str) -> Iterator[None]:
+    """A stranger's module may raise anything, and must not stop the others."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # noqa: BLE001  SystemExit too
+        failures.append(Failure(plugin, str(error) if isinstance(error, PluginError) else _said(error)))
+
+
+def _said(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}"
+
+
 def _entry_points(disabled: Sequence[str]) -> list[metadata.EntryPoint]:
-    found = {
-        entry.name: entry
-        for entry in metadata.entry_points(group=GROUP)
-        if not {entry.name, _distribution(entry)} & set(disabled)
-    }
-    return [found[name] for name in sorted(found)]
+    return sorted(
+        (one for one in metadata.entry_points(group=GROUP) if not {one.name, _distribution(one)} & set(disabled)),
+        key=lambda entry: entry.name,
+    )
 
 
 def _own_entry_points(disabled: Sequence[str]) -> list[metadata.EntryPoint]:
@@ -117,46 +127,48 @@ def _distribution(entry: metadata.EntryPoint) -> str:
     return entry.dist.name if entry.dist else "?"
 
 
-def _identity(entry: metadata.EntryPoint) -> str:
+def _source(entry: metadata.EntryPoint) -> str:
     version = f" {entry.dist.version}" if entry.dist else ""
-    return f"{entry.name} ({_distribution(entry)}{version}, {entry.value})"
+    return f"{_distribution(entry)}{version}, {entry.value}"
+
+
+def _identity(entry: metadata.EntryPoint) -> str:
+    return f"{entry.name} ({_source(entry)})"
 
 
 def _module(file: Path) -> ModuleType:
-    name = f"sparserob_file_{hashlib.sha256(str(file).encode()).hexdigest()[:8]}_{file.stem}"
-    specification = importlib.util.spec_from_file_location(name, file)
-    if file.suffix != ".py" or not file.is_file() or specification is None or specification.loader is None:
-        raise PluginError(f"{file}: no such plugin; expected a Python file")
-    module = importlib.util.module_from_spec(specification)
-    sys.modules[name] = module  # pydantic looks the annotations of a class up there
-    try:
-        specification.loader.exec_module(module)
-    except Exception as error:
-        del sys.modules[name]
-        raise PluginError(f"{file}: the plugin failed to load: {type(error).__name__}: {error}") from error
-    return module
+    if file.suffix != ".py" or not file.is_file():
+        raise UnknownPluginError(f"{file}: no such plugin; expected a Python file")
+    with blaming(f"plugin '{file.stem}' ({file})", "loading it", but=()):
+        return files.load(file)
 
 
-def _records(name: str, module: ModuleType) -> Iterator[Plugin]:
+def _records(plugin: _Loaded) -> Iterator[Plugin]:
+    who = f"plugin '{plugin.name}'" + (f" ({plugin.source})" if plugin.source else "")
     manager = pluggy.PluginManager(GROUP)
-    manager.add_hookspecs(Hooks)
-    manager.register(module, name=name)
-    callers = manager.get_hookcallers(module) or []
+    manager.add_hookspecs(SPECIFICATIONS)
+    with blaming(who, "registering it", but=()):
+        manager.register(plugin.module, name=plugin.name)
+    callers = manager.get_hookcallers(plugin.module) or []
     for caller in callers:
         if not caller.has_spec():
-            raise PluginError(f"unknown hook '{caller.name}'{nearest(caller.name, HOOKS)}")
-    _refuse_unmarked(module, {caller.name for caller in callers})
+            raise PluginError(f"{who}: unknown hook '{caller.name}'{nearest(caller.name, HOOKS)}")
+    _refuse_unmarked(who, plugin.module, {caller.name for caller in callers})
     for caller in callers:
         expected = HOOKS[caller.name]
-        for record in (record for records in caller() for record in records):
+        with blaming(who, f"hook {caller.name}", but=()):
+            yielded = [record for records in caller() for record in records]
+        for record in yielded:
             if not isinstance(record, expected):
-                raise PluginError(f"{caller.name} yielded {record!r}, expected records of type {expected.__name__}")
-            yield replace(record, plugin=name)
+                raise PluginError(
+                    f"{who}: {caller.name} yielded {shown(record)}, expected records of type {expected.__name__}"
+                )
+            yield replace(record, plugin=plugin.name, source=plugin.source)
 
 
-def _refuse_unmarked(module: ModuleType, marked: set[str]) -> None:
+def _refuse_unmarked(who: str, module: ModuleType, marked: set[str]) -> None:
     for name, _ in inspect.getmembers(module, inspect.isfunction):
         if name.startswith(f"{GROUP}_") and name not in marked:
-            raise PluginError(f"'{name}' is not marked with @sparserob_core.hookimpl")
+            raise PluginError(f"{who}: '{name}' is not marked with @sparserob_core.hookimpl")
     if not marked:
-        raise PluginError(f"it implements no hook; there are {', '.join(HOOKS)}")
+        raise PluginError(f"{who}: it implements no hook; there are {', '.join(HOOKS)}")

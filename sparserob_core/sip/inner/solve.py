@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from sparserob_core.errors import PluginError
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
 from sparserob_core.sip.inner.change_of_variables import from_new_variables, in_new_variables
 from sparserob_core.sip.inner.duality import farkas_margin, measure, minimisers
@@ -133,7 +134,8 @@ def _ask(case: _Case, program: FiniteProgram, form: Form, accuracy: float) -> tu
     try:
         claim = case.solver.solve(qp, accuracy)
     except Exception as error:  # noqa: BLE001  a foreign solver may raise anything; its failure must not be ours
-        case.attempts.append(f"{form} form: the solver raised {type(error).__name__}: {error}")
+        said = str(error) if isinstance(error, PluginError) else f"the solver raised {type(error).__name__}: {error}"
+        case.attempts.append(f"{form} form: {said}")
         return None, None
     if not _well_formed(claim, qp):
         case.attempts.append(

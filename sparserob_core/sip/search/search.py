@@ -133,7 +133,8 @@ class CountedObjective:
 
     def accepts(self, current: float, candidate: float, temperature: float, rng: np.random.Generator) -> bool:
         """See `Objective.accepts`."""
-        return bool((self.rules or Rules()).selection(current, candidate, temperature, rng))
+        selection = (self.rules or Rules()).selection
+        return bool(_of_rule("slcr", lambda: selection(current, candidate, temperature, rng)))
 
     def note(self, **scalars: float) -> None:
         """See `Objective.note`."""
@@ -176,9 +177,10 @@ class CountedObjective:
 
     def _stopped(self) -> bool:
         stop = None if self.rules is None else self.rules.stop
-        return stop is not None and bool(
-            stop(Progress(self.evaluations, self.best_value, self._last_notes(), self._improvements))
-        )
+        if stop is None:
+            return False
+        progress = Progress(self.evaluations, self.best_value, self._last_notes(), self._improvements)
+        return bool(_of_rule("sc2", lambda: stop(progress)))
 
     def _checked(self, points: Array) -> Array:
         asked = np.array(points, dtype=float)
@@ -237,6 +239,16 @@ class CountedObjective:
         if values[top] > self.best_value or first:
             self.best_value, self.best_point = float(values[top]), points[top].copy()
             self._improvements.append((self.evaluations, self.best_value))
+
+
+def _of_rule(name: str, ask: Callable[[], object]) -> object:
+    """What a rule answers; what it raises is not the maximiser's fault."""
+    try:
+        return ask()
+    except (SparseRobError, KeyboardInterrupt):
+        raise
+    except BaseException as error:
+        raise PluginError(f"{name}: the rule raised {type(error).__name__}: {error}") from error
 
 
 def _shown(point: Array) -> str:

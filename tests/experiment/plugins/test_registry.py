@@ -116,14 +116,14 @@ def test_a_plugin_that_is_asked_for_and_broken_says_why(plugin: Callable[[str], 
 
 def test_a_component_of_another_kind_is_refused(plugin: Callable[[str], Path]) -> None:
     registry = load(plugin(GOOD.replace("class Weighted(sr.Regulariser, sr.Options)", "class Weighted(sr.Options)")))
-    with pytest.raises(sr.PluginError, match="built a Weighted, expected a Regulariser"):
+    with pytest.raises(sr.PluginError, match=r"building it returned Weighted\(weight=1.0\), expected a Regulariser"):
         registry.build("regulariser", "mine")
 
 
 def test_a_lazy_factory_is_imported_only_when_it_is_chosen(plugin: Callable[[str], Path]) -> None:
     registry = load(plugin(GOOD.replace("factory=Weighted", 'factory="nowhere.to_be:Found"')))
     assert registry.names("regulariser") == ["mine"]
-    with pytest.raises(sr.PluginError, match=r"cannot be loaded from 'nowhere.to_be:Found'"):
+    with pytest.raises(sr.PluginError, match=r"loading 'nowhere.to_be:Found' raised ModuleNotFoundError"):
         registry.build("regulariser", "mine")
 
 
@@ -203,3 +203,26 @@ def test_where_directories_of_others_are_read_only_this_distribution_is_imported
     with pytest.raises(sr.PluginError, match=r"(?s)no regulariser is named 'mine'.*--plugins FILE"):
         registry.get("regulariser", "mine")
     assert discovery.load_own_registry([plugin(GOOD)]).names("regulariser") == ["mine"]
+
+
+def test_a_component_of_a_file_can_be_sent_to_a_fresh_process(plugin: Callable[[str], Path]) -> None:
+    import pickle
+    import subprocess
+    import sys
+
+    sent = pickle.dumps(load(plugin(GOOD)).build("regulariser", "mine", {"weight": 2.0}))
+    program = "import pickle, sys; print(pickle.load(sys.stdin.buffer))"
+    there = subprocess.run([sys.executable, "-c", program], input=sent, capture_output=True, check=True)
+    assert there.stdout.decode().strip() == "weight=2.0"
+
+
+def test_a_file_is_read_anew_whenever_it_is_loaded(plugin: Callable[[str], Path]) -> None:
+    assert load(plugin(GOOD)).build("regulariser", "mine").weight == 1.0
+    assert load(plugin(GOOD.replace("1.0", "7.25"))).build("regulariser", "mine").weight == 7.25
+
+
+def test_two_files_of_one_name_are_two_plugins(tmp_path: Path) -> None:
+    for folder, name in (("a", "one"), ("b", "two")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "x.py").write_text(GOOD.replace('name="mine"', f'name="{name}"'))
+    assert load(tmp_path / "a" / "x.py", tmp_path / "b" / "x.py").names("regulariser") == ["one", "two"]

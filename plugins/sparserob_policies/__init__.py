@@ -1,0 +1,17 @@
+"""Registers the policies, whose mathematics is the core's: the checker needs it too."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import sparserob_core as sr
+
+
+@sr.hookimpl
+def sparserob_policies() -> Iterator[sr.PolicyPlugin]:
+    """Offer ``open_loop``."""
+    yield sr.PolicyPlugin(
+        name="open_loop",
+        factory="sparserob_core.control.policies.policy:OpenLoop",
+        summary="the control is fixed before the run",
+    )

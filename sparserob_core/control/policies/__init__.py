@@ -1,0 +1,1 @@
+"""Policies: what the control may know of the run while the system runs."""

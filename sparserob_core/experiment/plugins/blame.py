@@ -1,0 +1,46 @@
+"""Whose fault it is: what strangers raise or return becomes one error with the name of the component."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TypeVar
+
+from sparserob_core.errors import PluginError, SparseRobError
+from sparserob_core.sip.maximiser import SearchEnded
+
+Answer = TypeVar("Answer")
+SHOWN = 80
+PASSING = (SparseRobError, SearchEnded)  # what says itself what is wrong
+
+
+@contextmanager
+def blaming(origin: str, what: str, but: tuple[type[Exception], ...] = PASSING) -> Iterator[None]:
+    """Whatever is raised inside, `SystemExit` too, becomes a `PluginError` that names the component ``origin`` and what
+    it was doing. The errors ``but`` and Ctrl-C pass."""
+    passing: tuple[type[BaseException], ...] = (KeyboardInterrupt, *but)
+    try:
+        yield
+    except passing:
+        raise
+    except BaseException as error:
+        said = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        raise PluginError(f"{origin}: {what} raised {said}") from error
+
+
+def asked(origin: str, what: str, question: Callable[[], object], expected: type[Answer]) -> Answer:
+    """The answer of a component, of the type that its kind must return; anything else is its `PluginError`."""
+    with blaming(origin, what):
+        answer = question()
+    if not isinstance(answer, expected):
+        raise PluginError(f"{origin}: {what} returned {shown(answer)}, expected a {expected.__name__}")
+    return answer
+
+
+def shown(value: object) -> str:
+    """A short text of a stranger's value, whose ``repr`` may fail too."""
+    try:
+        text = " ".join(repr(value).split())
+    except Exception:  # noqa: BLE001  a stranger's repr
+        text = f"a {type(value).__name__}"
+    return text if len(text) <= SHOWN else text[: SHOWN - 3] + "..."

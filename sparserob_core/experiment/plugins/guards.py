@@ -1,0 +1,192 @@
+"""Components of strangers behind a thin check: what they raise, or return in spite of their kind, is told with their
+name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager
+from typing import TYPE_CHECKING, Any, TypeVar, final
+
+import numpy as np
+
+from sparserob_core.control.problem.dictionary import Dictionary, DictionaryFactory
+from sparserob_core.control.problem.problem import OptimalControlProblem, ProblemFactory
+from sparserob_core.errors import PluginError
+from sparserob_core.experiment.plugins import files
+from sparserob_core.experiment.plugins.blame import asked, blaming, shown
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.maximiser import Maximiser, Objective
+from sparserob_core.sip.method import ExecutorFactory, Method, Tools
+from sparserob_core.sip.program import SemiInfiniteProgram
+from sparserob_core.sip.regulariser import ControlImage, Regulariser
+from sparserob_core.sip.result import MEANING, Result
+from sparserob_core.sip.rules import InnerStop, OuterStop, Schedule, Selection
+from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_array
+
+Component = TypeVar("Component")
+FILES = f"{files.__name__}."
+TRUTH = (bool, np.bool_)
+NUMBER = (int, float, np.integer, np.floating)
+
+
+def guarded(component: Component, origin: str) -> Component:
+    """The component behind the check of its kind; itself where its kind has none, or where it is the core's own, whose
+    faults are internal errors.
+
+    ``origin`` is what messages call it.
+    """
+    module = type(component).__module__
+    own = module.startswith("sparserob_core.") and not module.startswith(FILES)
+    guard = next((guard for kind, guard in GUARDS.items() if isinstance(component, kind)), None)
+    return component if own or guard is None else guard(component, origin)
+
+
+def origin_of(kind: str, component: object) -> str:
+    """What messages call a component that was handed over as an object."""
+    return f"{kind} {type(component).__name__} ({type(component).__module__})"
+
+
+@final
+class _Problem(ProblemFactory):
+    def __init__(self, problem: ProblemFactory, origin: str) -> None:
+        self._problem, self.origin = problem, origin
+
+    def build(self) -> OptimalControlProblem | SemiInfiniteProgram:
+        with blaming(self.origin, "build"):
+            built: object = self._problem.build()
+        if not isinstance(built, OptimalControlProblem | SemiInfiniteProgram):
+            raise PluginError(
+                f"{self.origin}: build returned {shown(built)}, expected an OptimalControlProblem or a "
+                "SemiInfiniteProgram"
+            )
+        return built
+
+
+@final
+class _Dictionary(DictionaryFactory):
+    def __init__(self, dictionary: DictionaryFactory, origin: str) -> None:
+        self._dictionary, self.origin = dictionary, origin
+
+    def build(self, horizon: float) -> Dictionary:
+        built = asked(self.origin, "build", lambda: self._dictionary.build(horizon), Dictionary)
+        first, last = float(built.breakpoints[0]), float(built.breakpoints[-1])
+        if first != 0.0 or abs(last - horizon) > 1e-9 * horizon:
+            raise PluginError(
+                f"{self.origin}: build returned a dictionary on [{first!r}, {last!r}], expected [0, {horizon!r}]"
+            )
+        return built
+
+
+@final
+class _Method(Method):
+    def __init__(self, method: Method, origin: str) -> None:
+        self._method, self.origin = method, origin
+
+    def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
+        result = asked(self.origin, "solve", lambda: self._method.solve(program, tools), Result)
+        if result.status not in MEANING:
+            raise PluginError(
+                f"{self.origin}: solve returned the status {shown(result.status)}, expected one of {', '.join(MEANING)}"
+            )
+        decision: Any = result.decision
+        if decision is not None and np.shape(decision) != (program.n,):
+            raise PluginError(
+                f"{self.origin}: solve returned the decision {shown(decision)}, expected {program.n} numbers"
+            )
+        return result
+
+
+@final
+class _Executors(ExecutorFactory):
+    def __init__(self, executors: ExecutorFactory, origin: str) -> None:
+        self._executors, self.origin = executors, origin
+
+    def open(self) -> AbstractContextManager[Executor]:
+        return asked(self.origin, "open", self._executors.open, AbstractContextManager)  # type: ignore[type-abstract]
+
+
+@final
+class _Solver(Solver):
+    def __init__(self, solver: Solver, origin: str) -> None:
+        self._solver, self.origin = solver, origin
+
+    def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
+        claim = asked(self.origin, "solve", lambda: self._solver.solve(program, accuracy), Claim)
+        if claim.status not in ("solved", "infeasible", "failed"):
+            raise PluginError(
+                f"{self.origin}: solve claimed {shown(claim.status)}, expected solved, infeasible or failed"
+            )
+        if claim.status != "solved":
+            return claim
+        parts = {"x": program.q, "z": program.h, "y": program.b, "z_box": program.q}
+        for name, like in parts.items():
+            value = getattr(claim, name)
+            if np.shape(value) != like.shape or np.asarray(value).dtype.kind not in "fiu":
+                raise PluginError(f"{self.origin}: solve claimed {name} = {shown(value)}, expected {like.size} numbers")
+        return claim
+
+
+@final
+class _Maximiser(Maximiser):
+    """`sparserob_core.sip.search.search.maximise` checks what it returns, and calls it by its ``origin``."""
+
+    def __init__(self, maximiser: Maximiser, origin: str) -> None:
+        self._maximiser, self.origin = maximiser, origin
+
+    def search(self, objective: Objective, rng: np.random.Generator) -> float:
+        return self._maximiser.search(objective, rng)
+
+
+@final
+class _Regulariser(Regulariser):
+    def __init__(self, regulariser: Regulariser, origin: str) -> None:
+        self._regulariser, self.origin = regulariser, origin
+
+    def quadratic(self, image: ControlImage) -> tuple[csc_array, Array]:
+        from scipy.sparse import csc_array
+
+        answer = asked(self.origin, "quadratic", lambda: self._regulariser.quadratic(image), tuple)
+        n = image.S.shape[1]
+        with blaming(self.origin, "quadratic: what it returned"):
+            P, q = csc_array(answer[0]), np.asarray(answer[1], dtype=float)
+        if len(answer) != 2 or P.shape != (n, n) or q.shape != (n,):
+            raise PluginError(
+                f"{self.origin}: quadratic returned shapes {P.shape} and {q.shape}, expected ({n}, {n}) and ({n},)"
+            )
+        if not (np.isfinite(P.data).all() and np.isfinite(q).all()):
+            raise PluginError(f"{self.origin}: quadratic returned numbers that are not finite")
+        return P, q
+
+
+def _rule(kind: type, expected: tuple[type, ...], words: str) -> Callable[[Any, str], object]:
+    """A guard of rules: objects that are called."""
+
+    def guard(rule: Callable[..., object], origin: str) -> object:
+        def call(_: object, *arguments: object) -> object:
+            answer = asked(origin, "calling it", lambda: rule(*arguments), object)
+            if not isinstance(answer, expected):
+                raise PluginError(f"{origin}: calling it returned {shown(answer)}, expected {words}")
+            return answer
+
+        return type(kind.__name__, (kind,), {"__call__": call, "origin": origin})()
+
+    return guard
+
+
+GUARDS: dict[type, Callable[[Any, str], Any]] = {
+    ProblemFactory: _Problem,
+    DictionaryFactory: _Dictionary,
+    Method: _Method,
+    ExecutorFactory: _Executors,
+    Solver: _Solver,
+    Maximiser: _Maximiser,
+    Regulariser: _Regulariser,
+    Schedule: _rule(Schedule, NUMBER, "a number"),
+    OuterStop: _rule(OuterStop, TRUTH, "true or false"),
+    InnerStop: _rule(InnerStop, TRUTH, "true or false"),
+    Selection: _rule(Selection, TRUTH, "true or false"),
+}
