@@ -44,7 +44,8 @@ class Explorer:
         )
 
     def aim(self, slots: Floats, epsilon: float, words: str) -> None:
-        """Ask for the landscape through a tuple ``(D, width)``; it is begun when the one in work is complete."""
+        """Ask for the landscape through a tuple ``(D, width)``, in the middle of the coordinates that it does not say;
+        it is begun when the one in work is complete."""
         if self.left > 0:
             self.waiting = (np.array(slots, dtype=float), epsilon, words)
 
@@ -81,7 +82,10 @@ class Explorer:
             return False
         slots, epsilon, self.words = self.waiting
         g = self.inspection.relaxed_value(len(slots), epsilon)
-        anchor = np.clip(slots, g.slot.lower, g.slot.upper)
+        known, middle = min(slots.shape[1], g.slot.dimension), (g.slot.lower + g.slot.upper) / 2
+        anchor = np.tile(middle, (len(slots), 1))
+        anchor[:, :known] = slots[:, :known]
+        anchor = np.clip(anchor, g.slot.lower, g.slot.upper)
         g.at(anchor)
         if self.options.coordinates is not None:
             pair = tuple(coordinate(name, g, len(slots)) for name in self.options.coordinates)

@@ -148,7 +148,7 @@ class Recorder:
                 self.best.reshape(-1, self.block), event.epsilon, f"others as in the best tuple of round {event.round}"
             )
         elif not self.searches:
-            slots = slots_of(active(event.imposed, event.multipliers))
+            slots = slots_of(active(event.imposed, event.multipliers), self._formulation)
             if slots.size:
                 self.explorer.aim(slots, event.epsilon, f"others as active in round {event.round}")
 
@@ -166,12 +166,19 @@ class Recorder:
                 self.rounds.violations(result.decision, result.indices, ())
             # a run that is shown again
             if self.explorer.landscape is None and self.explorer.waiting is None and result.indices:
-                self.explorer.aim(slots_of(list(result.indices)), result.epsilon, "others as active at the end")
+                self.explorer.aim(
+                    slots_of(list(result.indices), self._formulation), result.epsilon, "others as active at the end"
+                )
         self.say(
             f"{event.status}: {event.message}",
             {"failed": "ERROR", "refuted": "WARN", "undecided": "WARN"}.get(event.status, "INFO"),
         )
         self._page(event.status, lines)
+
+    @property
+    def _formulation(self) -> str:
+        """What the indices of the landscape say."""
+        return "literal" if self.inspection is not None and self.inspection.literal else "reduced"
 
     def _page(self, status: str, lines: list[str]) -> None:
         text = words.page(self.opening.title, status, self.lower, self.upper, lines)
@@ -193,13 +200,15 @@ def active(cuts: Any, multipliers: Floats) -> list[sr.Cut]:
     return [replace(cut, multiplier=float(m)) for cut, m in zip(cuts, multipliers, strict=True) if m > 0.0]
 
 
-def slots_of(cuts: list[sr.Cut]) -> Floats:
-    """The distinct indices of cuts as a tuple ``(D, width)``, the one with the largest multiplier first."""
+def slots_of(cuts: list[sr.Cut], formulation: str) -> Floats:
+    """The distinct indices of cuts as a tuple ``(D, width)``, the one with the largest multiplier first; of an index of
+    another formulation the first coordinate only, the time, which all of them have."""
     ordered = sorted(cuts, key=lambda cut: -cut.multiplier)
-    width = max((len(cut.index) for cut in ordered), default=0)
+    indices = [cut.index if cut.formulation == formulation else cut.index[:1] for cut in ordered]
+    width = max(map(len, indices), default=0)
     found: dict[bytes, Floats] = {}
-    for cut in ordered:
+    for index in indices:
         slot = np.zeros(width)
-        slot[: len(cut.index)] = cut.index
+        slot[: len(index)] = index
         found.setdefault(np.round(slot, 9).tobytes(), slot)
     return np.array(list(found.values())[:SLOTS]).reshape(-1, width) if found else np.zeros((0, 0))

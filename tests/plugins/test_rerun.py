@@ -458,3 +458,14 @@ def test_the_viewer_draws_every_panel_without_complaint(
     assert len(state.views) >= 8
     assert [view.reports for view in state.views] == [[]] * len(state.views)
     assert picture.stat().st_size > 50_000
+
+
+def test_a_landscape_takes_only_the_time_of_an_index_of_another_formulation() -> None:
+    from sparserob_rerun.recorder import slots_of
+
+    cuts = [
+        sr.Cut("path", np.array([1.0, 17.0]), 0, 2.0, "sampled"),
+        sr.Cut("path", np.array([0.5, 0.1, 0.2]), 0, 1.0, "reduced"),
+    ]
+    np.testing.assert_array_equal(slots_of(cuts, "reduced"), [[1.0, 0.0, 0.0], [0.5, 0.1, 0.2]])
+    np.testing.assert_array_equal(slots_of(cuts[:1], "literal"), [[1.0]])
