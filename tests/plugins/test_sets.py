@@ -203,3 +203,19 @@ def test_parameters_in_a_zonotope_give_the_answer_of_the_same_polytope(tmp_path)
         for name, one in (("zonotope", zonotope), ("polytope", polytope))
     ]
     assert found[0] == pytest.approx(found[1], rel=1e-6)
+
+
+def test_a_run_with_a_set_of_a_file_is_checked_with_that_file_only(disc, tmp_path):
+    pytest.importorskip("flint")
+    cost(changed(terminal=[{"disc": 0.4}]) | {"plugins": [disc]}, tmp_path / "run")
+    with pytest.raises(sr.InputError, match=r"terminal\.0\.disc: unknown key(.|\n)*--plugins FILE"):
+        sr.check(tmp_path / "run")
+    found = sr.check(tmp_path / "run", plugins=[disc])
+    assert {claim.name: claim.verdict for claim in found.claims}["terminal"] == "not checked"
+    assert found.status == "undecided"
+
+
+def test_a_missing_kind_says_which_plugin_is_disabled(monkeypatch):
+    monkeypatch.setenv("SPARSEROB_DISABLE_PLUGINS", "sets")
+    with pytest.raises(sr.InputError, match=r"problem\.control\.box: unknown key(.|\n)*'sets' is disabled"):
+        sr.run(BOXES, quiet=True, figures=False)

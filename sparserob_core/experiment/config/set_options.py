@@ -109,7 +109,7 @@ def _checked(registry: Registry, kind: str, value: object, keys: set[str]) -> tu
     """The typed options of one kind of set, or what is wrong with them; ``keys`` are those that are no kinds."""
     known = registry.names(KIND)
     if kind not in known:
-        return None, [Complaint((), f"unknown key{nearest(kind, {*known, *keys})}")]
+        return None, [Complaint((), f"unknown key{nearest(kind, {*known, *keys})}{registry.notes()}")]
     short = shorthand(registry.get(KIND, kind))
     if not isinstance(value, Mapping) and short is None:
         return None, [Complaint((), f"must be a mapping (got {shown(value)})")]

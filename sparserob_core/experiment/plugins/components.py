@@ -83,7 +83,7 @@ class Registry:
         known = self._records[record_type(kind).kind]
         if name in known:
             return known[name]
-        raise UnknownPluginError(f"no {kind} is named '{name}'{nearest(name, known)}{self._notes()}")
+        raise UnknownPluginError(f"no {kind} is named '{name}'{nearest(name, known)}{self.notes()}")
 
     def check(self, kind: str, name: str, options: Mapping[str, object]) -> tuple[Options | None, list[Complaint]]:
         """The typed options, or what is wrong with them. An option that is itself a component is spelt out with its own
@@ -145,11 +145,12 @@ class Registry:
         if not found:
             known = {record.name for record in self.records()}
             raise UnknownPluginError(
-                f"no component is named '{name}'{nearest(name.rpartition('.')[2], known)}{self._notes()}"
+                f"no component is named '{name}'{nearest(name.rpartition('.')[2], known)}{self.notes()}"
             )
         return found
 
-    def _notes(self) -> str:
+    def notes(self) -> str:
+        """Why a name may be missing, a line each: plugins that failed, that are disabled, or that are not loaded."""
         notes = [f"\n  note: {failure}" for failure in self.failures]
         notes += [f"\n  note: plugin '{plugin}' is disabled by {DISABLE}" for plugin in self._disabled]
         return "".join([*notes, f"\n  note: {self._hint}" if self._hint else ""])
