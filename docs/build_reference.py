@@ -29,8 +29,9 @@ MEANING = {
 FILES = {
     "config.yaml": "the complete, resolved config; `sparserob run` takes it",
     "result.json": (
-        "status, message, cost, value, epsilon, bounds, gap, worst constraint, sparsity, counts, seconds, seed,"
-        " versions; for the scenario approach `scenario_bound`"
+        "status, message, cost, value, epsilon, bounds, gap, worst constraint, sparsity, counts, seconds (of the"
+        " method: solving and proving, neither reading nor drawing), seed, versions; for the scenario approach"
+        " `scenario_bound`; `upper_bound` and `gap` are null unless the status is certified or verified"
     ),
     "certificate.json": (
         "what is claimed and what proves it; `sparserob check` takes it, [certificate.md](certificate.md) explains it"
@@ -50,7 +51,8 @@ FILES = {
     ),
     "adversary.npz": "per constraint its worst time, parameter, disturbance and the states that these cause",
     "simulation-LAW.json": "written by `sparserob simulate`: how often trajectories under a law break each constraint",
-    "figures/": "`control`, `states`, `convergence`, `adversary`, each as PDF and PNG; `clash` when infeasible",
+    "figures/": "`control`, `states`, `convergence`, `adversary`, each as PDF and PNG; `clash` when infeasible; an"
+    " extra: where they cannot be drawn a line says so, and the status of the run stays as it is",
 }
 
 

@@ -130,4 +130,9 @@ def _registry() -> Any:
 @sr.hookimpl
 def sparserob_maximisers() -> Iterator[sr.MaximiserPlugin]:
     """Offer ``nevergrad``."""
-    yield sr.MaximiserPlugin(name="nevergrad", factory=Nevergrad, summary="any optimiser of nevergrad (extra)")
+    yield sr.MaximiserPlugin(
+        name="nevergrad",
+        factory=Nevergrad,
+        summary="any optimiser of nevergrad (extra)",
+        needs=("nevergrad", "sparserob[nevergrad]"),
+    )

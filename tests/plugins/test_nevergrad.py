@@ -99,6 +99,25 @@ def test_a_misspelt_name_names_the_nearest_one():
         search(fallback="NGOpt!")
 
 
+def test_a_missing_package_is_found_before_anything_is_solved_or_written(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "nevergrad", None)
+    config = {
+        "problem": {
+            "name": "linear",
+            "system": {"A": [[0]], "B": [[1]]},
+            "horizon": 1.0,
+            "initial_state": [1],
+            "control": {"box": 1.0},
+            "terminal": [{"box": [0.5]}],
+        },
+        "method": "sparserob",
+        "maximiser": "nevergrad",
+    }
+    with pytest.raises(sr.PluginError, match=r"nevergrad is not installed; `pip install 'sparserob\[nevergrad\]'`"):
+        sr.run(config, out=tmp_path / "out", quiet=True)
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_missing_package_is_one_sentence_that_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "nevergrad.optimization", None)
     with pytest.raises(

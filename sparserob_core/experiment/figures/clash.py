@@ -13,6 +13,7 @@ import numpy as np
 from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.figures import style as look
+from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
@@ -75,7 +76,7 @@ def draw_clash(experiment: Experiment, result: Result, directory: Path) -> list[
         alone = any(
             strip.best - strip.sigma_low < strip.low or strip.best + strip.sigma_high > strip.high for strip in strips
         )
-        axes[0].set_title(experiment.title, pad=8 if alone else 22)
+        axes[0].set_title(printable(experiment.title), pad=8 if alone else 22)
         if not alone:
             axes[0].text(
                 0.0,

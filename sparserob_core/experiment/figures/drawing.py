@@ -18,6 +18,7 @@ from sparserob_core.experiment.directory.adversary import adversaries
 from sparserob_core.experiment.directory.finished import read_finished
 from sparserob_core.experiment.directory.sparsity import sparsity
 from sparserob_core.experiment.figures.figure_data import FigureData, Wall
+from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.events import RoundFinished
 
@@ -94,7 +95,7 @@ def _data(
     tolerance = experiment.loaded.config.method.options.get("tolerance")
     state, lower, upper = _tube(model, control, shown)
     return FigureData(
-        title=experiment.title,
+        title=printable(experiment.title),
         breakpoints=dictionary.breakpoints,
         control=control,
         control_lower=-problem.control.support(-axes),

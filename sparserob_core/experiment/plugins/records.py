@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
+from importlib.util import find_spec
 from typing import ClassVar
 
 from sparserob_core.errors import PluginError
@@ -24,7 +25,10 @@ class Plugin:
     ``factory``  the component's class, or ``"package.module:attribute"``, which is imported only when it is chosen;
     ``options``  the class of its options; not needed when the component's class is itself an `Options`;
     ``summary``  one line for ``sparserob plugins``;
-    ``plugin``   who registered it, and ``source``, its file or distribution (both filled in by the registry).
+    ``plugin``   who registered it, and ``source``, its file or distribution (both filled in by the registry);
+    ``needs``    a module that may be missing, and what pip is to install then, such as
+                 ``("nevergrad", "sparserob[nevergrad]")``; it is looked for where the component is built, before
+                 anything is solved.
 
     ``factory(**options)`` builds the component. Raises `PluginError` when a field is malformed. A kind of component is
     a subclass: ``hook`` yields its records, ``component`` is the class of what they build, and ``kind`` its name.
@@ -40,6 +44,7 @@ class Plugin:
     summary: str = ""
     plugin: str = ""
     source: str = ""
+    needs: tuple[str, str] | None = None
 
     def __init_subclass__(cls, hook: str, component: str) -> None:
         cls.hook, cls.component = hook, component
@@ -85,6 +90,8 @@ class Plugin:
 
     def create(self, options: Options) -> object:
         """The component for validated options, checked to be of this kind."""
+        if self.needs is not None and find_spec(self.needs[0]) is None:
+            raise PluginError(f"{self}: {self.needs[0]} is not installed; `pip install '{self.needs[1]}'` brings it")
         factory = self.resolved()
         module, _, attribute = self.component.partition(":")
         expected = getattr(import_module(module), attribute)

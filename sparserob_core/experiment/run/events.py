@@ -51,8 +51,8 @@ class RunStarted(Event):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RunFinished(Event):
-    """A run is over, whether well or not; always the last event. ``result`` is ``None`` when it was interrupted or an
-    error ended it."""
+    """A run is over, whether well or not; always the last event. ``result`` is ``None`` when an error ended it, or an
+    interrupt before there was a decision."""
 
     status: str
     message: str

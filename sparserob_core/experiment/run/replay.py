@@ -13,6 +13,7 @@ from sparserob_core.experiment.directory.finished import UNFINISHED, StoredRun, 
 from sparserob_core.experiment.run.events import Event, RunFinished, RunStarted
 from sparserob_core.experiment.run.inspection import Inspection
 from sparserob_core.experiment.run.viewer import recorder
+from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.events import Batch, EvaluationsFinished
 from sparserob_core.sip.result import Result, SearchTrace
 
@@ -39,7 +40,7 @@ def replay(
     run = stored_run(directory)
     if run.summary["message"] == UNFINISHED:
         raise InputError(f"{directory}: expected a finished run, got one that is still going on or was killed")
-    title = run.summary["title"] or run.directory.name
+    title = printable(run.summary["title"] or run.directory.name)
     inspection, result = Inspection(run.config(plugins)), stored_result(run)
     play(events(inspection, title, run.directory, result), save=save, serve=serve, connect=connect)
     return run.directory

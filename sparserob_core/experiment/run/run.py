@@ -17,6 +17,7 @@ from sparserob_core.experiment.directory.finished import UNFINISHED
 from sparserob_core.experiment.run.events import Broadcast, Event, Observer, RunFinished, RunStarted
 from sparserob_core.experiment.run.inspection import Inspection
 from sparserob_core.experiment.run.journal import Journal
+from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.method import Method, Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
@@ -105,7 +106,7 @@ def run(
             journal.record(Result(status="failed", message=UNFINISHED))
             broadcast(
                 RunStarted(
-                    title=experiment.title,
+                    title=printable(experiment.title),
                     directory=directory.path,
                     problem=experiment.problem if isinstance(experiment, ControlExperiment) else None,
                     program=experiment.program,
