@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -11,12 +12,14 @@ from typing import final
 import numpy as np
 from pydantic import Field
 
+from sparserob_core.errors import InputError
 from sparserob_core.options import Options
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.maximiser import Maximiser
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.regulariser import Regulariser
 from sparserob_core.sip.result import Result
+from sparserob_core.sip.rules import Geometric
 from sparserob_core.sip.solver import Solver
 
 GAP_TOLERANCE = 1e-7  # relative gap at which the bounds have met, unless a method is told otherwise
@@ -41,6 +44,17 @@ class Continuation(Options):
 
     tolerance: float = Field(default=GAP_TOLERANCE, ge=0.0)
     """Relative change of the cost below which a smaller weight changes nothing any more."""
+
+    def lighter(self, epsilon: float, j: int = 1, regu: Callable[[float, int], float] | None = None) -> float:
+        """The weight of iteration ``j``, where the one before had ``epsilon``: by the schedule ``regu``, or else
+        ``factor`` times ``epsilon``; not below ``stop``.
+
+        Raises `InputError` for a schedule that does not give a positive weight below ``epsilon``.
+        """
+        weight: object = (regu or Geometric(factor=self.factor))(epsilon, j)
+        if isinstance(weight, int | float | np.floating) and 0.0 < weight < epsilon:
+            return max(self.stop, float(weight))
+        raise InputError(f"regu: expected a positive weight below {epsilon!r}, got {weight!r}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -115,7 +115,7 @@ class _Run:
         solution = self._solved(self.epsilon)
         regu = self.tools.continuation
         while _usable(solution) and self.epsilon > regu.stop and self._open(solution):
-            lighter = max(regu.stop, self.epsilon * regu.factor)
+            lighter = regu.lighter(self.epsilon)
             candidate = self._solved(lighter)
             if not _usable(candidate):
                 break

@@ -31,7 +31,7 @@ from sparserob_core.sip.proof.verdict import infeasible_subsystem, verdict, witn
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
 from sparserob_core.sip.relaxed.tuples import TupleValue, imposed_program
 from sparserob_core.sip.result import Result, SearchTrace, Status, relative_gap
-from sparserob_core.sip.rules import Geometric, Metropolis, OptimisersSettle, OuterStep
+from sparserob_core.sip.rules import Metropolis, OptimisersSettle, OuterStep
 from sparserob_core.sip.search.search import Rules, Target, maximise
 from sparserob_core.sip.separation.separation import separate
 
@@ -109,7 +109,6 @@ class _Run:
         self.g = TupleValue(self.imposed, self.relaxed, self.method.indices or self.program.n)
 
     def solve(self) -> Result:
-        regu = self.method.regu or Geometric(factor=self.tools.continuation.factor)
         sc1 = self.method.sc1 or OptimisersSettle()
         epsilon = 0.0 if self.tools.regulariser is None else self.tools.continuation.start
         point = self.tools.rng.uniform(self.g.domain.lower, self.g.domain.upper)  # (t_0, Beta_0)
@@ -121,7 +120,7 @@ class _Run:
             if epsilon <= self.tools.continuation.stop or sc1(self.steps):
                 return self._finished(epsilon)
             j += 1
-            epsilon = max(self.tools.continuation.stop, _smaller(regu(epsilon, j), epsilon))
+            epsilon = self.tools.continuation.lighter(epsilon, j, self.method.regu)
 
     @property
     def lower(self) -> float:
@@ -272,9 +271,3 @@ def _change(before: Sequence[Cut], now: Sequence[Cut]) -> tuple[tuple[Cut, ...],
     return tuple(cut for key, cut in new.items() if key not in old), tuple(
         cut for key, cut in old.items() if key not in new
     )
-
-
-def _smaller(weight: object, before: float) -> float:
-    if isinstance(weight, int | float | np.floating) and 0.0 < weight < before:
-        return float(weight)
-    raise InputError(f"regu: expected a positive weight below {before!r}, got {weight!r}")
