@@ -20,7 +20,7 @@ class Status:
         self.round: sr.RoundFinished | None = None
         self.searched: sr.EvaluationsFinished | None = None
         self.proving: sr.ProofProgress | None = None
-        self.lower, self.upper = -math.inf, math.inf
+        self.lower, self.upper, self.gap = -math.inf, math.inf, math.inf
 
     @property
     def elapsed(self) -> float:
@@ -34,6 +34,7 @@ class Status:
                 self.round, self.proving = event, None
                 self.lower = max(self.lower, event.lower_bound)
                 self.upper = min(self.upper, math.inf if event.simplified else event.upper_bound)
+                self.gap = math.inf if event.simplified else event.gap
             case sr.EvaluationsFinished():
                 self.searched, self.proving = event, None
                 self.lower = max(self.lower, event.lower_bound)
@@ -42,7 +43,7 @@ class Status:
 
     def parts(self) -> list[tuple[str, str]]:
         """What is known, as labels and texts of less than 70 characters."""
-        parts = [("bounds", _bounds(self.lower, self.upper))] if self.round or self.searched else []
+        parts = [("bounds", _bounds(self.lower, self.upper, self.gap))] if self.round or self.searched else []
         if self.round is not None:
             parts += [("round", _round(self.round)), ("", _work(self.round))]
         if self.searched is not None:
@@ -51,13 +52,16 @@ class Status:
             parts += [("", notes)] if notes else []
         if self.proving is not None:
             parts.append(("proof", _proof(self.proving)))
+            parts += [("stuck", self.proving.hindrance)] if self.proving.hindrance else []
         return parts
 
     def last(self, event: sr.Event) -> str:
         """One event in one line."""
         match event:
             case sr.RoundFinished():
-                return f"round {_round(event)}  {_bounds(event.lower_bound, event.upper_bound)}  {_work(event)}"
+                return (
+                    f"round {_round(event)}  {_bounds(event.lower_bound, event.upper_bound, event.gap)}  {_work(event)}"
+                )
             case sr.EvaluationsFinished():
                 return "  ".join(["search " + _search(event), _notes(event)]).strip()
             case sr.ProofProgress():
@@ -79,13 +83,11 @@ def duration(seconds: float) -> str:
     return f"{minutes} min {rest:02d} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"
 
 
-def _bounds(lower: float, upper: float) -> str:
+def _bounds(lower: float, upper: float, gap: float) -> str:
     if not (math.isfinite(lower) and math.isfinite(upper)):
         return f"lower {_number(lower)}  upper {_number(upper)}"
-    return (
-        f"lower {_number(lower)}  upper {_number(upper)} (to be proven)  gap"
-        f" {(upper - lower) / max(1.0, abs(upper)):.1e}"
-    )
+    closing = f"  gap {gap:.1e}" if math.isfinite(gap) else ""
+    return f"lower {_number(lower)}  upper {_number(upper)} (to be proven){closing}"
 
 
 def _round(event: sr.RoundFinished) -> str:
@@ -128,7 +130,8 @@ def _notes(event: sr.EvaluationsFinished) -> str:
 def _proof(event: sr.ProofProgress) -> str:
     rate = f" at {_rate(event.examined, event.seconds)}/s" if event.examined and event.seconds > 0.0 else ""
     seen = f"  {event.examined} examined{rate}" if event.examined else ""
-    return f"of {event.family}  cells open {event.cells}{seen}  violation not excluded {event.bound:.1e}"
+    before = "" if math.isnan(event.bound_before) else f", half a minute ago {event.bound_before:.1e}"
+    return f"of {event.family}  cells open {event.cells}{seen}  violation not excluded {event.bound:.1e}{before}"
 
 
 def _rate(count: int, seconds: float) -> str:

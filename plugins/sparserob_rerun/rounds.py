@@ -52,11 +52,7 @@ class Rounds:
             [value if np.isfinite(value) else np.nan for value in (event.lower_bound, event.upper_bound)],
         )
         self.stream.log("rounds/bounds", rr.Scalars(shown))
-        gap = (
-            (event.upper_bound - event.lower_bound) / max(1.0, abs(event.upper_bound))
-            if np.isfinite(shown).all()
-            else np.nan
-        )
+        gap = event.gap if np.isfinite(event.gap) else np.nan
         self.stream.log("rounds/log10", rr.Scalars([_decades(event.violation), _decades(gap)]))
         self.stream.log("rounds/counts", rr.Scalars([float(event.active_indices), float(event.cuts_added)]))
 

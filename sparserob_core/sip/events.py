@@ -118,6 +118,7 @@ class RoundFinished(Event):
     ``decision (n,)`` has the ``cost`` J. ``separations``: per family what was found most violated at it, worst first.
     ``imposed``: the constraints of this round's relaxed program, with their ``multipliers (r,)`` (the multiplier within
     each `Cut` is not filled); ``added`` and ``dropped``: how they differ from those of the round before.
+    ``gap``: the relative gap of the two bounds (`sip.result.relative_gap`).
     ``simplified``: it is a round on a program with some of the uncertainty only (methods ``nominal``, ``scenario``),
     whose ``upper_bound`` and ``violation`` say nothing of the program itself; its lower bound holds for both.
     """
@@ -141,6 +142,7 @@ class RoundFinished(Event):
     added: Sequence[Cut] = field(default=(), repr=False)
     dropped: Sequence[Cut] = field(default=(), repr=False)
     simplified: bool = False
+    gap: float = np.inf
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -149,6 +151,8 @@ class ProofProgress(Event):
     excluded.
 
     ``examined`` cells were bounded so far, of a ``budget`` after which the proof is given up (0: unknown).
+    ``bound_before`` is the ``bound`` of half a minute ago, NaN while the proof is younger; where it has hardly fallen
+    since, ``hindrance`` says what hinders the proof and what would help, and is empty otherwise.
     """
 
     family: str
@@ -157,6 +161,8 @@ class ProofProgress(Event):
     seconds: float = 0.0
     examined: int = 0
     budget: int = 0
+    bound_before: float = np.nan
+    hindrance: str = ""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

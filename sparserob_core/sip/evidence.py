@@ -4,7 +4,7 @@ feasible."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, final
 
 import numpy as np
@@ -29,13 +29,14 @@ class Cut:
 class Dual:
     """Multipliers that prove a lower ``bound`` of the semi-infinite program's value, or of its infeasibility: those of
     the imposed constraints (in ``cuts``), ``mu (e,)`` of the equalities, and ``z (k,)`` of the image ``S x`` unless
-    ``S`` is the identity.
+    ``S`` is the identity; ``fixed (r,)`` are those of the program's fixed rows ``G x <= h``.
     """
 
     bound: float
     cuts: Sequence[Cut]
     mu: Array
     z: Array | None = None
+    fixed: Array = field(default_factory=lambda: np.zeros(0))
 
 
 NO_BOUND = Dual(-np.inf, (), np.zeros(0))

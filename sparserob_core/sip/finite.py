@@ -50,6 +50,12 @@ class FiniteProgram:
         quadratic = 0.0 if self.P is None else 0.5 * float(x @ (self.P @ x))
         return float(self.weights @ np.abs(self.image(x)) + self.q @ x) + quadratic
 
+    def magnitude(self, x: Array) -> float:
+        """The sum of the absolute values of the terms of the cost at ``x``: what its rounding is relative to."""
+        size = np.abs(x)
+        quadratic = 0.0 if self.P is None else 0.5 * float(size @ (abs(self.P) @ size))
+        return float(self.weights @ np.abs(self.image(x)) + np.abs(self.q) @ size) + quadratic
+
     def residual(self, x: Array) -> float:
         """The largest violation of bounds, rows and equalities at ``x``, each divided by its own scale (see
         `scaled_violation`)."""

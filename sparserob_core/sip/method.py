@@ -1,7 +1,8 @@
-"""What a method is, and the tools that it is handed."""
+"""What a method is, the tools that it is handed, and the time that it may take."""
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from concurrent.futures import Executor
@@ -10,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import final
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from sparserob_core.errors import InputError
 from sparserob_core.options import Options
@@ -56,6 +57,70 @@ class Continuation(Options):
             return max(self.stop, float(weight))
         raise InputError(f"regu: expected a positive weight below {epsilon!r}, got {weight!r}")
 
+    @model_validator(mode="after")
+    def _decreases(self) -> Continuation:
+        if self.stop > self.start:
+            raise InputError(path="stop", expected=f"at most start, which is {self.start!r}", got=f"{self.stop!r}")
+        return self
+
+
+class OutOfTime(KeyboardInterrupt):
+    """The limit is reached. It travels like the interrupt from the keyboard that it stands for: whatever lets the one
+    pass (a foreign maximiser, a solver) lets the other."""
+
+
+class Deadline:
+    """The end of the time that a computation may take, ``seconds`` from now; without a number it has no end.
+
+    Whoever works in rounds asks `check` between them. An interrupt that was caught where something could be saved is
+    noted by `interrupt`: from then on the time is over for everyone who asks.
+    """
+
+    def __init__(self, seconds: float | None = None) -> None:
+        self.seconds = seconds
+        self._ends = np.inf if seconds is None else time.monotonic() + seconds
+        self._interrupted = ""
+
+    @property
+    def bounded(self) -> bool:
+        """Whether there is a limit."""
+        return self.seconds is not None
+
+    @property
+    def reason(self) -> str:
+        """Why the time is over, in words; empty while it is not."""
+        if self._interrupted:
+            return self._interrupted
+        return f"the limit of {self.seconds:g} s is reached" if time.monotonic() >= self._ends else ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether the time is over."""
+        return bool(self._interrupted) or time.monotonic() >= self._ends
+
+    def check(self) -> None:
+        """Raise `OutOfTime` when the time is over."""
+        if self.passed:
+            raise OutOfTime(self.reason)
+
+    def interrupt(self, error: KeyboardInterrupt) -> str:
+        """Take note of an interrupt, and return why the time is over: in the words of the error where it has some."""
+        self._interrupted = self.reason or str(error) or "interrupted from the keyboard"
+        return self._interrupted
+
+
+def as_seconds(seconds: object) -> float | None:
+    """A limit as a user gives it: a positive number of seconds, or ``None`` for no limit; raises `InputError`."""
+    if seconds is None:
+        return None
+    if (
+        isinstance(seconds, bool)
+        or not isinstance(seconds, int | float | np.integer | np.floating)
+        or not 0.0 < seconds < np.inf
+    ):
+        raise InputError(f"seconds: expected a positive number of seconds, or None for no limit, got {seconds!r}")
+    return float(seconds)
+
 
 @dataclass(frozen=True, eq=False)
 class Tools:
@@ -64,6 +129,7 @@ class Tools:
 
     ``budget``: evaluations that one search of the maximiser may spend, of which the share ``polish`` goes to a local
     method at its end. ``executor``: workers for programs that do not depend on one another; ``None``: solve them here.
+    ``deadline``: when a method has to end with what it knows.
     """
 
     solver: Solver
@@ -75,6 +141,7 @@ class Tools:
     executor: Executor | None = None
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
     notify: Notify = ignore
+    deadline: Deadline = field(default_factory=Deadline)
 
 
 class ExecutorFactory(ABC):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias, final
 
 import numpy as np
@@ -125,6 +126,7 @@ class ConstraintFamily:
     ``source``        what the family was made of: never looked at here, handed back to whoever made it;
     ``scale``         the size of the numbers that the constraint compares; where it is tiny, a violation is judged
         relative to it;
+    ``hindrance(lower (d,), upper (d,))``  what keeps the enclosure of a cell wide, and what would help, in words;
     ``explain(index (d,), row)``  one constraint for people (an `Explanation`).
     """
 
@@ -140,6 +142,7 @@ class ConstraintFamily:
     literal: ConstraintFamily | None = None
     reduced: ConstraintFamily | None = None
     explain: Callable[[Array, int], Explanation] | None = None
+    hindrance: Callable[[Array, Array], str] | None = None
     scale: float = 1.0
     formulation: Formulation = "reduced"
     source: object = None
@@ -244,15 +247,24 @@ class SemiInfiniteProgram:
         """The family of that name whose indices are those of a formulation (`ConstraintFamily.formulated`)."""
         return self.family(name).formulated(formulation)
 
-    @property
+    @cached_property
     def cost_scale(self) -> float:
-        """The largest possible cost of the bounded entries, at most 1: what a gap is relative to where the cost itself
-        is smaller."""
+        """The largest possible cost: that of the bounds, what a gap is relative to (`sip.result.relative_gap`). Where
+        an entry that costs something has no bound, a million of the largest coefficient, but at most a million."""
         program = self.finite
         reach = np.maximum(np.abs(program.lower), np.abs(program.upper))
-        if program.q.any() or program.P is not None or not np.isfinite(reach[program.weights > 0]).all():
-            return 1.0
-        return min(1.0, float(program.weights @ np.where(program.weights > 0, reach, 0.0))) or 1.0
+        size = np.full(self.n, np.inf) if program.S is not None else reach
+        curvature = np.zeros(self.n) if program.P is None else abs(program.P).sum(axis=0)
+        with np.errstate(invalid="ignore"):
+            terms = [
+                np.where(cost > 0.0, cost * far, 0.0)
+                for cost, far in ((program.weights, reach), (np.abs(program.q), size), (curvature / 2, size**2))
+            ]
+        largest = float(sum(term.sum() for term in terms))
+        if np.isfinite(largest):
+            return largest
+        coefficients = (program.weights, np.abs(program.q), curvature)
+        return 1e6 * min(1.0, max(float(cost.max(initial=0.0)) for cost in coefficients))
 
     def cost(self, x: Array) -> float:
         """``J(x)``, recomputed from the data."""

@@ -29,6 +29,8 @@ MEANING: Mapping[Status, str] = {
 }
 
 
+SMALL_COST = 1e-6  # of the largest possible cost: a cost below this is judged as if it were this large
+UNKNOWN_SCALE = 1e6  # where the largest possible cost is not known, costs are judged as if 1 were a small one
 COLUMNS = ("outer", "epsilon", "value", "bound", "seconds")
 NOTE = "note_"
 POINTS = 500_000  # coordinates of tuples that a run keeps
@@ -105,12 +107,13 @@ class Result:
     """The outcome of a method.
 
     ``cost`` is ``J`` of ``decision`` (no regulariser), ``value`` is ``J + epsilon rho``; ``lower_bound`` and
-    ``upper_bound`` enclose the value of the *unregularised* semi-infinite program; ``lower_bound`` is proven in any
-    case, ``upper_bound`` (the cost) only when ``status`` is certified or verified: it is what the search suggests when
-    undecided, and infinite when refuted. ``gap = (upper_bound - lower_bound) / max(1, |upper_bound|)``. ``dual``: the
-    multipliers behind ``lower_bound``, or behind infeasibility; ``proofs``: what was shown of every constraint family
-    at the decision. ``trace``: for a method that searches, every value of ``g``; ``scenario_bound``: for the scenario
-    approach, what its theory promises.
+    ``upper_bound`` enclose the value of the *unregularised* semi-infinite program. ``lower_bound`` is proven in any
+    case; ``upper_bound`` is the cost where ``status`` is certified or verified, and infinite where nothing is proven of
+    the decision. ``gap``: see `relative_gap`; ``cost_scale`` is the largest possible cost. ``dual``: the multipliers
+    behind ``lower_bound``, or behind infeasibility; ``proofs``: what was shown of every constraint family at the
+    decision. ``trace``: for a method that searches, every value of ``g``; ``scenario_bound``: for the scenario
+    approach, what its theory promises. ``stopped``: the limit or the interrupt that ended the method early, in words.
+    ``ray (n,)``: a direction along which the cost falls for ever, where one was found.
     """
 
     status: Status
@@ -131,14 +134,19 @@ class Result:
     scenario_bound: ScenarioBound | None = None
     infeasible: InfeasibleSubsystem | None = None
     seconds: float = 0.0
+    cost_scale: float = UNKNOWN_SCALE
+    stopped: str = ""
+    ray: Array | None = None
 
     @property
     def gap(self) -> float:
-        return relative_gap(self.lower_bound, self.upper_bound)
+        """The relative gap of the two bounds."""
+        return relative_gap(self.lower_bound, self.upper_bound, self.cost_scale)
 
 
-def relative_gap(lower: float, upper: float, scale: float = 1.0) -> float:
-    """``(upper - lower) / max(scale, |upper|)``, infinite when either bound is."""
+def relative_gap(lower: float, upper: float, largest: float = UNKNOWN_SCALE) -> float:
+    """``(upper - lower) / max(|upper|, 1e-6 largest)``, where ``largest`` is the largest possible cost: 0 when both are
+    equal, infinite when either bound is. Bounds that cross by no more than the proofs allow leave no gap."""
     if not (np.isfinite(lower) and np.isfinite(upper)):
         return float("inf")
-    return float((upper - lower) / max(scale, abs(upper)))
+    return 0.0 if upper <= lower else float((upper - lower) / max(SMALL_COST * largest, abs(upper)))

@@ -15,6 +15,7 @@ import numpy as np
 
 from sparserob_core.experiment.config.load import load_config
 from sparserob_core.experiment.config.reader import read_source, write_yaml
+from sparserob_core.sip.result import relative_gap
 
 
 @dataclass
@@ -91,7 +92,7 @@ def _agree(files: Forgery, untouched: bool) -> None:
     cost, lower = certificate.get("cost"), certificate.get("lower_bound")
     result["upper_bound"] = None if certificate.get("status") in ("infeasible", "refuted") else cost
     if isinstance(cost, float) and isinstance(lower, float):
-        result["gap"] = (cost - lower) / max(1.0, abs(cost))
+        result["gap"] = relative_gap(lower, cost, result["cost_scale"])
     if untouched and certificate.get("decision") is not None:
         _solved(files)
 

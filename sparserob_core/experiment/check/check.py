@@ -16,6 +16,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.experiment.config.run_config import digest
 from sparserob_core.experiment.directory.finished import StoredRun, read_json, stored_run
 from sparserob_core.sip.program import SemiInfiniteProgram
+from sparserob_core.sip.result import UNKNOWN_SCALE, relative_gap
 
 if TYPE_CHECKING:
     from sparserob_core.experiment.config.load import Loaded
@@ -94,8 +95,9 @@ def _result(data: Mapping[str, Any], summary: Mapping[str, Any]) -> Claim:
     if status == "infeasible":
         wanted |= {"cost": None, "upper_bound": None}
     else:
-        proven = status in ("certified", "verified")
-        wanted |= {"cost": data.get("cost"), "upper_bound": data.get("cost") if proven else None}
+        wanted |= {"cost": data.get("cost"), "upper_bound": data.get("cost")}
+    if status == "refuted" or (status == "undecided" and summary.get("upper_bound") is None):
+        wanted["upper_bound"] = None  # earlier versions wrote the cost of an undecided run
     different = [
         f"{name} is {summary.get(name)!r}, not {value!r}"
         for name, value in wanted.items()
@@ -111,7 +113,8 @@ def _gap(summary: Mapping[str, Any]) -> list[str]:
     cost, lower, gap = (summary.get(name) for name in ("cost", "lower_bound", "gap"))
     if not (isinstance(cost, float) and isinstance(lower, float) and isinstance(gap, float)):
         return ["cost, lower_bound and gap are no numbers"]
-    derived = (cost - lower) / max(1.0, abs(cost))
+    scale = summary.get("cost_scale", UNKNOWN_SCALE)
+    derived = relative_gap(lower, cost, scale) if isinstance(scale, float) else np.nan
     return [] if abs(gap - derived) <= 1e-12 else [f"gap is {gap!r}, not {derived!r}"]
 
 

@@ -14,7 +14,6 @@ from sparserob_core.experiment.comparison.comparison import Comparison
 from sparserob_core.experiment.comparison.curve import WITHOUT_CURVE, Curve, read_curve
 from sparserob_core.experiment.comparison.figure import write_comparison
 from sparserob_core.experiment.comparison.labels import labels, value_text
-from sparserob_core.sip.result import relative_gap
 
 SHARES = (0.1, 0.01, 0.001)
 SLACK = 1e-7
@@ -37,7 +36,7 @@ def compare(runs: Sequence[str | Path], out: str | Path | None = None) -> Compar
     names = labels([curve.config for curve in curves], [curve.searched for curve in curves])
     certified = min(
         (k for k, curve in enumerate(curves) if curve.status == "certified"),
-        key=lambda k: _gap(curves[k]),
+        key=lambda k: curves[k].gap,
         default=None,
     )
     exact = np.nan if certified is None else (curves[certified].lower_bound + curves[certified].upper_bound) / 2
@@ -89,7 +88,7 @@ def comparison_remarks(comparison: Comparison) -> Iterator[str]:
         best = comparison.curves[comparison.certified]
         yield (
             f"exact optimum {comparison.exact:.9g}: certified by {comparison.labels[comparison.certified]} "
-            f"to a relative gap of {_gap(best):.1e}"
+            f"to a relative gap of {best.gap:.1e}"
         )
         above = best.upper_bound + SLACK * max(1.0, abs(best.upper_bound))
     for curve, label in zip(comparison.curves, comparison.labels, strict=True):
@@ -104,10 +103,6 @@ def comparison_remarks(comparison: Comparison) -> Iterator[str]:
 
 def _reason(curve: Curve) -> str:
     return f"{curve.status}: {curve.message}" if curve.status in WITHOUT_CURVE else "no finite lower bound was proven"
-
-
-def _gap(curve: Curve) -> float:
-    return relative_gap(curve.lower_bound, curve.upper_bound)
 
 
 def _text(value: float, form: str) -> str:

@@ -14,6 +14,7 @@ from sparserob_core.errors import ConfigError, InputError
 from sparserob_core.experiment.config.reader import read_source
 from sparserob_core.experiment.directory.finished import read_arrays, stored_run
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.result import UNKNOWN_SCALE, relative_gap
 
 WITHOUT_CURVE = frozenset({"failed", "infeasible"})
 SEARCH, ROUNDS = (
@@ -44,6 +45,7 @@ class Curve:
     bound: Array
     lower_bound: float
     upper_bound: float
+    gap: float
     cost: float
     violation: float
     all_evaluations: float
@@ -61,7 +63,7 @@ def read_curve(directory: Path) -> Curve:
     counts, worst = _mapping(summary, "counts"), _mapping(summary, "worst")
     status, searched = str(summary["status"]), (directory / SEARCH[0]).is_file()
     spent, lower = _number(counts, "evaluations" if searched else "relaxed_programs"), _number(summary, "lower_bound")
-    seconds = _number(summary, "seconds")
+    seconds, upper = _number(summary, "seconds"), _number(summary, "upper_bound")
     evaluations, times, bound = _points(directory, searched) if status not in WITHOUT_CURVE else (np.empty(0),) * 3
     if bound.size and lower > bound[-1]:  # the last relaxed program came after the last evaluation
         evaluations, times, bound = np.append(evaluations, spent), np.append(times, seconds), np.append(bound, lower)
@@ -76,7 +78,8 @@ def read_curve(directory: Path) -> Curve:
         seconds=times,
         bound=bound,
         lower_bound=lower,
-        upper_bound=_number(summary, "upper_bound"),
+        upper_bound=upper,
+        gap=relative_gap(lower, upper, summary.get("cost_scale") or UNKNOWN_SCALE),
         cost=_number(summary, "cost"),
         violation=_number(worst, "violation"),
         all_evaluations=spent,

@@ -35,6 +35,8 @@ def summary_of(result: Result, control: Array | None, dictionary: Dictionary | N
         "lower_bound": result.lower_bound,
         "upper_bound": result.upper_bound if result.status in PROVEN else None,
         "gap": result.gap if result.status in PROVEN else None,
+        "cost_scale": result.cost_scale,
+        "stopped": result.stopped,
         "worst": _witness(result.worst),
         "sparsity": acting or {"active_fraction": None, "switches": None},
         "counts": {

@@ -107,6 +107,7 @@ def _data(
         walls=list(_walls(problem)),
         active_times=active_times,
         history=history,
+        cost_scale=experiment.program.cost_scale,
         active_fraction=sparsity(control, dictionary.breakpoints).active_fraction,
         cost=cost,
         tolerance=tolerance if isinstance(tolerance, float) else None,

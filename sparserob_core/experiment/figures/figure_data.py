@@ -10,6 +10,7 @@ import numpy as np
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import RoundFinished
+from sparserob_core.sip.result import UNKNOWN_SCALE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +33,7 @@ class FigureData:
     ``times (T,)`` with the nominal ``state (d, T)`` and the worst case ``tube_lower``, ``tube_upper`` ``(d, T)`` over
     every disturbance and parameter; ``walls`` the path and terminal constraints on single components; ``active_times``
     the times of the imposed constraints that carry a multiplier; ``history`` the rounds of the method. ``tolerance`` is
-    the relative gap that was asked for.
+    the relative gap that was asked for, ``cost_scale`` the largest possible cost.
     """
 
     title: str
@@ -50,6 +51,7 @@ class FigureData:
     active_fraction: float | None = None
     cost: float | None = None
     tolerance: float | None = None
+    cost_scale: float = UNKNOWN_SCALE
     control_names: Sequence[str] = ()
     state_names: Sequence[str] = ()
     time_unit: str = ""

@@ -91,7 +91,7 @@ def draw_convergence(data: FigureData) -> Figure:
     upper = np.array([entry.upper_bound for entry in data.history])
     best = float(upper.min())
     _draw_bounds(bounds, rounds, lower, upper, best)
-    _draw_gaps(gaps, rounds, np.array([relative_gap(bound, best) for bound in lower]), data)
+    _draw_gaps(gaps, rounds, np.array([relative_gap(bound, best, data.cost_scale) for bound in lower]), data)
     bounds.set_title(data.title)
     gaps.set_xlim(0.6, len(data.history) + 0.4)
     gaps.xaxis.set_major_locator(MaxNLocator(integer=True))

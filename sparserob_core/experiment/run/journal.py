@@ -117,6 +117,8 @@ def _drawn(experiment: Experiment, result: Result, worst: Mapping[str, Array], d
 
     if not isinstance(experiment, ControlExperiment) or result.status == "failed":
         return ()
+    if result.decision is None and result.status != "infeasible":
+        return ()
     try:
         if result.status == "infeasible":
             draw_clash(experiment, result, directory)

@@ -15,7 +15,7 @@ from sparserob_core.experiment.run.inspection import Inspection
 from sparserob_core.experiment.run.viewer import recorder
 from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.events import Batch, EvaluationsFinished
-from sparserob_core.sip.result import Result, SearchTrace
+from sparserob_core.sip.result import UNKNOWN_SCALE, Result, SearchTrace
 
 BATCHES = 100  # of the evaluations of a run
 PATIENCE = 60.0  # seconds that the landscape may take
@@ -90,6 +90,8 @@ def stored_result(run: StoredRun) -> Result:
             epsilon=_number(summary, "epsilon"),
             lower_bound=_number(summary, "lower_bound", -np.inf),
             upper_bound=_number(summary, "upper_bound", np.inf),
+            cost_scale=_number(summary, "cost_scale", UNKNOWN_SCALE),
+            stopped=str(summary.get("stopped") or ""),
             indices=run.cuts,
             history=run.history,
             trace=SearchTrace.stored(evaluations) if evaluations else None,

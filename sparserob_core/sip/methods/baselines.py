@@ -12,13 +12,13 @@ from pydantic import Field
 from sparserob_core.errors import InputError
 from sparserob_core.options import Options
 from sparserob_core.sip.events import RoundFinished, forwarded
-from sparserob_core.sip.evidence import Proof
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.methods.exchange import Exchange
-from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation
+from sparserob_core.sip.methods.ledger import alarm
+from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
 from sparserob_core.sip.proof.branch_and_bound import TOLERANCE, prove
-from sparserob_core.sip.proof.verdict import verdict, witness, worst_of
-from sparserob_core.sip.result import Result
+from sparserob_core.sip.proof.verdict import as_bad_as_found, verdict, witness, worst_of
+from sparserob_core.sip.result import Result, relative_gap
 from sparserob_core.sip.scenario_bound import scenario_bound
 from sparserob_core.sip.separation.separation import separate
 
@@ -92,35 +92,24 @@ def _judged(
     result = Exchange(tolerance=tolerance, rounds=rounds).close(simple, replace(tools, notify=notify), lambda x: ())
     if result.decision is None:
         return result
-    found = separate(program, result.decision, tools, TOLERANCE)
-    proofs = [
-        _worse(proof, family, separation)
-        for proof, (family, separation) in zip(prove(program, result.decision, tools.notify), found, strict=True)
-    ]
-    status, message = verdict(proofs, result.gap, tolerance)
+    x, found = result.decision, []
+    try:
+        found = separate(program, x, tools, TOLERANCE)
+    except KeyboardInterrupt as error:
+        tools.deadline.interrupt(error)
+    proofs = as_bad_as_found(prove(program, x, tools.notify, deadline=tools.deadline), found)
+    status, message = verdict(proofs, relative_gap(result.dual.bound, result.cost, program.cost_scale), tolerance)
+    proven = status in ("certified", "verified")
+    wrong = alarm(simple, result.dual, x) if proven else ""
+    stopped = tools.deadline.reason if result.stopped or status == "undecided" else ""
     return replace(
         result,
-        status=status,
-        message=message,
+        status="failed" if wrong else status,
+        message="; ".join(part for part in (wrong or message, stopped) if part),
+        decision=None if wrong else x,
         proofs=tuple(proofs),
         worst=witness(program, worst_of(found), proofs),
-        upper_bound=np.inf if status == "refuted" else result.cost,
-    )
-
-
-def _worse(proof: Proof, family: ConstraintFamily, found: Separation) -> Proof:
-    """A refutation ends at the first witness: of what is not proven, tell the worst that the separation finds."""
-    if (
-        proof.verdict == "proven"
-        or not found.violations.size
-        or found.violations[0] <= max(proof.violation, family.tolerance(TOLERANCE))
-    ):
-        return proof
-    return replace(
-        proof,
-        verdict="refuted",
-        violation=float(found.violations[0]),
-        index=found.indices[0],
-        row=int(found.rows[0]),
-        formulation=family.formulation,
+        lower_bound=min(result.dual.bound, result.cost) if proven and not wrong else result.dual.bound,
+        upper_bound=result.cost if proven and not wrong else np.inf,
+        stopped=stopped,
     )

@@ -8,36 +8,35 @@ regularisation: Friedlander and Tseng 2007).
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 import numpy as np
 from pydantic import Field
 
+from sparserob_core.errors import InputError
 from sparserob_core.options import Options
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.events import RoundFinished, frozen
-from sparserob_core.sip.evidence import NO_BOUND, Cut, Dual, Proof
+from sparserob_core.sip.evidence import Proof
 from sparserob_core.sip.finite import FiniteSolution
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
-from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation, WorstConstraint
+from sparserob_core.sip.methods.ledger import Answer, Ledger, Prover
+from sparserob_core.sip.methods.unbounded import bounding_rows, falls_for_ever
+from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation
 from sparserob_core.sip.proof.branch_and_bound import TOLERANCE, prove
-from sparserob_core.sip.proof.irreducible import irreducible
-from sparserob_core.sip.proof.verdict import infeasible_subsystem, verdict, witness, worst_of
+from sparserob_core.sip.proof.verdict import worst_of
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows, rows_at
-from sparserob_core.sip.result import Result, Status, relative_gap
+from sparserob_core.sip.result import SMALL_COST, Result
 from sparserob_core.sip.separation.separation import separate
 
 IDLE_ROUNDS = 3  # rounds that a row may stay without a multiplier before it is dropped
 DROPPING_ROUNDS = 40  # rounds after which rows are only added, so that nothing can cycle
 SMALLEST_MARGIN, LARGEST_MARGIN = 1e-15, 1e-6  # in units of the decision's bounds, where those are below 1
-RESIDUAL = 1e-8  # of bounds, fixed rows and equalities, relative to their scale, at a decision that is returned
 CRUDE = 1e-4  # residual and relative gap of a relaxed solution that a round can do with
 ALLOWED = TOLERANCE / 2  # a violation that the search may leave to the proof
 
-Prover: TypeAlias = Callable[[Array], Sequence[Proof]]
+Violated: TypeAlias = Sequence[tuple[Array, np.ndarray, str]]  # indices (k, d), rows (k,) and the name of a family
 
 
 class Exchange(Method, Options):
@@ -49,141 +48,154 @@ class Exchange(Method, Options):
     rounds: int = Field(default=200, ge=1)
     """Rounds at most."""
 
+    exact: bool = True
+    """Solve the unregularised problem, with the regulariser only as heavy as that allows; false: solve the regularised
+    problem with the last weight of ``continuation``, for studies of that weight."""
+
     def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
         """`certified` when the gap is closed and every family is proven; infeasible, refuted or undecided otherwise,
         with the reason."""
-        return self.close(program, tools, lambda x: prove(program, x, tools.notify))
+        return self.close(program, tools, lambda x: prove(program, x, tools.notify, deadline=tools.deadline))
 
     def close(self, program: SemiInfiniteProgram, tools: Tools, prover: Prover) -> Result:
         """Close the gap of ``program``; what is claimed of the decision is what ``prover`` proves of it."""
-        return _Run(self, program, tools, prover).solve()
+        if not self.exact and tools.regulariser is None:
+            raise InputError(path="exact", expected="true, for there is no regulariser", got="false")
+        relaxed = RelaxedProgram(program, tools.solver, tools.regulariser, deadline=tools.deadline)
+        ledger = Ledger(program, relaxed, tools, self.tolerance)
+        try:
+            return self._exchange(ledger, prover)
+        except KeyboardInterrupt as error:
+            return ledger.stopped(error, prover)
+
+    def _exchange(self, ledger: Ledger, prover: Prover) -> Result:
+        program, tools = ledger.program, ledger.tools
+        working = Working.start(program, tools)
+        for number in range(1, self.rounds + 1):
+            tools.deadline.check()
+            last = number == self.rounds
+
+            # Relax: the optimum under the imposed rows, with the regulariser as light as it must be.
+            answer = _relaxed(self, working, ledger)
+            if answer.solution.status == "failed" and not _usable(answer.solution) and not last:
+                # Without enough rows the cost may fall for ever: impose those that stop it, where there are any.
+                close = self.model_copy(update={"exact": True}).close
+                ray, fresh = bounding_rows(program, tools, close)
+                if ray is not None:
+                    return falls_for_ever(ledger, close, prover, ray)
+                if working.add(fresh):
+                    continue
+            if not _usable(answer.solution):
+                return ledger.without(answer)
+
+            # Separate: the constraints of the continuum that this decision violates most.
+            x = answer.solution.x
+            found = separate(program, x, tools, ALLOWED, number)
+            violated = [_above(family, separation) for family, separation in found]
+            suggested = np.inf if any(rows.size for _, rows, _ in violated) else program.cost(x)
+            ledger.tell(number, answer, found, suggested, kept=working.rows.h.size)
+
+            # Exchange: impose them, drop what has been idle; tighten the rows that are violated though imposed.
+            if not last and (working.exchange(answer, violated, number) or working.tighten(violated)):
+                continue
+
+            # Sharpen: nothing is violated but the bounds have not met, so do without the regulariser.
+            if not last and self.exact and ledger.open(x) and working.sharpen(ledger, x):
+                continue
+
+            # Prove: over the whole continuum; a witness that the proof meets is one more index to impose.
+            if not self.exact:
+                working.plain_bound(ledger)
+            proofs = prover(x)
+            witnesses = _witnesses(program, proofs)
+            if last or tools.deadline.passed or not working.exchange(answer, witnesses, number):
+                return ledger.judged(answer, worst_of(found), proofs, self._ending(ledger, answer, last))
+        raise AssertionError("the last round returns")
+
+    def _ending(self, ledger: Ledger, answer: Answer, last: bool) -> str:
+        if ledger.tools.deadline.passed:
+            return ledger.tools.deadline.reason
+        if last:
+            return f"the {self.rounds} rounds of the method are used up"
+        return (
+            "" if self.exact else f"the decision is optimal for the regularised problem, epsilon = {answer.epsilon:g}"
+        )
 
 
 @dataclass(eq=False)
-class _Run:
-    """One run: the working rows, the two bounds, the weight of the regulariser, and the margin with the least it may
-    be."""
+class Working:
+    """The working set of the exchange: the imposed ``rows``, since how many rounds each is ``idle (r,)``, the weight
+    ``epsilon``, the ``margin`` by which rows are tightened with the ``floor`` that it must not fall below, whether
+    there is a ``slater`` point for it, and a solution with these rows as the next ``guess``."""
 
-    method: Exchange
     program: SemiInfiniteProgram
-    tools: Tools
-    prover: Prover
-    started: float = field(default_factory=time.perf_counter)
-    dual: Dual = NO_BOUND
+    rows: Rows
+    epsilon: float
+    idle: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
     margin: float = 0.0
     floor: float = 0.0
     slater: bool = True
-    history: list[RoundFinished] = field(default_factory=list)
+    guess: FiniteSolution | None = None
 
-    def __post_init__(self) -> None:
-        self.relaxed = RelaxedProgram(self.program, self.tools.solver, self.tools.regulariser)
-        self.rows = Rows.none(self.program.n)
-        self.idle = np.zeros(0, dtype=int)
-        self.epsilon = 0.0 if self.tools.regulariser is None else self.tools.continuation.start
-        self.guess: FiniteSolution | None = None
-        self.added: tuple[Cut, ...] = ()
-        self.dropped: tuple[Cut, ...] = ()
+    @staticmethod
+    def start(program: SemiInfiniteProgram, tools: Tools) -> Working:
+        """No rows, and the first weight of the continuation."""
+        epsilon = 0.0 if tools.regulariser is None else tools.continuation.start
+        return Working(program, Rows.none(program.n), epsilon)
 
-    def solve(self) -> Result:
-        for number in range(1, self.method.rounds + 1):
-            solution = self._relax()
-            if not _usable(solution):
-                return self._without_answer(solution)
-            separations = separate(self.program, solution.x, self.tools, ALLOWED, number)
-            worst = worst_of(separations)
-            violated = [_above(family, found) for family, found in separations]
-            self._tell(number, solution, worst, separations)
-            last = number == self.method.rounds
-            if not last and (self._exchange(solution, violated) or self._tighten(violated)):
-                continue
-            if not last and self._open(solution) and self._sharpen(solution):
-                continue
-            proofs = self.prover(solution.x)
-            witnesses = [
-                (p.index[None], np.array([p.row]), p.family)
-                for p in proofs
-                if p.verdict == "refuted"
-                and p.index is not None
-                and p.formulation == self.program.family(p.family).formulation
-            ]
-            if last or not self._exchange(solution, witnesses):
-                return self._finished(solution, worst, proofs)
-        raise AssertionError("the last round returns")
-
-    def _relax(self) -> FiniteSolution:
-        """Solve the relaxed program, with the regulariser as light as it must be for the cost to be exact."""
-        solution = self._solved(self.epsilon)
-        regu = self.tools.continuation
-        while _usable(solution) and self.epsilon > regu.stop and self._open(solution):
-            lighter = regu.lighter(self.epsilon)
-            candidate = self._solved(lighter)
-            if not _usable(candidate):
-                break
-            changed = abs(self.program.cost(candidate.x) - self.program.cost(solution.x)) > regu.tolerance * max(
-                1.0, abs(self.lower)
-            )
-            self.epsilon, solution = lighter, candidate
-            if not changed and self._open(solution):
-                self._plain_bound()
-        return solution
-
-    def _solved(self, epsilon: float) -> FiniteSolution:
-        solution = self.relaxed.solve(self.rows, epsilon, self.margin, self.guess)
+    def solve(self, ledger: Ledger, epsilon: float) -> FiniteSolution:
+        """The relaxed program with this weight; its multipliers improve the lower bound."""
+        solution = ledger.relaxed.solve(self.rows, epsilon, self.margin, self.guess)
         # the margin, not the program, may be at fault: no Slater point
         if solution.status == "infeasible" and self.margin > 0.0:
             self.margin, self.slater = 0.0, False
-            solution = self.relaxed.solve(self.rows, epsilon, 0.0, None)
+            solution = ledger.relaxed.solve(self.rows, epsilon, 0.0, None)
         if _usable(solution):
             self.guess = solution
-            self._improve(self.relaxed.lower_bound(self.rows, solution))
-            self._set_margin(solution)
+            ledger.improve(ledger.relaxed.lower_bound(self.rows, solution))
+            self._set_margin(ledger, solution)
         return solution
 
-    def _plain_bound(self) -> FiniteSolution:
+    def plain_bound(self, ledger: Ledger) -> FiniteSolution:
         """The unregularised relaxed program: only its multipliers are wanted, for the lower bound."""
-        plain = self.relaxed.solve(self.rows, 0.0, self.margin)
+        plain = ledger.relaxed.solve(self.rows, 0.0, self.margin)
         if _usable(plain):
-            self._improve(self.relaxed.lower_bound(self.rows, plain))
+            ledger.improve(ledger.relaxed.lower_bound(self.rows, plain))
         return plain
 
-    @property
-    def lower(self) -> float:
-        return self.dual.bound
-
-    def _improve(self, dual: Dual) -> None:
-        self.dual = max(self.dual, dual, key=lambda one: one.bound)
-
-    def _open(self, solution: FiniteSolution) -> bool:
-        return self._gap(self.program.cost(solution.x)) > self.method.tolerance
-
-    def _gap(self, upper: float) -> float:
-        return relative_gap(self.lower, upper, self.program.cost_scale)
-
-    def _sharpen(self, solution: FiniteSolution) -> bool:
-        """The decision is feasible but its gap is open: try what else can close it; ``False`` when nothing is left."""
+    def sharpen(self, ledger: Ledger, x: Array) -> bool:
+        """Try what else can close the gap of the feasible ``x (n,)``: the lower bound of the plain program, then to go
+        on without the regulariser, which is not exact at its lightest; ``False`` when nothing is left to try."""
         if self.epsilon == 0.0:
             return False
-        plain = self._plain_bound()
-        if not self._open(solution) or not _usable(plain):
+        plain = self.plain_bound(ledger)
+        if not ledger.open(x) or not _usable(plain):
             return False
-        self.epsilon, self.guess = 0.0, None  # the regulariser is not exact at its lightest: go on without it
+        self.epsilon, self.guess = 0.0, None
         return True
 
-    def _set_margin(self, solution: FiniteSolution) -> None:
-        """Tighten the rows as much as a tenth of the tolerated gap pays for."""
-        if not self.slater or not self.rows.h.size:
-            return
-        price = float(self._multipliers(solution) @ np.linalg.norm(self.rows.G, axis=1))
-        budget = 0.1 * self.method.tolerance * max(self.program.cost_scale, abs(solution.value))
-        reach = np.maximum(np.abs(self.program.finite.lower), np.abs(self.program.finite.upper))
-        unit = min(1.0, float(np.where(np.isfinite(reach), reach, 1.0).max()))
-        margin = float(
-            np.clip(budget / max(price, np.finfo(float).tiny), SMALLEST_MARGIN * unit, LARGEST_MARGIN * unit)
-        )
-        if self.margin == 0.0 or margin < 0.5 * self.margin:
-            self.margin = max(margin, self.floor)
+    def exchange(self, answer: Answer, violated: Violated, number: int) -> int:
+        """Drop the rows that have been slack for a while, add the violated ones; returns how many were new."""
+        fresh = self._unknown(violated)
+        if not fresh.h.size:
+            return 0
+        y, added = answer.multipliers, np.zeros(fresh.h.size)
+        idle = np.where(y > 0.0, 0, self.idle + 1)
+        keep = (idle < IDLE_ROUNDS) | (number > DROPPING_ROUNDS)
+        self.rows = self.rows.take(keep).joined(fresh)
+        self.idle = np.concatenate([idle[keep], added.astype(int)])
+        fixed = answer.solution.y[: answer.solution.y.size - y.size]
+        self.guess = replace(answer.solution, y=np.concatenate([fixed, y[keep], added]))
+        return added.size
 
-    def _tighten(self, violated: Sequence[tuple[Array, np.ndarray, str]]) -> bool:
+    def add(self, rows: Violated) -> bool:
+        """Impose rows that no solution speaks of yet; ``False`` when none is new."""
+        fresh = self._unknown(rows)
+        self.rows, self.guess = self.rows.joined(fresh), None
+        self.idle = np.concatenate([self.idle, np.zeros(fresh.h.size, dtype=int)])
+        return bool(fresh.h.size)
+
+    def tighten(self, violated: Violated) -> bool:
         """Imposed rows that are violated nonetheless, by the solver's accuracy: tighten by twice as much; ``False``
         when that does not help."""
         known = {(cut.family, cut.row, cut.index.tobytes()): i for i, cut in enumerate(self.rows.cuts)}
@@ -201,11 +213,7 @@ class _Run:
         self.margin = max(self.margin, self.floor)
         return True
 
-    def _multipliers(self, solution: FiniteSolution) -> Array:
-        return solution.y[solution.y.size - self.rows.h.size :]
-
-    def _exchange(self, solution: FiniteSolution, violated: Sequence[tuple[Array, np.ndarray, str]]) -> int:
-        """Drop the rows that have been slack for a while, add the violated ones; returns how many were new."""
+    def _unknown(self, violated: Violated) -> Rows:
         known, fresh = {(cut.family, cut.row, cut.index.tobytes()) for cut in self.rows.cuts}, Rows.none(self.program.n)
         for indices, rows, family in violated:
             new = np.array(
@@ -213,112 +221,56 @@ class _Run:
             )
             if new.any():
                 fresh = fresh.joined(rows_at(self.program, family, indices[new], rows[new]))
-        added = fresh.h.size
-        if not added:
-            return 0
-        y = self._multipliers(solution)
-        self.idle = np.where(y > 0.0, 0, self.idle + 1)
-        keep = (self.idle < IDLE_ROUNDS) | (len(self.history) > DROPPING_ROUNDS)
-        self.added, self.dropped = (
-            fresh.cuts,
-            tuple(cut for cut, kept in zip(self.rows.cuts, keep, strict=True) if not kept),
-        )
-        self.rows, self.idle = (
-            self.rows.take(keep).joined(fresh),
-            np.concatenate([self.idle[keep], np.zeros(added, dtype=int)]),
-        )
-        fixed = solution.y[: solution.y.size - y.size]
-        self.guess = replace(solution, y=np.concatenate([fixed, y[keep], np.zeros(added)]))
-        return added
+        return fresh
 
-    def _tell(
-        self,
-        number: int,
-        solution: FiniteSolution,
-        worst: WorstConstraint,
-        found: Sequence[tuple[ConstraintFamily, Separation]],
-    ) -> None:
-        cost, violated = self.program.cost(solution.x), any(_above(family, one)[1].size for family, one in found)
-        event = RoundFinished(
-            round=number,
-            epsilon=self.epsilon,
-            lower_bound=self.lower,
-            violation=worst.violation,
-            worst_family=worst.constraint,
-            upper_bound=np.inf if violated else cost,
-            active_indices=self.rows.h.size,
-            cuts_added=len(self.added),
-            cuts_dropped=len(self.dropped),
-            relaxed_programs=self.relaxed.solves,
-            seconds=time.perf_counter() - self.started,
-            cost=cost,
-            decision=frozen(solution.x),
-            separations={family.name: one for family, one in found},
-            imposed=self.rows.cuts,
-            multipliers=frozen(self._multipliers(solution)),
-            added=self.added,
-            dropped=self.dropped,
+    def _set_margin(self, ledger: Ledger, solution: FiniteSolution) -> None:
+        """Tighten the rows as much as a tenth of the tolerated gap pays for."""
+        if not self.slater or not self.rows.h.size:
+            return
+        multipliers = solution.y[solution.y.size - self.rows.h.size :]
+        price = float(multipliers @ np.linalg.norm(self.rows.G, axis=1))
+        budget = 0.1 * ledger.tolerance * max(SMALL_COST * self.program.cost_scale, abs(solution.value))
+        reach = np.maximum(np.abs(self.program.finite.lower), np.abs(self.program.finite.upper))
+        unit = min(1.0, float(np.where(np.isfinite(reach), reach, 1.0).max()))
+        margin = float(
+            np.clip(budget / max(price, np.finfo(float).tiny), SMALLEST_MARGIN * unit, LARGEST_MARGIN * unit)
         )
-        self.added, self.dropped = (), ()
-        self.history.append(event)
-        self.tools.notify(event)
+        if self.margin == 0.0 or margin < 0.5 * self.margin:
+            self.margin = max(margin, self.floor)
 
-    def _finished(self, solution: FiniteSolution, worst: WorstConstraint, proofs: Sequence[Proof]) -> Result:
-        cost = self.program.cost(solution.x)
-        gap = self._gap(cost)
-        status, message = verdict(proofs, gap, self.method.tolerance)
-        residual = self.program.finite.residual(solution.x)
-        if residual > RESIDUAL:
-            status, message = (
-                "failed",
-                f"the decision misses its bounds or equalities by {residual:.1e}: {'; '.join(solution.attempts)}",
-            )
-        return replace(
-            self._result(status, message, solution, cost, witness(self.program, worst, proofs)), proofs=tuple(proofs)
-        )
 
-    def _without_answer(self, solution: FiniteSolution) -> Result:
-        if solution.status != "infeasible":
-            return self._result("failed", "; ".join(solution.attempts) or solution.message, solution, np.nan, None)
-        self.rows, solution = irreducible(self.relaxed, self.rows, solution)
-        found, worst = infeasible_subsystem(
-            self.program, self.rows, self._multipliers(solution), solution.infeasibility
-        )
-        self.dual = self.relaxed.dual(self.rows, solution.y, solution.mu, solution.z, solution.infeasibility)
-        return replace(self._result("infeasible", found.sentence(), solution, np.nan, worst), infeasible=found)
-
-    def _result(
-        self, status: Status, message: str, solution: FiniteSolution, cost: float, worst: WorstConstraint | None
-    ) -> Result:
-        y = self._multipliers(solution) if solution.y.size >= self.rows.h.size else np.zeros(self.rows.h.size)
-        cuts = tuple(replace(cut, multiplier=float(m)) for cut, m in zip(self.rows.cuts, y, strict=True) if m > 0.0)
-        return Result(
-            status=status,
-            message=message,
-            decision=solution.x if status not in ("infeasible", "failed") else None,
-            cost=cost,
-            value=solution.value,
-            epsilon=self.epsilon,
-            lower_bound=np.inf if status == "infeasible" else self.lower,
-            upper_bound=cost if status in ("certified", "verified", "undecided") else np.inf,
-            worst=worst,
-            indices=cuts,
-            counts={
-                "relaxed_programs": self.relaxed.solves,
-                "rounds": len(self.history),
-                "active_indices": len(cuts),
-                "solver_calls": self.relaxed.counted.calls,
-            },
-            history=tuple(self.history),
-            dual=self.dual,
-            seconds=time.perf_counter() - self.started,
-        )
+def _relaxed(method: Exchange, working: Working, ledger: Ledger) -> Answer:
+    """The relaxed program, with lighter and lighter regularisers while the cost still changes and the gap is open; for
+    the regularised problem, down to the last weight."""
+    solution, regu = working.solve(ledger, working.epsilon), ledger.tools.continuation
+    while _usable(solution) and working.epsilon > regu.stop and (not method.exact or ledger.open(solution.x)):
+        ledger.tools.deadline.check()
+        lighter = regu.lighter(working.epsilon)
+        candidate = working.solve(ledger, lighter)
+        if not _usable(candidate):
+            break
+        before, after = ledger.program.cost(solution.x), ledger.program.cost(candidate.x)
+        working.epsilon, solution = lighter, candidate
+        settled = abs(after - before) <= regu.tolerance * max(1.0, abs(ledger.lower))
+        if settled and method.exact and ledger.open(solution.x):
+            working.plain_bound(ledger)
+    return Answer(solution, working.rows, working.epsilon, solution.value)
 
 
 def _above(family: ConstraintFamily, found: Separation) -> tuple[Array, np.ndarray, str]:
     """The indices, rows and family of what is violated by more than the search may leave to the proof."""
     violated = found.violations > family.tolerance(ALLOWED)
     return found.indices[violated], found.rows[violated], family.name
+
+
+def _witnesses(program: SemiInfiniteProgram, proofs: Sequence[Proof]) -> Violated:
+    return [
+        (proof.index[None], np.array([proof.row]), proof.family)
+        for proof in proofs
+        if proof.verdict == "refuted"
+        and proof.index is not None
+        and proof.formulation == program.family(proof.family).formulation
+    ]
 
 
 def _usable(solution: FiniteSolution) -> bool:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from collections import deque
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ProofProgress, ignore
 from sparserob_core.sip.evidence import Proof
+from sparserob_core.sip.method import Deadline
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
 
 TOLERANCE = (
@@ -28,79 +30,147 @@ CLIMBED = (
     20,
     30,
 )
+FIRST_BATCH, QUICK = 16, 0.25  # cells bounded first, and the seconds that a batch may take, where time is limited
+OFTEN = 1.0  # seconds after which a batch that is not over is told of
+STALLED, ADVANCED = 30.0, 0.99  # a worst bound that has not fallen below this share within so many seconds is stuck
 MOVES = 24  # steps of such a climb at most
 
 
-def prove(program: SemiInfiniteProgram, x: Array, notify: Notify = ignore, cells: int = CELLS) -> tuple[Proof, ...]:
-    """Prove or refute every family at ``x (n,)``, one `Proof` each."""
+def prove(
+    program: SemiInfiniteProgram,
+    x: Array,
+    notify: Notify = ignore,
+    cells: int = CELLS,
+    deadline: Deadline | None = None,
+) -> tuple[Proof, ...]:
+    """Prove or refute every family at ``x (n,)``, one `Proof` each; past the deadline with one look at each."""
+    time_left = deadline or Deadline()
     proven = (family.reduced or family for family in program.families)
-    return tuple(replace(prove_family(one, x, notify, cells), formulation=one.formulation) for one in proven)
+    return tuple(replace(prove_family(one, x, notify, cells, time_left), formulation=one.formulation) for one in proven)
 
 
-def prove_family(family: ConstraintFamily, x: Array, notify: Notify = ignore, cells: int = CELLS) -> Proof:
+def prove_family(
+    family: ConstraintFamily, x: Array, notify: Notify = ignore, cells: int = CELLS, deadline: Deadline | None = None
+) -> Proof:
     """Bound the violation of one family over its whole index set.
 
     Cells whose enclosure is at most `TOLERANCE` are closed, the others halved; the centres of the worst are probed for
-    a witness, and where that takes long one is climbed to.
+    a witness, and where that takes long one is climbed to. At the deadline, or when it is interrupted from the
+    keyboard (of which the deadline takes note), a proof ends undecided, with what is left.
     """
-    if family.enclosure is None:
-        return _by_separation(family, x)
+    time_left = deadline or Deadline()
     try:
-        return _branch_and_bound(family, x, notify, cells)
-    except NotEnclosable as error:
-        return replace(_by_separation(family, x), reason=f"{family.name}: {error}")
+        if family.enclosure is None:
+            return _by_separation(family, x)
+        try:
+            return _branch_and_bound(family, x, Course(family, notify, cells, time_left))
+        except NotEnclosable as error:
+            return replace(_by_separation(family, x), reason=f"{family.name}: {error}")
+    except KeyboardInterrupt as error:
+        time_left.interrupt(error)
+        return Proof(family.name, "undecided", np.inf, reason=f"{family.name}: its proof had begun only")
 
 
-def _branch_and_bound(family: ConstraintFamily, x: Array, notify: Notify, cells: int) -> Proof:
-    start, tolerance = time.perf_counter(), family.tolerance(TOLERANCE)
-    lower, upper = (
-        family.cells if family.cells is not None else (family.index_set.lower[None], family.index_set.upper[None])
-    )
-    closed, examined, best = -np.inf, 0, (-np.inf, lower[0], 0)
+@dataclass(eq=False)
+class Course:
+    """How the proof of one family goes on: what it has examined of its budget, and how its worst bound has fallen."""
+
+    family: ConstraintFamily
+    notify: Notify
+    budget: int
+    deadline: Deadline
+    started: float = field(default_factory=time.perf_counter)
+    told: float = field(default_factory=time.perf_counter)
+    examined: int = 0
+    fall: deque[tuple[float, float]] = field(default_factory=deque)
+
+    def tell(self, cells: int, bound: float, lower: Array, upper: Array, pending: int = 0) -> None:
+        """Tell that ``cells`` are open, of which the worst, from ``lower (d,)`` to ``upper (d,)``, has this bound;
+        ``pending`` cells have been examined since they were counted."""
+        now = time.perf_counter()
+        self.fall.append((now, bound))
+        while len(self.fall) > 1 and self.fall[1][0] <= now - STALLED:
+            self.fall.popleft()
+        before = self.fall[0][1] if self.fall[0][0] <= now - STALLED else np.nan
+        self.told = now
+        self.notify(
+            ProofProgress(
+                family=self.family.name,
+                cells=cells,
+                bound=bound,
+                seconds=now - self.started,
+                examined=self.examined + pending,
+                budget=self.budget,
+                bound_before=before,
+                hindrance="" if not bound >= ADVANCED * before else self.hindrance(bound, lower, upper),
+            )
+        )
+
+    def hindrance(self, bound: float, lower: Array, upper: Array) -> str:
+        """What hinders the proof, and what would help: at the worst cell."""
+        advice = "" if self.family.hindrance is None else self.family.hindrance(lower, upper)
+        cell = f"the cell from {_shown(lower)} to {_shown(upper)} still allows {bound:.1e}"
+        return f"{self.family.name}: {cell}; {advice or 'narrower index sets, or numbers of one size, would help'}"
+
+
+def _branch_and_bound(family: ConstraintFamily, x: Array, course: Course) -> Proof:
+    tolerance, box = family.tolerance(TOLERANCE), family.index_set
+    lower, upper = family.cells if family.cells is not None else (box.lower[None], box.upper[None])
+    closed, best = -np.inf, (-np.inf, lower[0], 0)
     leaves: list[tuple[Array, Array]] = []  # one entry per halving
-    bounds, split = _bounded(family, x, lower, upper)
     while True:
-        examined += bounds.size
+        # Bound every cell, and close those where no violation is left.
+        bounds, split = _bounded(course, x, lower, upper)
+        course.examined += bounds.size
         open_ = bounds > tolerance
         leaves.append((lower[~open_], upper[~open_]))
         closed = max(closed, float(bounds[~open_].max(initial=-np.inf)))
+
+        # Look for a witness in the worst cells.
         best = max(best, _probe(family, x, lower, upper, bounds), key=lambda found: found[0])
-        if open_.any() and best[0] <= tolerance and len(leaves) in CLIMBED and family.index_set.dimension > 1:
-            best = max(
-                best,
-                _climb(family, x, *(corner[bounds.argmax()] for corner in (lower, upper))),
-                key=lambda found: found[0],
-            )
+        if open_.any() and best[0] <= tolerance and len(leaves) in CLIMBED and box.dimension > 1:
+            worst_cell = (corner[bounds.argmax()] for corner in (lower, upper))
+            best = max(best, _climb(family, x, *worst_cell), key=lambda found: found[0])
         if best[0] > tolerance:
-            return Proof(family.name, "refuted", np.inf, best[0], best[1], best[2], examined)
+            return Proof(family.name, "refuted", np.inf, best[0], best[1], best[2], course.examined)
         if not open_.any():
-            return Proof(family.name, "proven", closed, best[0], best[1], best[2], examined, leaves=_in_order(leaves))
-        worst = float(bounds.max())
-        notify(
-            ProofProgress(
-                family=family.name,
-                cells=int(open_.sum()),
-                bound=worst,
-                seconds=time.perf_counter() - start,
-                examined=examined,
-                budget=cells,
-            )
-        )
+            leaf_cells = _in_order(leaves)
+            return Proof(family.name, "proven", closed, best[0], best[1], best[2], course.examined, leaves=leaf_cells)
+
+        # Halve what is open, as long as cells, their width and time allow.
+        worst, at = float(bounds.max()), int(bounds.argmax())
+        course.tell(int(open_.sum()), worst, lower[at], upper[at])
         halves = _halved(lower[open_], upper[open_], split[open_])
-        if halves is None or examined + halves[0].shape[0] > cells:
-            reason = (
-                f"{int(open_.sum())} of {examined} cells were left, where a violation of {worst:.1e} is not excluded"
-            )
-            return Proof(family.name, "undecided", worst, best[0], best[1], best[2], examined, reason)
+        if halves is None or course.examined + halves[0].shape[0] > course.budget or course.deadline.passed:
+            hindrance = course.hindrance(worst, lower[at], upper[at])
+            reason = f"{int(open_.sum())} of {course.examined} cells were left; {hindrance}"
+            return Proof(family.name, "undecided", worst, best[0], best[1], best[2], course.examined, reason)
         lower, upper = halves
-        bounds, split = _bounded(family, x, lower, upper)
 
 
-def _bounded(family: ConstraintFamily, x: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+def _bounded(course: Course, x: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+    """Bounds ``(k,)`` of cells, and the coordinates ``(k,)`` to halve; infinite for cells that there was no time for.
+
+    In batches, so that memory does not grow with their number. Only where a deadline is set are batches as small as
+    the time that they take asks for: what a cell costs is not known before, and a result that has no limit shall not
+    depend on how fast the machine is.
+    """
+    family, count = course.family, lower.shape[0]
     assert family.enclosure is not None
-    parts = [family.enclosure(x, lower[i : i + BATCH], upper[i : i + BATCH]) for i in range(0, lower.shape[0], BATCH)]
-    bounds = np.concatenate([p.bounds for p in parts])
-    return np.where(np.isnan(bounds), np.inf, bounds), np.concatenate([p.split for p in parts])
+    bounds, split = np.full(count, np.inf), (upper - lower).argmax(axis=1)
+    start, size = 0, FIRST_BATCH if course.deadline.bounded or course.deadline.passed else BATCH
+    while start < count and not (start and course.deadline.passed):
+        began, part = time.perf_counter(), slice(start, start + size)
+        enclosed = family.enclosure(x, lower[part], upper[part])
+        bounds[part] = np.where(np.isnan(enclosed.bounds), np.inf, enclosed.bounds)
+        split[part] = enclosed.split
+        start, ended = start + size, time.perf_counter()
+        if course.deadline.bounded:
+            size = min(BATCH, 2 * size) if ended - began < QUICK else max(1, size // 2)
+        if start < count and ended - course.told > OFTEN:
+            at = int(bounds[:start].argmax())
+            course.tell(count, float(bounds[at]), lower[at], upper[at], start)
+    return bounds, split
 
 
 def _probe(family: ConstraintFamily, x: Array, lower: Array, upper: Array, bounds: Array) -> tuple[float, Array, int]:
@@ -176,3 +246,7 @@ def _by_separation(family: ConstraintFamily, x: Array) -> Proof:
         row,
         reason=f"family {family.name} offers no enclosure, so nothing can be excluded",
     )
+
+
+def _shown(point: Array) -> str:
+    return np.array2string(point, precision=4, separator=", ", threshold=8)

@@ -17,6 +17,7 @@ from sparserob_core.sip.program import (
     WorstConstraint,
     told_apart,
 )
+from sparserob_core.sip.proof.branch_and_bound import TOLERANCE
 from sparserob_core.sip.proof.reasons import least_of, reasons, sentence
 from sparserob_core.sip.relaxed.relaxed import Rows
 from sparserob_core.sip.result import MEANING, Status
@@ -34,6 +35,29 @@ def verdict(proofs: Sequence[Proof], gap: float, tolerance: float) -> tuple[Stat
         return "undecided", "; ".join(undecided)
     status: Status = "certified" if gap <= tolerance else "verified"
     return status, f"{MEANING[status]} (gap {max(gap, 0.0):.1e})"
+
+
+def as_bad_as_found(proofs: Sequence[Proof], separations: Sequence[tuple[ConstraintFamily, Separation]]) -> list[Proof]:
+    """A refutation ends at the first witness: of what is not proven, tell the worst that the separation finds."""
+    found = {family.name: (family, separation) for family, separation in separations}
+    return [_worse(proof, *found[proof.family]) if proof.family in found else proof for proof in proofs]
+
+
+def _worse(proof: Proof, family: ConstraintFamily, found: Separation) -> Proof:
+    if (
+        proof.verdict == "proven"
+        or not found.violations.size
+        or found.violations[0] <= max(proof.violation, family.tolerance(TOLERANCE))
+    ):
+        return proof
+    return replace(
+        proof,
+        verdict="refuted",
+        violation=float(found.violations[0]),
+        index=found.indices[0],
+        row=int(found.rows[0]),
+        formulation=family.formulation,
+    )
 
 
 def worst_of(separations: Sequence[tuple[ConstraintFamily, Separation]]) -> WorstConstraint:

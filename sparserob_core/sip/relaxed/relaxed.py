@@ -15,6 +15,7 @@ from sparserob_core.sip.inner.duality import dual_bound
 from sparserob_core.sip.inner.image import onto_stationary
 from sparserob_core.sip.inner.solve import solve_finite
 from sparserob_core.sip.inner.vertex import vertex_multipliers
+from sparserob_core.sip.method import Deadline
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.regulariser import ControlImage, Regulariser
 from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
@@ -128,7 +129,8 @@ class CountedSolver(Solver):
 class RelaxedProgram:
     """``g(epsilon; indices)``: minimise ``J + epsilon rho`` over the finite constraints and the imposed indices.
 
-    It remembers the rows that were active and their multipliers, and starts from them at the next call.
+    It remembers the rows that were active and their multipliers, and starts from them at the next call. Raises
+    `OutOfTime` instead of solving one more program when its ``deadline`` has passed.
     """
 
     program: SemiInfiniteProgram
@@ -136,6 +138,7 @@ class RelaxedProgram:
     regulariser: Regulariser | None = None
     tolerance: float = 1e-9
     solves: int = 0
+    deadline: Deadline = field(default_factory=Deadline)
     _terms: tuple[csc_array, Array] | None = None
     _last: RelaxedSolution | None = None
     _programs: dict[float, FiniteProgram] = field(default_factory=dict)
@@ -193,7 +196,8 @@ class RelaxedProgram:
             plain = self.finite(rows.G, rows.h, 0.0)
             z = onto_stationary(plain, z, plain.q + y @ plain.G + mu @ plain.A)
         cuts = tuple(replace(cut, multiplier=float(m)) for cut, m in zip(rows.cuts, own, strict=True) if m > 0.0)
-        return Dual(bound, cuts, mu, None if self.program.finite.S is None else z)
+        fixed = y[: y.size - rows.h.size]
+        return Dual(bound, cuts, mu, None if self.program.finite.S is None else z, fixed)
 
     def evaluate(self, indices: Mapping[str, Array], epsilon: float) -> RelaxedSolution:
         """``g`` at a tuple: per family the indices ``(k, d)``. Rows are imposed lazily: those active last time, then
@@ -254,6 +258,7 @@ class RelaxedProgram:
         return replace(last, y=np.concatenate([fixed, start.multipliers]))
 
     def _solved(self, G: Array, h: Array, epsilon: float, guess: FiniteSolution | None) -> FiniteSolution:
+        self.deadline.check()
         self.solves += 1
         return solve_finite(self.finite(G, h, epsilon), self.counted, tolerance=self.tolerance, guess=guess)
 

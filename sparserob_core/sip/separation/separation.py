@@ -10,7 +10,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import EvaluationsFinished, Notify, forwarded, ignore
 from sparserob_core.sip.maximiser import Maximiser
-from sparserob_core.sip.method import Tools
+from sparserob_core.sip.method import Deadline, Tools
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation
 from sparserob_core.sip.search.search import Rules, Target, maximise
 from sparserob_core.sip.separation.refinement import Candidates, refine
@@ -28,15 +28,21 @@ def separate(
     program: SemiInfiniteProgram, x: Array, tools: Tools, threshold: float = 1e-9, number: int = 0
 ) -> list[tuple[ConstraintFamily, Separation]]:
     """The most violated indices of every family at ``x (n,)``: in the family's own way, or as the maximiser finds them
-    (in round ``number``)."""
+    (in round ``number``). Raises `OutOfTime` when the deadline of the tools has passed."""
 
     def searched(family: ConstraintFamily) -> Separation:
         notify = forwarded(
             tools.notify, EvaluationsFinished, lambda event: replace(event, family=family.name, round=number)
         )
-        return search_worst(family, x, tools.maximiser, tools.budget, tools.rng, threshold, tools.polish, notify)
+        return search_worst(
+            family, x, tools.maximiser, tools.budget, tools.rng, threshold, tools.polish, notify, tools.deadline
+        )
 
-    return [(family, searched(family) if family.worst is None else family.worst(x)) for family in program.families]
+    separations = []
+    for family in program.families:
+        tools.deadline.check()
+        separations.append((family, searched(family) if family.worst is None else family.worst(x)))
+    return separations
 
 
 def search_worst(
@@ -48,6 +54,7 @@ def search_worst(
     threshold: float = 1e-9,
     polish: float = 0.0,
     notify: Notify = ignore,
+    deadline: Deadline | None = None,
 ) -> Separation:
     """The largest local maxima of the violation of every row of ``family`` at the decision ``x (n,)``, at most 8 per
     row, worst first.
@@ -58,9 +65,9 @@ def search_worst(
     the rounds of an exchange that find cuts stay cheap, and the last one is searched hard.
 
     A search proves nothing: ``bound`` is ``inf`` unless the maximiser proved one, or the index set is a single point.
-    Raises `InputError` when a row is not a number or the index set is unbounded.
+    Raises `InputError` when a row is not a number or the index set is unbounded, and `OutOfTime` past the deadline.
     """
-    field = _Violation(family, x)
+    field = _Violation(family, x, deadline or Deadline())
     found = refine(field, _grid_maxima(field, rng))
     bound = np.inf
     if field.dimension == 0:
@@ -75,14 +82,14 @@ def search_worst(
 class _Violation:
     """The violation of all rows, as a function on the unit box of the coordinates that move."""
 
-    def __init__(self, family: ConstraintFamily, x: Array) -> None:
+    def __init__(self, family: ConstraintFamily, x: Array, deadline: Deadline) -> None:
         box = family.index_set
         if not (np.isfinite(box.lower).all() and np.isfinite(box.upper).all()):
             raise InputError(
                 f"family {family.name!r}: expected a bounded index set, got {box.lower.tolist()} to"
                 f" {box.upper.tolist()}"
             )
-        self.family, self.x, self.box = family, x, box
+        self.family, self.x, self.box, self.deadline = family, x, box, deadline
         self.moves = np.flatnonzero(box.upper > box.lower)
         self.dimension = int(self.moves.size)
         self.width = LARGEST_ARRAY
@@ -113,6 +120,7 @@ class _Violation:
         return np.concatenate(parts) if len(parts) != 1 else parts[0]
 
     def _portion(self, indices: Array) -> Array:
+        self.deadline.check()
         values = self.family.violations(self.x, indices)
         if np.isnan(values).any():
             where = indices[np.isnan(values).any(axis=1)][0].tolist()

@@ -1,0 +1,237 @@
+"""The accounts of a method: the best lower bound, the rounds that were told, and what may be claimed at the end."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TypeAlias
+
+import numpy as np
+
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.events import RoundFinished, frozen
+from sparserob_core.sip.evidence import NO_BOUND, Cut, Dual, Proof
+from sparserob_core.sip.finite import FiniteSolution
+from sparserob_core.sip.method import Tools
+from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation, WorstConstraint
+from sparserob_core.sip.proof.branch_and_bound import TOLERANCE
+from sparserob_core.sip.proof.irreducible import irreducible
+from sparserob_core.sip.proof.verdict import as_bad_as_found, infeasible_subsystem, verdict, witness, worst_of
+from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
+from sparserob_core.sip.result import Result, Status, relative_gap
+
+ROUNDING = 1e-13  # of the terms of a cost, with which it is evaluated
+RESIDUAL = 1e-8  # of bounds, fixed rows and equalities, relative to their scale, at a decision that is returned
+
+Prover: TypeAlias = Callable[[Array], Sequence[Proof]]
+Found: TypeAlias = Sequence[tuple[ConstraintFamily, Separation]]
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """An answer to a relaxed program: the checked ``solution``, the ``rows`` that were imposed, and the weight
+    ``epsilon`` of the regulariser. ``value``: of the relaxed program, where it is not that of the solution."""
+
+    solution: FiniteSolution
+    rows: Rows
+    epsilon: float
+    value: float
+
+    @property
+    def multipliers(self) -> Array:
+        """The multipliers ``(r,)`` of the imposed rows; zeros where the solution has none."""
+        count, y = self.rows.h.size, self.solution.y
+        return y[y.size - count :] if y.size >= count else np.zeros(count)
+
+    @property
+    def active(self) -> tuple[Cut, ...]:
+        """The imposed constraints that carry a multiplier, with it."""
+        pairs = zip(self.rows.cuts, self.multipliers, strict=True)
+        return tuple(replace(cut, multiplier=float(m)) for cut, m in pairs if m > 0.0)
+
+
+@dataclass(eq=False)
+class Ledger:
+    """What a method has learned of ``program``: ``dual``, the multipliers of the best lower bound; ``history``, the
+    rounds told; ``best``, the last answer that no search refuted, or else the last one.
+
+    ``tolerance``: the relative gap at which the bounds have met.
+    """
+
+    program: SemiInfiniteProgram
+    relaxed: RelaxedProgram
+    tools: Tools
+    tolerance: float
+    started: float = field(default_factory=time.perf_counter)
+    dual: Dual = NO_BOUND
+    history: list[RoundFinished] = field(default_factory=list)
+    best: Answer | None = None
+    _found: Found = ()
+    _suggested: bool = False
+
+    @property
+    def lower(self) -> float:
+        """The best lower bound proven so far."""
+        return self.dual.bound
+
+    def improve(self, dual: Dual) -> None:
+        """Keep the better of two lower bounds."""
+        self.dual = max(self.dual, dual, key=lambda one: one.bound)
+
+    def open(self, x: Array) -> bool:
+        """Whether the gap between the lower bound and the cost of ``x (n,)`` is open."""
+        return self.gap(self.program.cost(x)) > self.tolerance
+
+    def gap(self, upper: float) -> float:
+        """The relative gap of the lower bound to an upper one."""
+        return relative_gap(self.lower, upper, self.program.cost_scale)
+
+    def tell(self, number: int, answer: Answer, found: Found, upper: float, kept: int) -> None:
+        """Tell of a round: its answer, what was found most violated at it, an upper bound that it suggests, and how
+        many rows were kept."""
+        worst, x = worst_of(found), answer.solution.x
+        added, dropped = _change(self.history[-1].imposed if self.history else (), answer.rows.cuts)
+        event = RoundFinished(
+            round=number,
+            epsilon=answer.epsilon,
+            lower_bound=self.lower,
+            upper_bound=upper,
+            violation=worst.violation,
+            worst_family=worst.constraint,
+            active_indices=kept,
+            cuts_added=len(added),
+            cuts_dropped=len(dropped),
+            relaxed_programs=self.relaxed.solves,
+            seconds=time.perf_counter() - self.started,
+            cost=self.program.cost(x),
+            decision=frozen(x),
+            separations={family.name: one for family, one in found},
+            imposed=answer.rows.cuts,
+            multipliers=frozen(answer.multipliers),
+            added=added,
+            dropped=dropped,
+            gap=self.gap(upper),
+        )
+        self.history.append(event)
+        if np.isfinite(upper) or not self._suggested:
+            self.keep(answer, found)
+            self._suggested = bool(np.isfinite(upper))
+        self.tools.notify(event)
+
+    def keep(self, answer: Answer, found: Found = ()) -> None:
+        """The answer to return should the method be stopped now, with what was found most violated at it."""
+        self.best, self._found = answer, found
+
+    def judged(self, answer: Answer, worst: WorstConstraint, proofs: Sequence[Proof], ending: str = "") -> Result:
+        """The result with the decision of ``answer``: what the proofs, the gap and the comparison of the bounds allow.
+        ``ending``: why the method came to an end, where it was not by its own rules."""
+        x, cost = answer.solution.x, self.program.cost(answer.solution.x)
+        status, message = verdict(proofs, self.gap(cost), self.tolerance)
+        residual = self.program.finite.residual(x)
+        if residual > RESIDUAL:
+            status = "failed"
+            message = f"the decision misses its bounds or equalities by {residual:.1e}: {answer.solution.message}"
+        proven = status in ("certified", "verified") and len(proofs) == len(self.program.families)
+        wrong = alarm(self.program, self.dual, x) if proven else ""
+        if wrong:
+            status, message = "failed", wrong
+        message = f"{message}; {ending}" if ending and status != "certified" else message
+        result = self.result(status, message, answer, witness(self.program, worst, proofs))
+        return replace(result, proofs=tuple(proofs), stopped=ending if ending == self.tools.deadline.reason else "")
+
+    def stopped(self, error: KeyboardInterrupt, prover: Prover) -> Result:
+        """The result where time is over or a key was pressed: the best decision so far, with what one look at it
+        proves (a proof whose deadline has passed looks at every family once)."""
+        reason = self.tools.deadline.interrupt(error)
+        if self.best is None:
+            return Result(
+                status="undecided",
+                message=f"{reason}, before there was a decision",
+                lower_bound=self.lower,
+                cost_scale=self.program.cost_scale,
+                counts=self._counts(0),
+                dual=self.dual,
+                seconds=time.perf_counter() - self.started,
+                stopped=reason,
+            )
+        proofs = as_bad_as_found(prover(self.best.solution.x), self._found)
+        return self.judged(self.best, worst_of(self._found), proofs, reason)
+
+    def without(self, answer: Answer) -> Result:
+        """The result where the relaxed program has no usable answer: ``infeasible`` with the reason where that is
+        proven, else ``failed``."""
+        solution = answer.solution
+        if solution.status != "infeasible":
+            return self.result("failed", solution.message, answer)
+        rows, solution = irreducible(self.relaxed, answer.rows, solution)
+        answer = replace(answer, rows=rows, solution=solution)
+        found, worst = infeasible_subsystem(self.relaxed.program, rows, answer.multipliers, solution.infeasibility)
+        self.dual = self.relaxed.dual(rows, solution.y, solution.mu, solution.z, solution.infeasibility)
+        return replace(self.result("infeasible", found.sentence(), answer, worst), infeasible=found)
+
+    def result(self, status: Status, message: str, answer: Answer, worst: WorstConstraint | None = None) -> Result:
+        """A result with this answer; the bounds are claimed as far as the status allows."""
+        cuts, proven = answer.active, status in ("certified", "verified")
+        decided = status not in ("infeasible", "failed")
+        cost = self.program.cost(answer.solution.x) if decided else np.nan
+        lower = np.inf if status == "infeasible" else self.lower
+        return Result(
+            status=status,
+            message=message,
+            decision=answer.solution.x if decided else None,
+            cost=cost,
+            value=answer.value,
+            epsilon=answer.epsilon,
+            lower_bound=min(lower, cost) if proven else lower,
+            upper_bound=cost if proven else np.inf,
+            cost_scale=self.program.cost_scale,
+            worst=worst,
+            indices=cuts,
+            counts=self._counts(len(cuts)),
+            history=tuple(self.history),
+            dual=self.dual,
+            seconds=time.perf_counter() - self.started,
+        )
+
+    def _counts(self, active: int) -> dict[str, int]:
+        return {
+            "relaxed_programs": self.relaxed.solves,
+            "rounds": len(self.history),
+            "active_indices": active,
+            "solver_calls": self.relaxed.counted.calls,
+        }
+
+
+def _change(before: Sequence[Cut], now: Sequence[Cut]) -> tuple[tuple[Cut, ...], tuple[Cut, ...]]:
+    """The constraints that were added and those that were dropped."""
+    old, new = ({(cut.family, cut.index.tobytes(), cut.row): cut for cut in cuts} for cuts in (before, now))
+    return tuple(cut for key, cut in new.items() if key not in old), tuple(
+        cut for key, cut in old.items() if key not in new
+    )
+
+
+def alarm(program: SemiInfiniteProgram, dual: Dual, x: Array) -> str:
+    """Words where the lower bound is above the cost of a proven decision ``x (n,)`` by more than the tolerances of the
+    proofs allow: then one of the two is wrong. Empty where all is well.
+
+    A decision that violates its rows by ``v`` may cost ``y'v`` less than the optimum, for the multipliers ``y`` of
+    the bound: by weak duality ``lower <= J(x) + y'(G x - h) + mu'(A x - b)``. What is allowed is that sum with the
+    tolerance of each proven row in place of its violation, with the real residuals of the others, and rounding.
+    """
+    base, cost = program.finite, program.cost(x)
+    image, allowed = base.image(x), ROUNDING * base.magnitude(x)
+    allowed += sum(cut.multiplier * program.family(cut.family).tolerance(TOLERANCE) for cut in dual.cuts)
+    if dual.z is not None:
+        allowed += float(np.abs(dual.z) @ np.maximum(np.maximum(base.lower - image, image - base.upper), 0.0))
+    if dual.mu.size:
+        allowed += float(np.abs(dual.mu) @ np.abs(base.A @ x - base.b))
+    if dual.fixed.size:
+        allowed += float(dual.fixed @ np.maximum(base.G @ x - base.h, 0.0))
+    if dual.bound - cost <= allowed:
+        return ""
+    return (
+        f"the lower bound {dual.bound:.12g} is above the cost {cost:.12g} of a decision that was proven, by more"
+        f" than the {allowed:.1e} that the tolerances of the proofs allow: one of the two is wrong, and neither is"
+        " claimed; try another solver, or state the problem in units in which its numbers are of one size"
+    )

@@ -1,0 +1,109 @@
+"""Programs without an optimum: rays along which the cost falls for ever, and the rows that stop it where there are any.
+
+A relaxed program may be unbounded below only because few constraints are imposed. Whether the whole program is, its
+recession program says (Rockafellar 1970, section 8): the same program with right-hand sides 0, whose decision is a
+direction ``d`` of bounded size with ``P d = 0``. Its value is negative exactly where a convex program that is feasible
+falls along a ray; where it is not, the indices that prove it bound the relaxed program too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TypeAlias
+
+import numpy as np
+
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.evidence import Cut
+from sparserob_core.sip.method import Tools
+from sparserob_core.sip.methods.ledger import Ledger, Prover
+from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
+from sparserob_core.sip.result import Result, Status
+
+Close: TypeAlias = Callable[[SemiInfiniteProgram, Tools, Prover], Result]  # an exchange that closes the gap
+FALLS = 1e-7  # of the largest coefficient: a cost per unit of a direction that is no rounding
+SHOWN = 6  # numbers of a ray that are written into the message
+
+
+def recession_program(program: SemiInfiniteProgram) -> SemiInfiniteProgram:
+    """The cost along directions ``d`` of size at most 1 that stay within the program however far one goes."""
+    base, images = program.finite, program.finite.weights.size
+    n, empty = program.n, (np.zeros((0, program.n)), np.zeros(0))
+    size = (np.vstack([np.eye(n), -np.eye(n)]), np.ones(2 * n)) if base.S is not None else empty
+    flat = np.zeros((0, n)) if base.P is None else base.P.toarray()
+    A = np.vstack([base.A, flat[flat.any(axis=1)]])
+    finite = np.isfinite(base.h)
+    G, h = np.vstack([base.G[finite], size[0]]), np.concatenate([np.zeros(int(finite.sum())), size[1]])
+    return SemiInfiniteProgram(
+        n=n,
+        q=base.q,
+        weights=base.weights,
+        S=base.S,
+        lower=np.where(np.isfinite(base.lower), np.zeros(images), -1.0),
+        upper=np.where(np.isfinite(base.upper), np.zeros(images), 1.0),
+        G=G if h.size else None,
+        h=h if h.size else None,
+        A=A if len(A) else None,
+        b=np.zeros(len(A)) if len(A) else None,
+        families=[_homogeneous(family) for family in program.families],
+    )
+
+
+def _homogeneous(family: ConstraintFamily) -> ConstraintFamily:
+    def rows(indices: Array) -> tuple[Array, Array]:
+        G, h = family.rows(indices)
+        return G, np.zeros_like(h)
+
+    return ConstraintFamily(name=family.name, index_set=family.index_set, rows=rows)
+
+
+def bounding_rows(
+    program: SemiInfiniteProgram, tools: Tools, close: Close
+) -> tuple[Array | None, list[tuple[Array, np.ndarray, str]]]:
+    """A ray ``(n,)`` along which the cost falls for ever; or ``None`` and the indices that let it fall along none."""
+    base = program.finite
+    if np.isfinite(base.lower).all() and np.isfinite(base.upper).all() and base.S is None:
+        return None, []
+    steps = replace(tools, regulariser=None, notify=lambda event: None)
+    result = close(recession_program(program), steps, lambda x: ())
+    coefficient = max(float(np.abs(base.q).max(initial=0.0)), float(base.weights.max(initial=0.0)))
+    if result.decision is not None and not result.stopped and result.cost < -FALLS * coefficient:
+        return result.decision / np.abs(result.decision).max(), []
+    return None, _by_family(result.history[-1].imposed if result.history else ())
+
+
+def _by_family(cuts: Sequence[Cut]) -> list[tuple[Array, np.ndarray, str]]:
+    names = dict.fromkeys(cut.family for cut in cuts)
+    groups = [[cut for cut in cuts if cut.family == name] for name in names]
+    return [(np.array([c.index for c in group]), np.array([c.row for c in group]), group[0].family) for group in groups]
+
+
+def falls_for_ever(ledger: Ledger, close: Close, prover: Prover, ray: Array) -> Result:
+    """The result for a program whose cost falls along a ray: a decision that meets its constraints, where there is one,
+    judged like any other; without a lower bound."""
+    program, tools = ledger.program, ledger.tools
+    feasible = replace(program, q=None, P=None, weights=None, families=program.families)
+    result = close(feasible, replace(tools, regulariser=None), prover)
+    if result.decision is None:
+        return result
+    cost = program.cost(result.decision)
+    slope = float(program.finite.weights @ np.abs(program.finite.image(ray)) + program.finite.q @ ray)
+    order = np.argsort(-np.abs(ray), kind="stable")[:SHOWN]
+    said = ", ".join(f"{ray[i]:.4g} in x{i + 1}" for i in np.sort(order))
+    more = ", ..." if program.n > SHOWN else ""
+    proven = result.status in ("certified", "verified")
+    met = "the decision is proven to meet the constraints" if proven else "the decision meets them as far as was seen"
+    words = f"unbounded below: along the ray ({said}{more}) the cost falls for ever, by {-slope:.4g} per unit; {met}"
+    status: Status = "verified" if proven else result.status
+    return replace(
+        result,
+        status=status,
+        message=words if status == "verified" else f"{words}; {result.message}",
+        cost=cost,
+        value=cost,
+        lower_bound=-np.inf,
+        upper_bound=cost if status == "verified" else np.inf,
+        cost_scale=program.cost_scale,
+        ray=ray,
+    )
