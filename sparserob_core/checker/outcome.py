@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
+from time import perf_counter
 from typing import Literal, TypeAlias, final
 
-VIOLATION = 1e-9  # a constraint that is exceeded by at most this counts as kept
+TOLERANCE = 1e-9  # of a constraint's own unit: a violation of at most this counts as none
+RESOLVED = 2.0**-18  # of the numbers that are added up, the least unit: TOLERANCE of it is 17 units of rounding
 
 Verdict: TypeAlias = Literal["holds", "fails", "not checked"]
 
@@ -27,3 +30,17 @@ class Claim:
     name: str
     verdict: Verdict
     text: str
+
+
+@final
+@dataclass(frozen=True)
+class Clock:
+    """When to stop: ``seconds`` after it was made. What is not decided by then is `Unchecked`."""
+
+    seconds: float = math.inf
+    started: float = field(default_factory=perf_counter)
+
+    def check(self) -> None:
+        """Raise `Unchecked` when the time is up."""
+        if perf_counter() - self.started > self.seconds:
+            raise Unchecked(f"the time limit of {self.seconds:g} s was reached")

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from flint import arb, arb_mat
 
 SMALL = 0.25  # norm below which the exponential series is summed
-TERMS = 24  # of it: what is left out is below 1e-38 then
+TERMS = 16  # of it: what is left out is below 1e-24 then
 
 
 @final
@@ -19,10 +19,18 @@ class Series:
     """``sum_k parts_k delta^k``; products drop what is beyond the degree of the monomials, which Lagrange's remainder
     accounts for."""
 
-    __slots__ = ("monomials", "parts")
+    __slots__ = ("_there", "monomials", "parts")
 
     def __init__(self, monomials: Monomials, parts: Sequence[arb_mat]) -> None:
         self.monomials, self.parts = monomials, list(parts)
+        self._there: list[bool] | None = None
+
+    @property
+    def there(self) -> list[bool]:
+        """Which coefficients are not exactly 0: those of a system are few."""
+        if self._there is None:
+            self._there = [any(not x.is_zero() for x in part.entries()) for part in self.parts]
+        return self._there
 
     @staticmethod
     def constant(monomials: Monomials, value: arb_mat) -> Series:
@@ -33,11 +41,18 @@ class Series:
         return Series(self.monomials, [a + b for a, b in zip(self.parts, other.parts, strict=True)])
 
     def __mul__(self, other: Series) -> Series:
+        if self.monomials.size == 1:
+            return Series(self.monomials, [self.parts[0] * other.parts[0]])
+        from flint import arb_mat
+
         total: list[arb_mat | None] = [None] * self.monomials.size
+        left, right, there = self.parts, other.parts, self.there
         for i, j, k in self.monomials.products:
-            term, so_far = self.parts[i] * other.parts[j], total[k]
-            total[k] = term if so_far is None else so_far + term
-        return Series(self.monomials, [part for part in total if part is not None])
+            if there[i]:
+                term, so_far = left[i] * right[j], total[k]
+                total[k] = term if so_far is None else so_far + term
+        zero = arb_mat(left[0].nrows(), right[0].ncols())
+        return Series(self.monomials, [zero if part is None else part for part in total])
 
     def scaled(self, factor: arb) -> Series:
         """Every coefficient times a number."""

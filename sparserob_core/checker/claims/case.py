@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
 from sparserob_core.checker.claims.duality import Duality
-from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.claims.units import Units
+from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.control.problem.dictionary import Dictionary
@@ -42,6 +43,7 @@ class Case:
     control: Dictionary
     disturbance: Dictionary
     certificate: Mapping[str, Any]
+    clock: Clock = field(default_factory=Clock)
 
     @cached_property
     def windows(self) -> list[Window]:
@@ -145,6 +147,16 @@ class Case:
             None if changes is None else self.problem.disturbance,
             changes or [],
         )
+
+    def units(self, window: Window) -> Units:
+        """What violations of a constraint are judged by."""
+        if window not in self._units:
+            self._units[window] = Units(self.problem, self.scene, window.shape, window.start, window.stop)
+        return self._units[window]
+
+    @cached_property
+    def _units(self) -> dict[Window, Units]:
+        return {}
 
     @cached_property
     def duality(self) -> Duality:

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, TypeAlias, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.bernstein import highest
-from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.outcome import TOLERANCE, Broken, Clock, Unchecked
 from sparserob_core.checker.reach.tube import Polynomial, Tube
 from sparserob_core.checker.sets.parameters import Corners, Parameters
-from sparserob_core.checker.sets.polynomials import OUTWARD, ROUNDING
+from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, ROUNDING
 from sparserob_core.checker.sets.sides import Bounded, Sides
 from sparserob_core.sip.convex_set import Array
 
@@ -31,10 +31,11 @@ Interval: TypeAlias = tuple[int, float, float]
 @final
 @dataclass(frozen=True, eq=False)
 class Proven:
-    """A constraint is exceeded by at most ``bound``; shown on ``cells`` cells of time in ``boxes`` boxes of
-    parameters."""
+    """A constraint is exceeded by at most ``bound``, of a row's own unit at most ``share``; shown on ``cells`` cells of
+    time in ``boxes`` boxes of parameters."""
 
     bound: float
+    share: float
     cells: int
     boxes: int
 
@@ -43,11 +44,11 @@ Work: TypeAlias = tuple[Corners, Sides, list[Interval]]
 """A box of parameters, what is to be bounded, and when."""
 
 
-def prove(tubes: Callable[[Corners], Tube], parameters: Parameters, work: Sequence[Work], tolerance: float) -> Proven:
-    """Show that no row is exceeded by more than ``tolerance`` on the cells ``work``; raises `Broken` where one is, and
+def prove(tubes: Callable[[Corners], Tube], parameters: Parameters, work: Sequence[Work], clock: Clock) -> Proven:
+    """Show that no row is exceeded by more than its slack on the cells ``work``; raises `Broken` where one is, and
     `Unchecked` where neither could be shown."""
     stack = list(reversed(work))
-    bound, cells, items = -np.inf, 0, 0
+    found, cells, items = _Found(), 0, 0
     while stack:
         box, sides, todo = stack.pop()
         if not parameters.meets(box):
@@ -58,30 +59,41 @@ def prove(tubes: Callable[[Corners], Tube], parameters: Parameters, work: Sequen
             cells += len(todo)
             if cells > MOST_CELLS or items > MOST_BOXES:
                 raise Unchecked(
-                    f"neither shown nor refuted: after {cells} cells a violation of more than {tolerance:.1e} is not"
-                    " excluded"
+                    f"neither shown nor refuted: after {cells} cells a violation of more than {TOLERANCE:.0e} of its"
+                    " unit is not excluded"
                 )
-            bound, todo = (
-                max(bound, _examine(Place(tubes(box), parameters, box, tolerance), sides, todo, left)),
-                left.halves,
-            )
-            left.halves = []
+            _examine(Place(tubes(box), parameters, box, clock), sides, todo, left, found)
+            todo, left.halves = left.halves, []
         if left.turned:
             stack += [(box, half, left.turned) for half in reversed(sides.halves())]
         if left.wide:
             stack += [(half, sides, left.wide) for half in reversed(_split(box, int(left.influence.argmax())))]
-    return Proven(bound, cells, items)
+    return Proven(found.bound, found.share, cells, items)
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Place:
-    """One box of parameters, and what counts as a violation there."""
+    """One box of parameters."""
 
     tube: Tube
     parameters: Parameters
     box: Corners
-    tolerance: float
+    clock: Clock
+
+
+@final
+@dataclass(eq=False)
+class _Found:
+    """The largest excess that could not be excluded so far: as it is, and as a share of its row's own unit."""
+
+    bound: float = -np.inf
+    share: float = -np.inf
+
+    def add(self, top: float, row: Bounded) -> None:
+        over = top + row.slack
+        self.bound = max(self.bound, over)
+        self.share = max(self.share, over / row.unit)
 
 
 @final
@@ -96,18 +108,17 @@ class _Left:
     wide: list[Interval] = field(default_factory=list)
 
 
-def _examine(place: Place, sides: Sides, todo: Sequence[Interval], left: _Left) -> float:
-    """Bound every cell of time; returns the largest bound that will do, and sorts what will not."""
-    bound = -np.inf
-    for interval, found, tops in _batch(place.tube, sides.rows, todo, place.tolerance):
+def _examine(place: Place, sides: Sides, todo: Sequence[Interval], left: _Left, shown: _Found) -> None:
+    """Bound every cell of time; notes the bounds that will do, and sorts what will not."""
+    for interval, found, tops in _batch(place, sides.rows, todo):
         tops = [
-            top if top <= place.tolerance else _cut(place, row, poly)
+            top if top <= 0.0 else _cut(place, row, poly)
             for top, row, poly in zip(tops, sides.rows, found, strict=True)
         ]
-        bound = max(bound, *(top for top in tops if top <= place.tolerance), -np.inf)
-        failed = [
-            (row, poly) for row, poly, top in zip(sides.rows, found, tops, strict=True) if not top <= place.tolerance
-        ]
+        for top, row in zip(tops, sides.rows, strict=True):
+            if top <= 0.0:
+                shown.add(top, row)
+        failed = [(row, poly) for row, poly, top in zip(sides.rows, found, tops, strict=True) if not top <= 0.0]
         if not failed:
             continue
         if _turn(place, sides, interval, failed):
@@ -117,7 +128,6 @@ def _examine(place: Place, sides: Sides, todo: Sequence[Interval], left: _Left) 
             left.influence += sum(_influence(place.tube, poly) for _, poly in failed)
         else:
             left.halves += _halves(interval)
-    return bound
 
 
 def _turn(place: Place, sides: Sides, interval: Interval, failed: Sequence[tuple[Bounded, Polynomial]]) -> bool:
@@ -125,34 +135,37 @@ def _turn(place: Place, sides: Sides, interval: Interval, failed: Sequence[tuple
     start."""
     middle = sides.centre
     if middle is None:
-        if sides.shape is None:
+        if sides.curved is None:
             _refute(place, interval, failed)
         return False
-    ((_, (poly,), (top,)),) = _batch(place.tube, [middle], [interval], place.tolerance)
+    ((_, (poly,), (top,)),) = _batch(place, [middle], [interval])
     _refute(place, interval, [(middle, poly)])
-    return top <= place.tolerance or _cut(place, middle, poly) <= place.tolerance
+    return top <= 0.0 or _cut(place, middle, poly) <= 0.0
 
 
 def _refute(place: Place, interval: Interval, rows: Sequence[tuple[Bounded, Polynomial]]) -> None:
     for row, poly in rows:
         least = float(poly.coefficients[0, 0]) - row.limit - poly.error - poly.kinks
-        if least > place.tolerance and place.parameters.holds(np.array(place.tube.flow.centre)):
-            raise Broken(f"it is exceeded by {least:.3g} at t = {interval[1]:.6g}")
+        if least > row.slack and place.parameters.holds(np.array(place.tube.flow.centre)):
+            raise Broken(f"it is exceeded by {least:.3g} at t = {interval[1]:.6g}, {least / row.unit:.1e} of its unit")
 
 
 def _batch(
-    tube: Tube, rows: Sequence[Bounded], todo: Sequence[Interval], tolerance: float
+    place: Place, rows: Sequence[Bounded], todo: Sequence[Interval]
 ) -> Iterator[tuple[Interval, list[Polynomial], list[float]]]:
-    """Every interval with its polynomials, one per row, and their proven upper bounds."""
-    directions = [row.direction for row in rows]
-    every = [tube.cells(*interval, directions) for interval in todo]
-    tops = _tops(tube, [(poly, row.limit) for found in every for poly, row in zip(found, rows, strict=True)], tolerance)
+    """Every interval with its polynomials, one per row, and the proven upper bounds of what they exceed their row's
+    limit and slack by."""
+    z, every = np.array([row.z for row in rows]), []
+    for interval in todo:
+        place.clock.check()
+        every.append(place.tube.cells(*interval, z))
+    tops = _tops(place.tube, [(poly, row.allowed) for found in every for poly, row in zip(found, rows, strict=True)])
     for number, (interval, found) in enumerate(zip(todo, every, strict=True)):
         yield interval, found, tops[number * len(rows) : (number + 1) * len(rows)].tolist()
 
 
-def _tops(tube: Tube, flat: Sequence[tuple[Polynomial, float]], tolerance: float) -> Array:
-    """Upper bounds of polynomials less their limits."""
+def _tops(tube: Tube, flat: Sequence[tuple[Polynomial, float]]) -> Array:
+    """Upper bounds of polynomials less what they may reach; sharp only where they are positive."""
     tops, monomials = np.empty(len(flat)), tube.flow.monomials
     for orders in {poly.coefficients.shape[0] for poly, _ in flat}:
         which = [i for i, (poly, _) in enumerate(flat) if poly.coefficients.shape[0] == orders]
@@ -162,10 +175,10 @@ def _tops(tube: Tube, flat: Sequence[tuple[Polynomial, float]], tolerance: float
         places = np.ravel_multi_index(tuple(powers), dense.shape[2:]) if monomials.count else [0]
         together[:, :, places] = np.array([flat[i][0].coefficients for i in which])
         together[:, 0, 0] -= np.array([flat[i][1] for i in which])
-        errors = np.array([flat[i][0].error + 1e-15 * abs(flat[i][1]) for i in which]) * OUTWARD
+        errors = np.array([flat[i][0].error + HALF_ULP * abs(flat[i][1]) for i in which]) * OUTWARD
         if not (np.isfinite(dense).all() and np.isfinite(errors).all()):
             raise Unchecked("the response grows beyond what numbers can hold")
-        tops[which] = highest(dense, [False] + [True] * monomials.count, errors, tolerance)
+        tops[which] = highest(dense, [False] + [True] * monomials.count, errors, 0.0)
     return tops
 
 
@@ -184,7 +197,7 @@ def _cut(place: Place, row: Bounded, poly: Polynomial) -> float:
         coefficients[0, 0] += float(weights @ (limits - normals @ centre))
         size = float(weights @ (np.abs(limits) + np.abs(normals) @ (np.abs(centre) + radius)))
         changed = replace(poly, coefficients=coefficients, error=poly.error + ROUNDING * size)
-        top = min(top, float(_tops(tube, [(changed, row.limit)], place.tolerance)[0]))
+        top = min(top, float(_tops(tube, [(changed, row.allowed)])[0]))
     return top
 
 

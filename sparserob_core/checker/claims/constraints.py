@@ -8,16 +8,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.arithmetic.balls import balls, below
 from sparserob_core.checker.claims.case import Case, Window, number, numbers
 from sparserob_core.checker.claims.cells import Interval, Work, prove
 from sparserob_core.checker.claims.subdivision import fill
-from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.claims.units import Units
+from sparserob_core.checker.outcome import TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.reach.flow import Flow
 from sparserob_core.checker.reach.tube import Tube
 from sparserob_core.checker.sets.parameters import Corners, Parameters
 from sparserob_core.checker.sets.shapes import facets, support
-from sparserob_core.checker.sets.sides import Sides
+from sparserob_core.checker.sets.sides import Bounded, Curved, Sides, flat_basis
 from sparserob_core.control.sets.sets import Box as BoxSet
 from sparserob_core.control.sets.sets import Cylinder
 from sparserob_core.sip.convex_set import Array
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 
 DEGREES = {0: 0, 1: 8, 2: 6, 3: 4, 4: 3}  # of the expansion in the parameters, by their number; 2 beyond
 TUBES_KEPT = 8
-MOST_TOLERANCE = 1e-9
 WIDER = 1e-12  # by which the boxes of a parameter set that is none are widened, relative to the whole
 
 
@@ -40,40 +40,35 @@ def bounded(case: Case, window: Window) -> str:
             raise Unchecked("the certificate does not claim it")
         raise Broken("the certificate holds no proof of it")
     tolerance = number(entry, "tolerance")
-    most = kept(case, window)
-    if not 0 < tolerance <= most * (1.0 + 1e-12):
-        raise Broken(f"a violation of {tolerance:g} is to count as none, at most {most:g} may")
+    if not 0 < tolerance <= TOLERANCE * (1.0 + 1e-12):
+        raise Broken(f"a violation of {tolerance:g} is to count as none, of its own unit at most {TOLERANCE:g} may")
     lower, upper = numbers(entry.get("lower"), "lower"), numbers(entry.get("upper"), "upper")
     if lower.shape == (0, 0):
         raise Unchecked("the certificate holds no cells for a constraint that was not proven on cells")
+    normals = _normals(window, entry.get("normals"))
     _covered(case, window, lower, upper)
-    found = prove(
-        _tubes(case, lower, upper),
-        Parameters(case.problem.system.parameters),
-        _work(case, window, lower, upper),
-        tolerance,
-    )
+    basis, work = _work(case, window, normals, lower, upper)
+    found = prove(_tubes(case, basis, lower, upper), Parameters(case.problem.system.parameters), work, case.clock)
     size = f"{found.cells} cells" + (f" in {found.boxes} boxes" if found.boxes > 1 else "")
-    return (
-        f"kept, with a margin of at least {-found.bound:.1e} ({size})"
-        if found.bound < 0
-        else f"kept to {found.bound:.1e} ({size})"
-    )
+    if found.bound < 0:
+        return f"kept, with a margin of at least {-found.bound:.1e} ({size})"
+    return f"kept to {found.bound:.1e}, {found.share:.1e} of its own unit ({size})"
 
 
-def kept(case: Case, window: Window) -> float:
-    """A violation of at most this counts as none: less where the numbers of the constraint are below a thousandth."""
-    start = np.asarray(case.problem.initial_state)
-    flat = facets(window.shape)
-    if flat is not None:
-        size = max((max(abs(float(b.mid())), abs(float(c @ start))) for c, b in flat), default=1.0)
-    else:
-        base = window.shape.base if isinstance(window.shape, Cylinder) else window.shape
-        axes = np.eye(base.dimension)
-        size = max(
-            float(np.abs(base.support(np.vstack([axes, -axes]))).max()), float(np.abs(start[: base.dimension]).max())
-        )
-    return MOST_TOLERANCE * min(1.0, 1e3 * (size or 1.0))
+def _normals(window: Window, data: object) -> Array:
+    """The coordinates of a curved set's directions, ``(b, d)``: they must be able to name every direction in which it
+    is bounded. Those of the state where the certificate has none."""
+    b, d = _spanned(window), window.shape.dimension
+    if data is None:
+        return np.eye(b, d)
+    normals = numbers(data, "normals")
+    if normals.shape != (b, d) or normals[:, b:].any():
+        raise Broken(f"normals: expected {b} directions of the first {b} of {d} states")
+    from flint import fmpq, fmpq_mat
+
+    if fmpq_mat([[fmpq(*v.as_integer_ratio()) for v in row] for row in normals[:, :b].tolist()]).det() == 0:
+        raise Broken("normals: the directions lie in a plane")
+    return normals
 
 
 def _spanned(window: Window) -> int:
@@ -116,18 +111,34 @@ def _extent(case: Case, window: Window, lower: Array, upper: Array) -> tuple[Arr
     return np.append(window.start, low), np.append(window.stop, high)
 
 
-def _work(case: Case, window: Window, lower: Array, upper: Array) -> list[Work]:
-    """The cells, those with the same parameters and directions together, their times cut at the breakpoints of the
-    grid."""
-    nu, flat = case.problem.system.parameter_count, Sides.flat(window.shape)
+def _work(case: Case, window: Window, normals: Array, lower: Array, upper: Array) -> tuple[Array, list[Work]]:
+    """What directions are combinations of ``(b, d)``, and the cells, those with the same parameters and directions
+    together, their times cut at the breakpoints of the grid."""
+    nu, units = case.problem.system.parameter_count, case.units(window)
+    basis, flat = _facets(window, units)
+    curved = None if flat is not None else Curved(window.shape, normals, units.sums)
     keys = [(tuple(a[1:].tolist()), tuple(b[1:].tolist())) for a, b in zip(lower, upper, strict=True)]
     order = sorted(range(len(keys)), key=lambda i: (keys[i], lower[i, 0]))
     work: list[Work] = []
     for (a, b), members in groupby(order, key=lambda i: keys[i]):
-        sides = flat or Sides.curved(window.shape, np.array(a[nu:]), np.array(b[nu:]))
+        case.clock.check()
+        sides = Sides.cell(curved, np.array(a[nu:]), np.array(b[nu:])) if curved is not None else flat
+        assert sides is not None
         intervals = [part for i in members for part in _cut(case, float(lower[i, 0]), float(upper[i, 0]))]
         work.append(((a[:nu], b[:nu]), sides, intervals))
-    return work
+    return normals if curved is not None else basis, work
+
+
+def _facets(window: Window, units: Units) -> tuple[Array, Sides | None]:
+    """The normals of a flat set's facets up to the sign, and its rows; no rows for a curved one."""
+    found, flat = flat_basis(window.shape), facets(window.shape)
+    if found is None or flat is None:
+        return np.zeros((0, 0)), None
+    basis, z = found
+    rows = [
+        Bounded(direction, below(b), unit) for direction, (_, b), unit in zip(z, flat, units.rows.tolist(), strict=True)
+    ]
+    return basis, Sides(rows)
 
 
 def _cut(case: Case, start: float, stop: float) -> list[Interval]:
@@ -140,7 +151,7 @@ def _cut(case: Case, start: float, stop: float) -> list[Interval]:
     return [(first + i, a, b) for i, (a, b) in enumerate(pairwise(points))]
 
 
-def _tubes(case: Case, lower: Array, upper: Array) -> Callable[[Corners], Tube]:
+def _tubes(case: Case, basis: Array, lower: Array, upper: Array) -> Callable[[Corners], Tube]:
     nu = case.problem.system.parameter_count
     widened = nu and not isinstance(case.problem.system.parameters, BoxSet)
     extra = WIDER * (upper[:, 1 : 1 + nu].max(axis=0) - lower[:, 1 : 1 + nu].min(axis=0)) if widened else np.zeros(nu)
@@ -156,6 +167,7 @@ def _tubes(case: Case, lower: Array, upper: Array) -> Callable[[Corners], Tube]:
             made[box] = Tube(
                 Flow(case.problem.system, tuple(centre.tolist()), tuple(radius.tolist()), DEGREES.get(nu, 2)),
                 case.scene,
+                basis,
             )
         return made[box]
 

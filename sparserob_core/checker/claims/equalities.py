@@ -3,16 +3,23 @@ there."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.jets import Monomials, expanded
 from sparserob_core.checker.claims.case import Case
-from sparserob_core.checker.outcome import VIOLATION, Broken, Unchecked
+from sparserob_core.checker.claims.units import Units
+from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.reach.flow import Flow
 from sparserob_core.checker.reach.tube import Tube
-from sparserob_core.checker.sets.shapes import support
+from sparserob_core.checker.sets.shapes import radius, support
+from sparserob_core.control.sets.sets import Box
+
+ROUNDING = 1e-12  # of the numbers that are added up: what solving in double precision leaves of an equality
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -23,16 +30,18 @@ if TYPE_CHECKING:
 def equalities(case: Case) -> str:
     """Show that the fixed states are met at every parameter and disturbance; a sentence with the figures."""
     middle = [] if case.problem.system.parameters is None else case.problem.system.parameters.interior_point().tolist()
-    tube = Tube(
-        Flow(case.problem.system, tuple(middle), (0.0,) * len(middle), 0), replace(case.scene, disturbance=None)
-    )
+    scene, d = replace(case.scene, disturbance=None), case.problem.system.states
+    tube = Tube(Flow(case.problem.system, tuple(middle), (0.0,) * len(middle), 0), scene, np.eye(d))
+    horizon, everything = case.problem.horizon, Box(np.full(d, -np.inf), np.full(d, np.inf))
+    sums = Units(case.problem, scene, everything, horizon, horizon).sums
     worst = 0.0
     for state, value in case.equalities:
         if _reached(case, state):
             raise Unchecked(f"the uncertainty may reach x{state + 1}, which is to be fixed")
         missed = abs(tube.nodes[-1].parts[0][state, 0] - balls([value])[0])
-        if not missed <= VIOLATION:
-            raise Broken(f"x{state + 1} is missed by up to {float(missed.upper()):.3g}")
+        most = ROUNDING * max(float(sums[state]), abs(value))
+        if not missed <= most:
+            raise Broken(f"x{state + 1} is missed by up to {float(missed.upper()):.3g}, rounding is at most {most:.1e}")
         worst = max(worst, float(missed.upper()))
     return f"kept to {worst:.1e}"
 
@@ -52,9 +61,9 @@ def _reached(case: Case, state: int) -> bool:
         for i in reaching
         for j in range(part.ncols())
     )
-    pushed = case.problem.disturbance is not None and any(
-        not part[i, j].is_zero() for part in parts["E"] for i in reaching for j in range(part.ncols())
-    )
+    bound = case.problem.disturbance
+    free = [] if bound is None else [w for w, size in enumerate(radius(bound)) if size > math.ulp(0.0)]
+    pushed = any(not part[i, w].is_zero() for part in parts["E"] for i in reaching for w in free)
     return uncertain or pushed
 
 

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
-from sparserob_core.checker.claims.case import Case, numbers
-from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.claims.case import Case, number, numbers
+from sparserob_core.checker.outcome import TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.reach.flow import Flow, held, stacked
-from sparserob_core.checker.sets.shapes import member
+from sparserob_core.checker.reach.tube import Tube
+from sparserob_core.checker.sets.shapes import facets, member
+from sparserob_core.checker.sets.sides import flat_basis
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -37,6 +41,30 @@ def reached(case: Case, time: float, parameter: Array, signal: object) -> list[a
         x = Phi * x + Gamma * arb_mat([[v] for v in case.scene.control[k].entries() + pushed])
     state: list[arb] = x.entries()
     return state
+
+
+def exceeded(case: Case, said: Mapping[str, object]) -> tuple[list[float], float]:
+    """By how much the worst disturbance exceeds each row of a constraint at one time and parameter, and how closely
+    that is known: `said` holds the names ``constraint``, ``time``, ``parameter`` and ``violation``. Raises `Broken`
+    where these are none, `Unchecked` for a curved set."""
+    window, time = case.window(str(said.get("constraint"))), number(said, "time")
+    parameter = numbers(said.get("parameter"), "parameter")
+    number(said, "violation")
+    if parameter.shape != (case.problem.system.parameter_count,):
+        raise Broken(f"parameter: {parameter.size} numbers where {case.problem.system.parameter_count} are expected")
+    if not window.start <= time <= window.stop:
+        raise Broken(f"t = {time!r} is not within {window.start:g} to {window.stop:g}")
+    flat, found = facets(window.shape), flat_basis(window.shape)
+    if flat is None or found is None:
+        raise Unchecked("the worst direction of a curved set is not told")
+    basis, z = found
+    centre = tuple(map(float, parameter))
+    tube = Tube(Flow(case.problem.system, centre, (0.0,) * len(centre), 0), case.scene, basis)
+    piece = min(bisect_right(case.grid, time) - 1, len(case.grid) - 2 if time < case.grid[-1] else len(case.grid) - 1)
+    polynomials = tube.cells(piece, time, time, z)
+    over = [float(poly.coefficients[0, 0]) - float(b.mid()) for poly, (_, b) in zip(polynomials, flat, strict=True)]
+    slack = max(float(poly.error) for poly in polynomials) + TOLERANCE * float(case.units(window).rows.max(initial=0.0))
+    return over, slack
 
 
 def _admissible(case: Case, signal: object) -> Array:

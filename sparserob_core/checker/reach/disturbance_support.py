@@ -4,6 +4,7 @@ disturbance."""
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, final
@@ -13,7 +14,7 @@ import numpy as np
 from sparserob_core.checker.arithmetic.bernstein import bernstein
 from sparserob_core.checker.arithmetic.series import Series
 from sparserob_core.checker.reach.flow import Flow, in_time, stacked, up_to
-from sparserob_core.checker.sets.polynomials import OUTWARD, ROUNDING, Enclosed, linear_bound
+from sparserob_core.checker.sets.polynomials import OUTWARD, ROUNDING, Enclosed, linear_bound, rounding
 from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.sip.convex_set import Array
 
@@ -57,81 +58,101 @@ class Table:
 
     def __init__(self) -> None:
         self.places: dict[int, int] = {}
-        self.mid = self.rad = np.zeros((0, 0, 0, 0))
+        self.mid = self.rad = np.zeros((0,))
 
-    def add(self, lag: int, entry: tuple[Array, Array]) -> None:
-        """One more lag."""
-        place = len(self.places)
-        if place == self.mid.shape[0] or not place:
-            size = max(16, 2 * place)
+    def add(self, lags: list[int], mid: Array, rad: Array) -> None:
+        """More lags, with their arrays along the first axis."""
+        used = len(self.places)
+        if used + len(lags) > self.mid.shape[0]:
+            size = max(16, 2 * used, used + len(lags))
             self.mid, self.rad = (
-                np.concatenate([old.reshape(place, *new.shape), np.zeros((size - place, *new.shape))])
-                for old, new in zip((self.mid, self.rad), entry, strict=True)
+                np.concatenate([old[:used].reshape(used, *new.shape[1:]), np.zeros((size - used, *new.shape[1:]))])
+                for old, new in zip((self.mid, self.rad), (mid, rad), strict=True)
             )
-        self.mid[place], self.rad[place] = entry
-        self.places[lag] = place
+        self.mid[used : used + len(lags)], self.rad[used : used + len(lags)] = mid, rad
+        self.places |= {lag: used + i for i, lag in enumerate(lags)}
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Operator:
+    """Products with power series of ball matrices, as one matrix ``(outputs, M n)`` of floats with an error each."""
+
+    mid: Array
+    rad: Array
+
+    @staticmethod
+    def of(factors: Sequence[Series], first: int) -> Operator:
+        """The product with each of ``factors``, of which rows from ``first`` on are wanted: outputs are ordered by
+        factor, monomial and row."""
+        monomials, n = factors[0].monomials, factors[0].parts[0].nrows()
+        M = monomials.size
+        mid = np.zeros((len(factors), M, n - first, M, n))
+        rad = np.zeros_like(mid)
+        for number, factor in enumerate(factors):
+            parts = Enclosed.all(factor.parts, (M, n, n))
+            for i, j, k in monomials.products:
+                mid[number, k, :, j], rad[number, k, :, j] = parts.mid[i, first:], parts.rad[i, first:]
+        return Operator(mid.reshape(-1, M * n), rad.reshape(-1, M * n))
+
+    def applied(self, rows: Enclosed) -> Enclosed:
+        """The product with ``rows (M n, k)``."""
+        size = np.abs(rows.mid)
+        mid = self.mid @ rows.mid
+        rad = np.abs(self.mid) @ (rows.rad + rounding(self.mid.shape[1]) * size) + self.rad @ (size + rows.rad)
+        return Enclosed(mid, rad * OUTWARD)
 
 
 @final
 @dataclass(eq=False)
 class DisturbanceSupports:
-    """The functionals ``c'e^{A s}`` and their integrals over one box of parameters, remembered by duration and
-    direction."""
+    """The functionals ``c'e^{A s}`` and their integrals over one box of parameters, for the rows ``c`` of ``basis (b,
+    d)``; remembered by duration."""
 
     flow: Flow
     scene: Scene
-    _tables: dict[tuple[int, bytes], Table] = field(default_factory=dict)
+    basis: Array
+    _tables: dict[tuple[int, int], Table] = field(default_factory=dict)
+    _operators: dict[int, Operator] = field(default_factory=dict)
+    _onward: dict[int, Operator] = field(default_factory=dict)
     _steps: dict[int, Series] = field(default_factory=dict)
-    _inside: dict[int, Series] = field(default_factory=dict)
-    _latest: tuple[tuple[float, int, bytes], Array, Array, Array, Array] | None = None
-    _rows: dict[bytes, tuple[list[int], list[Series]]] = field(default_factory=dict)
+    _rows: tuple[list[int], list[Series]] | None = None
+    _floats: dict[int, Enclosed] = field(default_factory=dict)
+    _latest: tuple[tuple[float, int], Array, Array] | None = None
 
-    def bound(self, start: float, ticks: int, direction: Array) -> tuple[Array, float, float]:
-        """Coefficients of a bound of the disturbance's support from ``start`` on for that many ticks, its error, and
-        how much of that is due to switching."""
+    def bounds(self, start: float, ticks: int, z: Array) -> tuple[Array, Array, Array]:
+        """For every direction ``z_i'basis``, ``z (k, b)``: coefficients ``(k, J + 1, M)`` of a bound of the
+        disturbance's support from ``start`` on for that many ticks, its error ``(k,)``, and how much of that is due to
+        switching."""
         assert self.scene.disturbance is not None
-        # opposite directions share everything but the sign
-        sign = 1.0 if direction[np.flatnonzero(direction)[0]] > 0 else -1.0
-        key = (start, ticks, (sign * direction).tobytes())
-        if self._latest is None or self._latest[0] != key:
-            self._latest = (key, *self._ranged(start, ticks, sign * direction))
-        _, mid, rad, value, spread = self._latest
-        w, excess = linear_bound(self.scene.disturbance, sign * value, spread)
-        size = np.abs(w)
-        moved = sign * np.einsum("lw,ljkw->jk", w, mid)
-        off = float(np.einsum("lw,lw->", size, rad.sum(axis=(1, 2)) + ROUNDING * np.abs(mid).sum(axis=(1, 2))))
-        return moved, off * OUTWARD, float(excess.sum()) * OUTWARD
+        if self._latest is None or self._latest[0] != (start, ticks):
+            self._latest = ((start, ticks), *self._weights(start, ticks))
+        _, every, errors = self._latest
+        mid = np.einsum("ljkwb,ib->iljkw", every, z)
+        rad = np.einsum("ljkwb,ib->iljkw", errors + rounding(z.shape[1]) * np.abs(every), np.abs(z)) * OUTWARD
+        k, pieces, mw = mid.shape[0], mid.shape[1], mid.shape[-1]
+        value, spread = _ranges(mid, rad)
+        w, excess = linear_bound(self.scene.disturbance, value.reshape(-1, mw), spread.reshape(-1, mw))
+        w, excess = w.reshape(k, pieces, mw), excess.reshape(k, pieces)
+        moved = np.einsum("ilw,iljkw->ijk", w, mid)
+        lost = rad.sum(axis=(2, 3)) + rounding(pieces * mw) * np.abs(mid).sum(axis=(2, 3))
+        return moved, np.einsum("ilw,ilw->i", np.abs(w), lost) * OUTWARD, excess.sum(axis=1) * OUTWARD
 
-    def _ranged(self, start: float, ticks: int, direction: Array) -> tuple[Array, Array, Array, Array]:
-        """`_weights`, and the ranges that they stay in on the cell: middles and half-widths, ``(pieces, mw)``."""
-        mid, rad = self._weights(start, ticks, direction)
-        ends = bernstein(np.moveaxis(mid[:, :, 0], 1, 2).reshape(-1, mid.shape[1]), [False]).reshape(
-            mid.shape[0], -1, mid.shape[1]
-        )
-        highest, lowest = ends.max(axis=2), ends.min(axis=2)
-        spread = (
-            (highest - lowest) / 2
-            + np.abs(mid[:, :, 1:]).sum(axis=(1, 2))
-            + rad.sum(axis=(1, 2))
-            + ROUNDING * np.abs(mid[:, :, 0]).sum(axis=1)
-        )
-        return mid, rad, (highest + lowest) / 2, spread * OUTWARD
-
-    def _weights(self, start: float, ticks: int, direction: Array) -> tuple[Array, Array]:
-        """What every piece of the disturbance before the cell adds per unit, ``(pieces, J + 1, M, mw)``, with errors of
-        the same shape."""
-        table = self._tables.setdefault((ticks, direction.tobytes()), Table())
-        lags = (
-            np.rint((start - self._jumps[: np.searchsorted(self._jumps, start, side="right")]) / self.scene.tick)
-            .astype(int)
-            .tolist()
-        )
-        for lag in reversed(lags):  # short ones first: each row starts from the one before
-            if lag not in table.places:
-                table.add(lag, self._integral(lag, ticks, direction))
+    def _weights(self, start: float, ticks: int) -> tuple[Array, Array]:
+        """What every piece of the disturbance before the cell adds per unit, ``(pieces, J + 1, M, mw, b)``, with errors
+        of the same shape."""
+        node = self.scene.grid[bisect_right(self.scene.grid, start) - 1]
+        jumps = self._jumps[: np.searchsorted(self._jumps, start, side="right")]
+        lags = np.rint((node - jumps) / self.scene.tick).astype(int).tolist()
+        offset = round((start - node) / self.scene.tick)
+        table = self._tables.setdefault((offset, ticks), Table())
+        # short ones first: each row starts from the one before
+        missing = [lag for lag in dict.fromkeys(reversed(lags)) if lag not in table.places]
+        if missing:
+            table.add(missing, *self._integrals(missing, offset, ticks))
         places = [table.places[lag] for lag in lags]
         mid, rad = table.mid[places], table.rad[places]
-        rad[:-1] += rad[1:] + ROUNDING * (np.abs(mid[:-1]) + np.abs(mid[1:]))
+        rad[:-1] += rad[1:] + rounding(1) * (np.abs(mid[:-1]) + np.abs(mid[1:]))
         mid[:-1] -= mid[1:]
         return mid, rad
 
@@ -139,33 +160,58 @@ class DisturbanceSupports:
     def _jumps(self) -> Array:
         return np.array(self.scene.changes)
 
-    def _integral(self, lag: int, ticks: int, direction: Array) -> tuple[Array, Array]:
-        """``int_0^s c'e^{A r} E dr`` for ``s`` from ``lag`` on, as ``(J + 1, M, mw)`` with errors of the same shape."""
-        row = self._widened * self._row(lag, direction)
-        terms = [row]
-        if ticks:
-            if ticks not in self._inside:
-                self._inside[ticks] = self.flow.rows.scaled(up_to(self.scene.duration(ticks))).exp()
-            terms += in_time(self.flow.rows, self.flow.rows * row, self.scene.duration(ticks), self._inside[ticks])
-        M, d = self.flow.monomials.size, len(self.scene.initial_state)
-        block = row.parts[0].nrows()
-        both = Enclosed.of(
-            stacked([[term.parts[k][i, 0] for k in range(M) for i in range(d, block)] for term in terms])
+    def _integrals(self, lags: list[int], offset: int, ticks: int) -> tuple[Array, Array]:
+        """``int_0^s c'e^{A r} E dr`` for ``s`` from each of the ``lags (l,)`` plus ``offset`` on: ``(l, J + 1, M, mw,
+        b)`` with errors of the same shape: products of float matrices, for all of them together."""
+        M, d, b = self.flow.monomials.size, len(self.scene.initial_state), self.basis.shape[0]
+        found = [self._row(lag) for lag in lags]
+        size = found[0].mid.shape[1]
+        rows = Enclosed(
+            *(
+                np.moveaxis(np.array(numbers), 0, 2).reshape(M * size, -1)
+                for numbers in ([one.mid for one in found], [one.rad for one in found])
+            )
         )
-        shape = (len(terms), M, block - d)
-        return both.mid.reshape(shape), both.rad.reshape(shape)
+        if offset:
+            rows = self._later(offset).applied(rows)
+        weights, outputs = self._operator(ticks).applied(rows), (-1, M, size - d, len(lags), b)
+        return np.moveaxis(weights.mid.reshape(outputs), 3, 0), np.moveaxis(weights.rad.reshape(outputs), 3, 0)
 
-    @cached_property
-    def _widened(self) -> Series:
-        """Whatever a row does within a tick to either side."""
+    def _later(self, ticks: int) -> Operator:
+        """From a row to that after so many ticks."""
+        if ticks not in self._onward:
+            self._onward[ticks] = Operator.of([self.flow.rows.scaled(self.scene.duration(ticks)).exp()], 0)
+        return self._onward[ticks]
+
+    def _operator(self, ticks: int) -> Operator:
+        """From a row to the coefficients of its integral within that many ticks; whatever a row does in two ticks to
+        either side is included, since lags are rounded to ticks twice."""
         from flint import arb
 
-        return self.flow.rows.scaled(arb(0, self.scene.tick)).exp()
+        if ticks not in self._operators:
+            A, length = self.flow.rows, self.scene.duration(ticks)
+            size = A.parts[0].nrows()
+            unit = Series.constant(A.monomials, stacked([[arb(int(i == j)) for j in range(size)] for i in range(size)]))
+            factors = [unit] + (in_time(A, A, length, A.scaled(up_to(length)).exp()) if ticks else [])
+            widened = A.scaled(arb(0, 2 * self.scene.tick)).exp()
+            self._operators[ticks] = Operator.of(
+                [factor * widened for factor in factors], len(self.scene.initial_state)
+            )
+        return self._operators[ticks]
 
-    def _row(self, ticks: int, direction: Array) -> Series:
-        """The row after that many ticks, from the longest one before it that is known."""
+    def _row(self, ticks: int) -> Enclosed:
+        """The rows after that many ticks, as columns: ``(M, n, b)``."""
+        if ticks not in self._floats:
+            row = self._balls(ticks)
+            shape = (len(row.parts), row.parts[0].nrows(), row.parts[0].ncols())
+            self._floats[ticks] = Enclosed.all(row.parts, shape)
+        return self._floats[ticks]
 
-        known = self._rows.setdefault(direction.tobytes(), ([0], [self._first_row(direction)]))
+    def _balls(self, ticks: int) -> Series:
+        """`_row` in balls, from the longest rows before it that are known."""
+        if self._rows is None:
+            self._rows = ([0], [self._first_rows()])
+        known = self._rows
         place = bisect_right(known[0], ticks)
         before = known[0][place - 1]
         if before == ticks:
@@ -177,9 +223,24 @@ class DisturbanceSupports:
         known[1].insert(place, row)
         return row
 
-    def _first_row(self, direction: Array) -> Series:
+    def _first_rows(self) -> Series:
         from flint import arb
 
-        size = self.flow.rows.parts[0].nrows()
-        column = [[arb(float(direction[i]) if i < direction.size else 0.0)] for i in range(size)]
-        return Series.constant(self.flow.monomials, stacked(column))
+        size, d = self.flow.rows.parts[0].nrows(), self.basis.shape[1]
+        columns = [[arb(float(c[i])) if i < d else arb(0) for c in self.basis] for i in range(size)]
+        return Series.constant(self.flow.monomials, stacked(columns))
+
+
+def _ranges(mid: Array, rad: Array) -> tuple[Array, Array]:
+    """The ranges that weights ``(k, pieces, J + 1, M, mw)`` stay in on the cell: middles and half-widths, ``(k, pieces,
+    mw)``."""
+    k, pieces, orders, _, mw = mid.shape
+    ends = bernstein(np.moveaxis(mid[:, :, :, 0], 2, 3).reshape(-1, orders), [False]).reshape(k, pieces, mw, -1)
+    highest, lowest = ends.max(axis=3), ends.min(axis=3)
+    spread = (
+        (highest - lowest) / 2
+        + np.abs(mid[:, :, :, 1:]).sum(axis=(2, 3))
+        + rad.sum(axis=(2, 3))
+        + ROUNDING * np.abs(mid[:, :, :, 0]).sum(axis=2)
+    )
+    return (highest + lowest) / 2, spread * OUTWARD

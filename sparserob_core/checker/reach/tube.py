@@ -3,7 +3,6 @@ with an error."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, final
@@ -13,12 +12,14 @@ import numpy as np
 from sparserob_core.checker.arithmetic.series import Series, norm, upper
 from sparserob_core.checker.reach.disturbance_support import DisturbanceSupports, Scene
 from sparserob_core.checker.reach.flow import Flow, held, in_time, stacked, up_to
-from sparserob_core.checker.sets.polynomials import OUTWARD, ROUNDING, Enclosed
+from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.checker.sets.shapes import radius
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
     from flint import arb, arb_mat
+
+STATES_KEPT = 20_000  # enclosures of the state, per box of parameters
 
 
 @final
@@ -38,14 +39,16 @@ class Polynomial:
 @final
 @dataclass(eq=False)
 class Tube:
-    """The reachable states over one box of parameters."""
+    """The reachable states over one box of parameters, seen along combinations of the rows of ``basis (b, d)``."""
 
     flow: Flow
     scene: Scene
+    basis: Array
     _lengths: dict[int, arb] = field(default_factory=dict)
     _transitions: dict[int, tuple[Series, Series]] = field(default_factory=dict)
     _growths: dict[int, tuple[arb_mat, arb_mat]] = field(default_factory=dict)
     _inside: dict[int, Series] = field(default_factory=dict)
+    _states: dict[tuple[int, float, int], Enclosed] = field(default_factory=dict)
 
     @cached_property
     def nodes(self) -> list[Series]:
@@ -107,30 +110,34 @@ class Tube:
             self._growths[key] = held(rest.growth, stacked([[b] for b in rest.control]), self._lengths[key])
         return self._growths[key]
 
-    def cells(self, piece: int, start: float, stop: float, directions: Sequence[Array]) -> list[Polynomial]:
-        """For every direction ``c (d,)`` the polynomial above ``c'x`` on ``[start, stop]``, a part of piece ``piece``
-        of the grid."""
+    def cells(self, piece: int, start: float, stop: float, z: Array) -> list[Polynomial]:
+        """For every ``c = z_i'basis``, ``z (k, b)``, the polynomial above ``c'x`` on ``[start, stop]``, a part
+        of piece ``piece`` of the grid."""
         from flint import arb
 
         ticks = self.scene.ticks(start, stop)  # never shorter than the cell: a bound on a little more is a bound
         offset, length = arb(start) - arb(self.scene.grid[piece]), self.scene.duration(ticks)
-        state, sigma = self._state_part(piece, offset, ticks, directions), None
+        state = self._state_part(piece, start, ticks)
+        mid = np.einsum("jkb,ib->ijk", state.mid, z)
+        lost = state.rad + rounding(z.shape[1]) * np.abs(state.mid)
+        rad, kinks = np.einsum("jkb,ib->i", lost, np.abs(z)), np.zeros(z.shape[0])
         if self.scene.disturbance is not None and stop > 0.0:
-            sigma = [self.sigmas.bound(start, ticks, c) for c in directions]
-        rest = self._left_out(piece, offset, length, directions)
-        answer = []
-        for i in range(len(directions)):
-            mid, rad, kinks = state[i].mid, float(state[i].rad.sum()), 0.0
-            if sigma is not None:
-                moved, off, kinks = sigma[i]
-                rad += off + float(ROUNDING * (np.abs(mid) + np.abs(moved)).sum())
-                mid = mid + moved
-            answer.append(Polynomial(mid, (rad + rest[i] + kinks) * OUTWARD, rest[i], kinks))
-        return answer
+            moved, off, kinks = self.sigmas.bounds(start, ticks, z)
+            rad += off + rounding(1) * (np.abs(mid) + np.abs(moved)).sum(axis=(1, 2))
+            mid = mid + moved
+        rest = self._left_out(piece, offset, length, z)
+        return [
+            Polynomial(mid[i], float(rad[i] + rest[i] + kinks[i]) * OUTWARD, float(rest[i]), float(kinks[i]))
+            for i in range(z.shape[0])
+        ]
 
-    def _state_part(self, piece: int, offset: arb, ticks: int, directions: Sequence[Array]) -> list[Enclosed]:
+    def _state_part(self, piece: int, start: float, ticks: int) -> Enclosed:
+        """``basis x`` of the undisturbed state, ``(J + 1, M, b)``."""
         from flint import arb
 
+        if (piece, start, ticks) in self._states:
+            return self._states[piece, start, ticks]
+        offset = arb(start) - arb(self.scene.grid[piece])
         x, u = self.nodes[piece], self.scene.control[min(piece, len(self.scene.control) - 1)]
         if not offset.is_zero():
             Phi, Gamma = self.flow.states.held(self.flow.inputs, offset)
@@ -143,56 +150,39 @@ class Tube:
             terms += in_time(
                 self.flow.states, self.flow.states * x + self.flow.inputs.applied(u), length, self._inside[ticks]
             )
-        M, d = self.flow.monomials.size, len(self.scene.initial_state)
-        answer = []
-        for c in directions:
-            exact = [arb(float(v)) for v in c]
-            table = [
-                [sum((exact[i] * term.parts[k][i, 0] for i in range(d) if c[i]), arb(0)) for k in range(M)]
-                for term in terms
-            ]
-            answer.append(Enclosed.of(stacked(table)))
-        return answer
+        rows = stacked([[arb(float(v)) for v in c] for c in self.basis])
+        every = Enclosed.of(stacked([(rows * part).entries() for term in terms for part in term.parts]))
+        shape = (len(terms), self.flow.monomials.size, self.basis.shape[0])
+        if len(self._states) >= STATES_KEPT:
+            self._states.clear()
+        self._states[piece, start, ticks] = Enclosed(every.mid.reshape(shape), every.rad.reshape(shape))
+        return self._states[piece, start, ticks]
 
     @cached_property
     def sigmas(self) -> DisturbanceSupports:
         """What the disturbance may add."""
-        return DisturbanceSupports(self.flow, self.scene)
+        return DisturbanceSupports(self.flow, self.scene, self.basis)
 
-    def _left_out(self, piece: int, offset: arb, length: arb, directions: Sequence[Array]) -> list[float]:
-        """Lagrange's remainder of the state and of what the disturbance adds, for every direction."""
-        from flint import arb
-
+    def _left_out(self, piece: int, offset: arb, length: arb, z: Array) -> Array:
+        """Lagrange's remainder ``(k,)`` of the state and of what the disturbance adds, for every direction."""
         rest = self.flow.remainder
         if rest is None:
-            return [0.0] * len(directions)
+            return np.zeros(z.shape[0])
         u = self.scene.control[min(piece, len(self.scene.control) - 1)]
         growth, driven = held(rest.growth, stacked([[b] for b in rest.control]), up_to(offset + length))
         last = upper((growth * self.norms[piece] + driven * upper(norm(u)))[rest.growth.nrows() - 1, 0])
-        answer = []
-        for c in directions:
-            size = upper(
-                norm(
-                    stacked(
-                        [
-                            [
-                                sum(
-                                    (arb(float(c[i])) * arb(float(rest.transform[i, j])) for i in range(c.size)), arb(0)
-                                )
-                                for j in range(c.size)
-                            ]
-                        ]
-                    )
-                )
-            )
-            answer.append(float((size * last + self._support_out(size)).upper()) * OUTWARD)
+        per_size = float((last + self._support_out).upper()) * OUTWARD
+        table = self.basis @ rest.transform  # rounded, which the second term covers
+        terms = rounding(sum(self.basis.shape)) * np.abs(z) @ (np.abs(self.basis) @ np.abs(rest.transform))
+        answer: Array = per_size * (np.linalg.norm(z @ table, axis=1) + np.linalg.norm(terms, axis=1)) * OUTWARD
         return answer
 
-    def _support_out(self, size: arb) -> arb:
-        """The remainder of the disturbance's part up to the horizon, for a direction of that size."""
+    @property
+    def _support_out(self) -> arb:
+        """The remainder of the disturbance's part up to the horizon, for a direction of size 1."""
         from flint import arb
 
-        return arb(0) if self.scene.disturbance is None else size * self._support_per_size
+        return arb(0) if self.scene.disturbance is None else self._support_per_size
 
     @cached_property
     def _support_per_size(self) -> arb:

@@ -3,6 +3,7 @@ ranges."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, final
 
@@ -22,6 +23,12 @@ TINY = 1e-300
 ROUNDING = 1e-13  # of a sum of floats, relative to the sum of absolute values (up to a few hundred terms)
 
 
+def rounding(terms: int) -> float:
+    """What rounding may do to a sum of that many products, relative to the sum of their absolute values (Higham 2002,
+    section 3.1)."""
+    return (terms + 4) * HALF_ULP
+
+
 @final
 @dataclass(frozen=True, eq=False)
 class Enclosed:
@@ -33,8 +40,12 @@ class Enclosed:
     @staticmethod
     def of(matrix: arb_mat) -> Enclosed:
         """The entries of a ball matrix, ``(rows, columns)``."""
-        shape = (matrix.nrows(), matrix.ncols())
-        entries = matrix.entries()
+        return Enclosed.all([matrix], (matrix.nrows(), matrix.ncols()))
+
+    @staticmethod
+    def all(matrices: Sequence[arb_mat], shape: tuple[int, ...]) -> Enclosed:
+        """The entries of ball matrices, one matrix after another, row by row, in an array of that shape."""
+        entries = [x for matrix in matrices for x in matrix.entries()]
         mid = np.array([float(x.mid()) for x in entries]).reshape(shape)
         rad = np.array([float(x.rad()) for x in entries]).reshape(shape)
         if not (np.isfinite(mid).all() and np.isfinite(rad).all()):

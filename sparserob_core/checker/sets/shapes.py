@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from fractions import Fraction
 from functools import lru_cache
 from itertools import combinations, product
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import above, balls, rational
-from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.outcome import RESOLVED, Broken, Unchecked
 from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Ellipsoid, NormBall, Polytope
 from sparserob_core.sip.convex_set import Array
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
 MOST_CORNERS = 20_000  # intersections of facets looked at when a polytope's corners are listed
 KINDS = (Box, Polytope, Ellipsoid, NormBall)  # the kinds whose definitions stand here, and cylinders over them
+PARALLEL = 1e-12  # of unit vectors: rows that differ by less are opposite ones
 MOST_SIGNS = 10  # dimension up to which a 1-norm ball is listed by its facets
 
 
@@ -223,6 +225,15 @@ def member(shape: ConvexSet, point: Sequence[float] | Array) -> bool:
     raise Unchecked(f"the checker cannot tell who is in a {type(shape).__name__}")
 
 
+def centre(shape: ConvexSet) -> Array:
+    """The centre ``(d,)`` of a curved set: what its gauge is about."""
+    if isinstance(shape, Cylinder):
+        return np.concatenate([centre(shape.base), np.zeros(shape.dimension - shape.base.dimension)])
+    if isinstance(shape, Ellipsoid | NormBall):
+        return np.asarray(shape.centre, dtype=float)
+    raise Unchecked(f"the checker does not know where the middle of a {type(shape).__name__} is")
+
+
 def boxed(shape: ConvexSet) -> ConvexSet:
     """A ball of the maximum norm as a box, larger by rounding; any other set as it is."""
     if isinstance(shape, NormBall) and (shape.p == np.inf or shape.dimension == 1):
@@ -237,25 +248,40 @@ def limit(shape: ConvexSet, direction: Array) -> arb:
     flat = facets(shape)
     if flat is None or isinstance(shape, Box | NormBall):
         return support(shape, balls(direction))
-    said = [b for c, b in flat if np.array_equal(c, direction)]
-    if not said:
-        raise Broken(f"{np.asarray(direction).tolist()} is not the normal of a facet")
-    return said[0]
+    number, factor = facet(flat, direction)
+    return flat[number][1] * rational(factor)
 
 
-def excess(shape: ConvexSet, point: Sequence[arb]) -> float:
-    """An upper bound of how far a point may lie outside, relative to the set's size (at least to 1 for facets); 0 when
-    proven inside."""
+def facet(flat: Sequence[tuple[Array, arb]], direction: Array) -> tuple[int, Fraction]:
+    """Which facet a direction is the normal of, and its length in terms of that normal; exact, and `Broken` if none."""
+    place = int(np.abs(direction).argmax())
+    for number, (c, _) in enumerate(flat):
+        if c[place] * direction[place] <= 0.0:
+            continue
+        factor = Fraction(float(direction[place])) / Fraction(float(c[place]))
+        if all(Fraction(float(a)) == factor * Fraction(float(b)) for a, b in zip(direction, c, strict=True)):
+            return number, factor
+    raise Broken(f"{np.asarray(direction).tolist()} is not the normal of a facet")
+
+
+def excess(shape: ConvexSet, point: Sequence[arb]) -> tuple[float, str]:
+    """An upper bound of how far a point may lie outside, and where: relative to the own unit of each facet (of a
+    component of a box: its range; of a row of a polytope: the smallest of its right-hand side, of how far it reaches
+    over the set and, where the opposite row exists, of what is between them; at least what double precision resolves),
+    or along the gauge of a curved set; 0 when proven inside."""
     from flint import arb, arb_mat
 
     flat = facets(shape)
     if flat is not None:
-        over = [
-            (sum((arb(float(a)) * x for a, x in zip(c, point, strict=True) if a), arb(0)) - b) / arb(1).max(abs(b))
-            for c, b in flat
-        ]
-        return max(0.0, *(float(o.upper()) for o in over))
-    offsets = [x - arb(float(m)) for x, m in zip(point, getattr(shape, "centre"), strict=True)]  # noqa: B009  every curved set has one
+        worst, where = 0.0, ""
+        for number, ((c, b), unit) in enumerate(zip(flat, units(shape), strict=True)):
+            terms = [arb(float(a)) * x for a, x in zip(c, point, strict=True) if a]
+            unit = max(unit, RESOLVED * float(sum((abs(t) for t in terms), abs(b)).mid())) or 1.0
+            over = float((sum(terms, arb(0)) - b).upper()) / unit
+            if over > worst:
+                worst, where = over, _named(shape, c, number)
+        return worst, where
+    offsets = [x - arb(float(m)) for x, m in zip(point, centre(shape), strict=True)]
     if isinstance(shape, Ellipsoid):
         z = arb_mat([[arb(float(v)) for v in row] for row in shape.shape]).solve(arb_mat([[v] for v in offsets]))
         gauge = sum((v * z[i, 0] for i, v in enumerate(offsets)), arb(0)).nonnegative_part().sqrt()
@@ -266,4 +292,39 @@ def excess(shape: ConvexSet, point: Sequence[arb]) -> float:
         raise Unchecked(f"the checker cannot tell who is in a {type(shape).__name__}")
     if not gauge.is_finite():
         raise Unchecked("the size of a point cannot be bounded")
-    return max(0.0, float((gauge - 1).upper()))
+    return max(0.0, float((gauge - 1).upper())), "it"
+
+
+def _named(shape: ConvexSet, normal: Array, number: int) -> str:
+    return f"u{int(np.abs(normal).argmax()) + 1}" if np.count_nonzero(normal) == 1 else f"row {number + 1}"
+
+
+def units(shape: ConvexSet) -> list[float]:
+    """The own unit of every facet of a bounded flat set: the smallest that is not zero of how far it reaches over the
+    set, the width between it and the opposite facet, and for a row of a polytope its right-hand side."""
+    flat = facets(shape)
+    assert flat is not None
+    answer = []
+    for (c, b), width in zip(flat, widths(flat), strict=True):
+        reach = max(abs(float(support(shape, balls(c)).mid())), abs(float(support(shape, balls(-c)).mid())))
+        answer.append(smallest([width, reach, *([abs(float(b.mid()))] if isinstance(shape, Polytope) else [])]))
+    return answer
+
+
+def widths(flat: Sequence[tuple[Array, arb]]) -> list[float]:
+    """For every facet how far it is from the opposite one, in its own measure; infinite where there is none."""
+    normals = np.array([c for c, _ in flat]).reshape(len(flat), -1)
+    sizes = np.linalg.norm(normals, axis=1)
+    heights = np.array([float(b.mid()) for _, b in flat])
+    turned = normals / sizes[:, None]
+    answer = []
+    for i in range(len(flat)):
+        opposite = np.abs(turned + turned[i]).max(axis=1) <= PARALLEL
+        across = heights[i] + heights[opposite] * sizes[i] / sizes[opposite]
+        answer.append(float(across.min(initial=math.inf)))
+    return answer
+
+
+def smallest(sizes: Sequence[float]) -> float:
+    """The smallest of these that is not zero; 0 when none is."""
+    return min((size for size in sizes if 0.0 < size < math.inf), default=0.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import click
@@ -19,11 +20,19 @@ from sparserob_core.experiment.terminal.printing import EXIT, print_json
     metavar="FILE",
     help="A plugin file that RUN was made with. RUN is data: no plugin that it names is loaded. Repeatable.",
 )
-def check(directory: Path, as_json: bool, plugins: tuple[Path, ...]) -> int:
+@click.option(
+    "--seconds",
+    type=click.FloatRange(min=0.0, min_open=True),
+    default=math.inf,
+    metavar="N",
+    help="Stop after N seconds: what was decided by then is told, the rest is not checked.",
+)
+def check(directory: Path, as_json: bool, plugins: tuple[Path, ...], seconds: float) -> int:
     """Verify a finished run: every claim of its certificate, derived anew.
 
     Reads RUN/config.yaml and RUN/certificate.json, computes every bound again in ball arithmetic, and shares no code
-    with what solved the problem. Prints one verdict per claim: it holds, fails, or was not checked, with the reason.
+    with what solved the problem. Prints one verdict per claim: it holds, fails, or was not checked, with the reason;
+    and what the files say besides that nothing was compared with, which changes no verdict.
 
     Exit status: 0 when every claim holds, 4 when one fails or was not checked, 2 when the input is at fault.
     """
@@ -32,7 +41,7 @@ def check(directory: Path, as_json: bool, plugins: tuple[Path, ...]) -> int:
     from sparserob_core.experiment.check.check import check as verify
     from sparserob_core.experiment.terminal.table import print_table
 
-    found = verify(directory, plugins)
+    found = verify(directory, plugins, seconds)
     if as_json:
         print_json(
             {
@@ -40,11 +49,14 @@ def check(directory: Path, as_json: bool, plugins: tuple[Path, ...]) -> int:
                 "status": found.status,
                 "seconds": found.seconds,
                 "claims": [asdict(claim) for claim in found.claims],
+                "not_compared": list(found.not_compared),
             }
         )
     else:
         print_table(
             found.title, ("claim", "verdict", "what was derived"), [(c.name, c.verdict, c.text) for c in found.claims]
         )
-        click.echo(f"{found.status}, in {found.seconds:.2f} s")
+        every = "every claim holds; " if found.status == "verified" else ""
+        click.echo(f"not compared: {'; '.join(found.not_compared) or 'nothing'}")
+        click.echo(f"{found.status}: {every}in {found.seconds:.2f} s")
     return EXIT[found.status]

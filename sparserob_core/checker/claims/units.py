@@ -1,0 +1,182 @@
+"""The own units of state constraints: what a violation is judged by (decision 0016)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+import numpy.typing as npt
+
+from sparserob_core.checker.outcome import RESOLVED, TOLERANCE, Unchecked
+from sparserob_core.checker.reach.disturbance_support import Scene
+from sparserob_core.checker.reach.flow import Flow, held, stacked
+from sparserob_core.checker.sets.shapes import centre, facet, facets, smallest, widths
+from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.sets.sets import Box, ConvexSet
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from flint import arb, arb_mat
+
+MOST_TIMES = 64  # at which a window is looked at
+MOST_AXES = 4  # of the parameters, at whose ends a window is looked at
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Units:
+    """The units of the constraint ``x(t)`` in ``shape`` from ``start`` to ``stop``.
+
+    That of a row ``c'x <= b`` is the smallest that is not zero of: how far ``c'x`` can reach over the window (any
+    admissible control, the worst disturbance, any parameter), ``|b|``, and the width of the slab where the opposite row
+    exists. That of a curved set in a direction ``c`` is ``h(c) - c'm``, ``m`` its centre. It is at least what double
+    precision resolves of the numbers that are added up. A violation of `TOLERANCE` of it counts as none. Units are no
+    claims: floating point will do.
+    """
+
+    problem: OptimalControlProblem
+    scene: Scene
+    shape: ConvexSet
+    start: float
+    stop: float
+
+    @cached_property
+    def rows(self) -> Array:
+        """The unit ``(k,)`` of every facet of a flat set."""
+        flat = facets(self.shape)
+        assert flat is not None
+        heights = np.array([abs(float(b.mid())) for _, b in flat])
+        reach, sums = self._measured(self._middle)
+        near = np.array([smallest(pair) for pair in zip(heights.tolist(), widths(flat), strict=True)])
+        if (reach[: near.size] < np.where(near > 0.0, near, np.inf)).any():  # elsewhere a row may reach further
+            others = [self._measured(point)[0] for point in self._elsewhere]
+            reach = np.max([reach, *others], axis=0)
+        unit = [smallest(pair) for pair in zip(near.tolist(), reach.tolist(), strict=False)]
+        least = RESOLVED * sums[: near.size]
+        answer: Array = np.where((unit > least) | (least > 0.0), np.maximum(unit, least), 1.0)
+        return answer
+
+    @cached_property
+    def sums(self) -> Array:
+        """The largest numbers ``(d,)`` that are added up to a state within the window."""
+        return self._measured(self._middle)[1][-self.problem.system.states :]
+
+    def slack(self, direction: Array, limit: arb) -> float:
+        """What counts as none in any direction ``c (d,)`` with ``c'x <= limit`` on the set: that of its facet, of a box
+        the sum of those of its sides."""
+        flat = facets(self.shape)
+        if flat is None:
+            width = float(limit.mid()) - float(direction @ centre(self.shape))
+            return TOLERANCE * max(width, RESOLVED * float(np.abs(direction) @ self.sums))
+        if not isinstance(self.shape, Box):
+            number, factor = facet(flat, direction)
+            return TOLERANCE * float(factor) * float(self.rows[number])
+        lengths = np.maximum(0.0, np.array([c for c, _ in flat]) @ direction)
+        return TOLERANCE * float(lengths @ self.rows)
+
+    @property
+    def _middle(self) -> tuple[float, ...]:
+        bound = self.problem.system.parameters
+        return () if bound is None else tuple(map(float, bound.interior_point()))
+
+    @property
+    def _elsewhere(self) -> list[tuple[float, ...]]:
+        """Some parameters at the edge of their set."""
+        bound = self.problem.system.parameters
+        if bound is None:
+            return []
+        axes = np.vstack([np.eye(bound.dimension)[:MOST_AXES], np.ones((1, bound.dimension))])
+        return [tuple(map(float, point)) for point in bound.support_point(np.vstack([axes, -axes]))]
+
+    def _measured(self, parameter: tuple[float, ...]) -> tuple[Array, Array]:
+        """How far the normal of every facet, and every state, reach at one parameter ``(k + d,)``, and the largest sums
+        of absolute numbers from which these are computed; by one walk back through the pieces from every time that is
+        looked at, all of them together."""
+        if parameter not in self._known:
+            with np.errstate(over="ignore", invalid="ignore"):
+                found = self._walked(parameter)
+            if not all(np.isfinite(numbers).all() for numbers in found):
+                raise Unchecked("the response grows beyond what numbers can hold")
+            self._known[parameter] = found
+        return self._known[parameter]
+
+    @cached_property
+    def _known(self) -> dict[tuple[float, ...], tuple[Array, Array]]:
+        return {}
+
+    def _walked(self, parameter: tuple[float, ...]) -> tuple[Array, Array]:
+        d, m, bound = self.problem.system.states, self.problem.system.controls, self.problem.disturbance
+        normals = np.array([c for c, _ in facets(self.shape) or []]).reshape(-1, d)
+        (nodes, places), step = self._nodes(), _Steps(self.problem, parameter, m, self.scene.tick)
+        v = np.tile(np.vstack([normals, np.eye(d)]), (len(places), 1, 1))
+        count = len(nodes) - 1
+        driven = np.zeros((count, *v.shape[:2], m))
+        pushed = np.zeros((count, *v.shape[:2], self.problem.system.disturbances))
+        for k in range(count - 1, -1, -1):
+            first = int(np.searchsorted(places, k, side="right"))
+            if first < len(places):
+                Phi, Gamma, Delta = step.over(nodes[k], nodes[k + 1])
+                driven[k, first:], pushed[k, first:] = v[first:] @ Gamma, v[first:] @ Delta
+                v[first:] = v[first:] @ Phi
+        start = np.asarray(self.problem.initial_state, dtype=float)
+        high, low, sums = v @ start, -(v @ start), np.abs(v) @ np.abs(start)
+        for convex, weights in ((self.problem.control, driven), (bound, self._joined(nodes, pushed))):
+            if convex is not None and count:
+                high, low = high + convex.support(weights).sum(axis=0), low + convex.support(-weights).sum(axis=0)
+                axes = np.eye(convex.dimension)
+                far = np.maximum(np.abs(convex.support(axes)), np.abs(convex.support(-axes)))
+                sums = sums + (np.abs(weights) @ far).sum(axis=0)
+        return np.maximum(np.abs(high), np.abs(low)).max(axis=0), sums.max(axis=0)
+
+    def _joined(self, nodes: list[float], pushed: Array) -> Array:
+        """What acts on each piece of the disturbance, from what acts on each interval between ``nodes``."""
+        if self.problem.disturbance is None or len(nodes) < 2:
+            return pushed
+        middles = (np.array(nodes[:-1]) + np.array(nodes[1:])) / 2
+        which = np.searchsorted(self.scene.changes, middles, side="right")
+        answer: Array = np.add.reduceat(pushed, np.flatnonzero(np.diff(which, prepend=-1)), axis=0)
+        return answer
+
+    def _nodes(self) -> tuple[list[float], npt.NDArray[np.intp]]:
+        """The grid up to the window's end with the window's ends, and the places among it that are looked at."""
+        inside = [t for t in self.scene.grid if t < self.stop]
+        nodes = sorted({*inside, self.start, self.stop})
+        window = np.flatnonzero(np.array(nodes) >= self.start)
+        if window.size > MOST_TIMES:
+            window = window[np.unique(np.linspace(0, window.size - 1, MOST_TIMES).round().astype(int))]
+        return nodes, window
+
+
+@final
+@dataclass(eq=False)
+class _Steps:
+    """What an interval makes of the state, of a control and of a disturbance, at one parameter."""
+
+    problem: OptimalControlProblem
+    parameter: tuple[float, ...]
+    controls: int
+    tick: float
+    _known: dict[int, tuple[Array, Array, Array]] = field(default_factory=dict)
+
+    def over(self, start: float, stop: float) -> tuple[Array, Array, Array]:
+        """``e^{A s}``, and the integrals of it times ``B`` and times ``E``, ``s`` the length of the interval."""
+        from flint import arb
+
+        key = round((stop - start) / self.tick)
+        if key not in self._known:
+            parts = self._parts
+            both = stacked([b + e for b, e in zip(parts["B"][0].tolist(), parts["E"][0].tolist(), strict=True)])
+            Phi, Gamma = held(parts["A"][0], both, arb(stop - start))
+            table = _floats(Gamma)
+            self._known[key] = (_floats(Phi), table[:, : self.controls], table[:, self.controls :])
+        return self._known[key]
+
+    @cached_property
+    def _parts(self) -> dict[str, list[arb_mat]]:
+        return Flow(self.problem.system, self.parameter, (0.0,) * len(self.parameter), 0).parts
+
+
+def _floats(matrix: arb_mat) -> Array:
+    return np.array([[float(x.mid()) for x in row] for row in matrix.tolist()])

@@ -1,0 +1,228 @@
+"""What the other files of a run say, beside its certificate: compared where it can be, else named as not compared."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+
+from sparserob_core.checker.outcome import Broken, Claim, Unchecked
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.directory.finished import StoredRun
+from sparserob_core.experiment.directory.sparsity import sparsity
+
+if TYPE_CHECKING:
+    from sparserob_core.checker.claims.case import Case
+    from sparserob_core.experiment.config.load import Loaded
+
+FIGURES = 1e-12  # how closely figures that were computed anew must agree
+READ = {"config.yaml", "certificate.json", "result.json", "solution.npz"}
+
+
+@final
+@dataclass
+class Compared:
+    """The verdicts on the files, and the names of what was not compared with anything, by file."""
+
+    claims: list[Claim] = field(default_factory=list)
+    left: dict[str, list[str]] = field(default_factory=dict)
+
+    @property
+    def not_compared(self) -> tuple[str, ...]:
+        """``file`` or ``file: names``."""
+        return tuple(f"{file}: {', '.join(names)}" if names else file for file, names in self.left.items())
+
+
+def compared(stored: StoredRun, loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Compared:
+    """``result.json`` and ``solution.npz`` against the certificate and the config; other files are not looked at."""
+    found = Compared()
+    for name, (different, agrees, left) in (
+        ("result.json", _result(loaded, case, summary)),
+        ("solution.npz", _solution(stored, case)),
+    ):
+        found.claims.append(Claim(name, "fails" if different else "holds", "; ".join(different) or agrees))
+        if left:
+            found.left[name] = left
+    unknown = sorted(set(case.certificate) - CERTIFICATE)
+    if unknown:
+        found.left["certificate.json"] = unknown
+    found.left |= {path.name: [] for path in sorted(stored.directory.iterdir()) if path.name not in READ}
+    return found
+
+
+CERTIFICATE = {
+    "format",
+    "config",
+    "status",
+    "cost",
+    "lower_bound",
+    "gap_tolerance",
+    "decision",
+    "multipliers",
+    "proof",
+    "witness",
+}
+Verdicts = tuple[list[str], str, list[str]]
+"""What is different, what to say when nothing is, and what was not compared."""
+
+
+def _result(loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Verdicts:
+    """``result.json``, key by key."""
+    status = case.certificate.get("status")
+    wanted = {
+        "status": (status,),
+        "lower_bound": (case.certificate.get("lower_bound"),),
+        "config": (case.certificate.get("config"),),
+        "cost": (None if status == "infeasible" else case.certificate.get("cost"),),
+        "upper_bound": {
+            "infeasible": (None,),
+            "refuted": (None,),
+            "undecided": (None, case.certificate.get("cost")),
+        }.get(str(status), (case.certificate.get("cost"),)),
+        "seed": (loaded.config.seed,),
+        "title": (loaded.config.title, loaded.config.title or summary.get("title")),
+    }
+    different = [
+        f"{name} is {summary.get(name)!r}, not {' or '.join(map(repr, dict.fromkeys(values)))}"
+        for name, values in wanted.items()
+        if summary.get(name) not in values
+    ]
+    left, known = [], set(wanted)
+    for name, compare in COMPARED.items():
+        verdict = compare(case, summary)
+        if verdict is None:
+            left.append(name)
+        else:
+            different += verdict
+        known.add(name)
+    return different, "it says what the certificate says", [*left, *(name for name in summary if name not in known)]
+
+
+def _gap(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
+    """The gap as it is defined, or as earlier versions defined it."""
+    from sparserob_core.checker.claims.claims import least_scale
+
+    if case.certificate.get("status") not in ("certified", "verified"):
+        return None
+    cost, lower, gap = (summary.get(name) for name in ("cost", "lower_bound", "gap"))
+    if not (isinstance(cost, float) and isinstance(lower, float) and isinstance(gap, float)):
+        return ["cost, lower_bound and gap are no numbers"]
+    derived = max(0.0, cost - lower) / max(least_scale(case), abs(cost))
+    earlier = (cost - lower) / max(1.0, abs(cost))
+    close = any(abs(gap - value) <= FIGURES + 1e-6 * abs(value) for value in (derived, earlier))
+    return [] if close else [f"gap is {gap!r}, not {derived!r}"]
+
+
+def _sparsity(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
+    """The share of the time at which the certificate's control acts, and how often it switches."""
+    said = summary.get("sparsity")
+    if not isinstance(said, Mapping):
+        return ["sparsity is no mapping"]
+    derived: dict[str, Any] = {"active_fraction": None, "switches": None}
+    if case.certificate.get("decision") is not None and case.certificate.get("status") != "infeasible":
+        try:
+            derived = asdict(sparsity(case.theta @ case.control.values, case.control.breakpoints))
+        except Broken as error:
+            return [f"sparsity: {error}"]
+    elif case.certificate.get("status") == "infeasible":
+        return None
+    return [
+        f"sparsity: {name} is {said.get(name)!r}, not {value!r}"
+        for name, value in derived.items()
+        if not _same(said.get(name), value)
+    ]
+
+
+def _value(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
+    """Without a regulariser the value is the cost; with one it is not computed anew."""
+    if summary.get("epsilon") != 0.0 or case.certificate.get("status") == "infeasible":
+        return None
+    value, cost = summary.get("value"), summary.get("cost")
+    return [] if _same(value, cost) else [f"value is {value!r} without a regulariser, the cost {cost!r}"]
+
+
+def _worst(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
+    """The worst constraint: that of the witness, or computed anew at its time and parameter where its set is flat."""
+    from sparserob_core.checker.claims.replay import exceeded
+
+    said, status = summary.get("worst"), case.certificate.get("status")
+    if not isinstance(said, Mapping):
+        return ["worst is no mapping"]
+    if status == "refuted":
+        witness = case.certificate.get("witness")
+        if not isinstance(witness, Mapping):
+            return None
+        names = ("violation", "constraint", "time")
+        return [
+            f"worst: {name} is {said.get(name)!r}, that of the witness {witness.get(name)!r}"
+            for name in names
+            if not _same(said.get(name), witness.get(name))
+        ]
+    if status not in ("certified", "verified") or said.get("constraint") is None:
+        return None
+    try:
+        most, slack = exceeded(case, said)
+    except Unchecked:
+        return None
+    except Broken as error:
+        return [f"worst: {error}"]
+    violation = said["violation"]
+    if not any(abs(violation - value) <= 1e-6 * abs(value) + slack for value in most):
+        return [f"worst: the violation is {violation!r}, derived are {', '.join(f'{value:.3g}' for value in most)}"]
+    return []
+
+
+COMPARED: dict[str, Callable[[Case, Mapping[str, Any]], list[str] | None]] = {
+    "gap": _gap,
+    "sparsity": _sparsity,
+    "value": _value,
+    "worst": _worst,
+}
+
+
+def _same(said: object, value: object) -> bool:
+    """Whether two entries of JSON agree, numbers to rounding."""
+    numbers = [one for one in (said, value) if isinstance(one, int | float) and not isinstance(one, bool)]
+    if len(numbers) == 2:
+        return abs(numbers[0] - numbers[1]) <= FIGURES * max(abs(numbers[0]), abs(numbers[1]))
+    return type(said) is type(value) and said == value
+
+
+def _solution(stored: StoredRun, case: Case) -> Verdicts:
+    """``solution.npz`` must hold the certificate's decision."""
+    if case.certificate.get("decision") is None:
+        return [], "there is no decision", []
+    try:
+        arrays = stored.solution
+        theta, control, breakpoints = (arrays[name] for name in ("theta", "control", "breakpoints"))
+        decision = np.array(case.certificate["decision"], dtype=float)
+        size = np.abs(decision) @ np.abs(case.control.values)
+        same = (
+            np.array_equal(theta, decision)
+            and np.array_equal(arrays.get("decision", theta).ravel(), decision.ravel())
+            and np.array_equal(breakpoints, case.control.breakpoints)
+            and control.shape == size.shape
+            and bool((np.abs(control - decision @ case.control.values) <= FIGURES * size).all())
+        )
+    except InputError as error:
+        return [f"it cannot be read: {error}"], "", []
+    except KeyError as error:
+        return [f"it holds no array {error}"], "", []
+    except (ValueError, TypeError, OverflowError):
+        return ["its control and the certificate's are no arrays of one shape"], "", []
+    left = sorted(set(arrays) - {"theta", "control", "breakpoints", "decision"} - set(_witnessed(case, arrays)))
+    different = [] if same else ["its control is not the certificate's"]
+    different += [text for text in _witnessed(case, arrays).values() if text]
+    return different, "it holds the certificate's control", left
+
+
+def _witnessed(case: Case, arrays: Mapping[str, Any]) -> dict[str, str]:
+    """The disturbance of the worst constraint, which is that of the witness, drawn inwards by rounding."""
+    witness = case.certificate.get("witness")
+    if "worst_disturbance" not in arrays or not isinstance(witness, Mapping) or witness.get("disturbance") is None:
+        return {}
+    signal, said = np.array(witness["disturbance"], dtype=float), np.asarray(arrays["worst_disturbance"], dtype=float)
+    close = signal.shape == said.shape and bool((np.abs(signal - said) <= 1e-9 * np.abs(said).max(initial=0.0)).all())
+    return {"worst_disturbance": "" if close else "its worst disturbance is not that of the witness"}
