@@ -261,5 +261,5 @@ def test_the_command_ends_with_a_status_for_scripts(runs: Runs, tmp_path: Path, 
     assert (false.returncode, json.loads(false.stdout)["status"]) == (4, "refuted")
     nothing = command("check", tmp_path)
     assert nothing.returncode == 2
-    assert "finished run" in nothing.stderr
+    assert "expected the directory of a run" in nothing.stderr
     assert "Traceback" not in nothing.stderr

@@ -99,9 +99,9 @@ def _agree(files: Forgery, untouched: bool) -> None:
 
 def _solved(files: Forgery) -> None:
     """Write the certificate's decision to ``solution.npz``, where it is one."""
-    from sparserob_core.experiment.assemble import assemble
+    from sparserob_core.experiment.assemble import dictionaries_of
 
-    dictionary = assemble(load_config(files.directory / "config.yaml")).control
+    dictionary, _ = dictionaries_of(load_config(files.directory / "config.yaml"), float(files.problem["horizon"]))
     try:
         theta = np.array(files.decision, dtype=float)
         control = theta @ dictionary.values

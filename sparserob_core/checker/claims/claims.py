@@ -206,12 +206,12 @@ def _status(case: Case, status: str, tolerance: float | None, claims: list[Claim
 
 
 def least_scale(case: Case) -> float:
-    """What the gap is relative to where the cost is smaller: a millionth of the largest cost of any control."""
+    """What the gap is relative to where the cost is smaller: the largest cost of any control, at most 1."""
     axes = np.eye(case.problem.system.controls)
     reach = [
         max(abs(float(support(case.problem.control, balls(s * axis)).mid())) for s in (1.0, -1.0)) for axis in axes
     ]
-    return 1e-6 * float(np.dot(np.asarray(case.problem.weights), reach)) * case.problem.horizon or 1.0
+    return min(1.0, float(np.dot(np.asarray(case.problem.weights), reach)) * case.problem.horizon) or 1.0
 
 
 def _witness(case: Case) -> str:

@@ -47,7 +47,10 @@ def exceeded(case: Case, said: Mapping[str, object]) -> tuple[list[float], float
     """By how much the worst disturbance exceeds each row of a constraint at one time and parameter, and how closely
     that is known: `said` holds the names ``constraint``, ``time``, ``parameter`` and ``violation``. Raises `Broken`
     where these are none, `Unchecked` for a curved set."""
-    window, time = case.window(str(said.get("constraint"))), number(said, "time")
+    name = str(said.get("constraint"))
+    if name == "control" and facets(case.problem.control) is None:
+        raise Unchecked("the worst direction of a curved set is not told")
+    window, time = case.window(name), number(said, "time")
     parameter = numbers(said.get("parameter"), "parameter")
     number(said, "violation")
     if parameter.shape != (case.problem.system.parameter_count,):

@@ -160,8 +160,10 @@ def _worst(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
             for name in names
             if not _same(said.get(name), witness.get(name))
         ]
-    if status not in ("certified", "verified") or said.get("constraint") is None:
+    if status not in ("certified", "verified"):
         return None
+    if said.get("constraint") in (None, ""):  # a problem without constraints that can be violated
+        return [] if said.get("violation") is None and not case.windows else ["worst: no constraint is named"]
     try:
         most, slack = exceeded(case, said)
     except Unchecked:
