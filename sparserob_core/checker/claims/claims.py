@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 PRECISION = 96  # bits
 FIGURES = 1e-11  # relative to the larger of it and 1: how closely a written figure must agree with the one derived
+SMALL_COST = 1e-6  # of the largest possible cost: a cost below this is judged as if it were this large
 MOST_MULTIPLIERS = 100_000
 
 
@@ -87,7 +88,7 @@ def cost_of(case: Case) -> arb:
 
 def _cost(case: Case) -> str:
     derived = cost_of(case)
-    _agrees("cost", number(case.certificate, "cost"), derived, least_scale(case))
+    _agrees("cost", number(case.certificate, "cost"), derived, SMALL_COST * largest_cost(case))
     return f"J = {float(derived.mid()):.12g}"
 
 
@@ -194,7 +195,7 @@ def _status(case: Case, status: str, tolerance: float | None, claims: list[Claim
     if any(claim.verdict == "not checked" for claim in (kept if status == "verified" else claims)):
         raise Unchecked(f"{status} rests on claims that were not checked")
     cost, lower = number(case.certificate, "cost"), number(case.certificate, "lower_bound")
-    gap = 0.0 if cost == lower else (cost - lower) / max(abs(cost), least_scale(case))
+    gap = relative_gap(case, cost, lower)
     if status == "verified":
         return f"every constraint is kept; the gap is {gap:.2e}"
     written = case.certificate.get("gap_tolerance")
@@ -202,16 +203,22 @@ def _status(case: Case, status: str, tolerance: float | None, claims: list[Claim
         raise Broken(f"the gap is to be within {written!r}, the config says {tolerance!r}")
     if not gap <= tolerance:
         raise Broken(f"it is certified, but the gap is {gap:.3g}, more than {tolerance:g}")
-    return f"every constraint is kept, and the bounds meet within {max(gap, 0.0):.2e}"
+    return f"every constraint is kept, and the bounds meet within {gap:.2e}"
 
 
-def least_scale(case: Case) -> float:
-    """What the gap is relative to where the cost is smaller: the largest cost of any control, at most 1."""
+def largest_cost(case: Case) -> float:
+    """The largest cost that a control may have."""
     axes = np.eye(case.problem.system.controls)
     reach = [
         max(abs(float(support(case.problem.control, balls(s * axis)).mid())) for s in (1.0, -1.0)) for axis in axes
     ]
-    return min(1.0, float(np.dot(np.asarray(case.problem.weights), reach)) * case.problem.horizon) or 1.0
+    return float(np.dot(np.asarray(case.problem.weights), reach)) * case.problem.horizon
+
+
+def relative_gap(case: Case, cost: float, lower: float) -> float:
+    """The gap relative to the cost, or to a millionth of the largest cost where that is more; 0 where the bounds
+    meet."""
+    return 0.0 if cost <= lower else (cost - lower) / (max(abs(cost), SMALL_COST * largest_cost(case)) or 1.0)
 
 
 def _witness(case: Case) -> str:

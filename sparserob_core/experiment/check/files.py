@@ -93,7 +93,7 @@ def _result(loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Verdicts:
     for name, compare in COMPARED.items():
         verdict = compare(case, summary)
         if verdict is None:
-            left.append(name)
+            left += [name] if name in summary else []
         else:
             different += verdict
         known.add(name)
@@ -102,17 +102,23 @@ def _result(loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Verdicts:
 
 def _gap(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     """The gap as it is defined, or as earlier versions defined it."""
-    from sparserob_core.checker.claims.claims import least_scale
+    from sparserob_core.checker.claims.claims import relative_gap
 
     if case.certificate.get("status") not in ("certified", "verified"):
         return None
     cost, lower, gap = (summary.get(name) for name in ("cost", "lower_bound", "gap"))
     if not (isinstance(cost, float) and isinstance(lower, float) and isinstance(gap, float)):
         return ["cost, lower_bound and gap are no numbers"]
-    derived = max(0.0, cost - lower) / max(least_scale(case), abs(cost))
-    earlier = (cost - lower) / max(1.0, abs(cost))
+    derived, earlier = relative_gap(case, cost, lower), (cost - lower) / max(1.0, abs(cost))
     close = any(abs(gap - value) <= FIGURES + 1e-6 * abs(value) for value in (derived, earlier))
     return [] if close else [f"gap is {gap!r}, not {derived!r}"]
+
+
+def _largest_cost(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
+    """The largest possible cost; where a program knows no bound of it, the file says something else."""
+    from sparserob_core.checker.claims.claims import largest_cost
+
+    return [] if _same(summary.get("cost_scale"), largest_cost(case)) else None
 
 
 def _sparsity(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
@@ -178,6 +184,7 @@ def _worst(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
 
 COMPARED: dict[str, Callable[[Case, Mapping[str, Any]], list[str] | None]] = {
     "gap": _gap,
+    "cost_scale": _largest_cost,
     "sparsity": _sparsity,
     "value": _value,
     "worst": _worst,
