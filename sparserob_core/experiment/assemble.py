@@ -16,7 +16,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.experiment.config.load import Loaded
 from sparserob_core.experiment.plugins.guards import guarded
 from sparserob_core.experiment.solve import indicators
-from sparserob_core.sip.method import Tools
+from sparserob_core.sip.method import Deadline, Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
 
 if TYPE_CHECKING:
@@ -155,4 +155,5 @@ def tools_of(loaded: Loaded) -> Tools:
         budget=config.maximiser.budget,
         polish=config.maximiser.polish,
         rng=np.random.default_rng(config.seed),
+        deadline=Deadline(config.limits.seconds),
     )

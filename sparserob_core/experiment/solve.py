@@ -16,7 +16,7 @@ from sparserob_core.experiment.plugins.registry import load_registry
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.events import Event, ignore
 from sparserob_core.sip.maximiser import Maximiser, Report
-from sparserob_core.sip.method import GAP_TOLERANCE, Continuation, Method, Tools
+from sparserob_core.sip.method import GAP_TOLERANCE, Continuation, Deadline, Method, Tools, as_seconds
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.regulariser import Regulariser
 from sparserob_core.sip.result import Result
@@ -43,6 +43,7 @@ def solve(
     continuation: Continuation | Mapping[str, float] | None = None,
     budget: int = 2000,
     polish: float = 0.0,
+    seconds: float | None = None,
     notify: Notify = ignore,
 ) -> Result:
     """Solve a semi-infinite program, or an optimal control problem on dictionaries, as ``sparserob run`` does, without
@@ -53,9 +54,11 @@ def solve(
     and ``disturbance`` one indicator function on each piece of the control; both are for control problems only.
     ``regulariser`` is by default the ridge for control problems, whose optimisers are to be unique, and none for other
     programs, so that ``value`` is the cost. ``budget``: evaluations per search of the maximiser, of which the share
-    ``polish`` goes to a local method at its end. Raises `InputError` when an argument is at fault.
+    ``polish`` goes to a local method at its end. ``seconds``: the time after which it returns what it knows, as it does
+    at an interrupt from the keyboard; ``Result.stopped`` then says so. Raises `InputError` when an argument is at
+    fault.
     """
-    registry = load_registry()
+    deadline, registry = Deadline(as_seconds(seconds)), load_registry()
     program = _program(registry, problem, control, disturbance)
     if regulariser == "default":
         regulariser = None if program.lengths is None else "ridge"
@@ -69,6 +72,7 @@ def solve(
         polish=_share(polish),
         rng=np.random.default_rng(_whole("seed", seed, 0)),
         notify=_heard(notify),
+        deadline=deadline,
     )
     chosen: Method = component(registry, "method", _with_tolerance(registry, method, tolerance), Method)
     return chosen.solve(program, tools)

@@ -65,6 +65,14 @@ class Dictionaries(Options):
 
 
 @final
+class Limits(Options):
+    """How long a run may take."""
+
+    seconds: float | None = Field(default=None, gt=0.0)
+    """Seconds after which a run, a margin or a set of initial states ends with what it knows by then; null: none."""
+
+
+@final
 class RunConfig(Options):
     """A complete experiment. Every key but ``problem`` has a default."""
 
@@ -94,6 +102,9 @@ class RunConfig(Options):
 
     observers: tuple[Entry, ...] = (Entry(name="progress"),)
     """Who is told of the progress."""
+
+    limits: Limits = Limits()
+    """How long a run may take."""
 
     seed: int = Field(default=0, ge=0)
     """Seed of every random number."""

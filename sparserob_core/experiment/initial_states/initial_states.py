@@ -23,7 +23,7 @@ from sparserob_core.experiment.initial_states.search import Search
 from sparserob_core.experiment.initial_states.section import section
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
-from sparserob_core.sip.method import GAP_TOLERANCE
+from sparserob_core.sip.method import GAP_TOLERANCE, OutOfTime
 
 __all__ = ["InitialStates", "initial_states"]
 FAR = 1e4  # times the numbers in the problem: a coordinate that may be as large as this is called unbounded
@@ -69,7 +69,11 @@ def initial_states(
     search = Search(plane, tools_of(loaded), _tolerance(loaded), notify, limit)
 
     def find() -> InitialStates:
-        found = search.states(experiment.title, directions, values)
+        try:
+            found = search.states(experiment.title, directions, values)
+        except OutOfTime as error:
+            bounded = "time until the set is known to be bounded"
+            raise InputError(path="limits.seconds", expected=bounded, got=str(error)) from error
         return replace(found, path=_path(problem, found))
 
     if out is None:

@@ -181,6 +181,7 @@ class Search:
         # The cost is linear and the point is all that is wanted: a regulariser of the control would only be in the way.
         result = Exchange(tolerance=self.tolerance).solve(program, replace(self.tools, regulariser=None))
         self.programs += result.counts.get("relaxed_programs", 0)
+        self.tools.deadline.check()
         self.cuts[tuple(direction.tolist())] = result.indices or tuple(known.values())
         return result
 
@@ -204,6 +205,7 @@ class Search:
             try:
                 self._tell("cost", number + 1, len(points))
                 result = Exchange(tolerance=self.tolerance).solve(self.plane.at(z), self.tools)
+                self.tools.deadline.check()
             except KeyboardInterrupt as pressed:
                 self._interrupt(pressed)
                 break

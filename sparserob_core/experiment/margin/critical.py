@@ -49,6 +49,7 @@ def _by_one_program(programs: ParametricProgram, scaling: Scaling, tools: Tools,
     """The factor as a decision variable: its two bounds meet at the critical factor."""
     program = extreme_program(programs, scaling.sense, scaling.highest)
     result = Exchange(tolerance=max(0.05 * width, 1e-9)).solve(program, replace(tools, regulariser=None))
+    tools.deadline.check()
     if result.status == "infeasible":
         return Critical("never", message=result.message)
     if result.decision is None or not np.isfinite(result.lower_bound):
@@ -98,6 +99,7 @@ def _slack(programs: ParametricProgram, factor: float, tools: Tools) -> float:
         if factor in (0.0, 1.0):
             raise
         return np.inf
+    tools.deadline.check()
     return np.inf if result.decision is None else float(result.decision[-1])
 
 

@@ -138,7 +138,7 @@ class Search:
         other that prove one side each; and every proven run on the feasible side, as a curve."""
         proven = sorted((one for one in self.points if one.status in FEASIBLE), key=lambda one: one.factor)
         if sides is not None:
-            return (sides[0], f"{sides[1]}; the curve was {said}", *sides[2:]), tuple(proven)
+            return (sides[0], f"{sides[1]}; no more of the curve: {said}", *sides[2:]), tuple(proven)
         refused = sorted((one for one in self.points if one.status == "infeasible"), key=lambda one: one.factor)
         last, first = (-1, 0) if self.scaling.sense == "largest" else (0, -1)
         feasible, infeasible = proven[last] if proven else None, refused[first] if refused else None
@@ -203,6 +203,8 @@ class Search:
         amount = self.scaling.amount(factor)
         point = Point(factor, amount, result.status, result.message, result.lower_bound, result.upper_bound)
         self.points.append(point)
+        if result.stopped:
+            self.tools.deadline.check()
         return point
 
     def _curve(self, feasible: Point, status: Answer, count: int) -> tuple[Point, ...]:

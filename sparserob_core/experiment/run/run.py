@@ -19,7 +19,7 @@ from sparserob_core.experiment.run.inspection import Inspection
 from sparserob_core.experiment.run.journal import Journal
 from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.method import Method, Tools
+from sparserob_core.sip.method import Deadline, Method, Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.result import Result
 
@@ -82,16 +82,18 @@ def run(
     """Run an experiment: what ``sparserob run CONFIG key=value ... --out OUT`` does.
 
     ``config`` is a file or a mapping, ``overrides`` a mapping such as ``{"solver.name": "clarabel"}`` or texts
-    ``key=value``. ``observers`` watch beside those that the config names.
+    ``key=value``. ``observers`` watch beside those that the config names. ``limits.seconds`` of the config bounds its
+    time: the method then ends as at an interrupt.
     Raises `ConfigError` or another `InputError` before anything is solved. An interrupt ends the method with what it
     knows by then: the outcome is that of the last round, ``undecided`` unless more was proven. An error, or an
     interrupt before there was a decision, leaves a directory with the config, the rounds so far and the status
     ``failed``.
     """
     loaded = load_config(config, overrides)
+    deadline = Deadline(loaded.config.limits.seconds)  # the transcription counts too
     experiment = assemble(loaded)
     tools, watching = (
-        tools_of(loaded),
+        replace(tools_of(loaded), deadline=deadline),
         [*_observers(loaded), *((type(observer).__name__, observer) for observer in observers)],
     )
     method: Method = build(loaded, "method", loaded.config.method)

@@ -4,6 +4,7 @@ input."""
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -224,3 +225,10 @@ def test_the_command_ends_with_the_status_of_what_it_found(command, tmp_path):
     done = command("margin", file, "--of", "disturbanse")
     assert (done.returncode, done.stdout) == (2, "")
     assert "did you mean 'disturbance'" in done.stderr
+
+
+def test_a_limit_ends_a_margin_with_what_is_proven_by_then():
+    config = Path(__file__).resolve().parents[3] / "configs" / "experiment1_repaired.yaml"
+    found = sr.margin(config, "disturbance", {"observers": [], "limits.seconds": 0.01})
+    assert found.status == "undecided"
+    assert found.message.startswith("the limit of 0.01 s is reached")

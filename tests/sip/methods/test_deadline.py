@@ -1,0 +1,200 @@
+"""Guards sip/method (deadline) and sip/methods/ledger: a method that runs out of time or is interrupted returns what it
+knows, and claims no more than that; bounds that cross are an alarm."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sparserob_core as sr
+from sparserob_core.sip.evidence import Cut, Dual
+from sparserob_core.sip.method import Deadline, OutOfTime
+from sparserob_core.sip.methods.ledger import alarm
+from sparserob_core.sip.program import Enclosure
+from sparserob_core.sip.proof.branch_and_bound import prove_family
+from sparserob_core.sip.result import relative_gap
+
+CONFIGS = Path(__file__).resolve().parents[3] / "configs"
+KNOWN = ("verified", "refuted", "undecided")
+
+
+def slow_family(pause=0.02, width=1.0, **more):
+    """``x >= t`` for t in [0, 1], whose enclosure takes its time and is never tight."""
+
+    def enclosure(x, lower, upper):
+        time.sleep(pause * len(lower))
+        return Enclosure(upper[:, 0] - x[0] + width, np.zeros(len(lower), dtype=int))
+
+    return sr.ConstraintFamily(
+        name="slow",
+        index_set=sr.Box([0.0], [1.0]),
+        rows=lambda t: (-np.ones((len(t), 1, 1)), -t),
+        enclosure=enclosure,
+        **more,
+    )
+
+
+def test_a_proof_ends_at_the_deadline_and_says_what_is_left():
+    started = time.monotonic()
+    proof = prove_family(slow_family(), np.array([1.0]), deadline=Deadline(0.5))
+    assert time.monotonic() - started < 3.0
+    assert proof.verdict == "undecided"
+    assert proof.cells > 10
+    assert "cells were left" in proof.reason
+
+
+def test_a_proof_whose_time_is_over_looks_at_every_family_once():
+    over = Deadline(1e-9)
+    time.sleep(0.01)
+    assert over.passed
+    easy = replace(slow_family(), enclosure=lambda x, lower, upper: Enclosure(upper[:, 0] - x[0], np.zeros(1, int)))
+    assert prove_family(easy, np.array([1.0]), deadline=over).verdict == "proven"
+    assert prove_family(easy, np.array([0.4]), deadline=over).verdict == "refuted"
+    assert prove_family(slow_family(0.001), np.array([1.0]), deadline=over).verdict == "undecided"
+
+
+def test_an_interrupt_of_a_proof_leaves_it_undecided_and_is_remembered():
+    def pressed(x, lower, upper):
+        raise KeyboardInterrupt
+
+    time_left = Deadline()
+    proof = prove_family(replace(slow_family(), enclosure=pressed), np.array([1.0]), deadline=time_left)
+    assert (proof.verdict, time_left.reason) == ("undecided", "interrupted from the keyboard")
+    with pytest.raises(OutOfTime, match="interrupted from the keyboard"):
+        time_left.check()
+
+
+def test_the_progress_of_a_proof_that_does_not_advance_says_what_hinders_it(monkeypatch):
+    monkeypatch.setattr("sparserob_core.sip.proof.branch_and_bound.STALLED", 0.05)
+    heard = []
+    prove_family(
+        slow_family(0.003, hindrance=lambda lower, upper: f"the cell is {upper[0] - lower[0]:g} wide"),
+        np.array([1.0]),
+        heard.append,
+        cells=100,
+    )
+    assert np.isnan(heard[0].bound_before)
+    assert not heard[0].hindrance
+    stuck = [event for event in heard if event.hindrance]
+    assert stuck
+    assert all(event.bound >= 0.99 * event.bound_before for event in stuck)
+    assert "wide" in stuck[-1].hindrance
+    assert "slow" in stuck[-1].hindrance
+
+
+@pytest.mark.parametrize("method", ["exchange", "nominal"])
+def test_a_limit_returns_the_decision_with_what_was_proven_of_it(method):
+    family = slow_family(0.02)
+    program = sr.SemiInfiniteProgram(n=1, q=[1.0], lower=-5.0, upper=5.0, families=[replace(family, nominal=family)])
+    started = time.monotonic()
+    result = sr.solve(program, method=method, seconds=4.0)
+    assert time.monotonic() - started < 20.0
+    assert result.status == "undecided"
+    assert result.stopped == "the limit of 4 s is reached"
+    assert result.message.endswith(result.stopped)
+    assert result.decision == pytest.approx([1.0], abs=1e-6)
+    assert result.lower_bound == pytest.approx(1.0, abs=1e-6)
+    assert (result.upper_bound, result.gap) == (np.inf, np.inf)
+
+
+def test_a_limit_that_is_over_before_anything_was_solved_returns_without_a_decision():
+    result = sr.solve(sr.SemiInfiniteProgram(n=1, q=[1.0], lower=0.0, upper=1.0), seconds=1e-9)
+    assert (result.status, result.decision) == ("undecided", None)
+    assert "before there was a decision" in result.message
+    assert result.lower_bound == -np.inf
+
+
+@pytest.mark.parametrize("seconds", [0, -1.0, np.inf, np.nan, "60", True])
+def test_a_limit_that_is_no_positive_number_is_refused(seconds):
+    with pytest.raises(sr.InputError, match="seconds: expected a positive number"):
+        sr.solve(sr.SemiInfiniteProgram(n=1, q=[1.0], lower=0.0, upper=1.0), seconds=seconds)
+
+
+@pytest.mark.parametrize("rounds", [1, 2])
+def test_an_interrupt_in_a_round_returns_the_decision_of_the_round_before(rounds):
+    class Pressed(Exception):
+        pass
+
+    calls = []
+
+    def rows(t):
+        return -np.ones((len(t), 1, 1)), -t
+
+    def worst(x):
+        calls.append(x)
+        if len(calls) > rounds:
+            raise KeyboardInterrupt
+        index = np.array([[min(1.0, 0.5 * len(calls))]])
+        return sr.Separation(index, np.array([0]), index[:, 0] - x)
+
+    family = sr.ConstraintFamily(name="above", index_set=sr.Box([0.0], [1.0]), rows=rows, worst=worst)
+    result = sr.solve(sr.SemiInfiniteProgram(n=1, q=[1.0], lower=-5.0, upper=5.0, families=[family]))
+    assert result.status == "refuted", "the search had found a violated index"
+    assert result.stopped == "interrupted from the keyboard"
+    assert result.decision is not None
+    assert result.counts["rounds"] == rounds
+
+
+def test_the_search_over_tuples_keeps_its_best_tuple_at_the_limit(tmp_path):
+    overrides = {
+        "observers": [],
+        "dictionaries.control.pieces": 40,
+        "dictionaries.disturbance.pieces": 40,
+        "method": {"name": "sparserob", "indices": 4},
+        "maximiser": {"name": "random_search", "budget": 100_000},
+        "limits.seconds": 2.0,
+    }
+    started = time.monotonic()
+    outcome = sr.run(CONFIGS / "experiment1_repaired.yaml", overrides, out=tmp_path / "run", figures=False)
+    assert time.monotonic() - started < 20.0
+    result = outcome.result
+    assert result.status in KNOWN
+    assert result.message.endswith("the limit of 2 s is reached")
+    assert result.decision is not None
+    assert np.isfinite(result.lower_bound)
+    assert result.trace is not None
+    assert result.counts["evaluations"] == result.trace.value.size > 0
+    assert outcome.summary["stopped"] == result.stopped
+
+
+def test_refuted_where_the_rounds_ran_out_says_so(tmp_path):
+    overrides = {"observers": [], "dictionaries.control.pieces": 40, "method": {"name": "exchange", "rounds": 1}}
+    result = sr.run(CONFIGS / "experiment1_repaired.yaml", overrides, out=tmp_path / "run", figures=False).result
+    assert result.status == "refuted"
+    assert result.message.endswith("the 1 rounds of the method are used up")
+
+
+def box_program():
+    """Minimise ``|x|`` with ``x >= t`` on [0, 1] in [-5, 5]: 1 at 1."""
+    return sr.SemiInfiniteProgram(n=1, weights=1.0, lower=-5.0, upper=5.0, families=[slow_family()])
+
+
+def test_a_lower_bound_above_the_cost_of_a_proven_decision_is_an_alarm():
+    program, x = box_program(), np.array([1.0])
+    cut = Cut("slow", np.array([1.0]), 0, multiplier=1.0)
+    assert not alarm(program, Dual(1.0 - 1e-12, (cut,), np.zeros(0)), x)
+    assert not alarm(program, Dual(1.0 + 5e-10, (cut,), np.zeros(0)), x), "the tolerance of the row pays for it"
+    said = alarm(program, Dual(1.0 + 5e-9, (cut,), np.zeros(0)), x)
+    assert "one of the two is wrong" in said
+    assert alarm(program, Dual(1.0 + 5e-10, (), np.zeros(0)), x), "no row pays for it"
+
+
+def test_the_gap_is_relative_to_the_cost_or_a_millionth_of_the_largest_possible_one():
+    assert relative_gap(0.0, 0.0, 5.0) == 0.0
+    assert relative_gap(1.0, 2.0, 5.0) == 0.5
+    assert relative_gap(-2e-6, 0.0, 2.0) == pytest.approx(1.0)
+    assert relative_gap(1e-9, 2e-9, 1e-8) == pytest.approx(0.5)
+    assert relative_gap(-np.inf, 1.0, 5.0) == np.inf
+    assert relative_gap(1.0, np.inf, 5.0) == np.inf
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+def test_the_largest_possible_cost_is_that_of_the_bounds(unit):
+    program = sr.SemiInfiniteProgram(n=2, weights=[unit, 0.0], q=[0.0, 2 * unit], lower=[-3.0, -1.0], upper=[1.0, 4.0])
+    assert program.cost_scale == pytest.approx(11.0 * unit)
+    quadratic = sr.SemiInfiniteProgram(n=1, P=[[2.0 * unit]], lower=-3.0, upper=1.0)
+    assert quadratic.cost_scale == pytest.approx(9.0 * unit)
