@@ -8,8 +8,6 @@ import numpy as np
 
 from sparserob_rerun.palette import Floats
 
-TIMELINES = ("evaluation", "round", "time")
-
 
 @final
 class Clock:

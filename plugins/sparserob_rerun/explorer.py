@@ -31,9 +31,9 @@ class Explorer:
         self.terrain, self.inspection, self.options = terrain, inspection, options
         self.left = 0 if options is None or inspection is None else options.evaluations
         self.landscape: Landscape | None = None
-        self.words = ""
+        self.words, self.round = "", 0
         self.work: Iterator[bool] = iter(())
-        self.waiting: tuple[Floats, float, str] | None = None
+        self.waiting: tuple[Floats, float, str, int] | None = None
         self.wrong = ""
 
     @property
@@ -43,11 +43,11 @@ class Explorer:
             (self.landscape is not None and self.landscape.level != 1) or self.waiting is not None
         )
 
-    def aim(self, slots: Floats, epsilon: float, words: str) -> None:
+    def aim(self, slots: Floats, epsilon: float, words: str, number: int = 0) -> None:
         """Ask for the landscape through a tuple ``(D, width)``, in the middle of the coordinates that it does not say;
-        it is begun when the one in work is complete."""
+        it is begun when the one in work is complete. ``number``: the round that the tuple is of, 0 for none."""
         if self.left > 0:
-            self.waiting = (np.array(slots, dtype=float), epsilon, words)
+            self.waiting = (np.array(slots, dtype=float), epsilon, words, number)
 
     def hurry(self) -> None:
         """Leave an unfinished landscape for the one that is waiting."""
@@ -80,7 +80,7 @@ class Explorer:
         """Start on the tuple that is waiting; ``False`` where there is none, or nothing in it can move."""
         if self.waiting is None or self.inspection is None or self.options is None or self.left < FEWEST:
             return False
-        slots, epsilon, self.words = self.waiting
+        slots, epsilon, self.words, self.round = self.waiting
         g = self.inspection.relaxed_value(len(slots), epsilon)
         known, middle = min(slots.shape[1], g.slot.dimension), (g.slot.lower + g.slot.upper) / 2
         anchor = np.tile(middle, (len(slots), 1))

@@ -91,11 +91,7 @@ class Recorder:
     def mark(self) -> None:
         """Mark on the last landscape where the maximum is, if it was proven."""
         landscape = self.explorer.landscape
-        if (
-            landscape is not None
-            and self.exact is not None
-            and self.explorer.words.endswith(("the end", f"round {self.clock.round}"))
-        ):
+        if landscape is not None and self.exact is not None and self.explorer.round == self.clock.round:
             at = np.array([[landscape.anchor[landscape.first], landscape.anchor[landscape.second]]])
             self.terrain.mark(at, f"exact maximum {self.exact:.5g}")
 
@@ -145,12 +141,15 @@ class Recorder:
         are active."""
         if self.searches and self.best.size:
             self.explorer.aim(
-                self.best.reshape(-1, self.block), event.epsilon, f"others as in the best tuple of round {event.round}"
+                self.best.reshape(-1, self.block),
+                event.epsilon,
+                f"others as in the best tuple of round {event.round}",
+                event.round,
             )
         elif not self.searches:
             slots = slots_of(active(event.imposed, event.multipliers), self._formulation)
             if slots.size:
-                self.explorer.aim(slots, event.epsilon, f"others as active in round {event.round}")
+                self.explorer.aim(slots, event.epsilon, f"others as active in round {event.round}", event.round)
 
     def _finished(self, event: sr.RunFinished) -> None:
         self.clock.move(seconds=event.seconds)
@@ -167,7 +166,10 @@ class Recorder:
             # a run that is shown again
             if self.explorer.landscape is None and self.explorer.waiting is None and result.indices:
                 self.explorer.aim(
-                    slots_of(list(result.indices), self._formulation), result.epsilon, "others as active at the end"
+                    slots_of(list(result.indices), self._formulation),
+                    result.epsilon,
+                    "others as active at the end",
+                    self.clock.round,
                 )
         self.say(
             f"{event.status}: {event.message}",

@@ -142,10 +142,12 @@ def check_states(states: object, count: int) -> tuple[int, int]:
     """Two different states, counted from 0; raises `InputError`."""
     given = tuple(states) if isinstance(states, Sequence | np.ndarray) else ()
     if len(given) != 2 or any(isinstance(one, bool) or not isinstance(one, int | np.integer) for one in given):
-        raise InputError(f"states: expected two different states, counted from 0, got {states!r}")
+        raise InputError(path="states", expected="two different states, counted from 0", got=repr(states))
     a, b = (int(one) for one in given)
     if a == b or not (0 <= a < count and 0 <= b < count):
-        raise InputError(f"states: expected two different states of the {count}, counted from 0, got {a} and {b}")
+        raise InputError(
+            path="states", expected=f"two different states of the {count}, counted from 0", got=f"{a} and {b}"
+        )
     return a, b
 
 

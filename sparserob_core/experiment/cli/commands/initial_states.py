@@ -72,18 +72,24 @@ def initial_states(
     from sparserob_core.experiment.initial_states.initial_states import initial_states as find
     from sparserob_core.experiment.terminal.table import print_table
 
-    with LiveLine() as line:
-        found = find(
-            config,
-            overrides,
-            [int(one) - 1 for one in _numbers("states", states)],
-            directions=directions,
-            values=values,
-            about=None if about is None else _numbers("about", about),
-            within=within,
-            out=out,
-            notify=line.hear,
-        )
+    chosen = [int(one) - 1 for one in _numbers("states", states)]
+    try:
+        with LiveLine() as line:
+            found = find(
+                config,
+                overrides,
+                chosen,
+                directions=directions,
+                values=values,
+                about=None if about is None else _numbers("about", about),
+                within=within,
+                out=out,
+                notify=line.hear,
+            )
+    except InputError as error:
+        if error.path != ("states",):
+            raise
+        raise InputError(path="--states", expected="two different states, counted from 1", got=repr(states)) from None
     if as_json:
         print_json(finite(found.summary()))
     else:
