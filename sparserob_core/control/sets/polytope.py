@@ -14,6 +14,7 @@ _VERTEX_DIMENSIONS = 6
 _VERTEX_ROWS = 200
 _SWEEPS = 12
 _ORDINARY = 10  # binary orders of magnitude between which rows and columns are left as they are
+_TOGETHER = 64  # linear programs that are solved as one
 _PROGRAMS = 96  # extreme points that are computed where the vertices are not known, one linear program each
 
 
@@ -148,8 +149,7 @@ class Polytope(ConvexSet):
         if self.vertices is not None:
             highest: Array = (directions @ self.vertices.T).max(axis=-1)
             return highest
-        flat = directions.reshape(-1, self.dimension)
-        return np.array([self._maximise(c)[0] for c in flat]).reshape(directions.shape[:-1])
+        return self._maximise_all(directions.reshape(-1, self.dimension))[0].reshape(directions.shape[:-1])
 
     def scaled(self, factor: float) -> Polytope:
         offset = self.H @ self.middle()
@@ -172,8 +172,31 @@ class Polytope(ConvexSet):
         if self.vertices is not None:
             point: Array = self.vertices[(directions @ self.vertices.T).argmax(axis=-1)]
             return point
-        flat = directions.reshape(-1, self.dimension)
-        return np.array([self._maximise(c)[1] for c in flat]).reshape(directions.shape)
+        return self._maximise_all(directions.reshape(-1, self.dimension))[1].reshape(directions.shape)
+
+    def _maximise_all(self, directions: Array) -> tuple[Array, Array]:
+        """`_maximise` for directions ``(k, d)``: several linear programs side by side in one, since calling the solver
+        costs far more than a small program does; one by one where that fails."""
+        from scipy.optimize import linprog
+        from scipy.sparse import block_diag
+
+        H, h, units = self._balanced
+        values, points = np.zeros(len(directions)), np.tile(self.interior_point(), (len(directions), 1))
+        asking = np.flatnonzero(np.abs(directions).max(axis=1, initial=0.0) > 0)
+        for start in range(0, asking.size, _TOGETHER):
+            part = asking[start : start + _TOGETHER]
+            scaled = directions[part] * units
+            costs = -scaled / np.abs(scaled).max(axis=1, keepdims=True)
+            if part.size > 1 and h.size and np.isfinite(costs).all():
+                rows = block_diag([H] * part.size, format="csc")
+                answer = linprog(costs.reshape(-1), rows, np.tile(h, part.size), bounds=(None, None))
+                if answer.status == 0:
+                    found = np.asarray(answer.x).reshape(scaled.shape)
+                    values[part], points[part] = (scaled * found).sum(axis=1), found * units
+                    continue
+            for position in part:
+                values[position], points[position] = self._maximise(directions[position])
+        return values, points
 
     def _maximise(self, direction: Array) -> tuple[float, Array]:
         """Support function and a maximiser by a linear program; ``(inf, some point)`` when unbounded."""
