@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sparserob_core.control.enclosures.matrix_exponential import COEFFICIENTS, Transitions
+from sparserob_core.control.enclosures.matrix_exponential import COEFFICIENTS, Transitions, exponential_rounding
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.sip.convex_set import Array
 
@@ -45,9 +45,15 @@ def flows_of(space: TaylorSpace, A: Array, durations: Array) -> tuple[Array, Arr
     d = A.shape[-1]
     block = np.zeros((durations.size, space.size, 2 * d, 2 * d))
     block[:, :, :d, :d] = A * durations[:, None, None, None]
-    block[:, 0, :d, d:] = np.eye(d) * durations[:, None, None]
+    block[:, 0, :d, d:] = np.eye(d)  # and times r after, as in `transitions`
     both = exponential(space, block)
-    return both[:, :, :d, :d], both[:, :, :d, d:]
+    return both[:, :, :d, :d], both[:, :, :d, d:] * durations[:, None, None, None]
+
+
+def flows_rounding(space: TaylorSpace, A: Array, durations: Array) -> Array:
+    """The relative error of `flows_of` in the exponential of the bounds, ``(k,)``."""
+    terms = int(np.bincount(space.products[2]).max()) * 2 * A.shape[-1]
+    return exponential_rounding(terms, np.abs(A).sum(axis=-2).max(axis=-1).sum() * durations)
 
 
 def exponential(space: TaylorSpace, polynomials: Array) -> Array:

@@ -12,11 +12,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sparserob_core.control.enclosures.matrix_exponential import transitions
+from sparserob_core.control.enclosures.matrix_exponential import (
+    EPSILON,
+    exponential_rounding,
+    rounding,
+    transitions,
+)
 from sparserob_core.sip.convex_set import Array
 
 WELL_CONDITIONED = 1e3
-EPSILON = float(np.finfo(float).eps)
 SEPARATED = (1e-6, 1e-4, 1e-2, 0.1, 0.5)  # of the largest eigenvalue: closer ones are tried in one group
 SWEEPS = 16  # of balancing
 
@@ -69,15 +73,18 @@ class Decoupling:
         return moved, size + self.defect @ (np.abs(moved) + size)
 
     @property
+    def parts(self) -> list[tuple[slice, bool]]:
+        """The groups, and whether each is a single block."""
+        ends = np.append(self.groups[1:], self.transform.shape[0])
+        return [
+            (slice(start, stop), ((self.starts >= start) & (self.starts < stop)).sum() == 1)
+            for start, stop in zip(self.groups, ends, strict=True)
+        ]
+
+    @property
     def is_identity(self) -> bool:
         """Whether nothing is transformed, and so nothing rounded."""
         return not self.defect.any()
-
-
-def rounding(terms: int) -> float:
-    """``gamma_n`` with room for the few operations around a product (Higham 2002, section 3.1): the relative error of
-    a sum of ``n`` products is at most this, in the sum of their absolute values."""
-    return (terms + 4) * EPSILON
 
 
 def decoupled(A: Array) -> Decoupling:
@@ -210,13 +217,28 @@ def decoupled_transitions(decoupling: Decoupling, D: Array, durations: Array) ->
     cost the slow ones their digits, as squaring a whole matrix would."""
     d = D.shape[-1]
     flow, driven = np.zeros((*durations.shape, d, d)), np.zeros((*durations.shape, d, d))
-    ends = np.append(decoupling.groups[1:], d)
-    for start, stop in zip(decoupling.groups, ends, strict=True):
-        part = slice(start, stop)
-        single = ((decoupling.starts >= start) & (decoupling.starts < stop)).sum() == 1
+    for part, single in decoupling.parts:
         found = (_mode if single else transitions)(D[part, part], durations)
         flow[..., part, part], driven[..., part, part] = found
     return flow, driven
+
+
+def decoupled_rounding(decoupling: Decoupling, D: Array, durations: Array) -> Array:
+    """The relative error of `decoupled_transitions` in the exponential of the bounds, ``(k,)`` for ``durations (k,)``.
+
+    A mode's exponent is rounded, by ``eps |a r|`` for a growing and ``eps |b r|`` for a turning one; where a mode
+    decays, ``|a r| e^{a r} <= 1``.
+    """
+    worst = np.zeros(durations.shape)
+    for part, single in decoupling.parts:
+        block = D[part, part]
+        if single:
+            turned = abs(block[0, -1]) if block.shape[0] == 2 else 0.0
+            found = EPSILON * (6.0 + 2.0 * (max(block[0, 0], 0.0) + turned) * durations)
+        else:
+            found = exponential_rounding(2 * block.shape[0], np.abs(block).sum(axis=0).max() * durations)
+        worst = np.maximum(worst, found)
+    return worst
 
 
 def _mode(D: Array, durations: Array) -> tuple[Array, Array]:

@@ -101,6 +101,12 @@ class DisturbanceSupport:
         return np.asarray(np.cumsum(pushed * lifted.fine.lengths, axis=1)[:, lifted.ends[1:] - 1])
 
     @property
+    def reached(self) -> Array:
+        """What any disturbance can have made of every block of the coordinates until the end of every piece,
+        ``(L, q)``."""
+        return self._gains[1:]
+
+    @property
     def _space(self) -> TaylorSpace:
         return (self.combination or self.lifted).space
 
@@ -188,11 +194,11 @@ class DisturbanceSupport:
 
     @cached_property
     def _gains(self) -> Array:
-        """``int_0^t e^{M s} |W| ds`` for the comparison system at the breakpoints, ``(L, q)``: what any disturbance
+        """``int_0^t e^{M s} |W| ds`` for the comparison system at the breakpoints, ``(L+1, q)``: what any disturbance
         until then can have made of every block."""
-        grid, gains = self.lifted.grid, np.zeros((self.lifted.grid.pieces, self.lifted.starts.size))
+        grid, gains = self.lifted.grid, np.zeros((self.lifted.grid.pieces + 1, self.lifted.starts.size))
         reach = self.lifted.comparison.over(grid.lengths)
-        for piece in range(1, grid.pieces):
+        for piece in range(1, grid.pieces + 1):
             step = product(reach.flow[piece - 1], gains[piece - 1][:, None])
             gains[piece] = (step + product(reach.integral[piece - 1], self._drive[:, None]))[:, 0]
         return gains

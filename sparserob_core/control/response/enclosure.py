@@ -17,6 +17,7 @@ import numpy as np
 
 from sparserob_core.control.enclosures.combination import Combination
 from sparserob_core.control.enclosures.comparison import block_norms, product
+from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.polynomial import distinct_patterns, face_matrix, monotone_ends, polynomial_bound
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.enclosures.valid_inequalities import Cuts
@@ -212,9 +213,17 @@ class CellEnclosure:
 
     @cached_property
     def _neglected(self) -> Array:
-        """What the Taylor models neglect, ``(r, L)``."""
-        total = product(self._row_norms, self.lifted.state_remainder(self.control).T)
-        return total if self.sigma is None else total + self.sigma.neglected
+        """What the Taylor models leave out, and what the last products and sums may round, ``(r, L)``."""
+        lifted = self.lifted
+        remainder, sizes = lifted.state_remainder(self.control)
+        total = product(self._row_norms, remainder.T)
+        widest = block_norms(np.abs(self.H) @ np.abs(lifted.transform), lifted.starts)  # with what cancels in H T
+        if self.sigma is not None:
+            total = total + self.sigma.neglected
+            sizes = sizes + self.sigma.reached
+        terms = rounding(2 * lifted.states + self.rhs.shape[1])
+        sides = np.abs(self.rhs).sum(axis=1, keepdims=True)  # of every row, or of the one that a combination makes
+        return np.asarray(total + terms * (product(widest, sizes.T) + sides))
 
 
 def _on_faces(space: TaylorSpace, coefficients: Array, ends: Array) -> Array:

@@ -14,7 +14,13 @@ from functools import cached_property
 
 import numpy as np
 
-from sparserob_core.control.enclosures.algebra import flows_of, lifted_matrix, lifted_transitions, multiplied
+from sparserob_core.control.enclosures.algebra import (
+    flows_of,
+    flows_rounding,
+    lifted_matrix,
+    lifted_transitions,
+    multiplied,
+)
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.comparison import (
     Comparison,
@@ -23,8 +29,14 @@ from sparserob_core.control.enclosures.comparison import (
     comparison_matrix,
     finite,
 )
-from sparserob_core.control.enclosures.decoupling import Decoupling, decoupled, decoupled_transitions, identity
-from sparserob_core.control.enclosures.matrix_exponential import Transitions
+from sparserob_core.control.enclosures.decoupling import (
+    Decoupling,
+    decoupled,
+    decoupled_rounding,
+    decoupled_transitions,
+    identity,
+)
+from sparserob_core.control.enclosures.matrix_exponential import Transitions, rounding
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.response import Response, TimeGrid
@@ -164,14 +176,20 @@ class LiftedSystem:
         answer: Array = self._path(control)[self.ends]
         return answer
 
-    def state_remainder(self, control: Array) -> Array:
-        """Norm bounds ``(L, q)``, per piece and block, of the part of the state that the Taylor models leave out."""
+    def state_remainder(self, control: Array) -> tuple[Array, Array]:
+        """Norm bounds ``(L, q)``, per piece and block, of the part of the state that the Taylor models leave out,
+        rounding included; and of the Taylor models themselves, summed over their coefficients."""
         inputs = control[:, self.fine.control_piece]
         driven = inputs.T @ self.forward.system.matrices(KNOWN)[1][0].T
-        sizes = self._sizes(self._path(control)[None], driven, rows=False)
+        nodes = self._path(control)[None]
+        sizes = self._sizes(nodes, driven, rows=False)
         drive = (self.slack_B @ np.abs(inputs)).T[None]
-        neglected = self._neglected(sizes, drive, self.slack_x[None], rows=False)[0]
-        return np.asarray(np.maximum.reduceat(neglected, self.ends[:-1], axis=0))
+        norms = np.abs(self.B).sum(axis=0) @ np.abs(inputs)
+        rounded = self._rounded(nodes, block_norms(norms.T, self.starts), rows=False)
+        neglected = self._neglected(sizes, drive, rounded, self.slack_x[None], rows=False)[0]
+        first = self.ends[:-1]
+        left_out: Array = np.maximum.reduceat(neglected, first, axis=0)
+        return left_out, np.maximum.reduceat(sizes[0].sum(axis=1), first, axis=0)
 
     def _path(self, control: Array) -> Array:
         """Taylor coefficients of the state at the breakpoints of the fine grid, remembered: all directions of a cell
@@ -190,9 +208,11 @@ class LiftedSystem:
         """For the Taylor models of ``c'e^{A(p) s}`` of ``directions (r, d)``, read backwards from ``t``: block norms
         ``(r, L', M, q)`` of their coefficients, the largest on every piece of the fine grid, and norm bounds
         ``(r, L', q)`` of what they leave out."""
-        sizes = self._sizes(self.row_nodes(directions), np.zeros(1), rows=True)
+        nodes = self.row_nodes(directions)
+        sizes = self._sizes(nodes, np.zeros(1), rows=True)
         still = np.zeros((1, 1, self.starts.size))
-        return sizes, self._neglected(sizes, still, np.zeros((1, self.starts.size)), rows=True)
+        rounded = self._rounded(nodes, still, rows=True)
+        return sizes, self._neglected(sizes, still, rounded, np.zeros((1, self.starts.size)), rows=True)
 
     def row_nodes(self, directions: Array) -> Array:
         """Taylor coefficients ``(r, L'+1, M, d)`` of ``c'e^{A(p) s}`` at the breakpoints ``s`` of the fine grid."""
@@ -248,10 +268,28 @@ class LiftedSystem:
     def _majorised(self) -> dict[bool, tuple[Array, Array]]:
         return {}
 
-    def _neglected(self, sizes: Array, extra: Array, start: Array, rows: bool) -> Array:
+    def _rounded(self, nodes: Array, driven: Array, rows: bool) -> tuple[Array, Array]:
+        """What rounding changes over every fine piece and within it, at most, ``(r, L', q)`` each: of the exponentials,
+        of the products with them, and of the time that is looked at."""
+        lengths = self.fine.lengths
+        if self.space.nu:
+            relative = flows_rounding(self.space, self.A, lengths)
+        else:
+            relative = decoupled_rounding(self.decoupling, self.A[0], lengths)
+        relative = relative + rounding(self.A.shape[1] * int(np.bincount(self.space.products[2]).max()))
+        reach = self.comparison.over(lengths)
+        start = block_norms(nodes[:, :-1], self.starts).sum(axis=2)
+        index = "lji,rlj->rli" if rows else "lij,rlj->rli"
+        driven = np.broadcast_to(driven, start.shape)
+        reached = np.einsum(index, reach.peak, start) + np.einsum(index, reach.integral, driven)
+        speed = reached @ (self.comparison.sizes if rows else self.comparison.sizes.T) + driven
+        whole, within = (self._backward_fine if rows else self.forward).lateness
+        return relative[:, None] * reached + whole * speed, relative[:, None] * reached + within * speed
+
+    def _neglected(self, sizes: Array, extra: Array, rounded: tuple[Array, Array], start: Array, rows: bool) -> Array:
         """Gronwall: ``|e|' <= M |e| + residual`` block by block, ``(r, L', q)``, from ``|e(0)| <= start (r, q)``, with
         the residual of the truncation bounded on every fine piece: ``sizes (r, L', M, q)`` of the coefficients, and
-        ``extra (r, L', q)``."""
+        ``extra (r, L', q)``; ``rounded``: as `_rounded` says."""
         spilt = self.spilt(block_sizes(self.A, self.starts)) + self.slack_A
         residual = np.einsum("rlaj,aij->rli" if not rows else "rlai,aij->rlj", sizes, spilt) + extra
         reach = self.comparison.over(self.fine.lengths)
@@ -259,11 +297,12 @@ class LiftedSystem:
             np.swapaxes(part, 1, 2) if rows else part for part in (reach.flow, reach.integral, reach.peak)
         )
         pushed = np.einsum("lij,rlj->rli", integral, residual)
+        added = pushed + rounded[0]
         bound, bounds = np.broadcast_to(start, pushed[:, 0].shape), np.empty((residual.shape[1], *pushed[:, 0].shape))
         for piece in range(residual.shape[1]):
             bounds[piece] = bound
-            bound = bound @ flow[piece].T + pushed[:, piece]
-        return np.asarray(np.einsum("lij,lrj->rli", peak, bounds) + pushed)
+            bound = bound @ flow[piece].T + added[:, piece]
+        return np.asarray(np.einsum("lij,lrj->rli", peak, bounds) + pushed + rounded[1])
 
     def spilt(self, coefficients: Array) -> Array:
         """For every monomial, the sum of those norms ``(M, ...)`` of the coefficients of a factor that push its product

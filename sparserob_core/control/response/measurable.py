@@ -127,8 +127,7 @@ class MeasurableCellSupport:
         rows, W = self.rows @ lifted.transform, lifted.W[0]
         slopes = rows @ lifted.forward.flows(start)[0] @ lifted.A[0]  # (k, r, d)
         reach = comparison.over(widths)
-        drive = np.linalg.norm(W, axis=1)
-        drive = bound.radius_bound * block_norms(drive, lifted.starts)
+        drive = self._drive
         square = (widths**2 / 8)[:, None]
         moved = product(block_norms(slopes, lifted.starts), product(reach.departure, drive[:, None]))[..., 0]
         exact = square * (bound.reach(slopes @ W) + moved)
@@ -141,5 +140,19 @@ class MeasurableCellSupport:
 
     @property
     def neglected(self) -> Array:
-        """Nothing: ``(r, L)`` of zeros."""
-        return np.zeros((self.rows.shape[0], self.support.response.grid.pieces))
+        """What rounding may change of ``e^{A' s} c``, times the disturbance, at most, ``(r, L)``."""
+        lifted = self.lifted
+        _, remainder = lifted.row_bounds(self.rows @ lifted.transform)
+        pushed = np.cumsum(remainder @ self._drive * lifted.fine.lengths, axis=1)
+        return np.asarray(pushed[:, lifted.ends[1:] - 1])
+
+    @property
+    def reached(self) -> Array:
+        """As in `DisturbanceSupport`, ``(L, q)``."""
+        reach = self.lifted.comparison.over(self.lifted.grid.breakpoints[1:])
+        return np.asarray(product(reach.integral, self._drive[:, None])[..., 0])
+
+    @property
+    def _drive(self) -> Array:
+        norms = block_norms(np.linalg.norm(self.lifted.W[0], axis=1), self.lifted.starts)
+        return np.asarray(self.support.bound.radius_bound * norms)

@@ -20,6 +20,7 @@ from sparserob_core.sip.convex_set import Array
 
 FEW = 64  # indices for which a table beats the loop over the pieces
 STEPS_KEPT = 16  # sets of parameters whose transitions are remembered
+SAME_DURATION = 1e-15  # of the horizon: durations that differ by less are computed once
 SAME_TIME = 1e-12  # times closer than this share of the horizon are one
 
 
@@ -207,6 +208,13 @@ class Propagator:
             done += count
         return powers
 
+    @cached_property
+    def lateness(self) -> tuple[float, float]:
+        """How far durations that are used may be from those that are meant: of pieces, where nearly equal ones are
+        taken for equal, and within a piece, where they are rounded (`TimeGrid.distinct`)."""
+        unequal = np.abs(self.grid.lengths - self._lengths[self._which]).max()
+        return float(unequal), float(SAME_DURATION * self.grid.breakpoints[-1])
+
     def length_of(self, piece: int) -> int:
         """Which of the distinct lengths, in the order of `Steps`, a piece has."""
         return int(self._which[piece])
@@ -254,6 +262,11 @@ class Response:
     def uniform(self) -> bool:
         """`Propagator.uniform`."""
         return self.propagator.uniform
+
+    @property
+    def lateness(self) -> tuple[float, float]:
+        """`Propagator.lateness`."""
+        return self.propagator.lateness
 
     @property
     def kernel(self) -> Array:

@@ -295,3 +295,42 @@ def test_the_bound_of_a_cell_does_not_depend_on_the_length_of_its_piece(name):
         truth = sampled_maximum(constraint, np.ones(pieces), np.array([1.2]), np.array([1.3]), rng)
         x[pieces] = found.bounds[0] - truth
         assert x[pieces] <= 0.01
+
+
+def exact_exponential(A, duration):
+    """``e^{A r}`` of a dyadic matrix in 300-bit ball arithmetic."""
+    import flint
+
+    flint.ctx.prec = 300
+    try:
+        return flint.arb_mat([[flint.arb(entry) * flint.arb(duration) for entry in row] for row in A.tolist()]).exp()
+    finally:
+        flint.ctx.prec = 53
+
+
+@pytest.mark.parametrize("growth", [0.5, 2.0, 5.0])
+@pytest.mark.parametrize("pieces", [1, 8])
+def test_the_bound_of_a_single_time_is_above_the_state_in_exact_arithmetic(growth, pieces):
+    """The state grows up to ``e^15``, and the rounding of every product on the way with it."""
+    import flint
+
+    A = np.array([[growth, 1.0, 0.3], [-0.7, growth - 1, 0.2], [0.1, 0.5, -1.5]])
+    system = LinearSystem(A, np.ones((3, 1)), np.eye(3)[:, :1])
+    start = np.array([0.7, -1.3, 0.4])
+    functionals = worst_case(system, uniform(pieces, HORIZON), initial_state=start)
+    truth = exact_exponential(A, HORIZON) * flint.arb_mat([[flint.arb(x)] for x in start.tolist()])
+    for sign in (1.0, -1.0):
+        for state in range(3):
+            exact = float(sign * truth[state, 0].mid())
+            one = FlatConstraint(
+                "end",
+                functionals,
+                sign * np.eye(3)[[state]],
+                np.array([exact]),
+                HORIZON,
+                HORIZON,
+                ParameterIndex(None),
+            )
+            found = one.enclosure(np.zeros(functionals.variables), np.array([[HORIZON]]), np.array([[HORIZON]]))
+            assert found.bounds[0] + 2e-16 * abs(exact) >= 0.0
+            assert found.bounds[0] <= 1e-10 * np.exp(growth * HORIZON)
