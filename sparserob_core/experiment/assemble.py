@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
+from sparserob_core.control.policies.policy import Policy
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.transcription.record import Transcription
@@ -93,11 +94,21 @@ def assemble(loaded: Loaded) -> Experiment:
     problem = problem_of(loaded)
     if isinstance(problem, SemiInfiniteProgram):
         return PlainExperiment(loaded, problem)
+    _of_time_alone(loaded)
     control, disturbance = dictionaries_of(loaded, problem.horizon)
     try:
         return ControlExperiment(loaded, prepare(problem, control, disturbance))
     except InputError as error:
         raise loaded.located(("problem",), error) from error
+
+
+def _of_time_alone(loaded: Loaded) -> None:
+    """Refuse a policy that the transcription does not know: its controls are functions of time."""
+    policy: Policy = build(loaded, "policy", loaded.config.policy)
+    if policy.knows:
+        known = ", ".join(sorted(policy.knows))
+        error = InputError(expected="a policy that knows nothing, such as open_loop", got=f"one that knows the {known}")
+        raise loaded.located(("policy", "name"), error)
 
 
 def problem_of(loaded: Loaded) -> OptimalControlProblem | SemiInfiniteProgram:

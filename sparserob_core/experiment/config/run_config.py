@@ -82,6 +82,9 @@ class RunConfig(Options):
     problem: Annotated[Entry, Slot("problem")]
     """What is to be solved."""
 
+    policy: Annotated[Entry, Slot("policy", "open_loop")] = Entry(name="open_loop")
+    """What the control may know while the system runs."""
+
     dictionaries: Dictionaries = Dictionaries()
     """In which functions the control and the disturbance are written."""
 
@@ -99,6 +102,9 @@ class RunConfig(Options):
 
     solver: Annotated[Entry, Slot("solver", "piqp")] = Entry(name="piqp")
     """The inner solver of quadratic programs."""
+
+    executor: Annotated[Entry, Slot("executor", "serial")] = Entry(name="serial")
+    """Where programs that do not depend on one another are solved."""
 
     observers: tuple[Entry, ...] = (Entry(name="progress"),)
     """Who is told of the progress."""

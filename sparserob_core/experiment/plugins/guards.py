@@ -3,9 +3,9 @@ name."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager
+from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar, final
 
 import numpy as np
@@ -105,8 +105,10 @@ class _Executors(ExecutorFactory):
     def __init__(self, executors: ExecutorFactory, origin: str) -> None:
         self._executors, self.origin = executors, origin
 
-    def open(self) -> AbstractContextManager[Executor]:
-        return asked(self.origin, "open", self._executors.open, AbstractContextManager)  # type: ignore[type-abstract]
+    @contextmanager
+    def open(self) -> Iterator[Executor]:
+        with ExitStack() as stack:
+            yield asked(self.origin, "open", lambda: stack.enter_context(self._executors.open()), Executor)
 
 
 @final

@@ -19,7 +19,7 @@ from sparserob_core.experiment.run.inspection import Inspection
 from sparserob_core.experiment.run.journal import Journal
 from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.method import Deadline, Method, Tools
+from sparserob_core.sip.method import Deadline, ExecutorFactory, Method, Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.result import Result
 
@@ -97,6 +97,7 @@ def run(
         [*_observers(loaded), *((type(observer).__name__, observer) for observer in observers)],
     )
     method: Method = build(loaded, "method", loaded.config.method)
+    executors: ExecutorFactory = build(loaded, "executor", loaded.config.executor)
     with create_directory(out, name_of(loaded), loaded.config.digest()) as directory:
         journal = Journal(directory, experiment)
         broadcast = Broadcast([("journal", journal), *watching])
@@ -117,7 +118,9 @@ def run(
                 )
             )
             try:
-                result = method.solve(experiment.program, _notifying(tools, broadcast))
+                with executors.open() as executor:
+                    handed = replace(_notifying(tools, broadcast), executor=executor)
+                    result = method.solve(experiment.program, handed)
             except KeyboardInterrupt as pressed:  # a method that does not return what it knows
                 result, told = journal.known(_said(pressed), time.perf_counter() - started), False
                 if result is None:

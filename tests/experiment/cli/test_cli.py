@@ -83,7 +83,7 @@ def test_a_traceback_is_there_for_those_who_ask(config: Path, command: Command) 
 def test_a_fault_of_the_program_is_status_5_and_says_what_was_saved(config: Path, command: Command) -> None:
     done = command("run", config, "method.fail=true", "--out", "out")
     assert done.returncode == 5
-    assert "internal error: RuntimeError: the stub fell over" in done.stderr
+    assert "solve raised RuntimeError: the stub fell over" in " ".join(done.stderr.split())
     assert "what was done until then is in out" in done.stderr
     assert "Traceback" not in done.stderr
 

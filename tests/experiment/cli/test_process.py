@@ -213,7 +213,7 @@ def test_of_many_that_start_at_once_one_gets_the_directory(config: Path, tmp_pat
 
 def test_the_lock_is_gone_when_a_run_is_over_whatever_its_end(config: Path, tmp_path: Path) -> None:
     sr.run(config, out=tmp_path / "well", quiet=True, figures=False)
-    with pytest.raises(RuntimeError):
+    with pytest.raises(sr.PluginError):
         sr.run(config, {"method.fail": True}, out=tmp_path / "ill", quiet=True)
     assert not [*tmp_path.glob("*/.*")]
 
