@@ -116,9 +116,8 @@ def _require_shapes(file: Path, arrays: Mapping[str, Array], model: Transcriptio
     }
     for name, letters in SHAPES.items():
         shape = tuple(sizes[letter] for letter in letters)
-        if arrays[name].shape != shape or (
-            name != "names" and not np.isfinite(np.asarray(arrays[name], dtype=float)).all()
-        ):
+        numbers = name == "names" or (arrays[name].dtype.kind in "fi" and bool(np.isfinite(arrays[name]).all()))
+        if arrays[name].shape != shape or not numbers:
             raise InputError(
                 f"{file}: {name}: expected finite numbers of shape {shape}, got shape {arrays[name].shape}"
             )

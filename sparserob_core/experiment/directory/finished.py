@@ -23,7 +23,7 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import RoundFinished
 from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.program import Formulation
-from sparserob_core.sip.result import MEANING
+from sparserob_core.sip.result import COLUMNS, MEANING, SearchTrace
 
 if TYPE_CHECKING:
     from sparserob_core.experiment.assemble import ControlExperiment, Experiment
@@ -33,6 +33,8 @@ UNFINISHED = "the run has not finished"
 NUMBERS = ("cost", "value", "epsilon", "lower_bound", "upper_bound", "gap", "seconds")
 LARGEST = 2**31
 """Bytes of arrays in one file, at most: no run writes as many, and a small file can pretend to hold any number."""
+IMPOSED = {"multipliers": "f", "times": "f", "indices": "f", "rows": "i", "families": "U"}
+"""What ``solution.npz`` says of every imposed constraint, and the kinds of numpy that say it."""
 SIMPLE = {"int": "iu", "float": "fiu", "str": "U", "bool": "b"}
 """Types of the fields of a round that a column of ``trace.npz`` can hold, and the kinds of numpy that serve."""
 
@@ -55,7 +57,17 @@ class StoredRun:
     @cached_property
     def solution(self) -> dict[str, Array]:
         """``solution.npz``; empty where there is none."""
-        return self.arrays("solution.npz")
+        file, arrays = self.directory / "solution.npz", self.arrays("solution.npz")
+        columns = {name: arrays[name] for name in IMPOSED if name in arrays}
+        for name, column in columns.items():
+            dimensions = 2 if name == "indices" else 1
+            counts = {other.shape[:1] for other in columns.values()}
+            if column.ndim != dimensions or column.dtype.kind not in IMPOSED[name] or len(counts) > 1:
+                raise InputError(
+                    f"{file}: {name}: expected one entry for each imposed constraint, as in "
+                    f"{', '.join(columns)}, got {column.dtype} of shape {column.shape}"
+                )
+        return arrays
 
     @cached_property
     def history(self) -> tuple[RoundFinished, ...]:
@@ -97,6 +109,24 @@ class StoredRun:
             return "literal" if entry.get("formulation") == "literal" else "reduced"
         known: dict[object, Formulation] = {"nominal": "nominal", "scenario": "sampled"}
         return known.get(entry.get("name"), "reduced")
+
+    @cached_property
+    def evaluations(self) -> SearchTrace | None:
+        """``evaluations.npz``; ``None`` where there is none."""
+        file, arrays = self.directory / "evaluations.npz", self.arrays("evaluations.npz")
+        if not arrays:
+            return None
+        count = arrays["value"].shape if "value" in arrays else ()
+        columns = {name: arrays.get(name, np.zeros(())) for name in (*COLUMNS, *arrays) if name != "points"}
+        for name, column in columns.items():
+            if column.dtype.kind not in "fi" or column.ndim != 1 or column.shape != count:
+                raise InputError(f"{file}: {name}: expected one number for each of the evaluations in value")
+        points = arrays.get("points", np.zeros((*count, 0)))
+        if points.ndim != 2 or points.shape[:1] != count or points.dtype.kind != "f":
+            raise InputError(f"{file}: points: expected one row for each of the evaluations in value")
+        if not np.isfinite(arrays["outer"]).all():
+            raise InputError(f"{file}: outer: expected the number of an outer iteration for each evaluation")
+        return SearchTrace.stored(arrays)
 
     def arrays(self, name: str) -> dict[str, Array]:
         """The arrays of one of its ``.npz`` files; none when there is no such file."""

@@ -77,7 +77,9 @@ def draw_run(directory: Path, plugins: Iterable[str | Path] = ()) -> list[Path]:
 
 
 def active_times(solution: Mapping[str, Array]) -> Array:
-    """The times of the imposed constraints that carry a multiplier, from ``solution.npz``."""
+    """The times of the imposed constraints that carry a multiplier, from ``solution.npz``; none where it has none."""
+    if not {"times", "multipliers"} <= set(solution):
+        return np.empty(0)
     return np.unique(solution["times"][solution["multipliers"] > 0])
 
 

@@ -78,7 +78,7 @@ def events(inspection: Inspection, title: str, directory: Path | None, result: R
 
 def stored_result(run: StoredRun) -> Result:
     """The result that a run directory holds."""
-    summary, solution, evaluations = run.summary, run.solution, run.arrays("evaluations.npz")
+    summary, solution = run.summary, run.solution
     decision = solution.get("decision", np.zeros(0))
     try:
         return Result(
@@ -94,7 +94,7 @@ def stored_result(run: StoredRun) -> Result:
             stopped=str(summary.get("stopped") or ""),
             indices=run.cuts,
             history=run.history,
-            trace=SearchTrace.stored(evaluations) if evaluations else None,
+            trace=run.evaluations,
             seconds=_number(summary, "seconds", 0.0),
         )
     except (KeyError, TypeError, ValueError) as error:
@@ -113,7 +113,8 @@ def _searches(trace: SearchTrace) -> Iterator[tuple[int, EvaluationsFinished]]:
         which = np.flatnonzero(trace.outer == outer)
         values, seconds = trace.value[which], trace.seconds[which] - trace.seconds[which[0]]
         best, done = np.maximum.accumulate(np.where(np.isnan(values), -np.inf, values)), 0
-        for part in np.array_split(np.arange(which.size), max(1, BATCHES * which.size // trace.outer.size)):
+        batches = min(which.size, max(1, BATCHES * which.size // trace.outer.size))
+        for part in np.array_split(np.arange(which.size), batches):
             before = -np.inf if not done else float(best[done - 1])
             moments = [(1, float(moment)) for moment in seconds[part]]
             batch = Batch(

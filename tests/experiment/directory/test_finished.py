@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import zipfile
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,9 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.experiment.directory.finished import StoredRun, read_arrays, read_finished
-from sparserob_core.experiment.figures.drawing import draw_run
+from sparserob_core.experiment.figures.drawing import active_times, draw_run
 from sparserob_core.experiment.run.inspection import Inspection
-from sparserob_core.experiment.run.replay import replay, stored_result
+from sparserob_core.experiment.run.replay import events, replay, stored_result
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -224,3 +225,57 @@ def test_a_result_that_is_none_is_refused_by_the_key_at_fault(copy: Path, change
         with pytest.raises(sr.InputError, match=r"result\.json") as caught:
             read(copy)
         assert said in str(caught.value)
+
+
+WRONG = {
+    "shorter": lambda array: array[:-1] if array.ndim else array,
+    "twice": lambda array: np.concatenate([array.ravel(), array.ravel()]),
+    "text": lambda array: np.full(array.shape, "x"),
+    "nan": lambda array: np.full(array.shape, np.nan),
+    "a number": lambda array: np.float64(3.0),
+    "empty": lambda array: np.zeros((0,) * max(array.ndim, 1)),
+    "negative": lambda array: np.full(array.shape, -7),
+    "true": lambda array: np.full(array.shape, True),
+    "gone": None,
+}
+
+
+@pytest.fixture(scope="module")
+def searched(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that leaves every kind of file."""
+    changes = ["method={name: sparserob, indices: 2}", "maximiser={name: random_search, budget: 20}"]
+    out = tmp_path_factory.mktemp("runs") / "searched"
+    return sr.run(CONFIG, changes, out=out, quiet=True, figures=False).directory
+
+
+@pytest.mark.parametrize("kind", WRONG)
+def test_whatever_is_wrong_with_an_array_is_an_error_of_the_input_or_none(
+    searched: Path, tmp_path: Path, kind: str
+) -> None:
+    directory, change = Path(shutil.copytree(searched, tmp_path / "run")), WRONG[kind]
+    inspection = Inspection.read(directory)
+
+    def replayed() -> object:
+        return list(events(inspection, "", directory, stored_result(StoredRun(directory))))
+
+    def compared() -> object:
+        return sr.compare([directory])
+
+    readers: dict[str, tuple[Callable[[], object], ...]] = {
+        "solution.npz": (replayed, lambda: active_times(StoredRun(directory).solution)),
+        "trace.npz": (replayed, compared),
+        "rounds.npz": (replayed,),
+        "evaluations.npz": (replayed, compared),
+        "adversary.npz": (lambda: sr.simulate(directory, law="adversary"),),
+    }
+    for read in (read for reads in readers.values() for read in reads):
+        read()
+    for name, reads in readers.items():
+        content, arrays = (directory / name).read_bytes(), read_arrays(directory / name)
+        for key, array in arrays.items():
+            others = {one: other for one, other in arrays.items() if one != key}
+            np.savez(directory / name, **(others if change is None else {**others, key: change(array)}))
+            for read in reads:
+                with suppress(sr.InputError):
+                    read()
+        (directory / name).write_bytes(content)
