@@ -121,7 +121,7 @@ def _registry() -> Any:
             warnings.simplefilter("ignore")
             from nevergrad.optimization import registry
     except ImportError as error:
-        raise sr.PluginError(
+        raise sr.UnknownPluginError(
             "nevergrad: the package is not installed; `pip install 'sparserob[nevergrad]'` brings it"
         ) from error
     return registry

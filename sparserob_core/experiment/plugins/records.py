@@ -9,7 +9,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import ClassVar
 
-from sparserob_core.errors import PluginError
+from sparserob_core.errors import PluginError, UnknownPluginError
 from sparserob_core.experiment.plugins.blame import asked, blaming
 from sparserob_core.options import Options
 
@@ -91,7 +91,9 @@ class Plugin:
     def create(self, options: Options) -> object:
         """The component for validated options, checked to be of this kind."""
         if self.needs is not None and find_spec(self.needs[0]) is None:
-            raise PluginError(f"{self}: {self.needs[0]} is not installed; `pip install '{self.needs[1]}'` brings it")
+            raise UnknownPluginError(
+                f"{self}: {self.needs[0]} is not installed; `pip install '{self.needs[1]}'` brings it"
+            )
         factory = self.resolved()
         module, _, attribute = self.component.partition(":")
         expected = getattr(import_module(module), attribute)
