@@ -78,7 +78,7 @@ class StoredRun:
         columns = {name: trace[name] for name in plain if name in trace}
         count = len(columns["round"]) if columns.get("round", np.zeros(())).ndim else 0
         for name, column in columns.items():
-            if column.shape != (count,) or column.dtype.kind not in SIMPLE[plain[name]]:
+            if column.shape != (count,) or (count and column.dtype.kind not in SIMPLE[plain[name]]):
                 raise InputError(
                     f"{file}: {name}: expected one entry of type {plain[name]} for each of {count} rounds, "
                     f"got {column.dtype} of shape {column.shape}"

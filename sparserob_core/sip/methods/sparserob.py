@@ -171,5 +171,5 @@ def _searched(
         if np.isfinite(report.best_value) and np.isfinite(g.at(report.best_point)):
             ledger.keep(Answer(g.solution, g.rows(), epsilon, report.best_value))
         ledger.relaxed.deadline = time_is_over
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt(report.stopped)
     return report.best_point

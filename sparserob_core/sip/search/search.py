@@ -301,8 +301,8 @@ def maximise(
             polish(shown, points[:, moves], values)
     except SearchEnded:
         pass
-    except KeyboardInterrupt:
-        stopped, interrupted = "interrupted from the keyboard", True
+    except KeyboardInterrupt as pressed:
+        stopped, interrupted = str(pressed) or "interrupted from the keyboard", True
     objective.tell()
     if not bound >= objective.best_value:
         raise PluginError(

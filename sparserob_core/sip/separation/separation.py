@@ -191,7 +191,7 @@ def _ask(
     target = Target(lambda indices: field.at(indices).max(axis=1), field.box)
     report = maximise(target, maximiser, budget, rng, Rules(polish=polish), notify)
     if report.interrupted:
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt(report.stopped)
     values = field.at(report.best_point[np.newaxis])[0]
     unit = np.repeat(field.unit(report.best_point[np.newaxis]), values.size, axis=0)
     return Candidates(unit, np.arange(values.size), values, np.full(values.size, 0.01)), report.upper_bound

@@ -136,6 +136,14 @@ def test_an_interrupted_run_keeps_its_last_control_and_claims_nothing_of_it(
     ]
 
 
+def test_what_stopped_a_search_is_told_in_the_words_of_the_signal() -> None:
+    def value(points: np.ndarray) -> np.ndarray:
+        raise KeyboardInterrupt("interrupted by SIGTERM")
+
+    report = sr.maximise(value, sr.Box([0.0], [1.0]), "random_search", budget=10)
+    assert report.stopped == "interrupted by SIGTERM"
+
+
 def test_a_signal_that_is_ignored_stays_ignored(config: Path, tmp_path: Path) -> None:
     program = (
         "import signal, sys\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\n"
