@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, final
 
 from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.transcription.rounding import rounded_down
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, assemble, build, name_of, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.reader import write_yaml
@@ -125,6 +126,8 @@ def run(
                 result, told = journal.known(_said(pressed), time.perf_counter() - started), False
                 if result is None:
                     raise
+            if isinstance(experiment, ControlExperiment):
+                result = rounded_down(experiment.transcription, result, experiment.gap_tolerance)
             ending = RunFinished(status=result.status, message=result.message, seconds=result.seconds, result=result)
             control, summary, remarks = journal.finish(result, figures=figures and told, certify=told)
             return Outcome(result, directory.path, experiment, control, summary, remarks)

@@ -37,7 +37,7 @@ def test_a_run_leaves_what_is_documented(config: Path, tmp_path: Path) -> None:
     assert set(written["worst"]) >= {"violation", "constraint", "time", "parameter"}
     assert set(written["counts"]) >= {"relaxed_programs", "rounds", "active_indices"}
     assert written["counts"]["relaxed_programs"] == 4
-    assert written["gap"] == 0.0
+    assert 0.0 <= written["gap"] <= 1e-13  # rounding is subtracted from the lower bound
     with np.load(outcome.directory / "solution.npz") as solution:
         assert solution["breakpoints"].shape == (11,)
         assert solution["control"].shape == solution["theta"].shape == (1, 10)

@@ -1,0 +1,70 @@
+"""Guards control.transcription.rounding: a bound that is written down is one that its multipliers prove."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import sparserob_core as sr
+from sparserob_core.experiment.check.check import check
+
+
+def on(pieces: int | list[float], problem: dict[str, Any]) -> dict[str, Any]:
+    grid = {"pieces": pieces} if isinstance(pieces, int) else {"breakpoints": pieces}
+    return {
+        "problem": {"name": "linear", **problem},
+        "dictionaries": {"control": {"name": "piecewise_constant", **grid}},
+        "observers": [],
+    }
+
+
+SHORT_AND_STRONG = on(
+    [0.0, 1e-6, 0.5, 0.5000010000000801, 1.0],
+    {
+        "system": {"A": [[0.0]], "B": [[1.0]]},
+        "horizon": 1.0,
+        "initial_state": [0.0],
+        "control": {"box": {"lower": [0.0], "upper": [1e6]}},
+        "path": [{"box": {"lower": [0.900000072], "upper": [None]}, "from": 0.6}],
+        "terminal": [{"box": {"lower": [1.5], "upper": [1.50000001]}}],
+    },
+)
+CHEAP = on(
+    6,
+    {
+        "system": {
+            "A": [["-0.3 + 0.1*p1", 1.0], [0.0, "-0.5+0.2*p1"]],
+            "B": [[0.0], [1.0]],
+            "parameters": {"p1": [-0.7, 0.7]},
+        },
+        "horizon": 2.0,
+        "initial_state": [1.0, 0.0],
+        "control": {"box": 2.0},
+        "terminal": [{"box": {"lower": [None, -0.5], "upper": [0.62, None]}}],
+    },
+)
+LARGE = on(
+    20,
+    {
+        "system": {"A": [[0, 1], [-2, -0.5]], "B": [[0], [1]]},
+        "horizon": 5.0,
+        "initial_state": [-1e3, 1e3],
+        "control": {"box": 1e3},
+        "disturbance": {"box": [50.0, 50.0]},
+        "terminal": [{"box": [300.0, 300.0]}],
+    },
+)
+
+
+@pytest.mark.parametrize("config", [SHORT_AND_STRONG, CHEAP, LARGE], ids=["short and strong", "cheap", "large"])
+def test_the_bound_that_is_written_is_never_above_the_one_that_its_multipliers_prove(
+    config: dict[str, Any], tmp_path: Path
+) -> None:
+    outcome = sr.run(config, out=tmp_path / "run", figures=False)
+    assert outcome.result.status == "certified"
+    assert 0.0 < outcome.result.lower_bound < outcome.result.upper_bound
+    assert outcome.result.dual.bound == outcome.result.lower_bound
+    found = {claim.name: claim.verdict for claim in check(tmp_path / "run").claims}
+    assert found["lower bound"] == found["status"] == "holds"
