@@ -77,6 +77,19 @@ class Comparison:
         """``P``: ``M`` without what decays."""
         return np.where(np.eye(self.metzler.shape[0]) > 0, np.maximum(self.metzler, 0.0), self.metzler)
 
+    def slips(self, slack: Array, widths: Array) -> tuple[Array, Array]:
+        """How much ``e^{(A + S) r}`` and its integral differ from those of ``A`` at ``r = width``, for any ``S`` with
+        blocks of norm ``slack (q, q)``: ``(k, q, q)`` each.
+
+        The difference is ``int_0^r e^{A (r - s)} S e^{(A + S) s} ds``, which is a block of one exponential.
+        """
+        q = slack.shape[0]
+        both = np.block([[self.metzler, slack], [np.zeros((q, q)), self.metzler + slack]])
+        distinct, which = np.unique(widths, return_inverse=True)
+        with np.errstate(over="ignore", invalid="ignore"):
+            flow, integral = (finite(SAFE * part[:, :q, q:]) for part in transitions(both, distinct))
+        return flow[which.reshape(-1)], integral[which.reshape(-1)]
+
     def _over(self, widths: Array) -> Reach:
         distinct, which = np.unique(widths, return_inverse=True)
         one = np.eye(self.metzler.shape[0])

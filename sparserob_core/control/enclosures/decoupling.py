@@ -9,8 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from sparserob_core.control.enclosures.matrix_exponential import (
     EPSILON,
@@ -20,6 +22,8 @@ from sparserob_core.control.enclosures.matrix_exponential import (
 )
 from sparserob_core.sip.convex_set import Array
 
+LongArray: TypeAlias = npt.NDArray[np.longdouble]
+
 WELL_CONDITIONED = 1e3
 SEPARATED = (1e-6, 1e-4, 1e-2, 0.1, 0.5)  # of the largest eigenvalue: closer ones are tried in one group
 SWEEPS = 16  # of balancing
@@ -27,14 +31,14 @@ SWEEPS = 16  # of balancing
 
 @dataclass(frozen=True, eq=False)
 class Decoupling:
-    """``transform`` is ``T (d, d)``, ``inverse`` its inverse ``V`` as computed, ``defect (d, d)`` a bound of
-    ``|T^-1 - V|`` relative to it: ``|T^-1 y - V y| <= defect |V y|``.
+    """``transform`` is ``T (d, d)``, ``inverse`` its inverse ``V`` as computed, in extended precision where the machine
+    has it, ``defect (d, d)`` a bound of ``|T^-1 - V|`` relative to it: ``|T^-1 y - V y| <= defect |V y|``.
 
     ``starts (q,)``: where the blocks begin; ``groups (g,)``: where the groups begin (each a union of blocks).
     """
 
     transform: Array
-    inverse: Array
+    inverse: LongArray
     defect: Array
     starts: np.ndarray
     groups: np.ndarray
@@ -60,17 +64,22 @@ class Decoupling:
         """``V b`` for columns ``b (..., d, e)``, and a bound of ``|T^-1 b - V b|``, entry by entry."""
         if self.is_identity:
             return columns, np.zeros(columns.shape)
-        size = rounding(columns.shape[-2]) * (np.abs(self.inverse) @ np.abs(columns))
-        moved = self.inverse @ columns
-        return moved, size + self.defect @ (np.abs(moved) + size)
+        return self._rounded(self.inverse @ columns.astype(np.longdouble), np.abs(columns))
 
     def matrix(self, A: Array) -> tuple[Array, Array]:
         """``V A T`` for matrices ``A (..., d, d)``, and a bound of ``|T^-1 A T - V A T|``, entry by entry."""
         if self.is_identity:
             return A, np.zeros(A.shape)
-        size = rounding(2 * A.shape[-1]) * (np.abs(self.inverse) @ np.abs(A) @ np.abs(self.transform))
-        moved = self.inverse @ A @ self.transform
-        return moved, size + self.defect @ (np.abs(moved) + size)
+        moved = self.inverse @ A.astype(np.longdouble) @ self.transform
+        return self._rounded(moved, np.abs(A) @ np.abs(self.transform))
+
+    def _rounded(self, moved: LongArray, sizes: Array) -> tuple[Array, Array]:
+        """``moved`` in double precision, and how far it may be from the truth; ``sizes`` bound what the inverse was
+        multiplied with."""
+        products = _long_rounding(2 * moved.shape[-2]) * (np.abs(self.inverse) @ sizes)
+        result = moved.astype(float)
+        bound = products + self.defect @ (np.abs(moved) + products) + np.abs(moved - result)
+        return result, 1.001 * bound.astype(float)
 
     @property
     def parts(self) -> list[tuple[slice, bool]]:
@@ -104,7 +113,7 @@ def decoupled(A: Array) -> Decoupling:
 
 def identity(d: int) -> Decoupling:
     """No change of coordinates, and every state a block of its own."""
-    return Decoupling(np.eye(d), np.eye(d), np.zeros((d, d)), np.arange(d), np.zeros(1, dtype=int))
+    return Decoupling(np.eye(d), np.eye(d, dtype=np.longdouble), np.zeros((d, d)), np.arange(d), np.zeros(1, dtype=int))
 
 
 def _checked(T: Array, starts: np.ndarray, groups: np.ndarray) -> Decoupling | None:
@@ -114,13 +123,20 @@ def _checked(T: Array, starts: np.ndarray, groups: np.ndarray) -> Decoupling | N
     except np.linalg.LinAlgError:
         return None
     d = T.shape[0]
-    residual = np.abs(V @ T - np.eye(d)) + rounding(d) * (np.abs(V) @ np.abs(T))
+    better = V + (np.eye(d) - V.astype(np.longdouble) @ T) @ V  # one step of Newton's method (Schulz 1933)
+    long = np.abs(better @ T - np.eye(d)) + _long_rounding(d) * (np.abs(better) @ np.abs(T))
+    residual = 1.001 * long.astype(float)
     size = float(residual.sum(axis=1).max())
     if not size < 0.5:
         return None
     # T^-1 = (I + S)^-1 V with |S| <= residual, and (I + S)^-1 - I is at most residual + residual^2 + ...
     defect = residual + residual @ residual + size**3 / (1.0 - size)
-    return Decoupling(T, V, defect, starts, groups)
+    return Decoupling(T, better, defect, starts, groups)
+
+
+def _long_rounding(terms: int) -> float:
+    """`rounding` in extended precision."""
+    return rounding(terms) * float(np.finfo(np.longdouble).eps) / EPSILON
 
 
 def _candidates(A: Array) -> Iterator[tuple[Array, np.ndarray, np.ndarray]]:

@@ -120,7 +120,7 @@ class LiftedSystem:
         growth = float(np.abs(np.linalg.eigvals(self.comparison.rising)).max())
         counts = np.clip(np.ceil(growth * self.grid.lengths / SHORT), 1, MOST_CUTS).astype(int)
         breaks = self.grid.breakpoints
-        if counts.max() == 1:
+        if counts.max() == 1 or not self.space.nu:  # without truncation there is little to bound
             return self.grid
         inner = [
             np.linspace(a, b, count, endpoint=False)
@@ -184,9 +184,8 @@ class LiftedSystem:
         nodes = self._path(control)[None]
         sizes = self._sizes(nodes, driven, rows=False)
         drive = (self.slack_B @ np.abs(inputs)).T[None]
-        norms = np.abs(self.B).sum(axis=0) @ np.abs(inputs)
-        rounded = self._rounded(nodes, block_norms(norms.T, self.starts), rows=False)
-        neglected = self._neglected(sizes, drive, rounded, self.slack_x[None], rows=False)[0]
+        pushed = block_norms((np.abs(self.B).sum(axis=0) @ np.abs(inputs)).T, self.starts)
+        neglected = self._neglected(nodes, sizes, pushed, drive, self.slack_x[None], rows=False)[0]
         first = self.ends[:-1]
         left_out: Array = np.maximum.reduceat(neglected, first, axis=0)
         return left_out, np.maximum.reduceat(sizes[0].sum(axis=1), first, axis=0)
@@ -211,8 +210,7 @@ class LiftedSystem:
         nodes = self.row_nodes(directions)
         sizes = self._sizes(nodes, np.zeros(1), rows=True)
         still = np.zeros((1, 1, self.starts.size))
-        rounded = self._rounded(nodes, still, rows=True)
-        return sizes, self._neglected(sizes, still, rounded, np.zeros((1, self.starts.size)), rows=True)
+        return sizes, self._neglected(nodes, sizes, still[0], still, np.zeros((1, self.starts.size)), rows=True)
 
     def row_nodes(self, directions: Array) -> Array:
         """Taylor coefficients ``(r, L'+1, M, d)`` of ``c'e^{A(p) s}`` at the breakpoints ``s`` of the fine grid."""
@@ -268,47 +266,67 @@ class LiftedSystem:
     def _majorised(self) -> dict[bool, tuple[Array, Array]]:
         return {}
 
-    def _rounded(self, nodes: Array, driven: Array, rows: bool) -> tuple[Array, Array]:
-        """What rounding changes over every fine piece and within it, at most, ``(r, L', q)`` each: of the exponentials,
-        of the products with them, and of the time that is looked at."""
+    def _neglected(self, nodes: Array, sizes: Array, driven: Array, extra: Array, start: Array, rows: bool) -> Array:
+        """Gronwall: ``|e|' <= M |e| + residual`` block by block, ``(r, L', q)``, from ``|e(0)| <= start (r, q)``.
+
+        The residual of the truncation is bounded on every fine piece by the ``sizes (r, L', M, q)`` of the
+        coefficients, and by ``extra (r, L', q)``. Every piece adds what the slack of ``A`` and rounding make of what
+        it starts from, ``nodes (r, L'+1, M, d)``, and of what drives it, ``driven (L', q)``.
+        """
+        comparison, lengths = self.comparison, self.fine.lengths
+        reach = comparison.over(lengths)
+        flow, integral, peak = (
+            np.swapaxes(part, 1, 2) if rows else part for part in (reach.flow, reach.integral, reach.peak)
+        )
+        begin = block_norms(nodes[:, :-1], self.starts).sum(axis=2)
+        reached = _by_piece(peak, begin) + _by_piece(integral, np.broadcast_to(driven, begin.shape))
+        whole, within = self._rounded(reached, driven, rows)
+
+        slack = self.slack_A.T if rows else self.slack_A
+        slips = Comparison(comparison.metzler.T, comparison.sizes.T) if rows else comparison
+        rising = Comparison(
+            slips.rising, slips.sizes
+        )  # whose slips grow with the time, so that the last is the largest
+        slipped, largest = (
+            _by_piece(one, begin) + _by_piece(two, np.broadcast_to(driven, begin.shape))
+            for one, two in (slips.slips(slack, lengths), rising.slips(slack, lengths))
+        )
+        largest = np.minimum(finite(largest), _by_piece(integral, reached @ slack.T))
+
+        spilt = self.spilt(block_sizes(self.A, self.starts))
+        residual = np.einsum("rlaj,aij->rli" if not rows else "rlai,aij->rlj", sizes, spilt) + extra
+        pushed = _by_piece(integral, residual)
+        added = pushed + whole + np.minimum(slipped, largest)
+        bound, bounds = np.broadcast_to(start, pushed[:, 0].shape), np.empty_like(pushed)
+        for piece in range(lengths.size):
+            bounds[:, piece] = bound
+            bound = bound @ flow[piece].T + added[:, piece]
+        return np.asarray(_by_piece(peak, bounds) + pushed + within + largest)
+
+    def _rounded(self, reached: Array, driven: Array, rows: bool) -> tuple[Array, Array]:
+        """What rounding changes over every fine piece and within it, at most, ``(r, L', q)`` each, where block norms
+        of ``reached (r, L', q)`` are reached: by the exponentials, by the products with them, and by the time that is
+        looked at."""
         lengths = self.fine.lengths
         if self.space.nu:
             relative = flows_rounding(self.space, self.A, lengths)
         else:
             relative = decoupled_rounding(self.decoupling, self.A[0], lengths)
         relative = relative + rounding(self.A.shape[1] * int(np.bincount(self.space.products[2]).max()))
-        reach = self.comparison.over(lengths)
-        start = block_norms(nodes[:, :-1], self.starts).sum(axis=2)
-        index = "lji,rlj->rli" if rows else "lij,rlj->rli"
-        driven = np.broadcast_to(driven, start.shape)
-        reached = np.einsum(index, reach.peak, start) + np.einsum(index, reach.integral, driven)
         speed = reached @ (self.comparison.sizes if rows else self.comparison.sizes.T) + driven
         whole, within = (self._backward_fine if rows else self.forward).lateness
         return relative[:, None] * reached + whole * speed, relative[:, None] * reached + within * speed
-
-    def _neglected(self, sizes: Array, extra: Array, rounded: tuple[Array, Array], start: Array, rows: bool) -> Array:
-        """Gronwall: ``|e|' <= M |e| + residual`` block by block, ``(r, L', q)``, from ``|e(0)| <= start (r, q)``, with
-        the residual of the truncation bounded on every fine piece: ``sizes (r, L', M, q)`` of the coefficients, and
-        ``extra (r, L', q)``; ``rounded``: as `_rounded` says."""
-        spilt = self.spilt(block_sizes(self.A, self.starts)) + self.slack_A
-        residual = np.einsum("rlaj,aij->rli" if not rows else "rlai,aij->rlj", sizes, spilt) + extra
-        reach = self.comparison.over(self.fine.lengths)
-        flow, integral, peak = (
-            np.swapaxes(part, 1, 2) if rows else part for part in (reach.flow, reach.integral, reach.peak)
-        )
-        pushed = np.einsum("lij,rlj->rli", integral, residual)
-        added = pushed + rounded[0]
-        bound, bounds = np.broadcast_to(start, pushed[:, 0].shape), np.empty((residual.shape[1], *pushed[:, 0].shape))
-        for piece in range(residual.shape[1]):
-            bounds[piece] = bound
-            bound = bound @ flow[piece].T + added[:, piece]
-        return np.asarray(np.einsum("lij,lrj->rli", peak, bounds) + pushed + rounded[1])
 
     def spilt(self, coefficients: Array) -> Array:
         """For every monomial, the sum of those norms ``(M, ...)`` of the coefficients of a factor that push its product
         out of the space, ``(M, ...)``."""
         leaves = self.space.degrees[:, None] + self.space.degrees[None, :] > self.space.degree
         return np.asarray(np.tensordot(leaves.astype(float), coefficients, axes=1))
+
+
+def _by_piece(matrices: Array, norms: Array) -> Array:
+    """Matrices of bounds ``(L', q, q)`` on block norms ``(r, L', q)``."""
+    return np.asarray(np.einsum("lij,rlj->rli", matrices, norms))
 
 
 def _applied(matrices: Array, norms: Array) -> Array:
@@ -321,7 +339,7 @@ def lift(system: LinearSystem, grid: TimeGrid, initial_state: Array, centre: Arr
     space = _space(centre.size)
     A, slack_A, B, slack_B, W, slack_W = system.taylor(space, centre, radius)
     basis = decoupled(A[0])
-    size, moved = np.abs(basis.inverse), basis.matrix(A)
+    size, moved = np.abs(basis.inverse).astype(float), basis.matrix(A)
     coefficients, rounded = moved[0].copy(), moved[1].sum(axis=0)
     coefficients[0] = basis.normal_form(moved[0][0])
     rounded = rounded + np.abs(coefficients[0] - moved[0][0])
