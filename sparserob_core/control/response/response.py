@@ -66,9 +66,16 @@ def distinct_times(times: Array, horizon: float) -> Array:
 
 
 def merge_grids(control: Array, disturbance: Array) -> TimeGrid:
-    """The merged grid of two sets of breakpoints over the same horizon; points closer than rounding are one."""
-    horizon = float(control[-1])
-    points = distinct_times(np.concatenate([control, disturbance]), horizon)
+    """The merged grid of two sets of breakpoints over the same horizon.
+
+    A breakpoint of the disturbance that is one of the control's but for rounding is taken for it. Two breakpoints of
+    one set are never taken for one, however near they are, so that no piece of either is lost.
+    """
+    after = np.clip(np.searchsorted(control, disturbance), 1, control.size - 1)
+    nearest = np.where(disturbance - control[after - 1] <= control[after] - disturbance, after - 1, after)
+    near = np.abs(disturbance - control[nearest]) <= SAME_TIME * float(control[-1])
+    same = near & (np.diff(np.where(near, nearest, -1), prepend=-1) != 0)  # the first of those near one breakpoint
+    points = np.union1d(control, disturbance[~same])
     middles = (points[:-1] + points[1:]) / 2
     return TimeGrid(points, np.searchsorted(control, middles) - 1, np.searchsorted(disturbance, middles) - 1)
 

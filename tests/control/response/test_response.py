@@ -193,6 +193,20 @@ def test_breakpoints_closer_than_rounding_are_one_in_the_merged_grid():
     assert grid.disturbance_piece.tolist() == [0, 1, 2]
 
 
+def test_breakpoints_of_one_set_are_never_taken_for_one():
+    """Half a rounding from each of two breakpoints of the control, one of the disturbance joined the three."""
+    control, apart = np.array([0.0, 0.5, 0.5 + 1.6e-12, 1.0]), np.array([0.0, 0.5 - 4e-13, 0.5 + 4e-13, 1.0])
+    grid = merge_grids(control, np.array([0.0, 0.5 + 8e-13, 1.0]))
+    assert grid.control_piece.tolist() == [0, 1, 2]
+    assert grid.disturbance_piece.tolist() == [0, 0, 1]
+    grid = merge_grids(np.array([0.0, 0.5, 1.0]), apart)
+    assert set(grid.control_piece) == {0, 1}
+    assert set(grid.disturbance_piece) == {0, 1, 2}
+    grid = merge_grids(apart, np.array([0.0, 0.5, 1.0]))
+    assert set(grid.control_piece) == {0, 1, 2}
+    assert set(grid.disturbance_piece) == {0, 1}
+
+
 def test_no_times_give_no_rows():
     functionals = worst_case(random_system(np.random.default_rng(1)), uniform(3, 1.0), bound=Box([-1, -1], [1, 1]))
     G, offset = functionals.rows(np.zeros(0), np.zeros((0, 2)), np.zeros((0, 0)))
