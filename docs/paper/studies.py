@@ -15,9 +15,8 @@ CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 WEIGHTS = (1.0, 1e-1, 1e-2, 1e-3, 1e-4, 1e-6)  # the epsilons of the figure
 BISECTIONS = 13
 
-# The tolerance of the sweep is as large as it can be: the optimiser of the regularised program is wanted, not of the
-# plain one.
-SWEEP = {"method": {"name": "exchange", "tolerance": 1.0}}
+# The optimiser of the regularised program is wanted, not of the plain one.
+SWEEP = {"method": {"name": "exchange", "exact": False}}
 PRINTED3 = {"problem.disturbance.box": [0.4, 0.4]}
 
 

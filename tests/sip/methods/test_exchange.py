@@ -354,3 +354,35 @@ def test_a_parameter_that_cannot_be_enclosed_ends_undecided(options):
     result = solved(problem, 10, options)
     assert result.status == "undecided", result.message
     assert "branch" in result.message
+
+
+@pytest.mark.parametrize("weight", [2.0, 4.0])
+def test_the_regularised_problem_is_solved_where_the_exact_one_is_not_asked_for(options, weight):
+    """``|x1| + 2 |x2| + weight/2 |x|^2`` with ``x1 + x2 >= t`` on [0, 1]: equal slopes ``1 + weight x1`` and
+    ``2 + weight x2``."""
+    above = sr.ConstraintFamily(
+        name="above", index_set=sr.Box([0.0], [1.0]), rows=lambda t: (-np.ones((len(t), 1, 2)), -t)
+    )
+    program = sr.SemiInfiniteProgram(n=2, weights=[1.0, 2.0], lower=-3.0, upper=3.0, families=[above])
+    fixed = {"continuation": {"start": weight, "stop": weight}, "regulariser": "ridge", "solver": options["solver"]}
+    result = sr.solve(program, method={"name": "exchange", "exact": False}, **fixed)
+    x = np.array([(1 + 1 / weight) / 2, (1 - 1 / weight) / 2])
+    assert result.decision == pytest.approx(x, abs=1e-5)
+    assert result.epsilon == weight
+    assert result.cost == pytest.approx(x @ [1, 2], abs=1e-5)
+    assert result.value == pytest.approx(x @ [1, 2] + weight / 2 * x @ x, abs=1e-5)
+    assert result.lower_bound == pytest.approx(1.0, abs=1e-6), "of the unregularised problem"
+    exact = sr.solve(program, method="exchange", **fixed)
+    assert exact.cost == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_regularised_problem_without_a_regulariser_is_refused(options):
+    program = sr.SemiInfiniteProgram(n=1, weights=1.0, lower=-3.0, upper=3.0)
+    with pytest.raises(sr.InputError, match="exact: expected true"):
+        sr.solve(program, method={"name": "exchange", "exact": False}, solver=options["solver"])
+
+
+@pytest.mark.parametrize("continuation", [{"start": 1e-8, "stop": 1.0}, {"stop": 2.0}])
+def test_a_continuation_that_would_rise_is_refused(continuation):
+    with pytest.raises(sr.InputError, match="stop: expected at most start"):
+        sr.solve(sr.SemiInfiniteProgram(n=1, lower=0.0, upper=1.0), continuation=continuation)
