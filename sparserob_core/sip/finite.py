@@ -85,6 +85,16 @@ class FiniteProgram:
             raise InputError("finite program: expected weights >= 0 and right-hand sides above -inf")
 
 
+def diagonal(P: csc_array | None, n: int) -> Array | None:
+    """The diagonal ``(n,)`` of a diagonal ``P`` (zeros for ``None``), or ``None`` when ``P`` has other entries."""
+    if P is None:
+        return np.zeros(n)
+    columns = np.repeat(np.arange(n), np.diff(P.indptr))
+    if not np.array_equal(columns, P.indices):
+        return None
+    return np.bincount(columns, P.data, n).astype(float)
+
+
 def scaled_violation(violations: Array, rows: Array, rhs: Array, size: Array) -> float:
     """``max_i violations_i / max(min(1, |rows_i|), |rhs_i| + |rows_i| size)``.
 

@@ -317,3 +317,128 @@ def test_a_random_search_ends_at_the_same_value():
     )
     assert abs(result.cost - 0.6490420933) <= 1e-7
     assert apart(result) <= 1e-6
+
+
+# Any convex program: free variables, no Slater point, numbers of any size, programs without a solution.
+
+
+def half_line(**more):
+    """``x >= t`` for t in [0, 1]."""
+    above = family("above", [0.0], [1.0], lambda t: (-np.ones((len(t), 1, 1)), -t))
+    return sr.SemiInfiniteProgram(n=1, families=[above], **more)
+
+
+def disc(radius=1.0, units=(1.0, 1.0), **more):
+    """The tangents of an ellipse with the half-axes ``radius units``."""
+    tangents = family(
+        "disc",
+        [0.0],
+        [2 * np.pi],
+        lambda a: ((circle(a) / units)[:, np.newaxis], radius * np.ones((len(a), 1))),
+    )
+    return sr.SemiInfiniteProgram(n=2, families=[tangents], **more)
+
+
+def parabola(**more):
+    """``x2 >= x1^2`` by its tangents from -3 to 3."""
+    tangents = family("above", [-3.0], [3.0], lambda s: (np.hstack([2 * s, -np.ones_like(s)])[:, np.newaxis], s**2))
+    return sr.SemiInfiniteProgram(n=2, families=[tangents], **more)
+
+
+ANSWERED = {
+    "a free variable": (half_line(q=[1.0]), 1.0),
+    "two free variables": (disc(q=[1.0, 1.0]), -math.sqrt(2)),
+    "a free polynomial": (
+        sr.SemiInfiniteProgram(
+            n=3,
+            q=1 / (1.0 + np.arange(3)),
+            families=[family("above", [0.0], [1.0], lambda t: (-(t ** np.arange(3))[:, np.newaxis], -np.tan(t)))],
+        ),
+        0.6490420933,
+    ),
+    "a relaxed program without a bound": (parabola(q=[0.0, 1.0]), 0.0),
+    "a slanted cost without a bound": (parabola(q=[1.0, 1.0]), -0.25),
+    "an equality": (half_line(q=[1.0], A=[[1.0]], b=[2.0]), 2.0),
+    "no Slater point": (disc(0.0, q=[1.0, 1.0]), 0.0),
+    "no Slater point in a box": (disc(0.0, q=[1.0, 1.0], lower=-10.0, upper=10.0), 0.0),
+    "variables of 1e12": (disc(1e12, q=[1.0, 1.0], lower=-1e12, upper=1e12), -math.sqrt(2) * 1e12),
+    "free variables of 1e12": (disc(1e12, q=[1.0, 1.0]), -math.sqrt(2) * 1e12),
+    "variables of two sizes": (
+        disc(1.0, (1.0, 1e12), q=[1.0, 1e-12], lower=[-1.0, -1e13], upper=[1.0, 1e13]),
+        -math.sqrt(2),
+    ),
+    "no cost": (half_line(), 0.0),
+}
+
+
+@pytest.mark.parametrize("name", ANSWERED)
+def test_any_convex_program_is_answered(name):
+    program, truth = ANSWERED[name]
+    result = sr.solve(program)
+    slack = 1e-6 * max(1.0, abs(truth))
+    assert result.status == "undecided", f"rows alone prove nothing: {result.message}"
+    assert result.cost == pytest.approx(truth, abs=slack)
+    assert truth - slack <= result.lower_bound <= truth + slack
+
+
+UNBOUNDED = {
+    "a half-line": (half_line(q=[-1.0]), [1.0], "undecided"),
+    "no constraint": (sr.SemiInfiniteProgram(n=2, q=[-1.0, 0.0]), [1.0, 0.0], "verified"),
+    "along a flat direction of a quadratic cost": (
+        parabola(P=[[2.0, 0.0], [0.0, 0.0]], q=[1.0, -1.0]),
+        [0.0, 1.0],
+        "undecided",
+    ),
+    "an absolute cost that a linear one outweighs": (
+        sr.SemiInfiniteProgram(n=1, weights=1.0, q=[-2.0]),
+        [1.0],
+        "verified",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", UNBOUNDED)
+def test_an_unbounded_program_is_told_with_a_ray(name):
+    program, ray, status = UNBOUNDED[name]
+    result = sr.solve(program)
+    assert result.status == status, result.message
+    assert result.message.startswith("unbounded below: along the ray")
+    assert (result.lower_bound, result.gap) == (-np.inf, np.inf)
+    assert result.ray == pytest.approx(ray, abs=1e-9)
+    costs = [program.cost(result.decision + length * result.ray) for length in (0.0, 1.0, 1e3, 1e6)]
+    assert (np.diff(costs) < 0).all()
+    indices = np.linspace(0.0, 1.0, 50)[:, np.newaxis]
+    for one in program.families:
+        assert (one.violations(result.decision + 1e6 * result.ray, indices) <= 1e-6).all()
+
+
+INFEASIBLE = {
+    "a bound": half_line(q=[1.0], upper=0.5),
+    "a bound and a box": half_line(q=[1.0], lower=-10.0, upper=0.5),
+    "a row": half_line(q=[1.0], G=[[1.0]], h=[0.5]),
+    "an equality": half_line(q=[1.0], A=[[1.0]], b=[0.5]),
+    "no cost": half_line(upper=0.5),
+    "a cost that would fall for ever": half_line(q=[-1.0], A=[[0.0]], b=[1.0]),
+}
+
+
+@pytest.mark.parametrize("name", INFEASIBLE)
+def test_a_program_that_leaves_nothing_is_infeasible_whatever_else_is_free(name):
+    result = sr.solve(INFEASIBLE[name])
+    assert result.status == "infeasible", result.message
+    assert result.decision is None
+    assert result.message
+
+
+def test_a_failure_says_once_what_is_wrong_and_what_to_do():
+    class Silent(sr.Solver):
+        def solve(self, program, accuracy):
+            n, r, e = program.q.size, program.h.size, program.b.size
+            return sr.Claim("failed", np.zeros(n), np.zeros(r), np.zeros(e), np.zeros(n), "nothing found")
+
+    image = {"S": [[1.0, 1.0], [1.0, -1.0], [1.0, 0.0]], "weights": 1.0, "lower": -2.0, "upper": 2.0}
+    result = sr.solve(disc(0.5, q=[-3.0, 1.0], **image), solver=Silent())
+    assert result.status == "failed"
+    assert "try another solver" in result.message
+    parts = result.message.split("; ")
+    assert len(parts) == len(set(parts)) <= 3

@@ -1,8 +1,9 @@
-"""A square image is a change of coordinates: after it the program is separable, and far easier."""
+"""Coordinates in which a program is easier: those of a square image, and units in which every variable is of size 1."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -16,16 +17,31 @@ if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
 WORST = 1e6  # condition number above which coordinates are left alone
+ORDINARY = 1e3  # variables whose bounds are within this factor of 1 are left in their units
 _inverses = Memory(4)
 _curvatures = Memory(4)
+_units = Memory(4)
 
 
-def in_new_variables(program: FiniteProgram) -> FiniteProgram | None:
-    """The program in the coordinates ``s = S x``; ``None`` unless ``S`` is square and well conditioned and ``P``
-    becomes diagonal.
+@dataclass(frozen=True, eq=False)
+class NewVariables:
+    """The ``program`` in new variables, with the ways ``to`` them and ``back`` for decisions, and ``dual`` for the
+    multipliers of the image; those of rows and equalities are the same."""
 
-    ``y``, ``mu`` and the image multiplier ``z`` are the same in both coordinates.
-    """
+    program: FiniteProgram
+    to: Callable[[Array], Array]
+    back: Callable[[Array], Array]
+    dual: Callable[[Array], Array]
+
+
+def in_new_variables(program: FiniteProgram) -> NewVariables | None:
+    """The program in coordinates that make it easier; ``None`` where it has such coordinates already."""
+    return _of_the_image(program) if program.S is not None else _of_size_one(program)
+
+
+def _of_the_image(program: FiniteProgram) -> NewVariables | None:
+    """The coordinates ``s = S x``, in which the program is separable; ``None`` unless ``S`` is square and well
+    conditioned and ``P`` becomes diagonal."""
     S = program.S
     if S is None or S.shape[0] != S.shape[1]:
         return None
@@ -35,14 +51,35 @@ def in_new_variables(program: FiniteProgram) -> FiniteProgram | None:
     P = None if program.P is None else _curvatures.recall((S, program.P), None, partial(_curvature, program.P, inverse))
     if program.P is not None and P is None:
         return None
-    return replace(program, S=None, P=P, q=program.q @ inverse, G=program.G @ inverse, A=program.A @ inverse)
+    easier = replace(program, S=None, P=P, q=program.q @ inverse, G=program.G @ inverse, A=program.A @ inverse)
+    return NewVariables(easier, program.image, lambda s: np.asarray(inverse @ s), lambda z: z)
 
 
-def from_new_variables(program: FiniteProgram, s: Array) -> Array:
-    """``x (n,)`` with ``S x = s``, for a program that has new variables."""
-    S = program.S
-    inverse = None if S is None else _inverses.recall((S,), None, partial(_inverse, S))
-    return s if inverse is None else np.asarray(inverse @ s)
+def _of_size_one(program: FiniteProgram) -> NewVariables | None:
+    """The variables ``x_k / unit_k``, with powers of two for units, which change no number but its exponent; ``None``
+    where the bounds of all variables are of ordinary size."""
+    sources = (program.lower, program.upper, program.weights)
+    found = _units.recall(sources, None, lambda: _scaled(*sources))
+    if found is None:
+        return None
+    unit, lower, upper, weights = found
+    P = None
+    if program.P is not None:
+        from scipy.sparse import diags_array
+
+        P = (diags_array(unit) @ program.P @ diags_array(unit)).tocsc()
+    G, A = program.G * unit, program.A * unit
+    easier = FiniteProgram(program.q * unit, weights, lower, upper, G, program.h, A, program.b, P=P)
+    return NewVariables(easier, lambda x: x / unit, lambda v: v * unit, lambda z: z / unit)
+
+
+def _scaled(lower: Array, upper: Array, weights: Array) -> tuple[Array, Array, Array, Array] | None:
+    reach = np.maximum(np.abs(lower), np.abs(upper))
+    told = np.isfinite(reach) & (reach > 0.0)
+    if not ((reach[told] > ORDINARY) | (reach[told] < 1.0 / ORDINARY)).any():
+        return None
+    unit = np.where(told, np.exp2(np.round(np.log2(np.where(told, reach, 1.0)))), 1.0)
+    return unit, lower / unit, upper / unit, weights * unit
 
 
 def _inverse(S: csc_array) -> Array | None:

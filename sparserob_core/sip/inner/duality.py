@@ -1,19 +1,33 @@
-"""Lower bounds of a finite program that hold for *any* multipliers, however inaccurate the solver that offered them."""
+"""Lower bounds of a finite program that hold for *any* multipliers, however inaccurate the solver that offered them.
+
+`dual_bound` and `farkas_bound` are weak duality, less the rounding of their own evaluation; `measure` is everything
+that can be checked about a claim. Better multipliers make better bounds: `repaired` gives unbounded variables the exact
+slopes that they ask for, and `vertex_multipliers` are those of the plain program at the optimiser of a regularised one.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
+from sparserob_core.sip.finite import FiniteProgram, FiniteSolution, diagonal
 from sparserob_core.sip.inner.image import onto_stationary
-from sparserob_core.sip.inner.repair import diagonal, repaired
 
 # Entries of a sum are evaluated with a relative error of at most this (Higham 2002, section 3.1, for sums of up to ~1e2
 # terms).
 ROUND_OFF = 1e-14
+
+NEAR = 1e-6  # a slope this close to its limit, or beyond it, is moved onto the limit
+REPAIRS = 4
+FREE = 1e-7  # an entry further than this from 0 and from both bounds, relative to their distance, is free
+TIGHT = 1e-9  # a row with a slack below this may carry a multiplier
+ACTIVE = 1e-9  # a row with a multiplier above this, relative to the largest, is active
+
+Multipliers: TypeAlias = tuple[Array, Array, Array | None, Array | None]
 
 
 @dataclass(frozen=True)
@@ -171,3 +185,90 @@ def _shrunk_bound(program: FiniteProgram, y: Array, mu: Array, z: Array | None, 
     factor = factor if np.isfinite(factor) and np.isfinite(slope).all() else 0.0
     scaled = [None if v is None else factor * v for v in (z, at)]
     return _bound(_terms(program, factor * y, factor * mu, *scaled), program)
+
+
+def repaired(program: FiniteProgram, y: Array, mu: Array, z: Array | None, at: Array | None) -> Multipliers | None:
+    """``(y, mu, z, at)`` after the least-norm correction that gives every unbounded entry the slope that it needs, or
+    ``None``.
+
+    Only positive ``y``, ``mu``, the point ``at`` of the tangent to ``P``, and the ``z`` of bounded images are moved.
+    """
+    better: Multipliers | None = (y, mu, z, at)
+    for _ in range(REPAIRS):
+        if better is None or not all(np.isfinite(v).all() for v in better if v is not None):
+            return None
+        better = _corrected(program, *better)
+        if better is not None and (better[0] >= 0).all():
+            return better
+        better = None if better is None else (np.maximum(better[0], 0.0), *better[1:])
+    return better
+
+
+def _corrected(program: FiniteProgram, y: Array, mu: Array, z: Array | None, at: Array | None) -> Multipliers | None:
+    tangent = None
+    if program.P is not None and (program.S is not None or diagonal(program.P, program.n) is None):
+        tangent = program.P.toarray()
+        at = np.zeros(program.n) if at is None else at
+    slope = program.q + y @ program.G + mu @ program.A + (0.0 if tangent is None else tangent @ at)
+    used = y > 0
+    blocks = [program.G[used].T, program.A.T, np.zeros((program.n, 0)) if tangent is None else tangent]
+    if program.S is None:
+        tight = _at_limit(program, -slope) & (tangent is not None or diagonal(program.P, program.n) == 0)
+        target = np.sign(slope[tight]) * program.weights[tight] - slope[tight]
+        moved = _least_norm([block[tight] for block in blocks], target)
+    else:
+        z = np.zeros(program.weights.size) if z is None else z.copy()
+        tight = _at_limit(program, z)
+        z[tight] = np.sign(z[tight]) * program.weights[tight]
+        moved = _least_norm([*blocks, program.S[np.flatnonzero(~tight)].toarray().T], -(program.S.T @ z + slope))
+        z[~tight] += 0.0 if moved is None else moved[3]
+    if moved is None:
+        return None
+    better = y.copy()
+    better[used] += moved[0]
+    return better, mu + moved[1], z, at if tangent is None or at is None else at + moved[2]
+
+
+def _at_limit(program: FiniteProgram, z: Array) -> npt.NDArray[np.bool_]:
+    """Unbounded images whose multiplier is at its limit, the weight, or beyond."""
+    near = np.abs(z) > program.weights - NEAR * (1.0 + program.weights)
+    return near & (np.isposinf(program.upper) & (z >= 0) | np.isneginf(program.lower) & (z <= 0))
+
+
+def _least_norm(blocks: list[Array], target: Array) -> list[Array] | None:
+    columns = np.hstack(blocks)
+    if not columns.size:
+        return None
+    change = np.linalg.lstsq(columns, target, rcond=1e-12)[0]
+    change = change + np.linalg.lstsq(columns, target - columns @ change, rcond=1e-12)[0]
+    return np.split(change, np.cumsum([block.shape[1] for block in blocks])[:-1])
+
+
+def vertex_multipliers(program: FiniteProgram, x: Array, y: Array, mu: Array) -> tuple[Array, Array]:
+    """``(y, mu)`` that make the linearised cost stationary in the free entries of ``x (n,)``, in the least-squares
+    sense, with ``y >= 0``.
+
+    The multipliers ``y (r,)``, ``mu (e,)`` of a regularised program differ from those of the plain one by the slope of
+    the regulariser; at an exactly regularised optimiser these are the plain ones (Friedlander and Tseng 2007, section
+    2). Any answer is safe: weak duality decides what it is worth. ``S`` must be the identity and ``P`` absent,
+    otherwise the multipliers come back unchanged.
+    """
+    from scipy.optimize import nnls
+
+    tight = program.h - program.G @ x <= TIGHT * np.maximum(1.0, np.abs(program.h))
+    active = np.flatnonzero((y > ACTIVE * y.max(initial=0.0)) | tight)
+    if program.S is not None or program.P is not None or not active.size + mu.size:
+        return y, mu
+    width = np.where(np.isfinite(program.upper - program.lower), program.upper - program.lower, 1.0)
+    kink = np.where(program.weights > 0.0, np.abs(x), np.inf)
+    away = np.minimum(kink, np.minimum(x - program.lower, program.upper - x))
+    free = away > FREE * width
+    rows = np.vstack([program.G[active], program.A, -program.A])[:, free]
+    slope = -program.q[free] - program.weights[free] * np.sign(x[free])
+    try:
+        found, _ = nnls(rows.T, slope)
+    except RuntimeError:  # its iteration limit: these multipliers were an offer only
+        return y, mu
+    plain, count = np.zeros_like(y), active.size
+    plain[active] = found[:count]
+    return plain, found[count : count + mu.size] - found[count + mu.size :]

@@ -1,4 +1,15 @@
-"""Solve a finite program, believing nothing that was not checked here."""
+"""Solve a finite program, believing nothing that was not checked here.
+
+The walk of `solve_finite`, each step only where the ones before gave no answer that is believed:
+
+1. `_contradiction`: bounds that cross, rows without entries that ask for the impossible.
+2. `_cheap`: the optimum without rows, and Newton's method from a guess (`polish`); no solver is called.
+3. `_through`: the program in other variables, where that makes it easier (`change_of_variables`), solved by this walk.
+4. `_tried`: the program in the form that a solver takes (`standard_form`), form after form and accuracy after accuracy;
+   every claim is polished, measured (`duality.measure`) and judged. Where the solver says infeasible, or nothing is
+   believed, the elastic program is asked how far the rows must be relaxed: its multipliers may prove infeasibility.
+5. `_failed`: the best of what was not believed, and what was wrong with it.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +19,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sparserob_core.errors import PluginError
-from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
-from sparserob_core.sip.inner.change_of_variables import from_new_variables, in_new_variables
-from sparserob_core.sip.inner.duality import farkas_margin, measure, minimisers
-from sparserob_core.sip.inner.elastic import elastic_program, unrelaxed
-from sparserob_core.sip.inner.proximal import polish
-from sparserob_core.sip.inner.repair import diagonal
+from sparserob_core.sip.finite import FiniteProgram, FiniteSolution, diagonal
+from sparserob_core.sip.inner.change_of_variables import NewVariables, in_new_variables
+from sparserob_core.sip.inner.duality import farkas_margin, measure, minimisers, vertex_multipliers
+from sparserob_core.sip.inner.polish import polish
 from sparserob_core.sip.inner.standard_form import Form, Recovered, standard_form
-from sparserob_core.sip.inner.vertex import vertex_multipliers
 from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
 
 # The accuracy that a solver is asked for, in multiples of the tolerance, in each form, until it is believed.
@@ -95,15 +103,15 @@ def _tried(case: _Case) -> FiniteSolution:
     return _failed(case)
 
 
-def _through(case: _Case, easier: FiniteProgram, guess: FiniteSolution | None) -> FiniteSolution | None:
-    """The answer found in the coordinates of the image, checked in those of the program."""
+def _through(case: _Case, easier: NewVariables, guess: FiniteSolution | None) -> FiniteSolution | None:
+    """The answer found in easier variables, checked in those of the program."""
     program = case.program
-    start = guess if guess is None or guess.x.size != program.n else replace(guess, x=program.image(guess.x))
-    found = solve_finite(easier, case.solver, tolerance=case.tolerance, guess=start)
-    x = from_new_variables(program, found.x)
+    start = guess if guess is None or guess.x.size != program.n else replace(guess, x=easier.to(guess.x))
+    found = solve_finite(easier.program, case.solver, tolerance=case.tolerance, guess=start)
+    x = easier.back(found.x)
     if found.status == "infeasible":
-        return _proof(case, (x, found.y, found.mu, None), "the program in the coordinates of its image")
-    return case.judge(measure(program, x, found.y, found.mu, found.z, found.message), "new variables")
+        return _proof(case, (x, found.y, found.mu, None), "the program in other variables")
+    return case.judge(measure(program, x, found.y, found.mu, easier.dual(found.z), found.message), "new variables")
 
 
 def cost_scale(program: FiniteProgram, value: float) -> float:
@@ -197,6 +205,44 @@ def _proof(case: _Case, answer: Recovered | None, source: str) -> FiniteSolution
     return replace(measured, status="infeasible", message=message, attempts=tuple(case.attempts), infeasibility=bound)
 
 
+def elastic_program(program: FiniteProgram) -> FiniteProgram:
+    """minimise ``t >= 0`` subject to the bounds, ``G_i x <= h_i + t |G_i|`` and ``|A_i x - b_i| <= t |A_i|``.
+
+    Its decision is ``(x, t)``; its rows are those of ``G``, then ``A x - b <= t |A|``, then ``b - A x <= t |A|``. It is
+    always feasible (when the bounds are), and a positive value proves the program infeasible.
+    """
+    images = program.weights.size
+    rows = np.vstack([program.G, program.A, -program.A])
+    rows = np.hstack([rows, -np.linalg.norm(rows, axis=1)[:, None]])
+    S = None
+    if program.S is not None:
+        from scipy.sparse import block_diag
+
+        S = block_diag([program.S, [[1.0]]], format="csc")
+    q = np.zeros(program.n + 1)
+    q[-1] = 1.0
+    return FiniteProgram(
+        q,
+        np.zeros(images + 1),
+        np.append(program.lower, 0.0),
+        np.append(program.upper, np.inf),
+        rows,
+        np.concatenate([program.h, program.b, -program.b]),
+        np.zeros((0, program.n + 1)),
+        np.zeros(0),
+        S=S,
+    )
+
+
+def unrelaxed(program: FiniteProgram, answer: Recovered) -> Recovered:
+    """An answer to the elastic program in terms of ``program``: its ``x``, and multipliers that may prove
+    infeasibility."""
+    x, multipliers, _, z = answer
+    r, e = program.h.size, program.b.size
+    y = np.maximum(multipliers, 0.0)
+    return x[:-1], y[:r], y[r : r + e] - y[r + e :], None if z is None else z[:-1]
+
+
 def _contradiction(program: FiniteProgram, tolerance: float) -> FiniteSolution | None:
     """Bounds that cross, and rows without entries that ask for the impossible."""
     y, mu, x = np.zeros(program.h.size), np.zeros(program.b.size), np.zeros(program.n)
@@ -222,13 +268,17 @@ def _contradiction(program: FiniteProgram, tolerance: float) -> FiniteSolution |
 
 
 def _failed(case: _Case) -> FiniteSolution:
-    program = case.program
-    best = case.best
+    program, best = case.program, case.best
     if best is None:
         best = measure(program, np.zeros(program.n), np.zeros(program.h.size), np.zeros(program.b.size))
-    return replace(
-        best, status="failed", message="no attempt gave an answer that could be checked", attempts=tuple(case.attempts)
-    )
+        found = "; ".join(dict.fromkeys(case.attempts)) or "the solver gave no answer"
+    else:
+        bound = "has no lower bound" if best.gap == np.inf else f"is {best.gap:.1e} above its lower bound"
+        found = (
+            f"of {len(case.attempts)} answers none holds: the best misses its rows by {best.residual:.1e} and {bound}"
+        )
+    advice = "try another solver, or state the problem in units in which its numbers are of one size"
+    return replace(best, status="failed", message=f"{found}; {advice}", attempts=tuple(case.attempts))
 
 
 def _badness(solution: FiniteSolution) -> float:

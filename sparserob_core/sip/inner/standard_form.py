@@ -10,9 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.finite import FiniteProgram
+from sparserob_core.sip.finite import FiniteProgram, diagonal
 from sparserob_core.sip.inner.image import Memory
-from sparserob_core.sip.inner.repair import diagonal
 from sparserob_core.sip.solver import Claim, QuadraticProgram
 
 if TYPE_CHECKING:

@@ -11,10 +11,9 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Cut, Dual
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
-from sparserob_core.sip.inner.duality import dual_bound
+from sparserob_core.sip.inner.duality import dual_bound, vertex_multipliers
 from sparserob_core.sip.inner.image import onto_stationary
 from sparserob_core.sip.inner.solve import solve_finite
-from sparserob_core.sip.inner.vertex import vertex_multipliers
 from sparserob_core.sip.method import Deadline
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.regulariser import ControlImage, Regulariser
