@@ -105,6 +105,28 @@ def test_a_folder_holds_a_dozen_modules_at_most_and_says_what_it_is() -> None:
     assert not [relative(one) for one in silent]
 
 
+def drawn_in(picture: str) -> set[str]:
+    """The paths in the core that a picture shows by indentation, two columns a level."""
+    drawn, above = set(), list[str]()
+    for indent, names in re.findall(r"^( +)(\w[\w./]*(?:, \w[\w.]*)*)", picture, re.MULTILINE):
+        above = above[: len(indent) // 2]
+        drawn |= {"/".join([*above, name.rstrip("/")]) for name in names.split(", ")}
+        above.append(names.rstrip("/"))
+    return drawn
+
+
+def test_the_picture_of_the_house_shows_every_folder_and_every_path_on_its_page_exists() -> None:
+    page, core = ROOT / "docs/architecture.md", ROOT / "sparserob_core"
+    before, picture, after = page.read_text().split("```", maxsplit=2)
+    drawn = drawn_in(picture.partition("\n sparserob_core ")[2].partition("\n")[2])
+    folders = {str(path.parent.relative_to(core)) for path in CORE if path.name == "__init__.py"} - {"."}
+    assert not folders - drawn, "these folders are missing in the picture"
+    assert not [one for one in drawn if not (core / one).exists()], "these are in the picture only"
+    named = set(re.findall(r"`([\w./]+/[\w./]*)`", before + after))
+    assert len(named) > A_DOZEN
+    assert not [one for one in named if not (ROOT / one).exists() and not (core / one).exists()]
+
+
 def test_no_import_goes_round_in_a_circle_between_modules_or_folders() -> None:
     graph = import_graph()
     assert not circle(graph)
