@@ -34,6 +34,8 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
     """
     if not isinstance(experiment, ControlExperiment) or result.status == "failed":
         return None
+    if result.decision is None and result.status != "infeasible":
+        return None  # it was stopped before there was anything to claim
     problem, program = experiment.problem, experiment.program
     theta = (
         None
