@@ -17,6 +17,7 @@ from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.events import Event, ignore
 from sparserob_core.sip.maximiser import Maximiser, Report
 from sparserob_core.sip.method import GAP_TOLERANCE, Continuation, Deadline, Method, Tools, as_seconds
+from sparserob_core.sip.methods.own_units import solve_in_own_units
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.regulariser import Regulariser
 from sparserob_core.sip.result import Result
@@ -75,7 +76,7 @@ def solve(
         deadline=deadline,
     )
     chosen: Method = component(registry, "method", _with_tolerance(registry, method, tolerance), Method)
-    return chosen.solve(program, tools)
+    return solve_in_own_units(chosen, program, tools)
 
 
 def maximise(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias, final
 
@@ -23,19 +23,23 @@ Formulation: TypeAlias = Literal["reduced", "nominal", "literal", "sampled"]
 ``nominal``: nothing of the uncertainty; ``literal``: all of it; ``sampled``: the number of a sample."""
 
 
+TOLERANCE = 1e-9  # of a row's own unit: a violation of at most this counts as none (docs/decisions/0016)
+
+
 @dataclass(frozen=True, eq=False)
 class Separation:
     """The most violated constraints of one family at a decision, worst first.
 
     ``indices (k, d)``, ``rows (k,)`` the row of the family at that index, ``violations (k,)`` (``rows x - rhs``,
     negative when satisfied), and ``bound``: a proven upper bound on the family's violation over its whole index set,
-    ``inf`` if none is known.
+    ``inf`` if none is known. ``formulation`` is that of the indices.
     """
 
     indices: Array
     rows: Array
     violations: Array
     bound: float = np.inf
+    formulation: Formulation = "reduced"
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,9 +128,9 @@ class ConstraintFamily:
         family, the way back;
     ``formulation``   what its indices say (`Formulation`); a cut says it too, so that its index can be understood;
     ``source``        what the family was made of: never looked at here, handed back to whoever made it;
-    ``scale``         the size of the numbers that the constraint compares; where it is tiny, a violation is judged
-        relative to it;
     ``hindrance(lower (d,), upper (d,))``  what keeps the enclosure of a cell wide, and what would help, in words;
+    ``row_units (r,)``, ``index_units (d,)``  what a violation of 1 and each coordinate of an index are in the user's
+        units, for a family in units of its own (`OwnUnits`);
     ``explain(index (d,), row)``  one constraint for people (an `Explanation`).
     """
 
@@ -143,7 +147,8 @@ class ConstraintFamily:
     reduced: ConstraintFamily | None = None
     explain: Callable[[Array, int], Explanation] | None = None
     hindrance: Callable[[Array, Array], str] | None = None
-    scale: float = 1.0
+    row_units: Array | None = None
+    index_units: Array | None = None
     formulation: Formulation = "reduced"
     source: object = None
 
@@ -157,16 +162,15 @@ class ConstraintFamily:
         forms = {"reduced": self.reduced, "nominal": self.nominal, "literal": self.literal}
         return forms.get(formulation)
 
-    def tolerance(self, level: float) -> float:
-        """``level``, or less where the numbers of this constraint are below a thousandth: a millionth of them, at the
-        level 1e-9."""
-        return level * min(1.0, 1e3 * self.scale)
-
     def explanation(self, index: Array, row: int) -> Explanation:
         """One constraint for people, by its number and index where the family does not explain itself."""
         if self.explain is not None:
             return self.explain(index, row)
         return Unexplained(f"row {row} of {self.name} at {np.array2string(index, precision=6)}")
+
+    def row_unit(self, row: int) -> float:
+        """What a violation of 1 of a row is in the user's units."""
+        return 1.0 if self.row_units is None else float(self.row_units[row])
 
     def violations(self, x: Array, indices: Array) -> Array:
         """``rows(xi) x - rhs(xi)`` at indices ``(k, d)``, as ``(k, r)``; positive where violated."""
@@ -181,7 +185,7 @@ class SemiInfiniteProgram:
 
     ``n`` is the number of decision variables; ``S (k, n)`` is the identity when ``None``; ``lower``, ``upper`` and
     ``weights`` are numbers or ``(k,)``. ``lengths``: how much each entry of ``S x`` counts in a weighted regulariser
-    (piece lengths), ``(k,)``.
+    (piece lengths), ``(k,)``. ``twin`` makes the same program in its own units (`own_units`).
     """
 
     n: int
@@ -198,6 +202,7 @@ class SemiInfiniteProgram:
     b: Array | None = None
     channels: int = 1
     lengths: Array | None = None
+    twin: Callable[[], OwnUnits] | None = field(default=None, repr=False)
     finite: FiniteProgram = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -235,6 +240,29 @@ class SemiInfiniteProgram:
         return rows, _vector(right, bounds, rows.shape[0])
 
     @property
+    def own_units(self) -> OwnUnits | None:
+        """The same program in its own units; ``None`` for one that has none, or that was changed since."""
+        own = None if self.twin is None else self.twin()
+        return own if own is not None and own.of == self._parts else None
+
+    @property
+    def _parts(self) -> tuple[int, ...]:
+        """What the program is made of, by identity."""
+        numbers = (self.q, self.P, self.weights, self.S, self.lower, self.upper, self.G, self.h, self.A, self.b)
+        return tuple(id(part) for part in (*numbers, *self.families))
+
+    def mirrored(self, twin: Callable[[SemiInfiniteProgram], OwnUnits]) -> SemiInfiniteProgram:
+        """This program with a twin in its own units, which is made when it is first asked for."""
+        made: list[OwnUnits] = []
+
+        def once() -> OwnUnits:
+            if not made:
+                made.append(replace(twin(self), of=self._parts))
+            return made[0]
+
+        return replace(self, twin=once)
+
+    @property
     def image_size(self) -> int:
         """Entries of ``S x`` that the regulariser is about: those with a length, or all of them."""
         return self.finite.weights.size if self.lengths is None else int(np.size(self.lengths))
@@ -269,6 +297,20 @@ class SemiInfiniteProgram:
     def cost(self, x: Array) -> float:
         """``J(x)``, recomputed from the data."""
         return self.finite.objective(x)
+
+
+@dataclass(frozen=True, eq=False)
+class OwnUnits:
+    """``program``: a program in its own units, every factor a power of two; ``decision (n,)``, ``image (k,)``,
+    ``equalities (e,)``, ``cost``: what one of each is in the user's. Its families know their own
+    (`ConstraintFamily.row_units`). ``of``: what the program was made of that it stands for."""
+
+    program: SemiInfiniteProgram
+    decision: Array
+    image: Array
+    equalities: Array
+    cost: float
+    of: tuple[int, ...] = ()
 
 
 def _vector(name: str, value: object, size: int) -> Array:

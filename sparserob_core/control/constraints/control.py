@@ -51,14 +51,14 @@ class ControlConstraint:
         every piece."""
         z = np.asarray(indices, dtype=float)[:, 1:]
         control = self.dictionary.control(x)[:, self._piece(indices[:, 0])].T
-        turned = across(z, (control - self.set.support_point(unit(self.set, z))) @ self.set.normals.T)
+        turned = across(self.set, z, (control - self.set.support_point(unit(self.set, z))) @ self.set.frame.T)
         return np.hstack([np.zeros((z.shape[0], 1)), turned])
 
     def worst(self, x: Array) -> Separation:
         """The pieces furthest outside, each with its worst direction; the bound is exact, since the pieces are finitely
         many."""
         control = self.dictionary.control(x).T
-        outside = self.set.violation(control)
+        outside = self.set.gauge(control) - 1.0
         pieces = np.argsort(-outside, kind="stable")[:CLIMBED]
         z = sampled(self.set.dimension)
         c = unit(self.set, z)

@@ -19,7 +19,7 @@ from sparserob_core.control.response.enclosure import CELLS_KEPT, CellEnclosure,
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.parameters import ParameterIndex
-from sparserob_core.control.sets.directions import across, faces, on_surface, sampled, unit
+from sparserob_core.control.sets.directions import across, faces, on_surface, sampled, shares, unit
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.program import Enclosure, Explanation, Separation
 
@@ -30,11 +30,12 @@ KEPT = 8  # separated constraints per round
 @final
 @dataclass(frozen=True, eq=False)
 class CurvedConstraint(StateConstraint):
-    """``x(t)`` in a curved set for all ``t`` in ``[start, stop]``, ``p`` and ``w``: ``c'x(t) <= h(c)`` for every unit
-    direction ``c``.
+    """``x(t)`` in a curved set for all ``t`` in ``[start, stop]``, ``p`` and ``w``: ``c'x(t) <= h(c)`` for every
+    direction ``c``, normalised such that ``h(c) - c'm = unit`` for the middle ``m`` of the set: what is exceeded is the
+    gauge of ``x(t)`` less 1, in multiples of ``unit``.
 
-    The index is ``(t, p, z)`` with ``z`` in ``[-1, 1]^b`` a direction, not normalised, in the span where the support
-    function ``h`` is finite.
+    The index is ``(t, p, z)`` with ``z`` in ``[-1, 1]^b`` a direction, not normalised, in the coordinates of the set's
+    `ConvexSet.frame`.
     """
 
     name: str
@@ -43,6 +44,7 @@ class CurvedConstraint(StateConstraint):
     start: float
     stop: float
     parameters: ParameterIndex
+    unit: float = 1.0
     shared: CurvedConstraint | None = field(default=None, repr=False)
 
     @property
@@ -50,17 +52,20 @@ class CurvedConstraint(StateConstraint):
         """None: the set is curved."""
 
     @property
+    def shape(self) -> ConvexSet:
+        return self.set
+
+    @property
     def index_set(self) -> Box:
         box, cube = self._flat.index_set, np.ones(self._b)
         return Box(np.concatenate([box.lower, -cube]), np.concatenate([box.upper, cube]))
 
-    @property
-    def scale(self) -> float:
-        return self._flat.scale
+    def divided(self, units: Array) -> CurvedConstraint:
+        return replace(self, unit=float(units[0]), shared=None)
 
     def functionals_at(self, indices: Array) -> tuple[Array, Array, Array, Array]:
         nu = self.parameters.count
-        directions = unit(self.set, indices[:, 1 + nu :])
+        directions = unit(self.set, indices[:, 1 + nu :]) / self.unit
         return indices[:, 0], directions, self.parameters.clamp(indices[:, 1 : 1 + nu]), self.set.support(directions)
 
     def violations(self, x: Array, indices: Array, rows: np.ndarray) -> Array:
@@ -108,11 +113,23 @@ class CurvedConstraint(StateConstraint):
         )
 
     def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
-        """Proven upper bounds of the violation (in the length of the cube's directions, at least 1) on cells
-        ``(k, 1 + nu + b)``."""
+        """Proven upper bounds of the violation on cells ``(k, 1 + nu + b)``; where nothing is violated, in the length
+        of the cube's directions."""
         nu = self.parameters.count
         touched = self.parameters.touches(lower[:, 1 : 1 + nu], upper[:, 1 : 1 + nu])
-        return enclose(lower, upper, touched, nu, lambda low, high: self._cell(x, low, high))
+        found = enclose(lower, upper, touched, nu, lambda low, high: self._cell(x, low, high))
+        with np.errstate(divide="ignore"):
+            rooms = np.maximum(self._rooms(lower[:, 1 + nu :], upper[:, 1 + nu :]), 0.0)
+            return replace(found, bounds=np.where(found.bounds > 0.0, found.bounds / rooms, found.bounds))
+
+    def _rooms(self, low: Array, high: Array) -> Array:
+        """Lower bounds ``(k,)`` of ``h(c) - c'm`` for the directions of cells: a point ``p`` of the set far out in the
+        middle direction gives at least ``c'(p - m)``."""
+        frame = self.set.frame
+        centre, radius = (low + high) / 2, (high - low) / 2
+        outwards = (self.set.support_point(centre @ frame) - self.set.interior_point()) @ frame.T
+        answer: Array = (centre * outwards).sum(axis=1) - (radius * np.abs(outwards)).sum(axis=1)
+        return answer
 
     def explain(self, index: Array, row: int) -> Explanation:
         times, directions, parameters, rhs = self.functionals_at(index[None])
@@ -122,32 +139,22 @@ class CurvedConstraint(StateConstraint):
 
     def nominal(self) -> CurvedConstraint:
         known = self.functionals.nominal()
-        return CurvedConstraint(self.name, known, self.set, self.start, self.stop, ParameterIndex(None))
+        return replace(self, functionals=known, parameters=ParameterIndex(None), shared=None)
 
     def from_state(self, initial_state: Array) -> CurvedConstraint:
         moved = self.functionals.from_state(initial_state)
-        return CurvedConstraint(
-            self.name, moved, self.set, self.start, self.stop, self.parameters, self._sharing or self
-        )
+        return replace(self, functionals=moved, shared=self._sharing or self)
 
     def directions(self, z: Array, rows: np.ndarray) -> tuple[Array, Array]:
-        normals = self.set.normals
-        return np.broadcast_to(normals, (rows.size, *normals.shape)), unit(self.set, z) @ normals.T
+        frame = self.set.frame / self.unit
+        return np.broadcast_to(frame, (rows.size, *frame.shape)), shares(self.set, z)
 
     def turned(self, z: Array, directions: Array, states: Array) -> Array:
-        return across(z, states - self.set.support_point(directions) @ self.set.normals.T)
+        return across(self.set, z, states - self.set.support_point(directions) @ self.set.frame.T / self.unit)
 
     def outwardness(self, states: Array) -> Array:
         sizes = self.set.gauge(states.T) - 1.0
         return sizes if np.isfinite(sizes).all() else self.set.violation(states.T)
-
-    def excess(self, states: Array) -> Array:
-        """The distance to the set outside, and inside the largest ``c'x - h(c)`` over sampled unit directions, which
-        never understates a margin."""
-        directions, points = unit(self.set, sampled(self._b)), states.T
-        tangent = (points @ directions.T - self.set.support(directions)).max(axis=1)
-        outside = self.set.violation(points)
-        return np.asarray(np.where(outside > 0.0, np.maximum(outside, tangent), tangent))
 
     def _cell(self, x: Array, low: Array, high: Array) -> CellEnclosure:
         key = x.tobytes() + low.tobytes() + high.tobytes()
@@ -155,7 +162,7 @@ class CurvedConstraint(StateConstraint):
             nu = self.parameters.count
             centre, radius = (low + high)[nu:] / 2, (high - low)[nu:] / 2
             free = np.flatnonzero(radius > 0)
-            H = np.vstack([centre, np.diag(radius)[free]]) @ self.set.normals
+            H = np.vstack([centre, np.diag(radius)[free]]) @ self.set.frame / self.unit
             lifted = self._flat.lifted(low[:nu], high[:nu])
             joined = self._combination(lifted, free.size)
             sigma = self.functionals.disturbance_support(lifted, H, joined)
@@ -222,7 +229,7 @@ class CurvedConstraint(StateConstraint):
         """The half-spaces of the sampled directions: an outer polytope of the set, on which the search starts."""
         if self._sharing is not None:
             return self._sharing._flat.from_state(self.functionals.response.initial_state)
-        H = unit(self.set, sampled(self._b))
+        H = unit(self.set, sampled(self._b)) / self.unit
         return FlatConstraint(
             self.name, self.functionals, H, self.set.support(H), self.start, self.stop, self.parameters
         )

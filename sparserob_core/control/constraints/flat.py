@@ -3,7 +3,7 @@ and disturbances."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import final
 
@@ -145,10 +145,8 @@ class FlatConstraint(StateConstraint):
         box = self.parameters.box
         return Box(np.concatenate([[self.start], box.lower]), np.concatenate([[self.stop], box.upper]))
 
-    @property
-    def scale(self) -> float:
-        """The largest bound, or what the initial state gives."""
-        return float(max(np.abs(self.h).max(), np.abs(self.H @ self.functionals.response.initial_state).max())) or 1.0
+    def divided(self, units: Array) -> FlatConstraint:
+        return replace(self, H=self.H / units[:, None], h=self.h / units, shared=None)
 
     def functionals_at(self, indices: Array) -> tuple[Array, Array, Array, Array]:
         parameters = np.repeat(self.parameters.clamp(indices[:, 1:]), self.h.size, axis=0)

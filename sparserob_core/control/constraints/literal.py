@@ -43,7 +43,6 @@ class LiteralConstraint:
             gradient=self.gradient,
             reduced=reduced,
             explain=self.explain,
-            scale=self.base.scale,
             formulation="literal",
             source=self.base,
         )

@@ -41,7 +41,6 @@ class ScenarioConstraint:
             index_set=index_set,
             rows=self.rows,
             worst=self.worst,
-            scale=self.base.scale,
             formulation="sampled",
             source=self.base,
         )

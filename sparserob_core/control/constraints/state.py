@@ -8,7 +8,7 @@ import numpy as np
 
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
-from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.program import Enclosure, Explanation, Separation
 
 
@@ -33,13 +33,13 @@ class StateConstraint(ABC):
 
     @property
     @abstractmethod
-    def scale(self) -> float:
-        """The size of the states that the constraint is about."""
-
-    @property
-    @abstractmethod
     def sides(self) -> tuple[Array, Array] | None:
         """``H (r, d)``, ``h (r,)`` of a set with flat sides; ``None`` for a curved set."""
+
+    @property
+    def shape(self) -> ConvexSet | None:
+        """The set, where it is curved; its `ConvexSet.frame` says what a direction ``z`` is."""
+        return None
 
     @abstractmethod
     def functionals_at(self, indices: Array) -> tuple[Array, Array, Array, Array]:
@@ -75,6 +75,10 @@ class StateConstraint(ABC):
     @abstractmethod
     def from_state(self, initial_state: Array) -> StateConstraint:
         """The same constraint from another initial state ``(d,)``; what does not depend on it is shared."""
+
+    @abstractmethod
+    def divided(self, units: Array) -> StateConstraint:
+        """The same constraint with its rows divided by ``units (r,)``, one for a curved set."""
 
     @abstractmethod
     def directions(self, z: Array, rows: np.ndarray) -> tuple[Array, Array]:

@@ -11,21 +11,34 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 PER_EDGE = {1: 1, 2: 33, 3: 13, 4: 7}  # sampled directions along an edge of the cube, by dimension; 3 beyond
 
 
+def shares(convex_set: ConvexSet, z: Array) -> Array:
+    """Cube points ``(k, b)`` divided by how far the set reaches from its middle ``m`` along ``c = z N``:
+    ``h(c) - c'm``. By its length where the set has no extent; 0 stays 0."""
+    directions = z @ convex_set.frame
+    return np.asarray(z / _rooms(convex_set, directions)[:, None])
+
+
 def unit(convex_set: ConvexSet, z: Array) -> Array:
-    """Unit directions ``(k, d)`` of cube points ``(k, b)``, in the span in which the support function is finite; 0
-    stays 0."""
-    directions = z @ convex_set.normals
-    norms = np.linalg.norm(directions, axis=1, keepdims=True)
-    return np.asarray(directions / np.where(norms > 0, norms, 1.0))
+    """Directions ``(k, d)`` of cube points ``(k, b)``, in the span in which the support function is finite, such that
+    ``h(c) - c'm = 1``: what ``c'x`` exceeds ``h(c)`` by is then the gauge about the middle ``m`` less 1; 0 stays 0."""
+    return np.asarray(shares(convex_set, z) @ convex_set.frame)
 
 
-def across(z: Array, slopes: Array) -> Array:
-    """Derivatives ``(k, b)`` in cube points, from derivatives ``slopes (k, b)`` in the coordinates of their unit
-    directions; 0 at the point 0."""
-    lengths = np.linalg.norm(z, axis=1, keepdims=True)
-    shares = z / np.where(lengths > 0, lengths, 1.0)
-    sideways = slopes - (slopes * shares).sum(axis=1, keepdims=True) * shares
-    return np.asarray(np.where(lengths > 0, sideways / np.where(lengths > 0, lengths, 1.0), 0.0))
+def across(convex_set: ConvexSet, z: Array, slopes: Array) -> Array:
+    """Derivatives ``(k, b)`` in cube points, from derivatives ``slopes (k, b)`` in their `shares`; 0 at the point 0."""
+    directions = z @ convex_set.frame
+    rooms, sizes = _rooms(convex_set, directions), np.linalg.norm(directions, axis=1, keepdims=True)
+    outwards = convex_set.support_point(directions) - convex_set.interior_point()
+    flat = (outwards * directions).sum(axis=1, keepdims=True) <= 0.0
+    outwards = np.where(flat, directions / np.where(sizes > 0, sizes, 1.0), outwards) @ convex_set.frame.T
+    along = (z / rooms[:, None] * slopes).sum(axis=1, keepdims=True)
+    return np.asarray(np.where(sizes > 0, (slopes - along * outwards) / rooms[:, None], 0.0))
+
+
+def _rooms(convex_set: ConvexSet, directions: Array) -> Array:
+    rooms = convex_set.support(directions) - directions @ convex_set.interior_point()
+    sizes = np.linalg.norm(directions, axis=1)
+    return np.asarray(np.where(rooms > 0, rooms, np.where(sizes > 0, sizes, 1.0)))
 
 
 def on_surface(z: Array) -> Array:

@@ -21,8 +21,14 @@ from sparserob_core.control.transcription.transcribe import from_state
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Cut
-from sparserob_core.sip.program import ConstraintFamily, Enclosure, Explanation, SemiInfiniteProgram, Separation
-from sparserob_core.sip.proof.branch_and_bound import TOLERANCE
+from sparserob_core.sip.program import (
+    TOLERANCE,
+    ConstraintFamily,
+    Enclosure,
+    Explanation,
+    SemiInfiniteProgram,
+    Separation,
+)
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
@@ -169,7 +175,6 @@ class _Joined:
             cells=self.base.cells,
             enclosure=self.enclosure if offers else None,
             explain=self.explain,
-            scale=self.base.scale,
             source=self.base.source,
         )
 

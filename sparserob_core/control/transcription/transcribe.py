@@ -18,20 +18,31 @@ from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.response.disturbance import DisturbanceModel, disturbance_model
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.response import SAME_TIME, Response, merge_grids
 from sparserob_core.control.sets.sets import Equality
+from sparserob_core.control.transcription.own_units import (
+    RESOLVED,
+    extent,
+    own_units,
+    reaches,
+    rough_units,
+    row_units,
+    units_of_sides,
+)
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.sip.convex_set import Array, ConvexSet
-from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
+from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, Formulation, OwnUnits, SemiInfiniteProgram
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
-SAME = 1e-11  # relative to the largest entry of a row, a difference that is rounding
+SAME = 1e-11  # of the numbers that are added up, a difference that is rounding
+IDLE = 1e-15  # of the numbers that are added up, an entry of a row that is rounding
 
 
 def transcribe(
@@ -70,15 +81,36 @@ def prepare(
                 f"{name} dictionary: a piece is {dictionary.lengths.min():.2g} long, "
                 f"which is rounding for a horizon of {problem.horizon:g}"
             )
+    model = _assembled(problem, control, disturbance, formulation)
+    return replace(model, program=model.program.mirrored(lambda _: _in_own_units(model)))
+
+
+def _functionals(
+    problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary
+) -> tuple[WorstCase, ParameterIndex]:
     grid = merge_grids(control.breakpoints, disturbance.breakpoints)
     model: DisturbanceModel | None = None
     if problem.disturbance is not None:
         model = disturbance_model(problem.disturbance_class, problem.disturbance, disturbance, grid)
     response = Response(problem.system, grid, np.asarray(problem.initial_state, dtype=float))
-    functionals, parameters = WorstCase(response, control, model), ParameterIndex(problem.system.parameters)
+    return WorstCase(response, control, model), ParameterIndex(problem.system.parameters)
+
+
+def _assembled(
+    problem: OptimalControlProblem,
+    control: Dictionary,
+    disturbance: Dictionary,
+    formulation: Formulation,
+    own: bool = False,
+) -> Transcription:
+    """The program in the units of the problem; every row divided by its ``own`` unit where that is asked for."""
+    functionals, parameters = _functionals(problem, control, disturbance)
     constraints = _state_constraints(problem, functionals, parameters)
-    S, lower, upper, weights = _image(problem, control)
+    S, lower, upper, weights = _image(problem, control, own)
     A, b = _equalities(problem, functionals, parameters)
+    if own:
+        A, b, _ = _own_equalities(problem, functionals, A, b)
+        constraints = tuple(one.divided(row_units(one, problem.control)) for one in constraints)
     families = [family_of(constraint) for constraint in constraints]
     if problem.control.halfspaces() is None:
         families.append(ControlConstraint(problem.control, control).family())
@@ -97,6 +129,100 @@ def prepare(
         lengths=np.tile(control.lengths, problem.system.controls),
     )
     return Transcription(problem, control, disturbance, functionals, parameters, constraints, program, formulation)
+
+
+def _in_own_units(model: Transcription) -> OwnUnits:
+    """The program of the same problem in its own units (decision 0016)."""
+    problem, rough = model.problem, rough_units(model.problem)
+    dictionaries = (model.control, model.disturbance)
+    known, _ = _functionals(rough.of_problem(problem), *(rough.of_dictionary(one) for one in dictionaries))
+    units = own_units(problem, rough, known)
+    control, disturbance = (units.of_dictionary(one) for one in dictionaries)
+    own = _assembled(units.of_problem(problem), control, disturbance, model.formulation, own=True)
+    families = [
+        _told_by(family, theirs, row, units, own)
+        for family, theirs, row in zip(
+            own.program.families, model.program.families, _rows_in_users(model, own, units), strict=True
+        )
+    ]
+    fixed = _own_equalities(own.problem, own.functionals, *_equalities(own.problem, own.functionals, own.parameters))
+    sides = [units.controls, _ratio(slanted(problem.control)[0], _sides_of_controls(own.problem)[0], units.controls)]
+    return OwnUnits(
+        program=replace(own.program, families=families),
+        decision=np.repeat(units.controls, control.functions),
+        image=np.repeat(np.concatenate(sides), control.pieces),
+        equalities=_fixed(problem) @ units.states * fixed[2],
+        cost=units.cost,
+    )
+
+
+def _rows_in_users(model: Transcription, own: Transcription, units: Units) -> list[Array]:
+    """What a violation of 1 of every row of every family of the program in own units is in the user's: the same index,
+    whose directions are the same, gives the same rows but for their factors."""
+    found = []
+    for theirs, ours in zip(model.constraints, own.constraints, strict=True):
+        rows = [one.functionals_at(one.index_set.lower[None])[1] for one in (theirs, ours)]
+        found.append(_ratio(rows[0], rows[1], units.states))
+    return found + [np.ones(1)] * (len(own.program.families) - len(found))
+
+
+def _ratio(theirs: Array, ours: Array, units: Array) -> Array:
+    """The powers of two ``(r,)`` that rows ``theirs (r, d)`` are of ``ours``, in coordinates with ``units (d,)``."""
+    largest = np.abs(ours).argmax(axis=1)[:, None]
+    shares = np.take_along_axis(theirs * units, largest, axis=1) / np.take_along_axis(ours, largest, axis=1)
+    return np.asarray(np.exp2(np.rint(np.log2(shares[:, 0]))))
+
+
+def _told_by(
+    family: ConstraintFamily, theirs: ConstraintFamily, rows: Array, units: Units, own: Transcription
+) -> ConstraintFamily:
+    """A family in own units, in all its forms, that is explained as the user's is."""
+    uncertain, model = own.constraint(family) is not None, own.functionals.disturbance
+    parameters = units.parameters if uncertain else np.zeros(0)
+    blocks = np.zeros(0) if model is None or not uncertain else _block_units(model, units)
+    of_index = {
+        "reduced": np.concatenate([[units.time], parameters]),
+        "nominal": np.array([units.time]),
+        "literal": np.concatenate([[units.time], blocks, parameters]),
+        "sampled": np.array([units.time, 1.0]),
+    }
+
+    def told(one: ConstraintFamily, other: ConstraintFamily) -> ConstraintFamily:
+        known = of_index[one.formulation]
+        scale = np.append(known, np.ones(one.index_set.dimension - known.size))  # directions are the same
+        said, hindered = other.explain, other.hindrance
+        return replace(
+            one,
+            explain=None if said is None else (lambda index, row: said(index * scale, row)),
+            hindrance=None if hindered is None else (lambda low, high: hindered(low * scale, high * scale)),
+            row_units=rows,
+            index_units=scale,
+        )
+
+    draw = family.sample
+
+    def sample(count: int, rng: np.random.Generator) -> ConstraintFamily:
+        assert draw is not None
+        found = draw(count, rng)
+        return told(found, found if found.formulation == "sampled" else theirs)
+
+    def form(one: ConstraintFamily | None, other: ConstraintFamily | None) -> ConstraintFamily | None:
+        return None if one is None or other is None else told(one, other)
+
+    return replace(
+        told(family, theirs),
+        nominal=form(family.nominal, theirs.nominal),
+        literal=form(family.literal, theirs.literal),
+        reduced=form(family.reduced, theirs.reduced),
+        sample=None if draw is None else sample,
+    )
+
+
+def _block_units(model: DisturbanceModel, units: Units) -> Array:
+    """What one of every coefficient of a disturbance's blocks is in the user's units."""
+    if model.scale is not None:
+        return np.ones(model.block_count * model.set.dimension)
+    return np.tile(np.repeat(units.disturbances, model.set.dimension // model.channels), model.block_count)
 
 
 def from_state(model: Transcription, initial_state: Array) -> Transcription:
@@ -143,7 +269,9 @@ def _name(kind: str, position: int, count: int) -> str:
     return f"{kind}[{position}]" if count > 1 else kind
 
 
-def _image(problem: OptimalControlProblem, dictionary: Dictionary) -> tuple[csc_array | None, Array, Array, Array]:
+def _image(
+    problem: OptimalControlProblem, dictionary: Dictionary, own: bool = False
+) -> tuple[csc_array | None, Array, Array, Array]:
     """The control on every piece, its bounds and weights, and one more image per piece and side of a polytope."""
     from scipy.sparse import csc_array, eye_array, kron, vstack
 
@@ -155,7 +283,7 @@ def _image(problem: OptimalControlProblem, dictionary: Dictionary) -> tuple[csc_
     )
     weights: Array = np.kron(np.asarray(problem.weights, dtype=float), dictionary.lengths)
     values = csc_array(dictionary.values.T)
-    H, h = slanted(bound)
+    H, h = _sides_of_controls(problem) if own else slanted(bound)
     if not h.size:
         return (
             (None if dictionary.is_indicators else csc_array(kron(eye_array(channels), values))),
@@ -173,6 +301,14 @@ def _image(problem: OptimalControlProblem, dictionary: Dictionary) -> tuple[csc_
     )
 
 
+def _sides_of_controls(problem: OptimalControlProblem) -> tuple[Array, Array]:
+    """The `slanted` sides of the controls, each divided by its own unit."""
+    H, h = slanted(problem.control)
+    size = np.abs(H) @ extent(problem.control)
+    units = units_of_sides(H, h, problem.control.reach(H), size) if h.size else h
+    return H / units[:, None], h / units
+
+
 def slanted(bound: ConvexSet) -> tuple[Array, Array]:
     """The sides ``(H (r, m), h (r,))`` of a set of controls that bound several of them together; none for a box or a
     curved set."""
@@ -188,25 +324,56 @@ def _equalities(
 ) -> tuple[Array, Array]:
     """Terminal equalities as rows; refused where the uncertainty reaches the state, since nothing could then satisfy
     them."""
-    horizon = problem.horizon
     A, b = [np.zeros((0, functionals.variables))], [np.zeros(0)]
     middle = np.zeros((1, 0)) if parameters.set is None else parameters.set.interior_point()[None]
-    for terminal in problem.terminal:
-        if not isinstance(terminal, Equality):
-            continue
-        for state in terminal.fixed:
-            time, up = np.array([horizon]), np.eye(terminal.dimension)[[state]]
-            G, offset = functionals.rows(time, up, middle)
-            sigma = functionals.offsets(time, up, middle) + functionals.offsets(time, -up, middle)
-            rounding = SAME * max(1.0, float(np.abs(G).max()), float(np.abs(offset).max()))
-            if sigma[0] > rounding or _reached(problem, parameters, int(state)):
-                raise InputError(
-                    f"terminal: equals: state {state + 1} depends on the uncertainty, so no control can fix its final"
-                    f" value to {terminal.values[state]:g}; expected a set with interior"
-                )
-            A.append(G)
-            b.append(np.array([terminal.values[state] - offset[0]]))
+    values = np.concatenate(
+        [np.zeros(0), *(end.values[end.fixed] for end in problem.terminal if isinstance(end, Equality))]
+    )
+    directions, added = _fixed(problem), _added_up(problem, functionals)
+    for up, value, size in zip(directions, values, added, strict=True):
+        time = np.array([problem.horizon])
+        G, offset = functionals.rows(time, up[None], middle)
+        sigma = functionals.offsets(time, up[None], middle) + functionals.offsets(time, -up[None], middle)
+        state = int(np.flatnonzero(up)[0])
+        if sigma[0] > SAME * size or _reached(problem, parameters, state):
+            raise InputError(
+                f"terminal: equals: state {state + 1} depends on the uncertainty, so no control can fix its final"
+                f" value to {value:g}; expected a set with interior"
+            )
+        A.append(G)
+        b.append(np.array([value - offset[0]]))
     return np.vstack(A), np.concatenate(b)
+
+
+def _fixed(problem: OptimalControlProblem) -> Array:
+    """The unit vectors ``(e, d)`` of the states that the terminal equalities fix, in the order of their rows."""
+    fixed = [state for end in problem.terminal if isinstance(end, Equality) for state in end.fixed]
+    directions: Array = np.eye(problem.system.states)[np.array(fixed, dtype=int)]
+    return directions
+
+
+def _added_up(problem: OptimalControlProblem, functionals: WorstCase) -> Array:
+    """The largest sums ``(e,)`` of absolute numbers from which the fixed states are computed."""
+    H, known = _fixed(problem), ParameterIndex(None)
+    if not H.size:
+        return np.zeros(0)
+    nominal = functionals if functionals.response.system.parameters is None else functionals.nominal()
+    _, added = reaches(nominal, known, problem.control, H, np.array([problem.horizon]))
+    return added
+
+
+def _own_equalities(
+    problem: OptimalControlProblem, functionals: WorstCase, A: Array, b: Array
+) -> tuple[Array, Array, Array]:
+    """Rows and right-hand sides in own units, and these ``(e,)``: equalities hold to rounding only.
+
+    Where no control enters a row, what is missing is compared with what double precision resolves.
+    """
+    added = _added_up(problem, functionals)
+    entered = np.abs(A).max(axis=1, initial=0.0) > IDLE * added
+    units = power_of_two(np.where(entered, 1.0, RESOLVED) * added)
+    A, b = np.where(entered[:, None], A, 0.0) / units[:, None], b / units
+    return A, np.asarray(np.where(entered | (np.abs(b) > TOLERANCE), b, 0.0)), units
 
 
 def _reached(problem: OptimalControlProblem, parameters: ParameterIndex, state: int) -> bool:
@@ -260,6 +427,5 @@ def _reduced(constraint: StateConstraint) -> ConstraintFamily:
         cells=constraint.cells,
         gradient=Sensitivity(constraint).gradient,
         explain=constraint.explain,
-        scale=constraint.scale,
         source=constraint,
     )

@@ -15,8 +15,7 @@ from sparserob_core.control.transcription.transcribe import slanted
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Proof
-from sparserob_core.sip.program import Formulation, SemiInfiniteProgram
-from sparserob_core.sip.proof.branch_and_bound import TOLERANCE
+from sparserob_core.sip.program import TOLERANCE, Formulation, SemiInfiniteProgram
 from sparserob_core.sip.result import Result
 
 FORMAT = 1
@@ -29,7 +28,8 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
 
     ``cost`` and ``lower_bound`` are as in ``result.json``. ``multipliers``: of constraints at a time, a parameter and a
     normal direction, of equalities, and of the control's pieces where the dictionary is not that of their indicators.
-    ``proof``: per constraint the cells ``[lower, upper]`` of (time, parameters, directions) on which it was shown.
+    ``proof``: per constraint the cells ``[lower, upper]`` of (time, parameters, directions) on which it was shown, to
+    ``tolerance`` in each row's own unit (decision 0016); a direction ``z`` of a curved set stands for ``z normals``.
     ``witness``: what refutes the decision.
     """
     if not isinstance(experiment, ControlExperiment) or result.status == "failed":
@@ -51,7 +51,7 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
         "gap_tolerance": experiment.gap_tolerance,
         "decision": theta,
         "multipliers": _multipliers(problem, program, result),
-        "proof": {proof.family: _cells(program, proof) for proof in result.proofs if proof.verdict == "proven"},
+        "proof": {proof.family: _cells(experiment, proof) for proof in result.proofs if proof.verdict == "proven"},
         "witness": _witness(problem, program, result) if result.status == "refuted" else None,
     }
 
@@ -125,9 +125,11 @@ def _inside(bound: ConvexSet, point: Array, middle: Array) -> Array:
     return answer
 
 
-def _cells(program: SemiInfiniteProgram, proof: Proof) -> dict[str, Any]:
+def _cells(experiment: ControlExperiment, proof: Proof) -> dict[str, Any]:
     lower, upper = proof.leaves if proof.leaves is not None else (np.zeros((0, 0)), np.zeros((0, 0)))
-    return {"tolerance": program.family(proof.family).tolerance(TOLERANCE), "lower": lower, "upper": upper}
+    shape = next((one.shape for one in experiment.transcription.constraints if one.name == proof.family), None)
+    normals = {} if shape is None else {"normals": shape.frame}
+    return {"tolerance": TOLERANCE, **normals, "lower": lower, "upper": upper}
 
 
 def _witness(problem: OptimalControlProblem, program: SemiInfiniteProgram, result: Result) -> dict[str, Any] | None:

@@ -16,6 +16,7 @@ from sparserob_core.experiment.run.events import StudyProgress
 from sparserob_core.sip.events import Notify
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.methods.exchange import Exchange
+from sparserob_core.sip.methods.own_units import solve_in_own_units
 from sparserob_core.sip.relaxed.parametric import ParametricProgram
 from sparserob_core.sip.result import Status
 
@@ -196,7 +197,7 @@ class Search:
     def run(self, factor: float) -> Point:
         """An ordinary run at a factor; a factor at which the problem is not defined fails."""
         try:
-            result = self.method.solve(self.programs.program(factor), self.tools)
+            result = solve_in_own_units(self.method, self.programs.program(factor), self.tools)
         except InputError as error:
             return Point(factor, self.scaling.amount(factor), "failed", str(error), -np.inf, np.inf)
         self._tell(f"{self.scaling.of} at {factor:.9g}: {result.status}")

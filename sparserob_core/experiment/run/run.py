@@ -21,6 +21,7 @@ from sparserob_core.experiment.run.journal import Journal
 from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.method import Deadline, ExecutorFactory, Method, Tools
+from sparserob_core.sip.methods.own_units import solve_in_own_units
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.result import Result
 
@@ -121,7 +122,7 @@ def run(
             try:
                 with executors.open() as executor:
                     handed = replace(_notifying(tools, broadcast), executor=executor)
-                    result = method.solve(experiment.program, handed)
+                    result = solve_in_own_units(method, experiment.program, handed)
             except KeyboardInterrupt as pressed:  # a method that does not return what it knows
                 result, told = journal.known(_said(pressed), time.perf_counter() - started), False
                 if result is None:

@@ -9,23 +9,22 @@ import numpy as np
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.response.response import SAME_TIME
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.proof.branch_and_bound import TOLERANCE
+from sparserob_core.sip.program import TOLERANCE
 
 
 @final
 class Census:
     """The largest violation of one constraint along every trajectory of a block, and over all blocks.
 
-    With flat sides: the largest ``H x(t) - h`` over the sides and the times. A curved set: the signed distance, outside
-    exactly, inside by tangents of the set (so that a margin is never understated), at the time at which the trajectory
-    is furthest out by the set's gauge.
+    With flat sides: the largest ``H x(t) - h`` over the sides and the times. A curved set: the gauge less 1, at the
+    time at which the trajectory is furthest out.
     """
 
     def __init__(self, constraint: StateConstraint, times: Array) -> None:
         slack = SAME_TIME * times[-1]
         self.constraint, self.times = constraint, times
         self._is_curved = constraint.sides is None
-        self.tolerance = TOLERANCE * min(1.0, 1e3 * constraint.scale)
+        self.tolerance = TOLERANCE
         self._inside = (times >= constraint.start - slack) & (times <= constraint.stop + slack)
         self.violated, self.largest, self.time = 0, -np.inf, np.nan
 

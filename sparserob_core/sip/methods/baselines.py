@@ -15,8 +15,8 @@ from sparserob_core.sip.events import RoundFinished, forwarded
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.methods.ledger import alarm
-from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
-from sparserob_core.sip.proof.branch_and_bound import TOLERANCE, prove
+from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram
+from sparserob_core.sip.proof.branch_and_bound import prove
 from sparserob_core.sip.proof.verdict import as_bad_as_found, verdict, witness, worst_of
 from sparserob_core.sip.result import Result, relative_gap
 from sparserob_core.sip.scenario_bound import scenario_bound

@@ -21,10 +21,10 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Proof
 from sparserob_core.sip.finite import FiniteSolution
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
-from sparserob_core.sip.methods.ledger import Answer, Ledger, Prover
+from sparserob_core.sip.methods.ledger import Answer, Found, Ledger, Prover
 from sparserob_core.sip.methods.unbounded import bounding_rows, falls_for_ever
-from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation
-from sparserob_core.sip.proof.branch_and_bound import TOLERANCE, prove
+from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram, Separation
+from sparserob_core.sip.proof.branch_and_bound import prove
 from sparserob_core.sip.proof.verdict import worst_of
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows, rows_at
 from sparserob_core.sip.result import SMALL_COST, Result
@@ -32,6 +32,7 @@ from sparserob_core.sip.separation.separation import separate
 
 IDLE_ROUNDS = 3  # rounds that a row may stay without a multiplier before it is dropped
 DROPPING_ROUNDS = 40  # rounds after which rows are only added, so that nothing can cycle
+THINNER = 1e-3  # share of a margin that leaves nothing feasible, which is tried next
 SMALLEST_MARGIN, LARGEST_MARGIN = 1e-15, 1e-6  # in units of the decision's bounds, where those are below 1
 CRUDE = 1e-4  # residual and relative gap of a relaxed solution that a round can do with
 ALLOWED = TOLERANCE / 2  # a violation that the search may leave to the proof
@@ -71,6 +72,7 @@ class Exchange(Method, Options):
     def _exchange(self, ledger: Ledger, prover: Prover) -> Result:
         program, tools = ledger.program, ledger.tools
         working = Working.start(program, tools)
+        kept: tuple[Answer, Found] | None = None
         for number in range(1, self.rounds + 1):
             tools.deadline.check()
             last = number == self.rounds
@@ -95,6 +97,8 @@ class Exchange(Method, Options):
             suggested = np.inf if any(rows.size for _, rows, _ in violated) else program.cost(x)
             ledger.tell(number, answer, found, suggested, kept=working.rows.h.size)
 
+            kept = (answer, found) if np.isfinite(suggested) else kept
+
             # Exchange: impose them, drop what has been idle; tighten the rows that are violated though imposed.
             if not last and (working.exchange(answer, violated, number) or working.tighten(violated)):
                 continue
@@ -107,9 +111,11 @@ class Exchange(Method, Options):
             if not self.exact:
                 working.plain_bound(ledger)
             proofs = prover(x)
-            witnesses = _witnesses(program, proofs)
-            if last or tools.deadline.passed or not working.exchange(answer, witnesses, number):
-                return ledger.judged(answer, worst_of(found), proofs, self._ending(ledger, answer, last))
+            # What rounding may do, where it alone keeps a proof open, is allowed for like the solver's accuracy.
+            again = working.exchange(answer, _witnesses(program, proofs), number) or working.allow_for(proofs)
+            if last or tools.deadline.passed or not again:
+                result = ledger.judged(answer, worst_of(found), proofs, self._ending(ledger, answer, last))
+                return _or_earlier(ledger, result, answer, kept, prover)
         raise AssertionError("the last round returns")
 
     def _ending(self, ledger: Ledger, answer: Answer, last: bool) -> str:
@@ -125,8 +131,9 @@ class Exchange(Method, Options):
 @dataclass(eq=False)
 class Working:
     """The working set of the exchange: the imposed ``rows``, since how many rounds each is ``idle (r,)``, the weight
-    ``epsilon``, the ``margin`` by which rows are tightened with the ``floor`` that it must not fall below, whether
-    there is a ``slater`` point for it, and a solution with these rows as the next ``guess``."""
+    ``epsilon``, the ``margin`` by which rows are tightened with the ``floor`` that it must not fall below and the
+    ``most`` that it may be, whether there is a ``slater`` point for it, and a solution with these rows as the next
+    ``guess``."""
 
     program: SemiInfiniteProgram
     rows: Rows
@@ -134,6 +141,7 @@ class Working:
     idle: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
     margin: float = 0.0
     floor: float = 0.0
+    most: float = LARGEST_MARGIN
     slater: bool = True
     guess: FiniteSolution | None = None
 
@@ -146,10 +154,11 @@ class Working:
     def solve(self, ledger: Ledger, epsilon: float) -> FiniteSolution:
         """The relaxed program with this weight; its multipliers improve the lower bound."""
         solution = ledger.relaxed.solve(self.rows, epsilon, self.margin, self.guess)
-        # the margin, not the program, may be at fault: no Slater point
-        if solution.status == "infeasible" and self.margin > 0.0:
-            self.margin, self.slater = 0.0, False
-            solution = ledger.relaxed.solve(self.rows, epsilon, 0.0, None)
+        # the margin, not the program, may be at fault: a thin set, or no Slater point
+        while solution.status == "infeasible" and self.margin > 0.0:
+            self.most = THINNER * self.margin if THINNER * self.margin >= SMALLEST_MARGIN else 0.0
+            self.margin, self.slater = self.most, self.most > 0.0
+            solution = ledger.relaxed.solve(self.rows, epsilon, self.margin, None)
         if _usable(solution):
             self.guess = solution
             ledger.improve(ledger.relaxed.lower_bound(self.rows, solution))
@@ -205,11 +214,28 @@ class Working:
             for i, r in zip(indices, rows, strict=True)
             if (key := (family, int(r), i.tobytes())) in known
         ]
-        if not places or not self.slater or self.guess is None or self.floor >= LARGEST_MARGIN:
+        if not places or not self.slater or self.guess is None or self.floor >= self.most:
             return False
         norms = np.maximum(np.linalg.norm(self.rows.G[places], axis=1), np.finfo(float).tiny)
         missed = float(((self.rows.G[places] @ self.guess.x - self.rows.h[places]) / norms).max())
-        self.floor = float(np.clip(2.0 * max(missed, self.margin), SMALLEST_MARGIN, LARGEST_MARGIN))
+        self.floor = float(np.clip(2.0 * max(missed, self.margin), SMALLEST_MARGIN, self.most))
+        self.margin = max(self.margin, self.floor)
+        return True
+
+    def allow_for(self, proofs: Sequence[Proof]) -> bool:
+        """Nothing is violated, but a proof must allow for rounding and cannot show it: tighten by as much; ``False``
+        where that is more than rounding, or was tried."""
+        open_ = {proof.family: proof.bound for proof in proofs if proof.verdict == "undecided"}
+        if any(proof.verdict == "refuted" for proof in proofs) or not self.slater:
+            return False
+        missed = [
+            open_[cut.family] / size
+            for cut, size in zip(self.rows.cuts, np.linalg.norm(self.rows.G, axis=1).tolist(), strict=True)
+            if cut.family in open_ and size > 0.0
+        ]
+        if not missed or not self.floor < 2.0 * max(missed) <= self.most:
+            return False
+        self.floor = 2.0 * max(missed)
         self.margin = max(self.margin, self.floor)
         return True
 
@@ -236,7 +262,17 @@ class Working:
             np.clip(budget / max(price, np.finfo(float).tiny), SMALLEST_MARGIN * unit, LARGEST_MARGIN * unit)
         )
         if self.margin == 0.0 or margin < 0.5 * self.margin:
-            self.margin = max(margin, self.floor)
+            self.margin = min(max(margin, self.floor), self.most)
+
+
+def _or_earlier(
+    ledger: Ledger, result: Result, answer: Answer, kept: tuple[Answer, Found] | None, prover: Prover
+) -> Result:
+    """The result, or that of the last decision that seemed feasible, with an open gap, where only that is proven."""
+    if result.status not in ("refuted", "undecided") or kept is None or kept[0] is answer:
+        return result
+    earlier = ledger.judged(kept[0], worst_of(kept[1]), prover(kept[0].solution.x))
+    return earlier if earlier.status in ("certified", "verified") else result
 
 
 def _relaxed(method: Exchange, working: Working, ledger: Ledger) -> Answer:
@@ -259,7 +295,7 @@ def _relaxed(method: Exchange, working: Working, ledger: Ledger) -> Answer:
 
 def _above(family: ConstraintFamily, found: Separation) -> tuple[Array, np.ndarray, str]:
     """The indices, rows and family of what is violated by more than the search may leave to the proof."""
-    violated = found.violations > family.tolerance(ALLOWED)
+    violated = found.violations > ALLOWED
     return found.indices[violated], found.rows[violated], family.name
 
 

@@ -14,8 +14,7 @@ from sparserob_core.sip.events import RoundFinished, frozen
 from sparserob_core.sip.evidence import NO_BOUND, Cut, Dual, Proof
 from sparserob_core.sip.finite import FiniteSolution
 from sparserob_core.sip.method import Tools
-from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation, WorstConstraint
-from sparserob_core.sip.proof.branch_and_bound import TOLERANCE
+from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram, Separation, WorstConstraint
 from sparserob_core.sip.proof.irreducible import irreducible
 from sparserob_core.sip.proof.verdict import as_bad_as_found, infeasible_subsystem, verdict, witness, worst_of
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
@@ -221,7 +220,7 @@ def alarm(program: SemiInfiniteProgram, dual: Dual, x: Array) -> str:
     """
     base, cost = program.finite, program.cost(x)
     image, allowed = base.image(x), ROUNDING * base.magnitude(x)
-    allowed += sum(cut.multiplier * program.family(cut.family).tolerance(TOLERANCE) for cut in dual.cuts)
+    allowed += sum(cut.multiplier * TOLERANCE for cut in dual.cuts)
     if dual.z is not None:
         allowed += float(np.abs(dual.z) @ np.maximum(np.maximum(base.lower - image, image - base.upper), 0.0))
     if dual.mu.size:

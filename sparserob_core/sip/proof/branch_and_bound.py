@@ -13,11 +13,8 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ProofProgress, ignore
 from sparserob_core.sip.evidence import Proof
 from sparserob_core.sip.method import Deadline
-from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
+from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram
 
-TOLERANCE = (
-    1e-9  # a violation of at most this counts as none (less where the numbers are tiny: `ConstraintFamily.tolerance`)
-)
 CELLS = 400_000  # cells examined per family before the proof is given up
 BATCH = 4096  # cells bounded at a time, worst first
 PROBED = 16  # centres of the worst cells at which a witness is looked for, per batch
@@ -46,7 +43,8 @@ def prove(
     """Prove or refute every family at ``x (n,)``, one `Proof` each; past the deadline with one look at each."""
     time_left = deadline or Deadline()
     proven = (family.reduced or family for family in program.families)
-    return tuple(replace(prove_family(one, x, notify, cells, time_left), formulation=one.formulation) for one in proven)
+    found = [(one, prove_family(one, x, notify, cells, time_left)) for one in proven]
+    return tuple(replace(proof, formulation=one.formulation, unit=one.row_unit(proof.row)) for one, proof in found)
 
 
 def prove_family(
@@ -114,7 +112,7 @@ class Course:
 
 
 def _branch_and_bound(family: ConstraintFamily, x: Array, course: Course) -> Proof:
-    tolerance, box = family.tolerance(TOLERANCE), family.index_set
+    tolerance, box = TOLERANCE, family.index_set
     lower, upper = family.cells if family.cells is not None else (box.lower[None], box.upper[None])
     closed, best = -np.inf, (-np.inf, lower[0], 0)
     leaves: list[tuple[Array, Array]] = []  # one entry per halving
@@ -233,9 +231,9 @@ def _by_separation(family: ConstraintFamily, x: Array) -> Proof:
     found = family.worst(x)
     violation = float(found.violations[0]) if found.violations.size else -np.inf
     index, row = (found.indices[0], int(found.rows[0])) if found.violations.size else (None, 0)
-    if violation > family.tolerance(TOLERANCE):
+    if violation > TOLERANCE:
         return Proof(family.name, "refuted", np.inf, violation, index, row)
-    if found.bound <= family.tolerance(TOLERANCE):
+    if found.bound <= TOLERANCE:
         return Proof(family.name, "proven", found.bound, violation, index, row)
     return Proof(
         family.name,

@@ -49,7 +49,7 @@ def _of_family(base: FiniteProgram, family: ConstraintFamily) -> Iterator[Reason
     G, h = family.rows(indices)
     least = least_of(base, G.reshape(-1, base.n), h.reshape(-1)).reshape(h.shape)
     size = np.linalg.norm(G, axis=2)
-    scale = REAL * np.maximum(family.scale, np.abs(h))
+    scale = REAL * np.maximum(1.0, np.abs(h))
     explained: set[int] = set()
     bare = np.where(size <= NONE * size.max(initial=0.0), -h, -np.inf)
     for row in np.flatnonzero((bare > scale).any(axis=0)):
@@ -138,10 +138,12 @@ def _reason(
 
 
 def sentence(kind: Kind, family: ConstraintFamily, rows: Rows, multipliers: Array, amount: float) -> str:
-    """The reason for people, as far as the family can tell it."""
+    """The reason for people, as far as the family can tell it: in the user's units."""
+    units = [family.row_unit(cut.row) for cut in rows.cuts]
+    amount = amount * units[0]
     told = [family.explanation(cut.index, cut.row) for cut in rows.cuts]
     if kind == "beyond every decision":
         return told[0].beyond(amount)
     if kind == "nothing between":
-        return told[0].apart(told[1], float(multipliers[1] / multipliers[0]), amount)
-    return told[0].out_of_reach(amount, -float(rows.h[0]))
+        return told[0].apart(told[1], float(multipliers[1] / multipliers[0]) * units[0] / units[1], amount)
+    return told[0].out_of_reach(amount, -float(rows.h[0]) * units[0])

@@ -10,6 +10,7 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Cut, InfeasibleSubsystem, Proof
 from sparserob_core.sip.program import (
+    TOLERANCE,
     ConstraintFamily,
     Explanation,
     SemiInfiniteProgram,
@@ -17,7 +18,6 @@ from sparserob_core.sip.program import (
     WorstConstraint,
     told_apart,
 )
-from sparserob_core.sip.proof.branch_and_bound import TOLERANCE
 from sparserob_core.sip.proof.reasons import least_of, reasons, sentence
 from sparserob_core.sip.relaxed.relaxed import Rows
 from sparserob_core.sip.result import MEANING, Status
@@ -27,7 +27,11 @@ NAMED = 6  # reasons, or members of an infeasible subsystem, that are named; of 
 
 def verdict(proofs: Sequence[Proof], gap: float, tolerance: float) -> tuple[Status, str]:
     """The status that the proofs and the gap allow, and a sentence."""
-    refuted = [f"{proof.family} is violated by {proof.violation:.4g}" for proof in proofs if proof.verdict == "refuted"]
+    refuted = [
+        f"{proof.family} is violated by {proof.violation * proof.unit:.4g}"
+        for proof in proofs
+        if proof.verdict == "refuted"
+    ]
     if refuted:
         return "refuted", "; ".join(refuted)
     undecided = [proof.reason for proof in proofs if proof.verdict == "undecided"]
@@ -44,11 +48,7 @@ def as_bad_as_found(proofs: Sequence[Proof], separations: Sequence[tuple[Constra
 
 
 def _worse(proof: Proof, family: ConstraintFamily, found: Separation) -> Proof:
-    if (
-        proof.verdict == "proven"
-        or not found.violations.size
-        or found.violations[0] <= max(proof.violation, family.tolerance(TOLERANCE))
-    ):
+    if proof.verdict == "proven" or not found.violations.size or found.violations[0] <= max(proof.violation, TOLERANCE):
         return proof
     return replace(
         proof,
@@ -57,6 +57,7 @@ def _worse(proof: Proof, family: ConstraintFamily, found: Separation) -> Proof:
         index=found.indices[0],
         row=int(found.rows[0]),
         formulation=family.formulation,
+        unit=family.row_unit(int(found.rows[0])),
     )
 
 
@@ -118,14 +119,17 @@ def _together(
 ) -> InfeasibleSubsystem:
     """Several rows that cannot hold together: each by name, and the sum of them that proves it."""
     told = [_explanation(program, rows.cuts[i]) for i in order[:NAMED]]
-    y = multipliers / multipliers.max()
-    asked = -float(y[order] @ rows.h[order])
-    missing = float(least_of(program.finite, (y[order] @ rows.G[order])[None], np.array([-asked]))[0])
+    units = np.array([program.family(cut.family).row_unit(cut.row) for cut in rows.cuts])
+    y = multipliers / units
+    share = 1.0 / y.max()
+    y, weights = y * share, multipliers * share  # of rows in the user's units, and in their own
+    asked = -float(weights[order] @ rows.h[order])
+    missing = float(least_of(program.finite, (weights[order] @ rows.G[order])[None], np.array([-asked]))[0])
     demand, decides = "", told[0].decides
     if missing > 0 and asked > 0:
         more, less = told_apart(asked, asked - missing)
-        weights = ", ".join(f"{y[i]:.3g}" for i in order[:NAMED]) + (", ..." if order.size > NAMED else "")
-        demand = f"weighted by {weights} they ask the {decides} for {more}, and it can give at most {less}"
+        named = ", ".join(f"{y[i]:.3g}" for i in order[:NAMED]) + (", ..." if order.size > NAMED else "")
+        demand = f"weighted by {named} they ask the {decides} for {more}, and it can give at most {less}"
     return InfeasibleSubsystem(
         members=tuple(one.text for one in told),
         amount=amount,

@@ -147,7 +147,7 @@ def _family(factored: ParametricProgram, one: ConstraintFamily, two: ConstraintF
         explain=one.explain,
         formulation=one.formulation,
         source=one.source,
-        scale=one.scale,
+        row_units=one.row_units,
     )
 
 
@@ -168,7 +168,7 @@ def _relaxed(family: ConstraintFamily) -> ConstraintFamily:
         explain=family.explain,
         formulation=family.formulation,
         source=family.source,
-        scale=family.scale,
+        row_units=family.row_units,
         cells=family.cells,
         worst=None if family.worst is None else partial(worst, separation=family.worst),
     )

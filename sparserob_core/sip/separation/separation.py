@@ -41,7 +41,8 @@ def separate(
     separations = []
     for family in program.families:
         tools.deadline.check()
-        separations.append((family, searched(family) if family.worst is None else family.worst(x)))
+        found = searched(family) if family.worst is None else family.worst(x)
+        separations.append((family, replace(found, formulation=family.formulation)))
     return separations
 
 

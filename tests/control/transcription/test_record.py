@@ -95,7 +95,8 @@ def test_what_does_not_depend_on_the_state_is_shared_and_by_no_constraint_that_d
     assert isinstance(curved, CurvedConstraint)
     other = replace(curved, set=sr.Ellipsoid(centre=[0, 0], shape=[[1.0, 0], [0, 1.0]]))
     x = np.zeros(8)
-    assert curved.worst(x).violations[0] - other.worst(x).violations[0] == pytest.approx(0.5, abs=0.05)
+    gauges = [1.0 + one.worst(x).violations[0] for one in (curved, other)]
+    assert gauges[1] == pytest.approx(0.5 * gauges[0], rel=1e-6)
 
 
 def test_every_constraint_on_the_state_offers_the_same() -> None:
@@ -105,7 +106,7 @@ def test_every_constraint_on_the_state_offers_the_same() -> None:
     flat, curved = models[0].constraints[1], models[2].constraints[1]
     np.testing.assert_allclose(flat.excess(states), [-0.5, 0.1, -0.1])
     assert (np.sign(curved.outwardness(states)) == [-1, 1, 1]).all()
-    np.testing.assert_allclose(curved.excess(states), [-0.5, 0.1, np.hypot(0.4, 0.4) - 0.5], atol=1e-6)
+    np.testing.assert_allclose(curved.excess(states), [-1.0, 0.2, np.hypot(0.4, 0.4) / 0.5 - 1.0], atol=1e-6)
 
 
 def test_cuts_of_a_literal_program_are_literal() -> None:

@@ -1,0 +1,186 @@
+"""The units in which a problem's own numbers are of ordinary size (decision 0016)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sparserob_core.control.constraints.state import StateConstraint
+from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.units import Units, power_of_two
+from sparserob_core.control.response.functional import WorstCase
+from sparserob_core.control.response.parameters import ParameterIndex
+from sparserob_core.control.sets.directions import sampled
+from sparserob_core.control.sets.sets import Equality
+from sparserob_core.sip.convex_set import Array, ConvexSet
+
+TIMES = 17  # at most, at which a reach is looked at
+PARAMETERS = 9  # at most, at which a reach is looked at
+RESOLVED = 2.0**-18  # of the numbers that are added up, the least unit: 1e-9 of it is 17 units of rounding
+CHAINED = 1e150  # a state that a chain of couplings might bring beyond this is left to the response
+
+
+def rough_units(problem: OptimalControlProblem) -> Units:
+    """Units from products of the problem's numbers alone: what one coupling after the other may bring into each state.
+
+    Every step is a product or a maximum, so a change of units by powers of two changes them by exactly that.
+    """
+    system, bound = problem.system, problem.disturbance
+    time = float(power_of_two(np.array(problem.horizon)))
+    controls, disturbances = power_of_two(extent(problem.control)), np.ones(system.disturbances)
+    if bound is not None:
+        disturbances = power_of_two(extent(bound))
+    index = ParameterIndex(system.parameters)
+    parameters = np.ones(0) if system.parameters is None else power_of_two(_widths(system.parameters))
+    A, B, E = (np.abs(matrix) for matrix in system.matrices(looked_at(index)))
+    A, B, E = A.max(axis=0), B.max(axis=0), E.max(axis=0)
+    # a fast system is coupled through for a time of about 1/norm only; the eigenvalues do not depend on the units
+    fastest = max(
+        float(np.abs(np.linalg.eigvals(one)).max()) for one in _balanced(system.matrices(looked_at(index))[0])
+    )
+    lasting = float(power_of_two(np.array(min(time, 1.0 / fastest if fastest > 0.0 else np.inf))))
+    reach = np.maximum(np.abs(np.asarray(problem.initial_state)), time * (B * controls).max(axis=1, initial=0.0))
+    if bound is not None:
+        reach = np.maximum(reach, time * (E * disturbances).max(axis=1, initial=0.0))
+    for _ in range(system.states - 1):
+        reach = np.maximum(reach, lasting * (A * reach).max(axis=1))
+    reach = np.where(reach < CHAINED, reach, 0.0)
+    return Units(
+        time, power_of_two(np.where(reach > 0.0, reach, _walls(problem))), controls, disturbances, parameters, 1.0
+    )
+
+
+def own_units(problem: OptimalControlProblem, rough: Units, functionals: WorstCase) -> Units:
+    """The units of a problem, from how far its states reach: ``functionals`` are those of the problem in rough
+    units."""
+    axes, parameters = np.eye(problem.system.states), ParameterIndex(functionals.response.system.parameters)
+    times = window_times(functionals, 0.0, float(functionals.response.grid.breakpoints[-1]))
+    reach, _ = reaches(functionals, parameters, rough.of_problem(problem).control, axes, times)
+    usable = np.isfinite(reach) & (reach > 0.0)
+    states = rough.states * power_of_two(np.where(usable, reach, 1.0))
+    states = np.where(usable, states, power_of_two(_walls(problem)))
+    weights = np.asarray(problem.weights) * extent(problem.control)
+    cost = float(power_of_two(np.array(weights.sum()))) * rough.time
+    return Units(rough.time, states, rough.controls, rough.disturbances, rough.parameters, cost)
+
+
+def row_units(constraint: StateConstraint, control: ConvexSet) -> Array:
+    """The unit ``(r,)`` of each row of a constraint: see `units_of_sides`; of a curved set, whose rows are in multiples
+    of its gauge, 1, or what double precision resolves of that."""
+    functionals, sides = constraint.functionals, constraint.sides
+    times = window_times(functionals, constraint.start, constraint.stop)
+    if sides is not None:
+        return units_of_sides(*sides, *reaches(functionals, constraint.parameters, control, sides[0], times))
+    box = constraint.index_set
+    z = sampled(box.dimension - 1 - constraint.parameters.count)
+    indices = np.hstack([np.tile(box.lower[: box.dimension - z.shape[1]], (z.shape[0], 1)), z])
+    _, added = reaches(functionals, constraint.parameters, control, constraint.functionals_at(indices)[1], times)
+    return np.maximum(1.0, power_of_two(np.array([RESOLVED * added.max()])))
+
+
+def units_of_sides(H: Array, h: Array, reach: Array, added: Array) -> Array:
+    """The unit ``(r,)`` of rows ``H x <= h``: the least of ``reach (r,)``, ``|h|`` and the width to the opposite row,
+    those of them that are not 0; no less than what double precision resolves of the sums ``added (r,)``. A power of
+    two, 1.2 to 2.5 times below that."""
+    sizes = np.stack([reach, np.abs(h), _slabs(H, h)])
+    sizes = np.where(np.isfinite(sizes) & (sizes > 0.0), sizes, np.inf).min(axis=0)
+    least = np.where(np.isfinite(added), RESOLVED * added, 0.0)
+    unit = np.where(np.isfinite(sizes), np.maximum(sizes, least), np.where(least > 0.0, least, 2.0))
+    return power_of_two(unit) / 2.0
+
+
+def reaches(
+    functionals: WorstCase, parameters: ParameterIndex, control: ConvexSet, H: Array, times: Array
+) -> tuple[Array, Array]:
+    """How far the quantities ``H x(t)`` come from 0 at some times, over the control's set and the worst disturbance,
+    ``(r,)``, and the largest sum of absolute values from which they are computed, ``(r,)``."""
+    points, r = looked_at(parameters), H.shape[0]
+    shape = (points.shape[0], times.size, r)
+    at = np.tile(np.repeat(times, r), shape[0])
+    directions, p = np.tile(H, (shape[0] * shape[1], 1)), np.repeat(points, shape[1] * r, axis=0)
+    up, down, added = (np.zeros(at.size) for _ in range(3))
+    size = max(1, 2_000_000 // (functionals.response.grid.pieces * functionals.response.initial_state.size))
+    for begin in range(0, at.size, size):
+        part = slice(begin, begin + size)
+        free, gains, B, W = functionals.response.adjoint(at[part], directions[part], p[part])
+        rest = free @ functionals.response.initial_state
+        on_control = gains @ B
+        up[part], down[part] = (
+            rest + control.support(on_control).sum(axis=1),
+            control.support(-on_control).sum(axis=1) - rest,
+        )
+        added[part] = np.abs(free) @ np.abs(functionals.response.initial_state)
+        added[part] += np.abs(on_control @ np.diag(extent(control))).sum(axis=(1, 2))
+        model = functionals.disturbance
+        if model is not None:
+            on_noise = gains @ W
+            up[part] += model.support(on_noise)
+            down[part] += model.support(-on_noise)
+            added[part] += np.abs(on_noise @ np.diag(extent(model.bound))).sum(axis=(1, 2))
+    reach = np.maximum(np.maximum(up, down), 0.0).reshape(-1, r).max(axis=0)
+    return reach, added.reshape(-1, r).max(axis=0)
+
+
+def looked_at(parameters: ParameterIndex) -> Array:
+    """A middle parameter and support points along the axes, ``(v, nu)``."""
+    if parameters.set is None:
+        return np.zeros((1, 0))
+    axes = np.eye(parameters.count)[: (PARAMETERS - 1) // 2]
+    points = parameters.set.support_point(np.vstack([axes, -axes]))
+    corners = np.ones((1, parameters.count))
+    outer = parameters.set.support_point(np.vstack([corners, -corners]))
+    return np.vstack([parameters.set.interior_point()[None], points, outer])
+
+
+def extent(convex: ConvexSet) -> Array:
+    """How far each component of a bounded set comes from 0, ``(d,)``."""
+    return convex.reach(np.eye(convex.dimension))
+
+
+def window_times(functionals: WorstCase, start: float, stop: float) -> Array:
+    """The ends of a window and some breakpoints between them."""
+    breaks = functionals.response.grid.breakpoints
+    inside = breaks[(breaks > start) & (breaks < stop)]
+    chosen = np.unique(np.linspace(0, inside.size - 1, min(inside.size, TIMES - 2)).round().astype(int))
+    return np.unique(np.concatenate([[start], inside[chosen] if inside.size else inside, [stop]]))
+
+
+def _slabs(H: Array, h: Array) -> Array:
+    """The width ``h + h'`` between each row and the nearest opposite one, ``(r,)``; infinite without one."""
+    width = np.full(h.size, np.inf)
+    for row in range(h.size):
+        mine, other = H[row], H
+        scale = np.abs(mine).max()
+        sizes = np.abs(other).max(axis=1)
+        share = scale / np.where(sizes > 0.0, sizes, 1.0)
+        opposite = (np.abs(mine + other * share[:, None]) <= 1e-14 * scale).all(axis=1)
+        width[row] = float(np.min(np.abs(h[row] + h[opposite] * share[opposite]), initial=np.inf))
+    return width
+
+
+def _widths(convex: ConvexSet) -> Array:
+    """The width of each component of a bounded set; where that is 0, its distance from 0."""
+    axes = np.eye(convex.dimension)
+    width = convex.support(axes) + convex.support(-axes)
+    return np.where(width > 0.0, width, convex.reach(axes))
+
+
+def _walls(problem: OptimalControlProblem) -> Array:
+    """The least bound other than 0 that a row or an equality on it alone gives each state; 1 without one."""
+    least = np.full(problem.system.states, np.inf)
+    for item in (*problem.path, *problem.terminal):
+        convex = item.set if isinstance(item, PathConstraint) else item
+        if isinstance(convex, Equality):
+            sizes = np.abs(np.where(np.isnan(convex.values), 0.0, convex.values))
+        else:
+            axes = np.eye(convex.dimension)
+            with np.errstate(invalid="ignore"):
+                sizes = np.minimum(np.abs(convex.support(axes)), np.abs(convex.support(-axes)))
+        least = np.minimum(least, np.where(sizes > 0.0, sizes, np.inf))
+    return np.where(np.isfinite(least), least, 1.0)
+
+
+def _balanced(matrices: Array) -> Array:
+    """Matrices ``(k, d, d)`` similar to the given ones, with rows and columns of like size."""
+    from scipy.linalg import matrix_balance
+
+    return np.stack([np.asarray(matrix_balance(one, permute=False)[0]) for one in matrices])

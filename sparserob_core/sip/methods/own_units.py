@@ -1,0 +1,212 @@
+"""A program in its own units: methods see numbers of ordinary size, whoever listens sees the user's.
+
+What a problem means must not depend on metres or millimetres; what a solver makes of it does. So a program may carry a
+twin in units of its own (`OwnUnits`), every factor a power of two, and therefore exact. `solve_in_own_units` hands the
+twin to a method and brings everything that comes back, result and events, into the user's units: nothing else does.
+(Decision 0016.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import final
+
+import numpy as np
+
+from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.events import Batch, EvaluationsFinished, Event, Notify, RoundFinished, ignore
+from sparserob_core.sip.evidence import Cut, Dual, Proof
+from sparserob_core.sip.method import Method, Tools
+from sparserob_core.sip.program import (
+    ConstraintFamily,
+    Formulation,
+    OwnUnits,
+    SemiInfiniteProgram,
+    Separation,
+    WorstConstraint,
+)
+from sparserob_core.sip.result import Result, SearchTrace
+
+
+def solve_in_own_units(method: Method, program: SemiInfiniteProgram, tools: Tools) -> Result:
+    """What the method makes of the program, solved in the program's own units and told in the user's."""
+    own = program.own_units
+    if own is None:
+        return method.solve(program, tools)
+    units, heard = UsersUnits(own), tools.notify
+    notify: Notify = ignore if heard is ignore else lambda event: heard(units.event(event))
+    return units.result(method.solve(own.program, replace(tools, notify=notify)))
+
+
+@final
+class UsersUnits:
+    """The way back from a program in its own units to the user's."""
+
+    def __init__(self, own: OwnUnits) -> None:
+        self.program, self.decision, self.image = own.program, own.decision, own.image
+        self.equalities, self.cost = own.equalities, own.cost
+
+    def result(self, own: Result) -> Result:
+        """A result of the program in its own units, in the user's."""
+        return replace(
+            own,
+            decision=None if own.decision is None else own.decision * self.decision,
+            cost=own.cost * self.cost,
+            value=own.value * self.cost,
+            lower_bound=own.lower_bound * self.cost,
+            upper_bound=own.upper_bound * self.cost,
+            cost_scale=own.cost_scale * self.cost,
+            ray=None if own.ray is None else own.ray * self.decision,
+            worst=None if own.worst is None else self._witness(own.worst),
+            indices=self._cuts(own.indices),
+            history=tuple(self._round(event) for event in own.history),
+            trace=None if own.trace is None else self._trace(own.trace),
+            dual=self._dual(own.dual, infeasible=own.status == "infeasible"),
+            proofs=tuple(self._proof(proof) for proof in own.proofs),
+        )
+
+    def event(self, own: Event) -> Event:
+        """An event of a method that works on the program in its own units, in the user's."""
+        if isinstance(own, RoundFinished):
+            return self._round(own)
+        if isinstance(own, EvaluationsFinished):
+            return self._evaluations(own)
+        return own
+
+    def _round(self, own: RoundFinished) -> RoundFinished:
+        decision = None if own.decision is None else _fixed(own.decision * self.decision)
+        worst = own.separations.get(own.worst_family)
+        row = int(worst.rows[0]) if worst is not None and worst.rows.size else 0
+        multipliers = [m * self._price(cut) for m, cut in zip(own.multipliers, own.imposed, strict=False)]
+        return replace(
+            own,
+            decision=decision,
+            cost=own.cost * self.cost,
+            lower_bound=own.lower_bound * self.cost,
+            upper_bound=own.upper_bound * self.cost,
+            violation=own.violation * self._row_unit(own.worst_family, row),
+            separations={name: self._separation(name, one) for name, one in own.separations.items()},
+            imposed=self._cuts(own.imposed),
+            multipliers=_fixed(np.array(multipliers, dtype=float)),
+            added=self._cuts(own.added),
+            dropped=self._cuts(own.dropped),
+        )
+
+    def _evaluations(self, own: EvaluationsFinished) -> EvaluationsFinished:
+        size = own.best_point.size if own.domain is None else own.domain.dimension
+        if own.family:
+            units, value = self._index_units(own.family, "reduced", size), 1.0
+        else:
+            units, value = self._tuple_units(size, own.block), self.cost
+        batch = own.batch
+        return replace(
+            own,
+            best_value=own.best_value * value,
+            best_point=own.best_point * units if own.best_point.size == size else own.best_point,
+            domain=None if own.domain is None else Box(own.domain.lower * units, own.domain.upper * units),
+            lower_bound=own.lower_bound * self.cost,
+            batch=Batch(
+                tuple(points * units for points in batch.points),
+                tuple(values * value for values in batch.values),
+                batch.moments,
+                batch.notes,
+                batch.first,
+                batch.best * value,
+                None if batch.origin is None else batch.origin * units,
+            ),
+        )
+
+    def _trace(self, own: SearchTrace) -> SearchTrace:
+        width = own.points.shape[1]
+        block = max((family.index_set.dimension for family in self._searched(width)), default=1)
+        return replace(
+            own,
+            value=own.value * self.cost,
+            bound=own.bound * self.cost,
+            points=own.points * self._tuple_units(width, block) if width else own.points,
+        )
+
+    def _searched(self, width: int) -> Sequence[ConstraintFamily]:
+        """The families whose indices a tuple of ``width`` coordinates may be made of: literal ones where they fit."""
+        reduced = self.program.families
+        literal = [family.literal or family for family in reduced]
+        sizes = [max((one.index_set.dimension for one in each), default=1) for each in (literal, reduced)]
+        return literal if width and width % sizes[0] == 0 and sizes[0] != sizes[1] else reduced
+
+    def _tuple_units(self, size: int, block: int) -> Array:
+        """The units ``(size,)`` of a tuple's coordinates: block after block those of the longest index."""
+        forms = [one for family in self.program.families for one in (family.literal, family) if one is not None]
+        longest = next((one for one in forms if one.index_set.dimension == block and one.index_units is not None), None)
+        unit = np.ones(block) if longest is None or longest.index_units is None else longest.index_units
+        return np.tile(unit, size // max(block, 1)) if size % max(block, 1) == 0 else np.ones(size)
+
+    def _separation(self, name: str, own: Separation) -> Separation:
+        rows = self.program.family(name).row_units
+        units = np.ones(own.rows.size) if rows is None else rows[own.rows]
+        return replace(
+            own,
+            indices=own.indices * self._index_units(name, own.formulation, own.indices.shape[1]),
+            violations=own.violations * units,
+            bound=own.bound * (1.0 if rows is None else float(rows.max())),
+        )
+
+    def _dual(self, own: Dual, infeasible: bool) -> Dual:
+        return replace(
+            own,
+            bound=own.bound if infeasible else own.bound * self.cost,
+            cuts=self._cuts(own.cuts),
+            mu=own.mu * self.cost / self.equalities if own.mu.size == self.equalities.size else own.mu,
+            z=None if own.z is None else own.z * self.cost / self.image,
+            fixed=own.fixed * self.cost,
+        )
+
+    def _cuts(self, own: Sequence[Cut]) -> tuple[Cut, ...]:
+        return tuple(
+            replace(
+                cut,
+                index=cut.index * self._index_units(cut.family, cut.formulation, cut.index.size),
+                multiplier=cut.multiplier * self._price(cut),
+            )
+            for cut in own
+        )
+
+    def _price(self, cut: Cut) -> float:
+        """What a multiplier of 1 of the row is in the user's cost for one of the user's units of the row."""
+        return self.cost / self._row_unit(cut.family, cut.row)
+
+    def _witness(self, own: WorstConstraint) -> WorstConstraint:
+        units = self._index_units(own.constraint, own.formulation, own.index.size)
+        violation = own.violation * self._row_unit(own.constraint, own.row)
+        return replace(own, index=own.index * units, violation=violation)
+
+    def _proof(self, own: Proof) -> Proof:
+        def placed(index: Array) -> Array:
+            return index * self._index_units(own.family, own.formulation, index.shape[-1])
+
+        return replace(
+            own,
+            violation=own.violation * own.unit,
+            unit=1.0,
+            index=None if own.index is None else placed(own.index),
+            leaves=None if own.leaves is None else (placed(own.leaves[0]), placed(own.leaves[1])),
+        )
+
+    def _row_unit(self, name: str, row: int) -> float:
+        units = self.program.family(name).row_units if name else None
+        return 1.0 if units is None else float(units[row])
+
+    def _index_units(self, name: str, formulation: Formulation, size: int) -> Array:
+        if not name:
+            return np.ones(size)
+        family = self.program.family(name)
+        if formulation == "sampled" and family.index_units is not None:
+            return np.array([family.index_units[0], 1.0])  # a time and the number of a sample
+        own = family.formulated(formulation)
+        units = None if own is None else own.index_units
+        return np.ones(size) if units is None or units.size != size else units
+
+
+def _fixed(array: Array) -> Array:
+    array.flags.writeable = False
+    return array

@@ -1,0 +1,185 @@
+"""Guards own units (docs/decisions/0016): an answer does not depend on units, nor on the factors of rows.
+
+The files in ``units/`` once had wrong answers; their truths were computed independently (HiGHS programs with exact
+worst cases, dense simulation, arithmetic of 600 bits).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sparserob_core as sr
+
+FILES = Path(__file__).parent / "units"
+INFEASIBLE = ("01", "11", "15", "16", "18", "21", "22", "23", "25", "27")
+COSTS = {
+    "14_units_1e5_terminal_only": 1.569187687,
+    "19_dist_row_1e-09": 0.9,
+    "19_dist_row_1e-12": 0.9,
+    "19_dist_row_1e-15": 0.9,
+    "20_param_row_1e-09": 0.708240960,
+    "20_param_row_1e-12": 0.708240960,
+    "33_dist_polytope_row_1e-6_check_refutes": 1.1,
+    "33_zero_box_equals": 2.0,
+    "34_param_polytope_row_1e-5_check_refutes": 0.708240960,
+    "f20023": 0.0,
+    "pulse1e+06_8e-14": 1.5,
+}
+
+
+def run(name: str, out: Path) -> sr.Result:
+    return sr.run(FILES / f"{name}.yaml", {"observers": []}, out=out, quiet=True, figures=False).result
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in FILES.glob("*.yaml") if path.stem[:2] in INFEASIBLE))
+def test_what_is_outside_in_its_own_unit_is_infeasible(name, tmp_path):
+    result = run(name, tmp_path / "run")
+    assert result.status == "infeasible", result.message
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in FILES.glob("*.yaml") if path.stem[:2] not in INFEASIBLE))
+def test_what_is_feasible_in_its_own_unit_is_certified(name, tmp_path):
+    result = run(name, tmp_path / "run")
+    if name.startswith("32"):  # the weights of two controls differ by 1e7 and more
+        assert result.status in ("certified", "verified") and result.gap <= 1e-4, result.message
+        assert result.cost == pytest.approx(1.606 * 10.0 ** -int(name[-1]), rel=1e-3)
+        return
+    assert result.status == "certified", result.message
+    if name in COSTS:
+        assert result.cost == pytest.approx(COSTS[name], rel=2e-8, abs=1e-12)
+
+
+@dataclass(frozen=True)
+class Factors:
+    """How many of the problem's own units one of the user's is; and the factors of the rows."""
+
+    time: float = 1.0
+    states: np.ndarray = field(default_factory=lambda: np.ones(2))
+    control: float = 1.0
+    noise: np.ndarray = field(default_factory=lambda: np.ones(2))
+    parameter: float = 1.0
+    weight: float = 1.0
+    rows: np.ndarray = field(default_factory=lambda: np.ones(5))
+
+    @staticmethod
+    def drawn(rng: np.random.Generator, binary: bool) -> Factors:
+        def some(size: int | None = None) -> np.ndarray:
+            return 2.0 ** rng.integers(-40, 41, size) if binary else 10.0 ** rng.uniform(-12, 12, size)
+
+        return Factors(some(), some(2), some(), some(2), some(), some(), some(5))
+
+    @property
+    def cost(self) -> float:
+        """What a cost of 1 of the problem is in the user's units."""
+        return self.weight / self.control / self.time
+
+
+def oscillator(kind: str, f: Factors) -> sr.OptimalControlProblem:
+    """The same oscillator in any units: ``x_user = x / states``, ``t_user = t / time`` and so on."""
+    to, x = f.time / f.states[:, None], f.states
+    B, E = to * np.array([[0.0], [1.0]]) * f.control, to * np.eye(2) * f.noise
+    H = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 1.0]])
+    h = np.array([1.2, 1.2, 1.2, 1.2, 1.5])
+
+    def A(p):
+        k = p[0] * f.parameter if kind == "uncertain" else 0.0
+        return np.array([[0.0 * k, to[0, 0] * x[1] * (1.0 + 0.0 * k)], [to[1, 0] * x[0] * (-1.0 - k), -0.5 * f.time]])
+
+    parameters = sr.Box([-0.1 / f.parameter], [0.1 / f.parameter]) if kind == "uncertain" else None
+    shape = np.array([[1.5, 0.2], [0.2, 1.1]]) / np.outer(x, x)
+    path = sr.Ellipsoid(np.zeros(2), shape) if kind == "curved" else sr.Polytope(f.rows[:, None] * H * x, f.rows * h)
+    corners = np.array([[1.0, 1.0], [-1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
+    noise = sr.Polytope(f.rows[:4, None] * corners * f.noise, f.rows[:4] * 0.03)
+    end = (
+        [sr.Equality(np.array([0.0, np.nan]))]
+        if kind == "fixed"
+        else [sr.Box(-np.array([0.25, 0.22]) / x, np.array([0.25, 0.22]) / x)]
+    )
+    return sr.OptimalControlProblem(
+        system=sr.LinearSystem(A if parameters is not None else A([0.0]), B, E, parameters=parameters),
+        horizon=3.0 / f.time,
+        initial_state=np.array([1.0, 0.3]) / x,
+        control=sr.Box([-1.0 / f.control], [1.0 / f.control]),
+        weights=[f.weight],
+        disturbance=None if kind == "fixed" else noise,
+        path=[path],
+        terminal=end,
+    )
+
+
+def solved(problem: sr.OptimalControlProblem) -> sr.Result:
+    return sr.solve(problem, control={"name": "piecewise_constant", "pieces": 15})
+
+
+def active(result: sr.Result) -> set[tuple[str, int]]:
+    return {(cut.family, cut.row) for cut in result.indices}
+
+
+KINDS = ("known", "uncertain", "curved", "fixed")
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def plain(request) -> tuple[str, sr.Result]:
+    return request.param, solved(oscillator(request.param, Factors()))
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_units_that_are_powers_of_two_change_no_bit(plain, seed):
+    kind, one = plain
+    f = Factors.drawn(np.random.default_rng(seed), binary=True)
+    other = solved(oscillator(kind, f))
+    assert one.status == other.status == "certified", other.message
+    assert other.cost / f.cost == one.cost and other.lower_bound / f.cost == one.lower_bound
+    np.testing.assert_array_equal(other.decision * f.control, one.decision)
+    for mine, theirs in zip(one.indices, other.indices, strict=True):
+        assert mine.row == theirs.row
+        assert theirs.index[0] * f.time == mine.index[0]
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_any_units_leave_the_status_the_cost_and_the_active_constraints(plain, seed):
+    kind, one = plain
+    f = Factors.drawn(np.random.default_rng(100 + seed), binary=False)
+    other = solved(oscillator(kind, f))
+    assert one.status == other.status == "certified", other.message
+    assert other.cost / f.cost == pytest.approx(one.cost, rel=1e-6)
+    assert active(one) == active(other)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_sweep_of_units_leaves_the_status_and_the_cost(kind, seed):
+    f = Factors.drawn(np.random.default_rng(1000 + seed), binary=False)
+    one, other = solved(oscillator(kind, Factors())), solved(oscillator(kind, f))
+    assert one.status == other.status
+    assert other.cost / f.cost == pytest.approx(one.cost, rel=1e-6)
+
+
+def test_results_are_in_the_users_units():
+    """A witness, a violation and events of a problem in odd units are those of the plain one, converted."""
+    f = Factors(time=8.0, states=np.array([2.0**-20, 2.0**7]), control=4.0, weight=2.0**-9)
+    told: dict[str, list[sr.Event]] = {"plain": [], "odd": []}
+    results = {}
+    for name, factors in (("plain", Factors()), ("odd", f)):
+        results[name] = sr.solve(
+            oscillator("known", factors),
+            "nominal",
+            control={"name": "piecewise_constant", "pieces": 15},
+            notify=told[name].append,
+        )
+    one, other = results["plain"], results["odd"]
+    assert one.status == other.status == "refuted"
+    state = int(np.flatnonzero(np.array([[1, 0], [0, 1], [1, 0], [0, 1]])[one.worst.row % 4])[0])
+    assert one.worst.constraint == other.worst.constraint == "terminal"
+    assert other.worst.violation * f.states[state] == pytest.approx(one.worst.violation, rel=1e-12)
+    assert other.worst.time * f.time == one.worst.time
+    assert f"terminal is violated by {other.worst.violation:.4g}" in other.message
+    rounds = [[event for event in events if isinstance(event, sr.RoundFinished)] for events in told.values()]
+    for mine, theirs in zip(*rounds, strict=True):
+        assert theirs.cost / f.cost == mine.cost
+        np.testing.assert_array_equal(theirs.decision * f.control, mine.decision)
