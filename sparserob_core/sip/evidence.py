@@ -89,7 +89,8 @@ class Proof:
 
     ``leaves``: the lower and upper corners ``(k, d)`` of the closed cells that prove it, a subdivision of the family's
     ``cells``, in lexicographic order; ``None`` unless proven by branch and bound. ``formulation`` is that of the index.
-    ``unit``: what a violation of 1 of that row is in the user's units; ``bound`` is in the rows' own.
+    ``unit``: what a violation of 1 of that row is in the user's units, and ``units (r,)`` of all rows; ``bound`` is in
+    the rows' own.
     """
 
     family: str
@@ -103,3 +104,4 @@ class Proof:
     leaves: tuple[Array, Array] | None = None
     formulation: Formulation = "reduced"
     unit: float = 1.0
+    units: Array | None = None

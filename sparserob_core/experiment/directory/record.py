@@ -13,7 +13,8 @@ from sparserob_core.control.constraints.explanation import Witness
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.experiment.directory.sparsity import sparsity
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.program import SemiInfiniteProgram, WorstConstraint
+from sparserob_core.sip.evidence import Proof
+from sparserob_core.sip.program import TOLERANCE, SemiInfiniteProgram, WorstConstraint
 from sparserob_core.sip.result import Result
 
 PROVEN = ("certified", "verified")
@@ -38,6 +39,7 @@ def summary_of(result: Result, control: Array | None, dictionary: Dictionary | N
         "cost_scale": result.cost_scale,
         "stopped": result.stopped,
         "worst": _witness(result.worst),
+        "tolerances": {proof.family: _tolerance(proof) for proof in result.proofs if proof.verdict == "proven"},
         "sparsity": acting or {"active_fraction": None, "switches": None},
         "counts": {
             "relaxed_programs": 0,
@@ -47,6 +49,16 @@ def summary_of(result: Result, control: Array | None, dictionary: Dictionary | N
         },
         **({} if result.scenario_bound is None else {"scenario_bound": asdict(result.scenario_bound)}),
         "seconds": result.seconds,
+    }
+
+
+def _tolerance(proof: Proof) -> dict[str, Any]:
+    """What was proven of one constraint: that it is exceeded by at most ``proven`` of each row's own unit (negative: a
+    margin). ``rows``: what counts as no violation, at most `TOLERANCE` of its own unit, of every row in the user's."""
+    return {
+        "own": TOLERANCE,
+        "proven": proof.bound,
+        "rows": None if proof.units is None else TOLERANCE * proof.units,
     }
 
 

@@ -55,6 +55,7 @@ def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("upper bound", _number(summary["upper_bound"], ".9g")),
         ("relative gap", _number(summary["gap"], ".2e")),
         ("worst violation", _worst(worst)),
+        ("proven to", _tolerances(summary.get("tolerances") or {})),
         ("active indices", str(counts["active_indices"])),
         ("rounds", str(counts["rounds"])),
         ("share of time active", _number(sparsity["active_fraction"], ".1%")),
@@ -66,6 +67,18 @@ def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def _number(value: Any, form: str) -> str:
     return "unknown" if value is None else format(value, form)
+
+
+def _tolerances(tolerances: Mapping[str, Any]) -> str:
+    """What was proven to count as no violation, in the user's units."""
+    if not tolerances:
+        return "unknown"
+    parts = []
+    for name, one in tolerances.items():
+        rows = [one["own"]] if one["rows"] is None else list(one["rows"])
+        least, most = f"{min(rows):.1e}", f"{max(rows):.1e}"
+        parts.append(f"{least if least == most else f'{least} to {most}'} in {name}")
+    return f"{', '.join(parts)} ({next(iter(tolerances.values()))['own']:g} of each row's own unit)"
 
 
 def _worst(worst: Mapping[str, Any]) -> str:

@@ -188,6 +188,7 @@ class UsersUnits:
             own,
             violation=own.violation * own.unit,
             unit=1.0,
+            units=self.program.family(own.family).row_units,
             index=None if own.index is None else placed(own.index),
             leaves=None if own.leaves is None else (placed(own.leaves[0]), placed(own.leaves[1])),
         )
