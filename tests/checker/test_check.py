@@ -6,15 +6,37 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.checker.claims.case import Case
+from sparserob_core.checker.claims.claims import check as derived
 from sparserob_core.errors import SparseRobError
+from sparserob_core.experiment.assemble import dictionaries_of, gap_tolerance, problem_of
 from sparserob_core.experiment.check.check import Check, check
-from tests.support.tampering import CONFIG, FILES, KINDS, NONSENSICAL, forged
+from sparserob_core.experiment.config.load import load_config
+from tests.support.subtle import RUNS, SUBTLE
+from tests.support.tampering import (
+    CONFIG,
+    DECISION,
+    FIGURES,
+    FILES,
+    KINDS,
+    MULTIPLIERS,
+    NONSENSICAL,
+    PROOF,
+    WITNESS,
+    Change,
+    Forgery,
+    copied,
+    forged,
+)
+
+CRUDE = [*KINDS][::12]
 
 SPRING: dict[str, Any] = {
     "name": "linear",
@@ -165,6 +187,7 @@ CONFIGS: dict[str, dict[str, Any]] = {
         "observers": [],
     },
 }
+CONFIGS |= {name: on(pieces, problem) for name, (pieces, problem) in RUNS.items()}
 STATUS = {"infeasible": "infeasible", "refuted": "refuted", "refuted parameter": "refuted"}
 Runs = Callable[[str], Path]
 
@@ -196,6 +219,60 @@ def test_every_claim_of_an_honest_run_holds(name: str, runs: Runs) -> None:
     assert {"config", "result.json", "solution.npz"} < {claim.name for claim in found.claims}
 
 
+@dataclass
+class Honest:
+    """An honest run in memory: what its files say, and what its config describes."""
+
+    directory: Path
+    config: dict[str, Any]
+    certificate: dict[str, Any]
+    result: dict[str, Any]
+    case: Case
+    tolerance: float | None
+
+    @staticmethod
+    def of(directory: Path) -> Honest:
+        files = copied(directory)
+        case, tolerance = described(files.config, files.certificate)
+        return Honest(directory, files.config, files.certificate, files.result, case, tolerance)
+
+    def refuses(self, change: Change) -> bool:
+        """Whether the checker does not accept the run after a change, by its mathematics alone: no digest is compared,
+        and the other files agree with the change. A claim is not shown, or the input is at fault; anything else is an
+        error of the test."""
+        files = Forgery(self.directory, *(copy.deepcopy(one) for one in (self.config, self.certificate, self.result)))
+        change(files)
+        certificate = json.loads(json.dumps(files.certificate))
+        try:
+            case, tolerance = (
+                (replace(self.case, certificate=certificate), self.tolerance)
+                if files.config == self.config
+                else described(files.config, certificate)
+            )
+            return any(claim.verdict != "holds" for claim in derived(case, tolerance))
+        except SparseRobError:
+            return True
+
+
+def described(config: dict[str, Any], certificate: dict[str, Any]) -> tuple[Case, float | None]:
+    loaded = load_config(config)
+    problem = problem_of(loaded)
+    assert isinstance(problem, sr.OptimalControlProblem)
+    return Case(problem, *dictionaries_of(loaded, problem.horizon), certificate), gap_tolerance(loaded)
+
+
+@pytest.fixture(scope="module")
+def honest(runs: Runs) -> Callable[[str], Honest]:
+    made: dict[str, Honest] = {}
+
+    def by_name(name: str) -> Honest:
+        if name not in made:
+            made[name] = Honest.of(runs(name))
+        return made[name]
+
+    return by_name
+
+
 def refused(directory: Path) -> bool:
     """Whether a run is not accepted: a claim is not shown, or the input is at fault. Anything but these is an error of
     the test."""
@@ -205,23 +282,36 @@ def refused(directory: Path) -> bool:
         return True
 
 
-@pytest.mark.parametrize("kind", {**KINDS, **NONSENSICAL})
-def test_a_forgery_is_refused_by_its_mathematics_alone(kind: str, runs: Runs, tmp_path: Path) -> None:
-    name, change = {**KINDS, **NONSENSICAL}[kind]
-    assert refused(forged(runs(name), tmp_path / "forged", change, consistent=True))
+GROUPS = {
+    "the decision": DECISION,
+    "the figures": FIGURES,
+    "the multipliers": MULTIPLIERS,
+    "the proofs": PROOF,
+    "the config": CONFIG,
+    "the witness": WITNESS,
+    "nonsense": NONSENSICAL,
+    **SUBTLE,
+}
 
 
-@pytest.mark.parametrize("kind", [*KINDS, *FILES])
-def test_a_crude_forgery_is_refused(kind: str, runs: Runs, tmp_path: Path) -> None:
+@pytest.mark.parametrize("group", GROUPS)
+def test_no_forgery_is_accepted_even_where_all_files_agree_with_it(group: str, honest: Callable[[str], Honest]) -> None:
+    accepted = [kind for kind, (name, change) in GROUPS[group].items() if not honest(name).refuses(change)]
+    assert accepted == []
+
+
+@pytest.mark.parametrize("kind", [*FILES, *CRUDE])
+def test_a_crude_forgery_of_the_files_is_refused(kind: str, runs: Runs, tmp_path: Path) -> None:
     name, change = {**KINDS, **FILES}[kind]
     assert refused(forged(runs(name), tmp_path / "forged", change, consistent=False))
 
 
 def test_there_are_many_kinds_of_forgery() -> None:
-    assert len(KINDS) + len(FILES) >= 45
+    assert len(KINDS) + len(FILES) >= 160
+    assert sum(map(len, SUBTLE.values())) >= 100
 
 
-@pytest.mark.parametrize("kind", CONFIG)
+@pytest.mark.parametrize("kind", [*CONFIG][::5])
 def test_a_changed_config_no_longer_has_the_recorded_digest(kind: str, runs: Runs, tmp_path: Path) -> None:
     name, change = CONFIG[kind]
     directory = forged(runs(name), tmp_path / "forged", change, consistent=False)
@@ -237,6 +327,33 @@ def test_a_changed_config_no_longer_has_the_recorded_digest(kind: str, runs: Run
 def test_a_copy_that_was_only_rewritten_is_verified(runs: Runs, tmp_path: Path) -> None:
     for name in CONFIGS:
         assert check(forged(runs(name), tmp_path / name, lambda files: None, consistent=True)).status == "verified"
+
+
+def test_what_nothing_was_compared_with_is_named_and_changes_no_verdict(runs: Runs, tmp_path: Path) -> None:
+    directory = forged(runs("known"), tmp_path / "forged", lambda files: files.result.update(own="word"), False)
+    (directory / "notes.txt").write_text("certified, I swear")
+    found = check(directory)
+    assert found.status == "verified"
+    named = dict(entry.partition(": ")[::2] for entry in found.not_compared)
+    assert {"message", "seconds", "counts", "own"} <= set(named["result.json"].split(", "))
+    assert not {"status", "cost", "worst", "sparsity", "gap", "seed"} & set(named["result.json"].split(", "))
+    assert {"indices", "multipliers", "times"} <= set(named["solution.npz"].split(", "))
+    assert {"notes.txt", "trace.npz", "rounds.npz"} <= set(named)
+
+
+def test_a_check_stops_in_time_with_what_was_decided(runs: Runs, command: Callable[..., Any]) -> None:
+    found = check(runs("known"), seconds=1e-9)
+    verdicts = {claim.name: claim.verdict for claim in found.claims}
+    assert found.status == "undecided"
+    assert verdicts["path"] == verdicts["lower bound"] == verdicts["status"] == "not checked"
+    assert verdicts["cost"] == verdicts["config"] == "holds"
+    assert check(runs("known"), seconds=60).status == "verified"
+    for wrong in (0, -1.0, float("nan"), "10", True):
+        with pytest.raises(sr.InputError, match="seconds"):
+            check(runs("known"), seconds=wrong)  # type: ignore[arg-type]
+    late = command("check", runs("known"), "--seconds", "1e-9")
+    assert late.returncode == 4
+    assert "the time limit of 1e-09 s was reached" in late.stdout
 
 
 def test_a_truncated_certificate_is_an_input_error(runs: Runs, tmp_path: Path) -> None:

@@ -59,9 +59,12 @@ class Forgery:
 Change = Callable[[Forgery], None]
 
 
-def copied(source: Path, target: Path) -> Forgery:
-    """A copy of a run directory."""
-    shutil.copytree(source, target)
+def copied(source: Path, target: Path | None = None) -> Forgery:
+    """A copy of a run directory; only of what its files say, without a target."""
+    if target is None:
+        target = source
+    else:
+        shutil.copytree(source, target)
     return Forgery(
         target,
         read_source(target / "config.yaml").data,
@@ -273,7 +276,7 @@ FIGURES: dict[str, tuple[str, Change]] = {
     "a rounding is called a violation, by a long direction": (
         "integrator",
         lambda files: (
-            scaled(1 - 5e-10 / 1.5)(files),
+            scaled(1 - 2.5e-10 / 1.5)(files),
             files.certificate.update(
                 status="refuted",
                 lower_bound=1.4,
@@ -283,7 +286,7 @@ FIGURES: dict[str, tuple[str, Change]] = {
                     "parameter": [],
                     "direction": [1e6],
                     "disturbance": None,
-                    "violation": 5e-4,
+                    "violation": 2.5e-4,
                 },
             ),
         ),
@@ -555,16 +558,22 @@ NONSENSE: dict[str, Any] = {
 }
 PLACES: dict[str, tuple[str, Callable[[Forgery], Any], str]] = {
     **{
-        key: ("known", lambda files: files.certificate, key)
+        key: ("integrator", lambda files: files.certificate, key)
         for key in ("format", "status", "cost", "lower_bound", "decision", "multipliers", "proof", "gap_tolerance")
     },
-    **{key: ("known", lambda files: files.heaviest, key) for key in ("constraint", "time", "direction", "multiplier")},
+    **{
+        key: ("integrator", lambda files: files.heaviest, key)
+        for key in ("constraint", "time", "direction", "multiplier")
+    },
     "multiplier's parameter": ("one parameter", lambda files: files.heaviest, "parameter"),
-    "multipliers.constraints": ("known", lambda files: files.multipliers, "constraints"),
+    "multipliers.constraints": ("integrator", lambda files: files.multipliers, "constraints"),
     "multipliers.equalities": ("minimum attention", lambda files: files.multipliers, "equalities"),
     "multipliers.pieces": ("walsh", lambda files: files.multipliers, "pieces"),
-    "proof.path": ("known", lambda files: files.certificate["proof"], "path"),
-    **{f"proof.{key}": ("known", lambda files: files.proof("path"), key) for key in ("tolerance", "lower", "upper")},
+    "proof.terminal": ("integrator", lambda files: files.certificate["proof"], "terminal"),
+    **{
+        f"proof.{key}": ("integrator", lambda files: files.proof("terminal"), key)
+        for key in ("tolerance", "lower", "upper")
+    },
     "witness": ("refuted", lambda files: files.certificate, "witness"),
     **{
         f"witness.{key}": ("refuted parameter", lambda files: files.certificate["witness"], key)
@@ -652,6 +661,36 @@ FILES: dict[str, tuple[str, Change]] = {
     ),
     "the result is about another config": ("known", lambda files: files.result.update(config="00000000")),
     "the certificate is about another config": ("known", lambda files: files.certificate.update(config="00000000")),
+    "the stored decision is another one": (
+        "known",
+        stored(lambda arrays: arrays.update(decision=arrays["decision"] + 1e-15)),
+    ),
+    "the stored worst disturbance is another one": (
+        "refuted",
+        stored(lambda arrays: arrays.update(worst_disturbance=-arrays["worst_disturbance"])),
+    ),
+    "the seed of the result is another one": ("known", lambda files: files.result.update(seed=7)),
+    "the title of the result is another one": ("known", lambda files: files.result.update(title="Certified by nobody")),
+    "the result acts less often": (
+        "known",
+        lambda files: files.result["sparsity"].update(
+            active_fraction=files.result["sparsity"]["active_fraction"] - 0.01
+        ),
+    ),
+    "the result switches less often": (
+        "known",
+        lambda files: files.result["sparsity"].update(switches=files.result["sparsity"]["switches"] - 1),
+    ),
+    "the worst violation is smaller": ("known", lambda files: files.result["worst"].update(violation=-0.1)),
+    "the worst violation is that of another constraint": (
+        "known",
+        lambda files: files.result["worst"].update(constraint="door"),
+    ),
+    "the worst violation is at a time outside": ("known", lambda files: files.result["worst"].update(time=6.0)),
+    "the worst violation is another than the witness shows": (
+        "refuted",
+        lambda files: files.result["worst"].update(violation=1e-12),
+    ),
     "the result is empty": ("known", lambda files: files.result.clear()),
 }
 KINDS = {**DECISION, **FIGURES, **MULTIPLIERS, **PROOF, **CONFIG, **WITNESS}
