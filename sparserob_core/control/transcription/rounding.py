@@ -29,7 +29,7 @@ def rounded_down(model: Transcription, result: Result, tolerance: float | None) 
     if not np.isfinite(result.lower_bound) or result.lower_bound <= 0.0:  # without multipliers 0 is exact
         return result
     lowered = max(0.0, result.lower_bound - SHARE * (_added(model, result) + result.lower_bound))
-    dual = replace(result.dual, bound=lowered) if result.dual.bound == result.lower_bound else result.dual
+    dual = replace(result.dual, bound=min(result.dual.bound, lowered))
     answer = replace(result, lower_bound=lowered, dual=dual)
     if answer.status != "certified" or tolerance is None or answer.gap <= tolerance + SMALL_GAP:
         return answer
