@@ -20,6 +20,8 @@ from sparserob_core.control.response.response import Response
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array, Box
 
+# said where it is met, and before anything is solved
+WITHOUT_PROOF = "measurable disturbances are proven only for known systems and sets with flat sides"
 CHUNK = 4_000_000  # entries of a gain array that are built at once (32 MB)
 
 
@@ -139,10 +141,7 @@ class WorstCase:
         if model.kind != "measurable":
             return DisturbanceSupport(lifted, model, H @ lifted.transform, joined)
         if lifted.space.nu or joined is not None:
-            raise NotEnclosable(
-                "measurable disturbances are proven only for known systems and sets with flat sides; "
-                "expected disturbance_class piecewise_constant"
-            )
+            raise NotEnclosable(f"{WITHOUT_PROOF}; with disturbance_class piecewise_constant there is one")
         return MeasurableCellSupport(self.measurable, H, lifted)
 
     def offsets(self, times: Array, directions: Array, parameters: Array) -> Array:

@@ -21,7 +21,8 @@ LEGENDRE = np.polynomial.legendre.Legendre.basis(5)
 NODES = np.concatenate([[-1.0], LEGENDRE.deriv().roots(), [1.0]])
 WEIGHTS = 1.0 / (15.0 * LEGENDRE(NODES) ** 2)
 ACCURACY = 1e-14  # of an integral over one interval, relative to the largest integrand times the horizon
-TABLES_KEPT = 64  # directions and parameters whose integrals are remembered
+TINY = float(np.finfo(float).tiny)
+TABLES_KEPT = 4096  # directions and parameters whose integrals are remembered
 MOST_SHORT = 4096  # intervals that one is cut into before any is halved
 HALVINGS = 48  # of an interval across a kink of the integrand: what is left of it is below rounding
 
@@ -33,56 +34,69 @@ class MeasurableSupport:
 
     response: Response
     bound: ConvexSet
-    _tables: dict[bytes, tuple[Array, Array, Array]] = field(default_factory=dict, repr=False)
+    _tables: dict[bytes, tuple[Array, Array]] = field(default_factory=dict, repr=False)
 
     def __call__(self, times: Array, directions: Array, parameters: Array) -> Array:
         """``sigma (k,)`` at ``times (k,)``, ``directions (k, d)``, ``parameters (k, nu)``."""
-        unique, which = np.unique(np.hstack([directions, parameters]), axis=0, return_inverse=True)
-        which = which.reshape(-1)
+        unique, which = np.unique(parameters, axis=0, return_inverse=True)
         result = np.empty(times.size)
-        for position, row in enumerate(unique):
-            here = which == position
-            starts, total, A = self._table(row[: directions.shape[1]], row[directions.shape[1] :])
-            breakpoints = self.response.grid.breakpoints
-            pieces = self.response.grid.locate(times[here])
-            within = np.clip(times[here] - breakpoints[pieces], 0.0, None)
-            result[here] = total[pieces] + self._integrals(A, starts[pieces], within)
+        for position, parameter in enumerate(unique):
+            here = np.flatnonzero(which.reshape(-1) == position)
+            result[here] = self._at(times[here], directions[here], parameter)
         return result
 
-    def _table(self, direction: Array, parameter: Array) -> tuple[Array, Array, Array]:
-        """Rows ``c'e^{A s}`` at the breakpoints, the integral up to them, and ``[A, E]`` at the parameter."""
-        key = direction.tobytes() + parameter.tobytes()
-        if key not in self._tables:
-            A, _, W = self.response.system.matrices(parameter[None])
-            both = np.hstack([A[0], W[0]])
-            breakpoints = self.response.grid.breakpoints
-            starts = np.einsum("i,lij->lj", direction, transitions(A[0][None], breakpoints)[0])
-            integrals = self._integrals(both, starts[:-1], np.diff(breakpoints))
-            remember(self._tables, key, (starts, np.concatenate([[0.0], np.cumsum(integrals)]), both), TABLES_KEPT)
-        return self._tables[key]
+    def _at(self, times: Array, directions: Array, parameter: Array) -> Array:
+        unique, which = np.unique(directions, axis=0, return_inverse=True)
+        which = which.reshape(-1)
+        A, _, E = self.response.system.matrices(parameter[None])
+        tables = self._known(A[0], E[0], unique, parameter)
+        grid = self.response.grid
+        pieces = grid.locate(times)
+        within = np.clip(times - grid.breakpoints[pieces], 0.0, None)
+        starts = np.stack([tables[one][0][piece] for one, piece in zip(which, pieces, strict=True)])
+        before = np.array([tables[one][1][piece] for one, piece in zip(which, pieces, strict=True)])
+        return np.asarray(before + self._integrals(A[0], E[0], starts, within, which))
 
-    def _integrals(self, both: Array, starts: Array, lengths: Array) -> Array:
+    def _known(self, A: Array, E: Array, directions: Array, parameter: Array) -> list[tuple[Array, Array]]:
+        """For each of ``directions (k, d)``: rows ``c'e^{A s}`` at the breakpoints ``(L+1, d)``, and the integral up to
+        them, ``(L+1,)``."""
+        keys = [direction.tobytes() + parameter.tobytes() for direction in directions]
+        new = np.array([place for place, key in enumerate(keys) if key not in self._tables], dtype=int)
+        found: dict[bytes, tuple[Array, Array]] = {key: self._tables[key] for key in keys if key in self._tables}
+        if new.size:
+            breakpoints = self.response.grid.breakpoints
+            starts = np.einsum("ki,lij->klj", directions[new], transitions(A[None], breakpoints)[0])
+            lengths = np.tile(np.diff(breakpoints), new.size)
+            owner = np.repeat(np.arange(new.size), breakpoints.size - 1)
+            integrals = self._integrals(A, E, starts[:, :-1].reshape(-1, A.shape[0]), lengths, owner)
+            total = np.cumsum(integrals.reshape(new.size, -1), axis=1)
+            for place, rows, sums in zip(new, starts, total, strict=True):
+                found[keys[place]] = (rows, np.concatenate([[0.0], sums]))
+                remember(self._tables, keys[place], found[keys[place]], TABLES_KEPT)
+        return [found[key] for key in keys]
+
+    def _integrals(self, A: Array, E: Array, starts: Array, lengths: Array, member: np.ndarray) -> Array:
         """``int_0^length h(E' y(s)) ds`` from rows ``y(0) = starts (l, d)``: Gauss-Lobatto, halving what has not
-        converged (kinks)."""
-        A, W = both[:, : both.shape[0]], both[:, both.shape[0] :]
+        converged (kinks). ``member (l,)``: of which functional each is part, whose largest integrand sets the
+        accuracy."""
         total = np.zeros(lengths.size)
-        fastest = float(np.abs(np.linalg.eigvals(A)).max())
+        fastest = min(float(np.linalg.norm(A, 2)), 4.0 * float(np.abs(np.linalg.eigvals(A)).max()))
         count = int(np.clip(np.ceil(fastest * lengths.max(initial=0.0)), 1, MOST_SHORT))
         owner = np.repeat(np.arange(lengths.size), count)  # short intervals, on which the quadrature is at home
         offsets = np.outer(lengths, np.arange(count) / count)
         starts = np.einsum("li,lqij->lqj", starts, transitions(A[None, None], offsets)[0]).reshape(-1, A.shape[0])
         lengths = lengths[owner] / count
-        whole, size = self._quadrature(A, W, starts, lengths)
-        accuracy = ACCURACY * max(
-            float(size.max(initial=0.0)) * float(self.response.grid.breakpoints[-1]), np.finfo(float).tiny
-        )
+        whole, size = self._quadrature(A, E, starts, lengths)
+        largest = np.zeros(int(member.max(initial=0)) + 1)
+        np.maximum.at(largest, member[owner], size)
+        accuracy = ACCURACY * np.maximum(largest[member] * float(self.response.grid.breakpoints[-1]), TINY)
         for _ in range(HALVINGS):
             middles = np.einsum("li,lij->lj", starts, transitions(A[None], lengths / 2)[0])
             left, right = (
-                self._quadrature(A, W, starts, lengths / 2)[0],
-                self._quadrature(A, W, middles, lengths / 2)[0],
+                self._quadrature(A, E, starts, lengths / 2)[0],
+                self._quadrature(A, E, middles, lengths / 2)[0],
             )
-            open_ = np.abs(left + right - whole) > accuracy
+            open_ = np.abs(left + right - whole) > accuracy[owner]
             np.add.at(total, owner[~open_], (left + right)[~open_])
             starts, lengths = np.vstack([starts[open_], middles[open_]]), np.tile(lengths[open_] / 2, 2)
             whole, owner = np.concatenate([left[open_], right[open_]]), np.tile(owner[open_], 2)

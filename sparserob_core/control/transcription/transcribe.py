@@ -33,6 +33,7 @@ from sparserob_core.control.transcription.own_units import (
     row_units,
     units_of_sides,
 )
+from sparserob_core.control.transcription.provable import hindrance
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.sip.convex_set import Array, ConvexSet
@@ -418,6 +419,7 @@ def family_of(constraint: StateConstraint) -> ConstraintFamily:
 
 
 def _reduced(constraint: StateConstraint) -> ConstraintFamily:
+    response = constraint.functionals.response
     return ConstraintFamily(
         name=constraint.name,
         index_set=constraint.index_set,
@@ -427,5 +429,6 @@ def _reduced(constraint: StateConstraint) -> ConstraintFamily:
         cells=constraint.cells,
         gradient=Sensitivity(constraint).gradient,
         explain=constraint.explain,
+        hindrance=lambda lower, upper: hindrance(response.system, float(response.grid.breakpoints[-1])),
         source=constraint,
     )

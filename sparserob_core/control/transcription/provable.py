@@ -1,0 +1,63 @@
+"""What stands against a proof, in words: known before anything is solved, or seen where a proof does not advance."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sparserob_core.control.enclosures.taylor import TaylorSpace
+from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.response.functional import WITHOUT_PROOF
+from sparserob_core.control.response.parameters import ParameterIndex
+from sparserob_core.control.sets.sets import Equality
+from sparserob_core.errors import NotEnclosable
+
+TINY = 1e-6  # of the parameters: a cell on which a system that can be enclosed at all will be
+NOTABLE = 10.0  # logarithm of a growth from which rounding may be what hinders a proof
+
+
+def unprovable(problem: OptimalControlProblem) -> str | None:
+    """Why no control of a problem can ever be certified, whatever the method; ``None`` where nothing is known to stand
+    against it.
+
+    Nothing is solved: this takes milliseconds.
+    """
+    if problem.disturbance is not None and problem.disturbance_class == "measurable":
+        paths = [entry.set if isinstance(entry, PathConstraint) else entry for entry in problem.path]
+        ends = [terminal for terminal in problem.terminal if not isinstance(terminal, Equality)]
+        curved = [one for one in (*paths, *ends) if one.halfspaces() is None]
+        if problem.system.parameter_count or curved:
+            over = "uncertain parameters" if problem.system.parameter_count else "sets with curved sides"
+            return (
+                f"{WITHOUT_PROOF}; this problem has {over}. With disturbance_class piecewise_constant it can be proven"
+            )
+    parameters = problem.system.parameters
+    if parameters is None:
+        return None
+    box = ParameterIndex(parameters).box
+    try:
+        space = TaylorSpace(problem.system.parameter_count, 1)
+        problem.system.taylor(space, parameters.interior_point(), TINY * (box.upper - box.lower) / 2)
+    except NotEnclosable as error:
+        return str(error)
+    return None
+
+
+def growth(system: LinearSystem, horizon: float) -> float:
+    """By which power of ``e`` the state can grow over the horizon: the largest real part of an eigenvalue of ``A(p)``,
+    at a lattice of parameters, times the horizon; 0 where nothing grows."""
+    A = system.matrices(ParameterIndex(system.parameters).lattice()[0])[0]
+    return max(0.0, float(np.linalg.eigvals(A).real.max()) * horizon)
+
+
+def hindrance(system: LinearSystem, horizon: float) -> str:
+    """What of a system keeps the bounds of a cell wide however small the cell is, and what would help; empty where it
+    is not the system."""
+    exponent = growth(system, horizon)
+    if exponent < NOTABLE:
+        return ""
+    size = f"e^{exponent:.0f} = {np.exp(min(exponent, 700.0)):.1g}"
+    return (
+        f"the state can grow by {size} over the horizon: double precision cannot resolve more than "
+        f"{np.finfo(float).eps:.0e} of what it grows to; a shorter horizon or wider sets would help"
+    )
