@@ -216,13 +216,16 @@ def alarm(program: SemiInfiniteProgram, dual: Dual, x: Array) -> str:
 
     A decision that violates its rows by ``v`` may cost ``y'v`` less than the optimum, for the multipliers ``y`` of
     the bound: by weak duality ``lower <= J(x) + y'(G x - h) + mu'(A x - b)``. What is allowed is that sum with the
-    tolerance of each proven row in place of its violation, with the real residuals of the others, and rounding.
+    tolerance of each proven row in place of its violation, that of each bound (1e-9 of the smallest number that it
+    compares) where it is missed, with the real residuals of the fixed rows and equalities, and rounding.
     """
     base, cost = program.finite, program.cost(x)
     image, allowed = base.image(x), ROUNDING * base.magnitude(x)
     allowed += sum(cut.multiplier * TOLERANCE for cut in dual.cuts)
-    if dual.z is not None:
-        allowed += float(np.abs(dual.z) @ np.maximum(np.maximum(base.lower - image, image - base.upper), 0.0))
+    if dual.z is not None and base.S is not None:
+        missed = np.maximum(np.maximum(base.lower - image, image - base.upper), 0.0)
+        rounding = ROUNDING * (abs(base.S) @ np.abs(x))
+        allowed += float(np.abs(dual.z) @ np.minimum(missed, TOLERANCE * _units(base.lower, base.upper) + rounding))
     if dual.mu.size:
         allowed += float(np.abs(dual.mu) @ np.abs(base.A @ x - base.b))
     if dual.fixed.size:
@@ -234,3 +237,12 @@ def alarm(program: SemiInfiniteProgram, dual: Dual, x: Array) -> str:
         f" than the {allowed:.1e} that the tolerances of the proofs allow: one of the two is wrong, and neither is"
         " claimed; try another solver, or state the problem in units in which its numbers are of one size"
     )
+
+
+def _units(lower: Array, upper: Array) -> Array:
+    """The units ``(k,)`` of bounds: the smallest of their sizes and of the width between them that is not 0 (decision
+    16); 0 where there is none."""
+    with np.errstate(invalid="ignore"):
+        sizes = np.abs(np.stack([lower, upper, upper - lower]))
+    units = np.where(np.isfinite(sizes) & (sizes > 0.0), sizes, np.inf).min(axis=0)
+    return np.where(np.isfinite(units), units, 0.0)

@@ -183,6 +183,18 @@ def test_a_lower_bound_above_the_cost_of_a_proven_decision_is_an_alarm():
     assert alarm(program, Dual(1.0 + 5e-10, (), np.zeros(0)), x), "no row pays for it"
 
 
+def test_a_bound_of_the_image_pays_with_its_own_tolerance_only():
+    """``u1 + u2 <= 0.5`` as a row of a hundred-thousandth: missed by 1e-9 in numbers, by 1e-4 in its own unit."""
+    program = sr.SemiInfiniteProgram(
+        n=2, weights=[1.0, 1.0, 0.0], S=[[1, 0], [0, 1], [1e-5, 1e-5]], lower=-1.0, upper=[1.0, 1.0, 0.5e-5]
+    )
+    x, z = np.array([0.5, 0.0001]), np.array([0.0, 0.0, 2e5])
+    missed = program.finite.image(x)[2] - 0.5e-5
+    assert 0.9e-9 < missed < 1.1e-9
+    assert alarm(program, Dual(program.cost(x) + z[2] * missed, (), np.zeros(0), z), x)
+    assert not alarm(program, Dual(program.cost(x) + z[2] * 0.9 * 1e-9 * 0.5e-5, (), np.zeros(0), z), x)
+
+
 def test_the_gap_is_relative_to_the_cost_or_a_millionth_of_the_largest_possible_one():
     assert relative_gap(0.0, 0.0, 5.0) == 0.0
     assert relative_gap(1.0, 2.0, 5.0) == 0.5
