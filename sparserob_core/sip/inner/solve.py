@@ -29,6 +29,8 @@ from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
 # The accuracy that a solver is asked for, in multiples of the tolerance, in each form, until it is believed.
 ATTEMPTS: tuple[tuple[Form, float], ...] = (("split", 0.1), ("epigraph", 0.1), ("split", 1e-3), ("split", 10.0))
 
+ADVICE = "try another solver, or state the problem in units in which its numbers are of one size"
+
 
 @dataclass
 class _Case:
@@ -277,8 +279,7 @@ def _failed(case: _Case) -> FiniteSolution:
         found = (
             f"of {len(case.attempts)} answers none holds: the best misses its rows by {best.residual:.1e} and {bound}"
         )
-    advice = "try another solver, or state the problem in units in which its numbers are of one size"
-    return replace(best, status="failed", message=f"{found}; {advice}", attempts=tuple(case.attempts))
+    return replace(best, status="failed", message=f"{found}; {ADVICE}", attempts=tuple(case.attempts))
 
 
 def _badness(solution: FiniteSolution) -> float:

@@ -12,7 +12,8 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import RoundFinished, frozen
 from sparserob_core.sip.evidence import NO_BOUND, Cut, Dual, Proof
-from sparserob_core.sip.finite import FiniteSolution
+from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
+from sparserob_core.sip.inner.solve import ADVICE
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram, Separation, WorstConstraint
 from sparserob_core.sip.proof.irreducible import irreducible
@@ -127,10 +128,13 @@ class Ledger:
         ``ending``: why the method came to an end, where it was not by its own rules."""
         x, cost = answer.solution.x, self.program.cost(answer.solution.x)
         status, message = verdict(proofs, self.gap(cost), self.tolerance)
-        residual = self.program.finite.residual(x)
+        residual, beyond = self.program.finite.residual(x), _beyond(self.program, x)
+        if beyond > TOLERANCE and status in ("certified", "verified"):
+            status = "failed"
+            message = f"the decision misses its bounds by {beyond:.1e} of what they compare; {ADVICE}"
         if residual > RESIDUAL:
             status = "failed"
-            message = f"the decision misses its bounds or equalities by {residual:.1e}: {answer.solution.message}"
+            message = f"the decision misses its bounds or equalities by {residual:.1e}; {ADVICE}"
         proven = status in ("certified", "verified") and len(proofs) == len(self.program.families)
         wrong = alarm(self.program, self.dual, x) if proven else ""
         if wrong:
@@ -220,11 +224,10 @@ def alarm(program: SemiInfiniteProgram, dual: Dual, x: Array) -> str:
     compares) where it is missed, with the real residuals of the fixed rows and equalities, and rounding.
     """
     base, cost = program.finite, program.cost(x)
-    image, allowed = base.image(x), ROUNDING * base.magnitude(x)
+    allowed = ROUNDING * base.magnitude(x)
     allowed += sum(cut.multiplier * TOLERANCE for cut in dual.cuts)
     if dual.z is not None and base.S is not None:
-        missed = np.maximum(np.maximum(base.lower - image, image - base.upper), 0.0)
-        rounding = ROUNDING * (abs(base.S) @ np.abs(x))
+        missed, rounding = _missed(base, x)
         allowed += float(np.abs(dual.z) @ np.minimum(missed, TOLERANCE * _units(base.lower, base.upper) + rounding))
     if dual.mu.size:
         allowed += float(np.abs(dual.mu) @ np.abs(base.A @ x - base.b))
@@ -235,8 +238,22 @@ def alarm(program: SemiInfiniteProgram, dual: Dual, x: Array) -> str:
     return (
         f"the lower bound {dual.bound:.12g} is above the cost {cost:.12g} of a decision that was proven, by more"
         f" than the {allowed:.1e} that the tolerances of the proofs allow: one of the two is wrong, and neither is"
-        " claimed; try another solver, or state the problem in units in which its numbers are of one size"
+        f" claimed; {ADVICE}"
     )
+
+
+def _missed(base: FiniteProgram, x: Array) -> tuple[Array, Array]:
+    """By how much the image of ``x (n,)`` misses its bounds ``(k,)``, and what is rounding of that."""
+    image, terms = base.image(x), np.abs(x) if base.S is None else abs(base.S) @ np.abs(x)
+    return np.maximum(np.maximum(base.lower - image, image - base.upper), 0.0), ROUNDING * terms
+
+
+def _beyond(program: SemiInfiniteProgram, x: Array) -> float:
+    """The largest miss of a bound by the image of ``x (n,)``, in the bound's own unit, less rounding."""
+    missed, rounding = _missed(program.finite, x)
+    units = _units(program.finite.lower, program.finite.upper)
+    shares = np.maximum(missed - rounding, 0.0) / np.where(units > 0.0, units, 1.0)
+    return float(shares.max(initial=0.0))
 
 
 def _units(lower: Array, upper: Array) -> Array:

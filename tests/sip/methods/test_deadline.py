@@ -195,6 +195,21 @@ def test_a_bound_of_the_image_pays_with_its_own_tolerance_only():
     assert not alarm(program, Dual(program.cost(x) + z[2] * 0.9 * 1e-9 * 0.5e-5, (), np.zeros(0), z), x)
 
 
+def test_a_decision_that_misses_a_bound_by_more_than_its_own_tolerance_is_no_answer():
+    """Whatever the factor of the row ``u1 + u2 <= 0.4``: a terminal state of 0.5 is out of reach."""
+    for factor in (1.0, 1e-5, 1e-9):
+        polytope = sr.Polytope([[factor, factor], [-1, 0], [0, -1], [1, 0], [0, 1]], [0.4 * factor, 1, 1, 1, 1])
+        problem = sr.OptimalControlProblem(
+            system=sr.LinearSystem([[0.0]], [[1.0, 1.0]]),
+            horizon=1.0,
+            initial_state=[0.0],
+            control=polytope,
+            terminal=[sr.Box([0.5], [1.0])],
+        )
+        result = sr.solve(problem, control={"name": "piecewise_constant", "pieces": 4})
+        assert result.status in ("infeasible", "failed"), f"{factor}: {result.message}"
+
+
 def test_the_gap_is_relative_to_the_cost_or_a_millionth_of_the_largest_possible_one():
     assert relative_gap(0.0, 0.0, 5.0) == 0.0
     assert relative_gap(1.0, 2.0, 5.0) == 0.5
