@@ -34,8 +34,8 @@ from sparserob_core.experiment.run.run import Outcome as Outcome
 from sparserob_core.experiment.run.run import run as run
 from sparserob_core.experiment.check.check import Check as Check
 from sparserob_core.experiment.check.check import check as check
-from sparserob_core.experiment.simulation.outcome import ConstraintShare as ConstraintShare
-from sparserob_core.experiment.simulation.outcome import Simulation as Simulation
+from sparserob_core.experiment.simulation.simulation import ConstraintShare as ConstraintShare
+from sparserob_core.experiment.simulation.simulation import Simulation as Simulation
 from sparserob_core.experiment.simulation.simulate import simulate as simulate
 from sparserob_core.experiment.margin.margin import Margin as Margin
 from sparserob_core.experiment.margin.margin import margin as margin

@@ -46,7 +46,7 @@ class _Descent:
     """The negated objective at one point.
 
     scipy finishes its iteration beyond ``maxfun``, and averages values: once the budget is spent, and where the
-    objective is ``-inf``, it is told the worst finite value that was seen.
+    objective is ``-inf``, it is given the worst finite value that was seen.
     """
 
     def __init__(self, objective: sr.Objective) -> None:

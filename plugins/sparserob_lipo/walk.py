@@ -67,7 +67,7 @@ class Walk:
         self._evaluate(points[chosen])
 
     def note(self, constant: float) -> None:
-        """Tell the constant in use, in units of the value per unit of ``z``, and the share of candidates that it has
+        """Note the constant in use, in units of the value per unit of ``z``, and the share of candidates that it has
         excluded."""
         self.objective.note(constant=constant, rejected=self.rejected / max(1, self.drawn))
 

@@ -51,20 +51,20 @@ class MaxLIPO(sr.Maximiser, sr.Options):
 
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
         """See `sparserob_core.Maximiser`."""
-        walk = _Walk(objective, rng)
-        walk.begin()
+        steps = _Steps(objective, rng)
+        steps.begin()
         waited = 0
         while objective.remaining:
-            if self.trust_region and waited >= (SECONDARY if walk.ascents.secondary else 1) and walk.step_locally():
+            if self.trust_region and waited >= (SECONDARY if steps.ascents.secondary else 1) and steps.step_locally():
                 waited = 0
             else:
-                walk.step_globally(self.candidates, self.uniform)
+                steps.step_globally(self.candidates, self.uniform)
                 waited += 1
-            walk.note(local=waited == 0)
+            steps.note(local=waited == 0)
         return float("inf")
 
 
-class _Walk:
+class _Steps:
     """One search: what was evaluated, in the unit box, and the two kinds of step."""
 
     def __init__(self, objective: sr.Objective, rng: np.random.Generator) -> None:
@@ -92,7 +92,7 @@ class _Walk:
         return value
 
     def note(self, local: bool) -> None:
-        """Tell what the last step was."""
+        """Note what the last step was."""
         fitted = {"radius": self.ascents.radius} if self.dimension <= MODELLED else {}
         self.objective.note(local=float(local), **fitted)
 
@@ -115,7 +115,7 @@ class _Walk:
             point = self.rng.random(self.dimension)
         else:
             point = self.ceiling.highest(seen, self.rng.random((candidates, self.dimension)))
-        self.ascents.hear(point, self.evaluate(point))
+        self.ascents.note_global(point, self.evaluate(point))
 
     def _change_blocks(self) -> None:
         """Beyond what can be modelled: a step of one or few blocks from the best point, adapted to success."""

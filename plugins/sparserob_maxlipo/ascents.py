@@ -45,7 +45,7 @@ class Ascents:
         """The value at the point that was proposed last."""
         self._region.tell(value)
 
-    def hear(self, point: np.ndarray, value: float) -> None:
+    def note_global(self, point: np.ndarray, value: float) -> None:
         """A global step has added this point: if it is the better start, and far away, the ascent begins again from
         there."""
         points, values = self._open()

@@ -20,13 +20,13 @@ class Nevergrad(sr.Maximiser, sr.Options):
     An optional extra: ``pip install 'sparserob[nevergrad]'``. It works in the unit box, one point at a time, with its
     random numbers drawn from the generator of the search and the global ones left as they were. Some of nevergrad's
     portfolios are not repeatable all the same: NGOpt in three dimensions or more may run ``cma.fmin2``, which takes its
-    seed from the clock. Where the function has no value the loss 1e20 is told. What an optimiser guarantees, and in how
-    many dimensions it is of use, nevergrad's documentation says for each; in a space of tuples nearly all of them
+    seed from the clock. Where the function has no value it is given the loss 1e20. What an optimiser guarantees, and in
+    how many dimensions it is of use, nevergrad's documentation says for each; in a space of tuples nearly all of them
     change every block at each step. It proves no upper bound.
 
     An optimiser that raises does not end the run. With numpy 2.4 or later NGOpt and its relatives do so for many pairs
     of dimension and budget ("only 0-dimensional arrays can be converted to Python scalars"). The exception is reported
-    in one warning, and the search goes on with ``fallback``, which is told all that was evaluated, or else shown the
+    in one warning, and the search goes on with ``fallback``, which is given all that was evaluated, or else the
     best of it.
 
     Its own time is 0.2 to 20 milliseconds for each evaluation, and importing it takes seconds. Notes ``spread``: the
@@ -49,7 +49,7 @@ class Nevergrad(sr.Maximiser, sr.Options):
             for key, name in (("optimiser", self.optimiser), ("fallback", self.fallback))
             if name
         ]
-        walk = _Walk(objective, rng)
+        walk = _AskAndTell(objective, rng)
         for name, following in zip(names, [*names[1:], None], strict=True):
             try:
                 walk.run(Guarded(registry[name], objective.domain.dimension, objective.remaining, rng))
@@ -66,7 +66,7 @@ class Nevergrad(sr.Maximiser, sr.Options):
         return float("inf")
 
 
-class _Walk:
+class _AskAndTell:
     """The points and losses so far, in the unit box."""
 
     def __init__(self, objective: sr.Objective, rng: np.random.Generator) -> None:

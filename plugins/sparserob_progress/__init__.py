@@ -1,4 +1,4 @@
-"""Tells the progress of a run on the terminal: a live block on a terminal, plain lines anywhere else, nothing for a
+"""Shows the progress of a run: a live block on a terminal, plain lines anywhere else, nothing for a
 short run."""
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from sparserob_progress.screen import Screen
 from sparserob_progress.status import Status, duration
 
 
-class Progress(sr.Observer, sr.Options):
+class ProgressObserver(sr.Observer, sr.Options):
     """Bounds, round, worst violation, the search with its best value, rate and time left, and the proof, on the
     standard error stream.
 
@@ -22,7 +22,7 @@ class Progress(sr.Observer, sr.Options):
     """
 
     patience: float = Field(default=2.0, ge=0.0)
-    """Seconds of silence; a run that is over by then shows nothing."""
+    """Seconds before anything is shown; a run that is over by then shows nothing."""
 
     verbose: bool = False
     """Write a plain line for every event from the start instead."""
@@ -36,7 +36,7 @@ class Progress(sr.Observer, sr.Options):
             self._status = Status(event.title)
             self._screen = None if self.verbose else Screen(self._status, self.patience, sys.stderr)
         elif self._status is not None:
-            self._hear(self._status, event)
+            self._show(self._status, event)
 
     def close(self) -> None:
         """Leave the terminal as it was."""
@@ -49,8 +49,8 @@ class Progress(sr.Observer, sr.Options):
         if screen.failure is not None:
             raise screen.failure
 
-    def _hear(self, status: Status, event: sr.Event) -> None:
-        status.hear(event)
+    def _show(self, status: Status, event: sr.Event) -> None:
+        status.receive(event)
         if isinstance(event, sr.RunFinished):
             self.close()
         elif self._screen is None and isinstance(event, sr.RoundFinished | sr.EvaluationsFinished | sr.ProofProgress):
@@ -63,5 +63,5 @@ class Progress(sr.Observer, sr.Options):
 def sparserob_observers() -> Iterator[sr.ObserverPlugin]:
     """Offer ``progress``."""
     yield sr.ObserverPlugin(
-        name="progress", factory=Progress, summary="Bounds, search and proof as they go on, on the terminal."
+        name="progress", factory=ProgressObserver, summary="Bounds, search and proof as they go on, on the terminal."
     )

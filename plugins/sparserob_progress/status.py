@@ -12,8 +12,7 @@ LABEL: Final = 9  # characters
 
 
 class Status:
-    """The last of what was heard. To hear an event costs microseconds; the words are put together when they are
-    shown."""
+    """The latest events of a run. To receive one costs microseconds; the text is put together when it is shown."""
 
     def __init__(self, title: str) -> None:
         self.title, self.started = title, time.monotonic()
@@ -27,7 +26,7 @@ class Status:
         """Seconds since the run began."""
         return time.monotonic() - self.started
 
-    def hear(self, event: sr.Event) -> None:
+    def receive(self, event: sr.Event) -> None:
         """Take note of an event."""
         match event:
             case sr.RoundFinished():

@@ -50,7 +50,7 @@ def record(messages: Any, report: Any, opening: Opening, chosen: Destinations, n
     parent, wrong = os.getppid(), []
     try:
         wrong = _record(messages, opening, chosen, name, parent)
-    except Exception as error:  # noqa: BLE001  told at the end, by the process that has a terminal
+    except Exception as error:  # noqa: BLE001  shown at the end, by the process that has a terminal
         wrong = [f"the recording broke off: {type(error).__name__}: {error}"]
     with suppress(OSError):
         report.send(Account(wrong))
@@ -119,7 +119,7 @@ def _serve(servers: list[subprocess.Popen[bytes]], keep: float, parent: int) -> 
 
 def _listen(messages: Any, recorder: Recorder, parent: int, wrong: list[str], share: float) -> Ending:
     """Log whatever comes until the run is over, or gone; an event that cannot be drawn is left out, and the first of
-    them is told."""
+    them is shown."""
     pause = Pause(share)
     while True:
         try:
@@ -165,7 +165,7 @@ class _WithoutPandas(MetaPathFinder):
 
 
 def _settle() -> None:
-    """Hear no signals of the terminal, take one core only, and step back for everybody else."""
+    """Ignore the signals of the terminal, take one core only, and step back for everybody else."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(0))  # through `finally`, to the servers
     with suppress(OSError, AttributeError):

@@ -10,15 +10,15 @@ import numpy as np
 
 import sparserob_core as sr
 from sparserob_rerun import words
-from sparserob_rerun.clock import Clock
 from sparserob_rerun.explorer import Explorer
 from sparserob_rerun.layout import Shown
 from sparserob_rerun.options import LandscapeOptions
 from sparserob_rerun.palette import Floats
 from sparserob_rerun.physics import Physics
 from sparserob_rerun.rounds import Rounds
-from sparserob_rerun.search import Search
+from sparserob_rerun.search import SearchView
 from sparserob_rerun.terrain import Terrain
+from sparserob_rerun.timelines import Timelines
 from sparserob_rerun.way import Way
 
 PICTURES = 60  # rounds whose physics is drawn; of later ones every tenth
@@ -50,19 +50,19 @@ class Recorder:
 
     def __init__(self, rr: Any, stream: Any, opening: Opening, shown: Shown, inspection: sr.Inspection | None) -> None:
         self.rr, self.stream, self.opening, self.inspection = rr, stream, opening, inspection
-        self.clock, self.rounds = Clock(rr, stream), Rounds(rr, stream, inspection)
+        self.timelines, self.rounds = Timelines(rr, stream), Rounds(rr, stream, inspection)
         problem = None if inspection is None else inspection.problem
         self.physics = Physics(rr, stream, inspection) if inspection is not None and problem is not None else None
         self.terrain = Terrain(rr, stream)
         self.explorer = Explorer(self.terrain, inspection, opening.landscape)
-        self.search = Search(rr, stream, self.clock)
+        self.search = SearchView(rr, stream, self.timelines)
         self.searches, self.began = shown.searches, 0.0
         self.best, self.best_value, self.block = np.zeros(0), -np.inf, 1
         self.lower, self.upper, self.over = -np.inf, np.inf, -1.0
         self.exact: float | None = None
         self.proofs: dict[str, int] = {}
         self.way = Way()
-        self.clock.move()
+        self.timelines.move()
         self.say(f"run: {opening.title}")
         self._page("solving", [])
 
@@ -74,7 +74,7 @@ class Recorder:
             case sr.RoundFinished():
                 self._round(event)
             case sr.ProofProgress():
-                self.clock.move(seconds=event.seconds)
+                self.timelines.move(seconds=event.seconds)
                 self.proofs[event.family] = self.proofs.get(event.family, 0) + 1
                 if self.proofs[event.family] <= PROOFS:
                     self.say(
@@ -91,13 +91,13 @@ class Recorder:
     def mark(self) -> None:
         """Mark on the last landscape where the maximum is, if it was proven."""
         landscape = self.explorer.landscape
-        if landscape is not None and self.exact is not None and self.explorer.round == self.clock.round:
+        if landscape is not None and self.exact is not None and self.explorer.round == self.timelines.round:
             at = np.array([[landscape.anchor[landscape.first], landscape.anchor[landscape.second]]])
             self.terrain.mark(at, f"exact maximum {self.exact:.5g}")
 
     def _evaluations(self, event: sr.EvaluationsFinished, kept: np.ndarray) -> None:
         if event.total == event.count:
-            self.began = self.clock.seconds
+            self.began = self.timelines.seconds
         if event.family:
             self.search.separation(event, self.began)
             return
@@ -109,7 +109,7 @@ class Recorder:
             slots = event.best_point.reshape(-1, event.block)
             self.explorer.aim(slots, event.epsilon, f"others as in the first tuples of search {max(1, event.round)}")
         if event.best_value > self.best_value or event.total == event.count:
-            self.say(f"evaluation {self.clock.evaluation}: best g {event.best_value:.8g}", "TRACE")
+            self.say(f"evaluation {self.timelines.evaluation}: best g {event.best_value:.8g}", "TRACE")
         self.best, self.best_value, self.block = event.best_point, event.best_value, event.block
         self.way.go(event, kept, self.terrain)
 
@@ -120,7 +120,7 @@ class Recorder:
             self.way.project(self.terrain)
 
     def _round(self, event: sr.RoundFinished) -> None:
-        self.clock.move(None if self.searches else event.relaxed_programs, event.round, event.seconds)
+        self.timelines.move(None if self.searches else event.relaxed_programs, event.round, event.seconds)
         self.lower = max(self.lower, event.lower_bound)
         self.upper = min(self.upper, np.inf if event.simplified else event.upper_bound)
         self.rounds.bounds(event)
@@ -152,7 +152,7 @@ class Recorder:
                 self.explorer.aim(slots, event.epsilon, f"others as active in round {event.round}", event.round)
 
     def _finished(self, event: sr.RunFinished) -> None:
-        self.clock.move(seconds=event.seconds)
+        self.timelines.move(seconds=event.seconds)
         result = event.result
         lines = words.verdict_lines(event)
         if result is not None:
@@ -169,7 +169,7 @@ class Recorder:
                     slots_of(list(result.indices), self._formulation),
                     result.epsilon,
                     "others as active at the end",
-                    self.clock.round,
+                    self.timelines.round,
                 )
         self.say(
             f"{event.status}: {event.message}",

@@ -8,13 +8,13 @@ import numpy as np
 
 import sparserob_core as sr
 from sparserob_rerun import palette as ink
-from sparserob_rerun.clock import Clock
 from sparserob_rerun.palette import Colour, Floats
+from sparserob_rerun.timelines import Timelines
 
 MOVES = (
     4  # coordinates of one evaluation that are shown; a search that changes all of them at once would bury the panel
 )
-TOLD = {  # what a maximiser notes: the words for it, and its colour
+NOTES = {  # what a maximiser notes: the words for it, and its colour
     "temperature": ("temperature", ink.VERMILLION),
     "accepted": ("share of moves accepted (last 50)", ink.GREEN),
     "scale": ("size of a move", ink.SKY),
@@ -34,11 +34,11 @@ WINDOW = 50
 
 
 @final
-class Search:
+class SearchView:
     """Logs evaluations below ``/search`` in columns: one call for each batch and entity, whatever its size."""
 
-    def __init__(self, rr: Any, stream: Any, clock: Clock) -> None:
-        self.rr, self.stream, self.clock = rr, stream, clock
+    def __init__(self, rr: Any, stream: Any, timelines: Timelines) -> None:
+        self.rr, self.stream, self.timelines = rr, stream, timelines
         self.base, self.known = 0, {"search/g"}
         self.recent = np.empty(0)
         stream.log(
@@ -57,19 +57,19 @@ class Search:
         batch = event.batch.trace
         count = batch.values.size
         if event.total == event.count:
-            self.base, self.recent = self.clock.evaluation, np.empty(0)
+            self.base, self.recent = self.timelines.evaluation, np.empty(0)
         numbers = self.base + event.total - count + 1 + np.arange(count)
-        at = self.clock.columns(numbers, began + batch.seconds, event.round)
+        at = self.timelines.columns(numbers, began + batch.seconds, event.round)
         values = np.stack(
             [_shown(batch.values), _shown(batch.best), np.full(count, _finite(event.lower_bound))], axis=1
         )
         self.stream.send_columns("search/g", at, self.rr.Scalars.columns(scalars=values.ravel()).partition([3] * count))
         self._notes(event, numbers, began)
         self._moves(event, numbers, names, kept)
-        self.clock.move(self.base + event.total, event.round, began + event.seconds)
+        self.timelines.move(self.base + event.total, event.round, began + event.seconds)
 
     def separation(self, event: sr.EvaluationsFinished, began: float) -> None:
-        """A search for the worst index of one family: a series of its own, on the clock only."""
+        """A search for the worst index of one family: a series of its own, on the timeline of seconds only."""
         path, batch = f"separation/{event.family}", event.batch.trace
         self._line(path, f"violation of {event.family}", ink.VERMILLION)
         at = [self.rr.TimeColumn("time", duration=began + batch.seconds)]
@@ -78,11 +78,11 @@ class Search:
     def _notes(self, event: sr.EvaluationsFinished, numbers: np.ndarray, began: float) -> None:
         batch = event.batch.trace
         for name, rows in batch.notes.items():
-            words, colour = TOLD.get(name, (name, ink.GREY))
+            words, colour = NOTES.get(name, (name, ink.GREY))
             where = np.clip(rows[:, 0].astype(int) + self.base - numbers[0], 0, numbers.size - 1)
             values = self._share(rows[:, 1]) if name == "accepted" else rows[:, 1]
             self._line(f"search/notes/{name}", words, colour)
-            at = self.clock.columns(numbers[where], began + batch.seconds[where], event.round)
+            at = self.timelines.columns(numbers[where], began + batch.seconds[where], event.round)
             self.stream.send_columns(f"search/notes/{name}", at, self.rr.Scalars.columns(scalars=_shown(values)))
 
     def _share(self, accepted: Floats) -> Floats:

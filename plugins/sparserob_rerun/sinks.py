@@ -135,7 +135,7 @@ def _unwritable(file: Path) -> str:
 
 
 def _started(port: int, extra: list[str]) -> subprocess.Popen[bytes]:
-    """A viewer that outlives the run, and hears only this machine."""
+    """A viewer that outlives the run, and takes connections from this machine only."""
     command = [
         str(viewer()),
         "--bind",

@@ -41,7 +41,7 @@ class Switching:
         total = np.zeros(program.n)
         for cut in cuts:
             family = program.formulated(cut.family, cut.formulation)
-            if family is None:  # the number of a sample does not tell its constraint
+            if family is None:  # the number of a sample does not say which constraint it is
                 return None
             rows, _ = family.rows(np.asarray(cut.index)[np.newaxis])
             total += cut.multiplier * rows[0, cut.row]

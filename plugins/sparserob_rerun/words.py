@@ -6,7 +6,7 @@ import math
 
 import sparserob_core as sr
 
-CUTS = 12  # cuts of one round that are told one by one
+CUTS = 12  # cuts of one round that are listed one by one
 
 LEGEND = """
 **Reading the pictures.** Blue: the control and the states. Blue band: where disturbance and parameters can push them.

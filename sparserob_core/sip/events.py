@@ -1,4 +1,4 @@
-"""What the optimisation wing tells while it works; whoever listens cannot disturb it.
+"""The events of a running method or search; whoever receives them cannot disturb it.
 
 Arrays in events cannot be written to. What takes time to put together is put together by whoever looks at it (`Batch`).
 """
@@ -30,15 +30,15 @@ T = TypeVar("T", bound=Event)
 
 
 def ignore(event: Event) -> None:
-    """The listener that hears nothing."""
+    """The listener that does nothing."""
 
 
-def forwarded(notify: Notify, kind: type[T], tell: Callable[[T], Event]) -> Notify:
-    """A listener that passes on what it hears, events of one kind as ``tell`` completes them; silence remains
-    silence."""
+def forwarded(notify: Notify, kind: type[T], complete: Callable[[T], Event]) -> Notify:
+    """A listener that passes every event on to ``notify``, those of one ``kind`` as ``complete`` returns them; `ignore`
+    stays `ignore`."""
     if notify is ignore:
         return ignore
-    return lambda event: notify(tell(event) if isinstance(event, kind) else event)
+    return lambda event: notify(complete(event) if isinstance(event, kind) else event)
 
 
 def frozen(array: Array) -> Array:
@@ -50,7 +50,7 @@ def frozen(array: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """The evaluations of a search since it was last told of: ``trace`` and ``moves`` are computed when they are first
+    """The evaluations of a search since the last event: ``trace`` and ``moves`` are computed when they are first
     read.
 
     ``points`` and ``values`` are the pieces ``(k_i, d)`` and ``(k_i,)`` as they were evaluated, ``moments`` their sizes

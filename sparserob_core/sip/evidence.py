@@ -49,7 +49,7 @@ class InfeasibleSubsystem:
     irreducible infeasible subsystem (Chinneck and Dravnieks 1991), which cannot hold together.
 
     ``amount``: of the members one is violated by at least that many times the norm of its row; infinite where the
-    decision enters none of them. ``others``: how many reasons or members are not told. ``equalities``: whether the
+    decision enters none of them. ``others``: how many further reasons or members there are. ``equalities``: whether the
     program has some, which belong to every subsystem. ``demand``: what a weighted sum of the members asks for.
     """
 

@@ -23,7 +23,7 @@ from sparserob_core.sip.result import Result
 from sparserob_core.sip.rules import Geometric
 from sparserob_core.sip.solver import Solver
 
-GAP_TOLERANCE = 1e-7  # relative gap at which the bounds have met, unless a method is told otherwise
+GAP_TOLERANCE = 1e-7  # relative gap at which the bounds have met, unless a method has another one
 
 
 @final

@@ -55,8 +55,8 @@ ALLOWED = 2e-3  # seconds that an event may take on the solver's thread, the med
 
 
 @final
-class Heard(Observer):
-    """Passes everything on to the observer that is tested, and keeps what it heard and what went wrong."""
+class Recording(Observer):
+    """Passes everything on to the observer that is tested, and keeps every event it received, and what went wrong."""
 
     def __init__(self, observer: Observer, fails_at: int | None = None, failure: BaseException | None = None) -> None:
         self.observer, self.fails_at, self.failure = observer, fails_at, failure
@@ -96,9 +96,9 @@ class ObserverContract(ABC):
     def create(self) -> Observer:
         """A new observer."""
 
-    def watched(self, method: str, observer: Heard | None = None, quiet: bool = False) -> tuple[Outcome, Heard]:
+    def watched(self, method: str, observer: Recording | None = None, quiet: bool = False) -> tuple[Outcome, Recording]:
         """One run of `METHODS`, watched by a new observer or by the given one."""
-        heard = observer or Heard(self.create())
+        recording = observer or Recording(self.create())
         with TemporaryDirectory() as directory:
             return (
                 run(
@@ -106,48 +106,48 @@ class ObserverContract(ABC):
                     out=Path(directory) / "run",
                     figures=False,
                     quiet=quiet,
-                    observers=[heard],
+                    observers=[recording],
                 ),
-                heard,
+                recording,
             )
 
     def test_it_hears_whole_runs_of_every_method(self) -> None:
         kinds: set[type[Event]] = set()
         for method in METHODS:
-            _, heard = self.watched(method)
-            assert not heard.errors, f"{method}: {heard.errors[0]!r}"
-            assert isinstance(heard.events[0], RunStarted)
-            assert isinstance(heard.events[-1], RunFinished)
-            assert heard.closed == 1
-            kinds |= {type(event) for event in heard.events}
+            _, recording = self.watched(method)
+            assert not recording.errors, f"{method}: {recording.errors[0]!r}"
+            assert isinstance(recording.events[0], RunStarted)
+            assert isinstance(recording.events[-1], RunFinished)
+            assert recording.closed == 1
+            kinds |= {type(event) for event in recording.events}
         assert kinds >= {RoundFinished, EvaluationsFinished, ProofProgress}, "not every event was there to be heard"
 
     def test_the_run_is_the_same_with_and_without_it(self) -> None:
         for method in METHODS:
-            watched, heard = self.watched(method)
-            alone, _ = self.watched(method, Heard(_Deaf()))
+            watched, recording = self.watched(method)
+            alone, _ = self.watched(method, Recording(_Ignoring()))
             assert numbers(watched.result) == numbers(alone.result), f"{method}: the observer has changed the result"
-            assert not heard.errors
+            assert not recording.errors
 
     def test_it_ends_with_a_run_that_is_interrupted(self) -> None:
         for count in BROKEN_OFF:
             with nothing_left():
-                heard = Heard(self.create(), count, KeyboardInterrupt())
+                recording = Recording(self.create(), count, KeyboardInterrupt())
                 with suppress(KeyboardInterrupt):
-                    self.watched("sparserob", heard)
-                assert isinstance(heard.events[-1], RunFinished)
-                assert not heard.errors, f"interrupted after {count} events: {heard.errors[0]!r}"
-                assert heard.closed == 1
+                    self.watched("sparserob", recording)
+                assert isinstance(recording.events[-1], RunFinished)
+                assert not recording.errors, f"interrupted after {count} events: {recording.errors[0]!r}"
+                assert recording.closed == 1
 
     def test_it_lets_go_when_it_is_detached_before_the_end(self) -> None:
         for count in (0, *BROKEN_OFF):
             with nothing_left():
-                outcome, heard = self.watched(
-                    "sparserob", Heard(self.create(), count, RuntimeError("detached by the contract"))
+                outcome, recording = self.watched(
+                    "sparserob", Recording(self.create(), count, RuntimeError("detached by the contract"))
                 )
-                assert len(heard.events) == count + 1
-                assert heard.closed == 1
-                assert not heard.errors, f"closed after {count} events: {heard.errors[0]!r}"
+                assert len(recording.events) == count + 1
+                assert recording.closed == 1
+                assert not recording.errors, f"closed after {count} events: {recording.errors[0]!r}"
                 assert outcome.result.decision is not None
 
     def test_nothing_of_it_is_left_after_a_run(self) -> None:
@@ -199,7 +199,7 @@ class _New(Event):
 
 
 @final
-class _Deaf(Observer):
+class _Ignoring(Observer):
     """Does nothing."""
 
     def receive(self, event: Event) -> None:

@@ -20,8 +20,8 @@ def fine_times(response: Response, parameters: ParameterIndex, more: Array) -> A
     on it; ``(T,)``."""
     grid = response.grid
     A, _, _ = response.system.matrices(parameters.lattice()[0])
-    pace = float(np.linalg.norm(A, axis=(1, 2)).max())
-    counts = np.clip(np.ceil(pace * grid.lengths / SMOOTH), INSIDE + 1, MOST_INSIDE).astype(int)
+    rate = float(np.linalg.norm(A, axis=(1, 2)).max())
+    counts = np.clip(np.ceil(rate * grid.lengths / SMOOTH), INSIDE + 1, MOST_INSIDE).astype(int)
     inside = np.concatenate(
         [
             left + (right - left) * np.arange(count) / count

@@ -46,8 +46,8 @@ def check(directory: str | Path, plugins: Iterable[str | Path] = (), seconds: fl
 
     Nothing is solved, and nothing of what solved it is used. ``plugins``: files that offer the problem or a dictionary
     where these are no part of this distribution; the directory itself is data, and no plugin that it names is loaded.
-    After ``seconds`` what was decided is told, and the rest is ``not checked``. Raises `InputError` when the directory
-    is not that of a finished run with a certificate, or ``seconds`` are not positive.
+    After ``seconds`` what was decided is returned, and the rest is ``not checked``. Raises `InputError` when the
+    directory is not that of a finished run with a certificate, or ``seconds`` are not positive.
     """
     from sparserob_core.checker.claims.case import Case
     from sparserob_core.checker.claims.claims import check as derive

@@ -57,7 +57,7 @@ def _status(arguments: Sequence[str] | None) -> int:
         return 0
     except MemoryError as error:
         return _end("out of memory; fewer pieces, cells or trajectories need less", error, 5)
-    except Exception as error:  # noqa: BLE001  the last resort: a fault of the program is told in one line too
+    except Exception as error:  # noqa: BLE001  the last resort: a fault of the program is one line too
         said = f"{type(error).__name__}: {error}".removesuffix(": ")
         return _end(f"internal error: {said}; {DEBUG}=1 shows where", error, 5)
 

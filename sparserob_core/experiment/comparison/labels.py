@@ -11,7 +11,7 @@ UNSEEN = frozenset({"problem", "dictionaries", "title", "observers", "plugins", 
 
 
 def labels(configs: Sequence[Mapping[str, Any]], searched: Sequence[bool]) -> list[str]:
-    """One label per resolved config; equal ones are told apart by a number.
+    """One label per resolved config; equal ones get a number.
 
     It begins with the method, for a run that searches with the maximiser; options are compared between runs of the same
     method (and those of a component between runs with the same component), since others have no such option or do not

@@ -39,11 +39,11 @@ def option_rows(record: Plugin) -> list[OptionRow]:
     of them."""
     schema = options_schema(record)
     prefix = f"#/$defs/{record.kind}.{record.name}."
-    return list(_Walk({prefix + name: part for name, part in schema.get("$defs", {}).items()}).rows(schema, ""))
+    return list(_Rows({prefix + name: part for name, part in schema.get("$defs", {}).items()}).rows(schema, ""))
 
 
 @final
-class _Walk:
+class _Rows:
     """Goes through a schema once; ``parts`` are its definitions, ``seen`` where each was first met."""
 
     def __init__(self, parts: Mapping[str, Any]) -> None:

@@ -58,7 +58,7 @@ class Dictionaries(Options):
     """In which functions the control and the disturbance are written."""
 
     control: Annotated[Entry, PIECES] = Entry.model_validate({"name": "piecewise_constant", "pieces": 100})
-    """Dictionary of the control; 100 equal pieces unless told otherwise."""
+    """Dictionary of the control; 100 equal pieces by default."""
 
     disturbance: Annotated[Entry | None, PIECES] = None
     """Dictionary of the disturbance; null: one indicator function on each piece of the control's dictionary."""
@@ -107,7 +107,7 @@ class RunConfig(Options):
     """Where programs that do not depend on one another are solved."""
 
     observers: tuple[Entry, ...] = (Entry(name="progress"),)
-    """Who is told of the progress."""
+    """Who receives the events of the run."""
 
     limits: Limits = Limits()
     """How long a run may take."""

@@ -120,8 +120,8 @@ def _checked(registry: Registry, kind: str, value: object, keys: set[str]) -> tu
 
 
 def _detail(fault: Complaint) -> InitErrorDetails:
-    told = PydanticCustomError(COMPLAINT, "{said}", {"said": fault.message, "below": fault.path})
-    return InitErrorDetails(type=told, input=None)
+    error = PydanticCustomError(COMPLAINT, "{said}", {"said": fault.message, "below": fault.path})
+    return InitErrorDetails(type=error, input=None)
 
 
 def shorthand(record: Plugin) -> str | None:

@@ -48,11 +48,11 @@ def adversaries(experiment: Experiment, decision: Array) -> dict[str, Array]:
     if not kept:
         return {}
     arrays = _stacked(kept, model)
-    times, states = replay(model, theta, arrays)
+    times, states = propagated(model, theta, arrays)
     return {**arrays, "state_times": times, "states": states}
 
 
-def replay(model: Transcription, theta: Array, arrays: Mapping[str, Array]) -> tuple[Array, Array]:
+def propagated(model: Transcription, theta: Array, arrays: Mapping[str, Array]) -> tuple[Array, Array]:
     """The state trajectories ``(f, d, T)`` that stored adversaries cause at a decision ``(m N,)``, at times ``(T,)``,
     their own among them."""
     response, control = model.response, model.functionals.on_grid(theta)

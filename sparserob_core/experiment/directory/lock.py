@@ -89,7 +89,7 @@ def _me() -> str:
 
 
 def _owner(content: str) -> tuple[int, str]:
-    """The number of the process, 0 where it cannot be told, and the host."""
+    """The number of the process, 0 where it is not known, and the host."""
     try:
         data = json.loads(content)
         return int(data["process"]), str(data["host"])

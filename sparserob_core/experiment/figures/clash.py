@@ -1,5 +1,5 @@
-"""The picture of an infeasible run: for every constraint that clashes, where the control can bring it, and what is
-allowed."""
+"""The picture of an infeasible run: for every constraint of the irreducible infeasible subsystems, where the control
+can bring its quantity, and what is allowed."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ BAR = 0.16  # half the height of a bar
 @dataclass(frozen=True)
 class Strip:
     """One quantity ``label``: allowed in ``[low, high]``, brought by the control to ``[reach_low, reach_high]`` where
-    nothing disturbs it, and moved from there by the worst disturbance by ``push_low`` downwards and ``push_high``
+    nothing disturbs it, and moved from there by the worst disturbance by ``sigma_low`` downwards and ``sigma_high``
     upwards."""
 
     label: str
@@ -58,7 +58,7 @@ class Strip:
 def draw_clash(experiment: Experiment, result: Result, directory: Path) -> list[Path]:
     """Draw why nothing is feasible into ``directory/figures``: ``clash.pdf`` and ``clash.png``. Returns the files.
 
-    One strip for every quantity of the reasons, or else of the rows whose multipliers prove the clash. Raises
+    One strip for every quantity of the reasons, or else of the rows whose multipliers prove the infeasibility. Raises
     `InputError` when the result is not infeasible, when it is about no quantity that can be drawn (equalities alone,
     another kind of program), and without matplotlib.
     """
@@ -149,8 +149,8 @@ def _reduced(program: SemiInfiniteProgram, family: ConstraintFamily) -> SemiInfi
 def _draw(ax: Axes, strips: Sequence[Strip]) -> None:
     left, right = _view(strips)
     ax.set_xlim(left, right)
-    for place, strip in enumerate(strips):
-        y = len(strips) - 1.0 - place
+    for position, strip in enumerate(strips):
+        y = len(strips) - 1.0 - position
         _forbidden(ax, strip, y, left, right)
         _bar(
             ax,

@@ -19,7 +19,7 @@ from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import RunDirectory, create_directory
 from sparserob_core.experiment.initial_states.feasible_set import InitialStates
-from sparserob_core.experiment.initial_states.search import Search
+from sparserob_core.experiment.initial_states.search import InitialStatesSearch
 from sparserob_core.experiment.initial_states.section import section
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
@@ -48,7 +48,7 @@ def initial_states(
     or of ``about (d,)``. ``directions``: support functions asked for at most, at least 4. ``values``: costs are
     measured on a lattice of so many points each way, 0 for none. ``within``: only coordinates of at most this size are
     looked at; needed where the set is unbounded. ``out``: a new or empty directory for the config,
-    ``initial_states.json``, ``.npz`` and ``.png``. ``notify`` hears `StudyProgress`. An interrupt, once the
+    ``initial_states.json``, ``.npz`` and ``.png``. ``notify`` receives `StudyProgress`. An interrupt, once the
     set is bounded, ends the search with what it has proven by then. Raises `InputError` when an argument or the config
     is at fault, and when the set is unbounded.
     """
@@ -66,7 +66,7 @@ def initial_states(
     pair = check_states(states, problem.system.states)
     size = _far(problem) if limit is None else limit
     plane = InitialPlane(model, pair, np.zeros(2), np.full(2, size))
-    search = Search(plane, tools_of(loaded), _tolerance(loaded), notify, limit)
+    search = InitialStatesSearch(plane, tools_of(loaded), _tolerance(loaded), notify, limit)
 
     def find() -> InitialStates:
         try:

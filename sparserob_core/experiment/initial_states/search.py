@@ -42,7 +42,7 @@ PROVEN = ("certified", "verified")
 
 @final
 @dataclass(eq=False)
-class Search:
+class InitialStatesSearch:
     """One search: the plane, the cuts that each direction needed, and the controls of the points found."""
 
     plane: InitialPlane

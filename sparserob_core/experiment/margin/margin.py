@@ -17,7 +17,7 @@ from sparserob_core.experiment.config.problems import LinearKeys
 from sparserob_core.experiment.config.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import RunDirectory, create_directory, finite
 from sparserob_core.experiment.margin.scaling import scaling
-from sparserob_core.experiment.margin.search import Margin, Point, Search
+from sparserob_core.experiment.margin.search import Margin, MarginSearch, Point
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.relaxed.parametric import ParametricProgram
@@ -43,7 +43,7 @@ def margin(
     of a window, in the unit of time). ``tolerance``: how close the two sides are to be, relative to the factor, or to 1
     if that is larger (for a window to its end). ``curve``: the cost at so many factors on the feasible side, each by a
     run of its own. ``out``: a new or empty directory for ``margin.json`` and ``margin.png``; with ``write`` and none
-    given it is ``runs/NAME-margin/STAMP-HASH``. ``notify`` hears `StudyProgress`. An interrupt ends the search
+    given it is ``runs/NAME-margin/STAMP-HASH``. ``notify`` receives `StudyProgress`. An interrupt ends the search
     with what it has proven by then, ``undecided``. Raises `InputError` when an argument or the
     config is at fault.
     """
@@ -87,7 +87,7 @@ def _between(lower: float, upper: float) -> str:
     return f"{lower:.9g} to {upper:.9g}" if lower != upper else f"{lower:.9g}"
 
 
-def _search(loaded: Loaded, of: str, tolerance: float, notify: Notify) -> Search:
+def _search(loaded: Loaded, of: str, tolerance: float, notify: Notify) -> MarginSearch:
     from sparserob_core.control.transcription.transcribe import transcribe
 
     experiment = assemble(loaded)
@@ -99,7 +99,7 @@ def _search(loaded: Loaded, of: str, tolerance: float, notify: Notify) -> Search
     chosen = scaling(problem, of, *_positions(loaded, problem))
     programs = ParametricProgram(lambda factor: transcribe(chosen.at(factor), control=control, disturbance=disturbance))
     width = tolerance * (chosen.highest if of.endswith(".from") else 1.0)
-    return Search(experiment.title, programs, chosen, _method(loaded), tools_of(loaded), width, notify)
+    return MarginSearch(experiment.title, programs, chosen, _method(loaded), tools_of(loaded), width, notify)
 
 
 def _positions(loaded: Loaded, problem: OptimalControlProblem) -> tuple[list[list[int]], list[list[int]]]:

@@ -83,7 +83,7 @@ class Margin:
 
 @final
 @dataclass(eq=False)
-class Search:
+class MarginSearch:
     """One search. ``width``: how close the two sides are to be, relative to the factor if that is above 1."""
 
     title: str

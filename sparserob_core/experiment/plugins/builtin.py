@@ -48,7 +48,7 @@ def sparserob_schedules() -> Iterator[SchedulePlugin]:
     yield SchedulePlugin(
         name="geometric",
         factory=f"{RULES}:Geometric",
-        summary="A constant factor, 1/2 unless told otherwise.",
+        summary="A constant factor, 1/2 by default.",
     )
     yield SchedulePlugin(
         name="accelerating",

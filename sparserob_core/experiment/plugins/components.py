@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, final
 
 from sparserob_core.errors import InputError, SparseRobError, UnknownPluginError
-from sparserob_core.experiment.plugins.blame import blaming
+from sparserob_core.experiment.plugins.attribution import attributed
 from sparserob_core.experiment.plugins.guards import guarded
 from sparserob_core.experiment.plugins.hookspecs import record_type
 from sparserob_core.experiment.plugins.messages import Complaint, complaints, nearest, shown
@@ -99,7 +99,7 @@ class Registry:
                 given[key], faults = self._spelt_out(part, entry)
                 wrong += [fault.under((key,)) for fault in faults]
         try:
-            with blaming(record.origin, "checking its options", but=(SparseRobError, ValidationError)):
+            with attributed(record.origin, "checking its options", but=(SparseRobError, ValidationError)):
                 checked = model.model_validate(given, context={"registry": self})
         except ValidationError as error:
             return None, [*complaints(error, model, options), *wrong]

@@ -1,5 +1,5 @@
-"""Components of strangers behind a thin check: what they raise, or return in spite of their kind, is told with their
-name."""
+"""Thin checks around foreign components: what they raise, or return in spite of their kind, becomes an error that names
+them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sparserob_core.control.problem.dictionary import Dictionary, DictionaryFact
 from sparserob_core.control.problem.problem import OptimalControlProblem, ProblemFactory
 from sparserob_core.errors import PluginError
 from sparserob_core.experiment.plugins import files
-from sparserob_core.experiment.plugins.blame import asked, blaming, shown
+from sparserob_core.experiment.plugins.attribution import asked, attributed, short_repr
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.maximiser import Maximiser, Objective
 from sparserob_core.sip.method import ExecutorFactory, Method, Tools
@@ -56,11 +56,11 @@ class _Problem(ProblemFactory):
         self._problem, self.origin = problem, origin
 
     def build(self) -> OptimalControlProblem | SemiInfiniteProgram:
-        with blaming(self.origin, "build"):
+        with attributed(self.origin, "build"):
             built: object = self._problem.build()
         if not isinstance(built, OptimalControlProblem | SemiInfiniteProgram):
             raise PluginError(
-                f"{self.origin}: build returned {shown(built)}, expected an OptimalControlProblem or a "
+                f"{self.origin}: build returned {short_repr(built)}, expected an OptimalControlProblem or a "
                 "SemiInfiniteProgram"
             )
         return built
@@ -90,12 +90,13 @@ class _Method(Method):
         result = asked(self.origin, "solve", lambda: self._method.solve(program, tools), Result)
         if result.status not in MEANING:
             raise PluginError(
-                f"{self.origin}: solve returned the status {shown(result.status)}, expected one of {', '.join(MEANING)}"
+                f"{self.origin}: solve returned the status {short_repr(result.status)}, expected one of"
+                f" {', '.join(MEANING)}"
             )
         decision: Any = result.decision
         if decision is not None and np.shape(decision) != (program.n,):
             raise PluginError(
-                f"{self.origin}: solve returned the decision {shown(decision)}, expected {program.n} numbers"
+                f"{self.origin}: solve returned the decision {short_repr(decision)}, expected {program.n} numbers"
             )
         return result
 
@@ -120,7 +121,7 @@ class _Solver(Solver):
         claim = asked(self.origin, "solve", lambda: self._solver.solve(program, accuracy), Claim)
         if claim.status not in ("solved", "infeasible", "failed"):
             raise PluginError(
-                f"{self.origin}: solve claimed {shown(claim.status)}, expected solved, infeasible or failed"
+                f"{self.origin}: solve claimed {short_repr(claim.status)}, expected solved, infeasible or failed"
             )
         if claim.status != "solved":
             return claim
@@ -128,7 +129,9 @@ class _Solver(Solver):
         for name, like in parts.items():
             value = getattr(claim, name)
             if np.shape(value) != like.shape or np.asarray(value).dtype.kind not in "fiu":
-                raise PluginError(f"{self.origin}: solve claimed {name} = {shown(value)}, expected {like.size} numbers")
+                raise PluginError(
+                    f"{self.origin}: solve claimed {name} = {short_repr(value)}, expected {like.size} numbers"
+                )
         return claim
 
 
@@ -153,7 +156,7 @@ class _Regulariser(Regulariser):
 
         answer = asked(self.origin, "quadratic", lambda: self._regulariser.quadratic(image), tuple)
         n = image.S.shape[1]
-        with blaming(self.origin, "quadratic: what it returned"):
+        with attributed(self.origin, "quadratic: what it returned"):
             P, q = csc_array(answer[0]), np.asarray(answer[1], dtype=float)
         if len(answer) != 2 or P.shape != (n, n) or q.shape != (n,):
             raise PluginError(
@@ -171,7 +174,7 @@ def _rule(kind: type, expected: tuple[type, ...], words: str) -> Callable[[Any, 
         def call(_: object, *arguments: object) -> object:
             answer = asked(origin, "calling it", lambda: rule(*arguments), object)
             if not isinstance(answer, expected):
-                raise PluginError(f"{origin}: calling it returned {shown(answer)}, expected {words}")
+                raise PluginError(f"{origin}: calling it returned {short_repr(answer)}, expected {words}")
             return answer
 
         return type(kind.__name__, (kind,), {"__call__": call, "origin": origin})()

@@ -88,7 +88,7 @@ class ExecutorPlugin(Plugin, hook="sparserob_executors", component="sparserob_co
 
 @final
 class ObserverPlugin(Plugin, hook="sparserob_observers", component="sparserob_core.experiment.run.events:Observer"):
-    """An `Observer`, told of every event."""
+    """An `Observer`, which receives every event."""
 
 
 Function = TypeVar("Function", bound=Callable[..., Iterable[Plugin]])

@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from typing import ClassVar
 
 from sparserob_core.errors import PluginError, UnknownPluginError
-from sparserob_core.experiment.plugins.blame import asked, blaming
+from sparserob_core.experiment.plugins.attribution import asked, attributed
 from sparserob_core.options import Options
 
 RECORDS: dict[str, type[Plugin]] = {}
@@ -75,7 +75,7 @@ class Plugin:
         if not isinstance(self.factory, str):
             return self.factory
         module, _, attribute = self.factory.partition(":")
-        with blaming(self.origin, f"loading {self.factory!r}", but=()):
+        with attributed(self.origin, f"loading {self.factory!r}", but=()):
             factory = getattr(import_module(module), attribute)
         if not callable(factory):
             raise PluginError(f"{self.origin}: {self.factory!r} is not callable")

@@ -17,7 +17,7 @@ import pluggy
 
 from sparserob_core.errors import PluginError, UnknownPluginError
 from sparserob_core.experiment.plugins import files
-from sparserob_core.experiment.plugins.blame import blaming, shown
+from sparserob_core.experiment.plugins.attribution import attributed, short_repr
 from sparserob_core.experiment.plugins.components import DISABLE, Failure, Registry
 from sparserob_core.experiment.plugins.hookspecs import GROUP, HOOKS, SPECIFICATIONS
 from sparserob_core.experiment.plugins.messages import nearest
@@ -139,7 +139,7 @@ def _identity(entry: metadata.EntryPoint) -> str:
 def _module(file: Path) -> ModuleType:
     if file.suffix != ".py" or not file.is_file():
         raise UnknownPluginError(f"{file}: no such plugin; expected a Python file")
-    with blaming(f"plugin '{file.stem}' ({file})", "loading it", but=()):
+    with attributed(f"plugin '{file.stem}' ({file})", "loading it", but=()):
         return files.load(file)
 
 
@@ -147,7 +147,7 @@ def _records(plugin: _Loaded) -> Iterator[Plugin]:
     who = f"plugin '{plugin.name}'" + (f" ({plugin.source})" if plugin.source else "")
     manager = pluggy.PluginManager(GROUP)
     manager.add_hookspecs(SPECIFICATIONS)
-    with blaming(who, "registering it", but=()):
+    with attributed(who, "registering it", but=()):
         manager.register(plugin.module, name=plugin.name)
     callers = manager.get_hookcallers(plugin.module) or []
     for caller in callers:
@@ -156,12 +156,12 @@ def _records(plugin: _Loaded) -> Iterator[Plugin]:
     _refuse_unmarked(who, plugin.module, {caller.name for caller in callers})
     for caller in callers:
         expected = HOOKS[caller.name]
-        with blaming(who, f"hook {caller.name}", but=()):
+        with attributed(who, f"hook {caller.name}", but=()):
             yielded = [record for records in caller() for record in records]
         for record in yielded:
             if not isinstance(record, expected):
                 raise PluginError(
-                    f"{who}: {caller.name} yielded {shown(record)}, expected records of type {expected.__name__}"
+                    f"{who}: {caller.name} yielded {short_repr(record)}, expected records of type {expected.__name__}"
                 )
             yield replace(record, plugin=plugin.name, source=plugin.source)
 

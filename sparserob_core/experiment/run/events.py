@@ -1,4 +1,4 @@
-"""What a run tells its observers, and how it tells them without being disturbed."""
+"""The events of a run, and how they reach its observers without disturbing it."""
 
 from __future__ import annotations
 
@@ -71,8 +71,8 @@ class StudyProgress(Event):
 
 
 class Observer(ABC):
-    """Watches a run. It hears `RunStarted` first and `RunFinished` last, each once, and in between whatever happens, on
-    the solver's thread: what takes long belongs into a thread or a process of its own, begun at `RunStarted`."""
+    """Watches a run. It receives `RunStarted` first and `RunFinished` last, each once, and in between whatever happens,
+    on the solver's thread: what takes long belongs into a thread or a process of its own, begun at `RunStarted`."""
 
     @abstractmethod
     def receive(self, event: Event) -> None:
@@ -87,8 +87,9 @@ class Observer(ABC):
 class Broadcast:
     """Passes every event on to every observer; one that raises is detached with one warning, and the run goes on.
 
-    Everybody who heard a run begin hears it end, once, and is closed; nobody hears anything after that. An interrupt
-    from the keyboard is not the observer's failure, and goes through, at the end of a run after all have heard it.
+    Every observer that received `RunStarted` receives `RunFinished`, once, and is closed; nothing is sent after that.
+    An interrupt from the keyboard is not the observer's failure: it is raised, at the end of a run only after all
+    observers have received the last event.
     """
 
     def __init__(self, observers: Iterable[tuple[str, Observer]]) -> None:
@@ -98,7 +99,7 @@ class Broadcast:
         last, interrupt = isinstance(event, RunFinished), None
         for listener in tuple(self._observers):
             try:
-                if not listener.hear(event):
+                if not listener.receive(event):
                     self._observers.remove(listener)
             except KeyboardInterrupt as pressed:
                 if not last:
@@ -117,8 +118,8 @@ class _Listener:
     def __init__(self, name: str, observer: Observer) -> None:
         self.name, self.observer, self.began = name, observer, False
 
-    def hear(self, event: Event) -> bool:
-        """Whether the observer is to hear of further events."""
+    def receive(self, event: Event) -> bool:
+        """Pass an event on; returns whether the observer takes further events."""
         last = isinstance(event, RunFinished)
         self.began |= isinstance(event, RunStarted)
         try:
@@ -134,7 +135,7 @@ class _Listener:
         return not last
 
     def _close(self, quietly: bool = False) -> None:
-        observer, self.observer = self.observer, _DEAF
+        observer, self.observer = self.observer, _DETACHED
         try:
             observer.close()
         except (Exception, SystemExit) as error:  # noqa: BLE001  as above
@@ -146,11 +147,11 @@ class _Listener:
 
 
 @final
-class _Deaf(Observer):
-    """In the place of an observer that was closed."""
+class _Detached(Observer):
+    """Stands for an observer that was closed."""
 
     def receive(self, event: Event) -> None:
         """Nothing."""
 
 
-_DEAF = _Deaf()
+_DETACHED = _Detached()

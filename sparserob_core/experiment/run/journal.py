@@ -56,7 +56,7 @@ class Journal(Observer):
 
     def known(self, said: str, seconds: float) -> Result | None:
         """What is known of a run whose method was interrupted: the decision of the last round, undecided; ``None``
-        where no round told of one."""
+        where no round had one."""
         last = next((entry for entry in reversed(self.rounds) if entry.decision is not None), None)
         if last is None:
             return None
@@ -76,7 +76,7 @@ class Journal(Observer):
             self.record(self._unfinished(said, seconds))
             self.directory.write_arrays("trace.npz", trace_columns(self.rounds))
         except SparseRobError:
-            return  # the error that ended the run is the one to be told
+            return  # the error that ended the run is the one to be shown
 
     def _unfinished(self, said: str, seconds: float) -> Result:
         result = Result(status="failed", message=said, history=tuple(self.rounds), seconds=seconds)

@@ -46,19 +46,19 @@ def replay(
     return run.directory
 
 
-def play(told: Iterator[Event], *, save: str | Path | None, serve: bool, connect: str | None) -> None:
-    """Tell events to a recorder."""
+def play(recorded: Iterator[Event], *, save: str | Path | None, serve: bool, connect: str | None) -> None:
+    """Hand events to a recorder."""
     observer = recorder(save, serve, connect, PATIENCE)
     try:
-        for event in told:
+        for event in recorded:
             observer.receive(event)
     finally:
         observer.close()
 
 
 def events(inspection: Inspection, title: str, directory: Path | None, result: Result) -> Iterator[Event]:
-    """What observers of a run with this result heard, as far as the result knows: searches and rounds in the order of
-    their seconds."""
+    """The events that observers of a run with this result received, as far as the result knows: searches and rounds in
+    the order of their seconds."""
     yield RunStarted(
         title=title,
         directory=directory,

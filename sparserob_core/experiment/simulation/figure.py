@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from sparserob_core.experiment.directory.finished import FinishedRun
-    from sparserob_core.experiment.simulation.outcome import Simulation
+    from sparserob_core.experiment.simulation.simulation import Simulation
 
 
 def write_simulation(

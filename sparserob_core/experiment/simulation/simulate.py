@@ -14,13 +14,13 @@ from sparserob_core.control.response.response import Response
 from sparserob_core.control.studies.laws import LawName, Uncertainty
 from sparserob_core.control.studies.simulate import fine_times, finer, trajectories_at_once, walk
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.directory.adversary import adversaries, attained, read_adversaries, replay
+from sparserob_core.experiment.directory.adversary import adversaries, attained, propagated, read_adversaries
 from sparserob_core.experiment.directory.artefacts import RunDirectory
 from sparserob_core.experiment.directory.finished import FinishedRun, read_finished
 from sparserob_core.experiment.plugins.messages import nearest
 from sparserob_core.experiment.run.events import StudyProgress
 from sparserob_core.experiment.simulation.census import Census
-from sparserob_core.experiment.simulation.outcome import (
+from sparserob_core.experiment.simulation.simulation import (
     ADVERSARY,
     ANY,
     LAWS,
@@ -52,7 +52,7 @@ def simulate(
 
     ``law`` is one of ``iid``, ``vertices``, ``slow``, ``neighbours``, or ``adversary``, which replays the worst case of
     every constraint and takes no number of ``trajectories`` (10 000 otherwise). The result is written to
-    ``simulation-<law>.json`` in the run's directory, and drawn into the file ``out`` when given. ``notify`` hears
+    ``simulation-<law>.json`` in the run's directory, and drawn into the file ``out`` when given. ``notify`` receives
     `StudyProgress`. ``plugins``: files that offer what the run was made with; the directory itself
     is data, and no plugin that it names is loaded. Raises `InputError` for a directory that is no finished run with a
     control, or another argument at fault, before anything is written.
@@ -75,7 +75,7 @@ def simulate(
     replayed: Mapping[str, Array] | None = None
     if law == ADVERSARY:
         replayed = read_adversaries(finished.directory, model) or worst
-        moments, states = replay(model, finished.theta.ravel(), replayed)
+        moments, states = propagated(model, finished.theta.ravel(), replayed)
         replayed = {**replayed, "state_times": moments, "states": states}
         found = _replayed(finished, replayed, started)
     else:
@@ -104,9 +104,9 @@ def _sampled(
     shown = np.unique(np.linspace(0, times.size - 1, min(times.size, SHOWN)).round().astype(int))
     known = tuple(worst[name] for name in ("times", "directions", "parameters"))
     uncertainty = Uncertainty(model.functionals, parameters, model.constraints, (known[0], known[1], known[2]))
-    counts, crowd = (
+    counts, envelope = (
         [Census(constraint, times) for constraint in model.constraints],
-        _Crowd(shown, response.initial_state.size),
+        _Envelope(shown, response.initial_state.size),
     )
     rng, block, done, out = np.random.default_rng(seed), trajectories_at_once(fine, parameters.count > 0), 0, 0
     while done < count:
@@ -115,7 +115,7 @@ def _sampled(
         for one in counts:
             one.begin(size)
         for position, state in enumerate(walk(fine, control, drawn, disturbances)):
-            crowd.meet(position, state)
+            envelope.add(position, state)
             for one in counts:
                 one.meet(position, state)
         out += int(np.any([one.close() for one in counts], axis=0).sum())
@@ -134,14 +134,14 @@ def _sampled(
         constraints=shares,
         any_violated=_together(shares, out) if len(shares) > 1 else None,
         shown=times[shown],
-        fan=crowd.fan(),
-        lower=crowd.lower,
-        upper=crowd.upper,
+        fan=envelope.fan(),
+        lower=envelope.lower,
+        upper=envelope.upper,
         seconds=time.perf_counter() - started,
     )
 
 
-class _Crowd:
+class _Envelope:
     """What is drawn of many trajectories: the first few, and the envelope of all, at some of the times."""
 
     def __init__(self, shown: np.ndarray, states: int) -> None:
@@ -149,7 +149,7 @@ class _Crowd:
         self.lower, self.upper = np.full((states, shown.size), np.inf), np.full((states, shown.size), -np.inf)
         self._first: list[Array] = []
 
-    def meet(self, position: int, state: Array) -> None:
+    def add(self, position: int, state: Array) -> None:
         """The states ``(d, n)`` at one of the times."""
         column = self._column.get(position)
         if column is None:

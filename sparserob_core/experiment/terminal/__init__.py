@@ -1,1 +1,1 @@
-"""What the terminal shows: tables, progress, exit statuses."""
+"""What the terminal shows: tables and printable text; exit statuses."""

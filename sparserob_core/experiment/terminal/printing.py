@@ -1,4 +1,4 @@
-"""What the commands end with: their exit status, and JSON."""
+"""How the commands print and end: text without control characters, JSON, exit statuses."""
 
 from __future__ import annotations
 

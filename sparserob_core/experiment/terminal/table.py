@@ -9,7 +9,7 @@ from typing import Any
 from sparserob_core.experiment.terminal.printing import printable
 
 KNOWN = {"lower bound", "upper bound", "relative gap"}
-"""What is told even where it is unknown."""
+"""Rows that are shown even where the value is unknown."""
 
 
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

@@ -1,1 +1,1 @@
-"""Global maximisation of a function over a box: accounts, polish, and what observers are told."""
+"""Global maximisation of a function over a box: accounts, local search, and events."""

@@ -1,4 +1,4 @@
-"""What observers are told of one search: batches now and then, not one event for every evaluation."""
+"""The events of one search: batches now and then, not one event for every evaluation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.events import Batch, EvaluationsFinished, Notify, frozen
 
 SECONDS_BETWEEN_EVENTS = 0.05
-NUMBERS_BETWEEN_EVENTS = 2**21  # coordinates that wait to be told of
+NUMBERS_BETWEEN_EVENTS = 2**21  # coordinates that wait for the next event
 
 
 @final
@@ -31,12 +31,12 @@ class Standing:
 
 @final
 class Notifier:
-    """Keeps the points that were not told of yet, without copying them, and where the walk stands."""
+    """Keeps the points of which no event was sent yet, without copying them, and where the walk stands."""
 
     def __init__(self, notify: Notify, domain: Box) -> None:
         self.notify, self.domain = notify, Box(frozen(domain.lower), frozen(domain.upper))
-        self.started = self.told_at = time.monotonic()
-        self.told, self.numbers, self.best = 0, 0, -np.inf
+        self.started = self.notified_at = time.monotonic()
+        self.notified, self.numbers, self.best = 0, 0, -np.inf
         self.points: list[Array] = []
         self.values: list[Array] = []
         self.moments: list[tuple[int, float]] = []
@@ -47,8 +47,8 @@ class Notifier:
 
     @property
     def due(self) -> bool:
-        """Whether it is time to tell of what has been collected."""
-        return time.monotonic() - self.told_at > SECONDS_BETWEEN_EVENTS or self.numbers > NUMBERS_BETWEEN_EVENTS
+        """Whether it is time for an event."""
+        return time.monotonic() - self.notified_at > SECONDS_BETWEEN_EVENTS or self.numbers > NUMBERS_BETWEEN_EVENTS
 
     def add(self, points: Array, values: Array, moment: float) -> None:
         """Collect points ``(k, d)`` and their values ``(k,)``, known ``moment`` seconds after the search began."""
@@ -70,13 +70,17 @@ class Notifier:
             for name, rows in notes.items()
             if len(rows) > self._noted.get(name, 0)
         }
-        batch = Batch(self.points, self.values, self.moments, fresh, self.told, self.best, self._origin)
-        count, self.told, self.told_at = standing.evaluations - self.told, standing.evaluations, time.monotonic()
+        batch = Batch(self.points, self.values, self.moments, fresh, self.notified, self.best, self._origin)
+        count, self.notified, self.notified_at = (
+            standing.evaluations - self.notified,
+            standing.evaluations,
+            time.monotonic(),
+        )
         event = EvaluationsFinished(
             count=count,
             total=standing.evaluations,
             best_value=standing.best_value,
-            seconds=self.told_at - self.started,
+            seconds=self.notified_at - self.started,
             notes={name: rows[-1][1] for name, rows in notes.items()},
             budget=standing.budget,
             best_point=frozen(standing.best_point),

@@ -104,7 +104,7 @@ class CountedObjective:
         if self.ended is not None:
             raise self.ended
         if self._notifier is not None and self._notifier.due:
-            self.tell()
+            self.notify_observers()
         asked = self._checked(points)
         allowed = asked[: self.remaining]
         values = np.empty(0)
@@ -166,9 +166,9 @@ class CountedObjective:
         trace = Trace(points, values, np.maximum.accumulate(values), seconds, notes)
         return Report(self.best_value, self.best_point, self.evaluations, upper_bound, trace, stopped)
 
-    def tell(self) -> None:
-        """Tell the observers of what was evaluated since they were told last."""
-        if self._notifier is not None and self.evaluations > self._notifier.told:
+    def notify_observers(self) -> None:
+        """Send what was evaluated since the last event."""
+        if self._notifier is not None and self.evaluations > self._notifier.notified:
             standing = Standing(self.evaluations, self.budget, self.best_value, self.best_point, self.block)
             self._notifier.publish(standing, self._notes)
 
@@ -303,7 +303,7 @@ def maximise(
         pass
     except KeyboardInterrupt as pressed:
         stopped, interrupted = str(pressed) or "interrupted from the keyboard", True
-    objective.tell()
+    objective.notify_observers()
     if not bound >= objective.best_value:
         raise PluginError(
             f"{name}: claims the upper bound {bound!r}, but the value {objective.best_value!r} was evaluated"

@@ -22,7 +22,7 @@ SLOPE_OVER_CURVATURE = 10.0
 """How much cheaper slope is than curvature where the points leave a choice."""
 
 
-class _Model(NamedTuple):
+class _Quadratic(NamedTuple):
     """``gradient's + 1/2 s'hessian s`` for steps ``s`` from the best point."""
 
     gradient: Array
@@ -130,11 +130,11 @@ def _neighbours(points: Array, values: Array, top: int) -> tuple[Array, Array, A
     )
 
 
-def _fit(offsets: Array, distances: Array, rises: Array, radius: float) -> _Model:
+def _fit(offsets: Array, distances: Array, rises: Array, radius: float) -> _Quadratic:
     """The quadratic through the best point that fits its neighbours."""
     count, dimension = offsets.shape
     if count == 0:
-        return _Model(np.zeros(dimension), np.zeros((dimension, dimension)))
+        return _Quadratic(np.zeros(dimension), np.zeros((dimension, dimension)))
     i, j = np.triu_indices(dimension)
     scale = min(radius, float(distances[min(count, dimension + i.size) - 1]))
     scaled, weights = offsets / scale, np.maximum(1.0, distances / scale) ** -3.0
@@ -144,7 +144,9 @@ def _fit(offsets: Array, distances: Array, rises: Array, radius: float) -> _Mode
     solution = np.linalg.lstsq(features * weights[:, np.newaxis], rises * weights, rcond=1e-10)[0]
     hessian = np.zeros((dimension, dimension))
     hessian[i, j] = solution[dimension:] * factors / scale**2
-    return _Model(np.asarray(solution[:dimension] * (SLOPE_OVER_CURVATURE / scale), dtype=float), hessian + hessian.T)
+    return _Quadratic(
+        np.asarray(solution[:dimension] * (SLOPE_OVER_CURVATURE / scale), dtype=float), hessian + hessian.T
+    )
 
 
 def _missing_direction(offsets: Array, distances: Array, radius: float, lower: Array, upper: Array) -> Array | None:

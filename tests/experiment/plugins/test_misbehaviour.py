@@ -1,4 +1,4 @@
-"""Guards experiment/plugins/blame and guards: whatever a stranger's component does, one error names it; nothing is
+"""Guards experiment/plugins, attribution and guards: whatever a foreign component does, one error names it; nothing is
 lost, and nothing ends with exit status 0."""
 
 from __future__ import annotations

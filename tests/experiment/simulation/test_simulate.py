@@ -21,7 +21,7 @@ from sparserob_core.control.sets.sets import NormBall, Polytope
 from sparserob_core.control.studies.laws import Uncertainty, admissibility
 from sparserob_core.control.studies.simulate import fine_times, finer, walk
 from sparserob_core.control.transcription.transcribe import prepare
-from sparserob_core.experiment.simulation.outcome import clopper_pearson
+from sparserob_core.experiment.simulation.simulation import clopper_pearson
 from tests.support.plants import held, indicators, random_system, simulated, uniform, walsh
 
 LAWS = ("iid", "vertices", "slow", "neighbours")

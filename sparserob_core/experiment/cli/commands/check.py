@@ -25,7 +25,7 @@ from sparserob_core.experiment.terminal.printing import EXIT, print_json
     type=click.FloatRange(min=0.0, min_open=True),
     default=math.inf,
     metavar="N",
-    help="Stop after N seconds: what was decided by then is told, the rest is not checked.",
+    help="Stop after N seconds: what was decided by then is shown, the rest is not checked.",
 )
 def check(directory: Path, as_json: bool, plugins: tuple[Path, ...], seconds: float) -> int:
     """Verify a finished run: every claim of its certificate, derived anew.

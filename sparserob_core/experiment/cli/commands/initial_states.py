@@ -84,7 +84,7 @@ def initial_states(
                 about=None if about is None else _numbers("about", about),
                 within=within,
                 out=out,
-                notify=line.hear,
+                notify=line.receive,
             )
     except InputError as error:
         if error.path != ("states",):

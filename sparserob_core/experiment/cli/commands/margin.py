@@ -59,7 +59,7 @@ def margin(
     from sparserob_core.experiment.terminal.table import print_table
 
     with LiveLine() as line:
-        found = find(config, of, overrides, tolerance=tolerance, curve=curve, out=out, write=True, notify=line.hear)
+        found = find(config, of, overrides, tolerance=tolerance, curve=curve, out=out, write=True, notify=line.receive)
     if as_json:
         print_json(summary_of_margin(found))
     else:

@@ -62,7 +62,7 @@ def simulate(
     missing = "" if out is None else missing_matplotlib()
     picture = None if missing else out
     with LiveLine() as line:
-        found = propagate(directory, trajectories, law, seed, out=picture, plugins=plugins, notify=line.hear)
+        found = propagate(directory, trajectories, law, seed, out=picture, plugins=plugins, notify=line.receive)
     if as_json:
         print_json(finite(found.summary()))
     else:

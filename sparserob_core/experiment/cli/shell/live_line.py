@@ -10,15 +10,15 @@ from sparserob_core.experiment.run.events import StudyProgress
 from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.events import Event
 
-PATIENCE = 2.0  # seconds of silence
+PATIENCE = 2.0  # seconds before the first line
 RENEWED = 0.1  # seconds between two looks of the line on a terminal
 WRITTEN = 5.0  # seconds between two lines anywhere else
 
 
 @final
 class LiveLine:
-    """Shows what a study tells (`StudyProgress`) on the standard error stream, after some patience: on a terminal in
-    one line, which is renewed and disappears in the end; anywhere else in a plain line now and then."""
+    """Shows the progress of a study (`StudyProgress`) on the standard error stream, after some patience: on a terminal
+    in one line, which is renewed and disappears in the end; anywhere else in a plain line now and then."""
 
     def __init__(self) -> None:
         self._started = self._last = time.monotonic()
@@ -32,7 +32,7 @@ class LiveLine:
             sys.stderr.write("\r\x1b[K")
             sys.stderr.flush()
 
-    def hear(self, event: Event) -> None:
+    def receive(self, event: Event) -> None:
         """What is handed to a study as ``notify``."""
         now = time.monotonic()
         pause = RENEWED if self._terminal else WRITTEN

@@ -25,9 +25,9 @@ def listen() -> None:
     A signal that is ignored, as Ctrl-C is in the background of a shell, stays ignored."""
     with suppress(ValueError):  # not in the main thread
         if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            signal.signal(signal.SIGINT, _hear)
+            signal.signal(signal.SIGINT, _interrupted)
         if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
-            signal.signal(signal.SIGTERM, _hear)
+            signal.signal(signal.SIGTERM, _interrupted)
 
 
 def status_unless_interrupted(status: int) -> int:
@@ -45,16 +45,16 @@ class Output(io.TextIOWrapper):
     reading is a `BrokenPipeError` as ever."""
 
     def write(self, text: str) -> int:
-        with _told():
+        with _as_output_error():
             return super().write(text)
 
     def flush(self) -> None:
-        with _told():
+        with _as_output_error():
             super().flush()
 
 
 @contextmanager
-def _told() -> Iterator[None]:
+def _as_output_error() -> Iterator[None]:
     try:
         yield
     except BrokenPipeError:
@@ -92,6 +92,6 @@ def drop_output() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 
-def _hear(number: int, frame: FrameType | None) -> None:
+def _interrupted(number: int, frame: FrameType | None) -> None:
     _caught.append(number)
     raise KeyboardInterrupt(*([] if number == signal.SIGINT else [f"interrupted by {signal.Signals(number).name}"]))

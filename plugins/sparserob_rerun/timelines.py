@@ -10,7 +10,7 @@ from sparserob_rerun.palette import Floats
 
 
 @final
-class Clock:
+class Timelines:
     """Evaluations of ``g`` so far (relaxed programs, for a method that does not search), the round, and the seconds
     since the start."""
 
