@@ -15,7 +15,7 @@ from typing import final
 import numpy as np
 
 from sparserob_core.sip.convex_set import Array, Box
-from sparserob_core.sip.events import Batch, EvaluationsFinished, Event, Notify, RoundFinished, ignore
+from sparserob_core.sip.events import Batch, EvaluationsFinished, Event, Notify, RoundFinished, frozen, ignore
 from sparserob_core.sip.evidence import Cut, Dual, Proof
 from sparserob_core.sip.method import Method, Tools
 from sparserob_core.sip.program import (
@@ -75,7 +75,7 @@ class UsersUnits:
         return own
 
     def _round(self, own: RoundFinished) -> RoundFinished:
-        decision = None if own.decision is None else _fixed(own.decision * self.decision)
+        decision = None if own.decision is None else frozen(own.decision * self.decision)
         worst = own.separations.get(own.worst_family)
         row = int(worst.rows[0]) if worst is not None and worst.rows.size else 0
         multipliers = [m * self._price(cut) for m, cut in zip(own.multipliers, own.imposed, strict=False)]
@@ -88,7 +88,7 @@ class UsersUnits:
             violation=own.violation * self._row_unit(own.worst_family, row),
             separations={name: self._separation(name, one) for name, one in own.separations.items()},
             imposed=self._cuts(own.imposed),
-            multipliers=_fixed(np.array(multipliers, dtype=float)),
+            multipliers=frozen(np.array(multipliers, dtype=float)),
             added=self._cuts(own.added),
             dropped=self._cuts(own.dropped),
         )
@@ -103,8 +103,10 @@ class UsersUnits:
         return replace(
             own,
             best_value=own.best_value * value,
-            best_point=own.best_point * units if own.best_point.size == size else own.best_point,
-            domain=None if own.domain is None else Box(own.domain.lower * units, own.domain.upper * units),
+            best_point=frozen(own.best_point * units) if own.best_point.size == size else own.best_point,
+            domain=None
+            if own.domain is None
+            else Box(frozen(own.domain.lower * units), frozen(own.domain.upper * units)),
             lower_bound=own.lower_bound * self.cost,
             batch=Batch(
                 tuple(points * units for points in batch.points),
@@ -206,8 +208,3 @@ class UsersUnits:
         own = family.formulated(formulation)
         units = None if own is None else own.index_units
         return np.ones(size) if units is None or units.size != size else units
-
-
-def _fixed(array: Array) -> Array:
-    array.flags.writeable = False
-    return array
