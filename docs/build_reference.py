@@ -30,8 +30,8 @@ FILES = {
     "config.yaml": "the complete, resolved config; `sparserob run` takes it",
     "result.json": (
         "status, message, cost, value, epsilon, bounds, gap, worst constraint, tolerances (what was proven of each"
-        " constraint, and what counts as no violation of its rows, in the user's units), sparsity, counts, seconds (of the"
-        " method: solving and proving, neither reading nor drawing), seed, versions; for the scenario approach"
+        " constraint, and what counts as no violation of its rows, in the user's units), sparsity, counts, seconds (of"
+        " the method: solving and proving, neither reading nor drawing), seed, versions; for the scenario approach"
         " `scenario_bound`; `upper_bound` and `gap` are null unless the status is certified or verified"
     ),
     "certificate.json": (
