@@ -32,6 +32,7 @@ from sparserob_core.sip.separation.separation import separate
 
 IDLE_ROUNDS = 3  # rounds that a row may stay without a multiplier before it is dropped
 DROPPING_ROUNDS = 40  # rounds after which rows are only added, so that nothing can cycle
+ALLOWANCES = 4  # times that a proof is helped over rounding
 THINNER = 1e-3  # share of a margin that leaves nothing feasible, which is tried next
 SMALLEST_MARGIN, LARGEST_MARGIN = 1e-15, 1e-6  # in units of the decision's bounds, where those are below 1
 CRUDE = 1e-4  # residual and relative gap of a relaxed solution that a round can do with
@@ -132,8 +133,8 @@ class Exchange(Method, Options):
 class Working:
     """The working set of the exchange: the imposed ``rows``, since how many rounds each is ``idle (r,)``, the weight
     ``epsilon``, the ``margin`` by which rows are tightened with the ``floor`` that it must not fall below and the
-    ``most`` that it may be, whether there is a ``slater`` point for it, and a solution with these rows as the next
-    ``guess``."""
+    ``most`` that it may be, whether there is a ``slater`` point for it, how often rounding was ``allowed`` for, and a
+    solution with these rows as the next ``guess``."""
 
     program: SemiInfiniteProgram
     rows: Rows
@@ -143,6 +144,7 @@ class Working:
     floor: float = 0.0
     most: float = LARGEST_MARGIN
     slater: bool = True
+    allowed: int = 0
     guess: FiniteSolution | None = None
 
     @staticmethod
@@ -233,10 +235,11 @@ class Working:
             for cut, size in zip(self.rows.cuts, np.linalg.norm(self.rows.G, axis=1).tolist(), strict=True)
             if cut.family in open_ and size > 0.0
         ]
-        if not missed or not self.floor < 2.0 * max(missed) <= self.most:
+        floor = self.margin + 1.25 * max(missed, default=np.inf)
+        if floor > self.most or self.allowed >= ALLOWANCES:
             return False
-        self.floor = 2.0 * max(missed)
-        self.margin = max(self.margin, self.floor)
+        self.floor = self.margin = floor
+        self.allowed += 1
         return True
 
     def _unknown(self, violated: Violated) -> Rows:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -30,6 +31,7 @@ CLIMBED = (
 FIRST_BATCH, QUICK = 16, 0.25  # cells bounded first, and the seconds that a batch may take, where time is limited
 OFTEN = 1.0  # seconds after which a batch that is not over is told of
 STALLED, ADVANCED = 30.0, 0.99  # a worst bound that has not fallen below this share within so many seconds is stuck
+REST, TINY = 8, 1e-5  # halvings without progress after which a bound below `TINY` of its unit is taken for rounding
 MOVES = 24  # steps of such a climb at most
 
 
@@ -116,6 +118,7 @@ def _branch_and_bound(family: ConstraintFamily, x: Array, course: Course) -> Pro
     lower, upper = family.cells if family.cells is not None else (box.lower[None], box.upper[None])
     closed, best = -np.inf, (-np.inf, lower[0], 0)
     leaves: list[tuple[Array, Array]] = []  # one entry per halving
+    worsts: list[float] = []
     while True:
         # Bound every cell, and close those where no violation is left.
         bounds, split = _bounded(course, x, lower, upper)
@@ -139,11 +142,18 @@ def _branch_and_bound(family: ConstraintFamily, x: Array, course: Course) -> Pro
         worst, at = float(bounds.max()), int(bounds.argmax())
         course.tell(int(open_.sum()), worst, lower[at], upper[at])
         halves = _halved(lower[open_], upper[open_], split[open_])
-        if halves is None or course.examined + halves[0].shape[0] > course.budget or course.deadline.passed:
+        worsts.append(worst)
+        spent = halves is None or course.examined + halves[0].shape[0] > course.budget or course.deadline.passed
+        if halves is None or spent or _at_rest(worsts):
             hindrance = course.hindrance(worst, lower[at], upper[at])
             reason = f"{int(open_.sum())} of {course.examined} cells were left; {hindrance}"
             return Proof(family.name, "undecided", worst, best[0], best[1], best[2], course.examined, reason)
         lower, upper = halves
+
+
+def _at_rest(worsts: Sequence[float]) -> bool:
+    """Whether a tiny worst bound no longer falls with the size of the cells: then it is made of rounding."""
+    return len(worsts) > 2 * REST and worsts[-1] <= TINY and worsts[-1] > ADVANCED * worsts[-1 - REST]
 
 
 def _bounded(course: Course, x: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
