@@ -176,6 +176,36 @@ CONFIGS: dict[str, dict[str, Any]] = {
             "terminal": [{"box": [1.0]}],
         },
     ),
+    "parameters in a polytope": on(
+        6,
+        {
+            **SPRING,
+            "system": {
+                "A": [["-0.3 + 0.1*p1", 1.0], [0.0, "-0.5+0.2*p2"]],
+                "B": [[0.0], [1.0]],
+                "parameters": {
+                    "names": ["p1", "p2"],
+                    "polytope": {
+                        "H": [
+                            [0.2978, -0.0231],
+                            [0.6863, -0.0413],
+                            [1.1229, 0.2146],
+                            [0.7865, -0.4354],
+                            [1.0277, 0.6719],
+                            [-0.755, -0.2983],
+                        ],
+                        "h": [0.3142, 0.61, 0.7822, 0.6021, 0.7651, 0.7853],
+                    },
+                },
+            },
+            "horizon": 2.0,
+            "initial_state": [1.0, 0.0],
+            "control": {"box": 2.0},
+            "disturbance": None,
+            "path": [],
+            "terminal": [{"box": {"lower": [None, -0.5], "upper": [0.9, None]}}],
+        },
+    ),
     "rounded": {
         "problem": {
             **DECAY,

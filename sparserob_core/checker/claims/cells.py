@@ -67,7 +67,7 @@ def prove(tubes: Callable[[Corners], Tube], parameters: Parameters, work: Sequen
         if left.turned:
             stack += [(box, half, left.turned) for half in reversed(sides.halves())]
         if left.wide:
-            stack += [(half, sides, left.wide) for half in reversed(_split(box, int(left.influence.argmax())))]
+            stack += [(half, sides, left.wide) for half in reversed(_split(box, left.influence))]
     return Proven(found.bound, found.share, cells, items)
 
 
@@ -208,7 +208,10 @@ def _to_blame(poly: Polynomial, interval: Interval) -> bool:
 
 
 def _influence(tube: Tube, poly: Polynomial) -> Array:
-    sizes = np.abs(poly.coefficients).sum(axis=0)
+    """How much each parameter has to do with what is left open: by the coefficients of the system where the expansion
+    is to blame, else by those of the polynomial."""
+    expansion = poly.expansion > BLAME * poly.error
+    sizes = tube.flow.sizes if expansion else np.abs(poly.coefficients).sum(axis=0)
     answer: Array = np.array(tube.flow.monomials.exponents, dtype=float).T @ sizes
     return answer
 
@@ -221,11 +224,15 @@ def _halves(interval: Interval) -> list[Interval]:
     return [(piece, start, middle), (piece, middle, stop)]
 
 
-def _split(box: Corners, axis: int) -> list[Corners]:
+def _split(box: Corners, influence: Array) -> list[Corners]:
+    """Both halves of a box, across the parameter of most influence whose interval still has a middle."""
     lower, upper = list(box[0]), list(box[1])
-    middle = (lower[axis] + upper[axis]) / 2
-    if not lower[axis] < middle < upper[axis]:
+    middles = (np.array(lower) + np.array(upper)) / 2
+    thick = (np.array(lower) < middles) & (middles < np.array(upper))
+    if not thick.any():
         raise Unchecked("a box of parameters cannot be halved any more")
+    axis = int(np.where(thick, influence, -np.inf).argmax())
+    middle = float(middles[axis])
     left, right = upper.copy(), lower.copy()
     left[axis] = right[axis] = middle
     return [(tuple(lower), tuple(left)), (tuple(right), tuple(upper))]

@@ -53,6 +53,13 @@ class Flow:
         return expanded(self.system, self.monomials, [arb(c) for c in self.centre], self.radius)
 
     @cached_property
+    def sizes(self) -> Array:
+        """The norms of the coefficients of ``A``, ``B`` and ``E``, summed, one per monomial."""
+        return np.array(
+            [sum(float(norm(part).mid()) for part in parts) for parts in zip(*self.parts.values(), strict=True)]
+        )
+
+    @cached_property
     def states(self) -> Series:
         """``A``."""
         return Series(self.monomials, self.parts["A"])
