@@ -34,6 +34,8 @@ class ProgressObserver(sr.Observer, sr.Options):
         """See `sparserob_core.Observer`."""
         if isinstance(event, sr.RunStarted) and not event.quiet:
             self._status = Status(event.title)
+            if event.unprovable:
+                sys.stderr.write(f"no control of this problem can be certified: {event.unprovable}\n")
             self._screen = None if self.verbose else Screen(self._status, self.patience, sys.stderr)
         elif self._status is not None:
             self._show(self._status, event)

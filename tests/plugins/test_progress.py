@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -234,3 +235,13 @@ def test_without_a_terminal_quiet_and_json_leave_the_error_stream_empty(tmp_path
     assert plain
     assert "\x1b" not in plain
     assert command(tmp_path, None, "--quiet").stderr == command(tmp_path, None, "--json").stderr == ""
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_what_can_never_be_certified_is_said_at_the_start(quiet: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = io.StringIO()
+    watching = observer(stream, monkeypatch)
+    watching.receive(replace(started(quiet), unprovable="its sets are curved"))
+    watching.close()
+    said = "no control of this problem can be certified: its sets are curved" in stream.getvalue()
+    assert said is not quiet

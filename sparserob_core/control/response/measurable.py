@@ -11,7 +11,7 @@ import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.comparison import block_norms, product
-from sparserob_core.control.enclosures.matrix_exponential import transitions
+from sparserob_core.control.enclosures.matrix_exponential import exponential
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.response import Response
 from sparserob_core.sip.convex_set import Array, ConvexSet
@@ -65,7 +65,7 @@ class MeasurableSupport:
         found: dict[bytes, tuple[Array, Array]] = {key: self._tables[key] for key in keys if key in self._tables}
         if new.size:
             breakpoints = self.response.grid.breakpoints
-            starts = np.einsum("ki,lij->klj", directions[new], transitions(A[None], breakpoints)[0])
+            starts = np.einsum("ki,lij->klj", directions[new], _flows(A, breakpoints))
             lengths = np.tile(np.diff(breakpoints), new.size)
             owner = np.repeat(np.arange(new.size), breakpoints.size - 1)
             integrals = self._integrals(A, E, starts[:, :-1].reshape(-1, A.shape[0]), lengths, owner)
@@ -84,14 +84,14 @@ class MeasurableSupport:
         count = int(np.clip(np.ceil(fastest * lengths.max(initial=0.0)), 1, MOST_SHORT))
         owner = np.repeat(np.arange(lengths.size), count)  # short intervals, on which the quadrature is at home
         offsets = np.outer(lengths, np.arange(count) / count)
-        starts = np.einsum("li,lqij->lqj", starts, transitions(A[None, None], offsets)[0]).reshape(-1, A.shape[0])
+        starts = np.einsum("li,lqij->lqj", starts, _flows(A, offsets)).reshape(-1, A.shape[0])
         lengths = lengths[owner] / count
         whole, size = self._quadrature(A, E, starts, lengths)
         largest = np.zeros(int(member.max(initial=0)) + 1)
         np.maximum.at(largest, member[owner], size)
         accuracy = ACCURACY * np.maximum(largest[member] * float(self.response.grid.breakpoints[-1]), TINY)
         for _ in range(HALVINGS):
-            middles = np.einsum("li,lij->lj", starts, transitions(A[None], lengths / 2)[0])
+            middles = np.einsum("li,lij->lj", starts, _flows(A, lengths / 2))
             left, right = (
                 self._quadrature(A, E, starts, lengths / 2)[0],
                 self._quadrature(A, E, middles, lengths / 2)[0],
@@ -106,9 +106,15 @@ class MeasurableSupport:
         return total
 
     def _quadrature(self, A: Array, W: Array, starts: Array, lengths: Array) -> tuple[Array, Array]:
-        flow, _ = transitions(A[None, None], lengths[:, None] * (NODES + 1) / 2)
-        values = self.bound.support(np.einsum("li,lqij,jw->lqw", starts, flow, W, optimize=True))
+        lines = np.einsum("lqij,jw->lqiw", _flows(A, lengths[:, None] * (NODES + 1) / 2), W)
+        values = self.bound.support(np.einsum("li,lqiw->lqw", starts, lines))
         return (values * WEIGHTS).sum(axis=1) * lengths / 2, np.abs(values).max(axis=1, initial=0.0)
+
+
+def _flows(A: Array, durations: Array) -> Array:
+    """``e^{A r} (..., d, d)``; of equal durations once, since directions share their times."""
+    distinct, which = np.unique(durations, return_inverse=True)
+    return np.asarray(exponential(A * distinct[:, None, None])[which.reshape(durations.shape)])
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,7 +38,8 @@ class RunStarted(Event):
     (``quiet``).
 
     Always the first event. ``inspection`` answers what an observer wants to know beside the events, on a copy of its
-    own; ``None`` where there is none.
+    own; ``None`` where there is none. ``unprovable`` says why no control can be certified, where that is known before
+    anything is solved.
     """
 
     title: str
@@ -47,6 +48,7 @@ class RunStarted(Event):
     program: SemiInfiniteProgram
     quiet: bool = False
     inspection: Inspection | None = None
+    unprovable: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

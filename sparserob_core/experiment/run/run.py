@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, final
 
 from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.transcription.provable import unprovable
 from sparserob_core.control.transcription.rounding import rounded_down
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, assemble, build, name_of, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
@@ -114,6 +115,7 @@ def run(
                     title=printable(experiment.title),
                     directory=directory.path,
                     problem=experiment.problem if isinstance(experiment, ControlExperiment) else None,
+                    unprovable=unprovable(experiment.problem) if isinstance(experiment, ControlExperiment) else None,
                     program=experiment.program,
                     quiet=quiet,
                     inspection=Inspection(loaded),
