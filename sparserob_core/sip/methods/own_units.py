@@ -144,7 +144,8 @@ class UsersUnits:
         return np.tile(unit, size // max(block, 1)) if size % max(block, 1) == 0 else np.ones(size)
 
     def _separation(self, name: str, own: Separation) -> Separation:
-        rows = self.program.family(name).row_units
+        family = self._family(name)
+        rows = None if family is None else family.row_units
         units = np.ones(own.rows.size) if rows is None else rows[own.rows]
         return replace(
             own,
@@ -190,21 +191,25 @@ class UsersUnits:
             own,
             violation=own.violation * own.unit,
             unit=1.0,
-            units=self.program.family(own.family).row_units,
+            units=None if (family := self._family(own.family)) is None else family.row_units,
             index=None if own.index is None else placed(own.index),
             leaves=None if own.leaves is None else (placed(own.leaves[0]), placed(own.leaves[1])),
         )
 
     def _row_unit(self, name: str, row: int) -> float:
-        units = self.program.family(name).row_units if name else None
-        return 1.0 if units is None else float(units[row])
+        family = self._family(name)
+        return 1.0 if family is None else family.row_unit(row)
 
     def _index_units(self, name: str, formulation: Formulation, size: int) -> Array:
-        if not name:
+        family = self._family(name)
+        if family is None:
             return np.ones(size)
-        family = self.program.family(name)
         if formulation == "sampled" and family.index_units is not None:
             return np.array([family.index_units[0], 1.0])  # a time and the number of a sample
         own = family.formulated(formulation)
         units = None if own is None else own.index_units
         return np.ones(size) if units is None or units.size != size else units
+
+    def _family(self, name: str) -> ConstraintFamily | None:
+        """The family of that name; ``None`` for one that only the method knows, which then has no units."""
+        return next((family for family in self.program.families if family.name == name), None)
