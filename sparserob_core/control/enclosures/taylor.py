@@ -1,7 +1,8 @@
 """Taylor models: polynomials with a rigorous remainder, the arithmetic in which functions of the parameters are
 enclosed.
 
-After Makino and Berz (2003), "Taylor models and other validated functional inclusion methods"; rounding is left aside.
+After Makino and Berz (2003), "Taylor models and other validated functional inclusion methods". Every operation adds
+what it may have rounded to the remainder; numbers that do not depend on the parameters are what floating point gives.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from sparserob_core.control.enclosures.elementary import (
     tanh_series,
     undefined,
 )
+from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.sip.convex_set import Array
 
@@ -57,6 +59,7 @@ class TaylorSpace:
         order = np.argsort(codes)
         target = order[np.searchsorted(codes[order], codes[left] + codes[right])]
         self.products = (left, right, target)
+        self.terms = int(np.bincount(target).max())  # products that add up to one coefficient, at most
         self.faces: dict[bytes, Array] = {}
 
     @property
@@ -133,7 +136,7 @@ class TaylorModel:
     def _shifted(self, number: float) -> TaylorModel:
         coefficients = self.coefficients.copy()
         coefficients[0] += number
-        return TaylorModel(self.space, coefficients, self.remainder)
+        return _rounded(self.space, coefficients, self.remainder)
 
     def __neg__(self) -> TaylorModel:
         return TaylorModel(self.space, -self.coefficients, self.remainder)
@@ -143,7 +146,7 @@ class TaylorModel:
 
     def __add__(self, other: object) -> TaylorModel:
         if isinstance(other, TaylorModel):
-            return TaylorModel(self.space, self.coefficients + other.coefficients, self.remainder + other.remainder)
+            return _rounded(self.space, self.coefficients + other.coefficients, self.remainder + other.remainder)
         return self._shifted(float(other)) if isinstance(other, _NUMBERS) else NotImplemented
 
     __radd__ = __add__
@@ -159,7 +162,7 @@ class TaylorModel:
             return self._product(other)
         if not isinstance(other, _NUMBERS):
             return NotImplemented
-        return TaylorModel(self.space, float(other) * self.coefficients, abs(float(other)) * self.remainder)
+        return _rounded(self.space, float(other) * self.coefficients, abs(float(other)) * self.remainder)
 
     __rmul__ = __mul__
 
@@ -193,6 +196,8 @@ class TaylorModel:
         a, b = self.coefficients, other.coefficients
         coefficients = np.bincount(target, weights=a[left] * b[right], minlength=self.space.size).astype(float)
         cross = self._magnitude() * other.remainder + self.remainder * (other._magnitude() + other.remainder)
+        if a[1:].any() or b[1:].any():
+            cross += rounding(self.space.terms) * float(np.abs(a).sum()) * float(np.abs(b).sum())
         return TaylorModel(self.space, coefficients, self.space.overflow(a, b) + cross)
 
     def _power(self, count: int) -> TaylorModel:
@@ -219,9 +224,11 @@ class TaylorModel:
         for coefficient in reversed(coefficients[:-1]):
             result = result * y + coefficient
         low, high = y.bounds()
-        return TaylorModel(
-            self.space, result.coefficients, result.remainder + bound * max(-low, high) ** len(coefficients)
-        )
+        reach = max(-low, high)
+        rest = bound * reach ** len(coefficients)
+        if reach > 0.0:  # the coefficients of the series are rounded too, by a few units each
+            rest += sum(rounding(4 * k) * abs(one) * reach**k for k, one in enumerate(coefficients))
+        return TaylorModel(self.space, result.coefficients, result.remainder + rest)
 
     def _domain(self) -> tuple[int, float, float, float]:
         return self.space.degree, float(self.coefficients[0]), *self.bounds()
@@ -272,3 +279,10 @@ class TaylorModel:
 
     def __bool__(self) -> bool:
         raise NotEnclosable("a function of the parameters may not branch on their values (a truth value was asked for)")
+
+
+def _rounded(space: TaylorSpace, coefficients: Array, remainder: float) -> TaylorModel:
+    """A model of which every coefficient has been rounded once."""
+    if coefficients[1:].any():
+        remainder += rounding(0) * float(np.abs(coefficients).sum())
+    return TaylorModel(space, coefficients, remainder)

@@ -65,9 +65,10 @@ def test_the_remainder_shrinks_with_the_degree_and_with_the_cell() -> None:
     assert remainder(3, 0.05) < remainder(3, 0.1) / 12  # fourth order in the radius
 
 
-def test_polynomials_within_the_degree_are_exact() -> None:
+def test_of_polynomials_within_the_degree_only_rounding_is_left_out() -> None:
     p, q = TaylorSpace(2, 4).variables(np.array([1.0, -2.0]), np.array([0.5, 0.25]))
-    assert ((p * q - q * p) + p**2 * q**2 - 3.0).remainder == 0.0
+    assert 0.0 < ((p * q - q * p) + p**2 * q**2 - 3.0).remainder < 1e-12
+    assert (p * 0.0 + 3.0).remainder == 0.0
 
 
 def test_monomials_are_graded_and_products_land_where_the_exponents_add() -> None:
@@ -91,7 +92,8 @@ def test_models_work_inside_numpy_arrays() -> None:
     assert (constant @ p)[0].bounds() == pytest.approx((4.5, 5.5))
     assert (np.float64(2.0) * p[0]).bounds() == pytest.approx((1.8, 2.2))
     assert (np.float64(2.0) / p[0]).bounds()[0] <= 2 / 1.1
-    assert np.square(p)[0].remainder == 0.0 and abs(-p[0]).bounds() == p[0].bounds()
+    assert 0.0 < np.square(p)[0].remainder < 1e-14
+    assert abs(-p[0]).bounds() == p[0].bounds()
 
 
 @pytest.mark.parametrize(
