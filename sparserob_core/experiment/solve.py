@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from sparserob_core.sip.events import Notify
 
 Choice: TypeAlias = str | Mapping[str, Any]
+logger = logging.getLogger("sparserob")
 PIECES = {"name": "piecewise_constant", "pieces": 100}
 
 
@@ -77,6 +79,15 @@ def solve(
     )
     chosen: Method = component(registry, "method", _with_tolerance(registry, method, tolerance), Method)
     return solve_in_own_units(chosen, program, tools)
+
+
+def announce(problem: OptimalControlProblem) -> None:
+    """Warn at once where no control of a problem can ever be certified, before anything is solved."""
+    from sparserob_core.control.transcription.provable import unprovable
+
+    why = unprovable(problem)
+    if why is not None:
+        logger.warning("no control of this problem can be certified: %s", why)
 
 
 def maximise(
@@ -156,6 +167,7 @@ def _program(registry: Registry, problem: object, control: object, disturbance: 
         )
     from sparserob_core.control.transcription.transcribe import transcribe
 
+    announce(problem)
     controls = dictionary(registry, PIECES if control is None else control, problem.horizon)
     disturbances = indicators(controls) if disturbance is None else dictionary(registry, disturbance, problem.horizon)
     return transcribe(problem, control=controls, disturbance=disturbances)

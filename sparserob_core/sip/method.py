@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
+from types import FrameType
 from typing import final
 
 import numpy as np
@@ -23,6 +26,7 @@ from sparserob_core.sip.result import Result
 from sparserob_core.sip.rules import Geometric
 from sparserob_core.sip.solver import Solver
 
+GRACE = 1.0  # seconds after a limit in which a method may end by itself
 GAP_TOLERANCE = 1e-7  # relative gap at which the bounds have met, unless a method has another one
 
 
@@ -102,6 +106,33 @@ class Deadline:
         """Raise `OutOfTime` when the time is over."""
         if self.passed:
             raise OutOfTime(self.reason)
+
+    @contextmanager
+    def enforced(self) -> Iterator[None]:
+        """Raise `OutOfTime` a second after the end of the time even where nobody asks, as a single step may take long.
+
+        By the alarm of the operating system, so in the main thread only, and only where nobody else uses it.
+        """
+        alarm = getattr(signal, "SIGALRM", None)
+        if (
+            alarm is None
+            or not self.bounded
+            or threading.current_thread() is not threading.main_thread()
+            or signal.getsignal(alarm) is not signal.SIG_DFL
+        ):
+            yield
+            return
+
+        def ring(number: int, frame: FrameType | None) -> None:
+            raise OutOfTime(self.reason)
+
+        signal.signal(alarm, ring)
+        signal.setitimer(signal.ITIMER_REAL, max(0.0, self._ends - time.monotonic()) + GRACE)
+        try:
+            yield
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            signal.signal(alarm, signal.SIG_DFL)
 
     def interrupt(self, error: KeyboardInterrupt) -> str:
         """Take note of an interrupt, and return why the time is over: in the words of the error where it has some."""

@@ -104,6 +104,12 @@ class Journal(Observer):
             write.write_json("certificate.json", proof)
         if result.trace is not None:
             write.write_arrays("evaluations.npz", result.trace.arrays())
+        if result.stopped:  # what is drawn may take longer than what was solved
+            return (
+                control,
+                summary,
+                ("no figures: the run was stopped; sparserob figures draws them",) if figures else (),
+            )
         worst = adversaries(experiment, np.asarray(result.decision)) if control is not None else {}
         if worst:
             write.write_arrays(ADVERSARY, worst)

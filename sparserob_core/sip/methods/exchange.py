@@ -66,7 +66,8 @@ class Exchange(Method, Options):
         relaxed = RelaxedProgram(program, tools.solver, tools.regulariser, deadline=tools.deadline)
         ledger = Ledger(program, relaxed, tools, self.tolerance)
         try:
-            return self._exchange(ledger, prover)
+            with tools.deadline.enforced():
+                return self._exchange(ledger, prover)
         except KeyboardInterrupt as error:
             return ledger.stopped(error, prover)
 
@@ -93,6 +94,7 @@ class Exchange(Method, Options):
 
             # Separate: the constraints of the continuum that this decision violates most.
             x = answer.solution.x
+            ledger.best = ledger.best or answer
             found = separate(program, x, tools, ALLOWED, number)
             violated = [_above(family, separation) for family, separation in found]
             suggested = np.inf if any(rows.size for _, rows, _ in violated) else program.cost(x)

@@ -19,7 +19,7 @@ from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfinite
 from sparserob_core.sip.proof.irreducible import irreducible
 from sparserob_core.sip.proof.verdict import as_bad_as_found, infeasible_subsystem, verdict, witness, worst_of
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
-from sparserob_core.sip.result import Result, Status, relative_gap
+from sparserob_core.sip.result import MEANING, Result, Status, relative_gap
 
 ROUNDING = 1e-13  # of the terms of a cost, with which it is evaluated
 RESIDUAL = 1e-8  # of bounds, fixed rows and equalities, relative to their scale, at a decision that is returned
@@ -158,7 +158,13 @@ class Ledger:
                 seconds=time.perf_counter() - self.started,
                 stopped=reason,
             )
-        proofs = as_bad_as_found(prover(self.best.solution.x), self._found)
+        try:
+            with self.tools.deadline.enforced():
+                proven = prover(self.best.solution.x)
+        except KeyboardInterrupt:
+            said = MEANING["undecided"]
+            proven = [Proof(family.name, "undecided", np.inf, reason=said) for family in self.program.families]
+        proofs = as_bad_as_found(proven, self._found)
         return self.judged(self.best, worst_of(self._found), proofs, reason)
 
     def without(self, answer: Answer) -> Result:

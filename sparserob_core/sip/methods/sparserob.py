@@ -92,7 +92,8 @@ class SparseRob(Method, Options):
         steps: list[OuterStep] = []
         parts: list[SearchTrace] = []
         try:
-            result = self._maximise(g, ledger, steps, parts)
+            with tools.deadline.enforced():
+                result = self._maximise(g, ledger, steps, parts)
         except KeyboardInterrupt as error:
             result = ledger.stopped(error, lambda x: prove(program, x, tools.notify, deadline=tools.deadline))
         trace = SearchTrace.joined(parts) if parts else None

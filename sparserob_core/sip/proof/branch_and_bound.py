@@ -65,6 +65,8 @@ def prove_family(
         try:
             return _branch_and_bound(family, x, Course(family, notify, cells, time_left))
         except NotEnclosable as error:
+            if time_left.passed:
+                return Proof(family.name, "undecided", np.inf, reason=f"{family.name}: {error}")
             return replace(_by_separation(family, x), reason=f"{family.name}: {error}")
     except KeyboardInterrupt as error:
         time_left.interrupt(error)

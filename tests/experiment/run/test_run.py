@@ -155,3 +155,22 @@ def test_maximise_resolves_the_name_and_its_options() -> None:
     assert report.best_value == pytest.approx(0.0, abs=1e-4)
     with pytest.raises(sr.InputError, match="maximiser direct: epz: unknown key"):
         sr.maximise(lambda x: x[:, 0], sr.Box([0.0], [1.0]), "direct", epz=3)
+
+
+def test_what_can_never_be_certified_is_said_before_anything_is_solved(caplog: pytest.LogCaptureFixture) -> None:
+    ball = sr.Ellipsoid([0.0, 0.0], [[0.25, 0.0], [0.0, 0.25]])
+    problem = sr.OptimalControlProblem(
+        system=sr.LinearSystem([[0, 1], [0, 0]], [[0.0], [1.0]]),
+        horizon=2.0,
+        initial_state=[0.4, 0.0],
+        control=sr.Box([-1.0], [1.0]),
+        disturbance=sr.Box([-0.01, -0.01], [0.01, 0.01]),
+        disturbance_class="measurable",
+        terminal=[ball],
+    )
+    with caplog.at_level("WARNING", logger="sparserob"):
+        result = sr.solve(problem, control={"name": "piecewise_constant", "pieces": 4}, seconds=1e-6)
+    assert "before there was a decision" in result.message
+    assert len(caplog.records) == 1
+    assert "no control of this problem can be certified" in caplog.text
+    assert "piecewise_constant" in caplog.text

@@ -3,6 +3,7 @@ knows, and claims no more than that; bounds that cross are an alarm."""
 
 from __future__ import annotations
 
+import signal
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -106,6 +107,20 @@ def test_a_limit_that_is_over_before_anything_was_solved_returns_without_a_decis
     assert (result.status, result.decision) == ("undecided", None)
     assert "before there was a decision" in result.message
     assert result.lower_bound == -np.inf
+
+
+def test_a_single_step_that_takes_long_is_ended_too():
+    def worst(x):
+        time.sleep(30.0)
+        raise AssertionError("it was not ended")
+
+    family = replace(slow_family(0.0), worst=worst, enclosure=None)
+    started = time.monotonic()
+    result = sr.solve(sr.SemiInfiniteProgram(n=1, q=[1.0], lower=-5.0, upper=5.0, families=[family]), seconds=2.0)
+    assert time.monotonic() - started < 15.0
+    assert (result.status, result.stopped) == ("undecided", "the limit of 2 s is reached")
+    assert result.decision == pytest.approx([-5.0]), "of the relaxed program without rows"
+    assert signal.getsignal(signal.SIGALRM) is signal.SIG_DFL
 
 
 @pytest.mark.parametrize("seconds", [0, -1.0, np.inf, np.nan, "60", True])
