@@ -81,7 +81,7 @@ def solve(
     return solve_in_own_units(chosen, program, tools)
 
 
-def announce(problem: OptimalControlProblem) -> None:
+def _announce(problem: OptimalControlProblem) -> None:
     """Warn at once where no control of a problem can ever be certified, before anything is solved."""
     from sparserob_core.control.transcription.provable import unprovable
 
@@ -167,7 +167,7 @@ def _program(registry: Registry, problem: object, control: object, disturbance: 
         )
     from sparserob_core.control.transcription.transcribe import transcribe
 
-    announce(problem)
+    _announce(problem)
     controls = dictionary(registry, PIECES if control is None else control, problem.horizon)
     disturbances = indicators(controls) if disturbance is None else dictionary(registry, disturbance, problem.horizon)
     return transcribe(problem, control=controls, disturbance=disturbances)

@@ -19,7 +19,6 @@ from sparserob_core.experiment.directory.finished import UNFINISHED
 from sparserob_core.experiment.run.events import Broadcast, Event, Observer, RunFinished, RunStarted
 from sparserob_core.experiment.run.inspection import Inspection
 from sparserob_core.experiment.run.journal import Journal
-from sparserob_core.experiment.solve import announce
 from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.method import Deadline, ExecutorFactory, Method, Tools
@@ -96,8 +95,6 @@ def run(
     loaded = load_config(config, overrides)
     deadline = Deadline(loaded.config.limits.seconds)  # the transcription counts too
     experiment = assemble(loaded)
-    if isinstance(experiment, ControlExperiment):
-        announce(experiment.problem)
     tools, watching = (
         replace(tools_of(loaded), deadline=deadline),
         [*_observers(loaded), *((type(observer).__name__, observer) for observer in observers)],
