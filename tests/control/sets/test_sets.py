@@ -197,3 +197,24 @@ def test_an_equality_measures_the_fixed_coordinates_only() -> None:
 def test_a_set_that_is_none_says_what_was_expected(build, message: str) -> None:
     with pytest.raises(InputError, match=message):
         build()
+
+
+def test_the_support_of_a_polytope_without_known_vertices_is_bounded_from_the_dual_side(monkeypatch) -> None:
+    """A linear program that stops early must not make the set smaller."""
+    import scipy.optimize
+
+    rng = np.random.default_rng(4)
+    d = 7  # too many dimensions for vertices
+    H = np.vstack([np.eye(d), -np.eye(d), rng.normal(size=(9, d))])
+    polytope, directions = Polytope(H, np.ones(len(H))), rng.normal(size=(5, d))
+    true = polytope.support(directions)
+    honest = scipy.optimize.linprog
+
+    def early(*arguments, **options):
+        answer = honest(*arguments, **options)
+        answer.x = 0.999 * answer.x
+        return answer
+
+    monkeypatch.setattr(scipy.optimize, "linprog", early)
+    assert (polytope.support(directions) >= true * (1.0 - 1e-12)).all()
+    assert polytope.support(directions) == pytest.approx(true, rel=1e-6)
