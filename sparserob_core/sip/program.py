@@ -185,7 +185,8 @@ class SemiInfiniteProgram:
 
     ``n`` is the number of decision variables; ``S (k, n)`` is the identity when ``None``; ``lower``, ``upper`` and
     ``weights`` are numbers or ``(k,)``. ``lengths``: how much each entry of ``S x`` counts in a weighted regulariser
-    (piece lengths), ``(k,)``. ``twin`` makes the same program in its own units (`own_units`).
+    (piece lengths), ``(k,)``. ``twin`` makes the same program in its own units (`own_units`);
+    ``cost_unit`` is what a cost of 1 is in the user's units, for a program in its own.
     """
 
     n: int
@@ -202,6 +203,7 @@ class SemiInfiniteProgram:
     b: Array | None = None
     channels: int = 1
     lengths: Array | None = None
+    cost_unit: float = 1.0
     twin: Callable[[], OwnUnits] | None = field(default=None, repr=False)
     finite: FiniteProgram = field(init=False, repr=False)
 

@@ -149,7 +149,7 @@ def _in_own_units(model: Transcription) -> OwnUnits:
     fixed = _own_equalities(own.problem, own.functionals, *_equalities(own.problem, own.functionals, own.parameters))
     sides = [units.controls, _ratio(slanted(problem.control)[0], _sides_of_controls(own.problem)[0], units.controls)]
     return OwnUnits(
-        program=replace(own.program, families=families),
+        program=replace(own.program, families=families, cost_unit=units.cost),
         decision=np.repeat(units.controls, control.functions),
         image=np.repeat(np.concatenate(sides), control.pieces),
         equalities=_fixed(problem) @ units.states * fixed[2],

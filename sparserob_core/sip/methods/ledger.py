@@ -241,10 +241,11 @@ def alarm(program: SemiInfiniteProgram, dual: Dual, x: Array) -> str:
         allowed += float(dual.fixed @ np.maximum(base.G @ x - base.h, 0.0))
     if dual.bound - cost <= allowed:
         return ""
+    unit = program.cost_unit
     return (
-        f"the lower bound {dual.bound:.12g} is above the cost {cost:.12g} of a decision that was proven, by more"
-        f" than the {allowed:.1e} that the tolerances of the proofs allow: one of the two is wrong, and neither is"
-        f" claimed; {ADVICE}"
+        f"the lower bound {dual.bound * unit:.12g} is above the cost {cost * unit:.12g} of a decision that was proven,"
+        f" by more than the {allowed * unit:.1e} that the tolerances of the proofs allow: one of the two is wrong, and"
+        f" neither is claimed; {ADVICE}"
     )
 
 
