@@ -34,9 +34,7 @@ def rough_units(problem: OptimalControlProblem) -> Units:
     A, B, E = (np.abs(matrix) for matrix in system.matrices(looked_at(index)))
     A, B, E = A.max(axis=0), B.max(axis=0), E.max(axis=0)
     # a fast system is coupled through for a time of about 1/norm only; the eigenvalues do not depend on the units
-    fastest = max(
-        float(np.abs(np.linalg.eigvals(one)).max()) for one in _balanced(system.matrices(looked_at(index))[0])
-    )
+    fastest = float(np.abs(np.linalg.eigvals(system.matrices(looked_at(index))[0])).max())  # LAPACK balances
     lasting = float(power_of_two(np.array(min(time, 1.0 / fastest if fastest > 0.0 else np.inf))))
     reach = np.maximum(np.abs(np.asarray(problem.initial_state)), time * (B * controls).max(axis=1, initial=0.0))
     if bound is not None:
@@ -177,10 +175,3 @@ def _walls(problem: OptimalControlProblem) -> Array:
                 sizes = np.minimum(np.abs(convex.support(axes)), np.abs(convex.support(-axes)))
         least = np.minimum(least, np.where(sizes > 0.0, sizes, np.inf))
     return np.where(np.isfinite(least), least, 1.0)
-
-
-def _balanced(matrices: Array) -> Array:
-    """Matrices ``(k, d, d)`` similar to the given ones, with rows and columns of like size."""
-    from scipy.linalg import matrix_balance
-
-    return np.stack([np.asarray(matrix_balance(one, permute=False)[0]) for one in matrices])
