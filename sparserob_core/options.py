@@ -100,8 +100,10 @@ def part(kind: str) -> Any:
 
 
 def _sentences(name: str, error: ValidationError) -> list[str]:
-    found = [
-        (".".join([name, *map(str, item["loc"])]), item["msg"].removeprefix("Value error, "), item["input"])
-        for item in error.errors(include_url=False)
-    ]
-    return [f"{where}: {said}" if "got" in said else f"{where}: {said}, got {given!r}" for where, said, given in found]
+    sentences = []
+    for item in error.errors(include_url=False):
+        cause = item.get("ctx", {}).get("error")  # what a validator has raised
+        said = item["msg"] if cause is None else str(cause)
+        got = "" if isinstance(cause, InputError) and cause.got else f", got {item['input']!r}"
+        sentences.append(f"{'.'.join([name, *map(str, item['loc'])])}: {said}{got}")
+    return sentences

@@ -15,32 +15,27 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-LABELS = {
-    "disturbance": "factor on the disturbance set",
-    "parameters": "factor on the set of parameters",
-    "initial_state": "factor on the initial state",
-    "control": "factor on the control set",
-}
+    from sparserob_core.experiment.margin.scaling import Scaling
 
 
-def write_margin_figure(file: Path, found: Margin) -> None:
+def write_margin_figure(file: Path, found: Margin, varied: Scaling) -> None:
     """Draw the curve of a margin into a file (.png, .pdf, .svg), which is complete or not there.
 
     Raises `InputError` when matplotlib is missing, and when the file cannot be written.
     """
     look.require_matplotlib()
     with look.style():
-        look.write_figure(file, draw_margin(found))
+        look.write_figure(file, draw_margin(found, varied))
 
 
-def draw_margin(found: Margin) -> Figure:
+def draw_margin(found: Margin, varied: Scaling) -> Figure:
     """Both bounds of the cost at every point, joined by a chord where the cost is convex in the factor, by a band where
     it is only monotone; what is proven infeasible is hatched; the upper axis counts in the problem's own unit."""
     figure, (ax,) = look.panels(1, 2.9)
     proven = [point for point in found.curve if point.status in FEASIBLE]
     factors = np.array([point.factor for point in proven])
     upper, lower = (np.array([getattr(point, name) for point in proven]) for name in ("upper_bound", "lower_bound"))
-    convex = not (found.of == "parameters" or found.of.endswith(".from"))
+    convex = varied.affine  # the value of a convex program is convex in its right-hand sides
     ax.fill_between(
         *_band(factors, lower, upper, found.sense == "largest"),
         color=look.SKY,
@@ -83,8 +78,9 @@ def draw_margin(found: Margin) -> Figure:
         )
     _forbid(ax, found, np.array([point.factor for point in found.curve]))
     ax.set_ylabel("least cost $J$")
-    ax.set_xlabel(_label(found.of))
-    _unit_axis(ax, found)
+    ax.set_xlabel(varied.label)
+    if varied.relative:
+        _unit_axis(ax, found)
     ax.set_title(found.title, pad=8)
     figure.legend(
         *ax.get_legend_handles_labels(), loc="outside lower center", ncols=2, columnspacing=1.6, handlelength=1.6
@@ -98,12 +94,6 @@ def _band(factors: Array, lower: Array, upper: Array, rising: bool) -> tuple[Arr
     x = np.repeat(factors, 2)[1:-1]
     below, above = (lower[:-1], upper[1:]) if rising else (lower[1:], upper[:-1])
     return x, np.repeat(below, 2), np.repeat(above, 2)
-
-
-def _label(of: str) -> str:
-    if of.endswith(".from"):
-        return f"start of the window of {of.removesuffix('.from')} [unit of time]"
-    return LABELS.get(of, f"factor on the set {of}")
 
 
 def _forbid(ax: Axes, found: Margin, factors: Array) -> None:
@@ -136,7 +126,7 @@ def _unit_axis(ax: Axes, found: Margin) -> None:
         and np.isfinite(share)
         and all(abs(point.amount - share * point.factor) <= 1e-9 * (1 + abs(point.amount)) for point in found.curve)
     )
-    if not straight or found.quantity == "start of the window":
+    if not straight:
         return
     above = ax.secondary_xaxis(
         "top", functions=(lambda x: share * np.asarray(x, dtype=float), lambda y: np.asarray(y, dtype=float) / share)

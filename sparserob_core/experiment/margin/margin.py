@@ -16,7 +16,7 @@ from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.problems import LinearKeys
 from sparserob_core.experiment.config.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import RunDirectory, create_directory, finite
-from sparserob_core.experiment.margin.scaling import scaling
+from sparserob_core.experiment.margin.scaling import Scaling, scaling
 from sparserob_core.experiment.margin.search import Margin, MarginSearch, Point
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.methods.exchange import Exchange
@@ -56,7 +56,7 @@ def margin(
     if out is None and not write:
         return search.margin(int(curve))
     with _directory(out, loaded, search.scaling.of) as directory:
-        return _written(directory, search.margin(int(curve)))
+        return _written(directory, search.margin(int(curve)), search.scaling)
 
 
 def summary_of_margin(found: Margin) -> dict[str, Any]:
@@ -98,7 +98,7 @@ def _search(loaded: Loaded, of: str, tolerance: float, notify: Notify) -> Margin
     problem, control, disturbance = experiment.problem, experiment.control, experiment.disturbance
     chosen = scaling(problem, of, *_positions(loaded, problem))
     programs = ParametricProgram(lambda factor: transcribe(chosen.at(factor), control=control, disturbance=disturbance))
-    width = tolerance * (chosen.highest if of.endswith(".from") else 1.0)
+    width = tolerance * (1.0 if chosen.relative else chosen.highest)
     return MarginSearch(experiment.title, programs, chosen, _method(loaded), tools_of(loaded), width, notify)
 
 
@@ -143,13 +143,13 @@ def _directory(out: str | Path | None, loaded: Loaded, of: str) -> RunDirectory:
     return directory
 
 
-def _written(directory: RunDirectory, found: Margin) -> Margin:
+def _written(directory: RunDirectory, found: Margin, varied: Scaling) -> Margin:
     """The figure is an extra: where it cannot be drawn, the numbers are there all the same, with a remark."""
     if len(found.curve) > 1:
         from sparserob_core.experiment.margin.figure import write_margin_figure
 
         try:
-            write_margin_figure(directory.path / "margin.png", found)
+            write_margin_figure(directory.path / "margin.png", found, varied)
         except SparseRobError as error:
             found = replace(found, remarks=(*found.remarks, str(error)))
     directory.write_json("margin.json", summary_of_margin(found))

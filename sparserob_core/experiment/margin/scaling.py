@@ -16,6 +16,7 @@ from sparserob_core.experiment.plugins.messages import nearest
 Sense: TypeAlias = Literal["largest", "smallest"]
 LARGEST = 1e6  # factors beyond are not looked at
 MOST_UNCERTAIN = 1024.0  # the same for factors on a set of parameters, whose matrices change with them
+CONTROL = "factor on the control set"
 POINT = 1e-6  # the factor of a curved set that stands for 0: such a set has an interior
 
 
@@ -27,16 +28,19 @@ class Scaling:
 
     ``sense``: whether the *largest* or the *smallest* feasible factor is asked for. ``affine``: the right-hand sides
     and bounds of the program are affine in the factor, and nothing else depends on it. Factors are in ``[0, highest]``;
-    ``amount(factor)`` is what it comes to of ``quantity``.
+    ``amount(factor)`` is what it comes to of ``quantity``. ``label`` says of what it is a factor.
     """
 
     of: str
+    label: str
     sense: Sense
     at: Callable[[float], OptimalControlProblem]
     quantity: str
     amount: Callable[[float], float]
     affine: bool = True
     highest: float = LARGEST
+    relative: bool = True
+    """Whether the factor multiplies something; otherwise it is itself an amount of ``quantity``: a time."""
     nested: bool = True
     """Whether a feasible factor makes every smaller (for the largest) or greater one (for the smallest) feasible
     too."""
@@ -79,7 +83,7 @@ def _choices(
     for i, positions in enumerate(members):
         if positions:
             yield f"path.{i}", lambda i=i, positions=positions: _path(problem, f"path.{i}", positions)  # type: ignore[misc]
-            yield f"path.{i}.from", lambda i=i, positions=positions: _window(problem, f"path.{i}.from", positions)  # type: ignore[misc]
+            yield f"path.{i}.from", lambda i=i, positions=positions: _window(problem, f"path.{i}", positions)  # type: ignore[misc]
     for i, positions in enumerate(ends):
         if positions:
             yield f"terminal.{i}", lambda i=i, positions=positions: _terminal(problem, f"terminal.{i}", positions)  # type: ignore[misc]
@@ -91,6 +95,7 @@ def _disturbance(problem: OptimalControlProblem) -> Scaling:
     resized = _resizing("disturbance", bound)
     return Scaling(
         "disturbance",
+        "factor on the disturbance set",
         "largest",
         lambda f: replace(problem, disturbance=resized(f)),
         "largest |w_i|",
@@ -104,6 +109,7 @@ def _parameters(problem: OptimalControlProblem) -> Scaling:
     resized = _resizing("parameters", bound)
     return Scaling(
         "parameters",
+        "factor on the set of parameters",
         "largest",
         lambda f: replace(problem, system=replace(problem.system, parameters=resized(f))),
         "largest half-width of a parameter",
@@ -119,6 +125,7 @@ def _initial_state(problem: OptimalControlProblem) -> Scaling:
         raise InputError("of: initial_state is the origin, which no factor moves; expected a state that is not 0")
     return Scaling(
         "initial_state",
+        "factor on the initial state",
         "largest",
         lambda f: replace(problem, initial_state=f * state),
         "largest |x_i(0)|",
@@ -131,10 +138,11 @@ def _control(problem: OptimalControlProblem) -> Scaling:
     paths = _entries(problem)
     named = [i for i, entry in enumerate(paths) if entry.name == "control"]
     if named:  # where the rate is the control, the bounds of the control itself are constraints of the augmented state
-        return _path(problem, "control", named)
+        return replace(_path(problem, "control", named), label=CONTROL)
     resized = _resizing("control", problem.control)
     return Scaling(
         "control",
+        CONTROL,
         "smallest",
         lambda f: replace(problem, control=resized(f)),
         "largest |u_i|",
@@ -147,6 +155,7 @@ def _path(problem: OptimalControlProblem, of: str, positions: Sequence[int]) -> 
     resized = {i: _resizing(of, paths[i].set) for i in positions}
     return Scaling(
         of,
+        f"factor on the set {of}",
         "smallest",
         lambda f: replace(
             problem,
@@ -165,6 +174,7 @@ def _terminal(problem: OptimalControlProblem, of: str, positions: Sequence[int])
     resized = {i: _resizing(of, end) for i, end in sets.items()}
     return Scaling(
         of,
+        f"factor on the set {of}",
         "smallest",
         lambda f: replace(problem, terminal=[resized[i](f) if i in resized else end for i, end in enumerate(ends)]),
         "largest half-width",
@@ -172,11 +182,12 @@ def _terminal(problem: OptimalControlProblem, of: str, positions: Sequence[int])
     )
 
 
-def _window(problem: OptimalControlProblem, of: str, positions: Sequence[int]) -> Scaling:
+def _window(problem: OptimalControlProblem, path: str, positions: Sequence[int]) -> Scaling:
     paths = _entries(problem)
     latest = min(problem.horizon if paths[i].stop is None else float(paths[i].stop or 0.0) for i in positions)
     return Scaling(
-        of,
+        f"{path}.from",
+        f"start of the window of {path} [unit of time]",
         "smallest",
         lambda start: replace(
             problem, path=[replace(entry, start=start) if i in positions else entry for i, entry in enumerate(paths)]
@@ -184,6 +195,7 @@ def _window(problem: OptimalControlProblem, of: str, positions: Sequence[int]) -
         "start of the window",
         _times(1.0),
         affine=False,
+        relative=False,
         highest=latest,
     )
 

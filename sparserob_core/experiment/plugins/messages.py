@@ -68,7 +68,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 def complaints(error: ValidationError, model: type[BaseModel], data: object) -> list[Complaint]:
     """One complaint per key; what several members of a union say of one key is joined by *or*."""
-    found: dict[Path, list[str]] = {}
+    found: dict[Path, list[tuple[str, str]]] = {}
     items = error.errors(include_url=False)
     misspelt = [item["loc"] for item in items if item["type"] == "extra_forbidden"]
     for item in items:
@@ -76,11 +76,20 @@ def complaints(error: ValidationError, model: type[BaseModel], data: object) -> 
             continue  # the unknown key beside it says which one was meant
         path = visible(item["loc"], data, missing=item["type"] == "missing")
         path += tuple(item.get("ctx", {}).get("below", ())) if item["type"] == COMPLAINT else ()
-        sentences = found.setdefault(path, [])
-        sentence = _sentence(dict(item), model)
-        if sentence not in sentences:
-            sentences.append(sentence)
-    return [Complaint(path, " or ".join(_without_repeated_got(sentences))) for path, sentences in found.items()]
+        faults = found.setdefault(path, [])
+        fault = _fault(dict(item), model)
+        if fault not in faults:
+            faults.append(fault)
+    return [Complaint(path, _joined(faults)) for path, faults in found.items()]
+
+
+def _joined(faults: list[tuple[str, str]]) -> str:
+    """Faults of one key as one sentence, in which a value that several of them name stands once, at the end."""
+    last = faults[-1][1]
+    return " or ".join(
+        f"{wrong} (got {got})" if got and (position == len(faults) - 1 or got != last) else wrong
+        for position, (wrong, got) in enumerate(faults)
+    )
 
 
 def _meant(written: Path, missing: Path) -> bool:
@@ -104,33 +113,28 @@ def visible(loc: Path, data: object, missing: bool = False) -> Path:
     return tuple(path)
 
 
-def _sentence(item: dict[str, Any], model: type[BaseModel]) -> str:
+def _fault(item: dict[str, Any], model: type[BaseModel]) -> tuple[str, str]:
+    """What is wrong, and the value that was given; empty where the sentence names it or there is none."""
+    got = shown(item["input"])
     match item["type"]:
         case "missing":
-            return "missing, and it has no default"
+            return "missing, and it has no default", ""
         case "extra_forbidden":
             known = _known_keys(model, item["loc"][:-1])
-            return f"unknown key{nearest(str(item['loc'][-1]), known)}" if known else "unknown key; it has no options"
+            return f"unknown key{nearest(str(item['loc'][-1]), known) if known else '; it has no options'}", ""
         case "value_error":
             cause = item.get("ctx", {}).get("error")
-            got = isinstance(cause, InputError) and cause.got
-            return str(cause) if got else f"{cause} (got {shown(item['input'])})"
+            return str(cause), "" if isinstance(cause, InputError) and cause.got else got
         case "too_short":
             least = item["ctx"]["min_length"]
-            return f"must have at least {least} {'entry' if least == 1 else 'entries'} (got {shown(item['input'])})"
+            return f"must have at least {least} {'entry' if least == 1 else 'entries'}", got
         case kind if kind == COMPLAINT:
-            return str(item["msg"])
+            return str(item["msg"]), ""
         case kind if kind in MUST_BE:
-            return f"must be {MUST_BE[kind]} (got {shown(item['input'])})"
+            return f"must be {MUST_BE[kind]}", got
         case _:
             said = str(item["msg"]).replace("Input should", "should", 1).replace("should be", "must be", 1)
-            return f"{said} (got {shown(item['input'])})"
-
-
-def _without_repeated_got(sentences: list[str]) -> list[str]:
-    *first, last = sentences
-    tail = last[last.rfind(" (got ") :] if " (got " in last else ""
-    return [sentence.removesuffix(tail) for sentence in first] + [last]
+            return said, got
 
 
 def _known_keys(model: type[BaseModel], loc: Path) -> set[str]:

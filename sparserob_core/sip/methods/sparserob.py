@@ -73,7 +73,7 @@ class SparseRob(Method, Options):
         """A rule, a function, or what the registry makes a rule of."""
         if rule is None or callable(rule) or (isinstance(rule, Mapping) and "name" in rule):
             return rule
-        raise InputError(f"expected the name of a rule, a mapping with a name, or a function, got {rule!r}")
+        raise InputError(expected="the name of a rule, a mapping with a name, or a function", got=repr(rule))
 
     def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
         """`certified`, `verified` or, as a rule, `refuted` with the uncertainty that breaks the decision; `infeasible`

@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.experiment.assemble import assemble
+from sparserob_core.experiment.config.load import load_config
 from sparserob_core.experiment.margin.margin import margin_rows
+from sparserob_core.experiment.margin.scaling import scaling
 
 DOUBLE_INTEGRATOR = {"A": [[0, 1], [0, 0]], "B": [[0], [1]]}
 
@@ -232,3 +235,18 @@ def test_a_limit_ends_a_margin_with_what_is_proven_by_then():
     found = sr.margin(config, "disturbance", {"observers": [], "limits.seconds": 0.01})
     assert found.status == "undecided"
     assert found.message.startswith("the limit of 0.01 s is reached")
+
+
+@pytest.mark.parametrize(
+    ("of", "label", "relative"),
+    [
+        ("disturbance", "factor on the disturbance set", True),
+        ("control", "factor on the control set", True),
+        ("path.0", "factor on the set path.0", True),
+        ("path.0.from", "start of the window of path.0 [unit of time]", False),
+    ],
+)
+def test_a_scaling_says_what_its_factor_is(of: str, label: str, relative: bool) -> None:
+    problem = assemble(load_config(config(disturbance={"box": 0.1}, path=[{"box": 4.0}]))).problem
+    varied = scaling(problem, of, [[0]], [])
+    assert (varied.of, varied.label, varied.relative) == (of, label, relative)

@@ -7,10 +7,12 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
+from pydantic import BaseModel, ValidationError, field_validator
 
 import sparserob_core as sr
 from sparserob_core.experiment.plugins import registry as discovery
 from sparserob_core.experiment.plugins.components import Registry
+from sparserob_core.experiment.plugins.messages import complaints
 
 GOOD = """
 import sparserob_core as sr
@@ -226,3 +228,40 @@ def test_two_files_of_one_name_are_two_plugins(tmp_path: Path) -> None:
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "x.py").write_text(GOOD.replace('name="mine"', f'name="{name}"'))
     assert load(tmp_path / "a" / "x.py", tmp_path / "b" / "x.py").names("regulariser") == ["one", "two"]
+
+
+def test_a_constructor_names_what_was_given_whatever_words_the_author_chose() -> None:
+    class Mine(sr.Options):
+        depth: int = 3
+        width: int = 3
+
+        @field_validator("depth")
+        @classmethod
+        def _even(cls, depth: int) -> int:
+            if depth % 2:
+                raise ValueError("an odd depth is forgotten")
+            return depth
+
+        @field_validator("width")
+        @classmethod
+        def _wide(cls, width: int) -> int:
+            if width < 1:
+                raise sr.InputError(expected="a width", got=f"{width}")
+            return width
+
+    with pytest.raises(sr.InputError) as refused:
+        Mine(depth=5, width=-1)
+    assert str(refused.value).splitlines() == [
+        "Mine.depth: an odd depth is forgotten, got 5",
+        "Mine.width: expected a width, got -1",
+    ]
+
+
+def test_the_members_of_a_union_name_a_value_once() -> None:
+    class Either(BaseModel):
+        size: int | list[int]
+
+    with pytest.raises(ValidationError) as refused:
+        Either.model_validate({"size": "wide"})
+    [complaint] = complaints(refused.value, Either, {"size": "wide"})
+    assert str(complaint) == "size: must be a whole number or must be a list (got 'wide')"
