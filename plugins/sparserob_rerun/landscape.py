@@ -123,7 +123,7 @@ def influential(g: sr.RelaxedValue, anchor: Floats, weights: Floats) -> tuple[tu
         return None
     order = np.argsort(-weights, kind="stable")
     head = int(order[0])
-    parameters = [k for k in moves if g.names[k].startswith(("p", "xi"))]
+    parameters = [k for k in moves if g.kinds[k] in ("parameter", "index")]
     if moves[0] == 0 and not parameters and len(anchor) > 1:
         return (head, 0), (int(order[1]), 0)
     chosen = [moves[0], *(k for k in parameters if k != moves[0])] if parameters else moves

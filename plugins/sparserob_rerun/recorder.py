@@ -101,8 +101,7 @@ class Recorder:
         if event.family:
             self.search.separation(event, self.began)
             return
-        names = () if self.inspection is None else self.inspection.names(event.block)
-        self.search.show(event, self.began, names, kept)
+        self.search.show(event, self.began, self._moving(event.block), kept)
         if not event.best_point.size:
             return
         if event.total == event.count:
@@ -112,6 +111,13 @@ class Recorder:
             self.say(f"evaluation {self.timelines.evaluation}: best g {event.best_value:.8g}", "TRACE")
         self.best, self.best_value, self.block = event.best_point, event.best_value, event.block
         self.way.go(event, kept, self.terrain)
+
+    def _moving(self, width: int) -> dict[int, str]:
+        """The coordinates of an index whose moves are drawn, with their names: neither disturbance nor direction."""
+        if self.inspection is None:
+            return {}
+        named = zip(self.inspection.names(width), self.inspection.kinds(width), strict=True)
+        return {k: name for k, (name, kind) in enumerate(named) if kind in ("time", "parameter", "index")}
 
     def idle(self) -> None:
         """Work on the landscape for a moment; the way of the search comes over to a new one."""
@@ -191,8 +197,7 @@ def shown_of(inspection: sr.Inspection | None, landscape: LandscapeOptions | Non
     """What a run has to show."""
     if inspection is None:
         return Shown(None, 0, True, False)
-    searches = inspection.config["method"]["name"] not in ("exchange", "scenario", "nominal")
-    return Shown(inspection.problem, len(inspection.program.families), searches, landscape is not None)
+    return Shown(inspection.problem, len(inspection.program.families), inspection.searches, landscape is not None)
 
 
 def active(cuts: Any, multipliers: Floats) -> list[sr.Cut]:

@@ -51,7 +51,7 @@ class SearchView:
             static=True,
         )
 
-    def show(self, event: sr.EvaluationsFinished, began: float, names: tuple[str, ...], kept: np.ndarray) -> None:
+    def show(self, event: sr.EvaluationsFinished, began: float, moving: dict[int, str], kept: np.ndarray) -> None:
         """Log a batch of a search that began ``began`` seconds after the run; of the points the coordinates ``kept``
         are there."""
         batch = event.batch.trace
@@ -65,7 +65,7 @@ class SearchView:
         )
         self.stream.send_columns("search/g", at, self.rr.Scalars.columns(scalars=values.ravel()).partition([3] * count))
         self._notes(event, numbers, began)
-        self._moves(event, numbers, names, kept)
+        self._moves(event, numbers, moving, kept)
         self.timelines.move(self.base + event.total, event.round, began + event.seconds)
 
     def separation(self, event: sr.EvaluationsFinished, began: float) -> None:
@@ -95,16 +95,14 @@ class SearchView:
         return np.asarray((sums[ends] - sums[starts]) / (ends - starts))
 
     def _moves(
-        self, event: sr.EvaluationsFinished, numbers: np.ndarray, names: tuple[str, ...], kept: np.ndarray
+        self, event: sr.EvaluationsFinished, numbers: np.ndarray, moving: dict[int, str], kept: np.ndarray
     ) -> None:
         """The value of the coordinates that moved, one series for each kind: to which time, to which parameter."""
         trace, moves = event.batch.trace, event.batch.moves
         if not len(moves) or trace.points.shape[1:] != kept.shape:
             return
         kinds = kept[moves[:, 1]] % event.block
-        for kind, name in enumerate(names):
-            if name[0] not in "tpx":
-                continue
+        for kind, name in moving.items():
             mine = _few(moves[kinds == kind])
             if not len(mine):
                 continue

@@ -11,7 +11,7 @@ from concurrent.futures import Executor
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from types import FrameType
-from typing import final
+from typing import ClassVar, final
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -184,7 +184,13 @@ class ExecutorFactory(ABC):
 
 
 class Method(ABC):
-    """A way to solve a semi-infinite program."""
+    """A way to solve a semi-infinite program.
+
+    ``searches``: whether it maximises ``g`` over tuples of indices, so that its `EvaluationsFinished` are about tuples;
+    observers then show the search.
+    """
+
+    searches: ClassVar[bool] = False
 
     @abstractmethod
     def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:

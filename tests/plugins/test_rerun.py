@@ -18,6 +18,7 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.experiment.cli.main import main
 from tests.support.places import CONFIGS
+from tests.support.stub import STUB
 
 pytest.importorskip("rerun", reason="a recording needs the extra rerun")
 
@@ -198,12 +199,26 @@ def test_coordinates_of_the_landscape_are_named_or_refused_with_what_there_is() 
         load_config(CONFIGS / "experiment2_reduced.yaml", {"dictionaries.control.pieces": 20})
     ).relaxed_value(3, 0.1)
     assert g.names == ("t", "p1", "p2", "p3")
+    assert g.kinds == ("time", "parameter", "parameter", "parameter")
     assert coordinate("p2", g, 3) == (0, 2)
     assert coordinate("t[3]", g, 3) == (2, 0)
     for wrong in ("q1", "t[4]", "t[0]", "t[x]"):
         with pytest.raises(sr.InputError, match=r"expected one of t, p1, p2, p3.*t\[1\] to t\[3\]"):
             coordinate(wrong, g, 3)
     assert influential(g, np.zeros((3, 4)), np.array([0.0, 2.0, 1.0])) == ((1, 0), (1, 1))
+
+
+@pytest.mark.parametrize(("method", "searches"), [("exchange", False), ("sparserob", True), ("stub", False)])
+def test_a_search_is_shown_of_the_methods_that_say_that_they_search(
+    method: str, searches: bool, tmp_path: Path
+) -> None:
+    from sparserob_core.experiment.config.load import load_config
+    from sparserob_rerun.recorder import shown_of
+
+    (tmp_path / "stub.py").write_text(STUB)
+    changes = {"plugins": [str(tmp_path / "stub.py")], "method": {"name": method}}
+    inspection = sr.Inspection(load_config(CONFIGS / "experiment1_reduced.yaml", changes))
+    assert shown_of(inspection, None).searches == searches
 
 
 def test_watching_changes_nothing(searched: sr.Outcome, tmp_path: Path) -> None:

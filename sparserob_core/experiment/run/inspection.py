@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, final
 
 import numpy as np
 
@@ -18,7 +18,17 @@ if TYPE_CHECKING:
     from sparserob_core.control.problem.problem import OptimalControlProblem
     from sparserob_core.experiment.config.load import Loaded
     from sparserob_core.experiment.figures.figure_data import FigureData
+    from sparserob_core.sip.method import Method
     from sparserob_core.sip.program import SemiInfiniteProgram
+
+CoordinateKind: TypeAlias = Literal["time", "parameter", "disturbance", "direction", "index"]
+LETTERS: Mapping[CoordinateKind, str] = {
+    "time": "t",
+    "parameter": "p",
+    "disturbance": "w",
+    "direction": "z",
+    "index": "xi",
+}
 
 
 @final
@@ -28,13 +38,15 @@ class RelaxedValue:
     infeasible.
 
     ``weights()`` are the multipliers of the constraints at every index ``(D,)`` in the last evaluation. ``slot`` is the
-    box ``(width,)`` of one index, ``names`` say what its coordinates are: ``t``, ``w1`` ..., ``p1`` ..., or ``xi1`` ...
+    box ``(width,)`` of one index, ``names`` and ``kinds`` say what its coordinates are: see `Inspection.names`
+    and `Inspection.kinds`.
     """
 
     at: Callable[[Array], float]
     weights: Callable[[], Array]
     slot: Box
     names: tuple[str, ...]
+    kinds: tuple[CoordinateKind, ...]
 
 
 @final
@@ -71,8 +83,14 @@ class Inspection:
     @property
     def literal(self) -> bool:
         """Whether an index of the method's tuples carries the coefficients of the disturbance."""
+        return self.searches and self._loaded.config.method.options.get("formulation") == "literal"
+
+    @cached_property
+    def searches(self) -> bool:
+        """Whether the method maximises ``g`` over tuples of indices."""
         method = self._loaded.config.method
-        return method.name == "sparserob" and method.options.get("formulation") == "literal"
+        built: Method = self._loaded.registry.build("method", method.name, method.options)
+        return bool(built.searches)
 
     def picture(self, decision: Array, active_times: Array | None = None) -> FigureData:
         """Control, nominal states, worst-case tube and walls at a decision ``(m N,)``; raises `InputError` for a
@@ -116,20 +134,32 @@ class Inspection:
             weights,
             value.layout.slot,
             self.names(value.layout.slot.dimension),
+            self.kinds(value.layout.slot.dimension),
         )
 
     def names(self, width: int) -> tuple[str, ...]:
         """What the ``width`` coordinates of one index are called: ``t``, ``w1`` ... (coefficients of the disturbance),
         ``p1`` ..., ``z1`` ... (a direction), or ``xi1`` ... where there is no control problem."""
+        kinds = self.kinds(width)
+        return tuple(
+            LETTERS[kind] + ("" if kind == "time" else str(kinds[: k + 1].count(kind))) for k, kind in enumerate(kinds)
+        )
+
+    def kinds(self, width: int) -> tuple[CoordinateKind, ...]:
+        """What the ``width`` coordinates of one index are; ``index`` where there is no control problem."""
         problem = self.problem
         if problem is None:
-            return tuple(f"xi{k + 1}" for k in range(width))
-        parameters = tuple(f"p{k + 1}" for k in range(problem.system.parameter_count))
+            return tuple(_repeated("index", width))
+        parameters = _repeated("parameter", problem.system.parameter_count)
         rest = width - 1 - len(parameters)
         if self.literal:  # as LiteralConstraint has them: time, coefficients, then the rest of the reduced index
-            return ("t", *(f"w{k + 1}" for k in range(rest)), *parameters)
-        return ("t", *parameters, *(f"z{k + 1}" for k in range(rest)))
+            return ("time", *_repeated("disturbance", rest), *parameters)
+        return ("time", *parameters, *_repeated("direction", rest))
 
     @cached_property
     def _experiment(self) -> Experiment:
         return assemble(self._loaded)
+
+
+def _repeated(kind: CoordinateKind, count: int) -> list[CoordinateKind]:
+    return [kind] * count

@@ -12,7 +12,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, field_validator
@@ -44,6 +44,8 @@ class SparseRob(Method, Options):
     same arguments. ``tolerance``: relative gap at which the bounds have met. Raises `InputError` for a formulation that
     a family does not have, for a missing maximiser, and for weights that do not decrease.
     """
+
+    searches: ClassVar[bool] = True
 
     formulation: Literal["reduced", "literal"] = "reduced"
     """What an index is: (t, p), the worst disturbance in closed form; or the paper's (t, Beta, p)."""
