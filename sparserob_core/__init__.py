@@ -1,18 +1,18 @@
 """SparseRob: sparse robust optimal control of uncertain linear systems, with the proof.
 
-Every public name is an attribute of this module, and is imported when it is first used. To read the package, follow the
-data:
+Every public name is an attribute of this module, and is imported when it is first used; ``__init__.pyi`` lists them. To
+read the package, follow the data; ``docs/architecture.md`` has the picture.
 
-1. ``control/``     ``sets``, ``system``, ``problem``: what is to be controlled; ``dictionary``: how controls are
-   written; ``response``, ``transcription``: the problem as a convex semi-infinite program.
-2. ``sip/``         ``program``: such a program in general; ``finite``, ``solver``: finitely many of its constraints,
-   and who solves them; ``method``, ``exchange``: from there to the whole continuum; ``tuples``,
-   ``sparserob``: the paper's own way, a search over tuples of indices; ``result``: what was found and what of it was
-   proven.
-3. ``experiment/``  ``config``: a file that names components; ``registry``: who offers them; ``run``: the whole walk;
-  ``cli``: the commands.
+1. ``control/``     what is to be controlled (``sets``, ``problem``), what the state does (``response``), and the
+   problem as a convex semi-infinite program (``constraints``, ``transcription``).
+2. ``sip/``         such a program in general (``program``), finitely many of its constraints (``relaxed``, ``inner``),
+   the most violated ones (``separation``), the way from there to the whole continuum (``methods``), and what was found
+   and proven (``result``, ``evidence``, ``proof``).
+3. ``checker/``     the same claims derived anew in ball arithmetic.
+4. ``experiment/``  a file that names components (``config``), who offers them (``plugins``), the whole walk (``run``),
+   and the commands (``cli``).
 
-``experiment`` imports ``control``, ``control`` imports ``sip``, never the other way; plugins import this module only.
+Imports go downwards only: ``experiment``, ``checker``, ``control``, ``sip``. Plugins import this module only.
 """
 
 from __future__ import annotations

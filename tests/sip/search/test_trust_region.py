@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import sparserob_core as sr
-from sparserob_core.sip.search.trust_region_step import highest_in_ball, highest_in_ball_and_box
+from sparserob_core.sip.search.trust_region import highest_in_ball, highest_in_ball_and_box
 
 TOP = np.array([0.31, 0.62, 0.47, 0.55, 0.38])
 
