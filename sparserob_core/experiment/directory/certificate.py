@@ -57,13 +57,13 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
 
 
 def _multipliers(problem: OptimalControlProblem, program: SemiInfiniteProgram, result: Result) -> dict[str, Any] | None:
-    """``None`` unless every constraint can be told: a sampled one, of the scenario approach, cannot."""
-    told = [
+    """``None`` unless every constraint can be stated in numbers: a sampled one, of the scenario approach, cannot."""
+    explained = [
         (cut, said)
         for cut in result.dual.cuts
         if (said := _explained(program, cut.family, cut.formulation, cut.index, cut.row)) is not None
     ]
-    if len(told) < len(result.dual.cuts) or result.dual.mu.size != program.finite.b.size:
+    if len(explained) < len(result.dual.cuts) or result.dual.mu.size != program.finite.b.size:
         return None
     return {
         "constraints": [
@@ -74,7 +74,7 @@ def _multipliers(problem: OptimalControlProblem, program: SemiInfiniteProgram, r
                 "direction": _direction(said),
                 "multiplier": cut.multiplier,
             }
-            for cut, said in told
+            for cut, said in explained
         ],
         "equalities": result.dual.mu,
         "pieces": _on_pieces(problem, result.dual.z),
@@ -94,7 +94,7 @@ def _on_pieces(problem: OptimalControlProblem, z: Array | None) -> Array | None:
 def _explained(
     program: SemiInfiniteProgram, name: str, formulation: Formulation, at: Array, row: int
 ) -> TimedExplanation | None:
-    """The constraint in numbers; ``None`` for one whose index does not tell them, as the number of a sample."""
+    """The constraint in numbers; ``None`` for one whose index does not say them, such as the number of a sample."""
     family = program.formulated(name, formulation)
     said = None if family is None else family.explanation(at, row)
     return said if isinstance(said, TimedExplanation) else None

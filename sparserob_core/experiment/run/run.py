@@ -106,7 +106,7 @@ def run(
         broadcast = Broadcast([("journal", journal), *watching])
         ending, started = RunFinished(status="failed", message=UNFINISHED, seconds=0.0), time.perf_counter()
         result: Result | None = None
-        told = True
+        complete = True
         try:
             directory.write_text("config.yaml", write_yaml(loaded.config.plain(), HEADING))
             journal.record(Result(status="failed", message=UNFINISHED))
@@ -126,13 +126,13 @@ def run(
                     handed = replace(_notifying(tools, broadcast), executor=executor)
                     result = solve_in_own_units(method, experiment.program, handed)
             except KeyboardInterrupt as pressed:  # a method that does not return what it knows
-                result, told = journal.known(_said(pressed), time.perf_counter() - started), False
+                result, complete = journal.known(_said(pressed), time.perf_counter() - started), False
                 if result is None:
                     raise
             if isinstance(experiment, ControlExperiment):
                 result = rounded_down(experiment.transcription, result, experiment.gap_tolerance)
             ending = RunFinished(status=result.status, message=result.message, seconds=result.seconds, result=result)
-            control, summary, remarks = journal.finish(result, figures=figures and told, certify=told)
+            control, summary, remarks = journal.finish(result, figures=figures and complete, certify=complete)
             return Outcome(result, directory.path, experiment, control, summary, remarks)
         except BaseException as error:
             error.add_note(f"what was done until then is in {directory.path}")

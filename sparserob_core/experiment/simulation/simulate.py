@@ -19,7 +19,6 @@ from sparserob_core.experiment.directory.artefacts import RunDirectory
 from sparserob_core.experiment.directory.finished import FinishedRun, read_finished
 from sparserob_core.experiment.plugins.messages import nearest
 from sparserob_core.experiment.run.events import StudyProgress
-from sparserob_core.experiment.simulation.census import Census
 from sparserob_core.experiment.simulation.simulation import (
     ADVERSARY,
     ANY,
@@ -28,6 +27,7 @@ from sparserob_core.experiment.simulation.simulation import (
     Simulation,
     clopper_pearson,
 )
+from sparserob_core.experiment.simulation.violations import ViolationCount
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
 
@@ -105,7 +105,7 @@ def _sampled(
     known = tuple(worst[name] for name in ("times", "directions", "parameters"))
     uncertainty = Uncertainty(model.functionals, parameters, model.constraints, (known[0], known[1], known[2]))
     counts, envelope = (
-        [Census(constraint, times) for constraint in model.constraints],
+        [ViolationCount(constraint, times) for constraint in model.constraints],
         _Envelope(shown, response.initial_state.size),
     )
     rng, block, done, out = np.random.default_rng(seed), trajectories_at_once(fine, parameters.count > 0), 0, 0
@@ -117,7 +117,7 @@ def _sampled(
         for position, state in enumerate(walk(fine, control, drawn, disturbances)):
             envelope.add(position, state)
             for one in counts:
-                one.meet(position, state)
+                one.add(position, state)
         out += int(np.any([one.close() for one in counts], axis=0).sum())
         done += size
         notify(StudyProgress(text=f"{done} of {count} trajectories", done=done, total=count))
@@ -170,7 +170,9 @@ def _replayed(finished: FinishedRun, stored: Mapping[str, Array], started: float
     shares = []
     for position, name in enumerate(stored["names"].tolist()):
         tolerance = next(
-            Census(one, times).tolerance for one in finished.experiment.transcription.constraints if one.name == name
+            ViolationCount(one, times).tolerance
+            for one in finished.experiment.transcription.constraints
+            if one.name == name
         )
         violated = int(reached[position] > tolerance)
         when = float(stored["times"][position])
@@ -209,7 +211,7 @@ def _replayed(finished: FinishedRun, stored: Mapping[str, Array], started: float
     )
 
 
-def _shares(counts: Sequence[Census], worst: Mapping[str, Array], count: int) -> list[ConstraintShare]:
+def _shares(counts: Sequence[ViolationCount], worst: Mapping[str, Array], count: int) -> list[ConstraintShare]:
     rows = {name: position for position, name in enumerate(worst["names"].tolist())} if worst else {}
     shares = []
     for one in counts:

@@ -13,7 +13,7 @@ from sparserob_core.sip.program import TOLERANCE
 
 
 @final
-class Census:
+class ViolationCount:
     """The largest violation of one constraint along every trajectory of a block, and over all blocks.
 
     With flat sides: the largest ``H x(t) - h`` over the sides and the times. A curved set: the gauge less 1, at the
@@ -33,7 +33,7 @@ class Census:
         self._best, self._when = np.full(count, -np.inf), np.zeros(count, dtype=int)
         self._states = np.zeros((self.constraint.functionals.response.initial_state.size, count))
 
-    def meet(self, position: int, state: Array) -> None:
+    def add(self, position: int, state: Array) -> None:
         """The states ``(d, n)`` at one of the times."""
         if not self._inside[position]:
             return
