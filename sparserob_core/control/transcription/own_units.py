@@ -16,6 +16,7 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 TIMES = 17  # at most, at which a reach is looked at
 PARAMETERS = 9  # at most, at which a reach is looked at
 RESOLVED = 2.0**-18  # of the numbers that are added up, the least unit: 1e-9 of it is 17 units of rounding
+COST = 0.125  # of the largest possible cost, its unit: weights of a regulariser keep their size in the paper's problems
 CHAINED = 1e150  # a state that a chain of couplings might bring beyond this is left to the response
 
 
@@ -57,7 +58,7 @@ def own_units(problem: OptimalControlProblem, rough: Units, functionals: WorstCa
     states = rough.states * power_of_two(np.where(usable, reach, 1.0))
     states = np.where(usable, states, power_of_two(_walls(problem)))
     weights = np.asarray(problem.weights) * extent(problem.control)
-    cost = float(power_of_two(np.array(weights.sum()))) * rough.time
+    cost = COST * float(power_of_two(np.array(weights.sum()))) * rough.time
     return Units(rough.time, states, rough.controls, rough.disturbances, rough.parameters, cost)
 
 
