@@ -13,6 +13,7 @@ from sparserob_core.control.constraints.flat import INSIDE
 from sparserob_core.control.response.response import Response
 from sparserob_core.control.studies.laws import LawName, Uncertainty
 from sparserob_core.control.studies.simulate import fine_times, finer, trajectories_at_once, walk
+from sparserob_core.control.transcription.own_units import row_units
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.directory.adversary import adversaries, attained, propagated, read_adversaries
 from sparserob_core.experiment.directory.artefacts import RunDirectory
@@ -30,6 +31,7 @@ from sparserob_core.experiment.simulation.simulation import (
 from sparserob_core.experiment.simulation.violations import ViolationCount
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
+from sparserob_core.sip.program import TOLERANCE
 
 if TYPE_CHECKING:
     from sparserob_core.experiment.run.run import Outcome
@@ -105,7 +107,7 @@ def _sampled(
     known = tuple(worst[name] for name in ("times", "directions", "parameters"))
     uncertainty = Uncertainty(model.functionals, parameters, model.constraints, (known[0], known[1], known[2]))
     counts, envelope = (
-        [ViolationCount(constraint, times) for constraint in model.constraints],
+        [ViolationCount(one, times, row_units(one, model.problem.control)) for one in model.constraints],
         _Envelope(shown, response.initial_state.size),
     )
     rng, block, done, out = np.random.default_rng(seed), trajectories_at_once(fine, parameters.count > 0), 0, 0
@@ -169,11 +171,9 @@ def _replayed(finished: FinishedRun, stored: Mapping[str, Array], started: float
     reached = attained(stored, times, states)
     shares = []
     for position, name in enumerate(stored["names"].tolist()):
-        tolerance = next(
-            ViolationCount(one, times).tolerance
-            for one in finished.experiment.transcription.constraints
-            if one.name == name
-        )
+        model = finished.experiment.transcription
+        constraint = next(one for one in model.constraints if one.name == name)
+        tolerance = TOLERANCE * float(row_units(constraint, model.problem.control).min())
         violated = int(reached[position] > tolerance)
         when = float(stored["times"][position])
         shares.append(

@@ -16,28 +16,41 @@ from sparserob_core.sip.program import TOLERANCE
 class ViolationCount:
     """The largest violation of one constraint along every trajectory of a block, and over all blocks.
 
-    With flat sides: the largest ``H x(t) - h`` over the sides and the times. A curved set: the gauge less 1, at the
-    time at which the trajectory is furthest out.
+    With flat sides: the largest ``H x(t) - h`` over the sides and the times, which counts as a violation where one is
+    above `TOLERANCE` of its own unit (``units (r,)``). A curved set: the gauge less 1, at the time at which the
+    trajectory is furthest out; its unit is 1.
     """
 
-    def __init__(self, constraint: StateConstraint, times: Array) -> None:
+    def __init__(self, constraint: StateConstraint, times: Array, units: Array) -> None:
         slack = SAME_TIME * times[-1]
         self.constraint, self.times = constraint, times
         self._is_curved = constraint.sides is None
-        self.tolerance = TOLERANCE
+        self.units = units
         self._inside = (times >= constraint.start - slack) & (times <= constraint.stop + slack)
         self.violated, self.largest, self.time = 0, -np.inf, np.nan
+
+    @property
+    def tolerance(self) -> float:
+        """What counts as no violation of any row, in the rows' unit."""
+        return TOLERANCE * float(self.units.min())
 
     def begin(self, count: int) -> None:
         """A new block of ``count`` trajectories."""
         self._best, self._when = np.full(count, -np.inf), np.zeros(count, dtype=int)
+        self._own = np.full(count, -np.inf)
         self._states = np.zeros((self.constraint.functionals.response.initial_state.size, count))
 
     def add(self, position: int, state: Array) -> None:
         """The states ``(d, n)`` at one of the times."""
         if not self._inside[position]:
             return
-        value = self.constraint.outwardness(state)
+        sides = self.constraint.sides
+        if sides is None:
+            value = self.constraint.outwardness(state)
+        else:
+            excess = sides[0] @ state - sides[1][:, None]
+            value = excess.max(axis=0)
+            np.maximum(self._own, (excess / self.units[:, None]).max(axis=0), out=self._own)
         better = value > self._best
         if better.any():
             np.copyto(self._best, value, where=better)
@@ -50,7 +63,8 @@ class ViolationCount:
         found = self._best
         if self._is_curved:  # outwardness grows outwards, but is no distance
             found = self.constraint.excess(self._states)
-        out = found > self.tolerance
+            self._own = found / self.units.max()
+        out = self._own > TOLERANCE
         self.violated += int(out.sum())
         top = int(found.argmax())
         if found[top] > self.largest:
