@@ -24,8 +24,8 @@ class Broken(Exception):
 
 @final
 @dataclass(frozen=True)
-class Claim:
-    """One claim of a run: its ``name``, the ``verdict`` and a sentence with the figures."""
+class Finding:
+    """What was found about one claim of a run: its ``name``, the ``verdict`` and a sentence with the figures."""
 
     name: str
     verdict: Verdict

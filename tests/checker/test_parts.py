@@ -4,6 +4,7 @@ that solves."""
 from __future__ import annotations
 
 import itertools
+import math
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from flint import arb, ctx
 import sparserob_core as sr
 from sparserob_core.checker.arithmetic.bernstein import highest
 from sparserob_core.checker.arithmetic.jets import Monomials, expanded
+from sparserob_core.checker.arithmetic.series import Series
 from sparserob_core.checker.claims.duality import Duality
 from sparserob_core.checker.claims.subdivision import fill
 from sparserob_core.checker.outcome import Broken, Unchecked
@@ -102,6 +104,17 @@ def test_a_linear_bound_of_a_thin_ellipsoid_loses_nothing_to_cancellation(thin):
             bound = sum((a * b for a, b in zip(exact(w[0]), exact(value), strict=True)), arb(float(over[0])))
             short = max(short, float((support(shape, exact(value)) - bound).upper()))
     assert short <= 0.0
+
+
+def test_a_linear_bound_of_a_polytope_loses_nothing_to_the_units_of_its_coordinates():
+    units = np.array([1e6, 1e-6])
+    plain = Polytope(np.vstack([np.eye(2), -np.eye(2)]), np.ones(4))
+    other = Polytope(np.vstack([np.eye(2), -np.eye(2)]) / units, np.ones(4))
+    value = np.array([[1.0, 1.0], [0.3, -2.0]])
+    for shape, seen in ((plain, value), (other, value / units)):
+        w, over = linear_bound(shape, seen, np.zeros((2, 2)))
+        assert np.einsum("kw,kw->k", w, seen) == pytest.approx([2.0, 2.3])
+        assert (over < 1e-14).all()
 
 
 def test_sets_without_a_linear_bound_are_left_unchecked():
@@ -241,6 +254,36 @@ def test_the_remainder_is_needed_and_enough_on_a_wide_box():
         (poly,) = tube.cells(1, 1.0, 1.0, np.eye(1))
     assert poly.coefficients[0] == pytest.approx([1.0, 1.0, 0.5])
     assert np.e - 2.5 <= poly.expansion < 1.0
+
+
+@pytest.mark.parametrize("second", [1.0, 100.0, 2.0**20])
+@pytest.mark.parametrize("metre", [1.0, 1e-6])
+def test_the_remainder_is_a_small_share_of_the_states_in_any_units(second, metre):
+    """Rendezvous (Clohessy and Wiltshire 1960): speeds are a thousandth of distances per unit of time, and a double
+    eigenvalue 0 has no modal coordinates."""
+    rows = [["0", "0", "1", "0"], ["0", "0", "0", "1"], ["3*p1**2", "0", "0", "2*p1"], ["0", "0", "-2*p1", "0"]]
+    n, horizon = np.array([0.00112, 0.00114]) / second, 3000.0 * second
+    system = LinearSystem(
+        parse_matrix("A", rows, ("p1",)),
+        metre / second**2 * np.array([[0.0], [0.0], [0.0], [1.0]]),
+        parameters=Box(n[:1], n[1:]),
+    )
+    control, start = uniform(10, horizon), metre * np.array([0.0, -1000.0, 0.0, 0.0])
+    with ctx.workprec(96):
+        tube, _, _ = tube_of(system, control, control, None, 8, np.full(10, 1e-3), start)
+        found = tube.cells(9, horizon, horizon, np.eye(4))
+    sizes = metre * np.array([1e3, 1e3, 1.0 / second, 1.0 / second])
+    assert (np.array([poly.expansion for poly in found]) < 1e-9 * sizes).all()
+
+
+def test_a_series_keeps_to_the_variables_that_appear():
+    known = Monomials(2, 3)
+    with ctx.workprec(96):
+        parts = [stacked([[arb(0.5 if e == (0, 1) else 0)]]) for e in known.exponents]
+        found = Series(known, parts).exp().parts
+    for e, part in zip(known.exponents, found, strict=True):
+        truth = 0.5 ** e[1] / math.factorial(e[1]) if e[0] == 0 else 0.0
+        assert part[0, 0].is_zero() if e[0] else abs(float(part[0, 0].mid()) - truth) < 1e-15
 
 
 @pytest.mark.parametrize("nu", [0, 1, 2])

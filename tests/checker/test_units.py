@@ -12,7 +12,7 @@ from flint import arb
 import sparserob_core as sr
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.claims.claims import check
-from sparserob_core.checker.outcome import Claim, Clock
+from sparserob_core.checker.outcome import Clock, Finding
 from sparserob_core.checker.sets.shapes import excess, units
 from sparserob_core.control.problem.dictionary import Dictionary
 
@@ -41,7 +41,7 @@ def still(x0: list[float], wall: sr.ConvexSet, path: bool = True) -> sr.OptimalC
 
 def claims(
     problem: sr.OptimalControlProblem, decision: Any, proof: dict[str, Any], clock: Clock | None = None, **more: Any
-) -> dict[str, Claim]:
+) -> dict[str, Finding]:
     """The verdicts on a certificate that a liar wrote."""
     decision = np.array(decision, dtype=float)
     lengths = problem.horizon / decision.shape[1]

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import lru_cache
 from itertools import product
 from typing import TYPE_CHECKING, Any, final
 
@@ -31,30 +31,47 @@ class Monomials:
     count: int
     degree: int
 
-    @cached_property
+    @property
     def exponents(self) -> list[tuple[int, ...]]:
         """Exponent vectors, in increasing degree."""
-        every = [e for e in product(range(self.degree + 1), repeat=self.count) if sum(e) <= self.degree]
-        return sorted(every, key=lambda e: (sum(e), e))
+        return _exponents(self.count, self.degree)
 
-    @cached_property
+    @property
     def number(self) -> dict[tuple[int, ...], int]:
         """The place of an exponent vector."""
-        return {e: i for i, e in enumerate(self.exponents)}
+        return _places(self.count, self.degree)
 
-    @cached_property
+    @property
     def products(self) -> list[tuple[int, int, int]]:
         """All ``(i, j, k)`` with monomial ``i`` times monomial ``j`` equal to monomial ``k``."""
-        found = [
-            (i, j, tuple(a + b for a, b in zip(e, f, strict=True)))
-            for i, e in enumerate(self.exponents)
-            for j, f in enumerate(self.exponents)
-        ]
-        return [(i, j, self.number[g]) for i, j, g in found if g in self.number]
+        return _products(self.count, self.degree)
 
     @property
     def size(self) -> int:
         return len(self.exponents)
+
+
+@lru_cache(maxsize=64)
+def _exponents(count: int, degree: int) -> list[tuple[int, ...]]:
+    every = [e for e in product(range(degree + 1), repeat=count) if sum(e) <= degree]
+    return sorted(every, key=lambda e: (sum(e), e))
+
+
+@lru_cache(maxsize=64)
+def _places(count: int, degree: int) -> dict[tuple[int, ...], int]:
+    return {e: i for i, e in enumerate(_exponents(count, degree))}
+
+
+@lru_cache(maxsize=64)
+def _products(count: int, degree: int) -> list[tuple[int, int, int]]:
+    places, every = _places(count, degree), _exponents(count, degree)
+    return [
+        (i, j, places[g])
+        for i, e in enumerate(every)
+        for j, f in enumerate(every)
+        if sum(e) + sum(f) <= degree
+        for g in [tuple(a + b for a, b in zip(e, f, strict=True))]
+    ]
 
 
 @final
@@ -95,10 +112,12 @@ class Jet:
     def __mul__(self, other: object) -> Jet:
         from flint import arb
 
-        right = self._other(other).coefficients
+        left, right = self.coefficients, self._other(other).coefficients
+        here, there = ([not a.is_zero() for a in side] for side in (left, right))
         total = [arb(0)] * self.monomials.size
         for i, j, k in self.monomials.products:
-            total[k] = total[k] + self.coefficients[i] * right[j]
+            if here[i] and there[j]:
+                total[k] = total[k] + left[i] * right[j]
         return Jet(self.monomials, total)
 
     def __truediv__(self, other: object) -> Jet:

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
 SMALL = 0.25  # norm below which the exponential series is summed
 TERMS = 16  # of it: what is left out is below 1e-24 then
+STRIDE = 4  # of the powers by which it is summed; divides the number of terms
 
 
 @final
@@ -32,6 +33,14 @@ class Series:
             self._there = [any(not x.is_zero() for x in part.entries()) for part in self.parts]
         return self._there
 
+    @property
+    def _generated(self) -> list[bool]:
+        """Which coefficients a power of this series may have: those of monomials in the variables that appear."""
+        every = self.monomials.exponents
+        present = [e for e, here in zip(every, self.there, strict=True) if here]
+        appear = [any(e[i] for e in present) for i in range(self.monomials.count)]
+        return [all(appears or not power for appears, power in zip(appear, e, strict=True)) for e in every]
+
     @staticmethod
     def constant(monomials: Monomials, value: arb_mat) -> Series:
         """A matrix that does not depend on the parameters."""
@@ -46,9 +55,9 @@ class Series:
         from flint import arb_mat
 
         total: list[arb_mat | None] = [None] * self.monomials.size
-        left, right, there = self.parts, other.parts, self.there
+        left, right, here, there = self.parts, other.parts, self.there, other.there
         for i, j, k in self.monomials.products:
-            if there[i]:
+            if here[i] and there[j]:
                 term, so_far = left[i] * right[j], total[k]
                 total[k] = term if so_far is None else so_far + term
         zero = arb_mat(left[0].nrows(), right[0].ncols())
@@ -84,11 +93,18 @@ class Series:
                 return Series(self.monomials, [part * arb("nan") for part in self.parts])
         small, n = self.scaled(arb(1) / 2**halvings), self.parts[0].nrows()
         unit = arb_mat([[int(i == j) for j in range(n)] for i in range(n)])
-        result = Series.constant(self.monomials, unit)
-        for order in range(TERMS, 0, -1):
-            result = Series.constant(self.monomials, unit) + (small * result).scaled(arb(1) / order)
-        tail = arb(0, (size ** (TERMS + 1) * 2 / arb(TERMS + 1).fac()).upper())
-        result = Series(self.monomials, [part + arb_mat([[tail] * n] * n) for part in result.parts])
+        powers = [Series.constant(self.monomials, unit), small]
+        while len(powers) <= STRIDE:
+            powers.append(powers[-1] * small)
+        factors = [1 / arb(order).fac() for order in range(TERMS + 1)]
+        result = powers[0].scaled(factors[TERMS])
+        for first in range(TERMS - STRIDE, -1, -STRIDE):  # Paterson and Stockmeyer 1973
+            result = powers[STRIDE] * result
+            for order in range(STRIDE):
+                result = result + powers[order].scaled(factors[first + order])
+        tail = arb_mat([[arb(0, (size ** (TERMS + 1) * 2 / arb(TERMS + 1).fac()).upper())] * n] * n)
+        parts = [part + tail if mine else part for part, mine in zip(result.parts, self._generated, strict=True)]
+        result = Series(self.monomials, parts)
         for _ in range(halvings):
             result = result * result
         return result

@@ -13,7 +13,7 @@ from sparserob_core.checker.claims.constraints import bounded
 from sparserob_core.checker.claims.duality import Row
 from sparserob_core.checker.claims.equalities import equalities
 from sparserob_core.checker.claims.replay import reached
-from sparserob_core.checker.outcome import TOLERANCE, Broken, Claim, Unchecked
+from sparserob_core.checker.outcome import TOLERANCE, Broken, Finding, Unchecked
 from sparserob_core.checker.sets.shapes import excess, limit, member, support
 from sparserob_core.sip.convex_set import Array
 
@@ -27,18 +27,18 @@ SMALL_GAP = 1e-11  # what is subtracted from a lower bound for rounding may open
 MOST_MULTIPLIERS = 100_000
 
 
-def check(case: Case, gap_tolerance: float | None) -> list[Claim]:
+def check(case: Case, gap_tolerance: float | None) -> list[Finding]:
     """One verdict per claim of the certificate; nothing that the file says is believed."""
     from flint import ctx
 
     status = case.certificate.get("status")
     with ctx.workprec(PRECISION):
         if type(case.certificate.get("format")) is not int or case.certificate["format"] != 1:
-            return [Claim("certificate", "fails", f"its format is {case.certificate.get('format')!r}, expected 1")]
+            return [Finding("certificate", "fails", f"its format is {case.certificate.get('format')!r}, expected 1")]
         if status == "infeasible":
             return [judged("infeasibility", lambda: _infeasible(case))]
         if status not in ("certified", "verified", "refuted", "undecided"):
-            return [Claim("status", "fails", f"it is {status!r}, which claims nothing")]
+            return [Finding("status", "fails", f"it is {status!r}, which claims nothing")]
         claims = [judged("control", lambda: _control(case)), judged("cost", lambda: _cost(case))]
         claims += [judged("lower bound", lambda: _lower(case))]
         if status == "refuted":
@@ -49,16 +49,16 @@ def check(case: Case, gap_tolerance: float | None) -> list[Claim]:
         return [*claims, judged("status", lambda: _status(case, str(status), gap_tolerance, claims))]
 
 
-def judged(name: str, derive: Callable[[], str]) -> Claim:
+def judged(name: str, derive: Callable[[], str]) -> Finding:
     """The verdict of a derivation that returns a sentence or raises."""
     try:
-        return Claim(name, "holds", derive())
+        return Finding(name, "holds", derive())
     except Broken as fault:
-        return Claim(name, "fails", str(fault))
+        return Finding(name, "fails", str(fault))
     except Unchecked as gap:
-        return Claim(name, "not checked", str(gap))
+        return Finding(name, "not checked", str(gap))
     except ZeroDivisionError:
-        return Claim(name, "not checked", "a ball around a divisor holds 0")
+        return Finding(name, "not checked", "a ball around a divisor holds 0")
 
 
 def _control(case: Case) -> str:
@@ -180,12 +180,12 @@ def _infeasible(case: Case) -> str:
         raise Broken(f"the multipliers prove {float(amount.lower()):.3g}, expected a positive number")
     entries = case.certificate["multipliers"]["constraints"]
     return (
-        f"{len(entries)} constraints clash: their weighted sum is at least {float(amount.lower()):.4g} for every"
-        " control, it must not be positive"
+        f"no control meets these {len(entries)} constraints together: their weighted sum is at least"
+        f" {float(amount.lower()):.4g} for every control, it must not be positive"
     )
 
 
-def _status(case: Case, status: str, tolerance: float | None, claims: list[Claim]) -> str:
+def _status(case: Case, status: str, tolerance: float | None, claims: list[Finding]) -> str:
     """The status must follow from the claims before it."""
     if status == "undecided":
         return "nothing is claimed beyond the figures above"

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 
     from sparserob_core.control.problem.system import LinearSystem
 
-WELL_CONDITIONED = 1e4
+WELL_CONDITIONED = 1e6
+SWEEPS = 12  # of balancing
 ORDER = 6  # of the expansion in time
 
 
@@ -81,11 +82,6 @@ class Flow:
         ]
         return Series(self.monomials, [arb_mat(part) for part in table])
 
-    @cached_property
-    def remainder(self) -> Remainder | None:
-        """Bounds of what the expansion leaves out; ``None`` for a known system."""
-        return Remainder.of(self) if self.centre else None
-
 
 @final
 @dataclass(frozen=True, eq=False)
@@ -104,21 +100,16 @@ class Remainder:
     inverse: arb_mat
 
     @staticmethod
-    def of(flow: Flow) -> Remainder:
+    def of(flow: Flow, horizon: float, speed: Array) -> Remainder:
+        """Bounds up to the ``horizon``, in units that fit states which their sources move by ``speed (d,)`` per
+        time."""
         from flint import arb, arb_mat
 
         degree = flow.degree + 1
         monomials = Monomials(len(flow.centre), degree)
         wide = [arb(c, abs(r)) for c, r in zip(flow.centre, flow.radius, strict=True)]
         parts = expanded(flow.system, monomials, wide, flow.radius)
-        T = _modal(
-            np.array(
-                [
-                    [float(flow.parts["A"][0][i, j].mid()) for j in range(flow.system.states)]
-                    for i in range(flow.system.states)
-                ]
-            )
-        )
+        T = _coordinates(_middles(flow.parts["A"][0]), horizon, speed)
         exact = arb_mat(T.tolist())
         inverse = exact.inv()
 
@@ -195,9 +186,51 @@ def held(matrix: arb_mat, inputs: arb_mat, time: arb) -> tuple[arb_mat, arb_mat]
     return Phi.parts[0], Gamma.parts[0]
 
 
+def _middles(matrix: arb_mat) -> Array:
+    return np.array([[float(x.mid()) for x in row] for row in matrix.tolist()])
+
+
+def _coordinates(A: Array, horizon: float, speed: Array) -> Array:
+    """Any invertible matrix would be right; this one keeps ``e^{mu t}`` small: every state in a unit of its own, and
+    real modal coordinates where these are not worse conditioned than they help."""
+    units = _balanced(A, horizon, speed)
+    scaled = A / units[:, None] * units
+    best, least = np.eye(A.shape[0]), np.inf
+    for T in (best, _modal(scaled)):
+        if T.shape != A.shape or not np.isfinite(T).all() or not np.linalg.cond(T) < WELL_CONDITIONED:
+            continue
+        S = np.linalg.solve(T, scaled @ T)
+        S = (S + S.T) / 2
+        growth = float((np.diag(S) + np.abs(S - np.diag(np.diag(S))).sum(axis=1)).max())
+        loss = max(0.0, growth * horizon) + float(np.log(np.linalg.cond(T)))
+        if loss < least:
+            best, least = T, loss
+    return np.asarray(units[:, None] * best, dtype=float)
+
+
+def _balanced(A: Array, horizon: float, speed: Array) -> Array:
+    """Units ``(d,)`` of the states, powers of two, in which rows and columns of ``A`` are about as large as each other
+    (Osborne 1960).
+
+    The sources take part as one more state, and where one state drives another but not the reverse, a small number
+    stands for the reverse: what makes the two of the size that one reaches through the other within the horizon.
+    """
+    rates = np.zeros((speed.size + 1, speed.size + 1))
+    rates[:-1, :-1], rates[:-1, -1] = np.abs(A), speed
+    np.fill_diagonal(rates, 0.0)
+    driven = np.where(rates > 0.0, rates, np.inf)
+    rates = np.maximum(rates, (1.0 / horizon / horizon / driven).T)
+    exponents = np.zeros(speed.size + 1)
+    for _ in range(SWEEPS):
+        for i in range(exponents.size):
+            scaled = np.exp2(exponents)
+            row, column = (rates[i] * scaled).max() / scaled[i], (rates[:, i] / scaled).max() * scaled[i]
+            if row > 0.0 and column > 0.0:
+                exponents[i] += np.log2(row / column) / 2
+    return np.asarray(np.exp2(np.clip(np.round(exponents[:-1] - exponents[-1]), -500, 500)), dtype=float)
+
+
 def _modal(A: Array) -> Array:
-    """Any invertible matrix would be right; this one makes the logarithmic norm small: real modal coordinates, where
-    well conditioned."""
     values, vectors = np.linalg.eig(A)
     columns = [
         part
@@ -205,5 +238,4 @@ def _modal(A: Array) -> Array:
         if value.imag >= 0
         for part in ((vectors[:, i].real,) if value.imag == 0 else (vectors[:, i].real, vectors[:, i].imag))
     ]
-    T = np.stack(columns, axis=1) * sqrt(A.shape[0])
-    return T if T.shape[0] == T.shape[1] and np.linalg.cond(T) < WELL_CONDITIONED else np.eye(A.shape[0])
+    return np.stack(columns, axis=1) * sqrt(A.shape[0])

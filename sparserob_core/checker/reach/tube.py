@@ -11,7 +11,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.series import Series, norm, upper
 from sparserob_core.checker.reach.disturbance_support import DisturbanceSupports, Scene
-from sparserob_core.checker.reach.flow import Flow, held, in_time, stacked, up_to
+from sparserob_core.checker.reach.flow import Flow, Remainder, held, in_time, stacked, up_to
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.checker.sets.shapes import radius
 from sparserob_core.sip.convex_set import Array
@@ -64,11 +64,23 @@ class Tube:
         return found
 
     @cached_property
+    def remainder(self) -> Remainder | None:
+        """Bounds of what the expansion leaves out; ``None`` for a known system."""
+        if not self.flow.centre:
+            return None
+        horizon, scene, parts = self.scene.grid[-1], self.scene, self.flow.parts
+        control = np.max([_sizes(u) for u in scene.control], axis=0) if scene.control else np.zeros((0, 1))
+        speed = np.abs(scene.initial_state) / horizon + (_sizes(parts["B"][0]) @ control)[:, 0]
+        if scene.disturbance is not None:
+            speed += _sizes(parts["E"][0]) @ np.array(radius(scene.disturbance))
+        return Remainder.of(self.flow, horizon, speed)
+
+    @cached_property
     def norms(self) -> list[arb_mat]:
         """The norms of the coefficients left out, at the breakpoints (see `Remainder`)."""
         from flint import arb
 
-        rest = self.flow.remainder
+        rest = self.remainder
         assert rest is not None
         n = rest.start(upper(norm(rest.inverse * stacked([[arb(v)] for v in self.scene.initial_state]))))
         found = [n]
@@ -105,7 +117,7 @@ class Tube:
 
     def _growth(self, key: int) -> tuple[arb_mat, arb_mat]:
         if key not in self._growths:
-            rest = self.flow.remainder
+            rest = self.remainder
             assert rest is not None
             self._growths[key] = held(rest.growth, stacked([[b] for b in rest.control]), self._lengths[key])
         return self._growths[key]
@@ -165,7 +177,7 @@ class Tube:
 
     def _left_out(self, piece: int, offset: arb, length: arb, z: Array) -> Array:
         """Lagrange's remainder ``(k,)`` of the state and of what the disturbance adds, for every direction."""
-        rest = self.flow.remainder
+        rest = self.remainder
         if rest is None:
             return np.zeros(z.shape[0])
         u = self.scene.control[min(piece, len(self.scene.control) - 1)]
@@ -188,9 +200,14 @@ class Tube:
     def _support_per_size(self) -> arb:
         from flint import arb
 
-        rest = self.flow.remainder
+        rest = self.remainder
         assert rest is not None and self.scene.disturbance is not None
         total = held(rest.growth, rest.start(arb(1)), arb(self.scene.grid[-1]))[1]
         last = rest.growth.nrows() - 1
         columns = zip(radius(self.scene.disturbance), rest.disturbance, strict=True)
         return sum((arb(w) * total[last - i, 0] * e for w, per in columns for i, e in enumerate(per)), arb(0))
+
+
+def _sizes(matrix: arb_mat) -> Array:
+    """The absolute values of the middles of balls."""
+    return np.array([[abs(float(x.mid())) for x in row] for row in matrix.tolist()])

@@ -73,11 +73,14 @@ def linear_bound(shape: ConvexSet, value: Array, spread: Array) -> tuple[Array, 
             else _octahedron(shape)
         )
         heights = value @ points.T
-        w = points[heights.argmax(axis=1)]
+        best = heights.argmax(axis=1)
+        w, reach = points[best], np.abs(value) + spread
         apart = np.einsum("kvw,kw->kv", np.abs(points[None] - w[:, None]), spread)
         ahead = heights - heights.max(axis=1, keepdims=True) + apart
-        rounding = 1e-14 * (np.abs(value) + spread).sum(axis=1) * np.abs(points).max()
-        return w, np.maximum(ahead.max(axis=1), 0.0) * OUTWARD + rounding
+        ahead += 3.0 * rounding(shape.dimension) * (reach @ np.abs(points).max(axis=0))[:, None]
+        ahead[np.arange(best.size), best] = 0.0
+        corner = 2.0 * HALF_ULP * (reach @ np.abs(points).T).max(axis=1)  # corners are rounded to floats
+        return w, (np.maximum(ahead.max(axis=1), 0.0) + corner) * OUTWARD
     if isinstance(shape, Ellipsoid) or (isinstance(shape, NormBall) and shape.p == 2.0):
         S = shape.shape if isinstance(shape, Ellipsoid) else shape.radius**2 * np.eye(shape.dimension)
         return _round_bound(shape.centre, S, value, spread)

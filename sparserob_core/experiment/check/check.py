@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
-from sparserob_core.checker.outcome import Claim, Clock
+from sparserob_core.checker.outcome import Clock, Finding
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.check.files import compared
 from sparserob_core.experiment.config.run_config import digest
@@ -30,7 +30,7 @@ class Check:
     verdict."""
 
     title: str
-    claims: tuple[Claim, ...]
+    claims: tuple[Finding, ...]
     seconds: float
     not_compared: tuple[str, ...] = ()
 
@@ -74,14 +74,14 @@ def check(directory: str | Path, plugins: Iterable[str | Path] = (), seconds: fl
     return Check(loaded.config.title or path.name, claims, time.perf_counter() - started, files.not_compared)
 
 
-def _config(loaded: Loaded, data: Mapping[str, Any], summary: Mapping[str, Any]) -> Claim:
+def _config(loaded: Loaded, data: Mapping[str, Any], summary: Mapping[str, Any]) -> Finding:
     """An earlier version had fewer keys: the digest is of the config as it is read today, or as it is written."""
     found, written = loaded.config.digest(), digest(loaded.source.data)
     if data.get("config") not in (found, written) or summary.get("config") != data.get("config"):
-        return Claim(
+        return Finding(
             "config",
             "fails",
             f"config.yaml is {found}, the certificate is about {data.get('config')!r}, "
             f"result.json about {summary.get('config')!r}",
         )
-    return Claim("config", "holds", f"the certificate is about this config ({data['config']})")
+    return Finding("config", "holds", f"the certificate is about this config ({data['config']})")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from sparserob_core.checker.outcome import Broken, Claim, Unchecked
+from sparserob_core.checker.outcome import Broken, Finding, Unchecked
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.directory.finished import StoredRun
 from sparserob_core.experiment.directory.sparsity import sparsity
@@ -26,7 +26,7 @@ READ = {"config.yaml", "certificate.json", "result.json", "solution.npz"}
 class Compared:
     """The verdicts on the files, and the names of what was not compared with anything, by file."""
 
-    claims: list[Claim] = field(default_factory=list)
+    claims: list[Finding] = field(default_factory=list)
     left: dict[str, list[str]] = field(default_factory=dict)
 
     @property
@@ -42,7 +42,7 @@ def compared(stored: StoredRun, loaded: Loaded, case: Case, summary: Mapping[str
         ("result.json", _result(loaded, case, summary)),
         ("solution.npz", _solution(stored, case)),
     ):
-        found.claims.append(Claim(name, "fails" if different else "holds", "; ".join(different) or agrees))
+        found.claims.append(Finding(name, "fails" if different else "holds", "; ".join(different) or agrees))
         if left:
             found.left[name] = left
     unknown = sorted(set(case.certificate) - CERTIFICATE)
