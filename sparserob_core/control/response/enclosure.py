@@ -29,6 +29,7 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.program import Enclosure
 
 LONG_STEP = 1.0  # in norm times duration: longer steps are taken by matrix exponentials
+WILD = 1e3  # times the numbers of a constraint, a distance from the chord that no halving of a short time explains
 SMALL_SHARE = 1e-6  # so that no coordinate is ever entirely blameless
 CELLS_KEPT = 256  # cells of parameters whose matrices are kept
 TIME_FIRST = (
@@ -80,7 +81,11 @@ class CellEnclosure:
             np.maximum(spreads[which[: start.size]][pick], spreads[which[start.size :]][pick])
             + self._shares * neglected[pick][:, None]
         )
-        return total[pick], bend[pick], spread + self.looseness
+        # A short cell that bends beyond all measure has models that are good for narrower parameters only.
+        short = self.lifted.norm * (stop - start) < 1.0
+        wild = short & ~(bend[pick] <= WILD * (1.0 + np.abs(left[pick]) + np.abs(right[pick])))
+        gain = np.where(wild, 0.0, bend[pick]) if spread.shape[1] else bend[pick]
+        return total[pick], gain, spread + self.looseness
 
     def _at(self, times: Array, pieces: np.ndarray) -> tuple[Array, Array]:
         """Bounds ``(k, r)`` at single times, and how much of them each parameter accounts for, ``(k, r, nu)``."""

@@ -120,7 +120,7 @@ def _branch_and_bound(family: ConstraintFamily, x: Array, course: Course) -> Pro
     lower, upper = family.cells if family.cells is not None else (box.lower[None], box.upper[None])
     closed, best = -np.inf, (-np.inf, lower[0], 0)
     leaves: list[tuple[Array, Array]] = []  # one entry per halving
-    worsts: list[float] = []
+    slacks: list[float] = []
     while True:
         # Bound every cell, and close those where no violation is left.
         bounds, split = _bounded(course, x, lower, upper)
@@ -144,18 +144,19 @@ def _branch_and_bound(family: ConstraintFamily, x: Array, course: Course) -> Pro
         worst, at = float(bounds.max()), int(bounds.argmax())
         course.tell(int(open_.sum()), worst, lower[at], upper[at])
         halves = _halved(lower[open_], upper[open_], split[open_])
-        worsts.append(worst)
+        slacks.append(worst - best[0])
         spent = halves is None or course.examined + halves[0].shape[0] > course.budget or course.deadline.passed
-        if halves is None or spent or _at_rest(worsts):
+        if halves is None or spent or _at_rest(slacks):
             hindrance = course.hindrance(worst, lower[at], upper[at])
             reason = f"{int(open_.sum())} of {course.examined} cells were left; {hindrance}"
             return Proof(family.name, "undecided", worst, best[0], best[1], best[2], course.examined, reason)
         lower, upper = halves
 
 
-def _at_rest(worsts: Sequence[float]) -> bool:
-    """Whether a tiny worst bound no longer falls with the size of the cells: then it is made of rounding."""
-    return len(worsts) > 2 * REST and worsts[-1] <= TINY and worsts[-1] > ADVANCED * worsts[-1 - REST]
+def _at_rest(slacks: Sequence[float]) -> bool:
+    """Whether what a tiny worst bound allows beyond the worst index that was met no longer falls with the size of the
+    cells: then it is made of rounding."""
+    return len(slacks) > 2 * REST and slacks[-1] <= TINY and slacks[-1] > ADVANCED * slacks[-1 - REST]
 
 
 def _bounded(course: Course, x: Array, lower: Array, upper: Array) -> tuple[Array, Array]:

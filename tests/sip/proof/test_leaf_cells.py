@@ -36,13 +36,13 @@ def flat(parameters, start):
     constraint = FlatConstraint(
         "path", functionals, np.array([[1.0, 0.4], [-0.3, 1.0]]), np.zeros(2), start, 2.0, index
     )
-    slack = 0.4 if start < 2.0 or isinstance(parameters, Polytope) else 0.02
+    slack = 0.1 if start < 2.0 or isinstance(parameters, Polytope) else 0.02
     return FlatConstraint("path", functionals, constraint.H, np.full(2, top(constraint) + slack), start, 2.0, index)
 
 
 def curved(parameters, start):
     functionals, index = plant(parameters)
-    size = 5.0 if start < 2.0 else 2.5 if isinstance(parameters, Polytope) else 1.9
+    size = 3.4 if start < 2.0 else 2.5 if isinstance(parameters, Polytope) else 1.9
     return CurvedConstraint("path", functionals, Ellipsoid([0.0, 0.0], size * np.eye(2)), start, 2.0, index)
 
 
