@@ -15,11 +15,11 @@ del os.environ["SPARSEROB_SHAPES"]  # processes that a test starts run as a user
 from hypothesis import settings
 
 from tests.support.places import ROOT
-from tests.support.stub import command, config
+from tests.support.stub import command, config, process
 
 assert sparserob_core.shapes.CHECKED
 
-__all__ = ["command", "config"]
+__all__ = ["command", "config", "process"]
 
 # the same examples in every run; HYPOTHESIS_PROFILE=default searches for new ones
 settings.register_profile("repeatable", derandomize=True)

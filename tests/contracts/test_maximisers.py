@@ -28,6 +28,10 @@ class TestRegisteredMaximiser(MaximiserContract):
     def create(self):
         return REGISTRY.build("maximiser", self.name)
 
+    @pytest.mark.slow  # a process each; that the contract looks is tested below, on one that fails it
+    def test_the_same_seed_gives_the_same_points_in_a_fresh_process(self):
+        super().test_the_same_seed_gives_the_same_points_in_a_fresh_process()
+
 
 class Uniform(sr.Maximiser):
     """An honest maximiser, for its flawed relatives to inherit from."""

@@ -20,7 +20,9 @@ def test_there_are_observers_to_be_tested():
     assert "progress" in NAMES
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name == "progress" else pytest.mark.slow) for name in NAMES]
+)  # others write files or start processes at each of a hundred runs
 class TestRegisteredObserver(ObserverContract):
     @pytest.fixture(autouse=True)
     def named(self, name, tmp_path, monkeypatch):

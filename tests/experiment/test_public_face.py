@@ -54,7 +54,7 @@ def test_a_type_checker_sees_the_types_of_the_public_names(tmp_path: Path) -> No
         "class Mine(sr.Options):\n    depth: int = 3\n"
         "reveal_type(Mine(depth=4).depth)\n"
     )
-    options = ["--cache-dir", str(tmp_path / "cache"), "--strict", "--config-file", "pyproject.toml"]
+    options = ["--strict", "--config-file", "pyproject.toml"]
     command = [sys.executable, "-m", "mypy", str(file), *options]
     said = subprocess.run(command, capture_output=True, text=True, check=False).stdout
     assert 'Revealed type is "int"' in said.replace("builtins.", "")

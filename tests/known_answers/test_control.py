@@ -59,7 +59,7 @@ def double_integrator_cost(horizon, x, v):
     return horizon - math.sqrt((horizon - v) ** 2 - 4 * x - 2 * v**2)
 
 
-@pytest.mark.parametrize(("pieces", "value"), [(50, 1.838710), (1000, 1.837725)])
+@pytest.mark.parametrize(("pieces", "value"), [(50, 1.838710), pytest.param(1000, 1.837725, marks=pytest.mark.slow)])
 def test_the_double_integrator_approaches_its_closed_form_from_above(run, pieces, value):
     truth = double_integrator_cost(5, 1, 1)
     assert abs(truth - 1.8377223398) <= 1e-10
@@ -213,7 +213,7 @@ def test_a_scalar_with_uncertain_rate_approaches_its_closed_form_from_above(run)
     assert truth - 1e-6 <= result.cost <= truth + 2e-6
 
 
-@pytest.mark.parametrize("on", [30, 35, 40])
+@pytest.mark.parametrize("on", [30, *(pytest.param(on, marks=pytest.mark.slow) for on in (35, 40))])
 def test_a_scalar_with_uncertain_rate_and_its_switch_on_the_grid_is_exact(run, on):
     duration = on / 50
     radius = 2 * math.exp(-0.5) - (1 - math.exp(-0.5 * duration)) / 0.5
@@ -237,7 +237,7 @@ def test_the_worst_frequency_of_an_oscillator_lies_in_the_interior(run):
 
 
 @pytest.mark.parametrize("kind", ["piecewise_constant", "measurable"])
-@pytest.mark.parametrize("pieces", [25, 40])
+@pytest.mark.parametrize("pieces", [25, pytest.param(40, marks=pytest.mark.slow)])
 def test_a_measurable_disturbance_counts_what_a_piecewise_constant_one_cannot_do(run, pieces, kind):
     """Steer only ``x1`` of an oscillator: ``x1(2 pi) = x1(0) - int sin(s) u(s) ds``. The cheapest control fills the
     pieces on which ``|int sin|`` is largest (a fractional knapsack), until the disturbance's support ``int |sin|``, or
@@ -286,7 +286,9 @@ PAPER = {
 }
 
 
-@pytest.mark.parametrize("row", PAPER)
+@pytest.mark.parametrize(
+    "row", [pytest.param(row, marks=pytest.mark.slow if row.startswith("experiment") else ()) for row in PAPER]
+)
 def test_the_papers_system_has_the_value_of_its_linear_program(run, row):
     config, overrides, value, accuracy = PAPER[row]
     assert_cost(run(config, overrides), value, accuracy)
@@ -346,7 +348,7 @@ def test_the_largest_disturbance_that_experiment_1_survives(run, bound, feasible
 # Random instances against linear programs that enclose the value.
 
 
-@pytest.mark.parametrize("seed", range(24))
+@pytest.mark.parametrize("seed", [*range(6), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(6, 24))])
 def test_a_random_instance_lies_between_two_independent_linear_programs(run, seed):
     problem = random_problem(seed)
     lower, upper = enclosed_value(problem)

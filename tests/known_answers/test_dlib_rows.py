@@ -35,7 +35,7 @@ def evaluations_to(landscape, budget, seed):
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if name == "deb5" else ()) for name in ROWS]
+    "name", [pytest.param(name, marks=() if name == "holder2" else pytest.mark.slow) for name in ROWS]
 )
 def test_no_more_evaluations_are_needed_than_dlib_needs(name):
     budget, means, deviations = ROWS[name]

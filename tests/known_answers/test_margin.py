@@ -37,6 +37,7 @@ def bisected(problem: Problem, low: float, high: float, width: float) -> tuple[f
     return low, high
 
 
+@pytest.mark.slow
 def test_experiment_1_bears_what_an_independent_bisection_says():
     low, high = bisected(experiment_1(0.06), 0.06, 0.08, 1e-7)
     found = sr.margin(CONFIGS / "experiment1_repaired.yaml", of="disturbance")
@@ -48,6 +49,7 @@ def test_experiment_1_bears_what_an_independent_bisection_says():
     assert abs(found.amounts[0] - 0.06 * found.lower) < 1e-12
 
 
+@pytest.mark.slow
 def test_experiment_1_starts_its_window_no_earlier_than_the_state_can_be_there(tmp_path):
     found = sr.margin(CONFIGS / "experiment1_repaired.yaml", of="path.0.from")
     assert found.status == "certified"

@@ -41,6 +41,7 @@ def test_no_control_withstands_the_printed_disturbance(tmp_path):
     assert result.status == "infeasible"
 
 
+@pytest.mark.slow
 def test_eight_indices_and_two_thousand_evaluations_come_within_one_percent(tmp_path):
     exact = sr.run(
         CONFIGS / "experiment1_repaired.yaml", {"observers": []}, out=tmp_path / "exact", figures=False

@@ -221,6 +221,7 @@ def test_a_search_is_shown_of_the_methods_that_say_that_they_search(
     assert shown_of(inspection, None).searches == searches
 
 
+@pytest.mark.slow
 def test_watching_changes_nothing(searched: sr.Outcome, tmp_path: Path) -> None:
     changes = {**SEARCH, "maximiser.name": "simulated_annealing", "observers": []}
     plain = sr.run(CONFIGS / "experiment1_reduced.yaml", changes, tmp_path / "run", quiet=True, figures=False)
@@ -233,8 +234,10 @@ def test_watching_changes_nothing(searched: sr.Outcome, tmp_path: Path) -> None:
     ("options", "said"),
     [
         ({"connect": "127.0.0.1:1", "save": None}, "no viewer answers at 127.0.0.1:1"),
-        ({"spawn": True}, "there is no display"),
-        ({"save": "/proc/nowhere/x.rrd"}, "/proc/nowhere/x.rrd: cannot be written to"),
+        pytest.param({"spawn": True}, "there is no display", marks=pytest.mark.slow),
+        pytest.param(
+            {"save": "/proc/nowhere/x.rrd"}, "/proc/nowhere/x.rrd: cannot be written to", marks=pytest.mark.slow
+        ),
     ],
 )
 def test_what_is_missing_is_one_warning_and_the_run_goes_on(
@@ -251,6 +254,7 @@ def test_what_is_missing_is_one_warning_and_the_run_goes_on(
     assert [record.getMessage().count(said) for record in caplog.records] == [1]
 
 
+@pytest.mark.slow
 def test_a_missing_package_is_one_warning_with_the_way_to_install_it(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -264,6 +268,7 @@ def test_a_missing_package_is_one_warning_with_the_way_to_install_it(
     assert not (tmp_path / "run" / "recording.rrd").exists()
 
 
+@pytest.mark.slow
 def test_of_several_destinations_those_that_exist_are_used(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     recorded(tmp_path / "run", "experiment1_repaired.yaml", QUICK, connect="127.0.0.1:1", save="some/where.rrd")
     assert len(caplog.records) == 1
@@ -276,6 +281,7 @@ def test_an_address_that_is_none_is_refused_before_the_run(wrong: str, tmp_path:
         recorded(tmp_path / "run", "experiment1_repaired.yaml", QUICK, connect=wrong)
 
 
+@pytest.mark.slow
 def test_a_run_that_breaks_off_leaves_a_complete_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from sparserob_core.experiment.run.journal import Journal
 
@@ -323,6 +329,7 @@ def test_a_process_that_dies_is_noticed_and_costs_nothing(tmp_path: Path, caplog
     assert time.perf_counter() - started < 5.0
 
 
+@pytest.mark.slow
 def test_a_system_without_fork_records_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import sparserob_rerun.outlet
 
@@ -338,6 +345,7 @@ def command(*arguments: str) -> int:
     return int(end.value.code or 0)
 
 
+@pytest.mark.slow
 def test_watch_records_a_run_and_replay_shows_it_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config, run = str(CONFIGS / "experiment1_repaired.yaml"), str(tmp_path / "run")
     changes = [f"{key}={value}" for key, value in QUICK.items()]
@@ -352,6 +360,7 @@ def test_watch_records_a_run_and_replay_shows_it_again(tmp_path: Path, capsys: p
     assert "/landscape/map/g" in again
 
 
+@pytest.mark.slow
 def test_an_outcome_can_be_shown_with_all_that_it_knows(searched: sr.Outcome, tmp_path: Path) -> None:
     searched.show(save=tmp_path / "shown.rrd")
     found = read(tmp_path / "shown.rrd")

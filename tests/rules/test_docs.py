@@ -69,9 +69,16 @@ def execute(fence: Fence, place: Path, variables: dict[str, str]) -> None:
 
 
 EXECUTED = [page for page in PAGES if any(block.language in {"bash", "python"} for block in fences(page))]
+LIGHT = {"README.md", "docs/certificate.md", "docs/simulate.md"}
 
 
-@pytest.mark.parametrize("page", EXECUTED, ids=relative)
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=() if relative(page) in LIGHT else pytest.mark.slow, id=relative(page))
+        for page in EXECUTED
+    ],
+)
 def test_every_command_and_snippet_of_a_page_runs(page: Path, tmp_path: Path) -> None:
     blocks = list(fences(page))
     shutil.copytree(ROOT / "configs", tmp_path / "configs")

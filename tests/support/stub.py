@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import io
+import os
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import pytest
@@ -78,13 +81,35 @@ def config(tmp_path: Path) -> Path:
     return file
 
 
+Command = Callable[..., subprocess.CompletedProcess[str]]
+
+
 @pytest.fixture
-def command(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
-    """The command ``sparserob`` in a process of its own, in the temporary directory."""
+def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Command:
+    """The command ``sparserob`` in the temporary directory, called in this process, which keeps its own signals: the
+    status, and what is written."""
+    from sparserob_core.experiment.cli.main import main
 
     def call(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
-        import os
+        given, out, err = [str(argument) for argument in arguments], io.StringIO(), io.StringIO()
+        with monkeypatch.context() as here, redirect_stdout(out), redirect_stderr(err):
+            here.chdir(tmp_path)
+            here.setattr("sparserob_core.experiment.cli.main.listen", lambda: None)
+            for name, value in {"COLUMNS": "200", **environment}.items():
+                here.setenv(name, value)
+            with pytest.raises(SystemExit) as end:
+                main(given)
+        return subprocess.CompletedProcess(given, int(end.value.code or 0), out.getvalue(), err.getvalue())
 
+    return call
+
+
+@pytest.fixture
+def process(tmp_path: Path) -> Command:
+    """The command ``sparserob`` in a process of its own, in the temporary directory: where the process is what is
+    tested."""
+
+    def call(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
             [sys.executable, "-m", "sparserob_core", *map(str, arguments)],
             cwd=tmp_path,

@@ -5,16 +5,15 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-Command = Callable[..., subprocess.CompletedProcess[str]]
+from tests.support.stub import Command
 
 
-def test_a_run_prints_a_table_and_where_everything_is(config: Path, command: Command) -> None:
-    done = command("run", config, "--out", "out", "--no-figures")
+def test_a_run_prints_a_table_and_where_everything_is(config: Path, process: Command) -> None:
+    done = process("run", config, "--out", "out", "--no-figures")
     assert done.returncode == 0, done.stderr
     for name in (
         "lower bound",
@@ -76,8 +75,8 @@ def test_an_input_at_fault_is_status_2_one_message_and_no_traceback(
     assert not (config.parent / "runs").exists()
 
 
-def test_a_traceback_is_there_for_those_who_ask(config: Path, command: Command) -> None:
-    assert "Traceback" in command("run", config, "problem.horizon=0", SPARSEROB_DEBUG="1").stderr
+def test_a_traceback_is_there_for_those_who_ask(config: Path, process: Command) -> None:
+    assert "Traceback" in process("run", config, "problem.horizon=0", SPARSEROB_DEBUG="1").stderr
 
 
 def test_a_fault_of_the_program_is_status_5_and_says_what_was_saved(config: Path, command: Command) -> None:

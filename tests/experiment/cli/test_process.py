@@ -20,8 +20,7 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.experiment.directory.artefacts import create_directory
 from sparserob_core.experiment.directory.lock import GUARD, NAME, Lock
-
-Command = Callable[..., subprocess.CompletedProcess[str]]
+from tests.support.stub import Command
 
 TELLING = '''
 import time
@@ -322,18 +321,15 @@ def test_control_characters_of_a_title_do_not_reach_the_terminal(config: Path, c
     "command_line", [["simulate", "out", "--trajectories", "3", "--out", "x.png"], ["compare", "out"]]
 )
 def test_a_missing_matplotlib_is_a_note_beside_the_result(
-    config: Path, command: Command, tmp_path: Path, command_line: list[str]
+    config: Path, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command_line: list[str]
 ) -> None:
-    blocked = tmp_path / "blocked" / "sitecustomize.py"
-    blocked.parent.mkdir()
-    blocked.write_text("import sys\nsys.modules['matplotlib'] = None\n")
-    path = os.pathsep.join([str(blocked.parent), os.environ.get("PYTHONPATH", "")])
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
     file = tmp_path / "margin.yaml"
     file.write_text(MARGIN)
     note = "no figure: matplotlib is not installed; `pip install 'sparserob[figures]'` brings it"
-    done = command("run", file, "--out", "out", PYTHONPATH=path)
+    done = command("run", file, "--out", "out")
     assert (done.returncode, note in done.stdout) == (0, True), done.stdout + done.stderr
-    done = command(*command_line, PYTHONPATH=path)
+    done = command(*command_line)
     assert (done.returncode, note in done.stdout) == (0, True), done.stdout + done.stderr
 
 
@@ -341,14 +337,11 @@ def test_a_missing_matplotlib_is_a_note_beside_the_result(
     "study", [("margin", "--curve", "2"), ("initial-states", "--directions", "4", "--values", "0")], ids=lambda a: a[0]
 )
 def test_a_study_without_matplotlib_has_a_note_and_its_own_status(
-    command: Command, tmp_path: Path, study: tuple[str, ...]
+    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, study: tuple[str, ...]
 ) -> None:
-    blocked = tmp_path / "blocked" / "sitecustomize.py"
-    blocked.parent.mkdir()
-    blocked.write_text("import sys\nsys.modules['matplotlib'] = None\n")
-    path = os.pathsep.join([str(blocked.parent), os.environ.get("PYTHONPATH", "")])
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
     file = tmp_path / "margin.yaml"
     file.write_text(MARGIN)
-    done = command(study[0], file, *study[1:], "--out", "out", PYTHONPATH=path)
+    done = command(study[0], file, *study[1:], "--out", "out")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "no figure: matplotlib is not installed; `pip install 'sparserob[figures]'` brings it" in done.stdout

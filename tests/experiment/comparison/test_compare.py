@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from copy import deepcopy
 from itertools import pairwise
 from pathlib import Path
@@ -21,8 +21,8 @@ from sparserob_core.experiment.comparison.figure import draw_comparison, write_c
 from sparserob_core.experiment.comparison.labels import labels
 from sparserob_core.experiment.config.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import RunDirectory
+from tests.support.stub import Command
 
-Command = Callable[..., subprocess.CompletedProcess[str]]
 EXACT = 2.0
 PROBLEM = {"name": "linear", "horizon": 1.0, "disturbance": {"box": [0.1, 0.1]}, "path": [{"box": [1.0, None]}]}
 BASE: dict[str, Any] = {

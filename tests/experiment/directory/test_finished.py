@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
 import zipfile
 from collections.abc import Callable
 from contextlib import suppress
@@ -19,8 +18,7 @@ from sparserob_core.experiment.directory.finished import StoredRun, read_arrays,
 from sparserob_core.experiment.figures.drawing import active_times, draw_run
 from sparserob_core.experiment.run.inspection import Inspection
 from sparserob_core.experiment.run.replay import events, replay, stored_result
-
-Command = Callable[..., subprocess.CompletedProcess[str]]
+from tests.support.stub import Command
 
 CONFIG = {
     "title": "A double integrator",
@@ -248,7 +246,13 @@ def searched(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return sr.run(CONFIG, changes, out=out, quiet=True, figures=False).directory
 
 
-@pytest.mark.parametrize("kind", WRONG)
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param(kind, marks=pytest.mark.slow if kind in ("twice", "a number", "negative", "true") else ())
+        for kind in WRONG
+    ],
+)
 def test_whatever_is_wrong_with_an_array_is_an_error_of_the_input_or_none(
     searched: Path, tmp_path: Path, kind: str
 ) -> None:

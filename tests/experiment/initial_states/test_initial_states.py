@@ -4,9 +4,6 @@ polygons, and the command that draws them."""
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -29,6 +26,7 @@ from sparserob_core.control.transcription.transcribe import prepare
 from sparserob_core.experiment.initial_states.figure import draw_initial_states, envelope
 from sparserob_core.experiment.initial_states.section import section
 from tests.support.plants import uniform
+from tests.support.stub import Command
 
 CART: dict[str, Any] = {
     "title": "A cart",
@@ -244,20 +242,9 @@ def test_the_figure_names_its_axes_and_shows_every_boundary() -> None:
     ]
 
 
-def command(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "sparserob_core", "initial-states", *arguments],
-        cwd=folder,
-        text=True,
-        capture_output=True,
-        check=False,
-        env=os.environ,
-    )
-
-
-def test_the_command_writes_its_files_whole_and_prints_what_it_wrote(tmp_path: Path) -> None:
+def test_the_command_writes_its_files_whole_and_prints_what_it_wrote(tmp_path: Path, command: Command) -> None:
     (tmp_path / "cart.yaml").write_text(json.dumps({key: value for key, value in CART.items() if key != "observers"}))
-    done = command("cart.yaml", "--directions", "6", "--values", "2", "--json", "--out", "set", folder=tmp_path)
+    done = command("initial-states", "cart.yaml", "--directions", "6", "--values", "2", "--json", "--out", "set")
     assert done.returncode == 0, done.stderr
     assert {path.name for path in (tmp_path / "set").iterdir()} == {
         "config.yaml",
@@ -273,9 +260,9 @@ def test_the_command_writes_its_files_whole_and_prints_what_it_wrote(tmp_path: P
         assert arrays["controls"].shape == (len(arrays["inner"]), 1, 10)
 
 
-def test_the_command_ends_with_3_for_an_empty_set_and_2_for_a_fault(tmp_path: Path) -> None:
+def test_the_command_ends_with_3_for_an_empty_set_and_2_for_a_fault(tmp_path: Path, command: Command) -> None:
     (tmp_path / "cart.yaml").write_text(json.dumps({key: value for key, value in CART.items() if key != "observers"}))
-    empty = command("cart.yaml", "problem.disturbance.box=[0,0.9]", folder=tmp_path)
+    empty = command("initial-states", "cart.yaml", "problem.disturbance.box=[0,0.9]")
     assert empty.returncode == 3 and "infeasible" in empty.stdout
-    wrong = command("cart.yaml", "--states", "1,1", folder=tmp_path)
+    wrong = command("initial-states", "cart.yaml", "--states", "1,1")
     assert wrong.returncode == 2 and wrong.stderr.count("\n") == 1 and "states" in wrong.stderr

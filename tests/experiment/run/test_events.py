@@ -162,12 +162,34 @@ def test_nothing_can_be_written_into_an_event(watched: Callable[..., sr.Outcome]
             array[:] = 0.0
 
 
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> sr.Outcome:
+    """A search that nobody watches."""
+    out = tmp_path_factory.mktemp("plain") / "run"
+    return sr.run({**CONFIG, **METHODS["sparserob"]}, out=out, figures=False)
+
+
+KINDS = (sr.RunStarted, sr.EvaluationsFinished, sr.RoundFinished, sr.ProofProgress, sr.RunFinished)
+
+
 @pytest.mark.parametrize(
-    "kind", [sr.RunStarted, sr.EvaluationsFinished, sr.RoundFinished, sr.ProofProgress, sr.RunFinished]
+    ("kind", "failure"),
+    [
+        *((kind, ValueError("oh")) for kind in KINDS),
+        (sr.RoundFinished, SystemExit("enough")),
+        *(
+            pytest.param(kind, SystemExit("enough"), marks=pytest.mark.slow)
+            for kind in KINDS
+            if kind is not sr.RoundFinished
+        ),
+    ],
 )
-@pytest.mark.parametrize("failure", [ValueError("oh"), SystemExit("enough")])
 def test_an_observer_that_fails_is_named_once_detached_and_closed_and_the_run_is_the_same(
-    kind: type[sr.Event], failure: BaseException, watched: Callable[..., sr.Outcome], caplog: pytest.LogCaptureFixture
+    kind: type[sr.Event],
+    failure: BaseException,
+    watched: Callable[..., sr.Outcome],
+    plain: sr.Outcome,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     clumsy, listener = Listener(kind, failure), Listener()
     with caplog.at_level(logging.WARNING, logger="sparserob"):
@@ -178,7 +200,7 @@ def test_an_observer_that_fails_is_named_once_detached_and_closed_and_the_run_is
     assert isinstance(clumsy.heard[-1], kind)
     assert len(clumsy.only(kind)) == clumsy.closed == listener.closed == 1
     assert isinstance(listener.heard[-1], sr.RunFinished)
-    assert same(outcome, watched("sparserob"))
+    assert same(outcome, plain)
 
 
 def test_an_observer_that_fails_to_close_is_named_too(
@@ -189,9 +211,7 @@ def test_an_observer_that_fails_to_close_is_named_too(
     assert [record.getMessage() for record in caplog.records] == ["observer 'Listener' is detached: OSError: disk full"]
 
 
-@pytest.mark.parametrize(
-    "kind", [sr.RunStarted, sr.EvaluationsFinished, sr.RoundFinished, sr.ProofProgress, sr.RunFinished]
-)
+@pytest.mark.parametrize("kind", KINDS)
 def test_an_interrupt_ends_the_run_and_everybody_hears_of_it(
     kind: type[sr.Event], watched: Callable[..., sr.Outcome]
 ) -> None:
