@@ -23,12 +23,24 @@ if TYPE_CHECKING:
         return function
 
 elif CHECKED:
+    import jaxtyping
     from beartype import beartype
-    from jaxtyping import Bool, Float, Int, jaxtyped
+
+    class _Checked:
+        """An array of one kind of numbers; a number of numpy is one without axes, since numpy makes it one."""
+
+        def __init__(self, kind: Any) -> None:
+            self.kind = kind
+
+        def __getitem__(self, item: tuple[object, str]) -> Any:
+            return self.kind[np.ndarray | np.generic, item[1]]
+
+    # whole numbers may stand where numbers are asked for: numpy computes with them, and shapes are what matters here
+    Bool, Float, Int = _Checked(jaxtyping.Bool), _Checked(jaxtyping.Real), _Checked(jaxtyping.Integer)
 
     def shaped(function: Any) -> Any:
         """Check the shapes in the annotations of a function whenever it is called."""
-        return jaxtyped(function, typechecker=beartype)
+        return jaxtyping.jaxtyped(function, typechecker=beartype)
 
 else:
 

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.errors import InputError
+from sparserob_core.shapes import Bool, Float, shaped
 
 Array: TypeAlias = npt.NDArray[np.float64]
 
@@ -26,9 +27,13 @@ MIXING = 8  # steps of hit and run per dimension
 TRIES = 10_000  # points drawn per wanted point before rejection sampling gives up
 
 
+@shaped
 def bisect(
-    beyond: Callable[[Array], npt.NDArray[np.bool_]], low: Array, high: Array, halvings: int = HALVINGS
-) -> tuple[Array, Array]:
+    beyond: Callable[[Array], npt.NDArray[np.bool_]],
+    low: Float[Array, " *k"],
+    high: Float[Array, " *k"],
+    halvings: int = HALVINGS,
+) -> tuple[Float[Array, " *k"], Float[Array, " *k"]]:
     """Brackets ``(low, high)`` of the points at which ``beyond`` changes from false to true, one for every entry of the
     two arrays; the last ``low`` was not beyond, the last ``high`` was, if that held at the start."""
     for _ in range(halvings):
@@ -53,11 +58,11 @@ class ConvexSet(ABC):
         """Dimension of the space that the set lives in."""
 
     @abstractmethod
-    def support(self, directions: Array) -> Array:
+    def support(self, directions: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         """Support function of directions ``(k, d)``, as ``(k,)``; ``inf`` where the set is unbounded."""
 
     @abstractmethod
-    def support_point(self, directions: Array) -> Array:
+    def support_point(self, directions: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
         """A maximiser ``(k, d)`` of ``c'x`` for each direction ``(k, d)``; finite wherever the support function is."""
 
     # What shape it is
@@ -72,11 +77,13 @@ class ConvexSet(ABC):
         """Whether the set is its own `bounding_box`."""
         return False
 
-    def halfspaces(self) -> tuple[Array, Array] | None:
+    @shaped
+    def halfspaces(self) -> tuple[Float[Array, "r d"], Float[Array, " r"]] | None:
         """``(H (r, d), h (r,))`` with the set ``= {x : H x <= h}``, or ``None`` for a curved set."""
         return None
 
-    def unit_ball_image(self) -> tuple[Array, Array] | None:
+    @shaped
+    def unit_ball_image(self) -> tuple[Float[Array, " d"], Float[Array, "d d"]] | None:
         """``(m (d,), L (d, d))`` with the set ``= {m + L z : |z| <= 1}`` and ``L`` regular, or ``None`` for another
         shape."""
         return None
@@ -109,7 +116,8 @@ class ConvexSet(ABC):
         upper = self.support(axes)
         return Box(np.minimum(-self.support(-axes), upper), upper)
 
-    def reach(self, directions: Array) -> Array:
+    @shaped
+    def reach(self, directions: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         """``max {|c'x| : x in the set}`` of directions ``(..., d)``, as ``(...,)``."""
         farthest: Array = np.maximum(self.support(directions), self.support(-directions))
         return farthest
@@ -119,13 +127,15 @@ class ConvexSet(ABC):
         """An upper bound of the 2-norm of any point: that of the corner of the bounding box."""
         return float(np.linalg.norm(self.reach(np.eye(self.dimension))))
 
-    def interior_point(self) -> Array:
+    @shaped
+    def interior_point(self) -> Float[Array, " d"]:
         """A point ``(d,)`` of the set, away from its boundary where the set allows; here the mean of support points."""
         axes = np.eye(self.dimension)
         centre: Array = self.support_point(np.vstack([axes, -axes])).mean(axis=0)
         return centre
 
-    def middle(self) -> Array:
+    @shaped
+    def middle(self) -> Float[Array, " d"]:
         """What the set is scaled about, ``(d,)``: the middle of its bounding box, 0 along sides that are free; an
         interior point where that is not in the set. Raises `InputError` where a side is free and 0 is not inside."""
         box = self.bounding_box()
@@ -147,13 +157,15 @@ class ConvexSet(ABC):
         """``m + factor (x - m)`` for all ``x`` in the set, ``m`` its `middle`; ``factor >= 0``."""
         return Scaled(self, self.middle(), factor)
 
-    def in_units(self, units: Array) -> ConvexSet:
+    @shaped
+    def in_units(self, units: Float[Array, " d"]) -> ConvexSet:
         """The set of all ``x / units`` for ``x`` in this one; ``units (d,)`` positive. Exact for powers of two."""
         return SetInUnits(self, np.asarray(units, dtype=float))
 
     # Where its boundary is
 
-    def gauge(self, points: Array) -> Array:
+    @shaped
+    def gauge(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         """The Minkowski functional about the interior point: the least ``g (...,)`` for which
         ``m + (x - m) / g`` is in the set, of points ``(..., d)``.
 
@@ -170,7 +182,8 @@ class ConvexSet(ABC):
             sizes = ratios(rays @ flat[0].T, np.maximum(flat[1] - flat[0] @ middle, 0.0)).max(axis=1, initial=0.0)
         return sizes.reshape(points.shape[:-1])
 
-    def normal(self, points: Array) -> Array:
+    @shaped
+    def normal(self, points: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
         """Outward normals ``(..., d)``, of any length, at points of the boundary ``(..., d)``; one of them at a
         corner."""
         points = np.asarray(points, dtype=float)
@@ -183,7 +196,8 @@ class ConvexSet(ABC):
         rays = points.reshape(-1, self.dimension) - middle
         return self._boundary(np.broadcast_to(middle, rays.shape), rays)[1].reshape(points.shape)
 
-    def violation(self, points: Array) -> Array:
+    @shaped
+    def violation(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         """How far outside (positive) or inside (negative) points ``(..., d)`` are: 0 on the boundary, never below
         ``max {c'x - h(c) : |c| = 1}``.
 
@@ -205,12 +219,16 @@ class ConvexSet(ABC):
         excess: Array = (points @ (H / norms[:, None]).T - h / norms).max(axis=-1)
         return excess
 
-    def contains(self, points: Array, tolerance: float = 1e-9) -> npt.NDArray[np.bool_]:
+    @shaped
+    def contains(self, points: Float[Array, "*k d"], tolerance: float = 1e-9) -> Bool[np.ndarray, " *k"]:
         """Whether points ``(..., d)`` violate nothing by more than the absolute ``tolerance``."""
         inside: npt.NDArray[np.bool_] = np.asarray(self.violation(points) <= tolerance)
         return inside
 
-    def chord(self, points: Array, directions: Array) -> tuple[Array, Array]:
+    @shaped
+    def chord(
+        self, points: Float[Array, "k d"], directions: Float[Array, "k d"]
+    ) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
         """``low (k,) <= 0 <= high (k,)`` such that ``point + s direction`` is in the set for ``low <= s <= high``, of
         points of the set ``(k, d)`` and directions ``(k, d)``."""
         flat = self.halfspaces()
@@ -226,7 +244,10 @@ class ConvexSet(ABC):
             np.where(slopes > 0, reach, np.inf).min(axis=1, initial=np.inf),
         )
 
-    def _boundary(self, origins: Array, rays: Array) -> tuple[Array, Array]:
+    @shaped
+    def _boundary(
+        self, origins: Float[Array, "k d"], rays: Float[Array, "k d"]
+    ) -> tuple[Float[Array, " k"], Float[Array, "k d"]]:
         """The gauge ``(k,)`` of ``rays (k, d)`` about points of the set ``origins (k, d)``, and a normal ``(k, d)``
         where each ray leaves the set.
 
@@ -278,13 +299,15 @@ class ConvexSet(ABC):
 
     # What its points are, at random
 
-    def sample(self, count: int, rng: np.random.Generator) -> Array:
+    @shaped
+    def sample(self, count: int, rng: np.random.Generator) -> Float[Array, "{count} d"]:
         """``count`` independent points ``(count, d)`` of a bounded set: uniform in up to three dimensions, unless the
         set is too thin for rejection; else hit and run (Smith 1984) makes them uniform in the limit only."""
         found = self._by_rejection(count, rng) if self.dimension <= PLAIN else None
         return self._hit_and_run(count, rng) if found is None else found
 
-    def sample_extreme(self, count: int, rng: np.random.Generator) -> Array:
+    @shaped
+    def sample_extreme(self, count: int, rng: np.random.Generator) -> Float[Array, "{count} d"]:
         """``count`` random extreme points ``(count, d)`` of a bounded set: here the support points of directions that
         are uniform on the sphere."""
         return self.support_point(rng.normal(size=(count, self.dimension)))
@@ -311,7 +334,8 @@ class ConvexSet(ABC):
 
     # How its support function curves
 
-    def linearisation_excess(self, centre: Array, spread: Array) -> Array:
+    @shaped
+    def linearisation_excess(self, centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]) -> Float[Array, " *k"]:
         """How much the support function can exceed its linearisation at ``centre (..., d)``, over
         ``centre + sum_j s_j spread_j``, ``|s_j| <= 1``.
 
@@ -324,7 +348,10 @@ class ConvexSet(ABC):
         excess: Array = np.maximum(self.support(spread) - along, self.support(-spread) + along).sum(axis=-1)
         return excess
 
-    def support_minorant(self, centre: Array, spread: Array) -> tuple[float, Array, Array]:
+    @shaped
+    def support_minorant(
+        self, centre: Float[Array, " d"], spread: Float[Array, "J d"]
+    ) -> tuple[float, Float[Array, " J"], Float[Array, "J J"]]:
         """A quadratic below ``h(centre + sum_j s_j spread_j)`` for ``|s_j| <= 1``: value, gradient ``(J,)`` and Hessian
         ``(J, J)`` in ``s``.
 
@@ -384,7 +411,8 @@ class Box(ConvexSet):
     def dimension(self) -> int:
         return int(self.lower.size)
 
-    def support(self, directions: Array) -> Array:
+    @shaped
+    def support(self, directions: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         directions = np.asarray(directions, dtype=float)
         if self.is_bounded:
             bounded: Array = np.maximum(directions * self.upper, directions * self.lower).sum(axis=-1)
@@ -394,24 +422,28 @@ class Box(ConvexSet):
         height: Array = np.where(directions == 0, 0.0, terms).sum(axis=-1)
         return height
 
-    def support_point(self, directions: Array) -> Array:
+    @shaped
+    def support_point(self, directions: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
         directions = np.asarray(directions, dtype=float)
         middle = np.clip(0.0, self.lower, self.upper)
         return np.where(directions > 0, self.upper, np.where(directions < 0, self.lower, middle))
 
-    def linearisation_excess(self, centre: Array, spread: Array) -> Array:
+    @shaped
+    def linearisation_excess(self, centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]) -> Float[Array, " *k"]:
         flipped = np.abs(spread).sum(axis=-2) - np.abs(centre)
         width = np.where(self.upper == self.lower, 0.0, self.upper - self.lower)
         excess: Array = (width * np.maximum(flipped, 0.0)).sum(axis=-1)
         return excess
 
-    def halfspaces(self) -> tuple[Array, Array]:
+    @shaped
+    def halfspaces(self) -> tuple[Float[Array, "r d"], Float[Array, " r"]]:
         identity = np.eye(self.dimension)
         rows, bounds = np.vstack([identity, -identity]), np.concatenate([self.upper, -self.lower])
         finite = np.isfinite(bounds)
         return rows[finite], bounds[finite]
 
-    def violation(self, points: Array) -> Array:
+    @shaped
+    def violation(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         excess: Array = np.maximum(np.asarray(points) - self.upper, self.lower - np.asarray(points)).max(axis=-1)
         return excess
 
@@ -430,14 +462,17 @@ class Box(ConvexSet):
         )
         return Box(lower, upper)
 
-    def sample(self, count: int, rng: np.random.Generator) -> Array:
+    @shaped
+    def sample(self, count: int, rng: np.random.Generator) -> Float[Array, "{count} d"]:
         return rng.uniform(self.lower, self.upper, size=(count, self.dimension))
 
-    def sample_extreme(self, count: int, rng: np.random.Generator) -> Array:
+    @shaped
+    def sample_extreme(self, count: int, rng: np.random.Generator) -> Float[Array, "{count} d"]:
         """Each corner equally likely."""
         return np.where(rng.integers(0, 2, size=(count, self.dimension), dtype=np.int8) > 0, self.upper, self.lower)
 
-    def interior_point(self) -> Array:
+    @shaped
+    def interior_point(self) -> Float[Array, " d"]:
         lower = np.where(np.isfinite(self.lower), self.lower, np.minimum(self.upper, 1.0) - 1.0)
         upper = np.where(np.isfinite(self.upper), self.upper, np.maximum(self.lower, -1.0) + 1.0)
         return 0.5 * (lower + upper)
@@ -446,7 +481,8 @@ class Box(ConvexSet):
     def is_bounded(self) -> bool:
         return bool(np.isfinite(self.lower).all() and np.isfinite(self.upper).all())
 
-    def in_units(self, units: Array) -> Box:
+    @shaped
+    def in_units(self, units: Float[Array, " d"]) -> Box:
         return Box(self.lower / units, self.upper / units)
 
 
@@ -465,29 +501,39 @@ class SetInUnits(ConvexSet):
     def kind(self) -> str:
         return self.base.kind
 
-    def support(self, directions: Array) -> Array:
+    @shaped
+    def support(self, directions: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         return self.base.support(np.asarray(directions, dtype=float) / self.units)
 
-    def support_point(self, directions: Array) -> Array:
+    @shaped
+    def support_point(self, directions: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
         return self.base.support_point(np.asarray(directions, dtype=float) / self.units) / self.units
 
-    def halfspaces(self) -> tuple[Array, Array] | None:
+    @shaped
+    def halfspaces(self) -> tuple[Float[Array, "r d"], Float[Array, " r"]] | None:
         flat = self.base.halfspaces()
         return None if flat is None else (flat[0] * self.units, flat[1])
 
-    def linearisation_excess(self, centre: Array, spread: Array) -> Array:
+    @shaped
+    def linearisation_excess(self, centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]) -> Float[Array, " *k"]:
         return self.base.linearisation_excess(np.asarray(centre) / self.units, np.asarray(spread) / self.units)
 
-    def support_minorant(self, centre: Array, spread: Array) -> tuple[float, Array, Array]:
+    @shaped
+    def support_minorant(
+        self, centre: Float[Array, " d"], spread: Float[Array, "J d"]
+    ) -> tuple[float, Float[Array, " J"], Float[Array, "J J"]]:
         return self.base.support_minorant(np.asarray(centre) / self.units, np.asarray(spread) / self.units)
 
-    def gauge(self, points: Array) -> Array:
+    @shaped
+    def gauge(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         return self.base.gauge(np.asarray(points) * self.units)
 
-    def normal(self, points: Array) -> Array:
+    @shaped
+    def normal(self, points: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
         return self.base.normal(np.asarray(points) * self.units) * self.units
 
-    def interior_point(self) -> Array:
+    @shaped
+    def interior_point(self) -> Float[Array, " d"]:
         return self.base.interior_point() / self.units
 
     @property
@@ -498,11 +544,13 @@ class SetInUnits(ConvexSet):
     def is_bounded(self) -> bool:
         return self.base.is_bounded
 
-    def in_units(self, units: Array) -> ConvexSet:
+    @shaped
+    def in_units(self, units: Float[Array, " d"]) -> ConvexSet:
         return SetInUnits(self.base, self.units * units)
 
 
-def few_digits(matrix: Array) -> Array:
+@shaped
+def few_digits(matrix: Float[Array, "b d"]) -> Float[Array, "b d"]:
     """A matrix ``(b, d)`` with the entries of each column rounded to 24 binary digits of its largest: what ``z`` with
     as few digits makes of it is exact, and units that are powers of two pass through."""
     _, exponents = np.frexp(np.abs(matrix).max(axis=0))
@@ -531,35 +579,45 @@ class Scaled(ConvexSet):
     def normals(self) -> Array:
         return self.base.normals
 
-    def support(self, directions: Array) -> Array:
+    @shaped
+    def support(self, directions: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         directions, height = np.asarray(directions, dtype=float), self.base.support(directions)
         finite = np.isfinite(height)
         moved = self.factor * np.where(finite, height, 0.0) + (1.0 - self.factor) * (directions @ self.about)
         return np.asarray(np.where(finite, moved, height))
 
-    def support_point(self, directions: Array) -> Array:
+    @shaped
+    def support_point(self, directions: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
         return self._moved(self.base.support_point(directions))
 
-    def halfspaces(self) -> tuple[Array, Array] | None:
+    @shaped
+    def halfspaces(self) -> tuple[Float[Array, "r d"], Float[Array, " r"]] | None:
         flat = self.base.halfspaces()
         if flat is None:
             return None
         offset = flat[0] @ self.about
         return flat[0], offset + self.factor * (flat[1] - offset)
 
-    def interior_point(self) -> Array:
+    @shaped
+    def interior_point(self) -> Float[Array, " d"]:
         return self._moved(self.base.interior_point())
 
-    def middle(self) -> Array:
+    @shaped
+    def middle(self) -> Float[Array, " d"]:
         return self._moved(self.base.middle())
 
-    def in_units(self, units: Array) -> ConvexSet:
+    @shaped
+    def in_units(self, units: Float[Array, " d"]) -> ConvexSet:
         return Scaled(self.base.in_units(units), self.about / units, self.factor)
 
-    def linearisation_excess(self, centre: Array, spread: Array) -> Array:
+    @shaped
+    def linearisation_excess(self, centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]) -> Float[Array, " *k"]:
         return self.factor * self.base.linearisation_excess(centre, spread)
 
-    def support_minorant(self, centre: Array, spread: Array) -> tuple[float, Array, Array]:
+    @shaped
+    def support_minorant(
+        self, centre: Float[Array, " d"], spread: Float[Array, "J d"]
+    ) -> tuple[float, Float[Array, " J"], Float[Array, "J J"]]:
         value, gradient, hessian = self.base.support_minorant(centre, spread)
         f, rest = self.factor, (1.0 - self.factor) * self.about
         return f * value + float(centre @ rest), f * gradient + spread @ rest, f * hessian
@@ -568,7 +626,10 @@ class Scaled(ConvexSet):
         return self.about + self.factor * (points - self.about)
 
 
-def vertex_excess(vertices: Array, centre: Array, spread: Array, blocks: int = 4096) -> Array:
+@shaped
+def vertex_excess(
+    vertices: Float[Array, "v d"], centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"], blocks: int = 4096
+) -> Float[Array, " *k"]:
     """`ConvexSet.linearisation_excess` of a polytope with ``vertices (v, d)``: how much any other vertex can gain on
     the centre's best one."""
     flat_centre, flat_spread = centre.reshape(-1, centre.shape[-1]), spread.reshape(-1, *spread.shape[-2:])

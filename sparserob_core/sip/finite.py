@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from sparserob_core.errors import InputError
+from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -41,22 +42,26 @@ class FiniteProgram:
         """Number of decision variables."""
         return int(self.q.size)
 
-    def image(self, x: Array) -> Array:
+    @shaped
+    def image(self, x: Float[Array, " n"]) -> Float[Array, " k"]:
         """``S x`` ``(k,)``."""
         return x if self.S is None else np.asarray(self.S @ x, dtype=float)
 
-    def objective(self, x: Array) -> float:
+    @shaped
+    def objective(self, x: Float[Array, " n"]) -> float:
         """The cost at ``x``."""
         quadratic = 0.0 if self.P is None else 0.5 * float(x @ (self.P @ x))
         return float(self.weights @ np.abs(self.image(x)) + self.q @ x) + quadratic
 
-    def magnitude(self, x: Array) -> float:
+    @shaped
+    def magnitude(self, x: Float[Array, " n"]) -> float:
         """The sum of the absolute values of the terms of the cost at ``x``: what its rounding is relative to."""
         size = np.abs(x)
         quadratic = 0.0 if self.P is None else 0.5 * float(size @ (abs(self.P) @ size))
         return float(self.weights @ np.abs(self.image(x)) + np.abs(self.q) @ size) + quadratic
 
-    def residual(self, x: Array) -> float:
+    @shaped
+    def residual(self, x: Float[Array, " n"]) -> float:
         """The largest violation of bounds, rows and equalities at ``x``, each divided by its own scale (see
         `scaled_violation`)."""
         size = np.abs(x)
@@ -95,7 +100,10 @@ def diagonal(P: csc_array | None, n: int) -> Array | None:
     return np.bincount(columns, P.data, n).astype(float)
 
 
-def scaled_violation(violations: Array, rows: Array, rhs: Array, size: Array) -> float:
+@shaped
+def scaled_violation(
+    violations: Float[Array, " r"], rows: Float[Array, "r n"], rhs: Float[Array, " r"], size: Float[Array, " n"]
+) -> float:
     """``max_i violations_i / max(min(1, |rows_i|), |rhs_i| + |rows_i| size)``.
 
     A row of ordinary size is judged by its absolute violation, a short row by the distance to its half-space, and any

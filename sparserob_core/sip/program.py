@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias, final
 import numpy as np
 
 from sparserob_core.errors import InputError
+from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, Box, as_bound
 from sparserob_core.sip.finite import FiniteProgram
 
@@ -162,7 +163,8 @@ class ConstraintFamily:
         forms = {"reduced": self.reduced, "nominal": self.nominal, "literal": self.literal}
         return forms.get(formulation)
 
-    def explanation(self, index: Array, row: int) -> Explanation:
+    @shaped
+    def explanation(self, index: Float[Array, " d"], row: int) -> Explanation:
         """One constraint for people, by its number and index where the family does not explain itself."""
         if self.explain is not None:
             return self.explain(index, row)
@@ -172,7 +174,8 @@ class ConstraintFamily:
         """What a violation of 1 of a row is in the user's units."""
         return 1.0 if self.row_units is None else float(self.row_units[row])
 
-    def violations(self, x: Array, indices: Array) -> Array:
+    @shaped
+    def violations(self, x: Float[Array, " n"], indices: Float[Array, "k d"]) -> Float[Array, "k r"]:
         """``rows(xi) x - rhs(xi)`` at indices ``(k, d)``, as ``(k, r)``; positive where violated."""
         G, h = self.rows(indices)
         return np.asarray(G @ x - h, dtype=float)
@@ -296,7 +299,8 @@ class SemiInfiniteProgram:
         coefficients = (program.weights, np.abs(program.q), curvature)
         return 1e6 * min(1.0, max(float(cost.max(initial=0.0)) for cost in coefficients))
 
-    def cost(self, x: Array) -> float:
+    @shaped
+    def cost(self, x: Float[Array, " n"]) -> float:
         """``J(x)``, recomputed from the data."""
         return self.finite.objective(x)
 

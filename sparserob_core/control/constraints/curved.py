@@ -20,6 +20,7 @@ from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.sets.directions import across, faces, on_surface, sampled, shares, unit
+from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.program import Enclosure, Explanation, Separation
 
@@ -60,19 +61,27 @@ class CurvedConstraint(StateConstraint):
         box, cube = self._flat.index_set, np.ones(self._b)
         return Box(np.concatenate([box.lower, -cube]), np.concatenate([box.upper, cube]))
 
-    def divided(self, units: Array) -> CurvedConstraint:
+    @shaped
+    def divided(self, units: Float[Array, " r"]) -> CurvedConstraint:
         return replace(self, unit=float(units[0]), shared=None)
 
-    def functionals_at(self, indices: Array) -> tuple[Array, Array, Array, Array]:
+    @shaped
+    def functionals_at(
+        self, indices: Float[Array, "k j"]
+    ) -> tuple[Float[Array, " n"], Float[Array, "n d"], Float[Array, "n nu"], Float[Array, " n"]]:
         nu = self.parameters.count
         directions = unit(self.set, indices[:, 1 + nu :]) / self.unit
         return indices[:, 0], directions, self.parameters.clamp(indices[:, 1 : 1 + nu]), self.set.support(directions)
 
-    def violations(self, x: Array, indices: Array, rows: np.ndarray) -> Array:
+    @shaped
+    def violations(
+        self, x: Float[Array, " n"], indices: Float[Array, "k j"], rows: Int[np.ndarray, " k"]
+    ) -> Float[Array, " k"]:
         times, directions, parameters, rhs = self.functionals_at(indices)
         return self.functionals.values(x, times, directions, parameters) - rhs
 
-    def worst(self, x: Array) -> Separation:
+    @shaped
+    def worst(self, x: Float[Array, " n"]) -> Separation:
         """The largest local maxima over a lattice of times, parameters and directions, climbed from until the steps
         vanish."""
         flat, count = self._flat, self._flat.parameters.count
@@ -103,7 +112,8 @@ class CurvedConstraint(StateConstraint):
         return Separation(indices[order], np.zeros(order.size, dtype=int), found[order])
 
     @property
-    def cells(self) -> tuple[Array, Array]:
+    @shaped
+    def cells(self) -> tuple[Float[Array, "k j"], Float[Array, "k j"]]:
         """The cells of times and parameters, times the faces of the cube of directions."""
         lower, upper = self._flat.cells
         low, high = faces(self._b)
@@ -112,7 +122,8 @@ class CurvedConstraint(StateConstraint):
             np.hstack([np.repeat(upper, high.shape[0], axis=0), np.tile(high, (upper.shape[0], 1))]),
         )
 
-    def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
+    @shaped
+    def enclosure(self, x: Float[Array, " n"], lower: Float[Array, "k j"], upper: Float[Array, "k j"]) -> Enclosure:
         """Proven upper bounds of the violation on cells ``(k, 1 + nu + b)``; where nothing is violated, in the length
         of the cube's directions."""
         nu = self.parameters.count
@@ -122,7 +133,8 @@ class CurvedConstraint(StateConstraint):
             rooms = np.maximum(self._rooms(lower[:, 1 + nu :], upper[:, 1 + nu :]), 0.0)
             return replace(found, bounds=np.where(found.bounds > 0.0, found.bounds / rooms, found.bounds))
 
-    def _rooms(self, low: Array, high: Array) -> Array:
+    @shaped
+    def _rooms(self, low: Float[Array, "k b"], high: Float[Array, "k b"]) -> Float[Array, " k"]:
         """Lower bounds ``(k,)`` of ``h(c) - c'm`` for the directions of cells: a point ``p`` of the set far out in the
         middle direction gives at least ``c'(p - m)``."""
         frame = self.set.frame
@@ -131,7 +143,8 @@ class CurvedConstraint(StateConstraint):
         answer: Array = (centre * outwards).sum(axis=1) - (radius * np.abs(outwards)).sum(axis=1)
         return answer
 
-    def explain(self, index: Array, row: int) -> Explanation:
+    @shaped
+    def explain(self, index: Float[Array, " j"], row: int) -> Explanation:
         times, directions, parameters, rhs = self.functionals_at(index[None])
         said = explanation(self.name, self.functionals, directions, rhs, 0, float(times[0]), parameters[0])
         tangent = f" (a tangent of the {self.set.kind})"
@@ -141,22 +154,31 @@ class CurvedConstraint(StateConstraint):
         known = self.functionals.nominal()
         return replace(self, functionals=known, parameters=ParameterIndex(None), shared=None)
 
-    def from_state(self, initial_state: Array) -> CurvedConstraint:
+    @shaped
+    def from_state(self, initial_state: Float[Array, " d"]) -> CurvedConstraint:
         moved = self.functionals.from_state(initial_state)
         return replace(self, functionals=moved, shared=self._sharing or self)
 
-    def directions(self, z: Array, rows: np.ndarray) -> tuple[Array, Array]:
+    @shaped
+    def directions(
+        self, z: Float[Array, "k b"], rows: Int[np.ndarray, " k"]
+    ) -> tuple[Float[Array, "k b d"], Float[Array, "k b"]]:
         frame = self.set.frame / self.unit
         return np.broadcast_to(frame, (rows.size, *frame.shape)), shares(self.set, z)
 
-    def turned(self, z: Array, directions: Array, states: Array) -> Array:
+    @shaped
+    def turned(
+        self, z: Float[Array, "k b"], directions: Float[Array, "k d"], states: Float[Array, "k b"]
+    ) -> Float[Array, "k b"]:
         return across(self.set, z, states - self.set.support_point(directions) @ self.set.frame.T / self.unit)
 
-    def outwardness(self, states: Array) -> Array:
+    @shaped
+    def outwardness(self, states: Float[Array, "d n"]) -> Float[Array, " n"]:
         sizes = self.set.gauge(states.T) - 1.0
         return sizes if np.isfinite(sizes).all() else self.set.violation(states.T)
 
-    def _cell(self, x: Array, low: Array, high: Array) -> CellEnclosure:
+    @shaped
+    def _cell(self, x: Float[Array, " n"], low: Float[Array, " j"], high: Float[Array, " j"]) -> CellEnclosure:
         key = x.tobytes() + low.tobytes() + high.tobytes()
         if key not in self._cells:
             nu = self.parameters.count
@@ -174,7 +196,10 @@ class CurvedConstraint(StateConstraint):
             )
         return self._cells[key]
 
-    def _minorant(self, H: Array, joined: Combination, nu: int) -> tuple[Array, Array]:
+    @shaped
+    def _minorant(
+        self, H: Float[Array, "r d"], joined: Combination, nu: int
+    ) -> tuple[Float[Array, "1 M"], Float[Array, " j"]]:
         """A quadratic polynomial below ``h(c_0 + sum_j eta_j c_j)``, ``(1, M')``, and how far below at the ends of
         every coordinate."""
         value, gradient, hessian = self.set.support_minorant(H[0], H[1:])
@@ -235,7 +260,8 @@ class CurvedConstraint(StateConstraint):
         )
 
 
-def _distinct(indices: Array, found: Array) -> np.ndarray:
+@shaped
+def _distinct(indices: Float[Array, "k j"], found: Float[Array, " k"]) -> Int[np.ndarray, " u"]:
     """Positions of different maxima, highest first."""
     kept: list[int] = []
     for position in np.argsort(-found, kind="stable"):

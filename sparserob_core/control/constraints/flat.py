@@ -21,6 +21,7 @@ from sparserob_core.control.response.lifted import LiftedSystem, lift
 from sparserob_core.control.response.measurable import MeasurableCellSupport
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.response import Response, distinct_times
+from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.program import Enclosure, Explanation, Separation
 
@@ -95,8 +96,9 @@ class Samples:
         flow, driven = transitions(A[:, None], distinct[None])
         return pieces, flow[:, which], driven[:, which]
 
+    @shaped
     def support_over(
-        self, lifted: LiftedSystem, low: Array, high: Array
+        self, lifted: LiftedSystem, low: Float[Array, " nu"], high: Float[Array, " nu"]
     ) -> DisturbanceSupport | MeasurableCellSupport | None:
         """The support of the disturbance over a cell of parameters, remembered."""
         key = low.tobytes() + high.tobytes()
@@ -134,7 +136,8 @@ class FlatConstraint(StateConstraint):
         return Samples(self.functionals, self.H, self.h, (self.start, self.stop), self.parameters)
 
     @property
-    def sides(self) -> tuple[Array, Array]:
+    @shaped
+    def sides(self) -> tuple[Float[Array, "r d"], Float[Array, " r"]]:
         """``H``, ``h``."""
         return self.H, self.h
 
@@ -145,20 +148,28 @@ class FlatConstraint(StateConstraint):
         box = self.parameters.box
         return Box(np.concatenate([[self.start], box.lower]), np.concatenate([[self.stop], box.upper]))
 
-    def divided(self, units: Array) -> FlatConstraint:
+    @shaped
+    def divided(self, units: Float[Array, " r"]) -> FlatConstraint:
         return replace(self, H=self.H / units[:, None], h=self.h / units, shared=None)
 
-    def functionals_at(self, indices: Array) -> tuple[Array, Array, Array, Array]:
+    @shaped
+    def functionals_at(
+        self, indices: Float[Array, "k j"]
+    ) -> tuple[Float[Array, " n"], Float[Array, "n d"], Float[Array, "n nu"], Float[Array, " n"]]:
         parameters = np.repeat(self.parameters.clamp(indices[:, 1:]), self.h.size, axis=0)
         count = indices.shape[0]
         return np.repeat(indices[:, 0], self.h.size), np.tile(self.H, (count, 1)), parameters, np.tile(self.h, count)
 
-    def violations(self, x: Array, indices: Array, rows: np.ndarray) -> Array:
+    @shaped
+    def violations(
+        self, x: Float[Array, " n"], indices: Float[Array, "k j"], rows: Int[np.ndarray, " k"]
+    ) -> Float[Array, " k"]:
         parameters = self.parameters.clamp(indices[:, 1:])
         answer: Array = self.functionals.values(x, indices[:, 0], self.H[rows], parameters) - self.h[rows]
         return answer
 
-    def worst(self, x: Array) -> Separation:
+    @shaped
+    def worst(self, x: Float[Array, " n"]) -> Separation:
         """The largest local maxima of the violation over the index set, times refined between the nodes, parameters
         between lattice points."""
         values = self.on_lattice(x)
@@ -186,7 +197,8 @@ class FlatConstraint(StateConstraint):
         order = np.argsort(-found, kind="stable")
         return Separation(indices[order], rows[order], found[order])
 
-    def explain(self, index: Array, row: int) -> Explanation:
+    @shaped
+    def explain(self, index: Float[Array, " j"], row: int) -> Explanation:
         time, parameter = float(index[0]), self.parameters.clamp(index[None, 1:])[0]
         return explanation(self.name, self.functionals, self.H, self.h, row, time, parameter)
 
@@ -194,18 +206,24 @@ class FlatConstraint(StateConstraint):
         known = self.functionals.nominal()
         return FlatConstraint(self.name, known, self.H, self.h, self.start, self.stop, ParameterIndex(None))
 
-    def from_state(self, initial_state: Array) -> FlatConstraint:
+    @shaped
+    def from_state(self, initial_state: Float[Array, " d"]) -> FlatConstraint:
         moved = self.functionals.from_state(initial_state)
         return FlatConstraint(self.name, moved, self.H, self.h, self.start, self.stop, self.parameters, self.samples)
 
-    def directions(self, z: Array, rows: np.ndarray) -> tuple[Array, Array]:
+    @shaped
+    def directions(
+        self, z: Float[Array, "k b"], rows: Int[np.ndarray, " k"]
+    ) -> tuple[Float[Array, "k e d"], Float[Array, "k e"]]:
         return self.H[rows][:, None], np.ones((rows.size, 1))
 
-    def outwardness(self, states: Array) -> Array:
+    @shaped
+    def outwardness(self, states: Float[Array, "d n"]) -> Float[Array, " n"]:
         return np.asarray((self.H @ states - self.h[:, None]).max(axis=0))
 
     @property
-    def cells(self) -> tuple[Array, Array]:
+    @shaped
+    def cells(self) -> tuple[Float[Array, "k j"], Float[Array, "k j"]]:
         """The window cut at the breakpoints, times the whole box of parameters: ``(lower, upper)``, ``(k, 1 + nu)``
         each."""
         breaks = self.functionals.response.grid.breakpoints
@@ -220,13 +238,15 @@ class FlatConstraint(StateConstraint):
             np.hstack([stops[:, None], np.tile(box.upper[1:], (starts.size, 1))]),
         )
 
-    def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
+    @shaped
+    def enclosure(self, x: Float[Array, " n"], lower: Float[Array, "k j"], upper: Float[Array, "k j"]) -> Enclosure:
         """Proven upper bounds of the violation on cells ``(k, 1 + nu)``, each within one piece; cells of parameters
         share their work."""
         touched = self.parameters.touches(lower[:, 1:], upper[:, 1:])
         return enclose(lower, upper, touched, self.parameters.count, lambda low, high: self._cell(x, low, high))
 
-    def lifted(self, low: Array, high: Array) -> LiftedSystem:
+    @shaped
+    def lifted(self, low: Float[Array, " nu"], high: Float[Array, " nu"]) -> LiftedSystem:
         """The lifted system over a cell of parameters, remembered."""
         key = low.tobytes() + high.tobytes()
         if key not in self._lifted:
@@ -239,7 +259,8 @@ class FlatConstraint(StateConstraint):
             )
         return self._lifted[key]
 
-    def _cell(self, x: Array, low: Array, high: Array) -> CellEnclosure:
+    @shaped
+    def _cell(self, x: Float[Array, " n"], low: Float[Array, " j"], high: Float[Array, " j"]) -> CellEnclosure:
         key = x.tobytes() + low.tobytes() + high.tobytes()
         if key not in self._cells:
             lifted = self.lifted(low, high)
@@ -279,7 +300,8 @@ class FlatConstraint(StateConstraint):
         """`Samples.lattice`."""
         return self.samples.lattice
 
-    def on_lattice(self, x: Array) -> Array:
+    @shaped
+    def on_lattice(self, x: Float[Array, " n"]) -> Float[Array, "v r t"]:
         """Violations ``(v, r, times)`` at every lattice point and sampled time."""
         response, points = self.functionals.response, self.lattice[0]
         control = self.functionals.dictionary.control(x)
@@ -293,7 +315,10 @@ class FlatConstraint(StateConstraint):
         answer: Array = np.einsum("ri,vti->vrt", self.H, states) - self.samples.margins
         return answer
 
-    def _climbed(self, x: Array, indices: Array, rows: np.ndarray) -> tuple[Array, Array]:
+    @shaped
+    def _climbed(
+        self, x: Float[Array, " n"], indices: Float[Array, "k j"], rows: Int[np.ndarray, " k"]
+    ) -> tuple[Float[Array, "k j"], Float[Array, " k"]]:
         """Climb from every candidate ``(t, p)``; the set of parameters is never left."""
         box = self.index_set
         radius = np.concatenate([[np.max(np.diff(self.times), initial=0.0)], (box.upper - box.lower)[1:] / 4])

@@ -8,6 +8,7 @@ import numpy as np
 
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
+from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.program import Enclosure, Explanation, Separation
 
@@ -33,7 +34,7 @@ class StateConstraint(ABC):
 
     @property
     @abstractmethod
-    def sides(self) -> tuple[Array, Array] | None:
+    def sides(self) -> tuple[Float[Array, "r d"], Float[Array, " r"]] | None:
         """``H (r, d)``, ``h (r,)`` of a set with flat sides; ``None`` for a curved set."""
 
     @property
@@ -42,29 +43,33 @@ class StateConstraint(ABC):
         return None
 
     @abstractmethod
-    def functionals_at(self, indices: Array) -> tuple[Array, Array, Array, Array]:
+    def functionals_at(
+        self, indices: Float[Array, "k j"]
+    ) -> tuple[Float[Array, " n"], Float[Array, "n d"], Float[Array, "n nu"], Float[Array, " n"]]:
         """Times ``(k r,)``, directions ``(k r, d)``, parameters ``(k r, nu)`` and right-hand sides ``(k r,)`` of all
         rows of every index ``(k, ...)``, index by index."""
 
     @abstractmethod
-    def violations(self, x: Array, indices: Array, rows: np.ndarray) -> Array:
+    def violations(
+        self, x: Float[Array, " n"], indices: Float[Array, "k j"], rows: Int[np.ndarray, " k"]
+    ) -> Float[Array, " k"]:
         """``row x - rhs`` for one row per index, ``(k,)``, without building rows."""
 
     @abstractmethod
-    def worst(self, x: Array) -> Separation:
+    def worst(self, x: Float[Array, " n"]) -> Separation:
         """The largest local maxima of the violation over the index set."""
 
     @property
     @abstractmethod
-    def cells(self) -> tuple[Array, Array]:
+    def cells(self) -> tuple[Float[Array, "k j"], Float[Array, "k j"]]:
         """The lower and upper corners of cells that fill the index set and on which `enclosure` converges."""
 
     @abstractmethod
-    def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
+    def enclosure(self, x: Float[Array, " n"], lower: Float[Array, "k j"], upper: Float[Array, "k j"]) -> Enclosure:
         """Proven upper bounds of the violation on cells of the index set, each within one piece."""
 
     @abstractmethod
-    def explain(self, index: Array, row: int) -> Explanation:
+    def explain(self, index: Float[Array, " j"], row: int) -> Explanation:
         """One constraint for people: what is bounded, when, and what the uncertainty does to it."""
 
     @abstractmethod
@@ -73,34 +78,41 @@ class StateConstraint(ABC):
         is not admissible)."""
 
     @abstractmethod
-    def from_state(self, initial_state: Array) -> StateConstraint:
+    def from_state(self, initial_state: Float[Array, " d"]) -> StateConstraint:
         """The same constraint from another initial state ``(d,)``; what does not depend on it is shared."""
 
     @abstractmethod
-    def divided(self, units: Array) -> StateConstraint:
+    def divided(self, units: Float[Array, " r"]) -> StateConstraint:
         """The same constraint with its rows divided by ``units (r,)``, one for a curved set."""
 
     @abstractmethod
-    def directions(self, z: Array, rows: np.ndarray) -> tuple[Array, Array]:
+    def directions(
+        self, z: Float[Array, "k b"], rows: Int[np.ndarray, " k"]
+    ) -> tuple[Float[Array, "k e d"], Float[Array, "k e"]]:
         """Directions ``(k, b, d)`` and shares ``(k, b)`` whose combinations are the normals ``(k, d)`` at one row
         ``(k,)`` and direction ``z (k, b)`` each; ``b`` is 1 for a set with flat sides."""
 
-    def turned(self, z: Array, directions: Array, states: Array) -> Array:
+    @shaped
+    def turned(
+        self, z: Float[Array, "k b"], directions: Float[Array, "k d"], states: Float[Array, "k e"]
+    ) -> Float[Array, "k b"]:
         """The derivative ``(k, b)`` of the violation in the direction ``z``, with the normals ``directions (k, d)`` and
         ``states (k, b)``, the states along the directions of `directions`; nothing, ``(k, 0)``, for flat sides."""
         return z
 
     @abstractmethod
-    def outwardness(self, states: Array) -> Array:
+    def outwardness(self, states: Float[Array, "d n"]) -> Float[Array, " n"]:
         """A cheap measure ``(n,)`` of states ``(d, n)``: positive outside the set, not positive inside, growing
         outwards."""
 
-    def excess(self, states: Array) -> Array:
+    @shaped
+    def excess(self, states: Float[Array, "d n"]) -> Float[Array, " n"]:
         """By how much states ``(d, n)`` violate the constraint, ``(n,)``; negative: a margin. With flat sides the
         `outwardness` itself."""
         return self.outwardness(states)
 
-    def rows(self, indices: Array) -> tuple[Array, Array]:
+    @shaped
+    def rows(self, indices: Float[Array, "k j"]) -> tuple[Float[Array, "k r n"], Float[Array, "k r"]]:
         """``G (k, r, n)``, ``rhs (k, r)`` at indices ``(k, ...)``."""
         times, directions, parameters, rhs = self.functionals_at(indices)
         G, offset = self.functionals.rows(times, directions, parameters)

@@ -16,24 +16,28 @@ import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.matrix_exponential import transitions
+from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 
 SAFE = 1.0 + 1e-6  # on every bound: sums of numbers of one sign, whose rounding is far below this
 KEPT = 64
 
 
-def block_norms(values: Array, starts: np.ndarray) -> Array:
+@shaped
+def block_norms(values: Float[Array, "*k d"], starts: Int[np.ndarray, " q"]) -> Float[Array, "*k q"]:
     """Norms ``(..., q)`` of the blocks of vectors ``(..., d)``."""
     return np.asarray(np.sqrt(np.add.reduceat(values * values, starts, axis=-1)))
 
 
-def block_sizes(matrices: Array, starts: np.ndarray) -> Array:
+@shaped
+def block_sizes(matrices: Float[Array, "*k d d"], starts: Int[np.ndarray, " q"]) -> Float[Array, "*k q q"]:
     """Norms ``(..., q, q)`` of the blocks of matrices ``(..., d, d)``, at most too large (Frobenius)."""
     rows = np.add.reduceat(matrices * matrices, starts, axis=-2)
     return np.asarray(np.sqrt(np.add.reduceat(rows, starts, axis=-1)))
 
 
-def comparison_matrix(D: Array, starts: np.ndarray) -> Array:
+@shaped
+def comparison_matrix(D: Float[Array, "d d"], starts: Int[np.ndarray, " q"]) -> Float[Array, "q q"]:
     """``M (q, q)`` of a matrix ``D (d, d)``: logarithmic norms of the diagonal blocks, norms of the others."""
     M = block_sizes(D, starts)
     ends = np.append(starts[1:], D.shape[0])
@@ -77,7 +81,10 @@ class Comparison:
         """``P``: ``M`` without what decays."""
         return np.where(np.eye(self.metzler.shape[0]) > 0, np.maximum(self.metzler, 0.0), self.metzler)
 
-    def slips(self, slack: Array, widths: Array) -> tuple[Array, Array]:
+    @shaped
+    def slips(
+        self, slack: Float[Array, "q q"], widths: Float[Array, " k"]
+    ) -> tuple[Float[Array, "k q q"], Float[Array, "k q q"]]:
         """How much ``e^{(A + S) r}`` and its integral differ from those of ``A`` at ``r = width``, for any ``S`` with
         blocks of norm ``slack (q, q)``: ``(k, q, q)`` each.
 

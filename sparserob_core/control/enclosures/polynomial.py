@@ -6,6 +6,7 @@ import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.taylor import TaylorSpace
+from sparserob_core.shapes import Bool, Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 
 DEFINITE = 1e-12  # relative to the largest, how negative the eigenvalues of a Hessian are made
@@ -14,7 +15,10 @@ ROUNDS = 3  # of the active set method, per variable
 FACES_KEPT = 256  # matrices of faces that a space remembers
 
 
-def polynomial_bound(space: TaylorSpace, coefficients: Array) -> tuple[Array, Array]:
+@shaped
+def polynomial_bound(
+    space: TaylorSpace, coefficients: Float[Array, "*k M"]
+) -> tuple[Float[Array, " *k"], Float[Array, "*k nu"]]:
     """Upper bounds of polynomials ``(..., M)`` on ``[-1, 1]^nu``, and how much each variable adds to their range,
     ``(..., nu)``.
 
@@ -41,7 +45,10 @@ def polynomial_bound(space: TaylorSpace, coefficients: Array) -> tuple[Array, Ar
     return bound.reshape(shape), spread.reshape(*shape, nu)
 
 
-def monotone_ends(space: TaylorSpace, coefficients: Array, steepness: Array) -> Array:
+@shaped
+def monotone_ends(
+    space: TaylorSpace, coefficients: Float[Array, "k M"], steepness: Float[Array, "k nu"]
+) -> Float[Array, "k nu"]:
     """The end, -1 or 1, of every variable in which polynomials ``(k, M)`` are monotone, whatever is added whose partial
     derivatives are at most ``steepness (k, nu)``; 0 for the other variables. ``(k, nu)``."""
     if space.nu == 0 or space.degree == 0:
@@ -51,7 +58,8 @@ def monotone_ends(space: TaylorSpace, coefficients: Array, steepness: Array) -> 
     return np.where(certain, np.sign(gradient), 0.0)
 
 
-def distinct_patterns(ends: Array) -> tuple[Array, np.ndarray]:
+@shaped
+def distinct_patterns(ends: Float[Array, "k r nu"]) -> tuple[Float[Array, "u nu"], Int[np.ndarray, "k r"]]:
     """The distinct rows of ``ends (k, r, nu)``, and which of them stands at every ``(k, r)``."""
     if not ends.shape[2]:
         return np.zeros((1, 0)), np.zeros(ends.shape[:2], dtype=int)
@@ -59,7 +67,8 @@ def distinct_patterns(ends: Array) -> tuple[Array, np.ndarray]:
     return patterns, which.reshape(ends.shape[:2])
 
 
-def face_matrix(space: TaylorSpace, ends: Array) -> Array:
+@shaped
+def face_matrix(space: TaylorSpace, ends: Float[Array, " nu"]) -> Float[Array, "M M"]:
     """The matrix ``(M, M)`` that sets the variables with ``ends (nu,)`` not 0 to them, in coefficient vectors on its
     right; remembered."""
     key = ends.tobytes()
@@ -77,7 +86,10 @@ def _face_matrix(space: TaylorSpace, ends: Array) -> Array:
     return matrix
 
 
-def quadratic_part(space: TaylorSpace, flat: Array) -> tuple[Array, Array]:
+@shaped
+def quadratic_part(
+    space: TaylorSpace, flat: Float[Array, "k M"]
+) -> tuple[Float[Array, "k nu"], Float[Array, "k nu nu"]]:
     """Gradient ``(k, nu)`` and Hessian ``(k, nu, nu)`` at the centre."""
     nu = space.nu
     unit = np.eye(nu, dtype=int)
@@ -91,7 +103,8 @@ def quadratic_part(space: TaylorSpace, flat: Array) -> tuple[Array, Array]:
     return gradient, hessian
 
 
-def _tail(space: TaylorSpace, flat: Array) -> tuple[Array, Array]:
+@shaped
+def _tail(space: TaylorSpace, flat: Float[Array, "k M"]) -> tuple[Float[Array, " k"], Float[Array, "k nu"]]:
     """Bounds of the terms of degree three and more, ``(k,)``, and of their partial derivatives, ``(k, nu)``."""
     high = space.degrees >= 3
     terms = flat[:, high]
@@ -99,7 +112,8 @@ def _tail(space: TaylorSpace, flat: Array) -> tuple[Array, Array]:
     return value, np.abs(terms) @ space.exponents[high]
 
 
-def _separable(gradient: Array, hessian: Array) -> Array:
+@shaped
+def _separable(gradient: Float[Array, "k d"], hessian: Float[Array, "k d d"]) -> Float[Array, " k"]:
     """``sum_i max_s g_i s + h_ii s^2 / 2`` plus the modulus of the mixed terms."""
     square = np.einsum("kii->ki", hessian) / 2
     inside = (square < 0) & (np.abs(gradient) < -2 * square)
@@ -108,7 +122,10 @@ def _separable(gradient: Array, hessian: Array) -> Array:
     return np.asarray(top.sum(axis=1) + mixed)
 
 
-def _concave(gradient: Array, hessian: Array, inner: np.ndarray) -> Array:
+@shaped
+def _concave(
+    gradient: Float[Array, "k d"], hessian: Float[Array, "k d d"], inner: Bool[np.ndarray, "k d"]
+) -> Float[Array, " k"]:
     """An upper bound of ``g's + s'H s / 2`` over the box in the inner variables, exact where ``H`` is negative definite
     in them.
 
@@ -137,7 +154,13 @@ def _solved(matrices: Array, right: Array) -> Array:
         return np.asarray(np.einsum("kij,kj->ki", np.linalg.pinv(matrices), right), dtype=float)
 
 
-def _highest(gradient: Array, hessian: Array, inner: np.ndarray, size: Array) -> Array:
+@shaped
+def _highest(
+    gradient: Float[Array, "k d"],
+    hessian: Float[Array, "k d d"],
+    inner: Bool[np.ndarray, "k d"],
+    size: Float[Array, " k"],
+) -> Float[Array, " k"]:
     """The maximum on the box of concave functions ``g's + s'H s / 2`` of the inner variables, from above, ``(k,)``: the
     least maximum of the tangents at the points of an active set method, in which one variable at a time is held at a
     side or released from it.

@@ -25,6 +25,7 @@ from sparserob_core.control.enclosures.elementary import (
 )
 from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.errors import InputError, NotEnclosable
+from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array
 
 _NUMBERS = (float, int, np.floating, np.integer)
@@ -82,7 +83,8 @@ class TaylorSpace:
         coefficients[0] = value
         return TaylorModel(self, coefficients, 0.0)
 
-    def variables(self, centre: Array, radius: Array) -> list[TaylorModel]:
+    @shaped
+    def variables(self, centre: Float[Array, " nu"], radius: Float[Array, " nu"]) -> list[TaylorModel]:
         """Models of ``p_i = centre_i + radius_i delta_i``, for ``centre, radius (nu,)``."""
         models = []
         for i in range(self.nu):
@@ -94,7 +96,8 @@ class TaylorSpace:
             models.append(model)
         return models
 
-    def monomials(self, delta: Array) -> Array:
+    @shaped
+    def monomials(self, delta: Float[Array, "k nu"]) -> Float[Array, "k M"]:
         """Values ``(k, M)`` of every monomial at ``delta (k, nu)``."""
         values: Array = np.prod(np.asarray(delta)[:, None, :] ** self.exponents[None], axis=-1)
         return values
@@ -118,7 +121,8 @@ class TaylorModel:
         low, high = self.bounds()
         return f"TaylorModel({low:.6g} .. {high:.6g})"
 
-    def evaluate(self, delta: Array) -> Array:
+    @shaped
+    def evaluate(self, delta: Float[Array, "k nu"]) -> Float[Array, " k"]:
         """Values ``(k,)`` of the polynomial at ``delta (k, nu)``; the truth is within ``remainder`` of them."""
         return self.space.monomials(delta) @ self.coefficients
 

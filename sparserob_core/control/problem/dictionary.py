@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from sparserob_core.errors import InputError
+from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array
 
 
@@ -74,7 +75,8 @@ class Dictionary:
         """Whether function ``k`` is the indicator of piece ``k``."""
         return self.functions == self.pieces and np.array_equal(self.values, np.eye(self.pieces))
 
-    def control(self, theta: Array) -> Array:
+    @shaped
+    def control(self, theta: Float[Array, " n"]) -> Float[Array, "m K"]:
         """The control ``(m, K)`` on the pieces, from coefficients ``(m N,)``, raveled channel by channel."""
         coefficients = theta.reshape(-1, self.functions)
         return coefficients if self.is_indicators else coefficients @ self.values

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from sparserob_core.control.enclosures.taylor import TaylorModel, TaylorSpace
 from sparserob_core.control.problem.expression import ExpressionMatrix
 from sparserob_core.errors import InputError, NotEnclosable
+from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 Matrix: TypeAlias = npt.ArrayLike | Callable[..., object] | ExpressionMatrix
@@ -69,7 +70,10 @@ class LinearSystem:
         """Number ``nu`` of parameters, 0 for a known system."""
         return 0 if self.parameters is None else self.parameters.dimension
 
-    def matrices(self, parameters: Array) -> tuple[Array, Array, Array]:
+    @shaped
+    def matrices(
+        self, parameters: Float[Array, "k nu"]
+    ) -> tuple[Float[Array, "k d d"], Float[Array, "k d m"], Float[Array, "k d mw"]]:
         """``A (k, d, d)``, ``B (k, d, m)``, ``E (k, d, mw)`` at parameters ``(k, nu)``; raises `InputError` where they
         are not finite."""
         points = np.asarray(parameters, dtype=float)
@@ -80,9 +84,17 @@ class LinearSystem:
         A, B, E = (self._values(name, points) for name in ("A", "B", "E"))
         return A, B, E
 
+    @shaped
     def taylor(
-        self, space: TaylorSpace, centre: Array, radius: Array
-    ) -> tuple[Array, Array, Array, Array, Array, Array]:
+        self, space: TaylorSpace, centre: Float[Array, " nu"], radius: Float[Array, " nu"]
+    ) -> tuple[
+        Float[Array, "M d d"],
+        Float[Array, "d d"],
+        Float[Array, "M d m"],
+        Float[Array, "d m"],
+        Float[Array, "M d mw"],
+        Float[Array, "d mw"],
+    ]:
         """Taylor models of all entries over the cell ``centre +- radius``, both ``(nu,)``.
 
         Returns ``A_coefficients (M, d, d), A_remainder (d, d)`` and the same for ``B`` and ``E``.
@@ -93,7 +105,10 @@ class LinearSystem:
         A, B, E = (self._enclosed(name, space, p) for name in ("A", "B", "E"))
         return *A, *B, *E
 
-    def in_units(self, A: Array, B: Array, E: Array, parameters: Array) -> LinearSystem:
+    @shaped
+    def in_units(
+        self, A: Float[Array, "d d"], B: Float[Array, "d m"], E: Float[Array, "d mw"], parameters: Float[Array, " nu"]
+    ) -> LinearSystem:
         """The system whose matrices are ``A``, ``B``, ``E`` times these factors, entry by entry, and whose parameter is
         this one's divided by ``parameters (nu,)``; exact for powers of two."""
         if self.parameters is None:
@@ -110,7 +125,8 @@ class LinearSystem:
             units=parameters,
         )
 
-    def describe(self, parameter: Array) -> str:
+    @shaped
+    def describe(self, parameter: Float[Array, " nu"]) -> str:
         """A parameter vector in words, such as ``p1 = 0.1, p2 = -0.1``."""
         return ", ".join(f"{name} = {value:.6g}" for name, value in zip(self.names, parameter, strict=True))
 
@@ -206,7 +222,8 @@ class LinearSystem:
                 f"the function {name} failed at {self.describe(parameter)}: {error}", path="system"
             ) from error
 
-    def _values(self, name: str, points: Array) -> Array:
+    @shaped
+    def _values(self, name: str, points: Float[Array, "k nu"]) -> Float[Array, "k rows columns"]:
         entry, shape = self._entry(name), self._shape(name)
         if isinstance(entry, np.ndarray):
             return np.broadcast_to(entry, (len(points), *shape))
@@ -269,22 +286,35 @@ class SystemInUnits(LinearSystem):
     def __post_init__(self) -> None:
         pass  # the base was checked
 
-    def describe(self, parameter: Array) -> str:
+    @shaped
+    def describe(self, parameter: Float[Array, " nu"]) -> str:
         return self.base.describe(parameter * self.units)
 
-    def in_units(self, A: Array, B: Array, E: Array, parameters: Array) -> LinearSystem:
+    @shaped
+    def in_units(
+        self, A: Float[Array, "d d"], B: Float[Array, "d m"], E: Float[Array, "d mw"], parameters: Float[Array, " nu"]
+    ) -> LinearSystem:
         mine = self.factors
         return self.base.in_units(A * mine["A"], B * mine["B"], E * mine["E"], parameters * self.units)
 
     def _shape(self, name: str) -> tuple[int, int]:
         return self.base._shape(name)
 
-    def _values(self, name: str, points: Array) -> Array:
+    @shaped
+    def _values(self, name: str, points: Float[Array, "k nu"]) -> Float[Array, "k rows columns"]:
         return self.base._values(name, points * self.units) * self.factors[name]
 
+    @shaped
     def taylor(
-        self, space: TaylorSpace, centre: Array, radius: Array
-    ) -> tuple[Array, Array, Array, Array, Array, Array]:
+        self, space: TaylorSpace, centre: Float[Array, " nu"], radius: Float[Array, " nu"]
+    ) -> tuple[
+        Float[Array, "M d d"],
+        Float[Array, "d d"],
+        Float[Array, "M d m"],
+        Float[Array, "d m"],
+        Float[Array, "M d mw"],
+        Float[Array, "d mw"],
+    ]:
         found = self.base.taylor(space, centre * self.units, radius * self.units)
         every = [part * self.factors[name] for name, part in zip("AABBEE", found, strict=True)]
         return every[0], every[1], every[2], every[3], every[4], every[5]

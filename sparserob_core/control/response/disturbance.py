@@ -17,6 +17,7 @@ from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.response.response import TimeGrid
 from sparserob_core.control.sets.sets import NormBall, Polytope
 from sparserob_core.errors import InputError
+from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 
@@ -55,7 +56,8 @@ class DisturbanceModel:
         """Whether the blocks are the pieces of the grid, one each."""
         return self.starts is not None and self.starts.size == self.grid.pieces
 
-    def blocks(self, weights: Array) -> Array:
+    @shaped
+    def blocks(self, weights: Float[Array, "*k L mw"]) -> Float[Array, "*k nb q"]:
         """The functional on every block, ``(..., nb, q)``, from weights ``(..., L, mw)``; linear, so it also serves
         Taylor coefficients."""
         if self.starts is not None:
@@ -69,12 +71,14 @@ class DisturbanceModel:
         )
         return blocks
 
-    def support(self, weights: Array) -> Array:
+    @shaped
+    def support(self, weights: Float[Array, "*k L mw"]) -> Float[Array, " *k"]:
         """``sigma (...,)``, the largest value of the functional over the admissible disturbances."""
         answer: Array = self.set.support(self.blocks(weights)).sum(axis=-1)
         return answer
 
-    def worst(self, weights: Array) -> Array:
+    @shaped
+    def worst(self, weights: Float[Array, "*k L mw"]) -> Float[Array, "*k mw L"]:
         """A disturbance ``(..., mw, L)`` on the grid's pieces that attains `support`."""
         return self.signals(self.set.support_point(self.blocks(weights)))
 
@@ -85,7 +89,8 @@ class DisturbanceModel:
             return int(self.starts.size)
         return self.channels if self.scale is not None else 1
 
-    def signals(self, points: Array) -> Array:
+    @shaped
+    def signals(self, points: Float[Array, "*k nb q"]) -> Float[Array, "*k mw L"]:
         """Disturbances ``(..., mw, L)`` on the grid's pieces from one point of the set per block, ``(..., nb, q)``."""
         if self.starts is not None:
             which = np.searchsorted(self.starts, np.arange(self.grid.pieces), side="right") - 1

@@ -18,6 +18,7 @@ from sparserob_core.control.response.lifted import LiftedSystem, frozen
 from sparserob_core.control.response.measurable import MeasurableCellSupport, MeasurableSupport
 from sparserob_core.control.response.response import Response
 from sparserob_core.errors import NotEnclosable
+from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, Box
 
 # said where it is met, and before anything is solved
@@ -38,7 +39,8 @@ class WorstCase:
     disturbance: DisturbanceModel | None
     shared: MeasurableSupport | None = field(default=None, repr=False)
 
-    def from_state(self, initial_state: Array) -> WorstCase:
+    @shaped
+    def from_state(self, initial_state: Float[Array, " d"]) -> WorstCase:
         """The functionals from another initial state ``(d,)``; what does not depend on it is shared."""
         measurable = self.disturbance is not None and self.disturbance.kind == "measurable"
         support = self.measurable if measurable else None
@@ -65,7 +67,10 @@ class WorstCase:
             model = fixed if point.any() else None
         return WorstCase(Response(known, self.response.grid, self.response.initial_state), self.dictionary, model)
 
-    def rows(self, times: Array, directions: Array, parameters: Array) -> tuple[Array, Array]:
+    @shaped
+    def rows(
+        self, times: Float[Array, " k"], directions: Float[Array, "k d"], parameters: Float[Array, "k nu"]
+    ) -> tuple[Float[Array, "k n"], Float[Array, " k"]]:
         """``G (k, n)`` and ``offset (k,)`` with ``max_w c'x(t) = G theta + offset``."""
         return self._rows(
             times,
@@ -74,9 +79,14 @@ class WorstCase:
             lambda part, gains, W: self._support(gains, W, times[part], directions[part], parameters[part]),
         )
 
+    @shaped
     def rows_under(
-        self, times: Array, directions: Array, parameters: Array, disturbances: Array | None
-    ) -> tuple[Array, Array]:
+        self,
+        times: Float[Array, " k"],
+        directions: Float[Array, "k d"],
+        parameters: Float[Array, "k nu"],
+        disturbances: Float[Array, "k mw L"] | None,
+    ) -> tuple[Float[Array, "k n"], Float[Array, " k"]]:
         """``G (k, n)`` and ``offset (k,)`` with ``c'x(t) = G theta + offset`` under given disturbances ``(k, mw, L)``
         on the grid's pieces."""
         return self._rows(
@@ -88,9 +98,14 @@ class WorstCase:
             ),
         )
 
+    @shaped
     def _rows(
-        self, times: Array, directions: Array, parameters: Array, pushed: Callable[[slice, Array, Array], Array | float]
-    ) -> tuple[Array, Array]:
+        self,
+        times: Float[Array, " k"],
+        directions: Float[Array, "k d"],
+        parameters: Float[Array, "k nu"],
+        pushed: Callable[[slice, Array, Array], Array | float],
+    ) -> tuple[Float[Array, "k n"], Float[Array, " k"]]:
         """Rows and offsets; ``pushed(part, gains, W)`` is what the disturbance adds to the offsets of a part of the
         indices."""
         G, offset = np.empty((times.size, self.variables)), np.empty(times.size)
@@ -100,13 +115,23 @@ class WorstCase:
             offset[part] = free @ self.response.initial_state + pushed(part, gains, W)
         return G, offset
 
-    def worst_blocks(self, times: Array, directions: Array, parameters: Array) -> Array:
+    @shaped
+    def worst_blocks(
+        self, times: Float[Array, " k"], directions: Float[Array, "k d"], parameters: Float[Array, "k nu"]
+    ) -> Float[Array, "k nb q"]:
         """The coefficients ``(k, nb, q)`` of a worst disturbance at every index."""
         assert self.disturbance is not None
         _, gains, _, W = self.response.adjoint(times, directions, parameters)
         return self.disturbance.set.support_point(self.disturbance.blocks(gains @ W))
 
-    def values(self, theta: Array, times: Array, directions: Array, parameters: Array) -> Array:
+    @shaped
+    def values(
+        self,
+        theta: Float[Array, " n"],
+        times: Float[Array, " k"],
+        directions: Float[Array, "k d"],
+        parameters: Float[Array, "k nu"],
+    ) -> Float[Array, " k"]:
         """``max_w c'x(t)`` at a decision, ``(k,)``, without building the rows."""
         control = self.on_grid(theta)
         result = np.empty(times.size)
@@ -117,7 +142,10 @@ class WorstCase:
             result[part] = free @ self.response.initial_state + driven + support
         return result
 
-    def profile(self, times: Array, directions: Array, parameter: Array) -> Array:
+    @shaped
+    def profile(
+        self, times: Float[Array, " k"], directions: Float[Array, "r d"], parameter: Float[Array, " nu"]
+    ) -> Float[Array, "k r"]:
         """``sigma (k, r)`` at one parameter, for all ``times (k,)`` and ``directions (r, d)``; by the age of the pieces
         where the grid allows."""
         model = self.disturbance
@@ -130,8 +158,9 @@ class WorstCase:
             0
         ][:, :, 0]
 
+    @shaped
     def disturbance_support(
-        self, lifted: LiftedSystem, H: Array, joined: Combination | None = None
+        self, lifted: LiftedSystem, H: Float[Array, "r d"], joined: Combination | None = None
     ) -> DisturbanceSupport | MeasurableCellSupport | None:
         """The support function of the disturbance on functionals ``H (r, d)`` over a cell; raises `NotEnclosable` where
         no bound of it is proven."""
@@ -144,7 +173,10 @@ class WorstCase:
             raise NotEnclosable(f"{WITHOUT_PROOF}; with disturbance_class piecewise_constant there is one")
         return MeasurableCellSupport(self.measurable, H, lifted)
 
-    def offsets(self, times: Array, directions: Array, parameters: Array) -> Array:
+    @shaped
+    def offsets(
+        self, times: Float[Array, " k"], directions: Float[Array, "k d"], parameters: Float[Array, "k nu"]
+    ) -> Float[Array, " k"]:
         """``sigma (k,)``: how far the worst disturbance alone pushes ``c'x(t)``."""
         if self.disturbance is None:
             return np.zeros(times.size)
@@ -154,7 +186,10 @@ class WorstCase:
             result[part] = self._support(gains, W, times[part], directions[part], parameters[part])
         return result
 
-    def worst_disturbance(self, time: float, direction: Array, parameter: Array) -> Array | None:
+    @shaped
+    def worst_disturbance(
+        self, time: float, direction: Float[Array, " d"], parameter: Float[Array, " nu"]
+    ) -> Float[Array, "mw L"] | None:
         """A disturbance ``(mw, L)`` on the pieces of the merged grid that attains the worst case at one index."""
         if self.disturbance is None:
             return None
@@ -171,17 +206,27 @@ class WorstCase:
             return given
         return MeasurableSupport(self.response, self.disturbance.bound)
 
-    def on_decision(self, weights: Array) -> Array:
+    @shaped
+    def on_decision(self, weights: Float[Array, "k L m"]) -> Float[Array, "k n"]:
         """Weights ``(k, L, m)`` on the control of every grid piece, as rows ``(k, n)`` of the decision."""
         on_pieces = np.add.reduceat(weights, self._control_starts(), axis=1)
         coefficients = on_pieces if self.dictionary.is_indicators else self.dictionary.values @ on_pieces
         return coefficients.swapaxes(1, 2).reshape(-1, self.variables)
 
-    def on_grid(self, theta: Array) -> Array:
+    @shaped
+    def on_grid(self, theta: Float[Array, " n"]) -> Float[Array, "m L"]:
         """The control ``(m, L)`` on the pieces of the merged grid."""
         return self.dictionary.control(theta)[:, self.response.grid.control_piece]
 
-    def _support(self, gains: Array, W: Array, times: Array, directions: Array, parameters: Array) -> Array:
+    @shaped
+    def _support(
+        self,
+        gains: Float[Array, "k L d"],
+        W: Float[Array, "k d mw"],
+        times: Float[Array, " k"],
+        directions: Float[Array, "k d"],
+        parameters: Float[Array, "k nu"],
+    ) -> Float[Array, " k"]:
         if self.disturbance is None:
             return np.zeros(times.size)
         if self.disturbance.kind == "measurable":

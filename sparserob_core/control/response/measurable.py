@@ -14,6 +14,7 @@ from sparserob_core.control.enclosures.comparison import block_norms, product
 from sparserob_core.control.enclosures.matrix_exponential import exponential
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.response import Response
+from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 LEGENDRE = np.polynomial.legendre.Legendre.basis(5)
@@ -36,7 +37,10 @@ class MeasurableSupport:
     bound: ConvexSet
     _tables: dict[bytes, tuple[Array, Array]] = field(default_factory=dict, repr=False)
 
-    def __call__(self, times: Array, directions: Array, parameters: Array) -> Array:
+    @shaped
+    def __call__(
+        self, times: Float[Array, " k"], directions: Float[Array, "k d"], parameters: Float[Array, "k nu"]
+    ) -> Float[Array, " k"]:
         """``sigma (k,)`` at ``times (k,)``, ``directions (k, d)``, ``parameters (k, nu)``."""
         unique, which = np.unique(parameters, axis=0, return_inverse=True)
         result = np.empty(times.size)
@@ -45,7 +49,10 @@ class MeasurableSupport:
             result[here] = self._at(times[here], directions[here], parameter)
         return result
 
-    def _at(self, times: Array, directions: Array, parameter: Array) -> Array:
+    @shaped
+    def _at(
+        self, times: Float[Array, " k"], directions: Float[Array, "k d"], parameter: Float[Array, " nu"]
+    ) -> Float[Array, " k"]:
         unique, which = np.unique(directions, axis=0, return_inverse=True)
         which = which.reshape(-1)
         A, _, E = self.response.system.matrices(parameter[None])
@@ -57,7 +64,14 @@ class MeasurableSupport:
         before = np.array([tables[one][1][piece] for one, piece in zip(which, pieces, strict=True)])
         return np.asarray(before + self._integrals(A[0], E[0], starts, within, which))
 
-    def _known(self, A: Array, E: Array, directions: Array, parameter: Array) -> list[tuple[Array, Array]]:
+    @shaped
+    def _known(
+        self,
+        A: Float[Array, "d d"],
+        E: Float[Array, "d mw"],
+        directions: Float[Array, "k d"],
+        parameter: Float[Array, " nu"],
+    ) -> list[tuple[Array, Array]]:
         """For each of ``directions (k, d)``: rows ``c'e^{A s}`` at the breakpoints ``(L+1, d)``, and the integral up to
         them, ``(L+1,)``."""
         keys = [direction.tobytes() + parameter.tobytes() for direction in directions]
@@ -75,7 +89,15 @@ class MeasurableSupport:
                 remember(self._tables, keys[place], found[keys[place]], TABLES_KEPT)
         return [found[key] for key in keys]
 
-    def _integrals(self, A: Array, E: Array, starts: Array, lengths: Array, member: np.ndarray) -> Array:
+    @shaped
+    def _integrals(
+        self,
+        A: Float[Array, "d d"],
+        E: Float[Array, "d mw"],
+        starts: Float[Array, "l d"],
+        lengths: Float[Array, " l"],
+        member: Int[np.ndarray, " l"],
+    ) -> Float[Array, " l"]:
         """``int_0^length h(E' y(s)) ds`` from rows ``y(0) = starts (l, d)``: Gauss-Lobatto, halving what has not
         converged (kinks). ``member (l,)``: of which functional each is part, whose largest integrand sets the
         accuracy."""
@@ -105,13 +127,17 @@ class MeasurableSupport:
         np.add.at(total, owner, whole)
         return total
 
-    def _quadrature(self, A: Array, W: Array, starts: Array, lengths: Array) -> tuple[Array, Array]:
+    @shaped
+    def _quadrature(
+        self, A: Float[Array, "d d"], W: Float[Array, "d mw"], starts: Float[Array, "l d"], lengths: Float[Array, " l"]
+    ) -> tuple[Float[Array, " l"], Float[Array, " l"]]:
         lines = np.einsum("lqij,jw->lqiw", _flows(A, lengths[:, None] * (NODES + 1) / 2), W)
         values = self.bound.support(np.einsum("li,lqiw->lqw", starts, lines))
         return (values * WEIGHTS).sum(axis=1) * lengths / 2, np.abs(values).max(axis=1, initial=0.0)
 
 
-def _flows(A: Array, durations: Array) -> Array:
+@shaped
+def _flows(A: Float[Array, "d d"], durations: Float[Array, " *k"]) -> Float[Array, "*k d d"]:
     """``e^{A r} (..., d, d)``; of equal durations once, since directions share their times."""
     distinct, which = np.unique(durations, return_inverse=True)
     return np.asarray(exponential(A * distinct[:, None, None])[which.reshape(durations.shape)])
@@ -130,17 +156,22 @@ class MeasurableCellSupport:
     rows: Array
     lifted: LiftedSystem
 
-    def steepness(self, times: Array) -> Array:
+    @shaped
+    def steepness(self, times: Float[Array, " k"]) -> Float[Array, "k r 0"]:
         """No parameters, no steepness: ``(k, r, 0)``."""
         return np.zeros((times.size, self.rows.shape[0], 0))
 
-    def at(self, times: Array, ends: Array) -> tuple[Array, Array]:
+    @shaped
+    def at(
+        self, times: Float[Array, " k"], ends: Float[Array, "k r 0"]
+    ) -> tuple[Float[Array, "k r 1"], Float[Array, "k r"]]:
         """The support function ``(k, r, 1)`` and an excess of zero ``(k, r)``; ``ends (k, r, 0)``."""
         k, r = times.size, self.rows.shape[0]
         sigma = self.support(np.repeat(times, r), np.tile(self.rows, (k, 1)), np.zeros((k * r, 0)))
         return sigma.reshape(k, r, 1), np.zeros((k, r))
 
-    def deviation(self, start: Array, widths: Array) -> Array:
+    @shaped
+    def deviation(self, start: Float[Array, " k"], widths: Float[Array, " k"]) -> Float[Array, "k r"]:
         """Bounds ``(k, r)`` of how far ``sigma`` is from its chord on ``[start, start + width]``: by the slope of
         ``h(E' e^{A' s} c)``, or by twice its integral, mode by mode."""
         bound, lifted, comparison = self.support.bound, self.lifted, self.lifted.comparison

@@ -16,6 +16,7 @@ import numpy as np
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.matrix_exponential import Transitions, transitions
 from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 
 FEW = 64  # indices for which a table beats the loop over the pieces
@@ -44,19 +45,22 @@ class TimeGrid:
     def lengths(self) -> Array:
         return np.diff(self.breakpoints)
 
-    def distinct(self, durations: Array) -> tuple[Array, np.ndarray]:
+    @shaped
+    def distinct(self, durations: Float[Array, " k"]) -> tuple[Float[Array, " u"], Int[np.ndarray, " k"]]:
         """The distinct durations ``(u,)`` among ``(k,)``, those that differ by rounding as one, and which of them each
         is."""
         horizon = self.breakpoints[-1]
         shares, which = np.unique(np.round(durations / horizon, 15), return_inverse=True)
         return shares * horizon, which.reshape(-1)
 
-    def locate(self, times: Array) -> np.ndarray:
+    @shaped
+    def locate(self, times: Float[Array, " k"]) -> Int[np.ndarray, " k"]:
         """Index of the piece that each time ``(k,)`` lies in; a breakpoint belongs to the piece that it ends."""
         return np.clip(np.searchsorted(self.breakpoints, times, side="left") - 1, 0, self.pieces - 1)
 
 
-def distinct_times(times: Array, horizon: float) -> Array:
+@shaped
+def distinct_times(times: Float[Array, " k"], horizon: float) -> Float[Array, " u"]:
     """The times in increasing order, those closer than rounding as one; the first and the last are kept as they are."""
     points = np.unique(times)
     kept = points[np.concatenate([[True], np.diff(points) > SAME_TIME * horizon])]
@@ -65,7 +69,8 @@ def distinct_times(times: Array, horizon: float) -> Array:
     return answer
 
 
-def merge_grids(control: Array, disturbance: Array) -> TimeGrid:
+@shaped
+def merge_grids(control: Float[Array, " K"], disturbance: Float[Array, " M"]) -> TimeGrid:
     """The merged grid of two sets of breakpoints over the same horizon.
 
     A breakpoint of the disturbance that is one of the control's but for rounding is taken for it. Two breakpoints of
@@ -119,7 +124,8 @@ class Propagator:
         means: Array = np.bincount(self._which, self.grid.lengths) / np.bincount(self._which)
         return means
 
-    def steps(self, parameters: Array) -> Steps:
+    @shaped
+    def steps(self, parameters: Float[Array, "v nu"]) -> Steps:
         """Matrices and whole-piece transitions at parameters ``(v, nu)``; remembered for the last few calls."""
         # no parameters: any number of rows has the same bytes
         key = bytes(str(parameters.shape), "ascii") + parameters.tobytes()
@@ -129,7 +135,10 @@ class Propagator:
             remember(self._steps, key, Steps(A, B, E, Phi, Gamma), STEPS_KEPT)
         return self._steps[key]
 
-    def adjoint(self, times: Array, directions: Array, parameters: Array) -> tuple[Array, Array, Array, Array]:
+    @shaped
+    def adjoint(
+        self, times: Float[Array, " k"], directions: Float[Array, "k d"], parameters: Float[Array, "k nu"]
+    ) -> tuple[Float[Array, "k d"], Float[Array, "k L d"], Float[Array, "k d m"], Float[Array, "k d mw"]]:
         """The functional ``c'x(t)`` of each index, as weights on the initial state and on what drives every piece.
 
         ``times (k,)``, ``directions (k, d)``, ``parameters (k, nu)`` give ``free (k, d) = e^{A't} c``,
@@ -249,15 +258,20 @@ class Response:
             return given
         return Propagator(self.system, self.grid, self.propagate)
 
-    def from_state(self, initial_state: Array) -> Response:
+    @shaped
+    def from_state(self, initial_state: Float[Array, " d"]) -> Response:
         """The responses of the same system from another initial state ``(d,)``."""
         return Response(self.system, self.grid, initial_state, self.propagate, self.propagator)
 
-    def steps(self, parameters: Array) -> Steps:
+    @shaped
+    def steps(self, parameters: Float[Array, "v nu"]) -> Steps:
         """`Propagator.steps`."""
         return self.propagator.steps(parameters)
 
-    def adjoint(self, times: Array, directions: Array, parameters: Array) -> tuple[Array, Array, Array, Array]:
+    @shaped
+    def adjoint(
+        self, times: Float[Array, " k"], directions: Float[Array, "k d"], parameters: Float[Array, "k nu"]
+    ) -> tuple[Float[Array, "k d"], Float[Array, "k L d"], Float[Array, "k d m"], Float[Array, "k d mw"]]:
         """`Propagator.adjoint`."""
         return self.propagator.adjoint(times, directions, parameters)
 
@@ -284,7 +298,13 @@ class Response:
         """`Propagator.length_of`."""
         return self.propagator.length_of(piece)
 
-    def states(self, control: Array, parameters: Array, disturbance: Array | None = None) -> Array:
+    @shaped
+    def states(
+        self,
+        control: Float[Array, "m K"],
+        parameters: Float[Array, "v nu"],
+        disturbance: Float[Array, "vw mw M"] | None = None,
+    ) -> Float[Array, "vx points d"]:
         """States ``(v, L+1, d)`` at the breakpoints of the grid.
 
         ``control (m, K)`` on the control's pieces, ``parameters (v, nu)`` (one row serves all disturbances),
@@ -312,7 +332,8 @@ class Response:
         return path
 
 
-def _unique_rows(parameters: Array) -> tuple[Array, np.ndarray]:
+@shaped
+def _unique_rows(parameters: Float[Array, "k nu"]) -> tuple[Float[Array, "u nu"], Int[np.ndarray, " k"]]:
     if parameters.shape[1] == 0 or parameters.shape[0] == 1:
         return parameters[:1], np.zeros(parameters.shape[0], dtype=int)
     unique, which = np.unique(parameters, axis=0, return_inverse=True)

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.errors import InputError
+from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet, as_bound, bisect, few_digits, ratios, vertex_excess
 
 _SIGN_DIMENSIONS = 10
@@ -54,30 +55,38 @@ class Ellipsoid(ConvexSet):
         """``L^-1``, but for its last digits: the support function about the centre is the 2-norm of ``z``."""
         return few_digits(np.asarray(np.linalg.solve(self.factor, np.eye(self.dimension)), dtype=float))
 
-    def in_units(self, units: Array) -> Ellipsoid:
+    @shaped
+    def in_units(self, units: Float[Array, " d"]) -> Ellipsoid:
         return Ellipsoid(self.centre / units, self.shape / np.outer(units, units))
 
-    def support(self, directions: Array) -> Array:
+    @shaped
+    def support(self, directions: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         directions = np.asarray(directions, dtype=float)
         height: Array = directions @ self.centre + np.linalg.norm(directions @ self.factor, axis=-1)
         return height
 
-    def support_point(self, directions: Array) -> Array:
+    @shaped
+    def support_point(self, directions: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
         images = np.asarray(directions, dtype=float) @ self.factor
         norms = np.linalg.norm(images, axis=-1, keepdims=True)
         point: Array = self.centre + images / np.where(norms > 0.0, norms, 1.0) @ self.factor.T
         return point
 
-    def linearisation_excess(self, centre: Array, spread: Array) -> Array:
+    @shaped
+    def linearisation_excess(self, centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]) -> Float[Array, " *k"]:
         return _round_excess(
             np.asarray(centre, dtype=float) @ self.factor, np.asarray(spread, dtype=float) @ self.factor
         )
 
-    def support_minorant(self, centre: Array, spread: Array) -> tuple[float, Array, Array]:
+    @shaped
+    def support_minorant(
+        self, centre: Float[Array, " d"], spread: Float[Array, "J d"]
+    ) -> tuple[float, Float[Array, " J"], Float[Array, "J J"]]:
         value, gradient, _ = super().support_minorant(centre, spread)
         return value, gradient, norm_curvature(centre @ self.factor, spread @ self.factor)
 
-    def violation(self, points: Array) -> Array:
+    @shaped
+    def violation(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         """Distance to the ellipsoid outside; inside, ``(gauge - 1) * shortest half-axis``, which is at least minus the
         depth."""
         squares, axes = np.linalg.eigh(self.shape)
@@ -93,31 +102,38 @@ class Ellipsoid(ConvexSet):
         excess: Array = np.where(gauge > 1.0, distance, (gauge - 1.0) * np.sqrt(squares[0]))
         return excess
 
-    def gauge(self, points: Array) -> Array:
+    @shaped
+    def gauge(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         return np.asarray(np.linalg.norm(self._solved(self.factor, points), axis=-1))
 
-    def normal(self, points: Array) -> Array:
+    @shaped
+    def normal(self, points: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
         return self._solved(self.shape, points)
 
-    def _solved(self, matrix: Array, points: Array) -> Array:
+    @shaped
+    def _solved(self, matrix: Float[Array, "d d"], points: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
         rays = np.asarray(points, dtype=float) - self.centre
         return np.asarray(np.linalg.solve(matrix, rays.reshape(-1, self.dimension).T).T.reshape(rays.shape))
 
-    def unit_ball_image(self) -> tuple[Array, Array]:
+    @shaped
+    def unit_ball_image(self) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:
         return self.centre, self.factor
 
     def scaled(self, factor: float) -> Ellipsoid:
         """Raises `InputError` for the factor 0: an ellipsoid has an interior."""
         return Ellipsoid(self.centre, factor**2 * self.shape)
 
-    def middle(self) -> Array:
+    @shaped
+    def middle(self) -> Float[Array, " d"]:
         return self.centre.copy()
 
-    def sample(self, count: int, rng: np.random.Generator) -> Array:
+    @shaped
+    def sample(self, count: int, rng: np.random.Generator) -> Float[Array, "{count} d"]:
         """Uniform."""
         return np.asarray(self.centre + _in_ball(2.0, self.dimension, count, rng) @ self.factor.T)
 
-    def interior_point(self) -> Array:
+    @shaped
+    def interior_point(self) -> Float[Array, " d"]:
         return self.centre.copy()
 
 
@@ -159,12 +175,14 @@ class NormBall(ConvexSet):
         """The exponent ``q`` of the dual norm."""
         return np.inf if self.p == 1.0 else 1.0 if self.p == np.inf else self.p / (self.p - 1.0)
 
-    def support(self, directions: Array) -> Array:
+    @shaped
+    def support(self, directions: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         directions = np.asarray(directions, dtype=float)
         height: Array = directions @ self.centre + self.radius * np.linalg.norm(directions, ord=self.dual, axis=-1)
         return height
 
-    def support_point(self, directions: Array) -> Array:
+    @shaped
+    def support_point(self, directions: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
         c = np.asarray(directions, dtype=float)
         size = np.abs(c).max(axis=-1, keepdims=True)
         c = c / np.where(size > 0.0, size, 1.0)
@@ -179,7 +197,8 @@ class NormBall(ConvexSet):
         point: Array = self.centre + self.radius * unit
         return point
 
-    def linearisation_excess(self, centre: Array, spread: Array) -> Array:
+    @shaped
+    def linearisation_excess(self, centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]) -> Float[Array, " *k"]:
         if self.p == 1.0:
             corners = self.radius * np.vstack([np.eye(self.dimension), -np.eye(self.dimension)])
             return vertex_excess(
@@ -196,7 +215,8 @@ class NormBall(ConvexSet):
             return np.minimum(super().linearisation_excess(centre, spread), smooth)
         return self.radius * _round_excess(np.asarray(centre, dtype=float), np.asarray(spread, dtype=float))
 
-    def halfspaces(self) -> tuple[Array, Array] | None:
+    @shaped
+    def halfspaces(self) -> tuple[Float[Array, "r d"], Float[Array, " r"]] | None:
         d = self.dimension
         if self.p == np.inf or d == 1:
             H = np.vstack([np.eye(d), -np.eye(d)])
@@ -206,7 +226,8 @@ class NormBall(ConvexSet):
             return None
         return H, H @ self.centre + self.radius
 
-    def violation(self, points: Array) -> Array:
+    @shaped
+    def violation(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         """Distance to the ball outside; inside, ``(|x - centre|_p - radius) / max {|v|_p : |v|_2 = 1}``, at least minus
         the depth."""
         if self.halfspaces() is not None:
@@ -235,25 +256,30 @@ class NormBall(ConvexSet):
         )
         return _shrunk(z, np.exp(high)[..., None], power)
 
-    def gauge(self, points: Array) -> Array:
+    @shaped
+    def gauge(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         return ratios(np.linalg.norm(np.asarray(points, dtype=float) - self.centre, ord=self.p, axis=-1), self.radius)
 
-    def normal(self, points: Array) -> Array:
+    @shaped
+    def normal(self, points: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
         if self.p == np.inf:
             return super().normal(points)
         z = (np.asarray(points, dtype=float) - self.centre) / (self.radius or 1.0)
         return np.asarray(np.sign(z) * np.abs(z) ** (self.p - 1.0))
 
-    def unit_ball_image(self) -> tuple[Array, Array] | None:
+    @shaped
+    def unit_ball_image(self) -> tuple[Float[Array, " d"], Float[Array, "d d"]] | None:
         return (self.centre, self.radius * np.eye(self.dimension)) if self.p == 2.0 and self.radius > 0.0 else None
 
     def scaled(self, factor: float) -> NormBall:
         return NormBall(self.p, factor * self.radius, self.centre)
 
-    def middle(self) -> Array:
+    @shaped
+    def middle(self) -> Float[Array, " d"]:
         return self.centre.copy()
 
-    def sample(self, count: int, rng: np.random.Generator) -> Array:
+    @shaped
+    def sample(self, count: int, rng: np.random.Generator) -> Float[Array, "{count} d"]:
         """Uniform."""
         unit = (
             rng.uniform(-1.0, 1.0, size=(count, self.dimension))
@@ -262,14 +288,16 @@ class NormBall(ConvexSet):
         )
         return np.asarray(self.centre + self.radius * unit)
 
-    def interior_point(self) -> Array:
+    @shaped
+    def interior_point(self) -> Float[Array, " d"]:
         return self.centre.copy()
 
     @property
     def frame(self) -> Array:
         return few_digits(np.eye(self.dimension) / (self.radius or 1.0))
 
-    def in_units(self, units: Array) -> ConvexSet:
+    @shaped
+    def in_units(self, units: Float[Array, " d"]) -> ConvexSet:
         if (units == units[0]).all():
             return NormBall(self.p, self.radius / units[0], self.centre / units)
         if self.p == np.inf:
@@ -285,7 +313,8 @@ def _positive(shape: Array) -> bool:
     return bool((sizes > 0.0).all() and np.linalg.eigvalsh(shape / np.outer(sizes, sizes))[0] > 0.0)
 
 
-def _round_excess(centre: Array, spread: Array) -> Array:
+@shaped
+def _round_excess(centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]) -> Float[Array, " *k"]:
     """The largest ``|y| - g'y`` over ``y = centre + sum_j s_j spread_j``, ``g`` the unit vector of the centre:
     ``sqrt(a^2 + b^2) - a``, which decreases in ``a <= g'y`` and increases in ``b >= |y - g g'y|``."""
     length = np.linalg.norm(centre, axis=-1)
@@ -316,7 +345,8 @@ def _finite(name: str, value: object, size: int | None) -> Array:
     return numbers
 
 
-def norm_curvature(centre: Array, spread: Array) -> Array:
+@shaped
+def norm_curvature(centre: Float[Array, " b"], spread: Float[Array, "J b"]) -> Float[Array, "J J"]:
     """``H (J, J)`` with ``|a + B's| >= |a| + a'B's / |a| + s'H s / 2`` for ``|s_j| <= 1``; ``centre`` is ``a (b,)``,
     ``spread`` is ``B (J, b)``.
 
@@ -334,7 +364,8 @@ def norm_curvature(centre: Array, spread: Array) -> Array:
     return max(0.0, factor) * (across @ across.T)
 
 
-def _power_excess(a: Array, b: Array, q: float) -> Array:
+@shaped
+def _power_excess(a: Float[Array, "*k d"], b: Float[Array, "*k d"], q: float) -> Float[Array, " *k"]:
     """A bound of ``|a + s|_q - |a|_q - gradient's`` for ``|s_i| <= b_i``: the root is concave in ``sum |a_i + s_i|^q``,
     whose terms are convex.
 

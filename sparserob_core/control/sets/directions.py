@@ -6,25 +6,29 @@ from itertools import product
 
 import numpy as np
 
+from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 PER_EDGE = {1: 1, 2: 33, 3: 13, 4: 7}  # sampled directions along an edge of the cube, by dimension; 3 beyond
 
 
-def shares(convex_set: ConvexSet, z: Array) -> Array:
+@shaped
+def shares(convex_set: ConvexSet, z: Float[Array, "k b"]) -> Float[Array, "k b"]:
     """Cube points ``(k, b)`` divided by how far the set reaches from its middle ``m`` along ``c = z N``:
     ``h(c) - c'm``. By its length where the set has no extent; 0 stays 0."""
     directions = z @ convex_set.frame
     return np.asarray(z / _rooms(convex_set, directions)[:, None])
 
 
-def unit(convex_set: ConvexSet, z: Array) -> Array:
+@shaped
+def unit(convex_set: ConvexSet, z: Float[Array, "k b"]) -> Float[Array, "k d"]:
     """Directions ``(k, d)`` of cube points ``(k, b)``, in the span in which the support function is finite, such that
     ``h(c) - c'm = 1``: what ``c'x`` exceeds ``h(c)`` by is then the gauge about the middle ``m`` less 1; 0 stays 0."""
     return np.asarray(shares(convex_set, z) @ convex_set.frame)
 
 
-def across(convex_set: ConvexSet, z: Array, slopes: Array) -> Array:
+@shaped
+def across(convex_set: ConvexSet, z: Float[Array, "k b"], slopes: Float[Array, "k b"]) -> Float[Array, "k b"]:
     """Derivatives ``(k, b)`` in cube points, from derivatives ``slopes (k, b)`` in their `shares`; 0 at the point 0."""
     directions = z @ convex_set.frame
     rooms, sizes = _rooms(convex_set, directions), np.linalg.norm(directions, axis=1, keepdims=True)
@@ -35,19 +39,22 @@ def across(convex_set: ConvexSet, z: Array, slopes: Array) -> Array:
     return np.asarray(np.where(sizes > 0, (slopes - along * outwards) / rooms[:, None], 0.0))
 
 
-def _rooms(convex_set: ConvexSet, directions: Array) -> Array:
+@shaped
+def _rooms(convex_set: ConvexSet, directions: Float[Array, "k d"]) -> Float[Array, " k"]:
     rooms = convex_set.support(directions) - directions @ convex_set.interior_point()
     sizes = np.linalg.norm(directions, axis=1)
     return np.asarray(np.where(rooms > 0, rooms, np.where(sizes > 0, sizes, 1.0)))
 
 
-def on_surface(z: Array) -> Array:
+@shaped
+def on_surface(z: Float[Array, "*k b"]) -> Float[Array, "*k b"]:
     """Cube points scaled to the surface of the cube."""
     size = np.abs(z).max(axis=-1, keepdims=True)
     return np.asarray(z / np.where(size > 0, size, 1.0))
 
 
-def sampled(dimension: int) -> Array:
+@shaped
+def sampled(dimension: int) -> Float[Array, "k b"]:
     """A lattice ``(k, b)`` on the surface of the cube."""
     points = np.linspace(-1.0, 1.0, PER_EDGE.get(dimension, 3)) if dimension > 1 else np.zeros(0)
     every = [
@@ -61,7 +68,8 @@ def sampled(dimension: int) -> Array:
     return np.unique(np.array(every), axis=0)
 
 
-def faces(dimension: int) -> tuple[Array, Array]:
+@shaped
+def faces(dimension: int) -> tuple[Float[Array, "f b"], Float[Array, "f b"]]:
     """The faces of the cube as degenerate boxes, ``lower`` and ``upper`` ``(2 b, b)``."""
     lower, upper = -np.ones((2 * dimension, dimension)), np.ones((2 * dimension, dimension))
     for axis in range(dimension):

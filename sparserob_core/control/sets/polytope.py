@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from sparserob_core.errors import InputError
+from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound, vertex_excess
 
 _VERTEX_DIMENSIONS = 6
@@ -56,10 +57,12 @@ class Polytope(ConvexSet):
     def dimension(self) -> int:
         return int(self.H.shape[1])
 
-    def halfspaces(self) -> tuple[Array, Array]:
+    @shaped
+    def halfspaces(self) -> tuple[Float[Array, "r d"], Float[Array, " r"]]:
         return self.H, self.h
 
-    def in_units(self, units: Array) -> Polytope:
+    @shaped
+    def in_units(self, units: Float[Array, " d"]) -> Polytope:
         """The set of all ``x / units``, every row divided by a power of two so that its largest entry is about 1."""
         H = self.H * units
         sizes = np.abs(H).max(axis=1, initial=0.0)
@@ -106,7 +109,8 @@ class Polytope(ConvexSet):
             raise InputError(f"could not decide whether it is empty ({answer.message})", path="polytope")
         return np.asarray(answer.x[:-1]) * units, float(answer.x[-1])
 
-    def interior_point(self) -> Array:
+    @shaped
+    def interior_point(self) -> Float[Array, " d"]:
         return self.chebyshev[0].copy()
 
     @cached_property
@@ -136,7 +140,8 @@ class Polytope(ConvexSet):
             return None
         return self._polished(found.intersections, found.dual_facets) * units
 
-    def _polished(self, points: Array, facets: list[list[int]]) -> Array:
+    @shaped
+    def _polished(self, points: Float[Array, "v d"], facets: list[list[int]]) -> Float[Array, "u d"]:
         """Vertices solved for from their active rows: what qhull returns has passed through a dual space."""
         H, h, _ = self._balanced
         vertices = [np.linalg.lstsq(H[rows], h[rows], rcond=None)[0] for rows in facets]
@@ -144,7 +149,8 @@ class Polytope(ConvexSet):
         _, first = np.unique(np.round(exact, 12), axis=0, return_index=True)
         return exact[np.sort(first)]
 
-    def support(self, directions: Array) -> Array:
+    @shaped
+    def support(self, directions: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         directions = np.asarray(directions, dtype=float)
         if self.vertices is not None:
             highest: Array = (directions @ self.vertices.T).max(axis=-1)
@@ -155,26 +161,30 @@ class Polytope(ConvexSet):
         offset = self.H @ self.middle()
         return Polytope(self.H, offset + factor * (self.h - offset))
 
-    def sample_extreme(self, count: int, rng: np.random.Generator) -> Array:
+    @shaped
+    def sample_extreme(self, count: int, rng: np.random.Generator) -> Float[Array, "{count} d"]:
         """Each vertex equally likely, as far as they are known."""
         known = self.vertices
         if known is None:
             known = self.support_point(rng.normal(size=(min(count, _PROGRAMS), self.dimension)))
         return np.asarray(known[rng.integers(0, known.shape[0], size=count)])
 
-    def linearisation_excess(self, centre: Array, spread: Array) -> Array:
+    @shaped
+    def linearisation_excess(self, centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]) -> Float[Array, " *k"]:
         if self.vertices is None:
             return super().linearisation_excess(centre, spread)
         return vertex_excess(self.vertices, np.asarray(centre, dtype=float), np.asarray(spread, dtype=float))
 
-    def support_point(self, directions: Array) -> Array:
+    @shaped
+    def support_point(self, directions: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
         directions = np.asarray(directions, dtype=float)
         if self.vertices is not None:
             point: Array = self.vertices[(directions @ self.vertices.T).argmax(axis=-1)]
             return point
         return self._maximise_all(directions.reshape(-1, self.dimension))[1].reshape(directions.shape)
 
-    def _maximise_all(self, directions: Array) -> tuple[Array, Array]:
+    @shaped
+    def _maximise_all(self, directions: Float[Array, "k d"]) -> tuple[Float[Array, " k"], Float[Array, "k d"]]:
         """`_maximise` for directions ``(k, d)``: several linear programs side by side in one, since calling the solver
         costs far more than a small program does; one by one where that fails."""
         from scipy.optimize import linprog
@@ -202,7 +212,8 @@ class Polytope(ConvexSet):
                 values[position], points[position] = self._maximise(directions[position])
         return values, points
 
-    def _maximise(self, direction: Array) -> tuple[float, Array]:
+    @shaped
+    def _maximise(self, direction: Float[Array, " d"]) -> tuple[float, Float[Array, " d"]]:
         """Support function and a maximiser by a linear program; ``(inf, some point)`` when unbounded."""
         from scipy.optimize import linprog
 

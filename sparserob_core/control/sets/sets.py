@@ -13,6 +13,7 @@ import numpy.typing as npt
 from sparserob_core.control.sets.curved import Ellipsoid, NormBall
 from sparserob_core.control.sets.polytope import Polytope
 from sparserob_core.errors import InputError
+from sparserob_core.shapes import Bool, Float, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
 __all__ = [
@@ -76,7 +77,8 @@ class Equality:
         """Indices of the coordinates that are fixed."""
         return np.flatnonzero(~np.isnan(self.values))
 
-    def violation(self, points: Array) -> Array:
+    @shaped
+    def violation(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         """Largest absolute deviation ``(...,)`` of points ``(..., d)`` from the fixed values; 0 when nothing is
         fixed."""
         deviation: Array = np.abs(np.asarray(points)[..., self.fixed] - self.values[self.fixed]).max(
@@ -84,11 +86,13 @@ class Equality:
         )
         return deviation
 
-    def in_units(self, units: Array) -> Equality:
+    @shaped
+    def in_units(self, units: Float[Array, " d"]) -> Equality:
         """The same values as ``values / units``, ``(d,)`` each."""
         return Equality(self.values / units)
 
-    def contains(self, points: Array, tolerance: float = 1e-9) -> npt.NDArray[np.bool_]:
+    @shaped
+    def contains(self, points: Float[Array, "*k d"], tolerance: float = 1e-9) -> Bool[np.ndarray, " *k"]:
         """Whether points ``(..., d)`` deviate by at most the absolute ``tolerance``."""
         inside: npt.NDArray[np.bool_] = np.asarray(self.violation(points) <= tolerance)
         return inside
@@ -135,30 +139,36 @@ class Cylinder(ConvexSet):
         own = self.base.frame
         return np.hstack([own, np.zeros((own.shape[0], self.size - own.shape[1]))])
 
-    def in_units(self, units: Array) -> Cylinder:
+    @shaped
+    def in_units(self, units: Float[Array, " d"]) -> Cylinder:
         return Cylinder(self.base.in_units(units[: self.base.dimension]), self.size)
 
-    def support(self, directions: Array) -> Array:
+    @shaped
+    def support(self, directions: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         directions = np.asarray(directions, dtype=float)
         bounded = (directions[..., self.base.dimension :] == 0.0).all(axis=-1)
         height: Array = np.where(bounded, self.base.support(directions[..., : self.base.dimension]), np.inf)
         return height
 
-    def support_point(self, directions: Array) -> Array:
+    @shaped
+    def support_point(self, directions: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
         directions = np.asarray(directions, dtype=float)
         inner = self.base.support_point(directions[..., : self.base.dimension])
         return np.concatenate([inner, np.zeros((*inner.shape[:-1], self.size - self.base.dimension))], axis=-1)
 
-    def violation(self, points: Array) -> Array:
+    @shaped
+    def violation(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         return self.base.violation(np.asarray(points)[..., : self.base.dimension])
 
-    def gauge(self, points: Array) -> Array:
+    @shaped
+    def gauge(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         return self.base.gauge(np.asarray(points)[..., : self.base.dimension])
 
     def scaled(self, factor: float) -> Cylinder:
         return Cylinder(self.base.scaled(factor), self.size)
 
-    def interior_point(self) -> Array:
+    @shaped
+    def interior_point(self) -> Float[Array, " d"]:
         return np.concatenate([self.base.interior_point(), np.zeros(self.size - self.base.dimension)])
 
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
+from sparserob_core.shapes import Bool, Float, shaped
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution, diagonal
 from sparserob_core.sip.inner.image import onto_stationary
@@ -43,7 +43,14 @@ class _Terms:
     magnitude: float
 
 
-def dual_bound(program: FiniteProgram, y: Array, mu: Array, z: Array | None = None, at: Array | None = None) -> float:
+@shaped
+def dual_bound(
+    program: FiniteProgram,
+    y: Float[Array, " r"],
+    mu: Float[Array, " e"],
+    z: Float[Array, " k"] | None = None,
+    at: Float[Array, " n"] | None = None,
+) -> float:
     """A lower bound of the program's value, by weak duality; ``-inf`` when these multipliers prove nothing.
 
     ``y (r,)`` (negative entries count as 0) and ``mu (e,)`` multiply ``G x <= h`` and ``A x = b``. A diagonal ``P``
@@ -64,7 +71,10 @@ def dual_bound(program: FiniteProgram, y: Array, mu: Array, z: Array | None = No
     return bound
 
 
-def farkas_bound(program: FiniteProgram, y: Array, mu: Array, z: Array | None = None) -> float:
+@shaped
+def farkas_bound(
+    program: FiniteProgram, y: Float[Array, " r"], mu: Float[Array, " e"], z: Float[Array, " k"] | None = None
+) -> float:
     """A lower bound of the infeasibility of the rows, after normalising ``sum_i y_i |G_i| + sum_i |mu_i| |A_i| = 1``.
 
     Positive proves that no ``x`` within the bounds meets the rows (Farkas); the number bounds from below how far, in
@@ -74,7 +84,10 @@ def farkas_bound(program: FiniteProgram, y: Array, mu: Array, z: Array | None = 
     return farkas_margin(program, y, mu, z)[0]
 
 
-def farkas_margin(program: FiniteProgram, y: Array, mu: Array, z: Array | None = None) -> tuple[float, float]:
+@shaped
+def farkas_margin(
+    program: FiniteProgram, y: Float[Array, " r"], mu: Float[Array, " e"], z: Float[Array, " k"] | None = None
+) -> tuple[float, float]:
     """`farkas_bound`, and the magnitude of the terms that cancelled in it."""
     y = _usable(program, y)
     total = float(y @ np.linalg.norm(program.G, axis=1) + np.abs(mu) @ np.linalg.norm(program.A, axis=1))
@@ -98,8 +111,14 @@ def homogeneous(program: FiniteProgram) -> FiniteProgram:
     )
 
 
+@shaped
 def measure(
-    program: FiniteProgram, x: Array, y: Array, mu: Array, z: Array | None = None, message: str = ""
+    program: FiniteProgram,
+    x: Float[Array, " n"],
+    y: Float[Array, " r"],
+    mu: Float[Array, " e"],
+    z: Float[Array, " k"] | None = None,
+    message: str = "",
 ) -> FiniteSolution:
     """Everything that can be checked about a claim, as a `FiniteSolution` that nobody has judged yet (``failed``)."""
     if program.S is None:
@@ -113,7 +132,14 @@ def measure(
     return FiniteSolution("failed", x, value, lower, y, mu, z, residual, value - lower, message)
 
 
-def minimisers(weights: Array, curvature: Array | None, slope: Array, lower: Array, upper: Array) -> Array:
+@shaped
+def minimisers(
+    weights: Float[Array, " k"],
+    curvature: Float[Array, " k"] | None,
+    slope: Float[Array, " k"],
+    lower: Float[Array, " k"],
+    upper: Float[Array, " k"],
+) -> Float[Array, " k"]:
     """The minimiser of ``weights |s| + 1/2 curvature s^2 + slope s`` over ``[lower, upper]``, entry by entry; may be
     infinite."""
     pull = -slope - np.clip(-slope, -weights, weights)
@@ -125,16 +151,27 @@ def minimisers(weights: Array, curvature: Array | None, slope: Array, lower: Arr
     return np.minimum(np.maximum(free, lower), upper)
 
 
-def _usable(program: FiniteProgram, y: Array) -> Array:
+@shaped
+def _usable(program: FiniteProgram, y: Float[Array, " r"]) -> Float[Array, " r"]:
     return np.where(np.isfinite(program.h), np.maximum(y, 0.0), 0.0)
 
 
-def _stationary(program: FiniteProgram, y: Array, mu: Array, at: Array | None) -> Array:
+@shaped
+def _stationary(
+    program: FiniteProgram, y: Float[Array, " r"], mu: Float[Array, " e"], at: Float[Array, " n"] | None
+) -> Float[Array, " n"]:
     slope = program.q + y @ program.G + mu @ program.A
     return slope if program.P is None or at is None else slope + program.P @ at
 
 
-def _terms(program: FiniteProgram, y: Array, mu: Array, z: Array | None, at: Array | None) -> _Terms:
+@shaped
+def _terms(
+    program: FiniteProgram,
+    y: Float[Array, " r"],
+    mu: Float[Array, " e"],
+    z: Float[Array, " k"] | None,
+    at: Float[Array, " n"] | None,
+) -> _Terms:
     finite = np.where(y > 0, program.h, 0.0)
     constant = -float(y @ finite + mu @ program.b)
     magnitude = float(y @ np.abs(finite) + np.abs(mu) @ np.abs(program.b))
@@ -173,7 +210,14 @@ def _bound(terms: _Terms, program: FiniteProgram) -> float:
     return terms.constant + float(values.sum()) - ROUND_OFF * size
 
 
-def _shrunk_bound(program: FiniteProgram, y: Array, mu: Array, z: Array | None, at: Array | None) -> float:
+@shaped
+def _shrunk_bound(
+    program: FiniteProgram,
+    y: Float[Array, " r"],
+    mu: Float[Array, " e"],
+    z: Float[Array, " k"] | None,
+    at: Float[Array, " n"] | None,
+) -> float:
     """Without a linear cost, multipliers may be scaled towards 0 until every unbounded entry's slope is within its
     weight."""
     slope = _terms(program, y, mu, z, at).slope
@@ -187,7 +231,14 @@ def _shrunk_bound(program: FiniteProgram, y: Array, mu: Array, z: Array | None, 
     return _bound(_terms(program, factor * y, factor * mu, *scaled), program)
 
 
-def repaired(program: FiniteProgram, y: Array, mu: Array, z: Array | None, at: Array | None) -> Multipliers | None:
+@shaped
+def repaired(
+    program: FiniteProgram,
+    y: Float[Array, " r"],
+    mu: Float[Array, " e"],
+    z: Float[Array, " k"] | None,
+    at: Float[Array, " n"] | None,
+) -> Multipliers | None:
     """``(y, mu, z, at)`` after the least-norm correction that gives every unbounded entry the slope that it needs, or
     ``None``.
 
@@ -204,7 +255,14 @@ def repaired(program: FiniteProgram, y: Array, mu: Array, z: Array | None, at: A
     return better
 
 
-def _corrected(program: FiniteProgram, y: Array, mu: Array, z: Array | None, at: Array | None) -> Multipliers | None:
+@shaped
+def _corrected(
+    program: FiniteProgram,
+    y: Float[Array, " r"],
+    mu: Float[Array, " e"],
+    z: Float[Array, " k"] | None,
+    at: Float[Array, " n"] | None,
+) -> Multipliers | None:
     tangent = None
     if program.P is not None and (program.S is not None or diagonal(program.P, program.n) is None):
         tangent = program.P.toarray()
@@ -229,7 +287,8 @@ def _corrected(program: FiniteProgram, y: Array, mu: Array, z: Array | None, at:
     return better, mu + moved[1], z, at if tangent is None or at is None else at + moved[2]
 
 
-def _at_limit(program: FiniteProgram, z: Array) -> npt.NDArray[np.bool_]:
+@shaped
+def _at_limit(program: FiniteProgram, z: Float[Array, " k"]) -> Bool[np.ndarray, " k"]:
     """Unbounded images whose multiplier is at its limit, the weight, or beyond."""
     near = np.abs(z) > program.weights - NEAR * (1.0 + program.weights)
     return near & (np.isposinf(program.upper) & (z >= 0) | np.isneginf(program.lower) & (z <= 0))
@@ -244,7 +303,10 @@ def _least_norm(blocks: list[Array], target: Array) -> list[Array] | None:
     return np.split(change, np.cumsum([block.shape[1] for block in blocks])[:-1])
 
 
-def vertex_multipliers(program: FiniteProgram, x: Array, y: Array, mu: Array) -> tuple[Array, Array]:
+@shaped
+def vertex_multipliers(
+    program: FiniteProgram, x: Float[Array, " n"], y: Float[Array, " r"], mu: Float[Array, " e"]
+) -> tuple[Float[Array, " r"], Float[Array, " e"]]:
     """``(y, mu)`` that make the linearised cost stationary in the free entries of ``x (n,)``, in the least-squares
     sense, with ``y >= 0``.
 

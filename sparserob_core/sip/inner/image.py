@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, TypeVar, cast
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram
 
@@ -44,7 +45,8 @@ CANCELLED = 1e-13
 _factors = Memory(12)
 
 
-def onto_stationary(program: FiniteProgram, z: Array, slope: Array) -> Array:
+@shaped
+def onto_stationary(program: FiniteProgram, z: Float[Array, " k"], slope: Float[Array, " n"]) -> Float[Array, " k"]:
     """A ``z (k,)`` near the given one with ``S'z + slope = 0`` to round-off, ``slope (n,)``; NaN where there is none.
 
     Where an image is unbounded its multiplier may not exceed its weight: it is held there, and the others make up for

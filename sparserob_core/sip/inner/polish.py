@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.shapes import Bool, Float, shaped
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution, diagonal
 from sparserob_core.sip.inner.duality import measure, minimisers
@@ -26,7 +27,10 @@ FLAT = 1e-4
 STILL = 1e-9  # a proximal point that moves by less, relative to the decision, has arrived
 
 
-def polish(program: FiniteProgram, x: Array, y: Array, mu: Array) -> FiniteSolution | None:
+@shaped
+def polish(
+    program: FiniteProgram, x: Float[Array, " n"], y: Float[Array, " r"], mu: Float[Array, " e"]
+) -> FiniteSolution | None:
     """The optimum to round-off from a nearby claim, by `newton_solve` or, where the curvature is too small for it,
     `proximal_polish`."""
     curvature = diagonal(program.P, program.n) if program.S is None else None
@@ -41,7 +45,10 @@ def _cost(program: FiniteProgram) -> float:
     return float(max(program.weights.max(initial=0.0), np.abs(program.q).max(initial=0.0)))
 
 
-def proximal_polish(program: FiniteProgram, x: Array, y: Array, mu: Array) -> FiniteSolution | None:
+@shaped
+def proximal_polish(
+    program: FiniteProgram, x: Float[Array, " n"], y: Float[Array, " r"], mu: Float[Array, " e"]
+) -> FiniteSolution | None:
     """Proximal points ``min cost + 1/2 weight |x - centre|^2`` (Rockafellar 1976) from a near-optimal ``x``, each by
     `newton_solve`.
 
@@ -109,12 +116,14 @@ class _Dual:
     c: Array
     signed: npt.NDArray[np.bool_]
 
-    def decision(self, slope: Array) -> Array:
+    @shaped
+    def decision(self, slope: Float[Array, " n"]) -> Float[Array, " n"]:
         """The minimising ``x (n,)`` of the Lagrangian whose linear part is ``slope (n,)``."""
         program = self.program
         return minimisers(program.weights, self.curvature, slope, program.lower, program.upper)
 
-    def at(self, dual: Array) -> _Point:
+    @shaped
+    def at(self, dual: Float[Array, " v"]) -> _Point:
         x = self.decision(self.program.q + dual @ self.M)
         return _Point(dual, x, self.M @ x - self.c)
 
@@ -123,7 +132,8 @@ class _Dual:
         natural = np.where(self.signed, np.minimum(point.dual, -point.gradient), point.gradient)
         return float(np.abs(natural).max(initial=0.0))
 
-    def hessian(self, point: _Point) -> Array:
+    @shaped
+    def hessian(self, point: _Point) -> Float[Array, "v v"]:
         """Minus the generalised Hessian, damped so that duplicated and flat directions stay solvable."""
         free = (point.x != 0) & (point.x > self.program.lower) & (point.x < self.program.upper)
         rows = self.M[:, free]
@@ -136,7 +146,10 @@ class _Dual:
         return hessian
 
 
-def newton_solve(program: FiniteProgram, y0: Array, mu0: Array | None = None) -> FiniteSolution | None:
+@shaped
+def newton_solve(
+    program: FiniteProgram, y0: Float[Array, " r"], mu0: Float[Array, " e"] | None = None
+) -> FiniteSolution | None:
     """The optimum of a program with identity image and a positive diagonal ``P``, from dual variables ``y0 (r,)``,
     ``mu0 (e,)``.
 
@@ -165,7 +178,8 @@ def newton_solve(program: FiniteProgram, y0: Array, mu0: Array | None = None) ->
     return measure(program, point.x, y, multipliers[int(keep.sum()) :], message="Newton")
 
 
-def _ascend(dual: _Dual, start: Array) -> _Point | None:
+@shaped
+def _ascend(dual: _Dual, start: Float[Array, " v"]) -> _Point | None:
     point = dual.at(start)
     scale = 1.0 + float(np.abs(point.x).max(initial=0.0))
     error = least = dual.error(point)
@@ -187,9 +201,13 @@ def _ascend(dual: _Dual, start: Array) -> _Point | None:
     return None
 
 
+@shaped
 def _non_negative(
-    hessian: Array, linear: Array, signed: npt.NDArray[np.bool_], support: npt.NDArray[np.bool_]
-) -> Array:
+    hessian: Float[Array, "v v"],
+    linear: Float[Array, " v"],
+    signed: Bool[np.ndarray, " v"],
+    support: Bool[np.ndarray, " v"],
+) -> Float[Array, " v"]:
     """argmin ``1/2 v'Hv - linear'v``, ``v >= 0`` where signed, by active sets from a first support (Lawson and Hanson
     1974, chapter 23)."""
     passive = support | ~signed
@@ -213,7 +231,8 @@ def _non_negative(
     return v
 
 
-def _line_maximum(dual: _Dual, point: _Point, step: Array) -> float:
+@shaped
+def _line_maximum(dual: _Dual, point: _Point, step: Float[Array, " v"]) -> float:
     """A feasible length at which the dual's derivative along ``step`` has fallen to a tenth, by bisection and false
     position."""
     slope, change, constant = dual.program.q + point.dual @ dual.M, step @ dual.M, float(dual.c @ step)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram, diagonal
 from sparserob_core.sip.inner.image import Memory
@@ -173,7 +174,10 @@ def _lifted(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticProgram
     return qp, recover
 
 
-def _unit_rows(rows: Array, rhs: Array, model: ImageModel) -> tuple[Array, Array, npt.NDArray[np.intp], Array]:
+@shaped
+def _unit_rows(
+    rows: Float[Array, "r n"], rhs: Float[Array, " r"], model: ImageModel
+) -> tuple[Float[Array, "p v"], Float[Array, " p"], Int[np.ndarray, " p"], Float[Array, " p"]]:
     """Rows over ``v`` and right-hand sides, divided by the norm of the row; which rows were kept, and their norms."""
     moved = rhs - rows @ model.offset
     block = rows[:, model.entry] * model.sign

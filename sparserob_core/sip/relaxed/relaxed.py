@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Cut, Dual
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
@@ -53,7 +54,10 @@ class Rows:
         return Rows(np.zeros((0, n)), np.zeros(0), ())
 
 
-def rows_at(program: SemiInfiniteProgram, family: str, indices: Array, rows: np.ndarray | None = None) -> Rows:
+@shaped
+def rows_at(
+    program: SemiInfiniteProgram, family: str, indices: Float[Array, "k d"], rows: Int[np.ndarray, " k"] | None = None
+) -> Rows:
     """The constraints of a family at indices ``(k, d)``: one row each when ``rows (k,)`` names it, else all of them."""
     if not indices.shape[0]:
         return Rows.none(program.n)
@@ -106,7 +110,8 @@ def _key(cut: Cut) -> tuple[str, bytes, int]:
     return cut.family, cut.index.tobytes(), cut.row
 
 
-def _most_violated(excess: Array, kinds: np.ndarray) -> np.ndarray:
+@shaped
+def _most_violated(excess: Float[Array, " r"], kinds: Int[np.ndarray, " r"]) -> Int[np.ndarray, " v"]:
     """The position of the largest excess of every kind, where it is above `LAZY`."""
     violated = np.flatnonzero(excess > LAZY)
     order = violated[np.lexsort((-excess[violated], kinds[violated]))]
@@ -180,7 +185,10 @@ class RelaxedProgram:
         best = int(np.argmax(bounds))
         return self.dual(rows, *offers[best], bounds[best])
 
-    def _rounding(self, plain: FiniteProgram, y: Array, mu: Array, x: Array) -> float:
+    @shaped
+    def _rounding(
+        self, plain: FiniteProgram, y: Float[Array, " r"], mu: Float[Array, " e"], x: Float[Array, " n"]
+    ) -> float:
         size = np.where(np.isfinite(x), np.abs(x), 0.0)
         used = (y > 0) & np.isfinite(plain.h)
         total = y[used] @ (np.abs(plain.h[used]) + np.abs(plain.G[used]) @ size) + np.abs(mu) @ (
@@ -188,7 +196,10 @@ class RelaxedProgram:
         )
         return ROUNDING * float(total)
 
-    def dual(self, rows: Rows, y: Array, mu: Array, z: Array, bound: float) -> Dual:
+    @shaped
+    def dual(
+        self, rows: Rows, y: Float[Array, " r"], mu: Float[Array, " e"], z: Float[Array, " k"], bound: float
+    ) -> Dual:
         """Multipliers of a program with these rows (and of its fixed rows, which come first in ``y``), as a record."""
         own = y[y.size - rows.h.size :]
         if self.program.finite.S is not None:
@@ -198,7 +209,8 @@ class RelaxedProgram:
         fixed = y[: y.size - rows.h.size]
         return Dual(bound, cuts, mu, None if self.program.finite.S is None else z, fixed)
 
-    def evaluate(self, indices: Mapping[str, Array], epsilon: float) -> RelaxedSolution:
+    @shaped
+    def evaluate(self, indices: Mapping[str, Float[Array, "_ _"]], epsilon: float) -> RelaxedSolution:
         """``g`` at a tuple: per family the indices ``(k, d)``. Rows are imposed lazily: those active last time, then
         what is violated."""
         pool = Rows.none(self.program.n)
@@ -218,8 +230,15 @@ class RelaxedProgram:
         self._last = RelaxedSolution(value_of(solution), solution.x, pool.take(imposed.positions), solution)
         return self._last
 
+    @shaped
     def lazily(
-        self, G: Array, h: Array, kinds: np.ndarray, epsilon: float, start: Imposed, norms: Array | None = None
+        self,
+        G: Float[Array, "r n"],
+        h: Float[Array, " r"],
+        kinds: Int[np.ndarray, " r"],
+        epsilon: float,
+        start: Imposed,
+        norms: Float[Array, " r"] | None = None,
     ) -> tuple[Imposed, FiniteSolution]:
         """Solve with all rows ``G x <= h`` by imposing few of them: those of ``start``, then the most violated of every
         kind ``(r,)``, until no other is violated. Returns the rows imposed last, in terms of which the solution's
@@ -256,12 +275,16 @@ class RelaxedProgram:
         fixed = last.y[: self.program.finite.h.size]
         return replace(last, y=np.concatenate([fixed, start.multipliers]))
 
-    def _solved(self, G: Array, h: Array, epsilon: float, guess: FiniteSolution | None) -> FiniteSolution:
+    @shaped
+    def _solved(
+        self, G: Float[Array, "r n"], h: Float[Array, " r"], epsilon: float, guess: FiniteSolution | None
+    ) -> FiniteSolution:
         self.deadline.check()
         self.solves += 1
         return solve_finite(self.finite(G, h, epsilon), self.counted, tolerance=self.tolerance, guess=guess)
 
-    def finite(self, G: Array, h: Array, epsilon: float) -> FiniteProgram:
+    @shaped
+    def finite(self, G: Float[Array, "r n"], h: Float[Array, " r"], epsilon: float) -> FiniteProgram:
         """The finite program with these rows."""
         base = self._regularised(epsilon)
         return replace(base, G=np.vstack([base.G, G]), h=np.concatenate([base.h, h]))

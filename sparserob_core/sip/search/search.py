@@ -10,6 +10,7 @@ from typing import TypeAlias
 import numpy as np
 
 from sparserob_core.errors import InputError, PluginError, SparseRobError
+from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.maximiser import EvaluationError, Maximiser, Objective, Report, SearchEnded, Trace
@@ -99,7 +100,7 @@ class CountedObjective:
         """See `Objective.differentiable`."""
         return self.target.gradient is not None
 
-    def evaluate(self, points: Array) -> Array:
+    def evaluate(self, points: Float[Array, "k d"]) -> Float[Array, " k"]:
         """See `Objective.evaluate`."""
         if self.ended is not None:
             raise self.ended
@@ -119,7 +120,8 @@ class CountedObjective:
             raise self._end(SearchEnded("the budget is spent"))
         return values
 
-    def value_and_gradient(self, point: Array) -> tuple[float, Array]:
+    @shaped
+    def value_and_gradient(self, point: Float[Array, " d"]) -> tuple[float, Float[Array, " d"]]:
         """See `Objective.value_and_gradient`."""
         if self.target.gradient is None:
             raise InputError("gradient: this objective offers none")
@@ -148,7 +150,8 @@ class CountedObjective:
         it."""
         self.ended, self.budget, self.rules = None, budget, None
 
-    def seen(self) -> tuple[Array, Array]:
+    @shaped
+    def seen(self) -> tuple[Float[Array, "n d"], Float[Array, " n"]]:
         """Every evaluated point ``(n, d)`` and its value ``(n,)``; only the best one where all of them would be too
         many."""
         if not self._keeps:
@@ -198,7 +201,8 @@ class CountedObjective:
         self.ended = reason
         return reason
 
-    def _values_at(self, points: Array) -> Array:
+    @shaped
+    def _values_at(self, points: Float[Array, "k d"]) -> Float[Array, " k"]:
         values = np.array(self._called(self.target.function, points.copy() if self._keeps else points, (len(points),)))
         missing = np.isnan(values)
         if missing.any():
@@ -225,7 +229,8 @@ class CountedObjective:
             raise self._end(EvaluationError(reason, self.report("the function failed"))) from error
         return values
 
-    def _record(self, points: Array, values: Array) -> None:
+    @shaped
+    def _record(self, points: Float[Array, "k d"], values: Float[Array, " k"]) -> None:
         if self._keeps:
             self._points.append(points)
         self._values.append(values.copy())
