@@ -131,12 +131,12 @@ class Scribbling(Counting):
 
 
 class Meddling(Counting):
-    """Changes what is solved."""
+    """Changes what is solved: the program in its own units."""
 
     def receive(self, event):
         super().receive(event)
-        if isinstance(event, sr.RunStarted):
-            event.program.finite.weights[:] *= 2.0
+        if isinstance(event, sr.RunStarted) and event.program.own_units is not None:
+            event.program.own_units.program.finite.weights[:] *= 2.0
 
 
 class Unfinished(Counting):
