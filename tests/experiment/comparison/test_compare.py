@@ -375,7 +375,7 @@ def test_a_finished_and_a_failed_run_of_the_program_itself_can_be_compared(
     done = command("compare", "a", "b", "--out", "both.pdf")
     assert (done.returncode, done.stderr) == (0, "")
     assert re.search(
-        r"no curve of stub, fail on: failed: PluginError: method 'stub' .*: solve raised RuntimeError: the stub fell over",
+        r"no curve of stub, fail on: failed: PluginError: method 'stub' .*: solve raised RuntimeError: the stub fell",
         done.stdout,
     )
     assert json.loads((tmp_path / "a" / "result.json").read_text())["status"] == "certified"
