@@ -276,6 +276,15 @@ def test_the_remainder_is_a_small_share_of_the_states_in_any_units(second, metre
     assert (np.array([poly.expansion for poly in found]) < 1e-9 * sizes).all()
 
 
+def test_a_coefficient_that_is_only_close_to_nothing_is_kept():
+    known = Monomials(1, 2)
+    with ctx.workprec(96):
+        near = Series(known, [stacked([[arb(1)]]), stacked([[arb(0, 1e-20)]]), stacked([[arb(0)]])])
+        assert near.there == [True, True, False]
+        assert (near * near).parts[1][0, 0].contains(arb(2e-20))
+        assert near.scaled(arb(1e-9)).exp().parts[0][0, 0].contains(arb(1e-9).exp())
+
+
 def test_a_series_keeps_to_the_variables_that_appear():
     known = Monomials(2, 3)
     with ctx.workprec(96):

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
 SMALL = 0.25  # norm below which the exponential series is summed
 TERMS = 16  # of it: what is left out is below 1e-24 then
+TINY = 1e-6  # norm below which as many terms as the stride leave out less than 1e-31
 STRIDE = 4  # of the powers by which it is summed; divides the number of terms
 
 
@@ -30,7 +31,11 @@ class Series:
     def there(self) -> list[bool]:
         """Which coefficients are not exactly 0: those of a system are few."""
         if self._there is None:
-            self._there = [any(not x.is_zero() for x in part.entries()) for part in self.parts]
+            from flint import arb_mat
+
+            zero = arb_mat(self.parts[0].nrows(), self.parts[0].ncols())
+            absent = [part == zero for part in self.parts]  # certainly equal; != is certainly different
+            self._there = [not gone for gone in absent]
         return self._there
 
     @property
@@ -96,13 +101,14 @@ class Series:
         powers = [Series.constant(self.monomials, unit), small]
         while len(powers) <= STRIDE:
             powers.append(powers[-1] * small)
-        factors = [1 / arb(order).fac() for order in range(TERMS + 1)]
-        result = powers[0].scaled(factors[TERMS])
-        for first in range(TERMS - STRIDE, -1, -STRIDE):  # Paterson and Stockmeyer 1973
+        terms = STRIDE if size < TINY else TERMS
+        factors = [1 / arb(order).fac() for order in range(terms + 1)]
+        result = powers[0].scaled(factors[terms])
+        for first in range(terms - STRIDE, -1, -STRIDE):  # Paterson and Stockmeyer 1973
             result = powers[STRIDE] * result
             for order in range(STRIDE):
                 result = result + powers[order].scaled(factors[first + order])
-        tail = arb_mat([[arb(0, (size ** (TERMS + 1) * 2 / arb(TERMS + 1).fac()).upper())] * n] * n)
+        tail = arb_mat([[arb(0, (size ** (terms + 1) * 2 / arb(terms + 1).fac()).upper())] * n] * n)
         parts = [part + tail if mine else part for part, mine in zip(result.parts, self._generated, strict=True)]
         result = Series(self.monomials, parts)
         for _ in range(halvings):
