@@ -23,6 +23,9 @@ if TYPE_CHECKING:
         return function
 
 elif CHECKED:
+    from functools import wraps
+    from itertools import count
+
     import jaxtyping
     from beartype import beartype
 
@@ -38,9 +41,21 @@ elif CHECKED:
     # whole numbers may stand where numbers are asked for: numpy computes with them, and shapes are what matters here
     Bool, Float, Int = _Checked(jaxtyping.Bool), _Checked(jaxtyping.Real), _Checked(jaxtyping.Integer)
 
+    FIRST, EVERY = 100, 100  # calls that are checked one by one; then one in so many, since a check takes 40 us
+
     def shaped(function: Any) -> Any:
-        """Check the shapes in the annotations of a function whenever it is called."""
-        return jaxtyping.jaxtyped(function, typechecker=beartype)
+        """Check the shapes in the annotations of a function at its first calls, and now and then; at every call of
+        what it has as ``checked``."""
+        checked = jaxtyping.jaxtyped(function, typechecker=beartype)
+        calls = count()
+
+        @wraps(function)
+        def sampled(*arguments: Any, **keywords: Any) -> Any:
+            number = next(calls)
+            return (checked if number < FIRST or number % EVERY == 0 else function)(*arguments, **keywords)
+
+        sampled.checked = checked
+        return sampled
 
 else:
 

@@ -25,14 +25,14 @@ def stacked(rows: Float[Array, "k d"], bounds: Float[Array, " k"]) -> Float[Arra
 def test_a_column_where_a_row_is_asked_for_is_caught() -> None:
     assert CHECKED
     with pytest.raises(TypeError, match="slope"):
-        minimisers(np.ones(2), None, np.ones((2, 1)), -np.ones(2), np.ones(2))
+        minimisers.checked(np.ones(2), None, np.ones((2, 1)), -np.ones(2), np.ones(2))
 
 
 def test_a_transposed_matrix_is_caught_before_it_is_used() -> None:
     rows = np.arange(6.0).reshape(2, 3)
     assert scaled_violation(np.zeros(2), rows, np.ones(2), np.ones(3)) == 0.0
     with pytest.raises(TypeError, match="Type-check error"):
-        scaled_violation(np.zeros(2), rows.T, np.ones(2), np.ones(3))
+        scaled_violation.checked(np.zeros(2), rows.T, np.ones(2), np.ones(3))
 
 
 def test_a_result_of_the_wrong_shape_is_caught() -> None:
@@ -44,6 +44,18 @@ def test_a_result_of_the_wrong_shape_is_caught() -> None:
 
     with pytest.raises(TypeError, match="return value"):
         transposed(np.ones((3, 2)))
+
+
+def test_the_first_calls_are_checked_and_later_ones_now_and_then() -> None:
+    @shaped
+    def kept(rows: Float[Array, "k d"]) -> Float[Array, "k d"]:
+        return rows
+
+    for _ in range(250):
+        kept(np.ones((3, 2)))
+    with pytest.raises(TypeError):
+        for _ in range(100):
+            kept(np.ones(3))
 
 
 def test_any_leading_axes_are_kept_down_to_a_single_number() -> None:
