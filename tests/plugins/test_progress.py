@@ -20,6 +20,7 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.testing.observers import CONFIG, METHODS
+from tests.support.stub import Command
 
 CODES = re.compile(r"\x1b\[[0-9;?]*[a-zA-Z]|\r")
 
@@ -191,17 +192,21 @@ def test_a_duration_is_written_in_few_figures(seconds: float, said: str) -> None
     assert duration(seconds) == said
 
 
-def command(tmp_path: Path, terminal: int | None, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """``sparserob run`` of a small search, with its standard error stream on a terminal if one is given."""
-    (tmp_path / "small.yaml").write_text(
-        json.dumps({**CONFIG, **METHODS["sparserob"], "observers": [{"name": "progress", "patience": 0.0}]})
-    )
+@pytest.fixture
+def small(tmp_path: Path) -> None:
+    """A small search that is watched from its first moment on."""
+    watched = {**CONFIG, **METHODS["sparserob"], "observers": [{"name": "progress", "patience": 0.0}]}
+    (tmp_path / "small.yaml").write_text(json.dumps(watched))
+
+
+def on_terminal(tmp_path: Path, terminal: int, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """``sparserob run`` in a process of its own, with its standard error stream on a terminal."""
     return subprocess.run(
         [sys.executable, "-m", "sparserob_core", "run", "small.yaml", "--no-figures", *arguments],
         cwd=tmp_path,
         text=True,
         stdout=subprocess.PIPE,
-        stderr=terminal or subprocess.PIPE,
+        stderr=terminal,
         timeout=120,
         check=False,
         env={**os.environ, "TERM": "xterm"},
@@ -209,11 +214,12 @@ def command(tmp_path: Path, terminal: int | None, *arguments: str) -> subprocess
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a pseudo-terminal")
+@pytest.mark.usefixtures("small")
 def test_on_a_real_terminal_it_shows_and_clears_its_lines_and_quiet_and_json_silence_it(tmp_path: Path) -> None:
     shown = {}
     for arguments in ((), ("--quiet",), ("--json",)):
         reading, terminal = os.openpty()
-        done = command(tmp_path, terminal, *arguments)
+        done = on_terminal(tmp_path, terminal, *arguments)
         os.set_blocking(reading, False)
         try:
             shown[arguments] = os.read(reading, 1 << 20).decode()
@@ -230,11 +236,13 @@ def test_on_a_real_terminal_it_shows_and_clears_its_lines_and_quiet_and_json_sil
     assert (shown["--quiet",], shown["--json",]) == ("", "")
 
 
-def test_without_a_terminal_quiet_and_json_leave_the_error_stream_empty(tmp_path: Path) -> None:
-    plain = command(tmp_path, None).stderr
+@pytest.mark.usefixtures("small")
+def test_without_a_terminal_quiet_and_json_leave_the_error_stream_empty(command: Command) -> None:
+    plain = command("run", "small.yaml", "--no-figures").stderr
     assert plain
     assert "\x1b" not in plain
-    assert command(tmp_path, None, "--quiet").stderr == command(tmp_path, None, "--json").stderr == ""
+    for option in ("--quiet", "--json"):
+        assert command("run", "small.yaml", "--no-figures", option).stderr == ""
 
 
 @pytest.mark.parametrize("quiet", [False, True])

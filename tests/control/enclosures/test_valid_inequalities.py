@@ -30,6 +30,7 @@ SETS = {
     "diamond": NormBall(p=1.0, radius=0.6, dimension=2),
     "rounded": NormBall(p=3.0, radius=0.5, dimension=2),
 }
+MANY = [pytest.param(name, marks=() if name in ("triangle", "rounded") else pytest.mark.slow) for name in sorted(SETS)]
 
 
 @settings(max_examples=60, deadline=None)
@@ -56,7 +57,7 @@ def test_at_a_corner_of_the_set_the_multipliers_are_exact():
     assert abs(found @ s - g @ corner) <= 1e-12
 
 
-@pytest.mark.parametrize("name", sorted(SETS))
+@pytest.mark.parametrize("name", MANY)
 def test_what_is_added_is_nowhere_negative_on_the_set(name):
     rng, index, space, tried = np.random.default_rng(0), ParameterIndex(SETS[name]), TaylorSpace(2, 4), 0
     for _ in range(60):
@@ -149,7 +150,7 @@ def constraint_over(parameters, rng, bound, curved):
 
 
 @settings(max_examples=4, deadline=None)
-@pytest.mark.parametrize("name", sorted(SETS))
+@pytest.mark.parametrize("name", MANY)
 @pytest.mark.parametrize("curved", [False, True])
 @given(seed=st.integers(0, 10**6), disturbed=st.booleans())
 def test_no_parameter_of_the_set_in_a_cell_is_above_its_bound(name, curved, seed, disturbed):
@@ -177,7 +178,7 @@ def test_no_parameter_of_the_set_in_a_cell_is_above_its_bound(name, curved, seed
     assert inside
 
 
-@pytest.mark.parametrize("name", sorted(SETS))
+@pytest.mark.parametrize("name", MANY)
 def test_a_cell_is_left_out_only_if_the_set_does_not_meet_it(name):
     rng, index = np.random.default_rng(0), ParameterIndex(SETS[name])
     centres, left_out = rng.uniform(-1.2, 1.2, (300, 2)), 0
