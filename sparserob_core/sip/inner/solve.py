@@ -6,7 +6,8 @@ The walk of `solve_finite`, each step only where the ones before gave no answer 
 2. `_cheap`: the optimum without rows, and Newton's method from a guess (`polish`); no solver is called.
 3. `_through`: the program in other variables, where that makes it easier (`change_of_variables`), solved by this walk.
 4. `_tried`: the program in the form that a solver takes (`standard_form`), form after form and accuracy after accuracy;
-   every claim is polished, measured (`duality.measure`) and judged. Where the solver says infeasible, or nothing is
+   every claim is polished, measured (`duality.measure`) and judged. Where the first is not believed, or not sharp
+   enough, the solver is asked for more digits of it (`more_digits`). Where the solver says infeasible, or nothing is
    believed, the elastic program is asked how far the rows must be relaxed: its multipliers may prove infeasibility.
 5. `_failed`: the best of what was not believed, and what was wrong with it.
 """
@@ -22,6 +23,7 @@ from sparserob_core.errors import PluginError
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution, diagonal
 from sparserob_core.sip.inner.change_of_variables import NewVariables, in_new_variables
 from sparserob_core.sip.inner.duality import farkas_margin, measure, minimisers, vertex_multipliers
+from sparserob_core.sip.inner.more_digits import refined
 from sparserob_core.sip.inner.polish import polish
 from sparserob_core.sip.inner.standard_form import Form, Recovered, standard_form
 from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
@@ -34,13 +36,16 @@ ADVICE = "try another solver, or state the problem in units in which its numbers
 
 @dataclass
 class _Case:
-    """One call of `solve_finite`: what was asked, the best unbelieved answer so far, and why each was not believed."""
+    """One call of `solve_finite`: what was asked, the best unbelieved answer so far, why each was not believed, and the
+    best believed one that is not ``sharp``."""
 
     program: FiniteProgram
     solver: Solver
     tolerance: float
+    small: float
     attempts: list[str] = field(default_factory=list)
     best: FiniteSolution | None = None
+    blunt: FiniteSolution | None = None
     elastic: bool = False
 
     def believes(self, solution: FiniteSolution) -> bool:
@@ -49,11 +54,15 @@ class _Case:
         )
 
     def judge(self, solution: FiniteSolution, name: str) -> FiniteSolution | None:
-        """The solution as ``optimal`` if it is believed; otherwise note why not."""
+        """The solution as ``optimal`` if believed and sharp; otherwise keep it, or note why it is not believed."""
         if self.believes(solution):
-            return replace(
-                solution, status="optimal", attempts=tuple(self.attempts), message=f"{name}: {solution.message}"
-            )
+            said = f"{name}: {solution.message}"
+            found = replace(solution, status="optimal", attempts=tuple(self.attempts), message=said)
+            if solution.gap <= 10 * self.tolerance * max(abs(solution.value), self.small):
+                return found
+            if self.blunt is None or solution.gap < self.blunt.gap:
+                self.blunt = found
+            return None
         if self.best is None or _badness(solution) < _badness(self.best):
             self.best = solution
         self.attempts.append(
@@ -63,18 +72,24 @@ class _Case:
 
 
 def solve_finite(
-    program: FiniteProgram, solver: Solver, *, tolerance: float = 1e-9, guess: FiniteSolution | None = None
+    program: FiniteProgram,
+    solver: Solver,
+    *,
+    tolerance: float = 1e-9,
+    guess: FiniteSolution | None = None,
+    small: float = np.inf,
 ) -> FiniteSolution:
     """Solve, trying forms and accuracies until an answer is believed.
 
     ``optimal`` is believed when `FiniteProgram.residual` is at most ``tolerance`` and the gap to the proven lower bound
     at most ``10 tolerance`` times `cost_scale`; ``infeasible`` only with multipliers that prove it (Farkas 1902),
     whatever the solver says. ``guess``: a solution of a program with the same numbers of rows; a separable program is
-    then first tried by Newton's method. Raises `InputError` when the program's shapes or numbers are at fault; a hard
-    program is ``failed``, never an exception.
+    then first tried by Newton's method. ``small``: a gap that is above ``10 tolerance`` times the value, and times
+    this, is worth more digits; whether they are found or not, what is believed stays ``optimal``. Raises `InputError`
+    when the program's shapes or numbers are at fault; a hard program is ``failed``, never an exception.
     """
     program.validate()
-    case = _Case(program, solver, tolerance)
+    case = _Case(program, solver, tolerance, small)
     impossible = _contradiction(program, tolerance)
     if impossible is not None:
         return impossible
@@ -98,6 +113,12 @@ def _tried(case: _Case) -> FiniteSolution:
             believed = case.judge(solution, f"{form} form")
             if believed is not None:
                 return believed
+        if (form, factor) == ATTEMPTS[0] and proof is None:
+            believed = _more_digits(case, claim)
+            if believed is not None:
+                return believed
+        if case.blunt is not None:
+            return case.blunt
         if proof is not None or form == ATTEMPTS[0][0] or (claim is not None and claim.status == "infeasible"):
             proof = _elastic_proof(case, proof)
         if proof is not None:
@@ -105,15 +126,37 @@ def _tried(case: _Case) -> FiniteSolution:
     return _failed(case)
 
 
+def _more_digits(case: _Case, claim: Claim | None) -> FiniteSolution | None:
+    """The first refined answer that is believed and sharp, from nothing and then from the ``claim``."""
+    form, factor = ATTEMPTS[0]
+    qp, recover = standard_form(case.program, form)
+    usable = claim is not None and _well_formed(claim, qp) and np.isfinite(claim.x).all()
+    for start in (None, claim) if usable else (None,):
+        badness = np.inf
+        try:
+            for one in refined(qp, case.solver, start, factor * case.tolerance):
+                for solution in _candidates(case, recover(one)):
+                    believed = case.judge(solution, "with more digits")
+                    if believed is not None:
+                        return believed
+                before, badness = badness, min(badness, _badness(solution))
+                if badness > 0.5 * before:
+                    break
+        except Exception as error:  # noqa: BLE001  as in `_ask`
+            case.attempts.append(f"with more digits: the solver raised {type(error).__name__}: {error}")
+    return None
+
+
 def _through(case: _Case, easier: NewVariables, guess: FiniteSolution | None) -> FiniteSolution | None:
     """The answer found in easier variables, checked in those of the program."""
     program = case.program
     start = guess if guess is None or guess.x.size != program.n else replace(guess, x=easier.to(guess.x))
-    found = solve_finite(easier.program, case.solver, tolerance=case.tolerance, guess=start)
+    found = solve_finite(easier.program, case.solver, tolerance=case.tolerance, guess=start, small=case.small)
     x = easier.back(found.x)
     if found.status == "infeasible":
         return _proof(case, (x, found.y, found.mu, None), "the program in other variables")
-    return case.judge(measure(program, x, found.y, found.mu, easier.dual(found.z), found.message), "new variables")
+    measured = measure(program, x, found.y, found.mu, easier.dual(found.z), found.message)
+    return case.judge(measured, "new variables") or case.blunt
 
 
 def cost_scale(program: FiniteProgram, value: float) -> float:

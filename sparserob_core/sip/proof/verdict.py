@@ -107,7 +107,9 @@ def infeasible_subsystem(
     if active.size == 1 and not equalities:
         i = int(order[0])
         family = program.family(rows.cuts[i].family)
-        alone = float(least_of(program.finite, rows.G[[i]], rows.h[[i]])[0])
+        # Farkas multipliers of one row say the same where its bounds are those of an image (a polytope of controls)
+        farkas = amount * float(np.linalg.norm(rows.G[i]))
+        alone = max(float(least_of(program.finite, rows.G[[i]], rows.h[[i]])[0]), farkas)
         if alone > 0:
             text = sentence("out of reach", family, rows.take(np.array([i])), np.ones(1), alone)
             return InfeasibleSubsystem(reasons=(text,)), replace(worst, violation=alone)

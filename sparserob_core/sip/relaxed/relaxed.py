@@ -18,6 +18,7 @@ from sparserob_core.sip.inner.solve import solve_finite
 from sparserob_core.sip.method import Deadline
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.regulariser import ControlImage, Regulariser
+from sparserob_core.sip.result import SMALL_COST
 from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
 
 if TYPE_CHECKING:
@@ -281,7 +282,9 @@ class RelaxedProgram:
     ) -> FiniteSolution:
         self.deadline.check()
         self.solves += 1
-        return solve_finite(self.finite(G, h, epsilon), self.counted, tolerance=self.tolerance, guess=guess)
+        small = SMALL_COST * self.program.cost_scale if epsilon == 0.0 else np.inf  # the bounds are to meet there
+        finite = self.finite(G, h, epsilon)
+        return solve_finite(finite, self.counted, tolerance=self.tolerance, guess=guess, small=small)
 
     @shaped
     def finite(self, G: Float[Array, "r n"], h: Float[Array, " r"], epsilon: float) -> FiniteProgram:

@@ -267,3 +267,40 @@ def test_no_program_is_both_optimal_and_infeasible_at_the_edge():
         assert status in (
             {"infeasible"} if shift >= 1e-7 else {"infeasible", "optimal", "failed"} if shift > 0 else {"optimal"}
         )
+
+
+def two_prices(cheap: float) -> FiniteProgram:
+    """Two channels of 10 variables each push one sum; those of the first cost ``cheap``, those of the other 1."""
+    weights = np.repeat([cheap, 1.0], 10)
+    row = -np.concatenate([np.linspace(1.0, 0.5, 10), np.full(10, 1e-3)])[None]
+    box = np.ones(20)
+    return FiniteProgram(np.zeros(20), weights, -box, box, row, np.array([-3.25]), np.zeros((0, 20)), np.zeros(0))
+
+
+@pytest.mark.parametrize("cheap", [1e-5, 1e-7, 1e-9])
+def test_a_cheap_variable_is_chosen_as_exactly_as_if_nothing_else_had_a_price(cheap):
+    program = two_prices(cheap)
+    solution = solve_finite(program, PIQP, small=cheap)
+    best = 3.5 * cheap  # the most effective first: 1 + 17/18 + 16/18 + 0.5 * 15/18 = 3.25
+    assert solution.status == "optimal" and solution.value == pytest.approx(best, rel=1e-8)
+    assert solution.gap <= 1e-8 * cheap
+
+
+def seen_late(seed: int, apart: float) -> FiniteProgram:
+    """Rows as an unstable system has them at its end: combinations of two, but for the share ``apart``; all but the
+    last, which is opposite to the first, nearly tight at one point."""
+    rng = np.random.default_rng(seed)
+    n, count = 21, 5
+    G = rng.standard_normal((count, 2)) @ rng.standard_normal((2, n)) + apart * rng.standard_normal((count, n))
+    G /= np.linalg.norm(G, axis=1)[:, None]
+    h = G @ (rng.uniform(-1, 1, n) * (rng.random(n) < 0.4)) - 0.01 * apart * rng.random(count)
+    box = np.ones(n)
+    G, h = np.vstack([G, -G[:1]]), np.append(h, 1.0 - h[0])
+    return FiniteProgram(np.zeros(n), box, -box, box, G, h, np.zeros((0, n)), np.zeros(0))
+
+
+@pytest.mark.parametrize(("seed", "apart"), [(1, 1e-6), (2, 1e-6), (8, 1e-7)])
+def test_rows_that_are_nearly_parallel_are_met_exactly(seed, apart):
+    program = seen_late(seed, apart)
+    solution = solve_finite(program, PIQP)
+    assert solution.status == "optimal" and (program.G @ solution.x <= program.h + 1e-14).all()
