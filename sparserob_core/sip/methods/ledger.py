@@ -175,7 +175,7 @@ class Ledger:
             return self.result("failed", solution.message, answer)
         rows, solution = irreducible(self.relaxed, answer.rows, solution)
         answer = replace(answer, rows=rows, solution=solution)
-        found, worst = infeasible_subsystem(self.relaxed.program, rows, answer.multipliers, solution.infeasibility)
+        found, worst = infeasible_subsystem(self.relaxed.program, rows, solution.y, solution.infeasibility)
         self.dual = self.relaxed.dual(rows, solution.y, solution.mu, solution.z, solution.infeasibility)
         return replace(self.result("infeasible", found.sentence(), answer, worst), infeasible=found)
 

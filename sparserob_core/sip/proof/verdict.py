@@ -88,31 +88,33 @@ def explained(program: SemiInfiniteProgram, bare: WorstConstraint) -> WorstConst
 
 
 def infeasible_subsystem(
-    program: SemiInfiniteProgram, rows: Rows, multipliers: Array, amount: float
+    program: SemiInfiniteProgram, rows: Rows, y: Array, amount: float
 ) -> tuple[InfeasibleSubsystem, WorstConstraint | None]:
-    """Why nothing is feasible, from Farkas multipliers ``(r,)`` of ``rows``: every separate reason that needs no
-    solver; where there is none, the rows that cannot hold together, and what they ask of the decision against what it
-    can give. With it the constraint that matters most.
+    """Why nothing is feasible, from Farkas multipliers ``y`` of the fixed rows and then of ``rows``: every separate
+    reason that needs no solver; where there is none, the rows that cannot hold together, and what they ask of the
+    decision against what it can give. With it the constraint that matters most.
     """
     found, equalities = reasons(program), bool(program.finite.b.size)
+    multipliers = y[y.size - rows.h.size :]
+    active = np.flatnonzero(multipliers > 0)
+    if active.size == 1 and not equalities and (program.finite.S is not None or not found) and len(found) < 2:
+        i = int(active[0])
+        # Farkas multipliers say more where the decision has more than bounds of its own (a polytope of controls)
+        norms = np.linalg.norm(np.vstack([program.finite.G, rows.G]), axis=1)
+        farkas = amount * float(y @ norms / multipliers[i])
+        alone = max(float(least_of(program.finite, rows.G[[i]], rows.h[[i]])[0]), farkas)
+        if alone > max((reason.amount for reason in found), default=0.0):
+            family = program.family(rows.cuts[i].family)
+            text = sentence("out of reach", family, rows.take(np.array([i])), np.ones(1), alone)
+            return InfeasibleSubsystem(reasons=(text,)), _worst_at(program, rows.cuts[i], alone)
     if found:
         texts = tuple(reason.text for reason in found[:NAMED])
         told = InfeasibleSubsystem(reasons=texts, others=max(0, len(found) - NAMED))
         return told, _worst_at(program, found[0].rows.cuts[0], found[0].amount)
-    active = np.flatnonzero(multipliers > 0)
     if not active.size:
         return InfeasibleSubsystem(amount=amount, equalities=equalities), None
     order = active[np.argsort(-multipliers[active], kind="stable")]
     worst = _worst_at(program, rows.cuts[order[0]], amount)
-    if active.size == 1 and not equalities:
-        i = int(order[0])
-        family = program.family(rows.cuts[i].family)
-        # Farkas multipliers of one row say the same where its bounds are those of an image (a polytope of controls)
-        farkas = amount * float(np.linalg.norm(rows.G[i]))
-        alone = max(float(least_of(program.finite, rows.G[[i]], rows.h[[i]])[0]), farkas)
-        if alone > 0:
-            text = sentence("out of reach", family, rows.take(np.array([i])), np.ones(1), alone)
-            return InfeasibleSubsystem(reasons=(text,)), replace(worst, violation=alone)
     return _together(program, rows, multipliers, order, amount), worst
 
 

@@ -87,17 +87,16 @@ def test_a_disturbance_that_is_wider_than_the_set_is_said_to_be_that(tmp_path):
 
 
 def test_what_a_polytope_of_controls_can_give_is_told_like_that_of_a_box(tmp_path):
-    """|u| <= 1 and a slanted row beside it, ``u <= 0.5`` at a small factor: x2(2) is at most 1."""
-    slanted = {"polytope": {"H": [[1, 0], [-1, 0], [0, 1], [0, -1], [1e-6, 1e-6]], "h": [1, 1, 1, 1, 0.5e-6]}}
+    """Two seconds of ``u1 + u2 <= 0.5``, a row that is stated at a small factor."""
+    slanted = {"polytope": {"H": [[1, 0], [0, 1], [-1, 0], [0, -1], [1e-6, 1e-6]], "h": [1, 1, 1, 1, 0.5e-6]}}
     outcome = solved(
         tmp_path,
-        system={"A": [[0, 1], [0, 0]], "B": [[0, 0], [1, 1]]},
-        initial_state=[0, 0],
+        system={"A": [[0]], "B": [[1, 1]]},
+        initial_state=[0],
         control=slanted,
-        disturbance=None,
-        terminal=[{"box": {"lower": [None, 1.5], "upper": [None, None]}}],
+        terminal=[{"box": {"lower": [1.00002], "upper": [None]}}],
     )
-    assert outcome.result.message.startswith("the control can raise x2(2) by at most 1, and 1.5 is needed")
+    assert outcome.result.message.startswith("the control can raise x1(2) by at most 1, and 1.00002 is needed")
 
 
 def test_a_control_that_is_too_weak_is_told_by_how_much(tmp_path):
