@@ -95,7 +95,8 @@ def test_every_evaluation_is_in_the_recording_with_the_value_that_the_trace_has(
         assert (values[mine, 1] == np.maximum.accumulate(trace.value[mine])).all()
     proven = values[:, 2][np.isfinite(values[:, 2])]
     assert (np.diff(proven) >= 0).all()
-    assert proven.max() <= searched.result.lower_bound
+    # of the bound that is written, what rounding may do to it is subtracted once more
+    assert proven.max() <= searched.result.lower_bound + 1e-12 * searched.result.cost_scale
 
 
 def test_rounds_have_the_bounds_of_the_history_on_all_three_timelines(exchanged: sr.Outcome) -> None:

@@ -76,7 +76,7 @@ class Dictionary:
         return self.functions == self.pieces and np.array_equal(self.values, np.eye(self.pieces))
 
     @shaped
-    def control(self, theta: Float[Array, " n"]) -> Float[Array, "m K"]:
+    def control(self, theta: Float[Array, "*n"]) -> Float[Array, "m K"]:
         """The control ``(m, K)`` on the pieces, from coefficients ``(m N,)``, raveled channel by channel."""
         coefficients = theta.reshape(-1, self.functions)
         return coefficients if self.is_indicators else coefficients @ self.values
