@@ -16,7 +16,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 help:
 	@echo "make demo        solve the repaired experiment 1, print the bounds, draw the figures"
 	@echo "make paper       every experiment and figure of the paper, and docs/paper.md (a few minutes)"
-	@echo "make test        lint, types, import rules, tests: the first stage, three minutes on two processors"
+	@echo "make test        lint, types, import rules, tests: the first stage, about five minutes on two processors"
 	@echo "make test-slow   the second stage: larger instances of what the first one tests"
 	@echo "make bench       time the certified solve and the maximisers beside other people's"
 	@echo "make docs        write the reference and the schema anew, execute README.md and docs/"

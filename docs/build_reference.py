@@ -23,7 +23,7 @@ MEANING = {
     2: "the input is at fault",
     3: "infeasible",
     4: "refuted or undecided",
-    5: "failed",
+    5: "failed, or a component of a plugin failed",
     130: "interrupted",
 }
 FILES = {
