@@ -286,7 +286,7 @@ def test_an_address_that_is_none_is_refused_before_the_run(wrong: str, tmp_path:
 def test_a_run_that_breaks_off_leaves_a_complete_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from sparserob_core.experiment.run.journal import Journal
 
-    def broken(*anything: object) -> None:
+    def broken(*anything: object, **options: object) -> None:
         raise RuntimeError("the disk is gone")
 
     monkeypatch.setattr(Journal, "finish", broken)

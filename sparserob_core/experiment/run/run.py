@@ -136,8 +136,9 @@ def run(
             return Outcome(result, directory.path, experiment, control, summary, remarks)
         except BaseException as error:
             error.add_note(f"what was done until then is in {directory.path}")
-            if result is None:
+            if result is None or not isinstance(error, KeyboardInterrupt):
                 ending = RunFinished(status="failed", message=_said(error), seconds=time.perf_counter() - started)
+            if result is None:
                 journal.record_unfinished(ending.message, ending.seconds)
             raise
         finally:
