@@ -24,6 +24,11 @@ def dotted(path: Path) -> str:
     return ".".join(str(step) for step in path)
 
 
+def named(error: BaseException) -> str:
+    """An exception as its type and, where it has one, its message."""
+    return f"{type(error).__name__}: {error}".removesuffix(": ")
+
+
 class SparseRobError(Exception):
     """Base class. ``exit_status`` is what the command line returns for it."""
 

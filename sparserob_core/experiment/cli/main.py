@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import click
 
-from sparserob_core.errors import SparseRobError
+from sparserob_core.errors import SparseRobError, named
 from sparserob_core.experiment.cli.commands.check import check
 from sparserob_core.experiment.cli.commands.compare import compare
 from sparserob_core.experiment.cli.commands.figures import figures
@@ -58,7 +58,7 @@ def _status(arguments: Sequence[str] | None) -> int:
     except MemoryError as error:
         return _end("out of memory; fewer pieces, cells or trajectories need less", error, 5)
     except Exception as error:  # noqa: BLE001  the last resort: a fault of the program is one line too
-        said = f"{type(error).__name__}: {error}".removesuffix(": ")
+        said = named(error)
         return _end(f"internal error: {said}; {DEBUG}=1 shows where", error, 5)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
 
-from sparserob_core.errors import PluginError, SparseRobError
+from sparserob_core.errors import PluginError, SparseRobError, named
 from sparserob_core.sip.maximiser import SearchEnded
 
 Answer = TypeVar("Answer")
@@ -25,7 +25,7 @@ def attributed(origin: str, what: str, but: tuple[type[Exception], ...] = PASSIN
     except passing:
         raise
     except BaseException as error:
-        said = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        said = named(error)
         raise PluginError(f"{origin}: {what} raised {said}") from error
 
 

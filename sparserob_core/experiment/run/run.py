@@ -11,6 +11,7 @@ from typing import Any, final
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.transcription.provable import unprovable
 from sparserob_core.control.transcription.rounding import rounded_down
+from sparserob_core.errors import named
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, assemble, build, name_of, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.reader import write_yaml
@@ -149,7 +150,7 @@ def _said(error: BaseException) -> str:
     """What ended a run that its method did not end; an interrupt says what it was, unless it is from the keyboard."""
     if isinstance(error, KeyboardInterrupt):
         return str(error) or "interrupted from the keyboard"
-    return f"{type(error).__name__}: {error}".removesuffix(": ")
+    return named(error)
 
 
 def _notifying(tools: Tools, broadcast: Broadcast) -> Tools:

@@ -25,7 +25,7 @@ class ViolationCount:
         slack = SAME_TIME * times[-1]
         self.constraint, self.times = constraint, times
         self._is_curved = constraint.sides is None
-        self.units = units
+        self.units, self._in_own_units = units, constraint.divided(units)
         self._inside = (times >= constraint.start - slack) & (times <= constraint.stop + slack)
         self.violated, self.largest, self.time = 0, -np.inf, np.nan
 
@@ -44,13 +44,9 @@ class ViolationCount:
         """The states ``(d, n)`` at one of the times."""
         if not self._inside[position]:
             return
-        sides = self.constraint.sides
-        if sides is None:
-            value = self.constraint.outwardness(state)
-        else:
-            excess = sides[0] @ state - sides[1][:, None]
-            value = excess.max(axis=0)
-            np.maximum(self._own, (excess / self.units[:, None]).max(axis=0), out=self._own)
+        value = self.constraint.outwardness(state)
+        if not self._is_curved:
+            np.maximum(self._own, self._in_own_units.outwardness(state), out=self._own)
         better = value > self._best
         if better.any():
             np.copyto(self._best, value, where=better)
