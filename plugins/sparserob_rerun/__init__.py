@@ -14,7 +14,7 @@ import sparserob_core as sr
 from sparserob_rerun.options import LandscapeOptions
 
 if TYPE_CHECKING:
-    from sparserob_rerun.outlet import Outlet
+    from sparserob_rerun.recording.outlet import Outlet
 
 logger = logging.getLogger("sparserob")
 
@@ -51,7 +51,7 @@ class Rerun(sr.Observer, sr.Options):
     @field_validator("connect")
     @classmethod
     def _address(cls, text: str | None) -> str | None:
-        from sparserob_rerun.sinks import address_of
+        from sparserob_rerun.recording.sinks import address_of
 
         if text is not None:
             address_of(text)
@@ -74,7 +74,7 @@ class Rerun(sr.Observer, sr.Options):
                 logger.warning("rerun: %s", line)
 
     def _begin(self, event: sr.RunStarted) -> None:
-        from sparserob_rerun.sinks import look
+        from sparserob_rerun.recording.sinks import look
 
         self.close()
         nowhere = not (self.spawn or self.connect or self.serve or self.save)
@@ -90,8 +90,8 @@ class Rerun(sr.Observer, sr.Options):
         if chosen.serve is not None:
             logger.warning("rerun: to watch, open %s", chosen.page)
         if chosen.any:
-            from sparserob_rerun.outlet import Outlet
-            from sparserob_rerun.recorder import Opening
+            from sparserob_rerun.recording.outlet import Outlet
+            from sparserob_rerun.recording.recorder import Opening
 
             opening = Opening(event.title, event.directory, event.inspection, self.landscape)
             self._outlet = Outlet(opening, chosen, 0 if event.problem is None else event.problem.system.parameter_count)

@@ -160,7 +160,7 @@ def test_the_signals_are_the_control_and_the_tube_of_the_figures(exchanged: sr.O
 
 
 def test_the_control_acts_just_where_the_push_of_the_active_constraints_leaves_the_band(exchanged: sr.Outcome) -> None:
-    from sparserob_rerun.switching import Switching
+    from sparserob_rerun.physics.switching import Switching
 
     push = Switching(exchanged.program).push(exchanged.result.indices, None)
     assert push is not None and exchanged.control is not None
@@ -173,7 +173,7 @@ def test_the_control_acts_just_where_the_push_of_the_active_constraints_leaves_t
 
 def test_the_landscape_is_g_and_decided_by_its_anchor_alone() -> None:
     from sparserob_core.experiment.config.load import load_config
-    from sparserob_rerun.landscape import Landscape
+    from sparserob_rerun.search.landscape import Landscape
 
     loaded = load_config(CONFIGS / "experiment1_reduced.yaml", SEARCH)
     anchor = np.array([[0.5], [0.9], [3.0], [4.9]])
@@ -194,7 +194,7 @@ def test_the_landscape_is_g_and_decided_by_its_anchor_alone() -> None:
 
 def test_coordinates_of_the_landscape_are_named_or_refused_with_what_there_is() -> None:
     from sparserob_core.experiment.config.load import load_config
-    from sparserob_rerun.landscape import coordinate, influential
+    from sparserob_rerun.search.landscape import coordinate, influential
 
     g = sr.Inspection(
         load_config(CONFIGS / "experiment2_reduced.yaml", {"dictionaries.control.pieces": 20})
@@ -214,7 +214,7 @@ def test_a_search_is_shown_of_the_methods_that_say_that_they_search(
     method: str, searches: bool, tmp_path: Path
 ) -> None:
     from sparserob_core.experiment.config.load import load_config
-    from sparserob_rerun.recorder import shown_of
+    from sparserob_rerun.recording.recorder import shown_of
 
     (tmp_path / "stub.py").write_text(STUB)
     changes = {"plugins": [str(tmp_path / "stub.py")], "method": {"name": method}}
@@ -259,9 +259,9 @@ def test_what_is_missing_is_one_warning_and_the_run_goes_on(
 def test_a_missing_package_is_one_warning_with_the_way_to_install_it(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import sparserob_rerun.sinks
+    import sparserob_rerun.recording.sinks
 
-    monkeypatch.setattr(sparserob_rerun.sinks, "find_spec", lambda name: None)
+    monkeypatch.setattr(sparserob_rerun.recording.sinks, "find_spec", lambda name: None)
     assert recorded(tmp_path / "run", "experiment1_repaired.yaml", QUICK).status == "certified"
     assert [record.getMessage() for record in caplog.records] == [
         "rerun: rerun-sdk is not installed; `pip install 'sparserob[rerun]'` brings it"
@@ -298,9 +298,9 @@ def test_a_run_that_breaks_off_leaves_a_complete_recording(tmp_path: Path, monke
 
 
 def test_a_full_queue_drops_at_once_and_says_so(tmp_path: Path) -> None:
-    from sparserob_rerun.outlet import Outlet
-    from sparserob_rerun.recorder import Opening
-    from sparserob_rerun.sinks import Destinations
+    from sparserob_rerun.recording.outlet import Outlet
+    from sparserob_rerun.recording.recorder import Opening
+    from sparserob_rerun.recording.sinks import Destinations
 
     outlet = Outlet(
         Opening("many", None, None, None), Destinations(tmp_path / "x.rrd", None, False, None), 0, capacity=2
@@ -316,9 +316,9 @@ def test_a_full_queue_drops_at_once_and_says_so(tmp_path: Path) -> None:
 
 
 def test_a_process_that_dies_is_noticed_and_costs_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    from sparserob_rerun.outlet import Outlet
-    from sparserob_rerun.recorder import Opening
-    from sparserob_rerun.sinks import Destinations
+    from sparserob_rerun.recording.outlet import Outlet
+    from sparserob_rerun.recording.recorder import Opening
+    from sparserob_rerun.recording.sinks import Destinations
 
     outlet = Outlet(Opening("killed", None, None, None), Destinations(tmp_path / "x.rrd", None, False, None), 0)
     outlet.process.kill()
@@ -332,9 +332,9 @@ def test_a_process_that_dies_is_noticed_and_costs_nothing(tmp_path: Path, caplog
 
 @pytest.mark.slow
 def test_a_system_without_fork_records_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import sparserob_rerun.outlet
+    import sparserob_rerun.recording.outlet
 
-    monkeypatch.setattr(sparserob_rerun.outlet, "START", "spawn")
+    monkeypatch.setattr(sparserob_rerun.recording.outlet, "START", "spawn")
     recorded(tmp_path / "run", "experiment1_repaired.yaml", QUICK)
     found = read(tmp_path / "run" / "recording.rrd")
     assert {"/physics/plots/curve", "/landscape/map/g", "/verdict"} <= set(found)
@@ -486,7 +486,7 @@ def test_the_viewer_draws_every_panel_without_complaint(
 
 
 def test_a_landscape_takes_only_the_time_of_an_index_of_another_formulation() -> None:
-    from sparserob_rerun.recorder import slots_of
+    from sparserob_rerun.recording.recorder import slots_of
 
     cuts = [
         sr.Cut("path", np.array([1.0, 17.0]), 0, 2.0, "sampled"),

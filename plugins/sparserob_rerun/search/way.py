@@ -7,9 +7,9 @@ from typing import final
 import numpy as np
 
 import sparserob_core as sr
-from sparserob_rerun.landscape import Landscape
-from sparserob_rerun.palette import Floats
-from sparserob_rerun.terrain import Terrain
+from sparserob_rerun.drawing.palette import Floats
+from sparserob_rerun.search.landscape import Landscape
+from sparserob_rerun.search.terrain import Terrain
 
 KEPT = 1000  # evaluated points that are remembered
 SEEN = 10  # evaluations, or a hundredth of the budget, between two pictures

@@ -9,9 +9,9 @@ from typing import Any, final
 import numpy as np
 
 import sparserob_core as sr
-from sparserob_rerun import palette as ink
-from sparserob_rerun.canvas import Axes, Drawing
-from sparserob_rerun.palette import Floats
+from sparserob_rerun.drawing import palette as ink
+from sparserob_rerun.drawing.canvas import Axes, Drawing
+from sparserob_rerun.drawing.palette import Floats
 
 INSTANTS, PARAMETERS = 97, 15
 FAMILIES = 4

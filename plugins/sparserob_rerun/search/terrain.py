@@ -6,10 +6,10 @@ from typing import Any, final
 
 import numpy as np
 
-from sparserob_rerun import palette as ink
-from sparserob_rerun.canvas import Axes, Drawing
-from sparserob_rerun.landscape import Landscape
-from sparserob_rerun.palette import Floats
+from sparserob_rerun.drawing import palette as ink
+from sparserob_rerun.drawing.canvas import Axes, Drawing
+from sparserob_rerun.drawing.palette import Floats
+from sparserob_rerun.search.landscape import Landscape
 
 SIDE = 384.0
 TRAIL, LAST = 300, 60  # evaluated points that stay visible, and how many of the last are joined by a line

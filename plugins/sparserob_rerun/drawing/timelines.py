@@ -6,7 +6,7 @@ from typing import Any, final
 
 import numpy as np
 
-from sparserob_rerun.palette import Floats
+from sparserob_rerun.drawing.palette import Floats
 
 
 @final

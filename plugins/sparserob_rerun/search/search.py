@@ -7,9 +7,9 @@ from typing import Any, final
 import numpy as np
 
 import sparserob_core as sr
-from sparserob_rerun import palette as ink
-from sparserob_rerun.palette import Colour, Floats
-from sparserob_rerun.timelines import Timelines
+from sparserob_rerun.drawing import palette as ink
+from sparserob_rerun.drawing.palette import Colour, Floats
+from sparserob_rerun.drawing.timelines import Timelines
 
 MOVES = (
     4  # coordinates of one evaluation that are shown; a search that changes all of them at once would bury the panel

@@ -15,9 +15,9 @@ from typing import Any, final
 import numpy as np
 
 import sparserob_core as sr
-from sparserob_rerun.desk import Account, Ending, record
-from sparserob_rerun.recorder import Opening
-from sparserob_rerun.sinks import Destinations
+from sparserob_rerun.recording.desk import Account, Ending, record
+from sparserob_rerun.recording.recorder import Opening
+from sparserob_rerun.recording.sinks import Destinations
 
 CAPACITY = 512  # events that may wait
 COLLECTING = 0.4  # seconds for which evaluations are collected before they are sent

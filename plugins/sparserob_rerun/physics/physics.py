@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 
 import sparserob_core as sr
-from sparserob_rerun import palette as ink
-from sparserob_rerun.canvas import Axes, Drawing
-from sparserob_rerun.palette import Floats
-from sparserob_rerun.switching import Switching
+from sparserob_rerun.drawing import palette as ink
+from sparserob_rerun.drawing.canvas import Axes, Drawing
+from sparserob_rerun.drawing.palette import Floats
+from sparserob_rerun.physics.switching import Switching
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -42,7 +42,7 @@ class Physics:
     def draw(self, decision: Floats, cuts: Sequence[sr.Cut], mu: Floats | None) -> None:
         """One decision with the constraints that carry a multiplier; ``mu`` are the multipliers of the equalities, if
         they are known."""
-        from sparserob_rerun.phase import draw_phase
+        from sparserob_rerun.physics.phase import draw_phase
 
         active = [cut for cut in cuts if cut.multiplier > 0.0]
         times = np.unique([cut.index[0] for cut in active])

@@ -12,7 +12,7 @@ from typing import Any, final
 
 import numpy as np
 
-from sparserob_rerun.palette import FAINT, GREY, INK, Colour, Floats
+from sparserob_rerun.drawing.palette import FAINT, GREY, GROUND, INK, Colour, Floats
 
 HATCHES = 60
 LIFT = 9.0  # the viewer writes labels this far below their points
@@ -161,3 +161,16 @@ def ticks(low: float, high: float, most: int = 5) -> Floats:
     first = np.ceil(low / step - 1e-9)
     values = step * np.arange(first, np.floor(high / step + 1e-9) + 1)
     return np.where(np.abs(values) < 1e-12 * span, 0.0, values)
+
+
+def view(origin: str, name: str, extent: tuple[float, float, float, float]) -> Any:
+    """A view of what is drawn below ``origin``: left, right, top and bottom of it are the ``extent``."""
+    import rerun.blueprint as rrb
+
+    left, right, top, bottom = extent
+    return rrb.Spatial2DView(
+        origin=origin,
+        name=name,
+        background=list(GROUND[:3]),
+        visual_bounds=rrb.VisualBounds2D(x_range=(left, right), y_range=(top, bottom)),
+    )

@@ -16,9 +16,9 @@ from importlib.abc import MetaPathFinder
 from typing import Any, final
 
 import sparserob_core as sr
-from sparserob_rerun.layout import layout
-from sparserob_rerun.recorder import Opening, Recorder, shown_of
-from sparserob_rerun.sinks import Destinations, open_sinks
+from sparserob_rerun.recording.layout import layout
+from sparserob_rerun.recording.recorder import Opening, Recorder, shown_of
+from sparserob_rerun.recording.sinks import Destinations, open_sinks
 
 IDLE = 0.5  # seconds between two looks at whether the run is still alive
 FLUSHING = 5.0

@@ -9,7 +9,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     import sparserob_core as sr
-    from sparserob_rerun.palette import Floats
+    from sparserob_rerun.drawing.palette import Floats
 
 
 @final

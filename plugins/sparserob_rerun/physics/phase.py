@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sparserob_rerun import palette as ink
-from sparserob_rerun.canvas import Axes, Drawing
+from sparserob_rerun.drawing import palette as ink
+from sparserob_rerun.drawing.canvas import Axes, Drawing
 
 if TYPE_CHECKING:
     import sparserob_core as sr
-    from sparserob_rerun.palette import Floats
+    from sparserob_rerun.drawing.palette import Floats
 
 SIDE = 420.0
 SLICES = 36

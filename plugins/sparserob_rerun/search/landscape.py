@@ -13,7 +13,7 @@ from typing import final
 import numpy as np
 
 import sparserob_core as sr
-from sparserob_rerun.palette import Floats
+from sparserob_rerun.drawing.palette import Floats
 
 STRIDES = (8, 4, 2, 1)
 

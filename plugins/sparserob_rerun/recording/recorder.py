@@ -9,17 +9,17 @@ from typing import Any, final
 import numpy as np
 
 import sparserob_core as sr
-from sparserob_rerun import words
-from sparserob_rerun.explorer import Explorer
-from sparserob_rerun.layout import Shown
+from sparserob_rerun.drawing.palette import Floats
+from sparserob_rerun.drawing.timelines import Timelines
+from sparserob_rerun.exchange.rounds import Rounds
 from sparserob_rerun.options import LandscapeOptions
-from sparserob_rerun.palette import Floats
-from sparserob_rerun.physics import Physics
-from sparserob_rerun.rounds import Rounds
-from sparserob_rerun.search import SearchView
-from sparserob_rerun.terrain import Terrain
-from sparserob_rerun.timelines import Timelines
-from sparserob_rerun.way import Way
+from sparserob_rerun.physics.physics import Physics
+from sparserob_rerun.recording import words
+from sparserob_rerun.recording.layout import Shown
+from sparserob_rerun.search.explorer import Explorer
+from sparserob_rerun.search.search import SearchView
+from sparserob_rerun.search.terrain import Terrain
+from sparserob_rerun.search.way import Way
 
 PICTURES = 60  # rounds whose physics is drawn; of later ones every tenth
 PROOFS = 12  # lines about the proof of one family

@@ -9,10 +9,10 @@ from typing import final
 import numpy as np
 
 import sparserob_core as sr
-from sparserob_rerun.landscape import Landscape, coordinate, influential
+from sparserob_rerun.drawing.palette import Floats
 from sparserob_rerun.options import LandscapeOptions
-from sparserob_rerun.palette import Floats
-from sparserob_rerun.terrain import Terrain
+from sparserob_rerun.search.landscape import Landscape, coordinate, influential
+from sparserob_rerun.search.terrain import Terrain
 
 SLICE = 0.02  # seconds of work between two looks at the queue
 FEWEST = 32  # evaluations that a first, coarse landscape needs
