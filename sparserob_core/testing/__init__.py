@@ -11,11 +11,12 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.maximiser import EvaluationError, Maximiser, Report
 from sparserob_core.sip.search.search import Target, maximise
+from sparserob_core.testing.executors import ExecutorContract
 from sparserob_core.testing.observers import ObserverContract
 from sparserob_core.testing.sets import SetContract
 from sparserob_core.testing.solvers import SolverContract
 
-__all__ = ["MaximiserContract", "ObserverContract", "SetContract", "SolverContract"]
+__all__ = ["ExecutorContract", "MaximiserContract", "ObserverContract", "SetContract", "SolverContract"]
 
 PLANE = Box(np.array([-3.0, -2.0]), np.array([2.0, 4.0]))
 ODD_BOXES = (
