@@ -55,7 +55,7 @@ class Objective(Protocol):
 
     @property
     def remaining(self) -> int:
-        """Evaluations that are left."""
+        """Evaluations that are left; 0 once the search is ended."""
 
     def evaluate(self, points: Array) -> Array:
         """Values ``(k,)`` at points ``(k, d)``; NaN comes back as ``-inf``.

@@ -1,8 +1,8 @@
-"""The contract of a solver: whatever it says, what comes out of the check is right or says that it failed."""
+"""The contract of a solver: its claims are what a claim means, and what comes out of the check is right or says that it
+failed."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -12,9 +12,12 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
 from sparserob_core.sip.inner.solve import solve_finite
-from sparserob_core.sip.solver import Solver
+from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
+from sparserob_core.testing.contract import Contract, broken, demand
 
 EPSILONS = (1.0, 1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+ASKED = 1e-9  # the accuracy that is asked for
+BELIEVED = "the check believes a wrong answer, which it never should, whatever the solver says; please report it"
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,19 +230,303 @@ def infeasible_instances() -> Iterator[Instance]:
             yield Instance(f"infeasible: {name}, epsilon {epsilon:g}", regularised(program, epsilon), np.inf, np.inf)
 
 
-class SolverContract(ABC):
-    """What every solver must keep, behind the check: subclass it as ``class TestMine(SolverContract)`` and give
-    ``create``.
+def coupled_instances() -> Iterator[Instance]:
+    """Programs that only a solver can solve: decisions that a full ``P``, or an image of their own, ties together.
 
-    A solver may fail where a program is too hard for it; it may not be believed when it is wrong. ``may_fail`` is the
-    number of instances of a test on which it may give up.
+    Each is made from its optimum: a decision, multipliers, and the linear cost for which they are optimal.
+    """
+    from scipy.sparse import csc_array
+
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        n, rows, equalities = 6 + 2 * seed, 5, seed % 3
+        S = None if seed % 2 else np.vstack([np.eye(n), np.tril(np.ones((n, n))) / n])
+        images = n if S is None else 2 * n
+        P = None if seed >= 6 else rng.normal(size=(n, n)) / np.sqrt(n)
+        P = None if P is None else csc_array(P @ P.T + 0.05 * np.eye(n))
+        x = np.where(rng.random(n) < 0.3, 0.0, rng.uniform(-1.0, 1.0, n))
+        s = x if S is None else S @ x
+        weights, reach = rng.uniform(0.1, 1.0, images), np.where(rng.random(images) < 0.3, 0.0, 1.0)
+        at_top = (rng.random(images) < 0.2) & (s > 0.0)
+        slope = np.where(s == 0.0, rng.uniform(-0.9, 0.9, images), np.sign(s)) * weights
+        slope[at_top] += rng.uniform(0.1, 1.0, int(at_top.sum()))
+        G, A = rng.normal(size=(rows, n)), rng.normal(size=(equalities, n))
+        y = np.where(np.arange(rows) < 3, rng.uniform(0.1, 1.0, rows), 0.0)
+        pull = G.T @ y + A.T @ rng.normal(size=equalities) + (slope if S is None else S.T @ slope)
+        program = FiniteProgram(
+            -pull - (0.0 if P is None else P @ x),
+            weights,
+            s - 0.5 - reach,
+            np.where(at_top, s, s + 0.5 + reach),
+            G,
+            G @ x + np.where(y > 0.0, 0.0, 0.7),
+            A,
+            A @ x,
+            P,
+            None if S is None else csc_array(S),
+        )
+        value = program.objective(x)
+        slack = 1e-8 * max(1.0, program.magnitude(x))
+        kind = "linear" if P is None else "quadratic"
+        yield Instance(f"coupled {kind} program {seed}", program, value - slack, value + slack)
+
+
+@dataclass(frozen=True, eq=False)
+class Question:
+    """A quadratic program as a solver is handed it, and its value (``inf``: infeasible, ``-inf``: unbounded)."""
+
+    name: str
+    program: QuadraticProgram
+    value: float
+
+
+def question(
+    name: str, rng: np.random.Generator, n: int, rows: int, equalities: int, bounded: bool, curved: bool
+) -> Question:
+    """A program made from its optimum: rows of unit norm, every second one active; a third of the bounds reached."""
+    from scipy.sparse import csc_array
+
+    half = rng.normal(size=(n, n)) / np.sqrt(n)
+    P = half @ half.T + 0.1 * np.eye(n) if curved else np.zeros((n, n))
+    G, A = rng.normal(size=(rows, n)), rng.normal(size=(equalities, n))
+    G, A = (M / np.linalg.norm(M, axis=1, keepdims=True) for M in (G, A))
+    x = rng.uniform(-1.0, 1.0, n)
+    z = np.where(np.arange(rows) % 2 == 0, rng.uniform(0.2, 1.0, rows), 0.0)
+    side = np.arange(n) % 3 if bounded else np.full(n, 2)  # at the lower bound, at the upper one, at neither
+    lower = np.where(side == 0, x, np.where(np.arange(n) % 2 == 0, -np.inf, x - 1.0)) if bounded else -np.inf
+    upper = np.where(side == 1, x, np.where(np.arange(n) % 2 == 1, np.inf, x + 1.0)) if bounded else np.inf
+    z_box = np.where(side == 0, -1.0, np.where(side == 1, 1.0, 0.0)) * rng.uniform(0.2, 1.0, n)
+    q = -(P @ x + G.T @ z + A.T @ rng.normal(size=equalities) + z_box)
+    scale = float(np.abs(q).max())
+    program = QuadraticProgram(
+        csc_array(P / scale),
+        q / scale,
+        csc_array(G),
+        G @ x + np.where(z > 0.0, 0.0, 0.5),
+        csc_array(A),
+        A @ x,
+        np.broadcast_to(lower, n).astype(float),
+        np.broadcast_to(upper, n).astype(float),
+    )
+    return Question(name, program, objective(program, x))
+
+
+def questions() -> Iterator[Question]:
+    """Programs with and without curvature, rows, equalities and bounds; each has a solution."""
+    rng = np.random.default_rng(11)
+    yield question("one variable", rng, 1, 1, 0, False, True)
+    yield question("bounds only", rng, 7, 0, 0, True, True)
+    yield question("rows only", rng, 6, 9, 0, False, True)
+    yield question("equalities only", rng, 8, 0, 3, False, True)
+    yield question("everything", rng, 12, 10, 3, True, True)
+    yield question("everything, larger", rng, 60, 40, 10, True, True)
+    yield question("a linear program", rng, 9, 12, 2, True, False)
+    yield question("a linear program, larger", rng, 50, 60, 5, True, False)
+
+
+def hopeless() -> Iterator[Question]:
+    """Programs without a solution: nothing is feasible, or the cost falls for ever."""
+    from scipy.sparse import csc_array
+
+    for n, curved in ((2, True), (10, False)):
+        eye, none = np.eye(n), np.zeros((0, n))
+        P, q, free = csc_array(eye * curved), np.ones(n), np.full(n, np.inf)
+        opposed, apart = np.vstack([eye[0], -eye[0]]), np.array([-1.0, -1.0])
+        yield Question(
+            "opposed rows",
+            QuadraticProgram(P, q, csc_array(opposed), apart, csc_array(none), np.zeros(0), -free, free),
+            np.inf,
+        )
+        yield Question(
+            "an equality out of reach",
+            QuadraticProgram(
+                P, q, csc_array(none), np.zeros(0), csc_array(eye[:1]), np.array([3.0]), -np.ones(n), np.ones(n)
+            ),
+            np.inf,
+        )
+    yield Question(
+        "unbounded",
+        QuadraticProgram(
+            csc_array((n, n)), q, csc_array(-eye[:1]), np.zeros(1), csc_array(none), np.zeros(0), -free, free
+        ),
+        -np.inf,
+    )
+
+
+def objective(program: QuadraticProgram, x: Array) -> float:
+    """``1/2 x'P x + q'x``."""
+    return float(x @ (program.P @ x) / 2 + program.q @ x)
+
+
+def misses(program: QuadraticProgram, claim: Claim) -> dict[str, float]:
+    """By how much a claim misses each condition of optimality (Karush 1939; Kuhn and Tucker 1951), in words."""
+    x, z, y, z_box = claim.x, claim.z, claim.y, claim.z_box
+    stationary = program.P @ x + program.q + program.G.T @ z + program.A.T @ y + z_box
+    low, high = np.minimum(z_box, 0.0), np.maximum(z_box, 0.0)
+    open_below, open_above = np.isneginf(program.lower), np.isposinf(program.upper)
+    lower, upper = np.where(open_below, 0.0, program.lower), np.where(open_above, 0.0, program.upper)
+    dual = -float(program.h @ z + program.b @ y + upper @ high + lower @ low) - float(x @ (program.P @ x)) / 2
+
+    def largest(values: Array) -> float:
+        return float(np.max(values, initial=0.0))
+
+    return {
+        "G x <= h": largest(program.G @ x - program.h),
+        "A x = b": largest(np.abs(program.A @ x - program.b)),
+        "lower <= x <= upper": largest(np.maximum(program.lower - x, x - program.upper)),
+        "P x + q + G'z + A'y + z_box = 0": largest(np.abs(stationary)),
+        "z >= 0": largest(-z),
+        "z_box >= 0 where lower is -inf, z_box <= 0 where upper is inf": largest(
+            np.concatenate([-z_box[open_below], z_box[open_above]])
+        ),
+        "the cost is that of the multipliers (complementary slackness)": abs(objective(program, x) - dual),
+    }
+
+
+class Counted(Solver):
+    """Passes everything on to a solver, and counts the calls."""
+
+    def __init__(self, solver: Solver) -> None:
+        self.solver, self.calls = solver, 0
+
+    def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
+        """Pass it on."""
+        self.calls += 1
+        return self.solver.solve(program, accuracy)
+
+
+class SolverContract(Contract[Solver], kind="solver"):
+    """What every solver must keep: subclass it as ``class TestMine(SolverContract)`` and give ``component``.
+
+    The first tests look at its claims themselves: shapes, signs of multipliers, residuals, programs without a solution.
+    The others look at what comes out of the check (`sip.inner`), which believes nothing: there a solver may fail where
+    a program is too hard for it, but it may not be believed when it is wrong. ``may_fail``: the number of programs of
+    a test on which it may give up. ``precision``: the residuals at which a claim of its own counts as a solution, when
+    it is asked for 1e-9; a first-order method needs a larger one.
     """
 
     may_fail = 0
+    precision = 1e-6
 
-    @abstractmethod
-    def create(self) -> Solver:
-        """A new solver."""
+    def claim(self, solver: Solver, question: Question) -> Claim:
+        """What a solver says to a question; a broken contract where it raises, or says what no claim can say."""
+        program = question.program
+        try:
+            said: object = solver.solve(program, ASKED)
+        except Exception as error:  # noqa: BLE001  a solver may raise anything, and must not
+            broken(
+                f"{question.name}: solve raised {type(error).__name__}: {error}",
+                'return a Claim with the status "failed" and the reason as its message',
+            )
+        claim = said if isinstance(said, Claim) else None
+        if claim is None or claim.status not in ("solved", "infeasible", "failed"):
+            broken(
+                f"{question.name}: solve returned {said!r}",
+                'return a Claim whose status is "solved", "infeasible" or "failed"',
+            )
+        if claim.status == "solved":
+            for name, like in (("x", program.q), ("z", program.h), ("y", program.b), ("z_box", program.q)):
+                value = np.asarray(getattr(claim, name))
+                demand(
+                    value.shape == like.shape and value.dtype.kind == "f" and bool(np.isfinite(value).all()),
+                    f"{question.name}: {name} has shape {value.shape} and type {value.dtype}, or numbers that are not "
+                    f"finite; expected {like.size} finite numbers",
+                    "x and z_box have one number for each variable, z for each row of G, y for each row of A",
+                )
+        return claim
+
+    def test_a_claim_satisfies_the_conditions_of_optimality(self) -> None:
+        solver, given_up = self.create(), []
+        for one in questions():
+            claim = self.claim(solver, one)
+            demand(
+                claim.status != "infeasible",
+                f'{one.name}: claims "infeasible" of a program that has a solution',
+                'claim "infeasible" only with a Farkas ray, and "failed" where the method merely got stuck',
+            )
+            if claim.status == "failed":
+                given_up.append(f"{one.name} ({claim.message})")
+                continue
+            for condition, missed in misses(one.program, claim).items():
+                demand(
+                    missed <= self.precision,
+                    f"{one.name}: claims a solution that misses `{condition}` by {missed:.1e} "
+                    f"(asked for {ASKED:g}, allowed {self.precision:g})",
+                    "compare the signs of your solver's multipliers with `P x + q + G'z + A'y + z_box = 0`, hand its "
+                    "tolerances `accuracy`, and see that every part of the program reaches it",
+                )
+            demand(
+                abs(objective(one.program, claim.x) - one.value) <= 10 * self.precision,
+                f"{one.name}: the cost at x is {objective(one.program, claim.x):.9g}, the optimum {one.value:.9g}",
+                "see that P is taken as a whole (or its upper triangle, where your solver wants that) and with 1/2",
+            )
+        demand(
+            len(given_up) <= self.may_fail,
+            f"gives up on {', '.join(given_up)}",
+            "these programs are small and well scaled; if it is right to give up, set `may_fail`",
+        )
+
+    def test_a_program_without_a_solution_is_not_claimed_to_be_solved(self) -> None:
+        solver = self.create()
+        for one in hopeless():
+            claim = self.claim(solver, one)
+            demand(
+                claim.status != "solved" or max(misses(one.program, claim).values()) > self.precision,
+                f"{one.name}: a contradiction, a claim that no solution can satisfy holds",
+                "this is a fault of the contract; please report it",
+            )
+            demand(
+                claim.status != "solved",
+                f"{one.name}: claims to have solved a program that has no solution",
+                'translate the status of your solver: only its word for an optimum is "solved"',
+            )
+            demand(
+                claim.status != "infeasible" or one.value == np.inf,
+                f'{one.name}: claims "infeasible" of a program whose cost falls for ever',
+                '"dual infeasible" is not "infeasible": claim "failed" there',
+            )
+
+    def test_the_program_is_left_as_it_was(self) -> None:
+        from copy import deepcopy
+
+        solver = self.create()
+        for one in questions():
+            before = deepcopy(one.program)
+            self.claim(solver, one)
+            changed = [
+                name
+                for name in ("P", "q", "G", "h", "A", "b", "lower", "upper")
+                if not np.array_equal(_dense(getattr(before, name)), _dense(getattr(one.program, name)))
+            ]
+            demand(
+                not changed,
+                f"{one.name}: solve has changed {', '.join(changed)} of the program",
+                "copy what your solver scales in place, infinite bounds above all",
+            )
+
+    def test_a_second_program_is_not_solved_by_the_answer_to_the_first(self) -> None:
+        solver = self.create()
+        for one in [*questions(), *questions()]:
+            again, fresh = self.claim(solver, one), self.claim(self.create(), one)
+            if "solved" == again.status == fresh.status:
+                apart = float(np.abs(again.x - fresh.x).max())
+                demand(
+                    apart <= 1e3 * self.precision,
+                    f"{one.name}: an old and a new solver give answers that are {apart:.1e} apart",
+                    "a warm start may save time, but must not change the answer: set up every program anew",
+                )
+            demand(
+                again.status == fresh.status,
+                f"{one.name}: an old solver says {again.status}, a new one {fresh.status}",
+                "set up every program anew: shapes, bounds and P may all differ from the last one's",
+            )
+
+    def test_programs_that_need_a_solver_are_solved(self) -> None:
+        for instance in coupled_instances():
+            counted = Counted(self.create())
+            solve_finite(instance.program, counted)
+            demand(counted.calls, f"{instance.name}: solved without the solver", "this is a fault of the contract")
+        self.solve_all(coupled_instances())
 
     def solve_all(self, instances: Iterator[Instance]) -> list[FiniteSolution]:
         """Solve each, compare with what is known, count the failures."""
@@ -252,7 +539,11 @@ class SolverContract(ABC):
             solutions.append(solution)
             if solution.status == "failed":
                 failures.append(f"{instance.name}: {solution.attempts}")
-        assert len(failures) <= self.may_fail, failures
+        demand(
+            len(failures) <= self.may_fail,
+            f"gives up on {len(failures)} programs, or is not believed: {'; '.join(failures)}",
+            "the words after each program say what was wrong with each attempt; `may_fail` is how many are allowed",
+        )
         return solutions
 
     def test_linear_programs_are_solved_or_given_up(self) -> None:
@@ -266,32 +557,55 @@ class SolverContract(ABC):
 
     def test_infeasible_programs_are_proven_infeasible_or_given_up(self) -> None:
         for solution in self.solve_all(infeasible_instances()):
-            assert solution.status == "failed" or solution.infeasibility > 0
+            demand(
+                solution.status == "failed" or solution.infeasibility > 0,
+                f"infeasible without a proof: {solution.message}",
+                "this is a fault of the check; please report it",
+            )
 
     def test_the_regularised_value_rises_with_epsilon(self) -> None:
         solver = self.create()
         solutions = [solve_finite(regularised(robust_terminal(), epsilon), solver) for epsilon in EPSILONS]
         values = [solution.value for solution in solutions if solution.status == "optimal"]
-        assert all(after <= before + 1e-8 for before, after in pairwise(values))
+        demand(
+            all(after <= before + 1e-8 for before, after in pairwise(values)),
+            f"the value rises where the weight of the regulariser falls: {values}",
+            "this is a fault of the check; please report it",
+        )
 
 
 def compare(instance: Instance, solution: FiniteSolution) -> None:
     """Raise `AssertionError` when a checked answer contradicts what is known of the instance."""
     if solution.status == "failed":
         return
-    assert (solution.status == "optimal") == instance.feasible, (
-        f"{instance.name}: {solution.status}, {solution.message}"
+    demand(
+        (solution.status == "optimal") == instance.feasible,
+        f"{instance.name}: {solution.status} is believed, which is wrong ({solution.message})",
+        BELIEVED,
     )
     if not instance.feasible:
         return
     program, x = instance.program, solution.x
     slack = 1e-6 * max(min(1.0, float(program.weights.max())), abs(instance.highest))
-    assert instance.lowest - slack <= solution.value <= instance.highest + slack, (
-        f"{instance.name}: {solution.value}, {solution.message}"
+    demand(
+        instance.lowest - slack <= solution.value <= instance.highest + slack,
+        f"{instance.name}: the value {solution.value} is believed, which lies in [{instance.lowest}, "
+        f"{instance.highest}] ({solution.message})",
+        BELIEVED,
     )
-    assert solution.lower_bound <= instance.highest + 1e-3 * slack, (
-        f"{instance.name}: the lower bound {solution.lower_bound} is too high"
+    demand(
+        solution.lower_bound <= instance.highest + 1e-3 * slack,
+        f"{instance.name}: the lower bound {solution.lower_bound} is too high",
+        BELIEVED,
     )
     for violations, rows in ((program.G @ x - program.h, program.G), (np.abs(program.A @ x - program.b), program.A)):
         allowed = 1e-8 * np.maximum(1.0, np.abs(rows) @ np.abs(x))
-        assert (violations <= allowed).all(), f"{instance.name}: a row is violated by {violations.max():.1e}"
+        demand(
+            (violations <= allowed).all(),
+            f"{instance.name}: a row is violated by {violations.max(initial=0.0):.1e}",
+            BELIEVED,
+        )
+
+
+def _dense(value: object) -> Array:
+    return np.asarray(value.toarray() if hasattr(value, "toarray") else value)

@@ -92,8 +92,8 @@ class CountedObjective:
 
     @property
     def remaining(self) -> int:
-        """Evaluations that are left."""
-        return self.budget - self.evaluations
+        """Evaluations that are left; none once the search is ended, so that who swallows the end still comes to one."""
+        return 0 if self.ended is not None else self.budget - self.evaluations
 
     @property
     def differentiable(self) -> bool:

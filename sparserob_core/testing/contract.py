@@ -1,0 +1,96 @@
+"""What every contract is made of: the component that is tested, and how a broken promise is told."""
+
+from __future__ import annotations
+
+from abc import ABC
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any, ClassVar, Generic, NoReturn, TypeVar
+
+import numpy as np
+
+from sparserob_core.experiment.plugins.hookspecs import record_type
+from sparserob_core.experiment.plugins.registry import load_registry
+from sparserob_core.options import Options
+
+Component = TypeVar("Component")
+
+
+class ContractBroken(AssertionError):
+    """A component does not keep its contract. The message says what is wrong, and how to mend it."""
+
+
+def broken(wrong: str, mend: str) -> NoReturn:
+    """Raise `ContractBroken`."""
+    raise ContractBroken(f"{wrong}\n  To mend it: {mend}")
+
+
+def demand(held: object, wrong: str, mend: str) -> None:
+    """Raise `ContractBroken` unless ``held``."""
+    if not held:
+        broken(wrong, mend)
+
+
+def same(first: Any, second: Any) -> bool:
+    """Whether two arrays, or numbers, are equal to the last bit; NaN equals NaN."""
+    return bool(np.array_equal(np.asarray(first), np.asarray(second), equal_nan=True))
+
+
+class Contract(ABC, Generic[Component]):
+    """What every component of a kind must keep: subclass the contract of the kind in a test module as
+    ``class TestMine(...)``, and say with the class attribute ``component`` what is tested.
+
+    ``component``: the class, or any function without arguments that makes a new component (such as a
+    ``functools.partial`` of the class with its options); or what a config would say of an installed one: its name, or
+    a mapping with its name and its options. A subclass may override `create` instead.
+
+    pytest then runs every test of the contract. A test that fails says what is wrong, and how to mend it.
+    """
+
+    component: ClassVar[Any] = None
+    kind: ClassVar[str]
+
+    def __init_subclass__(cls, kind: str | None = None) -> None:
+        super().__init_subclass__()
+        if kind is not None:
+            cls.kind = kind
+
+    def create(self) -> Component:
+        """A new component, as ``component`` says; raises `TypeError` where it says nothing of use."""
+        given = type(self).component
+        if isinstance(given, str | Mapping):
+            options = {"name": given} if isinstance(given, str) else dict(given)
+            name = str(options.pop("name"))
+            made: object = load_registry().build(self.kind, name, options)
+        elif callable(given):
+            made = given()
+        else:
+            raise TypeError(
+                f"{type(self).__name__}: expected the attribute `component`: the class of the {self.kind}, a function "
+                f"without arguments that makes one, or its name in a config; got {given!r}"
+            )
+        expected = self.expected()
+        if not isinstance(made, expected):
+            names = " or ".join(one.__name__ for one in expected)
+            raise TypeError(f"{type(self).__name__}: `component` gave {made!r}, expected a {names}")
+        return made  # type: ignore[return-value]
+
+    def expected(self) -> tuple[type, ...]:
+        """The classes of which a component of this kind may be."""
+        module, _, name = record_type(self.kind).component.partition(":")
+        return (getattr(import_module(module), name),)
+
+    def test_every_option_is_documented(self) -> None:
+        made = self.create()
+        if isinstance(made, Options):
+            silent = [name for name, option in type(made).model_fields.items() if not option.description]
+            demand(
+                not silent,
+                f"these options of {type(made).__name__} have no documentation: {', '.join(silent)}",
+                "write a string under each field of the class; `sparserob plugins NAME` shows it to users",
+            )
+            demand(
+                (type(made).__doc__ or "").strip() != (Options.__doc__ or "").strip() and type(made).__doc__,
+                f"{type(made).__name__} has no docstring",
+                "say in its first line what the component does, and from where the idea is (author, year)",
+            )
