@@ -180,3 +180,27 @@ def test_what_is_not_decided_in_time_is_not_checked() -> None:
     )
     assert found["path"].verdict == found["status"].verdict == "not checked"
     assert "the time limit of 0 s" in found["path"].text
+
+
+def proven(apart: float) -> float:
+    """The lower bound that one multiplier of the last state proves, where units differ by the square of ``apart``."""
+    A, units = np.array([[0.0, 1.0, 0.3], [-2.0, -0.5, 0.2], [0.4, 0.1, -1.0]]), np.array([1.0, apart, 1.0 / apart])
+    problem = sr.OptimalControlProblem(
+        system=sr.LinearSystem(units[:, None] * A / units, (units * [0.0, 1.0, 0.5])[:, None]),
+        horizon=2.0,
+        initial_state=units * [1.0, 0.5, 0.2],
+        control=box([-1.0], [1.0]),
+        terminal=[sr.Box(np.array([-1.0, -1.0, -0.01]) * units, np.array([1.0, 1.0, 0.01]) * units)],
+    )
+    row = {"constraint": "terminal", "time": 2.0, "parameter": [], "direction": [0.0, 0.0, 1.0 / units[2]]}
+    multipliers = {"constraints": [{**row, "multiplier": 1.3}], "equalities": [], "pieces": None}
+    nothing = {"tolerance": 1e-9, "lower": [], "upper": []}
+    found = claims(problem, np.zeros((1, 4)), nothing, multipliers=multipliers, lower_bound=1e3)["lower bound"]
+    return float(found.text.split("prove ")[1])
+
+
+@pytest.mark.parametrize("apart", [2.0**20, 2.0**40])
+def test_a_lower_bound_is_derived_as_sharply_where_the_units_of_states_are_far_apart(apart):
+    """The exponential's entries then differ by the fourth power of ``apart``."""
+    assert proven(1.0) > 0.01
+    assert proven(apart) == pytest.approx(proven(1.0), rel=1e-15)

@@ -15,12 +15,14 @@ from sparserob_core.checker.claims.equalities import equalities
 from sparserob_core.checker.claims.replay import reached
 from sparserob_core.checker.outcome import TOLERANCE, Broken, Finding, Unchecked
 from sparserob_core.checker.sets.shapes import excess, limit, member, support
+from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
     from flint import arb
 
-PRECISION = 96  # bits
+PRECISION = 96  # bits, where the numbers of a system are of one size
+MOST_PRECISION = 1024
 FIGURES = 1e-11  # relative to the larger of it and 1: how closely a written figure must agree with the one derived
 SMALL_COST = 1e-6  # of the largest possible cost: a cost below this is judged as if it were this large
 SMALL_GAP = 1e-11  # what is subtracted from a lower bound for rounding may open a gap that was closed
@@ -32,7 +34,7 @@ def check(case: Case, gap_tolerance: float | None) -> list[Finding]:
     from flint import ctx
 
     status = case.certificate.get("status")
-    with ctx.workprec(PRECISION):
+    with ctx.workprec(_precision(case)):
         if type(case.certificate.get("format")) is not int or case.certificate["format"] != 1:
             return [Finding("certificate", "fails", f"its format is {case.certificate.get('format')!r}, expected 1")]
         if status == "infeasible":
@@ -47,6 +49,22 @@ def check(case: Case, gap_tolerance: float | None) -> list[Finding]:
             claims.append(judged("equalities", lambda: equalities(case)))
         claims += [judged(window.name, lambda window=window: bounded(case, window)) for window in case.windows]  # type: ignore[misc]
         return [*claims, judged("status", lambda: _status(case, str(status), gap_tolerance, claims))]
+
+
+def _precision(case: Case) -> int:
+    """Bits of a number. The exponential of a matrix is enclosed in a norm, so that its smallest entries need as many
+    more bits as the system's numbers differ by, in the units that the user chose."""
+    problem = case.problem
+    parameters = problem.system.parameters
+    middle = np.zeros((1, 0)) if parameters is None else parameters.interior_point()[None]
+    try:
+        parts = problem.system.matrices(middle)
+    except InputError:  # not finite there
+        return PRECISION
+    entries = np.concatenate([np.ravel(part) for part in parts]) * problem.horizon
+    sizes = np.abs(entries[np.isfinite(entries) & (entries != 0.0)])
+    apart = np.log2(max(1.0, sizes.max(initial=1.0))) - np.log2(min(1.0, sizes.min(initial=1.0)))
+    return int(min(PRECISION + np.ceil(apart), MOST_PRECISION))
 
 
 def judged(name: str, derive: Callable[[], str]) -> Finding:

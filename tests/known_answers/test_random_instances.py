@@ -1,0 +1,60 @@
+"""Guards answers on random problems: sets of every kind, parameters, equalities, unequal pieces, in any units, against
+programs that share no code with the package (tests/support/instances.py); and `check` of every fifth run.
+
+The instances are those of fixed numbers. ``SPARSEROB_INSTANCES`` is how many the second stage takes (300 unless given),
+``SPARSEROB_FIRST_INSTANCE`` the number of the first.
+"""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+
+import sparserob_core as sr
+from tests.support.instances import config, instance, largest_violation, truth
+
+QUICK = 2
+COUNT = int(os.environ.get("SPARSEROB_INSTANCES", "300"))
+FIRST = int(os.environ.get("SPARSEROB_FIRST_INSTANCE", "300000"))
+SETS_THAT_ARE_NOT_CHECKED = "the checker has no bound of the support function of this"
+
+
+def numbers():
+    return [
+        *range(FIRST, FIRST + QUICK),
+        *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(FIRST + QUICK, FIRST + COUNT)),
+    ]
+
+
+@pytest.mark.parametrize("seed", numbers())
+def test_what_is_said_of_a_random_problem_in_any_units_is_true(seed, tmp_path):
+    problem, units = instance(seed)
+    lower, upper = truth(problem)
+    outcome = sr.run(
+        config(problem, units),
+        {"solver.name": ("piqp", "clarabel")[seed % 2]},
+        out=tmp_path / "run" if seed % 5 == 0 else None,
+        quiet=True,
+        figures=False,
+    )
+    result = outcome.result
+    if np.isinf(lower):
+        assert result.status == "infeasible", result.message
+    elif np.isfinite(upper):
+        assert result.status in ("certified", "verified"), result.message
+    if result.status in ("certified", "verified"):
+        largest = float(problem.price @ problem.bounds)
+        close = 1e-6 * max(1e-3 * largest, result.cost / units.value)
+        assert result.cost / units.value >= lower - close
+        assert result.lower_bound / units.value <= upper + close
+        if not problem.slopes:  # of an uncertain problem the upper value has room to spare
+            assert result.cost / units.value <= upper + close + result.gap * upper
+        if problem.dictionary == "piecewise_constant":
+            pieces = result.decision.reshape(len(problem.weights), -1) / units.controls[:, None]
+            assert largest_violation(problem, pieces.ravel()) <= 2e-9
+    if seed % 5 == 0:
+        found = [claim for claim in sr.check(tmp_path / "run").claims if claim.verdict != "holds"]
+        assert not [claim for claim in found if claim.verdict == "fails"], found
+        assert not found or any(SETS_THAT_ARE_NOT_CHECKED in claim.text for claim in found), found

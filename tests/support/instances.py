@@ -1,0 +1,528 @@
+"""Random robust problems over any sets, in any units, and what is true of them: programs sampled on fine grids of
+times, directions and parameters, by matrix exponentials and HiGHS. Nothing of the package is used.
+
+The truth of a known system is proven: a trajectory departs from its chords by at most ``step^2 / 8`` times its
+curvature, and a curved set lies between the polytope of its tangents and a smaller copy of that. Of an uncertain one
+the lower value is proven, the upper one is that of a control with room to spare on a grid of parameters four times as
+fine.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cache
+from itertools import product
+from typing import Any
+
+import numpy as np
+from scipy.linalg import expm
+from scipy.optimize import linprog
+from scipy.spatial import HalfspaceIntersection
+
+
+@dataclass(frozen=True)
+class Flat:
+    """``H x <= h``; a box when ``H`` is the identity over its negative."""
+
+    H: np.ndarray
+    h: np.ndarray
+
+    uniform = False
+
+    @staticmethod
+    def box(half_widths: np.ndarray) -> Flat:
+        eye = np.eye(len(half_widths))
+        return Flat(np.vstack([eye, -eye]), np.concatenate([half_widths, half_widths]))
+
+    def scaled(self, factor: float) -> Flat:
+        return Flat(self.H, self.h * factor)
+
+    def rows(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """Half-spaces, and by how much they are scaled to lie inside."""
+        some = np.isfinite(self.h)
+        return self.H[some], self.h[some], 1.0
+
+    def support(self, normals: np.ndarray) -> np.ndarray:
+        """``max v'x`` for every row ``v`` of ``(..., d)``."""
+        flat = normals.reshape(-1, normals.shape[-1])
+        d = flat.shape[1]
+        if len(self.H) == 2 * d and np.array_equal(self.H[:d], np.eye(d)):
+            value = np.maximum(flat, 0) @ self.h[:d] + np.maximum(-flat, 0) @ self.h[d:]
+        else:
+            value = (flat @ _vertices(self).T).max(axis=1)
+        return value.reshape(normals.shape[:-1])
+
+    def config(self, scale: np.ndarray, rows: np.ndarray | None) -> dict[str, Any]:
+        """In the user's units ``scale * x``; with a factor for every row, as a polytope."""
+        d = len(scale)
+        box = len(self.h) == 2 * d and np.array_equal(self.H[:d], np.eye(d))
+        if box and rows is None:
+            return {"box": [float(v) if np.isfinite(v) else None for v in self.h[:d] * scale]}
+        some = np.isfinite(self.h)
+        factor = np.resize(np.ones(1) if rows is None else rows, len(self.h))[some]
+        return {
+            "polytope": {"H": (factor[:, None] * self.H[some] / scale).tolist(), "h": (factor * self.h[some]).tolist()}
+        }
+
+
+def _vertices(shape: Flat) -> np.ndarray:
+    if shape.H.shape[1] == 1:
+        return np.array(
+            [
+                [min(h / a for a, h in zip(shape.H[:, 0], shape.h, strict=True) if a > 0)],
+                [max(h / a for a, h in zip(shape.H[:, 0], shape.h, strict=True) if a < 0)],
+            ]
+        )
+    return HalfspaceIntersection(np.column_stack([shape.H, -shape.h]), np.zeros(shape.H.shape[1])).intersections
+
+
+@dataclass(frozen=True)
+class Curved:
+    """``|x|_p <= radius``, or with axes ``(d, d)`` the ellipsoid ``{axes z: |z|_2 <= radius}``."""
+
+    d: int
+    p: float
+    radius: float = 1.0
+    axes: np.ndarray | None = None
+
+    @property
+    def uniform(self) -> bool:
+        """Whether it is of its kind in units that are the same for all components only."""
+        return self.axes is None
+
+    def scaled(self, factor: float) -> Curved:
+        return replace(self, radius=self.radius * factor)
+
+    def rows(self) -> tuple[np.ndarray, np.ndarray, float]:
+        z, inside = tangents(self.d, self.p)
+        axes = np.eye(self.d) if self.axes is None else self.axes
+        H = z @ np.linalg.inv(axes)
+        return H, self.support(H), inside
+
+    def support(self, normals: np.ndarray) -> np.ndarray:
+        q = np.inf if self.p == 1 else 1.0 if np.isinf(self.p) else self.p / (self.p - 1)
+        along = normals if self.axes is None else normals @ self.axes
+        return self.radius * np.linalg.norm(along, q, axis=-1)
+
+    def config(self, scale: np.ndarray, rows: np.ndarray | None) -> dict[str, Any]:
+        if self.axes is None:
+            p = "inf" if np.isinf(self.p) else self.p
+            return {"norm": {"p": p, "radius": float(self.radius * scale[0])}}
+        axes = scale[:, None] * self.axes * self.radius
+        shape = axes @ axes.T
+        return {"ellipsoid": {"shape": ((shape + shape.T) / 2).tolist()}}
+
+
+Shape = Flat | Curved
+
+
+@cache
+def tangents(d: int, p: float) -> tuple[np.ndarray, float]:
+    """Directions ``(r, d)`` in which a p-ball is bounded from outside, and the factor that brings what they bound
+    inside."""
+    if d == 1 or np.isinf(p):
+        return np.vstack([np.eye(d), -np.eye(d)]), 1.0
+    if p == 1:
+        return np.array(list(product([1.0, -1.0], repeat=d))), 1.0
+    if d == 2:
+        angle = 2 * np.pi * np.arange(96) / 96
+        z = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    else:
+        z = np.random.default_rng(0).normal(size=(240, d))
+        z /= np.linalg.norm(z, axis=1)[:, None]
+        for _ in range(40):  # points that repel one another cover the sphere evenly
+            apart = z[:, None] - z[None]
+            far = np.linalg.norm(apart, axis=2) + np.eye(len(z))
+            z += 0.5 * (apart / far[..., None] ** 3).sum(axis=1) / len(z)
+            z /= np.linalg.norm(z, axis=1)[:, None]
+    q = p / (p - 1)
+    corners = HalfspaceIntersection(np.column_stack([z, -np.linalg.norm(z, q, axis=1)]), np.zeros(d)).intersections
+    return z, 1.0 / float(np.linalg.norm(corners, p, axis=1).max())
+
+
+@dataclass(frozen=True)
+class Instance:
+    """``x' = (A + sum_k p_k slopes_k) x + B u + E w`` with ``|p_k| <= 1``, all sets about 0, the control and the
+    disturbance constant between ``edges``."""
+
+    A: np.ndarray
+    B: np.ndarray
+    E: np.ndarray
+    initial_state: np.ndarray
+    edges: np.ndarray
+    control: Shape
+    weights: np.ndarray
+    disturbance: Shape | None = None
+    terminal: list[Shape] = field(default_factory=list)
+    ends_at: np.ndarray | None = None
+    path: list[tuple[Shape, float, float]] = field(default_factory=list)
+    slopes: list[np.ndarray] = field(default_factory=list)
+    dictionary: str = "piecewise_constant"
+
+    @property
+    def price(self) -> np.ndarray:
+        """The price ``(m K,)`` of ``|u|`` on every piece."""
+        return np.outer(self.weights, np.diff(self.edges)).ravel()
+
+    @property
+    def sides(self) -> np.ndarray:
+        """The largest ``u``, and the largest ``-u``, ``(2, m K)``."""
+        eye = np.eye(len(self.weights))
+        return np.repeat([self.control.support(eye), self.control.support(-eye)], len(self.edges) - 1, axis=1)
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """The largest ``|u|`` ``(m K,)``."""
+        return self.sides.max(axis=0)
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """At the fine times ``(J,)``, for one parameter: the state without control ``(J, d)``, its response to the pieces
+    ``(J, d, m K)`` and to the disturbance ``(J, d, q, K)``, and how far a state may leave its chords ``(d,)``."""
+
+    times: np.ndarray
+    free: np.ndarray
+    response: np.ndarray
+    noise: np.ndarray
+    sag: np.ndarray
+
+
+def sample(problem: Instance, per_piece: int, parameter: np.ndarray) -> Sampled:
+    """Step through the fine grid with the exact discretisation of one step."""
+    A = problem.A + sum(
+        (p * slope for p, slope in zip(parameter, problem.slopes, strict=True)), np.zeros_like(problem.A)
+    )
+    (d, m), q, K = problem.B.shape, problem.E.shape[1], len(problem.edges) - 1
+    steps = np.repeat(np.diff(problem.edges) / per_piece, per_piece)
+    count = K * per_piece + 1
+    free, response, noise = np.zeros((count, d)), np.zeros((count, d, m, K)), np.zeros((count, d, q, K))
+    free[0] = problem.initial_state
+    for j in range(count - 1):
+        if j % per_piece == 0:
+            size = d + m + q
+            big = expm(steps[j] * np.vstack([np.hstack([A, problem.B, problem.E]), np.zeros((m + q, size))]))
+            Ad, Bd, Ed = big[:d, :d], big[:d, d : d + m], big[:d, d + m :]
+        free[j + 1] = Ad @ free[j]
+        response[j + 1] = np.einsum("ij,jmk->imk", Ad, response[j])
+        response[j + 1, :, :, j // per_piece] += Bd
+        noise[j + 1] = np.einsum("ij,jqk->iqk", Ad, noise[j])
+        noise[j + 1, :, :, j // per_piece] += Ed
+    times = np.concatenate([[0.0], np.cumsum(steps)])
+    times[per_piece::per_piece] = problem.edges[1:]
+    sampled = Sampled(times, free, response.reshape(count, d, m * K), noise, np.zeros(d))
+    w = np.zeros(q)
+    if problem.disturbance is not None:
+        w = np.maximum(problem.disturbance.support(np.eye(q)), problem.disturbance.support(-np.eye(q)))
+    both = deviations(problem, sampled, np.vstack([np.eye(d), -np.eye(d)]))
+    deviation = np.maximum(both[:, :d], both[:, d:])
+    farthest = np.abs(free) + np.abs(sampled.response) @ problem.bounds + deviation
+    inputs = np.abs(problem.B) @ problem.bounds[:: len(problem.edges) - 1] + np.abs(problem.E) @ w
+    curvature = np.abs(A @ A) @ farthest.max(axis=0) + np.abs(A) @ inputs
+    return replace(sampled, sag=curvature * steps.max() ** 2 / 8)
+
+
+def deviations(problem: Instance, sampled: Sampled, normals: np.ndarray) -> np.ndarray:
+    """The worst ``c'x`` ``(J, r)`` of the disturbance alone, for every row ``c``."""
+    if problem.disturbance is None:
+        return np.zeros((len(sampled.times), len(normals)))
+    return problem.disturbance.support(np.einsum("rd,jdqk->jrkq", normals, sampled.noise)).sum(axis=-1)
+
+
+Rows = tuple[np.ndarray, np.ndarray]
+
+
+def path_rows(problem: Instance, sampled: Sampled, tight: bool, spare: float) -> tuple[Rows, Rows]:
+    """Rows ``G u <= h`` of the path constraints, most of which will not matter, and of the end; with room for what lies
+    between the samples if ``tight``, and ``spare`` times the right-hand side besides."""
+    times, K = sampled.times, sampled.response.shape[2]
+    path, end = [(np.empty((0, K)), np.empty(0))], [(np.empty((0, K)), np.empty(0))]
+
+    def rows(shape: Shape, which: np.ndarray, sag: np.ndarray) -> Rows:
+        H, h, inside = shape.rows()
+        h = h * ((inside if tight else 1.0) - spare)
+        room = h - np.abs(H) @ sag - (H @ sampled.free[which].T).T - deviations(problem, sampled, H)[which]
+        return np.einsum("rd,jdk->jrk", H, sampled.response[which]).reshape(-1, K), room.ravel()
+
+    for shape, start, stop in problem.path:
+        inside = np.flatnonzero((times >= start - 1e-12) & (times <= stop + 1e-12))
+        if tight:  # with one more time on either side, the chords cover the whole window
+            first, last = np.searchsorted(times, [start, stop], side="right")
+            inside = np.arange(max(first - 1, 0), min(last + 1, len(times)))
+        path.append(rows(shape, inside, sampled.sag if tight else 0 * sampled.sag))
+    last = np.array([len(times) - 1])
+    end += [rows(shape, last, 0 * sampled.sag) for shape in problem.terminal]
+    return tuple(tuple(np.concatenate(part) for part in zip(*some, strict=True)) for some in (path, end))  # type: ignore[return-value]
+
+
+def control_rows(problem: Instance, tight: bool) -> Rows:
+    """Rows ``G u <= h`` of the set of controls, piece by piece."""
+    m, K = len(problem.weights), len(problem.edges) - 1
+    H, h, inside = problem.control.rows()
+    slanted = (H != 0).sum(axis=1) > 1  # the others are bounds
+    H, h = H[slanted], h[slanted]
+    return np.vstack([np.kron(H, np.eye(K)[k]) for k in range(K)]).reshape(-1, m * K), np.tile(
+        h * (inside if tight else 1.0), K
+    )
+
+
+def optimum(
+    problem: Instance, samples: list[Sampled], tight: bool, spare: float = 0.0
+) -> tuple[float, np.ndarray | None]:
+    """The optimal cost, ``inf`` when infeasible, and a control ``(m K,)``; rows are added where it violates them."""
+    pairs = [path_rows(problem, some, tight, spare) for some in samples]
+    G, h = (np.concatenate(part) for part in zip(*(pair[0] for pair in pairs), strict=True))
+    always = [control_rows(problem, tight), *(pair[1] for pair in pairs)]
+    rows, limits = (np.concatenate(part) for part in zip(*always, strict=True))
+    equal, at = None, None
+    if problem.ends_at is not None:
+        some = np.isfinite(problem.ends_at)
+        last = samples[0].response[-1][some]
+        equal, at = np.hstack([last, -last]), problem.ends_at[some] - samples[0].free[-1][some]
+    size, used = len(problem.price), np.zeros(len(h), dtype=bool)
+    for _ in range(200):
+        both = np.concatenate([rows, G[used]])
+        answer = linprog(
+            np.tile(problem.price, 2),
+            np.hstack([both, -both]),
+            np.concatenate([limits, h[used]]),
+            equal,
+            at,
+            bounds=np.stack([np.zeros(2 * size), problem.sides.ravel()], axis=1),
+            method="highs",
+            options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
+        )
+        if answer.status == 2:
+            return np.inf, None
+        if answer.status != 0:
+            raise ArithmeticError(answer.message)
+        u = answer.x[:size] - answer.x[size:]
+        excess = np.where(used, -np.inf, G @ u - h)
+        worst = np.argsort(-excess)[:60]
+        worst = worst[excess[worst] > 1e-9]
+        if not len(worst):
+            return float(answer.fun), u
+        used[worst] = True
+    raise ArithmeticError("the independent program did not end")
+
+
+def truth(problem: Instance, per_piece: int = 24) -> tuple[float, float]:
+    """Two values that enclose the optimal cost; ``(inf, inf)`` of an infeasible problem, and an upper one of ``inf``
+    where nothing is known."""
+    n = len(problem.slopes)
+
+    def grid(count: int, per_piece: int) -> list[Sampled]:
+        axes = np.linspace(-1, 1, count) if n else np.zeros(1)
+        return [sample(problem, per_piece, np.array(p)) for p in product(axes, repeat=n)]
+
+    if n:
+        per_piece = 6
+    lower, _ = optimum(problem, grid(3, per_piece), tight=False)
+    if np.isinf(lower):
+        return lower, lower
+    if not n:
+        return lower, optimum(problem, grid(1, per_piece), tight=True)[0]
+    upper, u = optimum(problem, grid(5 if n == 1 else 3, per_piece), tight=True, spare=4e-3)
+    if u is None:
+        return lower, np.inf
+    for some in grid(17 if n == 1 else 9, per_piece):
+        for G, h in path_rows(problem, some, True, 2e-3):
+            if len(h) and (G @ u > h).any():
+                return lower, np.inf
+    return lower, upper
+
+
+def largest_violation(problem: Instance, u: np.ndarray, per_piece: int = 24) -> float:
+    """By how much a sampled row is violated by the control ``(m K,)``, as a share of what its terms can be."""
+    rows = [control_rows(problem, False)]
+    for p in product([-1.0, 0.0, 1.0], repeat=len(problem.slopes)):
+        rows += path_rows(problem, sample(problem, per_piece, np.array(p)), tight=False, spare=0.0)
+    return max(float(((G @ u - h) / (np.abs(G) @ problem.bounds + np.abs(h))).max(initial=0.0)) for G, h in rows)
+
+
+@dataclass(frozen=True)
+class Units:
+    """How many of the user's units one of the instance's is; and factors of the rows of polytopes, none for boxes."""
+
+    time: float
+    states: np.ndarray
+    controls: np.ndarray
+    disturbances: np.ndarray
+    parameters: np.ndarray
+    cost: float
+    rows: np.ndarray | None = None
+
+    @property
+    def value(self) -> float:
+        """What a cost of 1 is."""
+        return self.time * self.cost
+
+
+def config(problem: Instance, units: Units) -> dict[str, Any]:
+    """The instance in the user's units, as a config of the package."""
+    X, to = units.states[:, None], 1.0 / units.time
+    A = to * X * problem.A / units.states
+    system: dict[str, Any] = {"A": A.tolist(), "B": (to * X * problem.B / units.controls).tolist()}
+    if problem.disturbance is not None:
+        system["E"] = (to * X * problem.E / units.disturbances).tolist()
+    if problem.slopes:
+        sides = units.parameters[: len(problem.slopes)]
+        slopes = [to * X * s / units.states / side for s, side in zip(problem.slopes, sides, strict=True)]
+        system["parameters"] = {f"p{k}": [-float(side), float(side)] for k, side in enumerate(sides)}
+        d = len(A)
+        system["A"] = [
+            [
+                repr(float(A[i, j])) + "".join(f" + ({float(s[i, j])!r})*p{k}" for k, s in enumerate(slopes))
+                for j in range(d)
+            ]
+            for i in range(d)
+        ]
+    horizon = float(problem.edges[-1] * units.time)
+    equal = problem.edges.size < 3 or np.ptp(np.diff(problem.edges)) < 1e-12
+    pieces = {"name": "piecewise_constant", "pieces": problem.edges.size - 1}
+    if not equal:
+        edges = (problem.edges * units.time).tolist()
+        pieces = {"name": "piecewise_constant", "breakpoints": [*edges[:-1], horizon]}
+    windows = [
+        {**shape.config(units.states, units.rows), "from": start * units.time, "to": min(stop * units.time, horizon)}
+        for shape, start, stop in problem.path
+    ]
+    ends: list[dict[str, Any]] = [shape.config(units.states, units.rows) for shape in problem.terminal]
+    if problem.ends_at is not None:
+        ends.append({"equals": [float(v) if np.isfinite(v) else None for v in problem.ends_at * units.states]})
+    stated = {
+        "name": "linear",
+        "system": system,
+        "horizon": horizon,
+        "initial_state": (units.states * problem.initial_state).tolist(),
+        "weights": (problem.weights * units.cost / units.controls).tolist(),
+        "control": problem.control.config(units.controls, units.rows),
+        "path": windows,
+        "terminal": ends,
+    }
+    if problem.disturbance is not None:
+        stated["disturbance"] = problem.disturbance.config(units.disturbances, units.rows)
+    control = pieces if problem.dictionary == "piecewise_constant" else {**pieces, "name": problem.dictionary}
+    return {"problem": stated, "dictionaries": {"control": control, "disturbance": pieces}, "observers": []}
+
+
+def drawn_units(rng: np.random.Generator, problem: Instance) -> Units:
+    """No change in one case of four, or factors from 1e-6 to 1e6 for every quantity, and in half of these cases from
+    1e-12 to 1e12 for every row."""
+
+    def some(size: int, decades: float, shapes: list[Shape | None]) -> np.ndarray:
+        if any(shape is not None and shape.uniform for shape in shapes):
+            return np.full(size, 10.0 ** rng.uniform(-decades, decades))
+        return 10.0 ** rng.uniform(-decades, decades, size)
+
+    far = rng.choice([0.0, 1.0, 1.0, 1.0])
+    states: list[Shape | None] = [*problem.terminal, *(shape for shape, _, _ in problem.path)]
+    return Units(
+        time=float(10.0 ** rng.uniform(-4 * far, 4 * far)),
+        states=some(problem.B.shape[0], 6 * far, states),
+        controls=some(problem.B.shape[1], 6 * far, [problem.control]),
+        disturbances=some(problem.E.shape[1], 6 * far, [problem.disturbance]),
+        parameters=10.0 ** rng.uniform(-6 * far, 6 * far, 2),
+        cost=float(10.0 ** rng.uniform(-6 * far, 6 * far)),
+        rows=10.0 ** rng.uniform(-12, 12, 16) if far and rng.random() < 0.5 else None,
+    )
+
+
+def drawn(rng: np.random.Generator) -> Instance:
+    """A stable or mildly unstable system of one to four states; sets about what a control reaches, so that about half
+    of the instances are feasible."""
+    d, m = int(rng.choice([1, 2, 2, 2, 3, 3, 4])), int(rng.integers(1, 3))
+    A = rng.normal(size=(d, d)) * rng.choice([0.3, 1.0, 2.0])
+    A -= np.eye(d) * max(0.0, np.linalg.eigvals(A).real.max() - rng.uniform(-1, 0.8))
+    uncertain = int(rng.choice([0, 0, 0, 1, 2])) if d < 4 else 0
+    dictionary = str(rng.choice(["piecewise_constant", "piecewise_constant", "unequal", "haar", "walsh"]))
+    K = int(2 ** rng.integers(2, 5)) if dictionary in ("haar", "walsh") else int(rng.integers(4, 20))
+    horizon = float(np.round(rng.uniform(0.5, 4), 3))
+    inner = np.sort(rng.uniform(0.03, 0.97, K - 1)) if dictionary == "unequal" else np.arange(1, K) / K
+    problem = Instance(
+        A=A,
+        B=rng.normal(size=(d, m)),
+        E=np.eye(d) if rng.random() < 0.5 else rng.normal(size=(d, int(rng.integers(1, d + 1)))),
+        initial_state=rng.normal(size=d),
+        edges=horizon * np.concatenate([[0.0], inner, [1.0]]),
+        control=shape(rng, rng.uniform(0.3, 2, m), bounded=True),
+        weights=rng.uniform(0.5, 2, m),
+        slopes=[rng.normal(size=(d, d)) * 0.03 for _ in range(uncertain)],
+        dictionary="piecewise_constant" if dictionary == "unequal" else dictionary,
+    )
+    if rng.random() < 0.7:
+        q = problem.E.shape[1]
+        problem = replace(problem, disturbance=shape(rng, rng.uniform(0.002, 0.05, q), bounded=True))
+    u = rng.uniform(-1, 1, (m, K)) * problem.bounds.reshape(m, K) * (rng.random((m, K)) < 0.4) / m
+    some = sample(problem, 8, np.zeros(uncertain))
+    x = some.free + some.response @ u.ravel()
+
+    def about(which: np.ndarray, room: float) -> Shape:
+        """A set that the states there are in when ``room`` is 1."""
+        reach = np.abs(x[which]).max(axis=0) + 1e-2
+        bare = shape(rng, reach * rng.uniform(0.3, 1, d), bounded=False)
+        H, h, _ = bare.rows()
+        share = ((x[which] @ H.T + deviations(problem, some, H)[which]) / h).max(initial=1e-3)
+        return bare.scaled(float(share * room))
+
+    room = rng.uniform(0.3, 1.3) if not uncertain else rng.uniform(0.7, 2.0)
+    if problem.disturbance is None and not uncertain and K * m > d + 2 and rng.random() < 0.5:
+        ends = np.where(rng.random(d) < 0.7, x[-1] * rng.choice([1.0, 1.0, 1.3]), np.nan)
+        if np.isfinite(ends).any():
+            problem = replace(problem, ends_at=ends)
+    if problem.ends_at is None:
+        problem = replace(problem, terminal=[about(np.array([len(x) - 1]), room)])
+    if rng.random() < 0.6:
+        start, stop = np.sort(rng.uniform(0, horizon, 2))
+        start = 0.0 if rng.random() < 0.2 else start
+        stop = start if rng.random() < 0.1 else horizon if rng.random() < 0.3 else stop
+        which = np.flatnonzero((some.times >= start - some.times[1]) & (some.times <= stop + some.times[1]))
+        problem = replace(problem, path=[(about(which, rng.uniform(0.7, 1.5)), float(start), float(stop))])
+    return problem
+
+
+def shape(rng: np.random.Generator, half_widths: np.ndarray, bounded: bool) -> Shape:
+    """A set about 0 of about these half-widths."""
+    d = len(half_widths)
+    kind = rng.choice(["box", "box", "polytope", "ellipsoid", "norm"]) if d <= 3 else rng.choice(["box", "polytope"])
+    if kind == "box":
+        free = np.zeros(d, bool) if bounded else rng.random(d) < 0.3
+        return Flat.box(np.where(free & ~free.all(), np.inf, half_widths))
+    if kind == "polytope":
+        H = np.vstack([np.eye(d), -np.eye(d), rng.normal(size=(2, d))])
+        reach = np.abs(H[2 * d :]) @ half_widths
+        return Flat(H, np.concatenate([half_widths, half_widths, reach * rng.uniform(0.5, 0.9, 2)]))
+    if kind == "ellipsoid":
+        turn = np.linalg.qr(rng.normal(size=(d, d)))[0]
+        return Curved(d, 2.0, axes=half_widths[:, None] * turn)
+    return Curved(d, float(rng.choice([1.0, 1.5, 2.0, 3.0, np.inf])), radius=float(half_widths.mean()))
+
+
+def on_the_boundary(rng: np.random.Generator, share: float) -> Instance | None:
+    """A known system between boxes whose terminal set is ``1 + share`` times the smallest one that can be reached."""
+    problem = drawn(rng)
+    K, m, d = len(problem.edges) - 1, len(problem.weights), len(problem.A)
+    widths = rng.uniform(0.3, 1, d)
+    noise = None if problem.disturbance is None else Flat.box(rng.uniform(0.002, 0.05, problem.E.shape[1]))
+    control, end = Flat.box(rng.uniform(0.1, 0.6, m)), Flat.box(widths)
+    problem = replace(problem, control=control, disturbance=noise, path=[], slopes=[], ends_at=None, terminal=[end])
+    G, h = path_rows(problem, sample(problem, 1, np.zeros(0)), tight=False, spare=0.0)[1]
+    answer = linprog(
+        np.append(np.zeros(m * K), 1.0),
+        np.hstack([G, -np.tile(widths, 2)[:, None]]),
+        h - np.tile(widths, 2),
+        bounds=[*((-b, b) for b in problem.bounds), (0, None)],
+        method="highs",
+        options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
+    )
+    if answer.status != 0 or answer.fun < 1e-2:
+        return None  # the origin is reached
+    return replace(problem, terminal=[end.scaled(float(answer.fun) * (1 + share))])
+
+
+def instance(seed: int) -> tuple[Instance, Units]:
+    """Number ``seed``: every tenth one on the boundary, feasible or infeasible by 1e-6."""
+    rng = np.random.default_rng(seed)
+    problem = on_the_boundary(rng, 1e-6 if seed % 20 else -1e-6) if seed % 10 == 0 else None
+    problem = problem if problem is not None else drawn(rng)
+    return problem, drawn_units(rng, problem)
