@@ -106,6 +106,7 @@ from sparserob_core.experiment.run.events import RunStarted as RunStarted
 from sparserob_core.experiment.run.events import StudyProgress as StudyProgress
 from sparserob_core.sip.events import Batch as Batch
 from sparserob_core.sip.events import EvaluationsFinished as EvaluationsFinished
+from sparserob_core.sip.events import Sketch as Sketch
 from sparserob_core.sip.events import Event as Event
 from sparserob_core.sip.events import ProofProgress as ProofProgress
 from sparserob_core.sip.events import RoundFinished as RoundFinished

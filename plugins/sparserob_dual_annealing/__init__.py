@@ -48,6 +48,7 @@ class DualAnnealing(sr.Maximiser, sr.Options):
         # scipy renamed the argument (1.15), and knows no end but a count of its iterations: the objective ends the
         # search.
         seeded: dict[str, Any] = {"rng" if "rng" in inspect.signature(dual_annealing).parameters else "seed": rng}
+        minima = _Found(objective)
         while objective.remaining:
             dual_annealing(
                 _Energy(objective),
@@ -59,9 +60,23 @@ class DualAnnealing(sr.Maximiser, sr.Options):
                 accept=self.accept,
                 no_local_search=self.no_local_search,
                 x0=start,
+                callback=minima.found,
                 **seeded,
             )
         return float("inf")
+
+
+class _Found:
+    """The points where scipy says that the best so far was found, by annealing or by a local search."""
+
+    def __init__(self, objective: sr.Objective) -> None:
+        self.objective, self.points = objective, list[np.ndarray]()
+
+    def found(self, point: np.ndarray, energy: float, context: int) -> None:
+        """See scipy's ``callback``: no answer, so that the search goes on."""
+        domain = self.objective.domain
+        self.points.append(np.clip(point, domain.lower, domain.upper))
+        self.objective.sketch("the best in turn", np.array(self.points[-60:]))
 
 
 class _Energy:

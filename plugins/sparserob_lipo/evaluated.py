@@ -41,6 +41,12 @@ class Evaluated:
         best: np.ndarray = self._points[self._order[self.count - 1]]
         return best
 
+    def balls(self, constant: float) -> tuple[np.ndarray, np.ndarray]:
+        """What the constant excludes: balls of centres ``(k, d)`` and radii ``(k,)``, the largest first."""
+        radii = (self.values[-1] - self.values) / constant
+        several = int(np.searchsorted(-radii, 0.0))
+        return self._points[self._order[:several]], radii[:several]
+
     def add(self, point: np.ndarray, value: float) -> None:
         """Remember a finite value; one pass over the points updates the slope."""
         count, row = self.count, self._order[self.count]

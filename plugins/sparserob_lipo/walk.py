@@ -17,6 +17,7 @@ MOST_AT_ONCE: Final = 256
 DRAWS_PER_HALVING: Final = 32  # candidates in boxes around the best point until these are half as large
 MOST_HALVINGS: Final = 40  # a box of 1e-12 of the sides; much smaller ones would repeat the best point
 BLOCK_NUMBERS: Final = 2**17  # coordinates of the candidates that are drawn at once
+SHOWN_EVERY: Final = 16  # evaluations
 WORK: Final = 2**31  # differences of coordinates that the candidates of one evaluation may cost
 
 
@@ -68,7 +69,12 @@ class Walk:
 
     def note(self, constant: float) -> None:
         """Note the constant in use, in units of the value per unit of ``z``, and the share of candidates that it has
-        excluded."""
+        excluded; show now and then the largest of the balls that it excludes."""
+        shown = self.objective.observed and self.objective.evaluations % SHOWN_EVERY == 0
+        if shown and constant > 0.0 and self.evaluated.count:
+            centres, radii = self.evaluated.balls(constant)
+            middles, reach = self.lower + self.scale * centres, radii[:, np.newaxis] * self.scale
+            self.objective.sketch("excluded", middles - reach, middles + reach, rounded=True)
         self.objective.note(constant=constant, rejected=self.rejected / max(1, self.drawn))
 
     def _candidates(self, drawn: int, count: int) -> np.ndarray:

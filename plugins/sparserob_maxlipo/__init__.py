@@ -95,6 +95,11 @@ class _Steps:
         """Note what the last step was."""
         fitted = {"radius": self.ascents.radius} if self.dimension <= MODELLED else {}
         self.objective.note(local=float(local), **fitted)
+        if self.objective.observed and fitted and self.ascents.radius > 0.0:
+            domain, reach = self.objective.domain, self.ascents.radius
+            ends = np.array([self.slopes.top - reach, self.slopes.top + reach])
+            lower, upper = domain.lower + ends * (domain.upper - domain.lower)
+            self.objective.sketch("trust region", lower[np.newaxis], upper[np.newaxis], rounded=True)
 
     def step_locally(self) -> bool:
         """Whether there was a local step to make."""

@@ -12,6 +12,8 @@ from pydantic import Field
 import sparserob_core as sr
 from sparserob_nevergrad.guarded import Failed, Guarded
 
+SHOWN_EVERY = 16  # evaluations
+
 
 class Nevergrad(sr.Maximiser, sr.Options):
     """Any optimiser of nevergrad's registry (Rapin and Teytaud 2018): evolution strategies, differential evolution,
@@ -87,8 +89,15 @@ class _AskAndTell:
                 loss = _loss(value)
                 self.told.append((unit, loss))
                 self.objective.note(spread=self._spread(unit))
+                if self.objective.observed and self.objective.evaluations % SHOWN_EVERY == 0:
+                    self._show(optimiser.population())
         finally:
             optimiser.close()
+
+    def _show(self, units: np.ndarray) -> None:
+        """Of an optimiser with a population, where it is."""
+        if len(units):
+            self.objective.sketch("population", self.lower + units * (self.upper - self.lower))
 
     def _unit(self, moved: np.ndarray) -> np.ndarray:
         return np.asarray(np.clip((moved - self.lower) / (self.upper - self.lower), 0.0, 1.0))

@@ -65,6 +65,16 @@ class Guarded:
                 raise ValueError(f"it asked for {unit.tolist()}")
             return np.asarray(np.clip(unit, 0.0, 1.0))
 
+    def population(self) -> np.ndarray:
+        """The individuals ``(k, d)`` of an optimiser that keeps them by name, as differential evolution and particle
+        swarms do; none of another."""
+        kept = getattr(self._optimiser, "population", None)
+        if not isinstance(kept, dict):
+            return np.zeros((0, *self._shape))
+        values = [np.array(individual.value, dtype=float) for individual in kept.values()]
+        fitting = [np.clip(value, 0.0, 1.0) for value in values if value.shape == self._shape]
+        return np.array(fitting).reshape(-1, *self._shape)
+
     def close(self) -> None:
         """Let go of the optimiser: some of them run in a thread, which ends with them."""
         self._optimiser = self._asked = None

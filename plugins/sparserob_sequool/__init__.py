@@ -73,9 +73,21 @@ class _Tree:
         opened, hmax = 0, len(schedule) - 1
         for depth, count in enumerate(schedule.tolist()):
             best = np.array([values.argmax()]) if count == 1 else (-values).argsort(kind="stable")[:count]
+            if self.objective.observed:
+                self._show(centres[best])
             centres, values = self._open(centres[best], values[best], depth % self.period)
             opened += count
             self.objective.note(depth=depth, openings=opened, hmax=hmax)
+
+    def _show(self, centres: np.ndarray) -> None:
+        """The cells that are opened; a coordinate that is never cut is as wide as the box."""
+        lower, upper = (
+            np.tile(edge, (len(centres), 1)) for edge in (self.objective.domain.lower, self.objective.domain.upper)
+        )
+        half = 1.5 * self.thirds  # thirds are between the centres of the next children
+        lower[:, self.cut] = np.maximum(centres - half, self.lower)
+        upper[:, self.cut] = np.minimum(centres + half, self.upper)
+        self.objective.sketch("cells opened", lower, upper)
 
     def _open(self, centres: np.ndarray, values: np.ndarray, across: int) -> tuple[np.ndarray, np.ndarray]:
         step = self.thirds[across]

@@ -34,7 +34,10 @@ class SimulatedAnnealing(sr.Maximiser, sr.Options):
     budget. A permutation of a tuple is the same value at another point: the walk does not merge them; that does it no
     harm, since every copy of a basin is as good. It proves no upper bound.
 
-    Notes ``temperature``, ``accepted`` (0 or 1) and ``scale`` (of the step, in widths of the box) at every evaluation.
+    Notes, at every step: ``temperature``, ``accepted`` (0 or 1), ``scale`` (of the step, in widths of the box),
+    ``move`` (what was moved: 0 everything anew, 1 one coordinate, 2 several, 3 all or a whole block), ``cycle`` (how
+    often the walk was heated again) and ``stands``: the number, from 1, of the evaluation at whose point the walk
+    stands after the step.
     """
 
     exploration: float = Field(default=0.05, ge=0.0, le=1.0)
@@ -111,43 +114,80 @@ class SimulatedAnnealing(sr.Maximiser, sr.Options):
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
         """See `sparserob_core.Maximiser`."""
         moves = Moves(self, objective, rng)
-        start = first_temperature(self, self._sampled(objective, moves)[1])
-        lowest, point, value = start * self.cooling_range, objective.best_point, objective.best_value
+        walk = _Walk(objective, rng, moves)
+        start = first_temperature(self, walk.begin(self._uniform(objective, moves)))
+        lowest = start * self.cooling_range
         for cycle in range(self.restarts + 1):
             if cycle:
                 moves.restart()
                 start *= self.reheat
-                point, value = self._restarted(objective, moves)
+                walk.restart(None if self.restart_from == "best" else self._uniform(objective, moves))
             length = objective.remaining // (self.restarts + 1 - cycle)
-            _walk(objective, rng, moves, Cooling(self, start, lowest, length), point, value)
+            walk.go(Cooling(self, start, lowest, length))
         return float("inf")
 
-    def _sampled(self, objective: sr.Objective, moves: Moves) -> tuple[np.ndarray, np.ndarray]:
-        points = moves.uniform(max(1, min(self.samples, objective.remaining // 10)))
-        return points, objective.evaluate(points)
+    def _uniform(self, objective: sr.Objective, moves: Moves) -> np.ndarray:
+        return moves.uniform(max(1, min(self.samples, objective.remaining // 10)))
 
-    def _restarted(self, objective: sr.Objective, moves: Moves) -> tuple[np.ndarray, float]:
-        if self.restart_from == "best" or not objective.remaining:
-            return objective.best_point, objective.best_value
-        points, values = self._sampled(objective, moves)
+
+class _Walk:
+    """Where the walk stands: a point, its value, and the number of the evaluation that it is from (0: of one before the
+    search); the same of the best."""
+
+    def __init__(self, objective: sr.Objective, rng: np.random.Generator, moves: Moves) -> None:
+        self.objective, self.rng, self.moves = objective, rng, moves
+        self.point, self.value, self.number = objective.best_point, -np.inf, 0
+        self.best, self.cycle = int(objective.evaluations == 1), 0
+
+    def begin(self, points: np.ndarray) -> np.ndarray:
+        """Evaluate the first points, and stand at the best that is known; returns their values."""
+        values = self._sampled(points)
+        self._to_best()
+        return values
+
+    def restart(self, points: np.ndarray | None) -> None:
+        """Heat up again, at the best point, or at the best of some new ones."""
+        self.cycle += 1
+        if points is None or not self.objective.remaining:
+            self._to_best()
+            return
+        before = self.objective.evaluations
+        values = self._sampled(points)
         top = int(np.argmax(values))
-        return points[top], float(values[top])
+        self.point, self.value, self.number = points[top], float(values[top]), before + top + 1
 
+    def go(self, cooling: Cooling) -> None:
+        """One cycle of the walk."""
+        objective = self.objective
+        for k in range(cooling.length):
+            temperature = cooling.temperature(k, objective.best_value - self.value)
+            candidate, record = self.moves.candidate(self.point), objective.best_value
+            found = float(objective.evaluate(candidate[np.newaxis])[0])
+            if found > record:
+                self.best = objective.evaluations
+            # There is nothing to lose where the function has no value, and a rule cannot be asked about -inf less -inf.
+            accepted = self.value == -np.inf or objective.accepts(self.value, found, temperature, self.rng)
+            self.moves.learn(accepted)
+            if accepted:
+                self.point, self.value, self.number = candidate, found, objective.evaluations
+            objective.note(
+                temperature=temperature,
+                accepted=float(accepted),
+                scale=self.moves.scale,
+                stands=self.number,
+                cycle=self.cycle,
+                move=self.moves.kind,
+            )
 
-def _walk(
-    objective: sr.Objective, rng: np.random.Generator, moves: Moves, cooling: Cooling, point: np.ndarray, value: float
-) -> None:
-    """One cycle of the walk, from a point and its value."""
-    for k in range(cooling.length):
-        temperature = cooling.temperature(k, objective.best_value - value)
-        candidate = moves.candidate(point)
-        found = float(objective.evaluate(candidate[np.newaxis])[0])
-        # There is nothing to lose where the function has no value, and a rule cannot be asked about -inf less -inf.
-        accepted = value == -np.inf or objective.accepts(value, found, temperature, rng)
-        moves.learn(accepted)
-        objective.note(temperature=temperature, accepted=float(accepted), scale=moves.scale)
-        if accepted:
-            point, value = candidate, found
+    def _sampled(self, points: np.ndarray) -> np.ndarray:
+        before, record = self.objective.evaluations, self.objective.best_value
+        values = self.objective.evaluate(points)
+        if values.max() > record or not before:
+            self.best = before + int(values.argmax()) + 1
+        return values
+
+    def _to_best(self) -> None:
+        self.point, self.value, self.number = self.objective.best_point, self.objective.best_value, self.best
 
 
 @sr.hookimpl

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 CHUNK = 256
 FEW = 3
 SMALLEST, LARGEST = 1e-13, 0.5
+UNIFORM, ONE, SEVERAL, FULL = 0.0, 1.0, 2.0, 3.0  # what a candidate changes: everything anew, one coordinate, ...
 VISITS = 20  # evaluations per scale that are needed to adapt it
 
 
@@ -24,7 +25,8 @@ class Moves:
 
     A step is noise times a scale times the width of the box, so that the units of the coordinates do not matter. In a
     space of tuples (``block > 1``) the scale of a coordinate is that of its place within its block. ``scale`` is that
-    of the last candidate.
+    of the last candidate, ``kind`` what it changed: `UNIFORM` everything, drawn anew, `ONE` coordinate, `SEVERAL`, or
+    `FULL` (all, or a whole block).
     """
 
     def __init__(self, options: SimulatedAnnealing, objective: sr.Objective, rng: np.random.Generator) -> None:
@@ -46,6 +48,7 @@ class Moves:
         self.scales = [self.options.initial_scale] * self.several
         self.factors = {"few": 1.0 / sqrt(2.0), "full": 1.0 / sqrt(self.places)}
         self.scale, self._moved = self.options.initial_scale, ""
+        self.kind = UNIFORM
         self._place = 0
 
     def uniform(self, count: int) -> np.ndarray:
@@ -58,17 +61,21 @@ class Moves:
     def candidate(self, current: np.ndarray) -> np.ndarray:
         """A candidate ``(d,)`` for a walk that is at ``current (d,)``; only one array of this size is made."""
         if next(self.uniforms) < self.options.exploration:
-            self._moved, self.scale = "", 1.0
+            self._moved, self.scale, self.kind = "", 1.0, UNIFORM
             return np.asarray(self.uniform(1)[0])
         moved = current.copy()
         kind = next(self.uniforms)
         coarse = next(self.uniforms) < self.options.coarse
         if kind < self.until_one or self.dimension == 1:
+            self.kind = ONE
             self._one(moved, coarse)
-        elif self.block > 1:
-            self._blocks(moved, "few" if kind < self.until_few else "full", coarse)
+            return moved
+        few = kind < self.until_few and (self.block > 1 or self.dimension > FEW)
+        self.kind = SEVERAL if few else FULL
+        if self.block > 1:
+            self._blocks(moved, "few" if few else "full", coarse)
         else:
-            self._coordinates(moved, "few" if kind < self.until_few and self.dimension > FEW else "full", coarse)
+            self._coordinates(moved, "few" if few else "full", coarse)
         return moved
 
     def learn(self, accepted: bool) -> None:

@@ -25,6 +25,9 @@ class Event:
     """Something that happened in a run."""
 
 
+SKETCHED = 400
+"""Points, boxes or ellipsoids in one sketch, at most."""
+
 Notify: TypeAlias = Callable[[Event], None]
 T = TypeVar("T", bound=Event)
 
@@ -106,6 +109,21 @@ class Batch:
         return accepted
 
 
+@dataclass(frozen=True, eq=False)
+class Sketch:
+    """What a maximiser looks at, or has ruled out: points, boxes, or the ellipsoids within boxes, from ``lower (k, d)``
+    to ``upper (k, d)``, equal for points, at most `SKETCHED` of them."""
+
+    lower: Array
+    upper: Array
+    rounded: bool = False
+
+    @property
+    def points(self) -> bool:
+        """Whether it is points."""
+        return self.lower is self.upper
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RoundFinished(Event):
     """One round of a method is over: a round of the exchange, or an outer iteration of the method ``sparserob``.
@@ -170,7 +188,8 @@ class EvaluationsFinished(Event):
     """A maximiser has evaluated ``count`` more points, ``total`` so far in this search, of ``budget`` (0: unknown).
 
     ``best_value`` was found at ``best_point (d,)``; ``seconds`` since the search began; ``notes`` are the maximiser's
-    own scalars (temperature, ...), the last of each. A new search begins where ``total == count``. ``batch``: every one
+    own scalars (temperature, ...), the last of each, and ``sketches`` by their roles what else it has shown of itself
+    since the last event. A new search begins where ``total == count``. ``batch``: every one
     of these evaluations.
 
     What is searched: the tuples of the method ``sparserob`` in the outer iteration ``round`` (from 1) with the weight
@@ -192,3 +211,4 @@ class EvaluationsFinished(Event):
     epsilon: float = np.nan
     lower_bound: float = -np.inf
     batch: Batch = field(default_factory=Batch, repr=False)
+    sketches: Mapping[str, Sketch] = field(default_factory=dict, repr=False)

@@ -79,6 +79,18 @@ class Objective(Protocol):
     def note(self, **scalars: float) -> None:
         """Pass scalars (temperature, acceptance, ...) to the trace and to observers."""
 
+    @property
+    def observed(self) -> bool:
+        """Whether anybody looks at sketches; where not, they need not be made. A search must not depend on it."""
+
+    def sketch(self, role: str, lower: Array, upper: Array | None = None, rounded: bool = False) -> None:
+        """Show observers what the search looks at, or has ruled out: points ``lower (k, d)``, boxes from ``lower`` to
+        ``upper``, or the ellipsoids within these boxes (``rounded``).
+
+        ``role`` says in words what they are; of every role the last sketch is shown, of which the first 400 rows. It is
+        no part of the trace, and changes nothing.
+        """
+
 
 class Maximiser(ABC):
     """A global maximiser over a box."""

@@ -306,3 +306,25 @@ def test_with_a_polish_the_shifted_rastrigin_function_is_solved_within_1000_eval
     box = sr.Box(np.full(3, -5.12), np.full(3, 5.12))
     regrets = [-search(rastrigin, box, 1000, seed, Rules(polish=0.2)).best_value for seed in range(20)]
     assert np.median(regrets) < 1e-9
+
+
+@pytest.mark.parametrize("restart_from", ["best", "anew"])
+def test_the_notes_say_at_which_evaluation_the_walk_stands_and_what_it_moved(restart_from):
+    report = search(corner, budget=400, restarts=2, restart_from=restart_from)
+    notes, values = report.trace.notes, report.trace.values
+    steps, stands = notes["stands"][:, 0].astype(int), notes["stands"][:, 1].astype(int)
+    accepted, cycle = notes["accepted"][:, 1] > 0, notes["cycle"][:, 1]
+    assert (stands >= 1).all() and (stands <= steps).all()
+    assert (stands[accepted] == steps[accepted]).all()
+    same = (np.diff(cycle) == 0) & ~accepted[1:]
+    assert (np.diff(stands)[same] == 0).all()
+    heated = np.flatnonzero(np.diff(cycle)) + 1
+    assert heated.size == 2
+    if restart_from == "best":  # where nothing was accepted yet, it stands at the best point
+        for k in heated[~accepted[heated]]:
+            assert values[stands[k] - 1] == values[: steps[k] - 1].max()
+    changed = (np.diff(report.trace.points, axis=0) != 0).sum(axis=1)
+    assert set(notes["move"][:, 1]) <= {0.0, 1.0, 2.0, 3.0}
+    one, after = notes["move"][:, 1] == 1.0, np.append(False, accepted[:-1] & (np.diff(cycle) == 0))
+    alone = np.flatnonzero(one & after)
+    assert alone.size and all(changed[steps[k] - 2] == 1 for k in alone)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
@@ -62,6 +63,7 @@ class Recorder:
         self.exact: float | None = None
         self.proofs: dict[str, int] = {}
         self.way = Way()
+        self.broken: dict[str, str] = {}
         self.timelines.move()
         self.say(f"run: {opening.title}")
         self._page("solving", [])
@@ -84,6 +86,16 @@ class Recorder:
             case sr.RunFinished():
                 self._finished(event)
 
+    def draw(self, panel: str, task: Callable[..., object], *arguments: Any) -> None:
+        """Draw a panel; one that fails is named in the log, once, and is left out from then on."""
+        if panel in self.broken:
+            return
+        try:
+            task(*arguments)
+        except Exception as error:  # noqa: BLE001  a panel less is better than no recording
+            self.broken[panel] = f"{panel} could not be drawn: {type(error).__name__}: {error}"
+            self.say(f"{self.broken[panel]}; the rest goes on", "WARN")
+
     def say(self, line: str, level: str = "INFO") -> None:
         """A line of the log."""
         self.stream.log("log", self.rr.TextLog(line, level=level))
@@ -99,9 +111,9 @@ class Recorder:
         if event.total == event.count:
             self.began = self.timelines.seconds
         if event.family:
-            self.search.separation(event, self.began)
+            self.draw("the search for violations", self.search.separation, event, self.began)
             return
-        self.search.show(event, self.began, self._moving(event.block), kept)
+        self.draw("the search", self.search.show, event, self.began, self._moving(event.block), kept)
         if not event.best_point.size:
             return
         if event.total == event.count:
@@ -110,7 +122,7 @@ class Recorder:
         if event.best_value > self.best_value or event.total == event.count:
             self.say(f"evaluation {self.timelines.evaluation}: best g {event.best_value:.8g}", "TRACE")
         self.best, self.best_value, self.block = event.best_point, event.best_value, event.block
-        self.way.go(event, kept, self.terrain)
+        self.draw("the way of the search", self.way.go, event, kept, self.terrain)
 
     def _moving(self, width: int) -> dict[int, str]:
         """The coordinates of an index whose moves are drawn, with their names: neither disturbance nor direction."""
@@ -121,26 +133,26 @@ class Recorder:
 
     def idle(self) -> None:
         """Work on the landscape for a moment; the way of the search comes over to a new one."""
-        self.explorer.step()
+        self.draw("the landscape", self.explorer.step)
         if self.terrain.known is not None and self.terrain.known is not self.way.landscape:
-            self.way.project(self.terrain)
+            self.draw("the way of the search", self.way.project, self.terrain)
 
     def _round(self, event: sr.RoundFinished) -> None:
         self.timelines.move(None if self.searches else event.relaxed_programs, event.round, event.seconds)
         self.lower = max(self.lower, event.lower_bound)
         self.upper = min(self.upper, np.inf if event.simplified else event.upper_bound)
-        self.rounds.bounds(event)
+        self.draw("the bounds", self.rounds.bounds, event)
         lines = words.round_lines(event)
         for line in lines:
             self.say(line, "INFO" if line is lines[0] else "DEBUG")
         self._page("solving", lines[:1])
-        self._aim(event)
+        self.draw("the landscape", self._aim, event)
         if event.decision is None or (event.round > PICTURES and event.round % 10):
             return
         cuts = active(event.imposed, event.multipliers)
         if self.physics is not None:
-            self.physics.draw(event.decision, cuts, None)
-        self.rounds.violations(event.decision, cuts, event.added)
+            self.draw("control and states", self.physics.draw, event.decision, cuts, None)
+        self.draw("the violations", self.rounds.violations, event.decision, cuts, event.added)
 
     def _aim(self, event: sr.RoundFinished) -> None:
         """The tuple whose surroundings are worth a look after a round: the best of the search, or the constraints that
@@ -165,10 +177,10 @@ class Recorder:
             self.lower, self.upper = result.lower_bound, result.upper_bound
             self.exact = result.value if event.status == "certified" else None
             if result.decision is not None and self.physics is not None:
-                self.physics.draw(result.decision, result.indices, result.dual.mu)
-                self.physics.signals(result.decision)
+                self.draw("control and states", self.physics.draw, result.decision, result.indices, result.dual.mu)
+                self.draw("the signals", self.physics.signals, result.decision)
             if result.decision is not None:
-                self.rounds.violations(result.decision, result.indices, ())
+                self.draw("the violations", self.rounds.violations, result.decision, result.indices, ())
             # a run that is shown again
             if self.explorer.landscape is None and self.explorer.waiting is None and result.indices:
                 self.explorer.aim(

@@ -13,6 +13,7 @@ import numpy as np
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, assemble, tools_of
 from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.methods.own_units import UsersUnits
 
 if TYPE_CHECKING:
     from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -22,9 +23,8 @@ if TYPE_CHECKING:
     from sparserob_core.sip.program import SemiInfiniteProgram
 
 CoordinateKind: TypeAlias = Literal["time", "parameter", "disturbance", "direction", "index"]
-LETTERS: Mapping[CoordinateKind, str] = {
+LETTERS: Mapping[str, str] = {
     "time": "t",
-    "parameter": "p",
     "disturbance": "w",
     "direction": "z",
     "index": "xi",
@@ -37,13 +37,15 @@ class RelaxedValue:
     """``g`` over tuples of indices: ``at`` maps ``slots (D, width)`` to a number, ``+inf`` where the relaxed program is
     infeasible.
 
-    ``weights()`` are the multipliers of the constraints at every index ``(D,)`` in the last evaluation. ``slot`` is the
-    box ``(width,)`` of one index, ``names`` and ``kinds`` say what its coordinates are: see `Inspection.names`
-    and `Inspection.kinds`.
+    ``weights()`` are the multipliers of the constraints at every index ``(D,)`` in the last evaluation, ``gradient()``
+    the slopes ``(D, width)`` of ``g`` there, as far as it has some (`TupleValue.gradient`). ``slot`` is the box
+    ``(width,)`` of one index, ``names`` and ``kinds`` say what its coordinates are: see `Inspection.names` and
+    `Inspection.kinds`.
     """
 
     at: Callable[[Array], float]
     weights: Callable[[], Array]
+    gradient: Callable[[], Array]
     slot: Box
     names: tuple[str, ...]
     kinds: tuple[CoordinateKind, ...]
@@ -119,30 +121,53 @@ class Inspection:
         from sparserob_core.sip.relaxed.relaxed import RelaxedProgram
         from sparserob_core.sip.relaxed.tuples import TupleValue, imposed_program
 
-        program, tools = imposed_program(self.program, "literal" if self.literal else "reduced"), tools_of(self._loaded)
-        if not program.families:
+        formulation: Literal["literal", "reduced"] = "literal" if self.literal else "reduced"
+        users, tools = imposed_program(self.program, formulation), tools_of(self._loaded)
+        if not users.families:
             raise InputError("families: expected at least one constraint family, got none")
+        # as methods see it: the weight epsilon is in the program's own units (decision 16)
+        own = self.program.own_units
+        program = users if own is None else imposed_program(own.program, formulation)
         value = TupleValue(program, RelaxedProgram(program, tools.solver, tools.regulariser), count)
         value.epsilon = epsilon if tools.regulariser is not None and np.isfinite(epsilon) else 0.0
+        width, cost = value.layout.slot.dimension, 1.0 if own is None else own.cost
+        units = np.ones(width) if own is None else UsersUnits(own).tuple_units(width, width)
         per_index = sum(family.rows(family.index_set.lower[np.newaxis])[1].shape[1] for family in program.families)
 
         def weights() -> Array:
             return np.bincount(value.imposed.positions // per_index, value.imposed.multipliers, count).astype(float)
 
+        def gradient() -> Array:
+            return cost * value.gradient(value.slots.ravel()).reshape(value.slots.shape) / units
+
+        slot = value.layout.slot
         return RelaxedValue(
-            lambda slots: value.at(np.asarray(slots, dtype=float).ravel()),
+            lambda slots: cost * value.at(np.ravel(np.clip(slots / units, slot.lower, slot.upper))),
             weights,
-            value.layout.slot,
-            self.names(value.layout.slot.dimension),
-            self.kinds(value.layout.slot.dimension),
+            gradient,
+            Box(slot.lower * units, slot.upper * units),
+            self.names(width),
+            self.kinds(width),
         )
+
+    @property
+    def width(self) -> int:
+        """How many coordinates one index of the method's tuples has."""
+        from sparserob_core.sip.relaxed.tuples import TupleLayout, imposed_program
+
+        program = imposed_program(self.program, "literal" if self.literal else "reduced")
+        return TupleLayout(program.families, 1).slot.dimension
 
     def names(self, width: int) -> tuple[str, ...]:
         """What the ``width`` coordinates of one index are called: ``t``, ``w1`` ... (coefficients of the disturbance),
-        ``p1`` ..., ``z1`` ... (a direction), or ``xi1`` ... where there is no control problem."""
-        kinds = self.kinds(width)
+        the parameters as in the config, ``z1`` ... (a direction), or ``xi1`` ... where there is no control problem."""
+        kinds, problem = self.kinds(width), self.problem
+        given = iter(() if problem is None else problem.system.names)
         return tuple(
-            LETTERS[kind] + ("" if kind == "time" else str(kinds[: k + 1].count(kind))) for k, kind in enumerate(kinds)
+            next(given)
+            if kind == "parameter"
+            else LETTERS[kind] + ("" if kind == "time" else str(kinds[: k + 1].count(kind)))
+            for k, kind in enumerate(kinds)
         )
 
     def kinds(self, width: int) -> tuple[CoordinateKind, ...]:

@@ -32,8 +32,9 @@ def replay(
     """Send a finished run to the viewer of Rerun, as `watch` does: what ``sparserob replay RUN`` does. Returns the
     run's directory.
 
-    The controls of all rounds come from ``rounds.npz``, the evaluations of g from ``evaluations.npz``; of the searches
-    for violated constraints a run directory keeps nothing. ``plugins``: files that offer what the run was made with;
+    The controls of all rounds come from ``rounds.npz``, the evaluations of g, with their tuples and with what the
+    maximiser noted, from ``evaluations.npz``; of the searches for violated constraints, and of what a maximiser shows
+    beside its points, a run directory keeps nothing. ``plugins``: files that offer what the run was made with;
     the directory itself is data, and no plugin that it names is loaded. Raises `InputError` for a directory that holds
     no finished run.
     """
@@ -67,7 +68,7 @@ def events(inspection: Inspection, title: str, directory: Path | None, result: R
         quiet=True,
         inspection=inspection,
     )
-    searches = [] if result.trace is None else list(_searches(result.trace))
+    searches = [] if result.trace is None else list(_searches(result.trace, inspection.width))
     for entry in result.history:
         while searches and searches[0][0] <= entry.round:
             yield searches.pop(0)[1]
@@ -107,20 +108,34 @@ def _number(summary: Mapping[str, Any], name: str, missing: float = np.nan) -> f
     return missing if summary.get(name) is None else float(summary[name])
 
 
-def _searches(trace: SearchTrace) -> Iterator[tuple[int, EvaluationsFinished]]:
-    """Every search in batches, each with the number of its round; the points are not known any more."""
+def _searches(trace: SearchTrace, width: int) -> Iterator[tuple[int, EvaluationsFinished]]:
+    """Every search in batches, each with the number of its round; the tuples of indices of ``width`` coordinates as far
+    as they were kept."""
+    size = trace.points.shape[1]
     for outer in np.unique(trace.outer):
         which = np.flatnonzero(trace.outer == outer)
         values, seconds = trace.value[which], trace.seconds[which] - trace.seconds[which[0]]
-        best, done = np.maximum.accumulate(np.where(np.isnan(values), -np.inf, values)), 0
+        points, notes = trace.points[which], {name: column[which] for name, column in trace.notes.items()}
+        ranked = np.where(np.isnan(values), -np.inf, values)
+        best, done = np.maximum.accumulate(ranked), 0
         batches = min(which.size, max(1, BATCHES * which.size // trace.outer.size))
         for part in np.array_split(np.arange(which.size), batches):
             before = -np.inf if not done else float(best[done - 1])
             moments = [(1, float(moment)) for moment in seconds[part]]
+            said = {
+                name: [(k + 1.0, column[k]) for k in part if not np.isnan(column[k])] for name, column in notes.items()
+            }
             batch = Batch(
-                points=[np.empty((part.size, 0))], values=[values[part]], moments=moments, first=done, best=before
+                points=[points[part]],
+                values=[values[part]],
+                moments=moments,
+                notes={name: rows for name, rows in said.items() if rows},
+                first=done,
+                best=before,
+                origin=_origin(points, notes, done) if size else None,
             )
             done = int(part[-1]) + 1
+            top = int(ranked[:done].argmax())
             yield (
                 int(outer) + 1,
                 EvaluationsFinished(
@@ -129,9 +144,20 @@ def _searches(trace: SearchTrace) -> Iterator[tuple[int, EvaluationsFinished]]:
                     best_value=float(best[done - 1]),
                     seconds=float(seconds[part[-1]]),
                     budget=which.size,
+                    best_point=points[top],
+                    block=width if size and size % width == 0 else max(1, size),
                     round=int(outer) + 1,
                     epsilon=float(trace.epsilon[which[0]]),
                     lower_bound=float(trace.bound[which[part[-1]]]),
                     batch=batch,
                 ),
             )
+
+
+def _origin(points: np.ndarray, notes: Mapping[str, np.ndarray], done: int) -> np.ndarray | None:
+    """Where the walk stood after ``done`` evaluations of a search: as in `Batch`."""
+    if not done:
+        return None
+    accepted = notes.get("accepted")
+    taken = np.zeros(0, dtype=int) if accepted is None else np.flatnonzero(accepted[:done] > 0.0)
+    return np.asarray(points[taken[-1] if taken.size else done - 1])

@@ -15,7 +15,7 @@ from typing import final
 import numpy as np
 
 from sparserob_core.sip.convex_set import Array, Box
-from sparserob_core.sip.events import Batch, EvaluationsFinished, Event, Notify, RoundFinished, frozen, ignore
+from sparserob_core.sip.events import Batch, EvaluationsFinished, Event, Notify, RoundFinished, Sketch, frozen, ignore
 from sparserob_core.sip.evidence import Cut, Dual, Proof
 from sparserob_core.sip.method import Method, Tools
 from sparserob_core.sip.program import (
@@ -98,7 +98,7 @@ class UsersUnits:
         if own.family:
             units, value = self._index_units(own.family, "reduced", size), 1.0
         else:
-            units, value = self._tuple_units(size, own.block), self.cost
+            units, value = self.tuple_units(size, own.block), self.cost
         batch = own.batch
         return replace(
             own,
@@ -108,6 +108,7 @@ class UsersUnits:
             if own.domain is None
             else Box(frozen(own.domain.lower * units), frozen(own.domain.upper * units)),
             lower_bound=own.lower_bound * self.cost,
+            sketches={role: _in_units(sketch, units) for role, sketch in own.sketches.items()},
             batch=Batch(
                 tuple(points * units for points in batch.points),
                 tuple(values * value for values in batch.values),
@@ -126,7 +127,7 @@ class UsersUnits:
             own,
             value=own.value * self.cost,
             bound=own.bound * self.cost,
-            points=own.points * self._tuple_units(width, block) if width else own.points,
+            points=own.points * self.tuple_units(width, block) if width else own.points,
         )
 
     def _searched(self, width: int) -> Sequence[ConstraintFamily]:
@@ -136,7 +137,7 @@ class UsersUnits:
         sizes = [max((one.index_set.dimension for one in each), default=1) for each in (literal, reduced)]
         return literal if width and width % sizes[0] == 0 and sizes[0] != sizes[1] else reduced
 
-    def _tuple_units(self, size: int, block: int) -> Array:
+    def tuple_units(self, size: int, block: int) -> Array:
         """The units ``(size,)`` of a tuple's coordinates: block after block those of the longest index."""
         forms = [one for family in self.program.families for one in (family.literal, family) if one is not None]
         longest = next((one for one in forms if one.index_set.dimension == block and one.index_units is not None), None)
@@ -213,3 +214,8 @@ class UsersUnits:
     def _family(self, name: str) -> ConstraintFamily | None:
         """The family of that name; ``None`` for one that only the method knows, which then has no units."""
         return next((family for family in self.program.families if family.name == name), None)
+
+
+def _in_units(sketch: Sketch, units: Array) -> Sketch:
+    lower = frozen(sketch.lower * units)
+    return Sketch(lower, lower if sketch.points else frozen(sketch.upper * units), sketch.rounded)

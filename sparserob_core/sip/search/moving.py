@@ -76,6 +76,15 @@ class Moving:
         """See `Objective.note`."""
         self._objective.note(**scalars)
 
+    @property
+    def observed(self) -> bool:
+        """See `Objective.observed`."""
+        return self._objective.observed
+
+    def sketch(self, role: str, lower: Array, upper: Array | None = None, rounded: bool = False) -> None:
+        """See `Objective.sketch`."""
+        self._objective.sketch(role, self._placed(lower), None if upper is None else self._placed(upper), rounded)
+
     def _placed(self, points: Array) -> Array:
         moved = np.asarray(points, dtype=float)
         if moved.ndim != 2 or moved.shape[1] != self._moves.size:

@@ -10,7 +10,7 @@ from typing import final
 import numpy as np
 
 from sparserob_core.sip.convex_set import Array, Box
-from sparserob_core.sip.events import Batch, EvaluationsFinished, Notify, frozen
+from sparserob_core.sip.events import SKETCHED, Batch, EvaluationsFinished, Notify, Sketch, frozen
 
 SECONDS_BETWEEN_EVENTS = 0.05
 NUMBERS_BETWEEN_EVENTS = 2**21  # coordinates that wait for the next event
@@ -41,6 +41,7 @@ class Notifier:
         self.values: list[Array] = []
         self.moments: list[tuple[int, float]] = []
         self._noted: dict[str, int] = {}
+        self._sketches: dict[str, Sketch] = {}
         self._origin: Array | None = None
         self._last: Array | None = None
         self._accepted: Array | None = None
@@ -62,6 +63,12 @@ class Notifier:
         """Where a maximiser notes that it has accepted the last point, the walk stands there."""
         if scalars.get("accepted"):
             self._accepted = self._last
+
+    def sketch(self, role: str, lower: Array, upper: Array | None, rounded: bool) -> None:
+        """Keep a sketch for the next event; the last one of a role is the one that counts."""
+        low = frozen(np.array(lower[:SKETCHED], dtype=float))
+        high = low if upper is None else frozen(np.array(upper[:SKETCHED], dtype=float))
+        self._sketches[str(role)] = Sketch(low, high, rounded)
 
     def publish(self, standing: Standing, notes: Mapping[str, Sequence[tuple[float, float]]]) -> None:
         """One event for all that was collected; ``notes`` are those of the whole search."""
@@ -87,7 +94,9 @@ class Notifier:
             domain=self.domain,
             block=standing.block,
             batch=batch,
+            sketches=self._sketches,
         )
+        self._sketches = {}
         self.points, self.values, self.moments, self.numbers, self.best = [], [], [], 0, standing.best_value
         self._noted = {name: len(rows) for name, rows in notes.items()}
         self._origin = self._last if self._accepted is None else self._accepted

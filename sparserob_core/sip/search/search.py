@@ -145,6 +145,16 @@ class CountedObjective:
         if self._notifier is not None:
             self._notifier.note(scalars)
 
+    @property
+    def observed(self) -> bool:
+        """See `Objective.observed`."""
+        return self._notifier is not None
+
+    def sketch(self, role: str, lower: Array, upper: Array | None = None, rounded: bool = False) -> None:
+        """See `Objective.sketch`."""
+        if self._notifier is not None:
+            self._notifier.sketch(role, lower, upper, rounded)
+
     def go_on(self, budget: int) -> None:
         """Open the search again, for its last part: up to ``budget`` evaluations in all, without a rule that stops
         it."""
