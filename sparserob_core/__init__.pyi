@@ -83,10 +83,12 @@ from sparserob_core.sip.regulariser import ControlImage as ControlImage
 from sparserob_core.sip.regulariser import Regulariser as Regulariser
 from sparserob_core.sip.maximiser import EvaluationError as EvaluationError
 from sparserob_core.sip.maximiser import Maximiser as Maximiser
+from sparserob_core.sip.maximiser import LinearBlocks as LinearBlocks
 from sparserob_core.sip.maximiser import Objective as Objective
 from sparserob_core.sip.maximiser import Report as Report
 from sparserob_core.sip.maximiser import SearchEnded as SearchEnded
 from sparserob_core.sip.maximiser import Trace as Trace
+from sparserob_core.sip.search.block_ascent import block_ascent as block_ascent
 from sparserob_core.sip.search.trust_region import TrustRegion as TrustRegion
 from sparserob_core.sip.rules import InnerStop as InnerStop
 from sparserob_core.sip.rules import OuterStep as OuterStep

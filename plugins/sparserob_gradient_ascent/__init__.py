@@ -21,7 +21,8 @@ class GradientAscent(sr.Maximiser, sr.Options):
 
     A start is uniform in the box or, with probability ``redraw``, the best point with those blocks of coordinates drawn
     anew in which the gradient vanishes there: of a tuple of indices these are the ones that impose nothing, and the
-    others are kept. With gradients, one evaluation is one step in any dimension; without, each gradient is taken from
+    others are kept. Where the blocks are linear in some coordinates (`Objective.linear`), as tuples of literal indices
+    are, `block_ascent` comes first. With gradients, one evaluation is one step in any dimension; without, each gradient is taken from
     differences and costs an evaluation per coordinate, so that in high dimension little is left. Where the function has
     kinks, as ``g`` does, a local method may stop at one: the restarts are what it relies on. Proves no upper bound.
 
@@ -39,6 +40,11 @@ class GradientAscent(sr.Maximiser, sr.Options):
         """See `sparserob_core.Maximiser`."""
         climb = _Climb(objective)
         start = objective.best_point if objective.evaluations else climb.uniform(rng)
+        if objective.linear is not None:
+            if not objective.evaluations:
+                objective.evaluate(start[np.newaxis])
+            sr.block_ascent(objective)
+            start = objective.best_point
         while objective.remaining:
             climb.run(start, self.steps)
             start = climb.redrawn(rng) if rng.random() < self.redraw else climb.uniform(rng)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -15,6 +15,23 @@ from sparserob_core.sip.convex_set import Array, Box
 
 class SearchEnded(Exception):
     """Raised through a maximiser to end its search; a maximiser lets it pass. Its text is `Report.stopped`."""
+
+
+@dataclass(frozen=True, eq=False)
+class LinearBlocks:
+    """What a function of ``D`` blocks of coordinates says of itself whose blocks count by one linear piece each, at
+    most: as the indices of a tuple do, by the constraints that they impose.
+
+    ``coordinates (d,)``: where a block is linear, as long as its other coordinates stay. ``acting()``: which blocks
+    ``(D,)`` the value at the point that was evaluated last rests on. ``steepest(point (d,))``: that point ``(d,)`` with
+    the linear coordinates of every block at the vertex where the block weighs most, as seen from the point that was
+    evaluated last (the linear maximisation of Frank and Wolfe 1956); a block that acts keeps to what it acts by. To go
+    there while the acting blocks keep their other coordinates never makes the value less. No evaluation is spent.
+    """
+
+    coordinates: np.ndarray
+    acting: Callable[[], np.ndarray]
+    steepest: Callable[[Array], Array]
 
 
 class Objective(Protocol):
@@ -52,6 +69,11 @@ class Objective(Protocol):
     @property
     def differentiable(self) -> bool:
         """Whether `value_and_gradient` is offered."""
+
+    @property
+    def linear(self) -> LinearBlocks | None:
+        """In which coordinates its blocks are linear, and where they weigh most; ``None`` where they are not.
+        `block_ascent` is what can be made of it."""
 
     @property
     def remaining(self) -> int:

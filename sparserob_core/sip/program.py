@@ -123,6 +123,11 @@ class ConstraintFamily:
     ``enclosure(x, lower (k, d), upper (k, d))``  an `Enclosure` of the violation on cells, for proofs;
     ``cells``         ``(lower, upper)``, a partition of the index set on whose cells the enclosure converges;
     ``gradient(x, indices (k, d), rows (k,))``  derivative ``(k, d)`` of ``row x - rhs`` in the index;
+    ``linear (d,)``   whether the right-hand sides are linear, and the rows constant, in a coordinate of the index while
+        the coordinates that are not linear stay (over the set that these stand for, where that is no box);
+    ``steepest(x, indices (k, d), rows (k,))``  the indices with their linear coordinates where the row is violated
+        most, one row per index; a row of -1 stands for the one that is then violated most (a `Separation`, in the order
+        of ``indices``);
     ``nominal``       the same constraints without the uncertainty;
     ``sample(count, rng)``  the same constraints for ``count`` sampled uncertainties only;
     ``literal``       the same constraints with an inner maximisation left to the index, and ``reduced``, from such a
@@ -142,6 +147,8 @@ class ConstraintFamily:
     enclosure: Callable[[Array, Array, Array], Enclosure] | None = None
     cells: tuple[Array, Array] | None = None
     gradient: Callable[[Array, Array, Array], Array] | None = None
+    linear: np.ndarray | None = None
+    steepest: Callable[[Array, Array, np.ndarray], Separation] | None = None
     nominal: ConstraintFamily | None = None
     sample: Callable[[int, np.random.Generator], ConstraintFamily] | None = None
     literal: ConstraintFamily | None = None

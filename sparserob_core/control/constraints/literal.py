@@ -41,6 +41,8 @@ class LiteralConstraint:
             rows=self.rows,
             worst=self.worst,
             gradient=self.gradient,
+            linear=np.concatenate([[False], np.tile(self._movable, count), np.zeros(lower.size - 1, dtype=bool)]),
+            steepest=self.steepest,
             reduced=reduced,
             explain=self.explain,
             formulation="literal",
@@ -83,6 +85,17 @@ class LiteralConstraint:
             beta.reshape(-1, size), self.disturbance.blocks(weights).reshape(-1, size)
         ).reshape(beta.shape)
         return np.hstack([slopes[:, :1], in_beta * moves, slopes[:, 1:]])
+
+    def steepest(self, x: Array, indices: Array, rows: np.ndarray) -> Separation:
+        """The worst disturbance of every index for one row, ``rows (k,)``; for -1 of the row that is violated most."""
+        reduced, beta = self._split(np.asarray(indices, dtype=float))
+        times, directions, parameters, rhs = self.base.functionals_at(reduced)
+        values = (self.base.functionals.values(x, times, directions, parameters) - rhs).reshape(len(reduced), -1)
+        chosen = np.where(rows >= 0, rows, values.argmax(axis=1))
+        pick = np.arange(chosen.size) * values.shape[1] + chosen
+        blocks = self.base.functionals.worst_blocks(times[pick], directions[pick], parameters[pick])
+        worst = np.hstack([indices[:, :1], blocks.reshape(beta.shape), indices[:, 1 + beta.shape[1] :]])
+        return Separation(worst, chosen, values.ravel()[pick], formulation="literal")
 
     @cached_property
     def _sensitivity(self) -> Sensitivity:

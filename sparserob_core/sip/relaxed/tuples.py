@@ -13,6 +13,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.finite import FiniteSolution
+from sparserob_core.sip.maximiser import LinearBlocks
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
 from sparserob_core.sip.relaxed.index_gradient import index_gradient
 from sparserob_core.sip.relaxed.relaxed import LAZY, Imposed, RelaxedProgram, Rows, value_of
@@ -147,6 +148,46 @@ class TupleValue:
             )
             np.add.at(slope[:, : box.dimension], where, np.where(wanted == indices, steps, 0.0))
         return slope.ravel()
+
+    @cached_property
+    def linear(self) -> LinearBlocks | None:
+        """In which coordinates the indices are linear, where every family says it is in some."""
+        said = [(family.index_set.dimension, family.linear) for family in self.program.families]
+        if not said or any(
+            linear is None or family.steepest is None for (_, linear), family in zip(said, self.program.families)
+        ):
+            return None
+        coordinates = np.ones(self.block, dtype=bool)
+        for size, linear in said:
+            coordinates[:size] &= linear
+            coordinates[size:] = False
+        return LinearBlocks(np.tile(coordinates, self.layout.count), self._acting, self._steepest)
+
+    def _acting(self) -> np.ndarray:
+        """Which indices ``(D,)`` of the last tuple have a multiplier."""
+        acts = np.zeros(self.layout.count, dtype=bool)
+        acts[self.imposed.positions[self.imposed.multipliers > 0.0] // self._h.shape[1]] = True
+        return acts
+
+    def _steepest(self, point: Array) -> Array:
+        """The tuple with the linear coordinates of every index where the row is violated most by the last optimum: the
+        row that the index acts by, or else the one of any family that is then violated most."""
+        slots, x = point.reshape(self.slots.shape).copy(), self.solution.x
+        kinds = np.full(len(slots), -1)
+        for position in self.imposed.positions[np.argsort(self.imposed.multipliers, kind="stable")]:
+            slot, kind = divmod(int(position), self._h.shape[1])
+            kinds[slot] = kind
+        most = np.full(len(slots), -np.inf)
+        for family, first, last in self._columns:
+            mine = np.flatnonzero((kinds < 0) | ((kinds >= first) & (kinds < last)))
+            rows = np.where(kinds[mine] < 0, -1, kinds[mine] - first)
+            assert family.steepest is not None
+            found = family.steepest(x, self.layout.indices(family, slots[mine]), rows)
+            better = found.violations > most[mine]
+            moved, linear = mine[better], np.flatnonzero(family.linear)
+            most[moved] = found.violations[better]
+            slots[np.ix_(moved, linear)] = found.indices[better][:, linear]
+        return slots.ravel()
 
     def rows(self) -> Rows:
         """The rows that were imposed in the last evaluation, in the order of its multipliers."""

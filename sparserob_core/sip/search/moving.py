@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import final
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from sparserob_core.errors import PluginError
 from sparserob_core.sip.convex_set import Array, Box
-from sparserob_core.sip.maximiser import Objective
+from sparserob_core.sip.maximiser import LinearBlocks, Objective
 
 
 @final
@@ -58,6 +59,18 @@ class Moving:
     def differentiable(self) -> bool:
         """See `Objective.differentiable`."""
         return self._objective.differentiable
+
+    @cached_property
+    def linear(self) -> LinearBlocks | None:
+        """See `Objective.linear`."""
+        full = self._objective.linear
+        if full is None or self.domain.dimension // self.block != self._fixed.size // self._objective.block:
+            return None
+
+        def steepest(point: Array) -> Array:
+            return full.steepest(self._placed(point[np.newaxis])[0])[self._moves]
+
+        return LinearBlocks(full.coordinates[self._moves], full.acting, steepest)
 
     def evaluate(self, points: Array) -> Array:
         """See `Objective.evaluate`; points ``(k, c)``."""

@@ -13,7 +13,7 @@ from sparserob_core.errors import InputError, PluginError, SparseRobError
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.events import Notify, ignore
-from sparserob_core.sip.maximiser import EvaluationError, Maximiser, Objective, Report, SearchEnded, Trace
+from sparserob_core.sip.maximiser import EvaluationError, LinearBlocks, Maximiser, Objective, Report, SearchEnded, Trace
 from sparserob_core.sip.rules import Metropolis, Progress
 from sparserob_core.sip.search.moving import Moving
 from sparserob_core.sip.search.notifier import Notifier, Standing
@@ -28,7 +28,7 @@ class Target:
     """What is maximised: ``function`` maps points ``(k, d)`` of a bounded ``domain`` to ``k`` numbers.
 
     ``gradient`` maps the point ``(d,)`` that was evaluated last to the gradient ``(d,)`` there; ``None`` if there is
-    none. ``block`` consecutive coordinates belong together (`Objective`). Raises `InputError` for an unbounded domain
+    none. ``block`` consecutive coordinates belong together, and may be ``linear`` (`Objective`). Raises `InputError` for an unbounded domain
     or blocks that do not fill it.
     """
 
@@ -36,6 +36,7 @@ class Target:
     domain: Box
     gradient: Callable[[Array], Array] | None = None
     block: int = 1
+    linear: LinearBlocks | None = None
 
     def __post_init__(self) -> None:
         domain = self.domain
@@ -99,6 +100,11 @@ class CountedObjective:
     def differentiable(self) -> bool:
         """See `Objective.differentiable`."""
         return self.target.gradient is not None
+
+    @property
+    def linear(self) -> LinearBlocks | None:
+        """See `Objective.linear`."""
+        return self.target.linear
 
     def evaluate(self, points: Float[Array, "k d"]) -> Float[Array, " k"]:
         """See `Objective.evaluate`."""
