@@ -22,9 +22,10 @@ class GradientAscent(sr.Maximiser, sr.Options):
     A start is uniform in the box or, with probability ``redraw``, the best point with those blocks of coordinates drawn
     anew in which the gradient vanishes there: of a tuple of indices these are the ones that impose nothing, and the
     others are kept. Where the blocks are linear in some coordinates (`Objective.linear`), as tuples of literal indices
-    are, `block_ascent` comes first. With gradients, one evaluation is one step in any dimension; without, each gradient is taken from
-    differences and costs an evaluation per coordinate, so that in high dimension little is left. Where the function has
-    kinks, as ``g`` does, a local method may stop at one: the restarts are what it relies on. Proves no upper bound.
+    are, `block_ascent` comes first. With gradients, one evaluation is one step in any dimension; without, each gradient
+    is taken from differences and costs an evaluation per coordinate, so that in high dimension little is left. Where
+    the function has kinks, as ``g`` does, a local method may stop at one: the restarts are what it relies on. Proves no
+    upper bound.
 
     Notes ``ascent`` (its number, from 1) and ``slope`` (the largest entry of the gradient, per width of the box) at
     every step.

@@ -152,14 +152,12 @@ class TupleValue:
     @cached_property
     def linear(self) -> LinearBlocks | None:
         """In which coordinates the indices are linear, where every family says it is in some."""
-        said = [(family.index_set.dimension, family.linear) for family in self.program.families]
-        if not said or any(
-            linear is None or family.steepest is None for (_, linear), family in zip(said, self.program.families)
-        ):
-            return None
         coordinates = np.ones(self.block, dtype=bool)
-        for size, linear in said:
-            coordinates[:size] &= linear
+        for family in self.program.families:
+            if family.linear is None or family.steepest is None:
+                return None
+            size = family.index_set.dimension
+            coordinates[:size] &= family.linear
             coordinates[size:] = False
         return LinearBlocks(np.tile(coordinates, self.layout.count), self._acting, self._steepest)
 
@@ -181,7 +179,7 @@ class TupleValue:
         for family, first, last in self._columns:
             mine = np.flatnonzero((kinds < 0) | ((kinds >= first) & (kinds < last)))
             rows = np.where(kinds[mine] < 0, -1, kinds[mine] - first)
-            assert family.steepest is not None
+            assert family.linear is not None and family.steepest is not None
             found = family.steepest(x, self.layout.indices(family, slots[mine]), rows)
             better = found.violations > most[mine]
             moved, linear = mine[better], np.flatnonzero(family.linear)

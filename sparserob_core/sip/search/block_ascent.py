@@ -22,8 +22,8 @@ def block_ascent(objective: Objective) -> None:
     (Frank and Wolfe 1956; for the maximum of a convex function, which is at a vertex: Mangasarian 1996). Blocks that do
     not act may be moved without loss: one half of them is placed beside those that act, at distances from half a side
     down to its ``2^-40``, which is a line search in all other coordinates at once; the other half is spread over the
-    box, by the additive recurrence of Kronecker, and finds what is not yet known. So no step makes the value less. Notes
-    ``acting``, how many blocks act. Ends by `SearchEnded` when the budget is spent.
+    box, by the additive recurrence of Kronecker, and finds what is not yet known. So no step makes the value less.
+    Notes ``acting``, how many blocks act. Ends by `SearchEnded` when the budget is spent.
     """
     linear = objective.linear
     if linear is None or not np.isfinite(objective.best_value):

@@ -24,10 +24,10 @@ def polish(objective: Objective, points: Array, values: Array) -> None:
     """Climb from the best of the evaluated ``points (k, d)`` with ``values (k,)`` until the budget is spent or nothing
     is left to gain.
 
-    Where blocks are linear, the `block_ascent` first. With gradients: L-BFGS-B (Byrd, Lu, Nocedal and Zhu 1995). Then, up to 30 coordinates, the
-    derivative-free `TrustRegion`; beyond, a compass search that moves one coordinate, hence one block, at a time.
-    Starts are the best points, then the next best that lie apart; one that its recent progress cannot bring to the top
-    is given up. Nothing is done without a finite value.
+    Where blocks are linear, the `block_ascent` first. With gradients: L-BFGS-B (Byrd, Lu, Nocedal and Zhu 1995). Then,
+    up to 30 coordinates, the derivative-free `TrustRegion`; beyond, a compass search that moves one coordinate, hence
+    one block, at a time. Starts are the best points, then the next best that lie apart; one that its recent progress
+    cannot bring to the top is given up. Nothing is done without a finite value.
     """
     finite = np.isfinite(values)
     if not finite.any():

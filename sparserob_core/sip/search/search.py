@@ -28,8 +28,8 @@ class Target:
     """What is maximised: ``function`` maps points ``(k, d)`` of a bounded ``domain`` to ``k`` numbers.
 
     ``gradient`` maps the point ``(d,)`` that was evaluated last to the gradient ``(d,)`` there; ``None`` if there is
-    none. ``block`` consecutive coordinates belong together, and may be ``linear`` (`Objective`). Raises `InputError` for an unbounded domain
-    or blocks that do not fill it.
+    none. ``block`` consecutive coordinates belong together, and may be ``linear`` (`Objective`). Raises `InputError`
+    for an unbounded domain or blocks that do not fill it.
     """
 
     function: Function
