@@ -41,6 +41,8 @@ from sparserob_core.experiment.margin.margin import Margin as Margin
 from sparserob_core.experiment.margin.margin import margin as margin
 from sparserob_core.experiment.initial_states.initial_states import InitialStates as InitialStates
 from sparserob_core.experiment.initial_states.initial_states import initial_states as initial_states
+from sparserob_core.experiment.sweep.study import Study as Study
+from sparserob_core.experiment.sweep.sweep import sweep as sweep
 from sparserob_core.experiment.comparison.comparison import Comparison as Comparison
 from sparserob_core.experiment.comparison.compare import compare as compare
 from sparserob_core.sip.result import Result as Result
@@ -106,6 +108,7 @@ from sparserob_core.experiment.run.events import Observer as Observer
 from sparserob_core.experiment.run.events import RunFinished as RunFinished
 from sparserob_core.experiment.run.events import RunStarted as RunStarted
 from sparserob_core.experiment.run.events import StudyProgress as StudyProgress
+from sparserob_core.experiment.run.events import SweepProgress as SweepProgress
 from sparserob_core.sip.events import Batch as Batch
 from sparserob_core.sip.events import EvaluationsFinished as EvaluationsFinished
 from sparserob_core.sip.events import Sketch as Sketch

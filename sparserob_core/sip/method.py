@@ -84,6 +84,8 @@ class Deadline:
         self.seconds = seconds
         self._ends = np.inf if seconds is None else time.monotonic() + seconds
         self._interrupted = ""
+        self.pressed = False
+        """Whether somebody has interrupted the computation, by a key or a signal, before the end of the time."""
 
     @property
     def bounded(self) -> bool:
@@ -136,6 +138,7 @@ class Deadline:
 
     def interrupt(self, error: KeyboardInterrupt) -> str:
         """Take note of an interrupt, and return why the time is over: in the words of the error where it has some."""
+        self.pressed |= not isinstance(error, OutOfTime)
         self._interrupted = self.reason or str(error) or "interrupted from the keyboard"
         return self._interrupted
 

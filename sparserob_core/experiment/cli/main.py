@@ -20,6 +20,7 @@ from sparserob_core.experiment.cli.commands.replay import replay
 from sparserob_core.experiment.cli.commands.run import run
 from sparserob_core.experiment.cli.commands.schema import schema
 from sparserob_core.experiment.cli.commands.simulate import simulate
+from sparserob_core.experiment.cli.commands.sweep import sweep
 from sparserob_core.experiment.cli.commands.watch import watch
 from sparserob_core.experiment.cli.shell.process import INTERRUPTED, OutputError, drop_output, listen, open_streams
 from sparserob_core.experiment.terminal.printing import printable
@@ -76,5 +77,5 @@ def commands() -> None:
     """Sparse robust optimal control of uncertain linear systems, with the proof."""
 
 
-for command in (run, watch, replay, check, simulate, margin, initial_states, compare, figures, plugins, schema):
+for command in (run, sweep, watch, replay, check, simulate, margin, initial_states, compare, figures, plugins, schema):
     commands.add_command(command)

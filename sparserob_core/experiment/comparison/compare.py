@@ -3,9 +3,8 @@ these take."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -13,7 +12,8 @@ from sparserob_core.errors import InputError
 from sparserob_core.experiment.comparison.comparison import Comparison
 from sparserob_core.experiment.comparison.curve import WITHOUT_CURVE, Curve, read_curve
 from sparserob_core.experiment.comparison.figure import write_comparison
-from sparserob_core.experiment.comparison.labels import labels, value_text
+from sparserob_core.experiment.comparison.labels import labels
+from sparserob_core.experiment.config.plain import difference, value_text
 
 SHARES = (0.1, 0.01, 0.001)
 SLACK = 1e-7
@@ -111,26 +111,10 @@ def _text(value: float, form: str) -> str:
 
 def _require_same_problem(first: Curve, other: Curve) -> None:
     for section in ("problem", "dictionaries"):
-        found = _difference(first.config.get(section), other.config.get(section), section)
+        found = difference(first.config.get(section), other.config.get(section), section)
         if found is not None:
             path, here, there = found
             raise InputError(
                 f"{other.directory}: expected a run of the same problem as {first.directory}; "
                 f"{path} is {value_text(there)} here and {value_text(here)} there"
             )
-
-
-def _difference(one: Any, two: Any, path: str) -> tuple[str, Any, Any] | None:
-    """The first place at which two parts of a config differ, and what stands there; a key that is missing is null."""
-    if isinstance(one, Mapping) and isinstance(two, Mapping):
-        steps = [(str(key), one.get(key), two.get(key)) for key in {**one, **two}]
-    elif (
-        isinstance(one, list)
-        and isinstance(two, list)
-        and len(one) == len(two)
-        and any(isinstance(entry, Mapping) for entry in one)
-    ):
-        steps = [(str(key), *pair) for key, pair in enumerate(zip(one, two, strict=True))]
-    else:
-        return None if one == two else (path, one, two)
-    return next((found for key, here, there in steps if (found := _difference(here, there, f"{path}.{key}"))), None)

@@ -6,6 +6,8 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from sparserob_core.experiment.config.plain import value_text
+
 COMPONENTS = ("method", "maximiser", "regulariser", "solver")
 UNSEEN = frozenset({"problem", "dictionaries", "title", "observers", "plugins", "method", "maximiser", "seed"})
 
@@ -23,20 +25,6 @@ def labels(configs: Sequence[Mapping[str, Any]], searched: Sequence[bool]) -> li
         peers = [other for other in configs if other["method"]["name"] == config["method"]["name"]]
         found.append(", ".join([_head(config, peers, searches, len(names) > 1), *_differences(config, peers)]))
     return _numbered(_with_seeds(found, [config.get("seed") for config in configs]))
-
-
-def value_text(value: object) -> str:
-    """A value of a config in a few letters: a component is its name and the options that are not null."""
-    if isinstance(value, Mapping):
-        options = ", ".join(
-            f"{key} {value_text(item)}" for key, item in value.items() if key != "name" and item is not None
-        )
-        return f"{value.get('name', '')} ({options})".strip() if options else str(value.get("name", "{}"))
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(value_text, value)) + "]"
-    if isinstance(value, bool) or value is None:
-        return {True: "on", False: "off", None: "none"}[value]
-    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _head(config: Mapping[str, Any], peers: Sequence[Mapping[str, Any]], searches: bool, several: bool) -> str:

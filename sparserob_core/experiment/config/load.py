@@ -44,7 +44,7 @@ class Loaded:
 
 
 def load_config(
-    config: str | File | Mapping[str, Any],
+    config: str | File | Mapping[str, Any] | Source,
     overrides: Mapping[str, object] | Iterable[str] | None = None,
     known: Registry | None = None,
 ) -> Loaded:

@@ -59,11 +59,13 @@ class Source:
         return place
 
 
-def read_source(config: str | File | Mapping[str, Any]) -> Source:
-    """Read a config from a ``.yaml``, ``.json`` or ``.toml`` file, or take it from a mapping.
+def read_source(config: str | File | Mapping[str, Any] | Source) -> Source:
+    """Read a config from a ``.yaml``, ``.json`` or ``.toml`` file, or take it from a mapping, or as it was read before.
 
     Raises `ConfigError` when there is no such file, it cannot be read, or it does not hold a mapping.
     """
+    if isinstance(config, Source):
+        return config
     if isinstance(config, Mapping):
         return Source("config", File.cwd(), _plain(config))
     file = File(config)

@@ -64,9 +64,9 @@ class RunDirectory:
         write_whole(self.path / name, stream.getvalue())
 
 
-def create_directory(out: str | Path | None, name: str, digest: str) -> RunDirectory:
+def create_directory(out: str | Path | None, name: str, digest: str, again: str = "") -> RunDirectory:
     """Make the directory of a run: ``out``, which must be new or empty, else ``runs/<name>/<UTC stamp>-<digest>``; lock
-    it until it is left.
+    it until it is left. A directory that holds the file ``again`` can be gone on with.
 
     Raises `InputError` when it is neither, when another run is writing into it, or when it cannot be written to.
     """
@@ -74,10 +74,10 @@ def create_directory(out: str | Path | None, name: str, digest: str) -> RunDirec
     lock = Lock(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
-        _require_empty(path, unless=lock.file)
+        _require_empty(path, unless=(lock.file.name, again))
         lock.acquire()
         try:
-            _require_empty(path)
+            _require_empty(path, unless=(again,))
         except InputError:
             lock.release()
             raise
@@ -88,9 +88,10 @@ def create_directory(out: str | Path | None, name: str, digest: str) -> RunDirec
     return RunDirectory(path, lock)
 
 
-def _require_empty(path: Path, unless: Path | None = None) -> None:
-    """Raise `InputError` when there are files but those of a lock, unless it has a lock, whose owner is to be named."""
-    if unless is not None and unless.exists():
+def _require_empty(path: Path, unless: Sequence[str] = ()) -> None:
+    """Raise `InputError` when there are files but those of a lock, unless one of these is among them: of a lock the
+    owner is to be named, and what can be gone on with may hold anything."""
+    if any(name and (path / name).exists() for name in unless):
         return
     if any(not file.name.startswith(LOCK) for file in path.iterdir()):
         raise InputError(f"{path}: expected a new or an empty directory, got one that holds files")

@@ -84,6 +84,14 @@ class Lock:
         )
 
 
+def owner_of(directory: Path) -> tuple[int, str]:
+    """The number of the process that holds the lock of a directory, and its host; 0 and no host where nobody does."""
+    try:
+        return _owner((directory / NAME).read_text(encoding="utf-8", errors="replace"))
+    except OSError:
+        return 0, ""
+
+
 def _me() -> str:
     return json.dumps({"process": os.getpid(), "host": platform.node()})
 
@@ -98,7 +106,11 @@ def _owner(content: str) -> tuple[int, str]:
 
 
 def _is_dead(content: str) -> bool:
-    process, host = _owner(content)
+    return is_dead(*_owner(content))
+
+
+def is_dead(process: int, host: str) -> bool:
+    """Whether the process is known to be gone; of another host nothing is known."""
     if process <= 0 or host != platform.node():
         return False
     try:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, final
+from typing import TYPE_CHECKING, Any, final
 
 from sparserob_core.sip.events import EvaluationsFinished, Event, ProofProgress, RoundFinished
 
@@ -27,6 +27,7 @@ __all__ = [
     "RunFinished",
     "RunStarted",
     "StudyProgress",
+    "SweepProgress",
 ]
 
 logger = logging.getLogger("sparserob")
@@ -70,6 +71,17 @@ class StudyProgress(Event):
     text: str
     done: int = 0
     total: int = 0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SweepProgress(StudyProgress):
+    """A sweep goes on: ``done`` of ``total`` points, of them ``failed`` without an answer; ``running`` now; about
+    ``left`` seconds to go (``None``: not known yet). ``row``: the row of the table that has just come, if any."""
+
+    running: int = 0
+    failed: int = 0
+    left: float | None = None
+    row: Mapping[str, Any] | None = None
 
 
 class Observer(ABC):

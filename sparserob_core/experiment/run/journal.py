@@ -27,8 +27,8 @@ from sparserob_core.sip.result import Result
 class Journal(Observer):
     """Keeps the rounds, so that a run that ends early leaves them, and writes everything down."""
 
-    def __init__(self, directory: RunDirectory, experiment: Experiment) -> None:
-        self.directory, self.experiment = directory, experiment
+    def __init__(self, directory: RunDirectory, experiment: Experiment, origin: Mapping[str, Any]) -> None:
+        self.directory, self.experiment, self.origin = directory, experiment, origin
         self.rounds: list[RoundFinished] = []
 
     def receive(self, event: Event) -> None:
@@ -46,6 +46,7 @@ class Journal(Observer):
             "seed": config.seed,
             "versions": versions(),
             "config": config.digest(),
+            "provenance": self.origin,
         }
         self.directory.write_json("result.json", summary)
         return control, summary

@@ -17,6 +17,7 @@ from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import create_directory
 from sparserob_core.experiment.directory.finished import UNFINISHED
+from sparserob_core.experiment.directory.provenance import git_revision, provenance
 from sparserob_core.experiment.run.events import Broadcast, Event, Observer, RunFinished, RunStarted
 from sparserob_core.experiment.run.inspection import Inspection
 from sparserob_core.experiment.run.journal import Journal
@@ -34,7 +35,8 @@ HEADING = "Complete and resolved. To repeat the run: sparserob run config.yaml"
 @dataclass(frozen=True, eq=False)
 class Outcome:
     """A finished run. ``control (m, K)`` is ``None`` without a decision or for a program that is no control problem;
-    ``summary`` is what ``result.json`` holds; ``remarks`` say what could not be done beside the result."""
+    ``summary`` is what ``result.json`` holds; ``remarks`` say what could not be done beside the result;
+    ``interrupted``: a key or a signal ended it, or came while it ended."""
 
     result: Result
     directory: Path
@@ -42,6 +44,7 @@ class Outcome:
     control: Array | None
     summary: Mapping[str, Any]
     remarks: Sequence[str] = ()
+    interrupted: bool = False
 
     @property
     def status(self) -> str:
@@ -94,6 +97,21 @@ def run(
     ``failed``.
     """
     loaded = load_config(config, overrides)
+    git = git_revision(loaded.source.folder)
+    return run_loaded(loaded, git, out, quiet=quiet, figures=figures, observers=observers)
+
+
+def run_loaded(
+    loaded: Loaded,
+    git: Mapping[str, Any] | None,
+    out: str | Path | None = None,
+    *,
+    quiet: bool = False,
+    figures: bool = True,
+    observers: Iterable[Observer] = (),
+) -> Outcome:
+    """`run`, of a config that was loaded; ``git``: the revision of its folder, as `git_revision` has it."""
+    origin = provenance(loaded.config.plain(), git)
     deadline = Deadline(loaded.config.limits.seconds)  # the transcription counts too
     experiment = assemble(loaded)
     tools, watching = (
@@ -103,7 +121,7 @@ def run(
     method: Method = build(loaded, "method", loaded.config.method)
     executors: ExecutorFactory = build(loaded, "executor", loaded.config.executor)
     with create_directory(out, name_of(loaded), loaded.config.digest()) as directory:
-        journal = Journal(directory, experiment)
+        journal = Journal(directory, experiment, origin)
         broadcast = Broadcast([("journal", journal), *watching])
         ending, started = RunFinished(status="failed", message=UNFINISHED, seconds=0.0), time.perf_counter()
         result: Result | None = None
@@ -127,6 +145,7 @@ def run(
                     handed = replace(_notifying(tools, broadcast), executor=executor)
                     result = solve_in_own_units(method, experiment.program, handed)
             except KeyboardInterrupt as pressed:  # a method that does not return what it knows
+                deadline.interrupt(pressed)
                 result, complete = journal.known(_said(pressed), time.perf_counter() - started), False
                 if result is None:
                     raise
@@ -134,7 +153,7 @@ def run(
                 result = rounded_down(experiment.transcription, result, experiment.gap_tolerance)
             ending = RunFinished(status=result.status, message=result.message, seconds=result.seconds, result=result)
             control, summary, remarks = journal.finish(result, figures=figures and complete, certify=complete)
-            return Outcome(result, directory.path, experiment, control, summary, remarks)
+            return Outcome(result, directory.path, experiment, control, summary, remarks, deadline.pressed)
         except BaseException as error:
             error.add_note(f"what was done until then is in {directory.path}")
             if result is None or not isinstance(error, KeyboardInterrupt):

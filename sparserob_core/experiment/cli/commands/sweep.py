@@ -1,0 +1,92 @@
+"""``sparserob sweep``: a config at every point of some axes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
+from sparserob_core.experiment.terminal.printing import print_json, printable
+
+
+@click.command()
+@click.argument("config", type=click.Path(path_type=Path), required=False)
+@click.argument("axes", nargs=-1, metavar="[KEY=VALUES]...")
+@click.option("--zip", "zipped", is_flag=True, help="Take the first values of all axes together, then the second, ...")
+@click.option("--random", type=int, metavar="N", help="Draw N points at random; ranges are written start:stop.")
+@click.option("--sobol", type=int, metavar="N", help="Draw N points along a scrambled sequence of Sobol.")
+@click.option(
+    "--executor",
+    metavar="NAME",
+    help="Where the runs are made: a name, or '{name: processes, workers: 2}'; the config's own unless given.",
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    help="A new directory, or that of a study of the same base to go on with; runs/NAME-sweep/STAMP-HASH unless given.",
+)
+@click.option("--resume", type=click.Path(path_type=Path), metavar="DIR", help="Go on with the study in DIR.")
+@click.option("--figures/--no-figures", default=False, help="Whether to draw every run too.", show_default=True)
+@click.option("--quiet", is_flag=True, help="Print nothing but errors.")
+@click.option("--json", "as_json", is_flag=True, help="Print the table as JSON instead.")
+def sweep(
+    config: Path | None,
+    axes: tuple[str, ...],
+    zipped: bool,
+    random: int | None,
+    sobol: int | None,
+    executor: str | None,
+    out: Path | None,
+    resume: Path | None,
+    figures: bool,
+    quiet: bool,
+    as_json: bool,
+) -> int:
+    """Run CONFIG at every point of some axes, and make one table of it.
+
+    KEY=VALUES is an axis: values (method=exchange,scenario), start:stop:count (seed=0:19:20), or
+    log:start:stop:count (continuation.stop=log:1e-6:1:13); commas inside brackets do not split. One value changes the
+    config for all points. CONFIG may also be a study's file, with the keys base and axes. What is finished in the
+    directory is not run again; a point that fails is a row that says why.
+
+    Exit status: 0 every point has an answer, whatever it is; 2 the input is at fault, 5 a point failed, 130
+    interrupted.
+    """
+    from sparserob_core.experiment.cli.shell.live_line import LiveLine
+    from sparserob_core.experiment.config.reader import read_value
+    from sparserob_core.experiment.sweep.study import remarks_of, shown
+    from sparserob_core.experiment.sweep.sweep import sweep as run_study
+    from sparserob_core.experiment.terminal.table import print_table
+
+    if resume is not None and config is not None and "=" in str(config):
+        config, axes = None, (str(config), *axes)
+    if (config is None) == (resume is None):
+        raise InputError("expected either CONFIG or --resume DIR, got " + ("neither" if config is None else "both"))
+    if resume is not None and out is not None:
+        raise InputError("--out: a study that is resumed stays in its directory; expected --resume DIR alone")
+    given = {"zip": zipped or None, "random": random, "sobol": sobol}
+    chosen = [name for name, value in given.items() if value is not None]
+    if len(chosen) > 1:
+        raise InputError(
+            "expected one of --zip, --random and --sobol, got " + " and ".join(f"--{one}" for one in chosen)
+        )
+    with LiveLine() as line:
+        study = run_study(
+            config if config is not None else resume,  # type: ignore[arg-type]
+            axes,
+            points=chosen[0] if chosen else None,  # type: ignore[arg-type]
+            number=random if random is not None else sobol,
+            executor=None if executor is None else read_value(executor),  # type: ignore[arg-type]
+            out=out,
+            figures=figures,
+            notify=line.receive,
+        )
+    if as_json:
+        print_json({**study.summary(), "table": study.table})
+    elif not quiet:
+        print_table(study.title, *shown(study))
+        for remark in (*remarks_of(study), f"written to {study.directory}"):
+            click.echo(printable(remark))
+    return status_unless_interrupted(5 if study.failed else 0)

@@ -1,0 +1,50 @@
+"""Resolved configs as plain data: what decides a result, how two of them differ, and a value in a few letters."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any
+
+BESIDE = ("executor", "observers", "title", "limits")
+"""Keys of a config that do not decide what a finished run finds."""
+
+
+def identity(plain: Mapping[str, Any]) -> str:
+    """The SHA-256 of a resolved config without the keys that do not decide what a finished run finds (where it is
+    solved, who watches, its title, how long it may take): of its JSON with sorted keys and without spaces."""
+    kept = {key: value for key, value in plain.items() if key not in BESIDE}
+    text = json.dumps(kept, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def difference(one: Any, two: Any, path: str = "") -> tuple[str, Any, Any] | None:
+    """The first place at which two parts of a config differ, and what stands there; a key that is missing is null."""
+    if isinstance(one, Mapping) and isinstance(two, Mapping):
+        steps = [(str(key), one.get(key), two.get(key)) for key in {**one, **two}]
+    elif (
+        isinstance(one, list)
+        and isinstance(two, list)
+        and len(one) == len(two)
+        and any(isinstance(entry, Mapping) for entry in one)
+    ):
+        steps = [(str(key), *pair) for key, pair in enumerate(zip(one, two, strict=True))]
+    else:
+        return None if one == two else (path, one, two)
+    below = ((f"{path}.{key}" if path else key, here, there) for key, here, there in steps)
+    return next((found for key, here, there in below if (found := difference(here, there, key))), None)
+
+
+def value_text(value: object) -> str:
+    """A value of a config in a few letters: a component is its name and the options that are not null."""
+    if isinstance(value, Mapping):
+        options = ", ".join(
+            f"{key} {value_text(item)}" for key, item in value.items() if key != "name" and item is not None
+        )
+        return f"{value.get('name', '')} ({options})".strip() if options else str(value.get("name", "{}"))
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(value_text, value)) + "]"
+    if isinstance(value, bool) or value is None:
+        return {True: "on", False: "off", None: "none"}[value]
+    return f"{value:g}" if isinstance(value, float) else str(value)

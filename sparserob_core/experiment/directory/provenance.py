@@ -1,0 +1,63 @@
+"""Where a run comes from: what a reader needs, years later, to know what was run, on what, and when."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from sparserob_core.experiment.config.plain import identity
+
+PATIENCE = 5.0  # seconds for git
+
+
+def provenance(plain: Mapping[str, Any], git: Mapping[str, Any] | None) -> dict[str, Any]:
+    """What ``result.json`` says of where a run comes from: the ``hash`` of the resolved config ``plain`` (`identity`),
+    when it ``started`` (UTC), the ``git`` revision of the config's folder (`git_revision`), the ``host``, and the
+    SHA-256 of every plugin file.
+    """
+    return {
+        "hash": identity(plain),
+        "started": f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",
+        "git": git,
+        "host": {
+            "system": platform.system(),
+            "machine": platform.machine(),
+            "cores": cores(),
+            "python": f"{platform.python_implementation()} {platform.python_version()}",
+        },
+        "plugins": {str(file): _digest(Path(file)) for file in plain.get("plugins") or ()},
+    }
+
+
+def cores() -> int:
+    """The processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def git_revision(folder: Path) -> dict[str, Any] | None:
+    """The revision of the folder's git repository, and whether tracked files were ``changed`` since; ``None`` where
+    there is no repository, or no git."""
+    command = ["git", "-c", "core.fsmonitor=false", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    try:
+        done = subprocess.run(
+            command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE, check=False, stdin=subprocess.DEVNULL
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    said = done.stdout.strip()
+    if done.returncode or not said:
+        return None
+    return {"revision": said.removesuffix("-dirty"), "changed": said.endswith("-dirty")}
+
+
+def _digest(file: Path) -> str | None:
+    try:
+        return sha256(file.read_bytes()).hexdigest()
+    except OSError:
+        return None

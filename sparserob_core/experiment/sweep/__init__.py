@@ -1,0 +1,1 @@
+"""Studies: one config, axes along which it is changed, and a run for every point."""

@@ -1,0 +1,236 @@
+"""The axes of a study: a key of the config, and the values that it takes, as they are written in one line."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+
+from sparserob_core.errors import InputError, Path, dotted
+from sparserob_core.experiment.config.overrides import parse_overrides
+from sparserob_core.experiment.config.plain import BESIDE
+from sparserob_core.experiment.config.reader import read_value
+from sparserob_core.experiment.config.run_config import SLOTS
+from sparserob_core.experiment.plugins.messages import shown
+
+MOST = 100_000
+"""Values of an axis, and points of a study, at most."""
+FIXED = (*BESIDE, "plugins")
+"""Keys that all points of a study have in common: they decide no result, and a list of them is one value."""
+NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+RANGE = re.compile(rf"(log:)?({NUMBER}):({NUMBER})(?::({NUMBER}))?")
+WHOLE = re.compile(r"[-+]?\d+")
+OPENING, CLOSING = "([{", ")]}"
+AS_WRITTEN = "values such as 1,2,3, start:stop:count such as 0:1:11, or log:start:stop:count such as log:1e-6:1:13"
+
+
+@final
+@dataclass(frozen=True)
+class Span:
+    """An interval to draw from, ``low`` to ``high``: evenly, or evenly in the logarithm (``log``); ``whole``: whole
+    numbers only, which both ends are."""
+
+    low: float
+    high: float
+    log: bool = False
+    whole: bool = False
+
+    def at(self, share: float) -> float | int:
+        """The value at that share of the way, in [0, 1)."""
+        if self.whole:
+            return int(self.low) + int(share * (int(self.high) - int(self.low) + 1))
+        if self.log:
+            return float(self.low * (self.high / self.low) ** share)
+        return float(self.low + share * (self.high - self.low))
+
+
+@final
+@dataclass(frozen=True)
+class Axis:
+    """A key of the config and its ``values``, or the ``span`` that they are drawn from. ``log``: they are spread evenly
+    in the logarithm. ``written`` is what stands in ``sweep.yaml``."""
+
+    key: str
+    values: tuple[Any, ...]
+    written: object
+    span: Span | None = None
+    log: bool = False
+
+    @property
+    def path(self) -> Path:
+        """The key, step by step."""
+        return path_of(self.key)
+
+    @property
+    def single(self) -> bool:
+        """Whether there is only one value: a change of the config, and no axis."""
+        return self.span is None and len(self.values) == 1
+
+    @property
+    def numeric(self) -> bool:
+        """Whether all values are numbers."""
+        return self.span is not None or all(
+            isinstance(value, int | float) and not isinstance(value, bool) for value in self.values
+        )
+
+
+def path_of(key: str) -> Path:
+    """A key, step by step; raises `InputError` when it is none."""
+    return parse_overrides({key: None}, read_value)[0].path
+
+
+def parse_axes(given: Mapping[str, object] | Sequence[str] | None) -> list[Axis]:
+    """Axes from texts ``key=values``, or from a mapping of keys to texts, to lists of values, or to single values.
+
+    Raises `InputError` that names the key, also for a key that is there twice.
+    """
+    if isinstance(given, str):
+        raise InputError(f"axes: expected a list of texts or a mapping, got {shown(given)}")
+    pairs: list[tuple[str, object]] = []
+    for one in given.items() if isinstance(given, Mapping) else given or ():
+        if isinstance(one, str):
+            key, equals, text = one.partition("=")
+            if not equals:
+                raise InputError(f"axis {shown(one)}: expected key=values, for example seed=0:19:20")
+            pairs.append((key.strip(), text))
+        else:
+            pairs.append((str(one[0]), one[1]))
+    axes = [_axis(key, value) for key, value in pairs]
+    for position, axis in enumerate(axes):
+        if axis.path in (other.path for other in axes[:position]):
+            raise InputError(path=axis.key, expected="every key once", got="it twice")
+    return axes
+
+
+def _axis(key: str, value: object) -> Axis:
+    if path_of(key)[0] in FIXED:
+        value = _plain(_value(key, value, 1) if isinstance(value, str) else value)
+        return Axis(key, (value,), value)
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, str):
+        return _written(key, value)
+    if isinstance(value, list | tuple | range):
+        values = tuple(_plain(one) for one in value)
+        return Axis(key, _counted(key, values), list(values), log=_geometric(values))
+    return Axis(key, (_plain(value),), _plain(value))
+
+
+def _written(key: str, text: str) -> Axis:
+    """An axis from one line of text."""
+    values, logs, span = list[Any](), list[bool](), None
+    parts = list(split(text))
+    for part in parts:
+        found = RANGE.fullmatch(part)
+        if found is None and part.startswith("log:"):
+            raise InputError(path=key, expected=AS_WRITTEN, got=shown(part))
+        if found is None:
+            values.append(_value(key, part, len(parts)))
+            continue
+        logs.append(bool(found[1]))
+        if found[4] is not None:
+            values += _range(key, part, found)
+        elif len(parts) == 1:
+            span = _span(key, part, found)
+        else:
+            raise InputError(path=key, expected=f"one range, or {AS_WRITTEN}", got=shown(text))
+    if len(values) == 1 and span is None and isinstance(values[0], list) and _of_components(key):
+        values = values[0]  # a component is never a list: these are its values
+    log = all(logs) if logs else _geometric(values)
+    return Axis(key, () if span else _counted(key, tuple(values)), text.strip(), span, log)
+
+
+def split(text: str) -> Iterator[str]:
+    """The parts of a text between commas; commas inside brackets, braces and quotes do not count."""
+    depth, quote, start, before = 0, "", 0, ","
+    for position, letter in enumerate(text):
+        if quote:
+            quote = "" if letter == quote else quote
+        elif letter in "'\"" and before in ",:" + OPENING:
+            quote = letter
+        elif letter in OPENING:
+            depth += 1
+        elif letter in CLOSING:
+            depth -= 1
+        elif letter == "," and depth == 0:
+            yield text[start:position].strip()
+            start = position + 1
+        before = before if letter.isspace() else letter
+    yield text[start:].strip()
+
+
+def _value(key: str, part: str, of: int) -> object:
+    if not part and of > 1:
+        raise InputError(path=key, expected="a value between commas", got="nothing")
+    try:
+        return read_value(part)
+    except InputError as error:
+        raise InputError(f"{key}: {error}") from None
+
+
+def _range(key: str, part: str, found: re.Match[str]) -> list[float] | list[int]:
+    low, high, log = float(found[2]), float(found[3]), bool(found[1])
+    if not WHOLE.fullmatch(found[4]) or not 1 <= int(found[4]) <= MOST or (int(found[4]) == 1 and low != high):
+        raise InputError(
+            path=key, expected=f"a whole number of values at the end of {shown(part)}, from 2 to {MOST}", got=found[4]
+        )
+    count = int(found[4])
+    _check_ends(key, part, low, high, log)
+    if log:
+        values = np.geomspace(low, high, count)
+    else:
+        values = np.linspace(low, high, count)
+        steps = max(1, count - 1)
+        if WHOLE.fullmatch(found[2]) and WHOLE.fullmatch(found[3]) and (int(found[3]) - int(found[2])) % steps == 0:
+            step = (int(found[3]) - int(found[2])) // steps
+            return [int(found[2]) + k * step for k in range(count)]
+    # to 15 digits, so that the third of ten steps to 1 is 0.3
+    return [low, *(float(f"{value:.15g}") for value in values[1:-1]), *([high] if count > 1 else [])]
+
+
+def _span(key: str, part: str, found: re.Match[str]) -> Span:
+    low, high, log = float(found[2]), float(found[3]), bool(found[1])
+    _check_ends(key, part, low, high, log)
+    if not low < high:
+        raise InputError(path=key, expected="a range that goes up", got=shown(part))
+    return Span(low, high, log, not log and bool(WHOLE.fullmatch(found[2]) and WHOLE.fullmatch(found[3])))
+
+
+def _check_ends(key: str, part: str, low: float, high: float, log: bool) -> None:
+    if not (np.isfinite(low) and np.isfinite(high)):
+        raise InputError(path=key, expected="finite numbers", got=shown(part))
+    if log and not (low > 0.0 and high > 0.0):
+        raise InputError(path=key, expected="positive numbers in a logarithmic range", got=shown(part))
+
+
+def _counted(key: str, values: tuple[Any, ...]) -> tuple[Any, ...]:
+    if not 1 <= len(values) <= MOST:
+        raise InputError(path=key, expected=f"1 to {MOST} values", got=str(len(values)))
+    seen = set[str]()
+    for value in values:
+        if repr(value) in seen:
+            raise InputError(path=key, expected="every value once", got=f"{shown(value)} twice")
+        seen.add(repr(value))
+    return values
+
+
+def _geometric(values: Sequence[Any]) -> bool:
+    """Whether listed numbers are meant on a logarithmic axis: at least three, over at least two decades."""
+    numbers = [float(one) for one in values if isinstance(one, int | float) and not isinstance(one, bool) and one > 0]
+    return len(numbers) == len(values) >= 3 and max(numbers) >= 100.0 * min(numbers)
+
+
+def _of_components(key: str) -> bool:
+    return key.strip() in {dotted(path) for path in SLOTS}
+
+
+def _plain(value: Any) -> Any:
+    """A value from Python as a config has it."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value

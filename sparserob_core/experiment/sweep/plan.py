@@ -1,0 +1,266 @@
+"""What a study consists of: a base config, what is changed in it for all points, and the axes; and its file."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any, Literal, final
+
+import numpy as np
+
+from sparserob_core.errors import ConfigError, InputError
+from sparserob_core.experiment.config.load import Loaded, load_config
+from sparserob_core.experiment.config.overrides import parse_overrides
+from sparserob_core.experiment.config.plain import BESIDE, difference, identity, value_text
+from sparserob_core.experiment.config.reader import Source, read_source, read_value, write_yaml
+from sparserob_core.experiment.plugins.messages import nearest, shown
+from sparserob_core.experiment.sweep.axes import FIXED, MOST, Axis, parse_axes
+
+FILE = "sweep.yaml"
+HEADING = "A study. To go on with it, or to repeat it elsewhere: sparserob sweep sweep.yaml --out DIRECTORY"
+KEYS = ("base", "overrides", "axes", "points", "number", "seed")
+Arrangement = Literal["grid", "zip", "random", "sobol"]
+ARRANGEMENTS: tuple[Arrangement, ...] = ("grid", "zip", "random", "sobol")
+
+
+@final
+@dataclass(frozen=True)
+class Point:
+    """One point: a value for every axis, its checked config, and the ``hash`` of what decides its result."""
+
+    values: tuple[Any, ...]
+    loaded: Loaded
+    hash: str
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A study before anything is run. ``changes`` of the base are made in this order; one with several values is an
+    axis, one with a single value holds for all points.
+
+    ``points``: all combinations of values (``grid``), the first values together, then the second, ... (``zip``), or
+    ``number`` points drawn at ``random`` or along a sequence of ``sobol``, by the ``seed``.
+    """
+
+    base: Source
+    changes: tuple[Axis, ...]
+    points: Arrangement = "grid"
+    number: int | None = None
+    seed: int | None = None
+
+    @property
+    def name(self) -> str:
+        """The name of the base config: its file's, without the ending."""
+        return Path(self.base.name).stem
+
+    @property
+    def axes(self) -> tuple[Axis, ...]:
+        """What has several values."""
+        return tuple(axis for axis in self.changes if not axis.single)
+
+    def loaded(self, values: Sequence[Any]) -> Loaded:
+        """The checked config of a point."""
+        rest = iter(values)
+        changes = {axis.key: axis.values[0] if axis.single else next(rest) for axis in self.changes}
+        return load_config(self.base, changes)
+
+    def values(self) -> list[tuple[Any, ...]]:
+        """The values of every point, in the order of the rows of the table: the last axis changes first."""
+        if self.points in ("random", "sobol"):
+            return self._drawn()
+        for axis in self.axes:
+            if axis.span is not None:
+                raise InputError(
+                    path=axis.key,
+                    expected="start:stop:count, or a number of points to draw (--random N, --sobol N)",
+                    got=shown(axis.written),
+                )
+        if self.points == "zip":
+            counts = {axis.key: len(axis.values) for axis in self.axes}
+            if len(set(counts.values())) > 1:
+                said = ", ".join(f"{count} of {key}" for key, count in counts.items())
+                raise InputError(path="zip", expected="axes with equally many values", got=said)
+            return list(zip(*(axis.values for axis in self.axes), strict=True)) if self.axes else [()]
+        count = int(np.prod([len(axis.values) for axis in self.axes], dtype=float))
+        if count > MOST:
+            raise InputError(path="axes", expected=f"at most {MOST} points", got=str(count))
+        return list(product(*(axis.values for axis in self.axes)))
+
+    def _drawn(self) -> list[tuple[Any, ...]]:
+        count, dimension = int(self.number or 0), len(self.axes)
+        if not any(axis.span for axis in self.axes):
+            expected = "at least one range to draw from, such as key=0.01:0.06"
+            raise InputError(
+                path=self.points, expected=expected, got="lists of values only" if self.axes else "no axis"
+            )
+        rng = np.random.default_rng(self.seed)
+        if self.points == "random":
+            shares = rng.random((count, dimension))
+        else:
+            shares = _sobol(dimension, count, rng)
+        return [
+            tuple(
+                axis.span.at(share) if axis.span else axis.values[int(share * len(axis.values))]
+                for axis, share in zip(self.axes, row, strict=True)
+            )
+            for row in shares.tolist()
+        ]
+
+    def checked(self) -> list[Point]:
+        """Every point with its checked config; raises `ConfigError` for the first one that is at fault."""
+        points = []
+        for values in self.values():
+            loaded = self.loaded(values)
+            points.append(Point(values, loaded, identity(loaded.config.plain())))
+        return points
+
+    def written(self) -> str:
+        """The contents of ``sweep.yaml``."""
+        axes = {axis.key: _listed(axis) for axis in self.changes}
+        data: dict[str, Any] = {"base": self.base.data, "axes": axes, "points": self.points}
+        if self.number is not None:
+            data |= {"number": self.number, "seed": self.seed}
+        return write_yaml(data, HEADING)
+
+    def apart_from(self, other: Plan) -> str:
+        """How the base differs from another study's in what decides results; empty where it does not."""
+        here, there = (
+            {key: value for key, value in plan.base.data.items() if key not in BESIDE} for plan in (self, other)
+        )
+        found = difference(here, there)
+        return "" if found is None else f"{found[0]} is {value_text(found[2])} there and {value_text(found[1])} here"
+
+
+def make_plan(
+    config: str | Path | Mapping[str, Any],
+    axes: Mapping[str, object] | Sequence[str] | None = None,
+    overrides: Mapping[str, object] | Iterable[str] | None = None,
+    *,
+    points: Arrangement | None = None,
+    number: int | None = None,
+) -> Plan:
+    """The study of a config, or of a study's own file, with further axes, which replace those of the same key.
+
+    Raises `InputError` when one of them is at fault.
+    """
+    source = read_source(config)
+    plan = _stored(source) if {"base", "axes"} & set(source.data) else Plan(_based(source), ())
+    kept = list(plan.changes)
+    for axis in parse_axes(list(axes) if isinstance(axes, Iterable) and not isinstance(axes, str | Mapping) else axes):
+        place = next((k for k, other in enumerate(kept) if other.path == axis.path), len(kept))
+        kept[place : place + 1] = [axis]
+    for change in reversed(_changes(overrides)):
+        kept = [change, *(other for other in kept if other.path != change.path)]
+    plan = replace(
+        plan,
+        changes=tuple(map(_absolute, kept)),
+        points=points or plan.points,
+        number=number if points else plan.number,
+    )
+    drawn = plan.points in ("random", "sobol")
+    return replace(plan, seed=_seed(plan)) if drawn and plan.seed is None else plan
+
+
+def _changes(overrides: Mapping[str, object] | Iterable[str] | None) -> list[Axis]:
+    """Overrides as `sparserob_core.run` takes them: every one is one value, lists and texts with commas too."""
+    found = parse_overrides(overrides, read_value)
+    return [Axis(".".join(map(str, one.path)), (one.value,), one.value) for one in found]
+
+
+def _listed(axis: Axis) -> object:
+    """An axis as it stands in ``sweep.yaml``; a single value is a list of one, unless its key is never an axis."""
+    return [axis.values[0]] if axis.single and axis.path[0] not in FIXED else axis.written
+
+
+def read_plan(file: Path) -> Plan:
+    """The study in a ``sweep.yaml``; raises `InputError` when it is none."""
+    source = read_source(file)
+    if not {"base", "axes"} & set(source.data):
+        raise ConfigError(f"{file}: expected a study, with the keys base and axes, got {', '.join(source.data)}")
+    return make_plan(file)
+
+
+def _stored(source: Source) -> Plan:
+    """The study in a file, its keys checked."""
+    data = source.data
+    for key in data:
+        if key not in KEYS:
+            raise _fault(source, key, f"unknown key{nearest(str(key), KEYS)}")
+    base = data.get("base")
+    if not isinstance(base, str | Mapping) or not base:
+        raise _fault(source, "base", f"must be a config, or the name of its file (got {shown(base)})")
+    for key in ("axes", "overrides"):
+        if not isinstance(data.get(key, {}), Mapping):
+            raise _fault(source, key, f"must be a mapping of keys of the config to values (got {shown(data[key])})")
+    points, number, seed = _arrangement(source)
+    try:
+        changes = [*_changes(data.get("overrides")), *parse_axes(data.get("axes"))]
+    except InputError as error:
+        raise ConfigError(f"{source.where(('axes', *error.path))}: {error}") from None
+    below = read_source(source.folder / base) if isinstance(base, str) else replace(source, data=dict(base), text="")
+    return Plan(_based(below), tuple(changes), points, number, seed)
+
+
+def _arrangement(source: Source) -> tuple[Arrangement, int | None, int | None]:
+    """How the points of a study's file are arranged, how many are drawn, and with which seed."""
+    points = source.data.get("points", "grid")
+    if points not in ARRANGEMENTS:
+        raise _fault(source, "points", f"must be one of {', '.join(ARRANGEMENTS)} (got {shown(points)})")
+    drawn = points in ("random", "sobol")
+    numbers = list[int | None]()
+    for key, least in (("number", 1), ("seed", 0)):
+        value = source.data.get(key)
+        if value is not None and not drawn:
+            raise _fault(source, key, f"is for points that are drawn (random, sobol), not for {points}")
+        if (value is not None or (drawn and key == "number")) and not _is_whole(value, least):
+            raise _fault(source, key, f"must be a whole number of at least {least} (got {shown(value)})")
+        numbers.append(value)
+    return points, numbers[0], numbers[1]
+
+
+def _is_whole(value: object, least: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= least
+
+
+def _fault(source: Source, key: str, said: str) -> ConfigError:
+    return ConfigError(f"{source.where((key,))}: {key}: {said}")
+
+
+def _based(source: Source) -> Source:
+    """The base of a study, which can be moved: the files of its plugins by their whole names, its own name as title."""
+    data = dict(source.data)
+    files = data.get("plugins")
+    if isinstance(files, list) and all(isinstance(file, str) for file in files):
+        data["plugins"] = [str((source.folder / file).resolve()) for file in files]
+    if not data.get("title"):
+        data["title"] = Path(source.name).stem
+    return replace(source, data=data)
+
+
+def _absolute(axis: Axis) -> Axis:
+    if axis.path != ("plugins",) or not isinstance(axis.values[0], list):
+        return axis
+    files = [str(Path(str(file)).resolve()) for file in axis.values[0]]
+    return replace(axis, values=(files,), written=files)
+
+
+def _seed(plan: Plan) -> int:
+    """The seed of the base config, with which points are drawn."""
+    fixed = (axis.values[0] for axis in plan.changes if axis.single and axis.path == ("seed",))
+    changed = next(fixed, plan.base.data.get("seed", 0))
+    return changed if _is_whole(changed, 0) else 0
+
+
+def _sobol(dimension: int, count: int, rng: np.random.Generator) -> np.ndarray:
+    """The first points ``(count, dimension)`` of a scrambled sequence; more points begin with the same ones."""
+    from scipy.stats import qmc
+
+    # scipy renamed the argument in 1.15
+    seeded: dict[str, Any] = {"rng" if "rng" in inspect.signature(qmc.Sobol).parameters else "seed": rng}
+    sequence = qmc.Sobol(dimension, scramble=True, **seeded)
+    drawn: np.ndarray = sequence.random_base2(max(0, (count - 1).bit_length()))[:count]
+    return drawn

@@ -1,0 +1,93 @@
+"""One point of a study, run wherever the executor likes: from plain data to a run directory, and plain data back."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, final
+
+from sparserob_core.errors import SparseRobError, named
+from sparserob_core.experiment.config.load import load_config
+from sparserob_core.experiment.directory.artefacts import finite
+from sparserob_core.experiment.run.run import run_loaded
+from sparserob_core.sip.method import OutOfTime
+
+TRIES = 5  # to give a directory a name that somebody else gives another one at the same moment
+
+
+@final
+@dataclass(frozen=True)
+class Task:
+    """What a worker is to do: run the resolved ``config`` into the directory ``partial``, and move it to ``final`` when
+    it is over, both absolute paths. ``git``: the revision of the base's folder; ``figures``: whether to draw the
+    run."""
+
+    config: Mapping[str, Any]
+    partial: str
+    final: str
+    git: Mapping[str, Any] | None
+    figures: bool
+
+
+@final
+@dataclass(frozen=True)
+class Answer:
+    """What came of a task: what ``result.json`` says, or why there is none (``failure``). ``interrupted``: a key or a
+    signal came while it ended."""
+
+    summary: Mapping[str, Any] | None = None
+    failure: str = ""
+    interrupted: bool = False
+
+    @property
+    def failed(self) -> bool:
+        """Whether there is no checked answer."""
+        return self.summary is None or self.summary["status"] == "failed"
+
+
+def run_point(task: Task) -> Answer:
+    """Run a point. What it leaves stands under its final name only when it is complete, so that a process that dies
+    loses nothing but the points that it was about to finish. Nothing is raised but an interrupt."""
+    partial, ends = Path(task.partial), Path(task.final)
+    try:
+        partial.parent.mkdir(parents=True, exist_ok=True)
+        outcome = run_loaded(load_config(task.config), task.git, partial, quiet=True, figures=task.figures)
+        if outcome.interrupted and outcome.result.stopped:
+            raise KeyboardInterrupt(outcome.result.stopped)
+        keep(partial, ends)
+        return Answer(finite(outcome.summary), interrupted=outcome.interrupted)
+    except OutOfTime as error:
+        return _failed(partial, ends, str(error))
+    except KeyboardInterrupt:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+    except (Exception, SystemExit) as error:  # noqa: BLE001  one point must not end the study
+        return _failed(partial, ends, str(error) if isinstance(error, SparseRobError) else named(error))
+
+
+def keep(partial: Path, ends: Path) -> None:
+    """Give a complete run directory its final name; one that has it already, of a run that was cut short, goes."""
+    for attempt in range(TRIES):
+        old = partial.with_name(f"{partial.name}.old{attempt}")
+        try:
+            ends.rename(old)
+            shutil.rmtree(old, ignore_errors=True)
+        except FileNotFoundError:
+            pass
+        try:
+            partial.rename(ends)
+            return
+        except OSError:
+            if attempt == TRIES - 1 or not ends.exists():
+                raise
+
+
+def _failed(partial: Path, ends: Path, said: str) -> Answer:
+    """Keep what a run left that ended in an error, and say which."""
+    if (partial / "result.json").is_file():
+        keep(partial, ends)
+    else:
+        shutil.rmtree(partial, ignore_errors=True)
+    return Answer(failure=said)

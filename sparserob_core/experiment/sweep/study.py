@@ -1,0 +1,171 @@
+"""A study that was run: its table, and the outcome of every point."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, final, overload
+
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.assemble import assemble
+from sparserob_core.experiment.config.load import load_config
+from sparserob_core.experiment.config.plain import value_text
+from sparserob_core.experiment.directory.finished import stored_run
+from sparserob_core.experiment.run.replay import stored_result
+from sparserob_core.experiment.run.run import Outcome
+from sparserob_core.experiment.sweep.axes import Axis
+from sparserob_core.experiment.sweep.plan import FILE, read_plan
+from sparserob_core.experiment.sweep.table import Row, read_table
+
+RUNS = "runs"
+LINES = 50  # rows of a table that a terminal shows
+NAMED = 5  # failures that are told one by one
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Study:
+    """A study: the ``directory`` that holds it, its ``axes``, and its ``table``, one row (a mapping) for every point
+    that has an answer or an error, the keys of the axes first, ``None`` where nothing is known. ``pandas.DataFrame(study.table)`` makes a data frame.
+
+    ``points`` is the number of all points; ``stopped`` says why some have no row; ``remarks`` say what could not be
+    done beside them.
+    """
+
+    directory: Path
+    title: str
+    axes: Sequence[Axis] = field(repr=False)
+    table: list[Row] = field(repr=False)
+    points: int
+    stopped: str = ""
+    remarks: Sequence[str] = ()
+
+    @property
+    def outcomes(self) -> Outcomes:
+        """The outcome of every row, read from its run directory, and its problem built again, when it is asked for."""
+        return Outcomes(self.directory, self.table)
+
+    @property
+    def failed(self) -> int:
+        """How many points have no checked answer."""
+        return sum(row["status"] == "failed" for row in self.table)
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """How many points ended with each status."""
+        return Counter(str(row["status"]) for row in self.table)
+
+    def summary(self) -> dict[str, Any]:
+        """The study in a few numbers, as plain data."""
+        return {
+            "title": self.title,
+            "directory": str(self.directory),
+            "axes": [axis.key for axis in self.axes],
+            "points": self.points,
+            "counts": dict(self.counts),
+            "stopped": self.stopped,
+            "remarks": list(self.remarks),
+        }
+
+
+def shown(study: Study) -> tuple[list[str], list[list[str]]]:
+    """The table for a terminal: column names, and one row per point, or one per status where there are many."""
+    if len(study.table) > LINES:
+        return _by_status(study.table)
+    keys = [axis.key for axis in study.axes]
+    columns = [*keys, "status", "cost", "relative gap", "active", "seconds"]
+    return columns, [[*(value_text(row[key]) for key in keys), *short(row)] for row in study.table]
+
+
+def short(row: Row) -> list[str]:
+    """What a reader wants to know of a point: status, cost, gap, share of time active, seconds."""
+    return [
+        str(row["status"]),
+        _number(row.get("cost"), ".9g"),
+        _number(row.get("gap"), ".1e"),
+        _number(row.get("sparsity.active_fraction"), ".1%"),
+        _number(row.get("seconds"), ".2f"),
+    ]
+
+
+def remarks_of(study: Study) -> Iterator[str]:
+    """What is to be said below the table."""
+    counts = ", ".join(f"{count} {status}" for status, count in sorted(study.counts.items()))
+    yield f"{len(study.table)} of {study.points} points: {counts or 'none yet'}"
+    failed = [row for row in study.table if row["status"] == "failed"]
+    for row in failed[:NAMED]:
+        values = ", ".join(f"{axis.key}={value_text(row[axis.key])}" for axis in study.axes)
+        yield f"failed: {values}: {row.get('message')}"
+    if len(failed) > NAMED:
+        yield f"and {len(failed) - NAMED} more that failed; the column message says why"
+    cut = sum(bool(row.get("stopped")) for row in study.table)
+    if cut:
+        yield f"{cut} ended at a time limit; they run again when the study is resumed"
+    yield from study.remarks
+    if study.stopped:
+        yield f"{study.stopped}; what is left: sparserob sweep --resume {study.directory}"
+
+
+def _by_status(table: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
+    rows = []
+    for status in sorted({str(row["status"]) for row in table}):
+        of = [row for row in table if row["status"] == status]
+        costs = [row["cost"] for row in of if row.get("cost") is not None]
+        seconds = sum(row.get("seconds") or 0.0 for row in of)
+        least, most = (_number(pick(costs), ".9g") if costs else "-" for pick in (min, max))
+        rows.append([status, str(len(of)), least, most, f"{seconds:.2f}"])
+    return ["status", "points", "least cost", "largest cost", "seconds"], rows
+
+
+def _number(value: Any, form: str) -> str:
+    return "-" if value is None else format(value, form)
+
+
+@final
+class Outcomes(Sequence[Outcome]):
+    """The outcomes of a study, one for each row of its table. One of a point without a run raises `InputError`, which
+    says why."""
+
+    def __init__(self, directory: Path, table: Sequence[Row]) -> None:
+        self._directory, self._table = directory, table
+
+    def __len__(self) -> int:
+        return len(self._table)
+
+    @overload
+    def __getitem__(self, position: int) -> Outcome: ...
+
+    @overload
+    def __getitem__(self, position: slice) -> Sequence[Outcome]: ...
+
+    def __getitem__(self, position: int | slice) -> Outcome | Sequence[Outcome]:
+        if isinstance(position, slice):
+            return Outcomes(self._directory, self._table[position])
+        row = self._table[position]
+        return read_outcome(self._directory / RUNS / str(row["run"]), str(row.get("message") or ""))
+
+    def __iter__(self) -> Iterator[Outcome]:
+        return (self[position] for position in range(len(self)))
+
+
+def read_outcome(directory: Path, failure: str = "") -> Outcome:
+    """The outcome of a run, from its directory. The plugin files that its config names are loaded."""
+    if not directory.is_dir() and failure:
+        raise InputError(f"{directory.name}: there is no outcome: {failure}")
+    run = stored_run(directory)
+    experiment = assemble(load_config(directory / "config.yaml"))
+    return Outcome(stored_result(run), directory, experiment, run.solution.get("control"), run.summary)
+
+
+def read_study(directory: str | Path) -> Study:
+    """The study in a directory, as data; raises `InputError` when there is none, or it cannot be understood."""
+    path = Path(directory)
+    if not (path / FILE).is_file():
+        raise InputError(f"{path}: expected the directory of a study, got one without {FILE}")
+    plan, table = read_plan(path / FILE), read_table(path)
+    for axis in plan.axes:
+        if table and axis.key not in table[0]:
+            raise InputError(f"{path / 'table.csv'}: expected a column for the axis {axis.key}, got none")
+    return Study(path, str(plan.base.data.get("title") or plan.name), plan.axes, table, len(plan.values()))

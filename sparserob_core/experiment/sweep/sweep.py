@@ -1,0 +1,338 @@
+"""The walk of a study: what is finished is taken as it is, the other points go to the executor, and the table fills."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, CancelledError, Future
+from contextlib import contextmanager
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any, final
+
+from sparserob_core.errors import InputError, SparseRobError, named
+from sparserob_core.experiment.assemble import build
+from sparserob_core.experiment.config.load import load_config
+from sparserob_core.experiment.config.plain import value_text
+from sparserob_core.experiment.directory.artefacts import RunDirectory, create_directory, finite
+from sparserob_core.experiment.directory.finished import UNFINISHED, read_summary
+from sparserob_core.experiment.directory.lock import is_dead, owner_of
+from sparserob_core.experiment.directory.provenance import git_revision
+from sparserob_core.experiment.run.events import SweepProgress
+from sparserob_core.experiment.sweep.axes import Axis
+from sparserob_core.experiment.sweep.plan import FILE, Arrangement, Plan, Point, make_plan, read_plan
+from sparserob_core.experiment.sweep.point import Answer, Task, run_point
+from sparserob_core.experiment.sweep.study import RUNS, Study
+from sparserob_core.experiment.sweep.table import COLUMNS, TABLE, Row, columns_of, columns_text, row_of, table_text
+from sparserob_core.sip.events import Notify, ignore
+from sparserob_core.sip.method import ExecutorFactory
+
+PAUSE = 0.5  # seconds between two looks at what is running
+RENEWED = 2.0  # seconds between two versions of the table
+STILLBORN = 3  # executors whose workers die before any of them has begun a point
+LETTERS = 60  # of the name of a run directory, before its hash
+DIGITS = 12  # of the hash there
+PARTIAL = ".partial"
+
+
+def sweep(
+    config: str | Path | Mapping[str, Any],
+    axes: Mapping[str, object] | Sequence[str] | None = None,
+    overrides: Mapping[str, object] | Iterable[str] | None = None,
+    *,
+    points: Arrangement | None = None,
+    number: int | None = None,
+    executor: str | Mapping[str, Any] | None = None,
+    out: str | Path | None = None,
+    figures: bool = False,
+    notify: Notify = ignore,
+) -> Study:
+    """Run a config at every point of some axes: what ``sparserob sweep CONFIG key=a,b,c key=start:stop:count`` does.
+
+    ``config`` is a config, a study's own file (``sweep.yaml``), or the directory of a study to go on with. ``axes``
+    maps keys to lists of values, or to texts such as ``"0:19:20"`` or ``"log:1e-6:1:13"``; or they are texts
+    ``key=values``. ``overrides`` hold for all points. ``points``: all combinations (``"grid"``, the default),
+    ``"zip"``, or ``number`` points at ``"random"`` or along ``"sobol"``. ``executor``: a name, or a mapping with a
+    name, unless the config's own is meant; the runs themselves are serial, and no result depends on it. ``figures``:
+    whether to draw every run. ``notify`` receives `SweepProgress`.
+
+    In ``out`` (``runs/NAME-sweep/STAMP-HASH`` unless given) a study of the same base is gone on with: what is finished
+    there, by the hash of its config, is not run again; what failed or ended at a time limit is. A point that fails is a
+    row with the reason. An interrupt abandons what is running: the study has the rows that are known by then.
+    Raises `InputError` before anything is run when an axis, a point's config or the directory is at fault.
+    """
+    if isinstance(config, str | Path) and Path(config).is_dir():
+        directory = Path(config)
+        if not (directory / FILE).is_file():
+            raise InputError(f"{directory}: expected the directory of a study, got one without {FILE}")
+        config, out = directory / FILE, directory if out is None else out
+    plan = make_plan(config, axes, overrides, points=points, number=_number(points, number))
+    if not plan.axes:
+        raise InputError(path="axes", expected="at least one, for example seed=0:19:20", got="none")
+    checked = plan.checked()
+    factory = _executors(checked[0], executor)
+    with create_directory(out, f"{plan.name}-sweep", checked[0].hash[:8], again=FILE) as made:
+        _require_same_base(made.path, plan)
+        made.write_text(FILE, plan.written())
+        return _Walk(plan, checked, made, figures, notify).run(factory)
+
+
+def _number(points: Arrangement | None, number: int | None) -> int | None:
+    drawn = points in ("random", "sobol")
+    if points not in (None, "grid", "zip", "random", "sobol"):
+        raise InputError(path="points", expected="grid, zip, random or sobol", got=repr(points))
+    if number is None and not drawn:
+        return None
+    if not drawn or isinstance(number, bool) or not isinstance(number, int) or number < 1:
+        raise InputError(
+            path="number", expected="how many points to draw, with points random or sobol alone", got=repr(number)
+        )
+    return number
+
+
+def _executors(point: Point, chosen: str | Mapping[str, Any] | None) -> ExecutorFactory:
+    loaded = point.loaded
+    if chosen is not None:
+        loaded = load_config({**loaded.config.plain(), "executor": None}, {"executor": chosen})
+    factory: ExecutorFactory = build(loaded, "executor", loaded.config.executor)
+    return factory
+
+
+def _require_same_base(directory: Path, plan: Plan) -> None:
+    if (directory / FILE).is_file():
+        apart = plan.apart_from(read_plan(directory / FILE))
+        if apart:
+            raise InputError(
+                f"{directory}: holds a study of another base config ({apart}); expected another directory, or that base"
+            )
+
+
+@final
+class _Walk:
+    """One call of `sweep`: the points by their hash, and what is known of each."""
+
+    def __init__(self, plan: Plan, points: Sequence[Point], made: RunDirectory, figures: bool, notify: Notify) -> None:
+        self.plan, self.points, self.made, self.figures, self.notify = plan, points, made, figures, notify
+        self.directory = made.path.resolve()
+        self.git = git_revision(plan.base.folder)
+        self.by_hash = {point.hash: point for point in reversed(points)}  # of equal configs the first one names the run
+        self.names = {point.hash: run_name(plan.axes, point) for point in self.by_hash.values()}
+        self.copies = Counter(point.hash for point in points)
+        self.answers: dict[str, Answer] = {}
+        self.pending: set[str] = set()
+        self.done = self.failed = self.new = 0
+        self.began = time.monotonic()
+        self.due = self.began
+
+    def run(self, factory: ExecutorFactory) -> Study:
+        """Everything that is not finished; then the table and the figure."""
+        self._clear()
+        waiting = self._left()
+        self.pending = set(waiting)
+        self.done = sum(self.copies[digest] for digest in self.answers if digest not in self.pending)
+        self._write()
+        stopped = ""
+        try:
+            self._tell("")
+            self._solve(factory, waiting)
+        except KeyboardInterrupt as pressed:
+            stopped = str(pressed) or "interrupted from the keyboard"
+        finally:
+            self._clear()
+            self._write()
+        rows = self._rows()
+        study = Study(
+            self.made.path, str(self.plan.base.data["title"]), self.plan.axes, rows, len(self.points), stopped
+        )
+        return study if stopped else _drawn(study)
+
+    def _left(self) -> list[str]:
+        """The hashes of the points that are to be run; of the others the answers are read."""
+        found = {one.rpartition("-")[2]: one for one in _directories(self.directory / RUNS)}
+        left = []
+        for digest in dict.fromkeys(point.hash for point in self.points):
+            name = found.get(digest[:DIGITS])
+            summary = None if name is None else _readable(self.directory / RUNS / name, digest)
+            if name is not None and summary is not None:
+                self.names[digest], self.answers[digest] = name, Answer(summary)
+            if summary is None or summary["status"] == "failed" or summary.get("stopped"):
+                left.append(digest)
+        return left
+
+    def _solve(self, factory: ExecutorFactory, waiting: list[str]) -> None:
+        """Hand out points until each has an answer. Where a worker dies, its executor is replaced, and the points that
+        had begun are tried again one by one: the one that kills its worker again fails, and no other."""
+        suspects, stillborn = list[str](), 0
+        while waiting or suspects:
+            if suspects:
+                digest = suspects.pop(0)
+                if self._round(factory, [digest]):
+                    self._take(digest, Answer(failure="the process that ran it died, twice"))
+                continue
+            lost, before = self._round(factory, waiting), len(waiting)
+            suspects = [digest for digest in lost if self._partial(digest).exists()]
+            waiting = [digest for digest in lost if digest not in set(suspects)]
+            stillborn = stillborn + 1 if len(waiting) == before else 0
+            if stillborn >= STILLBORN:
+                raise SparseRobError("the executor's workers die before they begin a point; is there memory for them?")
+
+    def _round(self, factory: ExecutorFactory, batch: list[str]) -> list[str]:
+        """Run a batch on a fresh executor; returns the points that were lost since a worker died."""
+        lost: list[str] = []
+        with _workers(factory) as executor:
+            ended: SimpleQueue[Future[Answer]] = SimpleQueue()
+            open_ones: dict[Future[Answer], str] = {}
+            for digest in batch:
+                shutil.rmtree(self._partial(digest), ignore_errors=True)
+                try:
+                    future = executor.submit(run_point, self._task(digest))
+                except BrokenExecutor:
+                    lost.append(digest)
+                    continue
+                open_ones[future] = digest
+                future.add_done_callback(ended.put)
+                while not ended.empty():
+                    self._collect(ended.get(), open_ones, lost)
+            while open_ones:
+                try:
+                    self._collect(ended.get(timeout=PAUSE), open_ones, lost)
+                except Empty:
+                    self._tell("", open_ones)
+        return lost
+
+    def _collect(self, future: Future[Answer], open_ones: dict[Future[Answer], str], lost: list[str]) -> None:
+        digest = open_ones.pop(future)
+        try:
+            answer = future.result()
+        except (BrokenExecutor, CancelledError):
+            lost.append(digest)
+            return
+        except Exception as error:  # noqa: BLE001  what the executor could not send or fetch is this point's failure
+            answer = Answer(failure=named(error))
+        self._take(digest, answer, open_ones)
+        if answer.interrupted:
+            raise KeyboardInterrupt
+
+    def _take(self, digest: str, answer: Answer, open_ones: Mapping[Future[Answer], str] | None = None) -> None:
+        """Take an answer, and say so."""
+        self.answers[digest] = answer
+        self.pending.discard(digest)
+        self.new += 1
+        self.done += self.copies[digest]
+        self.failed += answer.failed
+        self._tell(digest, open_ones)
+        if time.monotonic() >= self.due:
+            self._write()
+
+    def _task(self, digest: str) -> Task:
+        plain = self.by_hash[digest].loaded.config.plain()
+        return Task(
+            config={**plain, "executor": {"name": "serial"}},
+            partial=str(self._partial(digest)),
+            final=str(self.directory / RUNS / self.names[digest]),
+            git=self.git,
+            figures=self.figures,
+        )
+
+    def _partial(self, digest: str) -> Path:
+        return self.directory / RUNS / f".{self.names[digest]}.{os.getpid()}{PARTIAL}"
+
+    def _rows(self) -> list[Row]:
+        rows = [self._row(point) for point in self.points if point.hash in self.answers]
+        names = columns_of([axis.key for axis in self.plan.axes], rows)
+        return [{name: row.get(name) for name in names} for row in rows]
+
+    def _row(self, point: Point) -> Row:
+        answer = self.answers[point.hash]
+        values = dict(zip((axis.key for axis in self.plan.axes), point.values, strict=True))
+        return row_of(values, answer.summary, self.names[point.hash], point.hash, answer.failure)
+
+    def _write(self) -> None:
+        """The table as it is known now."""
+        began, keys, rows = time.monotonic(), [axis.key for axis in self.plan.axes], self._rows()
+        self.made.write_text(TABLE, table_text(keys, rows))
+        self.made.write_text(COLUMNS, columns_text(keys, rows))
+        self.due = time.monotonic() + RENEWED + 10.0 * (time.monotonic() - began)  # a long table is written less often
+
+    def _clear(self) -> None:
+        """Remove what dead processes, and this one, have left of runs."""
+        for name in _directories(self.directory / RUNS, hidden=True):
+            path = self.directory / RUNS / name
+            owner = owner_of(path)
+            if owner[0] in (0, os.getpid()) or is_dead(*owner):
+                shutil.rmtree(path, ignore_errors=True)
+
+    def _tell(self, digest: str, open_ones: Mapping[Future[Answer], str] | None = None) -> None:
+        running = sum(future.running() and self._partial(one).exists() for future, one in (open_ones or {}).items())
+        left = (time.monotonic() - self.began) / self.new * len(self.pending) if self.new else None
+        self.notify(
+            SweepProgress(
+                text=_said(self.done, len(self.points), running, self.failed, left),
+                done=self.done,
+                total=len(self.points),
+                running=running,
+                failed=self.failed,
+                left=left,
+                row=self._row(self.by_hash[digest]) if digest else None,
+            )
+        )
+
+
+def run_name(axes: Sequence[Axis], point: Point) -> str:
+    """The name of a point's directory: its values for a reader, and the beginning of its hash for the program."""
+    parts = []
+    for axis, value in zip(axes, point.values, strict=True):
+        steps = [str(step) for step in axis.path if step != "name"]
+        parts.append(f"{steps[-1] if steps else axis.key}={value_text(value)}")
+    text = re.sub(r"[^A-Za-z0-9=.,+_-]+", "-", re.sub(r"[][(){}\s]", "", "_".join(parts)))
+    return f"{text[:LETTERS].strip('-.,')}-{point.hash[:DIGITS]}"
+
+
+@contextmanager
+def _workers(factory: ExecutorFactory) -> Iterator[Any]:
+    """An executor whose end cannot hide that its workers died."""
+    try:
+        with factory.open() as executor:
+            yield executor
+    except BrokenExecutor:
+        return
+
+
+def _directories(folder: Path, hidden: bool = False) -> list[str]:
+    if not folder.is_dir():
+        return []
+    return sorted(one.name for one in folder.iterdir() if one.name.startswith(".") == hidden and one.is_dir())
+
+
+def _readable(directory: Path, digest: str) -> dict[str, Any] | None:
+    """The result of a run, if it is whole and of this config."""
+    try:
+        summary = read_summary(directory / "result.json")
+    except InputError:
+        return None
+    origin = summary.get("provenance")
+    same = isinstance(origin, Mapping) and origin.get("hash") == digest
+    return dict(finite(summary)) if same and summary["message"] != UNFINISHED else None
+
+
+def _said(done: int, total: int, running: int, failed: int, left: float | None) -> str:
+    parts = [f"{done} of {total} points done"]
+    parts += [f"{failed} failed"] if failed else []
+    parts += [f"{running} running"] if running else []
+    parts += [f"about {_duration(left)} left"] if left is not None and done < total else []
+    return ", ".join(parts)
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 100:
+        return f"{max(1, round(seconds))} s"
+    return f"{round(seconds / 60)} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+
+
+def _drawn(study: Study) -> Study:
+    """The figure is an extra: where it cannot be drawn, a remark says so."""
+    return study

@@ -1,0 +1,132 @@
+"""The table of a study: one row for every point, the axes and then what ``result.json`` says, as a file that anything
+can read."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from sparserob_core.errors import InputError
+
+TABLE, COLUMNS = "table.csv", "columns.csv"
+Row = dict[str, Any]
+FIRST = (
+    "status",
+    "cost",
+    "value",
+    "epsilon",
+    "lower_bound",
+    "upper_bound",
+    "gap",
+    "cost_scale",
+    "worst.violation",
+    "worst.constraint",
+    "worst.time",
+    "sparsity.active_fraction",
+    "sparsity.switches",
+)
+LAST = ("stopped", "message", "run", "hash", "seconds")
+"""Columns at the end; ``seconds`` is the last one, for it alone differs when a study is repeated."""
+LEFT = frozenset({"title", "versions", "provenance", "config", "tolerances", "worst.parameter", "seed"})
+MEANING = {
+    "status": ("", "what was proven; see method.md"),
+    "cost": ("cost", "J of the returned control, without the regulariser"),
+    "value": ("cost", "J and the weighted regulariser"),
+    "epsilon": ("1", "weight of the regulariser that was solved"),
+    "lower_bound": ("cost", "proven lower bound of the least cost"),
+    "upper_bound": ("cost", "proven upper bound; empty unless the status is certified or verified"),
+    "gap": ("1", "relative distance of the bounds"),
+    "cost_scale": ("cost", "the largest possible cost"),
+    "worst.violation": ("constraint", "by how much the worst constraint is exceeded; negative: a margin"),
+    "worst.constraint": ("", "which constraint that is"),
+    "worst.time": ("time", "when"),
+    "sparsity.active_fraction": ("1", "share of the time at which the control acts"),
+    "sparsity.switches": ("1", "how often it switches"),
+    "stopped": ("", "the limit that ended the run early"),
+    "message": ("", "the result in a sentence, or why there is none"),
+    "run": ("", "the run's directory below runs"),
+    "hash": ("", "SHA-256 of the run's config, without where it was solved, who watched, its title and its limits"),
+    "seconds": ("s", "what the method took"),
+}
+"""Unit and meaning of the columns. ``cost``, ``constraint`` and ``time``: the units in which the config states them."""
+
+
+def row_of(axes: Mapping[str, Any], summary: Mapping[str, Any] | None, run: str, digest: str, said: str = "") -> Row:
+    """A row: the values of the axes, then every number and text of ``summary`` (``result.json``), those inside an
+    object as ``object.name``. Without a summary the status is ``failed``, and ``said`` says why."""
+    found: Row = {"status": "failed", "message": said} if summary is None else {}
+    for name, value in (summary or {}).items():
+        inside = {f"{name}.{key}": one for key, one in value.items()} if isinstance(value, Mapping) else {name: value}
+        if name not in LEFT:
+            found |= {
+                key: one for key, one in inside.items() if key not in LEFT and not isinstance(one, list | Mapping)
+            }
+    return {**axes, **{key: one for key, one in found.items() if key not in axes}, "run": run, "hash": digest}
+
+
+def columns_of(axes: Sequence[str], rows: Iterable[Row]) -> list[str]:
+    """The columns of a table: the axes, what is known of every run in a fixed order, then the rest by name."""
+    seen = {name for row in rows for name in row} - set(axes)
+    rest = sorted(seen - {*FIRST, *LAST})
+    return [*axes, *(name for name in (*FIRST, *rest, *LAST) if name not in axes)]
+
+
+def table_text(axes: Sequence[str], rows: Sequence[Row]) -> str:
+    """The table as CSV (RFC 4180, line feeds): numbers as short as they can be read back exactly, lists and mappings as
+    JSON, nothing where nothing is known."""
+    names = columns_of(axes, rows)
+    return _csv([names, *([_cell(row.get(name)) for name in names] for row in rows)])
+
+
+def columns_text(axes: Sequence[str], rows: Sequence[Row]) -> str:
+    """The unit and the meaning of every column, as CSV."""
+    lines = [["column", "unit", "meaning"]]
+    for name in columns_of(axes, rows):
+        unit, meaning = ("", "an axis: this key of the config") if name in axes else MEANING.get(name, ("1", ""))
+        lines.append([name, unit, meaning or (f"{name.partition('.')[2]} of {name.partition('.')[0]} in result.json")])
+    return _csv(lines)
+
+
+def read_table(directory: Path) -> list[Row]:
+    """The rows of a study's ``table.csv``, its numbers as numbers; raises `InputError` when it cannot be understood."""
+    file = directory / TABLE
+    try:
+        lines = list(csv.reader(io.StringIO(file.read_text(encoding="utf-8"), newline=""), strict=True))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{file}: cannot be read: expected the table of a study: {error}") from None
+    if not lines or not {"status", "run", "seconds"} <= set(lines[0]) or len(set(lines[0])) < len(lines[0]):
+        raise InputError(f"{file}: expected the table of a study, with columns such as status, run and seconds")
+    for number, line in enumerate(lines[1:], 2):
+        if len(line) != len(lines[0]):
+            raise InputError(f"{file}:{number}: expected {len(lines[0])} cells, as in the first line, got {len(line)}")
+    return [{name: _read(name, cell) for name, cell in zip(lines[0], line, strict=True)} for line in lines[1:]]
+
+
+def _csv(lines: Iterable[Sequence[str]]) -> str:
+    stream = io.StringIO()
+    csv.writer(stream, lineterminator="\n").writerows(lines)
+    return stream.getvalue()
+
+
+def _cell(value: object) -> str:
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return ""
+    if isinstance(value, bool | list | Mapping):
+        return json.dumps(value)
+    return repr(value) if isinstance(value, float) else str(value)
+
+
+def _read(name: str, cell: str) -> Any:
+    if cell == "":
+        return None
+    if name in ("message", "stopped", "run", "hash", "status", "worst.constraint"):
+        return cell
+    try:
+        return json.loads(cell)
+    except ValueError:
+        return cell
