@@ -32,7 +32,9 @@ FILES = {
         "status, message, cost, value, epsilon, bounds, gap, worst constraint, tolerances (what was proven of each"
         " constraint, and what counts as no violation of its rows, in the user's units), sparsity, counts, seconds (of"
         " the method: solving and proving, neither reading nor drawing), seed, versions; for the scenario approach"
-        " `scenario_bound`; `upper_bound` and `gap` are null unless the status is certified or verified"
+        " `scenario_bound`; `upper_bound` and `gap` are null unless the status is certified or verified; `provenance`:"
+        " the hash of what decides the result, when the run started, the git revision of the config's folder, host,"
+        " contents of the plugin files"
     ),
     "certificate.json": (
         "what is claimed and what proves it; `sparserob check` takes it, [certificate.md](certificate.md) explains it"
@@ -54,6 +56,16 @@ FILES = {
     "simulation-LAW.json": "written by `sparserob simulate`: how often trajectories under a law break each constraint",
     "figures/": "`control`, `states`, `convergence`, `adversary`, each as PDF and PNG; `clash` when infeasible; an"
     " extra: where they cannot be drawn a line says so, and the status of the run stays as it is",
+}
+
+STUDY = {
+    "sweep.yaml": "the base config and the axes: `sparserob sweep sweep.yaml --out ELSEWHERE` does the study again",
+    "runs/": "one run directory for every point, named by its values and the first letters of its hash",
+    "table.csv": (
+        "one row for every point: the axes, then the numbers and texts of its `result.json`, an entry of an object as"
+        " `object.entry`; numbers can be read back exactly, what is not known is empty; `seconds` is the last column"
+    ),
+    "columns.csv": "the unit and the meaning of every column of `table.csv`",
 }
 
 
@@ -145,6 +157,10 @@ def _files() -> list[str]:
         "## Files of a run",
         "",
         *table(("file", "contents"), [(f"`{name}`", text) for name, text in FILES.items()]),
+        "",
+        "## Files of a study",
+        "",
+        *table(("file", "contents"), [(f"`{name}`", text) for name, text in STUDY.items()]),
     ]
 
 

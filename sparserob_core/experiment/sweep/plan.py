@@ -43,7 +43,8 @@ class Plan:
     axis, one with a single value holds for all points.
 
     ``points``: all combinations of values (``grid``), the first values together, then the second, ... (``zip``), or
-    ``number`` points drawn at ``random`` or along a sequence of ``sobol``, by the ``seed``.
+    ``number`` points drawn at ``random`` or along a sequence of ``sobol``, by the ``seed``. ``file``: the study's own
+    file, where it has one.
     """
 
     base: Source
@@ -51,6 +52,7 @@ class Plan:
     points: Arrangement = "grid"
     number: int | None = None
     seed: int | None = None
+    file: str = ""
 
     @property
     def name(self) -> str:
@@ -113,7 +115,11 @@ class Plan:
     def checked(self) -> list[Point]:
         """Every point with its checked config; raises `ConfigError` for the first one that is at fault."""
         points = []
-        for values in self.values():
+        try:
+            rows = self.values()
+        except InputError as error:
+            raise (ConfigError(f"{self.file}: {error}") if self.file else error) from None
+        for values in rows:
             loaded = self.loaded(values)
             points.append(Point(values, loaded, identity(loaded.config.plain())))
         return points
@@ -202,7 +208,7 @@ def _stored(source: Source) -> Plan:
     except InputError as error:
         raise ConfigError(f"{source.where(('axes', *error.path))}: {error}") from None
     below = read_source(source.folder / base) if isinstance(base, str) else replace(source, data=dict(base), text="")
-    return Plan(_based(below), tuple(changes), points, number, seed)
+    return Plan(_based(below), tuple(changes), points, number, seed, source.name)
 
 
 def _arrangement(source: Source) -> tuple[Arrangement, int | None, int | None]:

@@ -28,7 +28,8 @@ NAMED = 5  # failures that are told one by one
 @dataclass(frozen=True, eq=False)
 class Study:
     """A study: the ``directory`` that holds it, its ``axes``, and its ``table``, one row (a mapping) for every point
-    that has an answer or an error, the keys of the axes first, ``None`` where nothing is known. ``pandas.DataFrame(study.table)`` makes a data frame.
+    that has an answer or an error: the keys of the axes, then what ``result.json`` says, ``None`` where nothing is
+    known. ``pandas.DataFrame(study.table)`` makes a data frame.
 
     ``points`` is the number of all points; ``stopped`` says why some have no row; ``remarks`` say what could not be
     done beside them.
