@@ -8,7 +8,6 @@ import signal
 import threading
 import time
 import traceback
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, wait
 from contextlib import contextmanager
@@ -18,25 +17,26 @@ from typing import Any
 
 import numpy as np
 
-from sparserob_core.errors import InputError
+from sparserob_core.errors import InputError, named
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.method import ExecutorFactory
+from sparserob_core.testing.contract import Contract, broken, demand
 
 CALLS = 12
 MOMENT = 0.05  # seconds that a call takes where it has to take some
 
 
-class ExecutorContract(ABC):
+class ExecutorContract(Contract[ExecutorFactory], kind="executor"):
     """What every executor must keep: subclass it in a test module as ``class TestMine(ExecutorContract)`` and give
-    ``create``.
+    ``component``.
 
     An executor is a component whose ``open()`` is a context with a `concurrent.futures.Executor`. The contract asks for
     nothing but ``submit``, ``map`` without chunks, futures, and the end of the context.
     """
 
     isolated = True
-    """Whether calls are made in processes of their own; ``False``: here, so that none may die, and what cannot be
-    pickled goes through."""
+    """Whether calls are made in processes of their own; ``False``: in this one, so that none may die, and everything
+    can be sent."""
 
     patience = 60.0
     """Seconds after which an answer is taken for lost."""
@@ -44,23 +44,29 @@ class ExecutorContract(ABC):
     long = 30.0
     """Seconds of a call that is abandoned."""
 
-    @abstractmethod
-    def create(self) -> ExecutorFactory:
-        """A new executor with its default options."""
-
     @contextmanager
     def opened(self) -> Iterator[Executor]:
         """The workers of a new executor."""
         with self.create().open() as executor:
-            assert isinstance(executor, Executor)
+            demand(
+                isinstance(executor, Executor),
+                f"the context of open() gave {executor!r}",
+                "yield a `concurrent.futures.Executor`: a class that inherits from it needs `submit` and `shutdown`",
+            )
             yield executor
 
     def test_answers_come_in_the_order_of_the_arguments_whatever_is_ready_first(self) -> None:
+        mend = "let `submit` return a future of its own for each call, and inherit `map` from `Executor`"
         with self.opened() as executor:
             seconds = [MOMENT * ((CALLS - k) % 3) for k in range(CALLS)]
-            assert list(executor.map(late, range(CALLS), seconds, timeout=self.patience)) == list(range(CALLS))
+            try:
+                mapped = list(executor.map(late, range(CALLS), seconds, timeout=self.patience))
+            except TimeoutError:
+                broken("`map` does not come to its end", mend)
+            demand(mapped == list(range(CALLS)), f"`map` gave {mapped} for {list(range(CALLS))}", mend)
             futures = [executor.submit(late, k, seconds[k]) for k in range(CALLS)]
-            assert [self.answer(future) for future in futures] == list(range(CALLS))
+            answers = [self.answer(future) for future in futures]
+            demand(answers == list(range(CALLS)), f"futures gave {answers} for {list(range(CALLS))}", mend)
 
     def test_every_call_is_made_exactly_once(self) -> None:
         with TemporaryDirectory() as folder, self.opened() as executor:
@@ -68,80 +74,120 @@ class ExecutorContract(ABC):
                 self.answer(future)
             for future in [executor.submit(mark, folder, "equal") for _ in range(CALLS)]:  # equal calls are calls
                 self.answer(future)
-            assert marks(folder) == {**{f"{k}": 1 for k in range(CALLS)}, "equal": CALLS}
+            made, due = marks(folder), {**{f"{k}": 1 for k in range(CALLS)}, "equal": CALLS}
+            demand(
+                made == due,
+                f"calls were made so often: {made}, not {due}",
+                "make each call that is submitted once, and remember no answers (in dask: pure=False)",
+            )
 
     def test_what_fails_is_not_tried_again(self) -> None:
         with TemporaryDirectory() as folder, self.opened() as executor:
-            assert isinstance(self.error(executor.submit(marked_failure, folder)), ArithmeticError)
-            assert marks(folder) == {"failed": 1}
+            self.error(executor.submit(marked_failure, folder))
+            demand(
+                marks(folder) == {"failed": 1},
+                f"a call that raises was made {marks(folder).get('failed', 0)} times",
+                "make it once: whoever submits decides whether to try again (in dask: retries=0)",
+            )
 
     def test_arguments_and_answers_arrive_as_they_are(self) -> None:
         numbers = np.array([0.1, -0.0, np.nan, -np.inf, 5e-324, 1.0 + 2.0**-52])
+        mend = "send arguments, keywords and answers by pickle, which keeps every bit"
         with self.opened() as executor:
             array = self.answer(executor.submit(echo, numbers))
-            assert array.tobytes() == numbers.tobytes()
-            assert self.answer(executor.submit(echo, {"a": (1, "b", None)}, again=[2])) == ({"a": (1, "b", None)}, [2])
+            demand(np.asarray(array).tobytes() == numbers.tobytes(), f"{numbers} came back as {array}", mend)
+            several = self.answer(executor.submit(echo, {"a": (1, "b", None)}, again=[2]))
+            demand(several == ({"a": (1, "b", None)}, [2]), f"what came back was {several!r}", mend)
             products = np.random.default_rng(0).random((3, 40, 40))
             there = [self.answer(executor.submit(product, matrix)) for matrix in products]
-            assert [one.tobytes() for one in there] == [product(matrix).tobytes() for matrix in products]
+            demand(
+                [one.tobytes() for one in there] == [product(matrix).tobytes() for matrix in products],
+                "a product of matrices has other digits there than here",
+                f"{mend}; give linear algebra one thread, see `test_linear_algebra_has_one_thread`",
+            )
 
     def test_an_error_arrives_with_its_type_its_words_and_where_it_was_raised(self) -> None:
+        mend = "pass the exception itself to `Future.set_exception`, from another process with its traceback as cause"
         with self.opened() as executor:
             futures = [executor.submit(fails if k == 1 else echo, f"call {k}") for k in range(4)]
             error = self.error(futures[1])
-            assert type(error) is ArithmeticError
-            assert str(error) == "call 1 has no answer"
-            assert "in fails" in "".join(traceback.format_exception(error)), "the traceback is lost"
-            assert [self.answer(futures[k]) for k in (0, 2, 3)] == ["call 0", "call 2", "call 3"]
-            refused = self.error(executor.submit(refuses))
-            assert isinstance(refused, InputError)
-            assert str(refused) == "horizon: expected a number, got None"
+            told = named(error)
+            demand(type(error) is ArithmeticError, f"an ArithmeticError arrived as a {type(error).__name__}", mend)
+            demand(told == "ArithmeticError: call 1 has no answer", f"the error arrived as: {told}", mend)
+            demand("in fails" in "".join(traceback.format_exception(error)), "the traceback is lost", mend)
+            others = [self.answer(futures[k]) for k in (0, 2, 3)]
+            demand(others == ["call 0", "call 2", "call 3"], "an error has harmed other calls", mend)
+            told = named(self.error(executor.submit(refuses)))
+            demand(
+                told == "InputError: horizon: expected a number, got None", f"an InputError arrived as: {told}", mend
+            )
 
     def test_an_error_that_cannot_be_sent_arrives_in_its_words(self) -> None:
+        mend = "try in the worker whether the exception can be pickled; if not, send its text in a RuntimeError"
         with self.opened() as executor:
-            assert "it is odd" in "".join(traceback.format_exception(self.error(executor.submit(fails_oddly))))
-            assert self.answer(executor.submit(echo, 1)) == 1
+            told = "".join(traceback.format_exception(self.error(executor.submit(fails_oddly))))
+            demand("it is odd" in told, f"an error that cannot be pickled arrived as: {told}", mend)
+            demand(self.answer(executor.submit(echo, 1)) == 1, "it has ended the workers", mend)
 
     def test_what_cannot_be_sent_is_named_and_harms_nothing_else(self) -> None:
+        mend = "pickle the call in `submit`, and the answer in the worker, and pass on what that raises"
         with self.opened() as executor:
             for future in (executor.submit(echo, _unsendable()), executor.submit(_unsendable)):
-                if self.isolated:
-                    error = self.error(future)
-                    assert not isinstance(error, BrokenExecutor), "what cannot be sent has ended the workers"
-                    assert "_unsendable" in str(error), f"it is not named: {error}"
+                error = self.outcome(future)
+                if error is None:  # it can be sent after all
+                    demand(future.result()(3) == 3, "a function has come back as another one", mend)
                 else:
-                    assert self.answer(future)(3) == 3
-            assert self.answer(executor.submit(echo, 1)) == 1
+                    demand(not isinstance(error, BrokenExecutor), "what cannot be sent has ended the workers", mend)
+                    demand("_unsendable" in str(error), f"it is not named: {named(error)}", mend)
+            if self.isolated:
+                told = named(self.error(executor.submit(echo, threading.Lock())))
+                demand("lock" in told, f"a lock cannot be sent, and that is told as: {told}", mend)
+            demand(self.answer(executor.submit(echo, 1)) == 1, "what cannot be sent has ended the workers", mend)
 
     def test_who_waits_is_told_once(self) -> None:
         told: list[Future[Any]] = []
+        mend = "give a future its answer once, by `set_result` or `set_exception` of `concurrent.futures.Future`"
         with self.opened() as executor:
             futures = [executor.submit(echo, k) for k in range(3)] + [executor.submit(fails, "it")]
             for future in futures:
                 future.add_done_callback(told.append)
-            assert not wait(futures, self.patience).not_done, "a future is never done"
-        assert sorted(map(id, told)) == sorted(map(id, futures))
+            demand(not wait(futures, self.patience).not_done, "a future is never done", mend)
+        demand(
+            sorted(map(id, told)) == sorted(map(id, futures)),
+            f"{len(futures)} futures have told those who wait {len(told)} times",
+            mend,
+        )
 
     def test_what_is_cancelled_is_not_called_and_what_is_not_has_its_answer(self) -> None:
+        mend = "call `Future.set_running_or_notify_cancel` when a call begins, and leave it out where that is false"
         with TemporaryDirectory() as folder:
             with self.opened() as executor:
                 futures = [executor.submit(mark, folder, f"{k}", MOMENT) for k in range(CALLS)]
                 cancelled = [future.cancel() for future in reversed(futures)][::-1]
                 for k, future in enumerate(futures):
                     if cancelled[k]:
-                        assert future.cancelled()
-                        assert isinstance(self.error(future), CancelledError)
+                        demand(
+                            future.cancelled() and isinstance(self.error(future), CancelledError),
+                            "a future that was cancelled has an answer",
+                            mend,
+                        )
                     else:
-                        assert self.answer(future) == f"{k}"
-            assert marks(folder) == {f"{k}": 1 for k in range(CALLS) if not cancelled[k]}
+                        demand(
+                            self.answer(future) == f"{k}", "a future that was not cancelled has another answer", mend
+                        )
+            made = {name for name in marks(folder) if cancelled[int(name)]}
+            demand(not made, f"{len(made)} calls that were cancelled were made all the same", mend)
 
     def test_the_end_waits_for_what_was_submitted(self) -> None:
+        mend = "let `open` end with `shutdown(wait=True)`; drop nothing unless the context ends by an exception"
         with TemporaryDirectory() as folder:
             with self.opened() as executor:
                 futures = [executor.submit(mark, folder, f"{k}", MOMENT) for k in range(CALLS)]
-            assert all(future.done() for future in futures), "the context ended before its calls"
-            assert [future.result(0) for future in futures] == [f"{k}" for k in range(CALLS)]
-            assert len(marks(folder)) == CALLS
+            demand(all(future.done() for future in futures), "the context ended before its calls", mend)
+            demand(not any(future.cancelled() for future in futures), "the end has cancelled calls", mend)
+            answers = [future.result(0) for future in futures]
+            demand(answers == [f"{k}" for k in range(CALLS)], f"calls gave {answers} at the end", mend)
+            demand(len(marks(folder)) == CALLS, f"{len(marks(folder))} of {CALLS} calls were made", mend)
 
     def test_nothing_can_be_submitted_after_the_end(self) -> None:
         with self.opened() as executor:
@@ -150,10 +196,10 @@ class ExecutorContract(ABC):
             executor.submit(echo, 1)
         except RuntimeError:
             return
-        raise AssertionError("a call was accepted after the end")
+        broken("a call was accepted after the end", "let `submit` raise a RuntimeError after `shutdown`")
 
     def test_an_error_of_the_caller_passes_and_abandons_what_is_running(self) -> None:
-        futures, began = list[Future[Any]](), time.monotonic()
+        futures, began, passed = list[Future[Any]](), time.monotonic(), ""
         try:
             with self.opened() as executor:
                 self.answer(executor.submit(echo, 1))
@@ -162,55 +208,87 @@ class ExecutorContract(ABC):
                 began = time.monotonic()
                 raise KeyboardInterrupt("the caller's")
         except KeyboardInterrupt as error:
-            assert str(error) == "the caller's"
-        else:
-            raise AssertionError("the caller's error was swallowed")
-        assert time.monotonic() - began < min(self.patience, self.long), "the end waits for calls that nobody waits for"
-        assert all(future.done() for future in futures), "who waits for a call that was abandoned waits for ever"
+            passed = str(error)
+        demand(passed == "the caller's", "the caller's error was swallowed", "raise in `open` what is raised inside it")
+        mend = "where `open` ends by an exception, cancel what waits, and end the workers at once"
+        seconds = time.monotonic() - began
+        demand(seconds < min(self.patience, self.long), f"the end took {seconds:.0f} s: calls nobody waits for", mend)
+        demand(all(one.done() for one in futures), "who waits for a call that was abandoned waits for ever", mend)
 
     def test_it_can_be_opened_again_and_leaves_no_thread(self) -> None:
         factory, before = self.create(), set(threading.enumerate())
         for k in range(2):
-            with factory.open() as executor:
-                assert self.answer(executor.submit(echo, k)) == k
+            try:
+                with factory.open() as executor:
+                    demand(self.answer(executor.submit(echo, k)) == k, "an answer is wrong", "see the other tests")
+            except RuntimeError as error:
+                broken(f"opened {k + 1} times it says: {named(error)}", "make the workers in `open`, anew each time")
         ends = time.monotonic() + min(self.patience, 5.0)
         while (left := set(threading.enumerate()) - before) and time.monotonic() < ends:
             time.sleep(0.01)
-        assert not left, f"still running: {', '.join(thread.name for thread in left)}"
+        demand(
+            not left,
+            f"still running after the end: {', '.join(thread.name for thread in left)}",
+            "start in `open` whatever runs, and end it there",
+        )
 
     def test_linear_algebra_has_one_thread(self) -> None:
         """Many add up in another order; answers would depend on the executor."""
         with self.opened() as executor:
             pools = self.answer(executor.submit(threads))
-        assert pools
-        assert set(pools) == {1}
+        demand(
+            pools and set(pools) == {1},
+            f"libraries of linear algebra have so many threads: {pools}",
+            "set OMP_NUM_THREADS=1 and OPENBLAS_NUM_THREADS=1 before a worker imports numpy; in this process, use "
+            "threadpoolctl.threadpool_limits(1)",
+        )
 
     def test_a_worker_that_dies_breaks_the_executor_and_hangs_nobody(self) -> None:
         if not self.isolated:
             return
+        mend = "watch the workers; where one ends, give the futures of its calls a `concurrent.futures.BrokenExecutor`"
         with self.opened() as executor:
-            assert isinstance(self.error(executor.submit(dies)), BrokenExecutor)
+            told = self.error(executor.submit(dies))
+            demand(isinstance(told, BrokenExecutor), f"a worker that dies is told as: {named(told)}", mend)
         with self.opened() as executor:
-            assert self.answer(executor.submit(echo, 1)) == 1
+            demand(self.answer(executor.submit(echo, 1)) == 1, "it cannot be opened again after that", mend)
 
     def test_workers_leave_an_interrupt_to_the_caller(self) -> None:
         if not self.isolated:
             return
         with self.opened() as executor:
-            assert self.answer(executor.submit(interrupts_itself)) == "still here"
+            error = self.outcome(executor.submit(interrupts_itself))
+            demand(
+                error is None,
+                f"Ctrl-C in the terminal reaches a worker, too: {error}",
+                "ignore SIGINT in the workers; the caller decides what an interrupt ends",
+            )
 
     def answer(self, future: Future[Any]) -> Any:
         """What a call has returned."""
-        return future.result(self.patience)
+        error = self.outcome(future)
+        if error is not None:
+            raise error
+        return future.result()
 
     def error(self, future: Future[Any]) -> BaseException:
         """What a call has raised, or that it was cancelled."""
+        error = self.outcome(future)
+        if error is None:
+            broken("an error was swallowed", "pass what a call raises to `Future.set_exception`")
+        return error
+
+    def outcome(self, future: Future[Any]) -> BaseException | None:
+        """What a call has raised, or that it was cancelled, or none."""
         try:
-            error = future.exception(self.patience)
+            return future.exception(self.patience)
         except CancelledError as cancelled:
             return cancelled
-        assert error is not None, "an error was swallowed"
-        return error
+        except TimeoutError:
+            broken(
+                f"a future was not done after {self.patience:g} s",
+                "give every future that `submit` returns its answer, its error or its cancellation",
+            )
 
 
 def echo(value: Any, **more: Any) -> Any:

@@ -1,0 +1,241 @@
+"""A dask cluster as an executor whose calls can be cancelled until they begin."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor, Executor, Future
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pickle import PicklingError
+from types import ModuleType
+from typing import Any, ParamSpec, TypeVar, final
+
+import cloudpickle
+import dask
+from distributed import Client, KilledWorker, LocalCluster, Nanny, WorkerPlugin
+from distributed.core import Status
+
+import sparserob_core as sr
+
+Arguments = ParamSpec("Arguments")
+Answer = TypeVar("Answer")
+
+LOUD = 50  # logging.CRITICAL: what dask has to say about workers that are ended on purpose is not for users
+ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS", "RAYON_NUM_THREADS"), 1
+)
+SETTINGS = {
+    "distributed.scheduler.allowed-failures": 0,  # whoever submits decides whether to try again
+    "distributed.worker.multiprocessing-method": "spawn",
+    "distributed.nanny.pre-spawn-environ": ONE_THREAD,
+}
+
+
+@contextmanager
+def started(workers: int | None, host: str, timeout: float) -> Iterator[Executor]:
+    """A cluster of this machine, which ends with the context."""
+    count = workers or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+    with dask.config.set(SETTINGS), _without_script():
+        cluster = LocalCluster(
+            n_workers=count,
+            threads_per_worker=1,
+            host=host,
+            dashboard_address=f"{host}:0",
+            worker_class=_Mortal,
+            memory_limit=0,
+            silence_logs=LOUD,
+        )
+    try:
+        with connected(cluster.scheduler_address, timeout, breaks=True) as executor:
+            yield executor
+    finally:
+        cluster.close(timeout=timeout)
+
+
+@contextmanager
+def connected(address: str, timeout: float, breaks: bool = False) -> Iterator[Executor]:
+    """The workers of the cluster whose scheduler listens at ``address``; ``breaks``: whether a worker that dies ends
+    the executor."""
+    try:
+        client = Client(address, timeout=timeout, set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise sr.InputError(
+            path="executor.address", expected="the address of a dask scheduler that answers", got=f"{address} ({error})"
+        ) from error
+    try:
+        try:
+            client.wait_for_workers(1, timeout=timeout)
+        except TimeoutError:
+            raise sr.InputError(
+                f"executor dask: no worker at {address} within {timeout:g} s; start some with `dask worker {address}`"
+            ) from None
+        if breaks:
+            client.register_plugin(_LeavesInterrupts())
+        missing = "" if find_spec("bokeh") else " (it needs the package bokeh)"
+        sys.stderr.write(f"dask dashboard: {client.dashboard_link}{missing}\n")
+        executor = _Cluster(client, breaks)
+        try:
+            yield executor
+        except BaseException:
+            executor.abandon("the context was left by an exception")
+            raise
+        executor.shutdown()
+    finally:
+        client.close(timeout=timeout)
+
+
+@final
+class _Cluster(Executor):
+    """Hands out one call for each thread of the workers; the others wait here."""
+
+    def __init__(self, client: Client, breaks: bool) -> None:
+        self._client, self._breaks = client, breaks
+        self._waiting = deque[tuple[Future[Any], bytes]]()
+        self._running: dict[Future[Any], Any] = {}
+        self._changed = threading.Condition()
+        self._broken, self._closed = "", False
+        self._threads, self._asked = 1, -float("inf")
+        self._count_threads()
+
+    def submit(
+        self, fn: Callable[Arguments, Answer], /, *args: Arguments.args, **kwargs: Arguments.kwargs
+    ) -> Future[Answer]:
+        future: Future[Answer] = Future()
+        with self._changed:
+            if self._closed:
+                raise RuntimeError("cannot schedule new futures after shutdown")
+            if self._broken:
+                raise BrokenExecutor(self._broken)
+        try:
+            call = cloudpickle.dumps((fn, args, kwargs))
+        except Exception as error:  # noqa: BLE001  it is raised again where the result is asked for
+            name = getattr(fn, "__qualname__", None) or repr(fn)
+            future.set_exception(PicklingError(f"the call of {name} cannot be sent to a worker: {error}"))
+            return future
+        with self._changed:
+            self._waiting.append((future, call))
+        self._count_threads()
+        self._send()
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        with self._changed:
+            self._closed = True
+            if cancel_futures:
+                while self._waiting:
+                    self._waiting.popleft()[0].cancel()
+            while wait and (self._waiting or self._running):
+                self._changed.wait(1.0)
+                self._waiting = deque(one for one in self._waiting if not one[0].cancelled())
+
+    def abandon(self, why: str) -> None:
+        """End everything that is not done: what waits is cancelled, what has begun is a `BrokenExecutor`."""
+        with self._changed:
+            self._closed = True
+            waiting, running = list(self._waiting), dict(self._running)
+            self._waiting.clear()
+            self._running.clear()
+            self._changed.notify_all()
+        for future, _ in waiting:
+            future.cancel()
+        for future, there in running.items():
+            there.cancel()
+            future.set_exception(BrokenExecutor(why))
+
+    def _send(self) -> None:
+        with self._changed:
+            while self._waiting and len(self._running) < self._threads:
+                future, call = self._waiting.popleft()
+                if future.set_running_or_notify_cancel():
+                    there = self._client.submit(_called, call, pure=False)
+                    self._running[future] = there
+                    self._client.loop.add_callback(self._follow, future, there)
+            self._changed.notify_all()
+
+    async def _follow(self, future: Future[Any], there: Any) -> None:
+        """In the thread of dask's own loop: pass an answer on, and send the next call."""
+        answer: object = None
+        failure: BaseException | None = None
+        try:
+            answer = cloudpickle.loads(await there)
+        except KilledWorker:
+            failure = BrokenExecutor("a worker has died")
+        except BaseException as error:  # noqa: BLE001  it is raised again where the result is asked for
+            failure = error
+        with self._changed:
+            mine = self._running.pop(future, None) is not None
+        if mine and isinstance(failure, BrokenExecutor) and self._breaks:
+            self._break(str(failure))
+        if mine and failure is None:
+            future.set_result(answer)
+        elif mine:
+            future.set_exception(failure)
+        self._send()
+
+    def _break(self, why: str) -> None:
+        with self._changed:
+            self._broken = why
+            waiting = list(self._waiting)
+            self._waiting.clear()
+        for future, _ in waiting:
+            if future.set_running_or_notify_cancel():
+                future.set_exception(BrokenExecutor(why))
+
+    def _count_threads(self) -> None:
+        """Workers of a cluster come and go: ask now and then."""
+        if time.monotonic() - self._asked > 10.0:
+            self._asked = time.monotonic()
+            self._threads = max(1, sum(self._client.nthreads().values()))
+
+
+def _called(call: bytes) -> bytes:
+    """On a worker: make a call; its answer as bytes, so that what cannot be sent is an error here."""
+    fn, args, kwargs = cloudpickle.loads(call)
+    answer = fn(*args, **kwargs)
+    try:
+        return bytes(cloudpickle.dumps(answer))
+    except Exception as error:  # noqa: BLE001  whatever the class of the answer does
+        name = getattr(fn, "__qualname__", None) or repr(fn)
+        raise PicklingError(f"the answer of {name} cannot be sent between processes: {error}") from None
+
+
+@final
+class _LeavesInterrupts(WorkerPlugin):  # type: ignore[misc]
+    """Workers leave Ctrl-C to the process that has started them."""
+
+    name = "sparserob-leaves-interrupts"
+
+    def setup(self, worker: Any) -> None:
+        """On each worker, in its main thread."""
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+@final
+class _Mortal(Nanny):  # type: ignore[misc]
+    """Starts its worker once: another one would begin with the script that is run here."""
+
+    begun = False
+
+    async def instantiate(self) -> Status:
+        """Start the worker, unless there was one."""
+        if self.begun:
+            return Status.closed
+        self.begun = True
+        return await super().instantiate()
+
+
+@contextmanager
+def _without_script() -> Iterator[None]:
+    """A process that is started meanwhile does not import the script that is run here."""
+    script = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = script

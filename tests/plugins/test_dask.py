@@ -1,0 +1,80 @@
+"""Guards plugins/sparserob_dask: what it says and what it needs; the contract is tested with the others."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+import sparserob_core as sr
+from sparserob_core.testing.executors import echo
+from tests.support.places import ROOT
+
+REGISTRY = sr.load_registry()
+
+
+def opened(**options):
+    return REGISTRY.build("executor", "dask", options).open()
+
+
+def test_a_missing_package_is_named_with_the_extra_that_brings_it(monkeypatch):
+    monkeypatch.delitem(sys.modules, "sparserob_dask.cluster", raising=False)
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    monkeypatch.setitem(sys.modules, "cloudpickle", None)
+    with (
+        pytest.raises(sr.UnknownPluginError, match=r"needs the package \w+: pip install 'sparserob\[dask\]'"),
+        opened(),
+    ):
+        pass
+
+
+@pytest.mark.parametrize("options", [{"workers": 2}, {"host": "0.0.0.0"}])
+def test_a_running_cluster_has_its_own_workers(options):
+    with pytest.raises(sr.InputError, match=rf"{next(iter(options))}: expected nothing beside address"):
+        REGISTRY.build("executor", "dask", {"address": "tcp://127.0.0.1:8786", **options})
+
+
+@pytest.mark.parametrize("options", [{"workers": 0}, {"timeout": 0.0}, {"adress": "here"}])
+def test_options_out_of_range_are_named(options):
+    with pytest.raises(sr.InputError, match=next(iter(options))):
+        REGISTRY.build("executor", "dask", options)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nowhere"])
+def test_a_scheduler_that_does_not_answer_is_an_error_of_the_input(address):
+    pytest.importorskip("distributed")
+    with (
+        pytest.raises(sr.InputError, match=f"address: expected the address of a dask scheduler.* got {address}"),
+        opened(address=address, timeout=1.0),
+    ):
+        pass
+
+
+@pytest.mark.slow
+def test_the_dashboard_is_told_and_nothing_listens_beyond_this_machine(capfd):
+    pytest.importorskip("distributed")
+    with opened(workers=1) as executor:
+        assert executor.submit(echo, 3).result(60) == 3
+        listening = executor._client.scheduler_info()["address"]
+    said = capfd.readouterr()
+    assert said.out == ""
+    assert said.err.startswith("dask dashboard: http://127.0.0.1:")
+    assert listening.startswith("tcp://127.0.0.1:")
+
+
+@pytest.mark.slow
+def test_a_script_without_a_guard_starts_its_work_once(tmp_path):
+    pytest.importorskip("distributed")
+    (tmp_path / "study.py").write_text(
+        "import sparserob_core as sr\n"
+        "print('begins')\n"
+        "def mine(value):\n    return 2 * value\n"
+        "with sr.load_registry().build('executor', 'dask', {'workers': 2}).open() as executor:\n"
+        "    print(list(executor.map(mine, range(3))))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, str(tmp_path / "study.py")], capture_output=True, text=True, timeout=120, cwd=ROOT, check=True
+    )
+    assert done.stdout.splitlines() == ["begins", "[0, 2, 4]"]
