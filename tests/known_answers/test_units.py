@@ -183,3 +183,98 @@ def test_results_are_in_the_users_units():
     for mine, theirs in zip(*rounds, strict=True):
         assert theirs.cost / f.cost == mine.cost
         np.testing.assert_array_equal(theirs.decision * f.control, mine.decision)
+
+
+def written(f: Factors, curved: bool = False, uncertain: bool = False) -> dict[str, object]:
+    """A config of the same oscillator, with an uncertain spring where asked for, in any units."""
+    to, x = f.time / f.states[:, None], f.states
+    spring = f"{to[1, 0] * x[0]:.17g} * (-1 - {0.1 * f.parameter:.17g} * p)" if uncertain else -float(to[1, 0] * x[0])
+    H = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 1.0]])
+    h = f.rows * np.array([1.2, 1.2, 1.2, 1.2, 1.5])
+    flat = {"polytope": {"H": (f.rows[:, None] * H * x).tolist(), "h": h.tolist()}}
+    disc = {"ellipsoid": {"centre": [0.0, 0.0], "shape": np.diag((np.array([0.25, 0.22]) / x) ** 2).tolist()}}
+    return {
+        "problem": {
+            "name": "linear",
+            "system": {
+                "A": [[0.0, float(to[0, 0] * x[1])], [spring, -0.5 * f.time]],
+                "B": [[0.0], [float(to[1, 0] * f.control)]],
+                "E": (to * np.eye(2) * f.noise).tolist(),
+                "parameters": {"p": [-1.0 / f.parameter, 1.0 / f.parameter]} if uncertain else None,
+            },
+            "horizon": 3.0 / f.time,
+            "initial_state": (np.array([1.0, 0.3]) / x).tolist(),
+            "control": {"box": 1.0 / f.control},
+            "weights": [f.weight],
+            "disturbance": {"box": (0.02 / f.noise).tolist()},
+            "path": [flat],
+            "terminal": [disc if curved else {"box": (np.array([0.25, 0.22]) / x).tolist()}],
+        },
+        "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 10}},
+        "observers": [],
+    }
+
+
+def same_set(plain: sr.InitialStates, other: sr.InitialStates, f: Factors) -> None:
+    """Each one's proven points are in the other's proven half-planes, and it is as large."""
+    assert other.status == plain.status in ("certified", "verified"), other.message
+    x = f.states[list(plain.states)]
+    size = np.abs(plain.outer).max()
+    assert (plain.directions @ (other.inner * x).T <= plain.bounds[:, None] + 1e-6 * size).all()
+    room = 1e-6 * np.abs(other.directions) @ (size / x)
+    assert (other.directions @ (plain.inner / x).T <= (other.bounds + room)[:, None]).all()
+    np.testing.assert_allclose(np.ptp(other.outer, axis=0) * x, np.ptp(plain.outer, axis=0), rtol=1e-5)
+    np.testing.assert_allclose(np.abs(other.controls).max() * f.control, np.abs(plain.controls).max(), rtol=1e-6)
+    middle = plain.inner.mean(axis=0)
+    assert other.where(middle / x) == "inside" and other.where((9.0 * size + middle) / x) == "outside"
+    if plain.costs.size:
+        assert other.cost(middle / x) / f.cost == pytest.approx(plain.cost(middle), rel=1e-2)
+
+
+def test_a_set_of_initial_states_changes_by_its_units_only():
+    plain, f = (
+        sr.initial_states(written(Factors()), directions=6, values=0),
+        Factors.drawn(np.random.default_rng(1), False),
+    )
+    same_set(plain, sr.initial_states(written(f), directions=6, values=0), f)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("curved", [False, True], ids=["flat", "curved"])
+def test_a_set_of_initial_states_with_costs_changes_by_its_units_only(curved):
+    plain, f = (
+        sr.initial_states(written(Factors(), curved), directions=8, values=1),
+        Factors.drawn(np.random.default_rng(1), binary=True),
+    )
+    same_set(plain, sr.initial_states(written(f, curved), directions=8, values=1), f)
+
+
+@pytest.mark.slow
+def test_a_set_of_initial_states_of_an_uncertain_system_changes_by_its_units_only():
+    plain = sr.initial_states(written(Factors(), uncertain=True), directions=8, values=0)
+    f = Factors.drawn(np.random.default_rng(5), binary=False)
+    same_set(plain, sr.initial_states(written(f, uncertain=True), directions=8, values=0), f)
+
+
+def same_margin(of: str, curved: bool, seed: int, binary: bool) -> None:
+    uncertain = of == "parameters"
+    plain = sr.margin(written(Factors(), curved, uncertain), of=of, tolerance=1e-4)
+    assert plain.status in ("certified", "unbounded"), plain.message
+    f = Factors.drawn(np.random.default_rng(seed), binary)
+    other = sr.margin(written(f, curved, uncertain), of=of, tolerance=1e-4)
+    assert other.status == plain.status, other.message
+    unit = f.time if of.endswith("from") else 1.0
+    assert other.lower * unit == pytest.approx(plain.lower, rel=2e-4, abs=1e-9)
+    assert other.feasible.upper_bound / f.cost == pytest.approx(plain.feasible.upper_bound, rel=5e-3)
+
+
+@pytest.mark.parametrize("of", ["disturbance", "control", "terminal.0"])
+def test_a_margin_changes_by_its_units_only(of):
+    same_margin(of, curved=False, seed=10, binary=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("of", ["disturbance", "control", "path.0", "path.0.from", "terminal.0", "parameters"])
+@pytest.mark.parametrize("curved", [False, True], ids=["flat", "curved"])
+def test_margins_of_everything_change_by_their_units_only(of, curved):
+    same_margin(of, curved, seed=11, binary=True)

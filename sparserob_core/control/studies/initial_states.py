@@ -42,7 +42,7 @@ class InitialPlane:
     """Initial states ``x(0)`` with the coordinates ``states (2,)`` at ``centre + radius z``, ``|z_i| <= 1``, the others
     as the problem has them.
 
-    ``centre (2,)`` and ``radius (2,)`` are in the units of the states.
+    ``centre (2,)`` and ``radius (2,)`` are in the units of the states of the ``model``, which may be in its own.
     """
 
     model: Transcription
@@ -175,6 +175,8 @@ class _Joined:
             cells=self.base.cells,
             enclosure=self.enclosure if offers else None,
             explain=self.explain,
+            row_units=self.base.row_units,
+            index_units=self.base.index_units,
             source=self.base.source,
         )
 
@@ -202,8 +204,8 @@ class _Joined:
         return enclosure(x[:-2], lower, upper)
 
     def explain(self, index: Array, row: int) -> Explanation:
-        """The constraint for people, without what the centre's initial state gives: it is free."""
-        said = self.base.explanation(index, row)
+        """The constraint for people, without what the initial state gives: it is free."""
+        said = self.plane.model.program.family(self.base.name).explanation(index, row)
         return said.from_any_state() if isinstance(said, TimedExplanation) else said
 
     def _at(self, x: Array) -> ConstraintFamily:

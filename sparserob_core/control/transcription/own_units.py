@@ -44,7 +44,7 @@ def rough_units(problem: OptimalControlProblem) -> Units:
         reach = np.maximum(reach, lasting * (A * reach).max(axis=1))
     reach = np.where(reach < CHAINED, reach, 0.0)
     return Units(
-        time, power_of_two(np.where(reach > 0.0, reach, _walls(problem))), controls, disturbances, parameters, 1.0
+        time, power_of_two(np.where(reach > 0.0, reach, walls(problem))), controls, disturbances, parameters, 1.0
     )
 
 
@@ -56,7 +56,7 @@ def own_units(problem: OptimalControlProblem, rough: Units, functionals: WorstCa
     reach, _ = reaches(functionals, parameters, rough.of_problem(problem).control, axes, times)
     usable = np.isfinite(reach) & (reach > 0.0)
     states = rough.states * power_of_two(np.where(usable, reach, 1.0))
-    states = np.where(usable, states, power_of_two(_walls(problem)))
+    states = np.where(usable, states, power_of_two(walls(problem)))
     weights = np.asarray(problem.weights) * extent(problem.control)
     cost = COST * float(power_of_two(np.array(weights.sum()))) * rough.time
     return Units(rough.time, states, rough.controls, rough.disturbances, rough.parameters, cost)
@@ -163,7 +163,7 @@ def _widths(convex: ConvexSet) -> Array:
     return np.where(width > 0.0, width, convex.reach(axes))
 
 
-def _walls(problem: OptimalControlProblem) -> Array:
+def walls(problem: OptimalControlProblem) -> Array:
     """The least bound other than 0 that a row or an equality on it alone gives each state; 1 without one."""
     least = np.full(problem.system.states, np.inf)
     for item in (*problem.path, *problem.terminal):

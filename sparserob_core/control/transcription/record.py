@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -15,12 +17,27 @@ from sparserob_core.sip.program import ConstraintFamily, Formulation, SemiInfini
 
 
 @dataclass(frozen=True, eq=False)
+class RowUnits:
+    """What the rows of a program in own units were divided by, beside those of its constraints: the slanted ``sides``
+    of the controls, and the terminal equalities, ``fixed (e,)``. ``entered (e,)``: whether a control enters that."""
+
+    sides: Array
+    fixed: Array
+    entered: Array
+
+    def equalities(self, A: Array, b: Array) -> tuple[Array, Array]:
+        """``A x = b`` in these units, without entries that are rounding."""
+        return np.where(self.entered[:, None], A, 0.0) / self.fixed[:, None], b / self.fixed
+
+
+@dataclass(frozen=True, eq=False)
 class Transcription:
     """A problem on its dictionaries and the semi-infinite program that it became.
 
     ``constraints`` are the path and terminal constraints, named and ordered as the families of the ``program``;
     terminal equalities are not among them, they are rows of the program. ``functionals`` are what every family is built
-    from, ``formulation`` says what the indices of the families are.
+    from, ``formulation`` says what the indices of the families are. ``rows``: what rows were divided by, where the
+    problem is in its own units.
     """
 
     problem: OptimalControlProblem
@@ -31,6 +48,7 @@ class Transcription:
     constraints: tuple[StateConstraint, ...]
     program: SemiInfiniteProgram
     formulation: Formulation = "reduced"
+    rows: RowUnits | None = None
 
     @property
     def response(self) -> Response:

@@ -34,7 +34,7 @@ from sparserob_core.control.transcription.own_units import (
     units_of_sides,
 )
 from sparserob_core.control.transcription.provable import hindrance
-from sparserob_core.control.transcription.record import Transcription
+from sparserob_core.control.transcription.record import RowUnits, Transcription
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, Formulation, OwnUnits, SemiInfiniteProgram
@@ -103,15 +103,25 @@ def _assembled(
     disturbance: Dictionary,
     formulation: Formulation,
     own: bool = False,
+    like: Transcription | None = None,
 ) -> Transcription:
-    """The program in the units of the problem; every row divided by its ``own`` unit where that is asked for."""
+    """The program in the units of the problem; every row divided by its ``own`` unit where that is asked for, or by
+    what it is divided by in another one that it is to be ``like``."""
     functionals, parameters = _functionals(problem, control, disturbance)
     constraints = _state_constraints(problem, functionals, parameters)
-    S, lower, upper, weights = _image(problem, control, own)
     A, b = _equalities(problem, functionals, parameters)
-    if own:
-        A, b, _ = _own_equalities(problem, functionals, A, b)
+    rows: RowUnits | None = None
+    if like is not None and like.rows is not None:
+        rows = like.rows
+        pairs = zip(constraints, like.constraints, strict=True)
+        constraints = tuple(one.divided(_shares(one, other)) for one, other in pairs)
+    elif own:
+        rows = _row_units(problem, functionals, A)
         constraints = tuple(one.divided(row_units(one, problem.control)) for one in constraints)
+    S, lower, upper, weights = _image(problem, control, rows)
+    if rows is not None:
+        A, b = rows.equalities(A, b)
+        b = np.where(A.any(axis=1) | (np.abs(b) > TOLERANCE), b, 0.0)  # no control enters, and rounding is missing
     families = [family_of(constraint) for constraint in constraints]
     if problem.control.halfspaces() is None:
         families.append(ControlConstraint(problem.control, control).family())
@@ -129,11 +139,14 @@ def _assembled(
         channels=problem.system.controls,
         lengths=np.tile(control.lengths, problem.system.controls),
     )
-    return Transcription(problem, control, disturbance, functionals, parameters, constraints, program, formulation)
+    return Transcription(
+        problem, control, disturbance, functionals, parameters, constraints, program, formulation, rows
+    )
 
 
-def _in_own_units(model: Transcription) -> OwnUnits:
-    """The program of the same problem in its own units (decision 0016)."""
+def in_own_units(model: Transcription) -> tuple[Transcription, Units]:
+    """The same problem in its own units (decision 0016), every row divided by its own, and these units; its families
+    are explained in the user's."""
     problem, rough = model.problem, rough_units(model.problem)
     dictionaries = (model.control, model.disturbance)
     known, _ = _functionals(rough.of_problem(problem), *(rough.of_dictionary(one) for one in dictionaries))
@@ -146,15 +159,53 @@ def _in_own_units(model: Transcription) -> OwnUnits:
             own.program.families, model.program.families, _rows_in_users(model, own, units), strict=True
         )
     ]
-    fixed = _own_equalities(own.problem, own.functionals, *_equalities(own.problem, own.functionals, own.parameters))
-    sides = [units.controls, _ratio(slanted(problem.control)[0], _sides_of_controls(own.problem)[0], units.controls)]
+    return replace(own, program=replace(own.program, families=families, cost_unit=units.cost)), units
+
+
+def like(own: Transcription, problem: OptimalControlProblem) -> SemiInfiniteProgram:
+    """The program of another problem on the dictionaries of ``own``, with its rows divided by what those of ``own`` are
+    divided by, and told as these are: for problems that differ from it in numbers on the right-hand sides only."""
+    program = _assembled(problem, own.control, own.disturbance, own.formulation, like=own).program
+    families = [
+        replace(one, explain=told.explain, row_units=told.row_units, index_units=told.index_units)
+        for one, told in zip(program.families, own.program.families, strict=True)
+    ]
+    return replace(program, families=families)
+
+
+def _in_own_units(model: Transcription) -> OwnUnits:
+    """The program of the same problem in its own units, and the way back."""
+    own, units = in_own_units(model)
+    rows = own.rows
+    assert rows is not None
+    theirs, ours = slanted(model.problem.control)[0], slanted(own.problem.control)[0]
+    sides = _ratio(theirs, ours / rows.sides[:, None], units.controls)
     return OwnUnits(
-        program=replace(own.program, families=families, cost_unit=units.cost),
-        decision=np.repeat(units.controls, control.functions),
-        image=np.repeat(np.concatenate(sides), control.pieces),
-        equalities=_fixed(problem) @ units.states * fixed[2],
+        program=own.program,
+        decision=np.repeat(units.controls, own.control.functions),
+        image=np.repeat(np.concatenate([units.controls, sides]), own.control.pieces),
+        equalities=_fixed(model.problem) @ units.states * rows.fixed,
         cost=units.cost,
     )
+
+
+def _row_units(problem: OptimalControlProblem, functionals: WorstCase, A: Array) -> RowUnits:
+    """Equalities hold to rounding only: where no control enters a row, what is missing is compared with what double
+    precision resolves."""
+    added = _added_up(problem, functionals)
+    entered = np.abs(A).max(axis=1, initial=0.0) > IDLE * added
+    H, h = slanted(problem.control)
+    size = np.abs(H) @ extent(problem.control)
+    sides = units_of_sides(H, h, problem.control.reach(H), size) if h.size else h
+    return RowUnits(sides, power_of_two(np.where(entered, 1.0, RESOLVED) * added), entered)
+
+
+def _shares(one: StateConstraint, other: StateConstraint) -> Array:
+    """What the rows ``(r,)`` of a constraint are of those of another one, whose directions are the same."""
+    theirs, ours = (each.functionals_at(each.index_set.lower[None])[1] for each in (one, other))
+    largest = np.abs(ours).argmax(axis=1)[:, None]
+    shares = np.take_along_axis(theirs, largest, axis=1) / np.take_along_axis(ours, largest, axis=1)
+    return np.asarray(shares[:, 0] if one.sides is not None else shares[:1, 0])
 
 
 def _rows_in_users(model: Transcription, own: Transcription, units: Units) -> list[Array]:
@@ -232,8 +283,12 @@ def from_state(model: Transcription, initial_state: Array) -> Transcription:
     functionals = model.functionals.from_state(initial_state)
     problem = replace(model.problem, initial_state=initial_state)
     constraints = tuple(one.from_state(initial_state) for one in model.constraints)
-    moved = {one.name: _reduced(one) for one in constraints}
+    moved = {
+        one.name: replace(_reduced(one), row_units=told.row_units, index_units=told.index_units)
+        for one, told in zip(constraints, model.program.families, strict=False)
+    }
     A, b = _equalities(problem, functionals, model.parameters)
+    A, b = (A, b) if model.rows is None else model.rows.equalities(A, b)
     program = replace(
         model.program,
         families=[moved.get(family.name, family) for family in model.program.families],
@@ -271,7 +326,7 @@ def _name(kind: str, position: int, count: int) -> str:
 
 
 def _image(
-    problem: OptimalControlProblem, dictionary: Dictionary, own: bool = False
+    problem: OptimalControlProblem, dictionary: Dictionary, rows: RowUnits | None
 ) -> tuple[csc_array | None, Array, Array, Array]:
     """The control on every piece, its bounds and weights, and one more image per piece and side of a polytope."""
     from scipy.sparse import csc_array, eye_array, kron, vstack
@@ -284,7 +339,8 @@ def _image(
     )
     weights: Array = np.kron(np.asarray(problem.weights, dtype=float), dictionary.lengths)
     values = csc_array(dictionary.values.T)
-    H, h = _sides_of_controls(problem) if own else slanted(bound)
+    H, h = slanted(bound)
+    H, h = (H, h) if rows is None else (H / rows.sides[:, None], h / rows.sides)
     if not h.size:
         return (
             (None if dictionary.is_indicators else csc_array(kron(eye_array(channels), values))),
@@ -300,14 +356,6 @@ def _image(
         np.concatenate([upper, extra]),
         np.concatenate([weights, np.zeros(extra.size)]),
     )
-
-
-def _sides_of_controls(problem: OptimalControlProblem) -> tuple[Array, Array]:
-    """The `slanted` sides of the controls, each divided by its own unit."""
-    H, h = slanted(problem.control)
-    size = np.abs(H) @ extent(problem.control)
-    units = units_of_sides(H, h, problem.control.reach(H), size) if h.size else h
-    return H / units[:, None], h / units
 
 
 def slanted(bound: ConvexSet) -> tuple[Array, Array]:
@@ -361,20 +409,6 @@ def _added_up(problem: OptimalControlProblem, functionals: WorstCase) -> Array:
     nominal = functionals if functionals.response.system.parameters is None else functionals.nominal()
     _, added = reaches(nominal, known, problem.control, H, np.array([problem.horizon]))
     return added
-
-
-def _own_equalities(
-    problem: OptimalControlProblem, functionals: WorstCase, A: Array, b: Array
-) -> tuple[Array, Array, Array]:
-    """Rows and right-hand sides in own units, and these ``(e,)``: equalities hold to rounding only.
-
-    Where no control enters a row, what is missing is compared with what double precision resolves.
-    """
-    added = _added_up(problem, functionals)
-    entered = np.abs(A).max(axis=1, initial=0.0) > IDLE * added
-    units = power_of_two(np.where(entered, 1.0, RESOLVED) * added)
-    A, b = np.where(entered[:, None], A, 0.0) / units[:, None], b / units
-    return A, np.asarray(np.where(entered | (np.abs(b) > TOLERANCE), b, 0.0)), units
 
 
 def _reached(problem: OptimalControlProblem, parameters: ParameterIndex, state: int) -> bool:

@@ -84,9 +84,10 @@ class InitialStates:
     def where(self, point: npt.ArrayLike) -> Literal["inside", "outside", "open"]:
         """Whether a point ``(2,)`` is proven to be in the set, proven not to be, or between the polygons."""
         x = _point(point)
-        if (
-            self.directions @ x > self.bounds + ROUNDING * np.maximum(1.0, np.abs(self.bounds))
-        ).any() or not self.outer.shape[0]:
+        if not self.outer.shape[0]:
+            return "outside"
+        added = np.abs(self.directions) @ np.abs(self.outer).max(axis=0)  # what is added up to a bound
+        if (self.directions @ x > self.bounds + ROUNDING * np.maximum(added, np.abs(self.bounds))).any():
             return "outside"
         return "inside" if self.inner.shape[0] > 2 and bool(inside(self.inner, x[None])[0]) else "open"
 
@@ -189,6 +190,10 @@ def _combination(points: Array, x: Array, costs: Array) -> Array | None:
 
     if not points.shape[0]:
         return None
-    size = float(np.abs(points).max()) or 1.0
-    found = linprog(costs, A_eq=np.vstack([points.T / size, np.ones(points.shape[0])]), b_eq=np.append(x / size, 1.0))
-    return np.asarray(found.x) if found.status == 0 and np.abs(found.x @ points - x).max() <= ON_EDGE * size else None
+    size = np.abs(points).max(axis=0)  # of each coordinate: they have different units
+    size = np.where(size > 0.0, size, 1.0)
+    price = float(np.abs(costs).max(initial=0.0)) or 1.0
+    rows = np.vstack([(points / size).T, np.ones(points.shape[0])])
+    found = linprog(costs / price, A_eq=rows, b_eq=np.append(x / size, 1.0))
+    missed = np.inf if found.status else np.abs((found.x @ points - x) / size).max()
+    return np.asarray(found.x) if missed <= ON_EDGE else None

@@ -25,7 +25,7 @@ COLOURS = "viridis"  # perceptually uniform, and one for eyes that see fewer col
 MARGIN = 0.07  # of the set's extent, around it
 HEIGHT = 5.3
 REACH = 0.35  # of the set's extent: an initial state that is no further away than this is in the picture
-FLAT = 1e-6  # of its greatest extent, the least of a set that is drawn as one with interior
+FLAT = 1e-6  # of the picture, the least extent of a set that is drawn as one with interior
 
 
 def write_initial_states(file: Path, found: InitialStates) -> None:
@@ -46,14 +46,14 @@ def draw_initial_states(found: InitialStates) -> Figure:
     figure = Figure(figsize=(look.WIDTH, HEIGHT), layout="constrained")
     ax = figure.subplots()
     low, high = found.outer.min(axis=0), found.outer.max(axis=0)
-    extent = np.maximum(high - low, 0.05 * (high - low).max() + np.finfo(float).tiny)
+    extent = np.maximum(high - low, 0.05 * np.abs(found.outer).max(axis=0) + np.finfo(float).tiny)
     near = (found.start >= low - REACH * extent).all() and (found.start <= high + REACH * extent).all()
     if near:
         low, high = np.minimum(low, found.start), np.maximum(high, found.start)
     middle, half = (low + high) / 2, np.maximum(high - low, extent) * (0.5 + MARGIN)
     ax.set_xlim(middle[0] - half[0], middle[0] + half[0])
     ax.set_ylim(middle[1] - half[1], middle[1] + half[1])
-    if (found.outer.max(axis=0) - found.outer.min(axis=0)).min() > FLAT * extent.max() and found.inner.shape[0] > 2:
+    if (np.ptp(found.outer, axis=0) > FLAT * extent).all() and found.inner.shape[0] > 2:
         _costs(figure, ax, found)
     elif found.costs.size:
         _bar(

@@ -10,15 +10,17 @@ from typing import Any
 import numpy as np
 
 from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.units import Units
 from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.studies.initial_states import InitialPlane, check_states
-from sparserob_core.control.transcription.transcribe import from_state
+from sparserob_core.control.transcription.own_units import walls
+from sparserob_core.control.transcription.transcribe import from_state, in_own_units
 from sparserob_core.errors import InputError, SparseRobError
 from sparserob_core.experiment.assemble import ControlExperiment, assemble, name_of, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import RunDirectory, create_directory
-from sparserob_core.experiment.initial_states.feasible_set import InitialStates
+from sparserob_core.experiment.initial_states.feasible_set import ON_EDGE, InitialStates
 from sparserob_core.experiment.initial_states.search import InitialStatesSearch
 from sparserob_core.experiment.initial_states.section import section
 from sparserob_core.sip.convex_set import Array
@@ -27,6 +29,7 @@ from sparserob_core.sip.method import GAP_TOLERANCE, OutOfTime
 
 __all__ = ["InitialStates", "initial_states"]
 FAR = 1e4  # times the numbers in the problem: a coordinate that may be as large as this is called unbounded
+THINNEST = 1e-10  # of the first box, and of the walls of the problem: a coordinate without interior
 
 
 def initial_states(
@@ -62,11 +65,13 @@ def initial_states(
     model = experiment.transcription
     if about is not None:
         model = from_state(model, _about(about, model.problem))
-    problem = model.problem
-    pair = check_states(states, problem.system.states)
-    size = _far(problem) if limit is None else limit
-    plane = InitialPlane(model, pair, np.zeros(2), np.full(2, size))
-    search = InitialStatesSearch(plane, tools_of(loaded), _tolerance(loaded), notify, limit)
+    pair = check_states(states, model.problem.system.states)
+    own, units = in_own_units(model)  # what is looked at and what is told are in other units (docs/decisions/0016)
+    x = units.states[list(pair)]
+    size = np.full(2, _far(own.problem)) if limit is None else limit / x
+    least = THINNEST * size * np.minimum(1.0, walls(own.problem)[list(pair)])
+    plane = InitialPlane(own, pair, np.zeros(2), size)
+    search = InitialStatesSearch(plane, tools_of(loaded), _tolerance(loaded), notify, least, x, limit is not None)
 
     def find() -> InitialStates:
         try:
@@ -74,7 +79,7 @@ def initial_states(
         except OutOfTime as error:
             bounded = "time until the set is known to be bounded"
             raise InputError(path="limits.seconds", expected=bounded, got=str(error)) from error
-        return replace(found, path=_path(problem, found))
+        return _in_users_units(replace(found, path=_path(own.problem, found)), units, limit)
 
     if out is None:
         return find()
@@ -82,6 +87,29 @@ def initial_states(
         heading = "The experiment whose feasible initial states were sought."
         directory.write_text("config.yaml", write_yaml(loaded.config.plain(), heading))
         return _written(directory, find())
+
+
+def _in_users_units(own: InitialStates, units: Units, limit: float | None) -> InitialStates:
+    """What was found in the problem's own units, in the user's; ``limit``: the bound that was asked for."""
+    x = units.states[list(own.states)]
+    normals, outer = own.directions / x, own.outer * x
+    norms = np.linalg.norm(normals, axis=1)
+    return replace(
+        own,
+        inner=own.inner * x,
+        outer=outer,
+        controls=own.controls * units.controls[:, None] if own.controls.size else own.controls,
+        directions=normals / norms[:, None],
+        bounds=own.bounds / norms,
+        reached=own.reached / norms,
+        points=own.points * x,
+        costs=own.costs * units.cost,
+        lower_bounds=own.lower_bounds * units.cost,
+        origin=own.origin * units.states,
+        path=tuple(polygon * x for polygon in own.path),
+        limit=limit,
+        cut=limit is not None and bool((np.abs(outer) >= limit * (1.0 - ON_EDGE)).any()),
+    )
 
 
 def _limit(within: object) -> float | None:

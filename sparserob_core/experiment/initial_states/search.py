@@ -34,7 +34,6 @@ from sparserob_core.sip.result import Result
 ROOM = 1.1  # the box of coordinates, relative to what is proven to contain the set: its sides must not matter
 FRAMES = 4  # boxes at most, each fitted to the set by the last one
 SLIVER = 1e-9  # of the box in area: a set without interior
-THINNEST = 1e-10  # of the first box, the last: the set may have no interior
 CLOSED = 1e-3  # of the area: a difference of the polygons that is called none
 ASIDE = 1e-3  # how far costs are measured within the vertices, where no control has any room
 PROVEN = ("certified", "verified")
@@ -43,13 +42,18 @@ PROVEN = ("certified", "verified")
 @final
 @dataclass(eq=False)
 class InitialStatesSearch:
-    """One search: the plane, the cuts that each direction needed, and the controls of the points found."""
+    """One search: the plane, the cuts that each direction needed, and the controls of the points found.
+
+    ``least (2,)``: radii of the plane below which a coordinate has no interior; ``units (2,)``: what one of each
+    coordinate is in the user's units, for messages only."""
 
     plane: InitialPlane
     tools: Tools
     tolerance: float
     notify: Notify
-    within: float | None
+    least: Array
+    units: Array
+    bounded: bool
     cuts: dict[tuple[float, ...], Sequence[Cut]] = field(default_factory=dict)
     controls: dict[bytes, Array] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
@@ -62,14 +66,12 @@ class InitialStatesSearch:
     def states(self, title: str, directions: int, values: int) -> InitialStates:
         self.directions = directions
         origin = np.asarray(self.plane.model.problem.initial_state, dtype=float)
-        bare = InitialStates(
-            title=title, states=self.plane.states, status="undecided", message="", origin=origin, limit=self.within
-        )
-        limit, framed = float(self.plane.radius[0]), self._framed()
+        bare = InitialStates(title=title, states=self.plane.states, status="undecided", message="", origin=origin)
+        limit, framed = self._size(self.plane.radius), self._framed()
         if isinstance(framed, Result):
             # amounts would be relative to rows that hold the initial state in units of the box: of no use
             why = framed.message if framed.infeasible is None else framed.infeasible.sentence(amounts=False)
-            message = f"no initial state of this plane, up to {limit:.4g} in size, is feasible: {why}"
+            message = f"no initial state of this plane, up to {limit} in size, is feasible: {why}"
             return self._finished(bare, status="infeasible", message=message)
         try:
             self._tell("direction", len(framed), directions)
@@ -100,7 +102,7 @@ class InitialStatesSearch:
         )
 
     def _polygons(self, bare: InitialStates, supports: Sequence[Support], inner: Array) -> InitialStates:
-        """The polygons and half-planes in the units of the states."""
+        """The polygons and half-planes in the units of the model's states."""
         plane, scaled = self.plane, np.array([s.direction for s in supports]) / self.plane.radius
         norms = np.linalg.norm(scaled, axis=1)
         normals, vertices, outer = scaled / norms[:, None], plane.point(inner), plane.point(outer_polygon(supports))
@@ -112,7 +114,6 @@ class InitialStatesSearch:
             directions=normals,
             bounds=np.array([s.bound for s in supports]) / norms + normals @ plane.centre,
             reached=(normals @ vertices.T).max(axis=1, initial=-np.inf),
-            cut=self.within is not None and bool((np.abs(outer) >= self.within * (1.0 - SLIVER)).any()),
         )
 
     def _finished(self, found: InitialStates, **changes: Any) -> InitialStates:
@@ -126,6 +127,11 @@ class InitialStatesSearch:
             **changes,
         )
 
+    def _size(self, radius: Array) -> str:
+        """The size of a box about 0 in the user's units."""
+        first, second = (f"{size:.4g}" for size in radius * self.units)
+        return first if first == second else f"{first} and {second}"
+
     def _tell(self, what: str, done: int, total: int) -> None:
         self.notify(StudyProgress(text=f"{what} {done} of {total}", done=done, total=total))
 
@@ -136,8 +142,7 @@ class InitialStatesSearch:
     def _framed(self) -> list[Support] | Result:
         """Fit the box of coordinates to the set; returns the supports along the axes, or the result that proves the set
         empty."""
-        limit = self.plane.radius
-        least = THINNEST * limit
+        limit, least = self.plane.radius, self.least
         for number in range(FRAMES):
             supports = []
             for axis in AXES:
@@ -148,7 +153,7 @@ class InitialStatesSearch:
                     raise SolverError(f"the initial states could not be bounded: {result.message}")
                 supports.append(self._support(axis, result))
             high, low = np.array([s.bound for s in supports[:2]]), -np.array([s.bound for s in supports[2:]])
-            if not number and self.within is None:
+            if not number and not self.bounded:
                 self._require_bounded(np.concatenate([high, -low]))
             lower, upper = self.plane.point(low), self.plane.point(high)
             fits = (high - low > 1.0) | (self.plane.radius <= least)
@@ -162,10 +167,10 @@ class InitialStatesSearch:
         free = np.flatnonzero(bounds > 0.999)
         if free.size:
             names = [f"x{self.plane.states[k % 2] + 1}(0) {'above' if k < 2 else 'below'}" for k in free]
+            limit = self._size(self.plane.radius)
             raise InputError(
-                f"within: the set of feasible initial states has no bound on {', '.join(names)} up to"
-                f" {self.plane.radius[0]:.4g}; expected path or terminal sets that bound it, or a size of the plane to"
-                " look at, such as 10"
+                f"within: the set of feasible initial states has no bound on {', '.join(names)} up to {limit}; expected"
+                " path or terminal sets that bound it, or a size of the plane to look at, such as 10"
             )
 
     def _ask(self, direction: Array) -> Support:

@@ -35,11 +35,18 @@ class Critical:
 
 
 def critical_factor(
-    programs: ParametricProgram, scaling: Scaling, tools: Tools, width: float, notify: Notify
+    programs: ParametricProgram,
+    joined: ParametricProgram | None,
+    scaling: Scaling,
+    tools: Tools,
+    width: float,
+    notify: Notify,
 ) -> Critical:
-    """Find the critical factor to about ``width``, which is what ordinary runs then have to prove."""
-    if scaling.affine:
-        found = _by_one_program(programs, scaling, tools, width)
+    """Find the critical factor to about ``width``, which is what ordinary runs then have to prove.
+
+    ``joined``: the programs in units that do not depend on the factor, where that enters linearly."""
+    if joined is not None:
+        found = _by_one_program(joined, scaling, tools, width)
         if found.status != "unknown" or not scaling.nested:
             return found
     return _by_slack(programs, scaling, tools, width, notify)
@@ -91,6 +98,7 @@ def _slack(programs: ParametricProgram, factor: float, tools: Tools) -> float:
     not defined."""
     try:
         program = programs.program(factor)
+        program = program if program.own_units is None else program.own_units.program
         bounds = _room(program)
         result = Exchange(tolerance=1e-9).close(
             slack_program(program, *bounds), replace(tools, regulariser=None), lambda x: ()

@@ -88,7 +88,7 @@ def _between(lower: float, upper: float) -> str:
 
 
 def _search(loaded: Loaded, of: str, tolerance: float, notify: Notify) -> MarginSearch:
-    from sparserob_core.control.transcription.transcribe import transcribe
+    from sparserob_core.control.transcription.transcribe import in_own_units, like, prepare, transcribe
 
     experiment = assemble(loaded)
     if not isinstance(experiment, ControlExperiment):
@@ -98,8 +98,12 @@ def _search(loaded: Loaded, of: str, tolerance: float, notify: Notify) -> Margin
     problem, control, disturbance = experiment.problem, experiment.control, experiment.disturbance
     chosen = scaling(problem, of, *_positions(loaded, problem))
     programs = ParametricProgram(lambda factor: transcribe(chosen.at(factor), control=control, disturbance=disturbance))
+    joined: ParametricProgram | None = None
+    if chosen.affine:  # programs at several factors become one: in the units of the factor 1
+        own, units = in_own_units(prepare(chosen.at(1.0), control, disturbance))
+        joined = ParametricProgram(lambda factor: like(own, units.of_problem(chosen.at(factor))))
     width = tolerance * (1.0 if chosen.relative else chosen.highest)
-    return MarginSearch(experiment.title, programs, chosen, _method(loaded), tools_of(loaded), width, notify)
+    return MarginSearch(experiment.title, programs, joined, chosen, _method(loaded), tools_of(loaded), width, notify)
 
 
 def _positions(loaded: Loaded, problem: OptimalControlProblem) -> tuple[list[list[int]], list[list[int]]]:

@@ -84,10 +84,13 @@ class Margin:
 @final
 @dataclass(eq=False)
 class MarginSearch:
-    """One search. ``width``: how close the two sides are to be, relative to the factor if that is above 1."""
+    """One search. ``programs``: those of ordinary runs, by their factor; ``joined``: the same in units that do not
+    depend on it, where the factor enters linearly. ``width``: how close the two sides are to be, relative to the factor
+    if that is above 1."""
 
     title: str
     programs: ParametricProgram
+    joined: ParametricProgram | None
     scaling: Scaling
     method: Exchange
     tools: Tools
@@ -101,7 +104,7 @@ class MarginSearch:
         sides: Sides | None = None
         try:
             self._tell(f"looking for the {self.scaling.sense} factor of {self.scaling.of}")
-            found = critical_factor(self.programs, self.scaling, self.tools, self.width, self.notify)
+            found = critical_factor(self.programs, self.joined, self.scaling, self.tools, self.width, self.notify)
             sides = self._sides(found)
             feasible = sides[2]
             curve = self._curve(feasible, sides[0], count) if feasible is not None else ()

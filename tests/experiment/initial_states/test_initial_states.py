@@ -158,7 +158,7 @@ def test_the_envelope_of_convex_costs_interpolates_them_and_of_others_lies_below
 
 def test_an_unbounded_set_names_what_is_unbounded_and_a_limit_says_that_it_cuts() -> None:
     free = {"problem.path": [], "problem.terminal": [{"box": [0.5, None]}]}
-    with pytest.raises(sr.InputError, match=r"within: .*no bound on x1\(0\) above, x1\(0\) below"):
+    with pytest.raises(sr.InputError, match=r"within: .*no bound on .*x1\(0\) above.*x1\(0\) below"):
         sr.initial_states(CART, free, directions=4, values=0)
     found = sr.initial_states(CART, free, directions=12, values=0, within=3.0)
     assert found.cut and found.limit == 3.0
