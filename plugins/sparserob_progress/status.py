@@ -19,6 +19,7 @@ class Status:
         self.round: sr.RoundFinished | None = None
         self.searched: sr.EvaluationsFinished | None = None
         self.proving: sr.ProofProgress | None = None
+        self.study: sr.StudyProgress | None = None
         self.lower, self.upper, self.gap = -math.inf, math.inf, math.inf
 
     @property
@@ -39,6 +40,8 @@ class Status:
                 self.lower = max(self.lower, event.lower_bound)
             case sr.ProofProgress():
                 self.searched, self.proving = None, event
+            case sr.StudyProgress():
+                self.searched, self.proving, self.study = None, None, event
 
     def parts(self) -> list[tuple[str, str]]:
         """What is known, as labels and texts of less than 70 characters."""
@@ -52,6 +55,8 @@ class Status:
         if self.proving is not None:
             parts.append(("proof", _proof(self.proving)))
             parts += [("stuck", self.proving.hindrance)] if self.proving.hindrance else []
+        if self.study is not None:
+            parts.append(("now", self.study.text))
         return parts
 
     def last(self, event: sr.Event) -> str:

@@ -3,7 +3,7 @@ them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,6 @@ from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment
-from sparserob_core.experiment.directory.adversary import adversaries
-from sparserob_core.experiment.directory.finished import read_finished
 from sparserob_core.experiment.directory.sparsity import sparsity
 from sparserob_core.experiment.figures.figure_data import FigureData, Wall
 from sparserob_core.experiment.terminal.printing import printable
@@ -57,23 +55,6 @@ def figure_data(
     if not isinstance(experiment, ControlExperiment):
         raise InputError("figures: they are for control problems; this is a semi-infinite program of another kind")
     return _data(experiment, theta, active_times, history, cost)
-
-
-def draw_run(directory: Path, plugins: Iterable[str | Path] = ()) -> list[Path]:
-    """Draw the figures of a run directory again; raises `InputError` when it is none, or holds no control.
-
-    ``plugins``: files that offer what the run was made with; the directory itself is data, and no plugin that it names
-    is loaded."""
-    finished = read_finished(directory, plugins)
-    return draw_experiment(
-        finished.experiment,
-        finished.theta,
-        active_times(finished.solution),
-        finished.stored.history,
-        directory,
-        finished.summary["cost"],
-        adversaries(finished.experiment, finished.theta),
-    )
 
 
 def active_times(solution: Mapping[str, Array]) -> Array:

@@ -56,8 +56,9 @@ class Inspection:
     """Questions about an experiment. Every answer comes from a program that was built anew, so that asking cannot
     change what the method does; nothing is built before the first question."""
 
-    def __init__(self, loaded: Loaded) -> None:
-        self._loaded = loaded
+    def __init__(self, loaded: Loaded, experiment: Experiment | None = None) -> None:
+        """``experiment``: what the config describes, where it is built already and no method is at work on it."""
+        self._loaded, self._built = loaded, experiment
 
     @staticmethod
     def read(directory: Path) -> Inspection:
@@ -183,7 +184,7 @@ class Inspection:
 
     @cached_property
     def _experiment(self) -> Experiment:
-        return assemble(self._loaded)
+        return self._built or assemble(self._loaded)
 
 
 def _repeated(kind: CoordinateKind, count: int) -> list[CoordinateKind]:

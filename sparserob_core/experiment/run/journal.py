@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, final
 
 import numpy as np
@@ -18,8 +17,10 @@ from sparserob_core.experiment.directory.artefacts import RunDirectory, trace_co
 from sparserob_core.experiment.directory.certificate import certificate
 from sparserob_core.experiment.directory.record import arrays_of, control_of, summary_of, versions
 from sparserob_core.experiment.directory.rounds import round_arrays
+from sparserob_core.experiment.run.drawing import drawn
 from sparserob_core.experiment.run.events import Event, Observer, RoundFinished
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.result import Result
 
 
@@ -88,10 +89,11 @@ class Journal(Observer):
         return replace(result, lower_bound=last.lower_bound, epsilon=last.epsilon, counts=counts)
 
     def finish(
-        self, result: Result, figures: bool, certify: bool = True
+        self, result: Result, figures: bool, certify: bool = True, notify: Notify = ignore
     ) -> tuple[Array | None, dict[str, Any], Sequence[str]]:
         """Write the outcome, with a certificate where the multipliers of its lower bound are known (``certify``);
-        returns the control ``(m, K)``, what ``result.json`` holds, and what could not be drawn."""
+        returns the control ``(m, K)``, what ``result.json`` holds, and what could not be drawn. ``notify`` receives
+        `StudyProgress` where a figure takes longer."""
         experiment, write = self.experiment, self.directory
         control, summary = self.record(result)
         write.write_arrays("solution.npz", arrays_of(result, experiment.program, self._dictionary, control))
@@ -114,28 +116,4 @@ class Journal(Observer):
         worst = adversaries(experiment, np.asarray(result.decision)) if control is not None else {}
         if worst:
             write.write_arrays(ADVERSARY, worst)
-        return control, summary, _drawn(experiment, result, worst, write.path) if figures else ()
-
-
-def _drawn(experiment: Experiment, result: Result, worst: Mapping[str, Array], directory: Path) -> Sequence[str]:
-    """The figures are an extra: whatever goes wrong with them is a remark, and the run is as good as before."""
-    from sparserob_core.experiment.figures.clash import draw_clash
-    from sparserob_core.experiment.figures.drawing import draw_experiment
-
-    if not isinstance(experiment, ControlExperiment) or result.status == "failed":
-        return ()
-    if result.decision is None and result.status != "infeasible":
-        return ()
-    try:
-        if result.status == "infeasible":
-            draw_clash(experiment, result, directory)
-        else:
-            active = np.array([cut.index[0] for cut in result.indices if cut.multiplier > 0])
-            draw_experiment(
-                experiment, np.asarray(result.decision), active, result.history, directory, result.cost, worst
-            )
-    except SparseRobError as error:
-        return (str(error),)
-    except Exception as error:  # noqa: BLE001  as said above
-        return (f"the figures could not be drawn: {type(error).__name__}: {error}",)
-    return ()
+        return control, summary, drawn(experiment, result, write.path, worst, notify) if figures else ()

@@ -152,7 +152,7 @@ def run_loaded(
             if isinstance(experiment, ControlExperiment):
                 result = rounded_down(experiment.transcription, result, experiment.gap_tolerance)
             ending = RunFinished(status=result.status, message=result.message, seconds=result.seconds, result=result)
-            control, summary, remarks = journal.finish(result, figures=figures and complete, certify=complete)
+            control, summary, remarks = journal.finish(result, figures and complete, certify=complete, notify=broadcast)
             return Outcome(result, directory.path, experiment, control, summary, remarks, deadline.pressed)
         except BaseException as error:
             error.add_note(f"what was done until then is in {directory.path}")

@@ -25,7 +25,7 @@ from sparserob_core.sip.method import GAP_TOLERANCE, Deadline, Method, Tools
 from sparserob_core.sip.methods.ledger import Answer, Ledger
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.proof.branch_and_bound import prove
-from sparserob_core.sip.proof.verdict import worst_of
+from sparserob_core.sip.proof.verdict import as_bad_as_found, worst_of
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram
 from sparserob_core.sip.relaxed.tuples import TupleValue, imposed_program
 from sparserob_core.sip.result import Result, SearchTrace
@@ -131,8 +131,8 @@ class SparseRob(Method, Options):
                 if plain.status == "optimal":
                     ledger.improve(ledger.relaxed.lower_bound(answer.rows, plain))
                 proofs = prove(program, x, tools.notify, deadline=tools.deadline)
-                worst = worst_of(separate(program, x, tools))
-                return ledger.judged(answer, worst, proofs, tools.deadline.reason)
+                found = separate(program, x, tools)
+                return ledger.judged(answer, worst_of(found), as_bad_as_found(proofs, found), tools.deadline.reason)
 
             # Regu: the next weight.
             j += 1

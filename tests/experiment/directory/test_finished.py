@@ -15,7 +15,8 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.experiment.directory.finished import StoredRun, read_arrays, read_finished
-from sparserob_core.experiment.figures.drawing import active_times, draw_run
+from sparserob_core.experiment.figures.drawing import active_times
+from sparserob_core.experiment.run.drawing import draw_run
 from sparserob_core.experiment.run.inspection import Inspection
 from sparserob_core.experiment.run.replay import events, replay, stored_result
 from tests.support.stub import Command

@@ -78,7 +78,7 @@ def test_an_infeasible_run_has_no_control_and_says_why(config: Path, tmp_path: P
 
 def test_figures_are_drawn_and_can_be_drawn_again(config: Path, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    from sparserob_core.experiment.figures.drawing import draw_run
+    from sparserob_core.experiment.run.drawing import draw_run
 
     changes = {"problem.disturbance.box": [0.0, 0.1], "problem.path": [{"box": [2.0, None], "from": 0.5}]}
     outcome = sr.run(config, changes, out=tmp_path / "out")

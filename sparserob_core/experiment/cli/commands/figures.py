@@ -17,9 +17,15 @@ import click
     help="A plugin file that RUN was made with. RUN is data: no plugin that it names is loaded. Repeatable.",
 )
 def figures(directory: Path, plugins: tuple[Path, ...]) -> int:
-    """Draw the figures of a finished run again, into RUN/figures."""
-    from sparserob_core.experiment.figures.drawing import draw_run
+    """Draw the figures of a finished run again, into RUN/figures.
 
-    for file in draw_run(directory, plugins):
+    Of a run that searches the landscape of g is evaluated once more, which takes about four seconds.
+    """
+    from sparserob_core.experiment.cli.shell.live_line import LiveLine
+    from sparserob_core.experiment.run.drawing import draw_run
+
+    with LiveLine() as line:
+        files = draw_run(directory, plugins, line.receive)
+    for file in files:
         click.echo(str(file))
     return 0
