@@ -209,7 +209,12 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any], dict[str, Any] | None]] =
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+LARGE = {"a round set at the end", "parameters in an ellipsoid", "a polytope of controls"}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name in LARGE else ()) for name in CASES]
+)
 def test_every_limit_of_a_problem_is_verified(name: str, tmp_path: Path) -> None:
     problem, control, disturbance = CASES[name]
     summary = verified(tmp_path / "run", problem, control, disturbance)

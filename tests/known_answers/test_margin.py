@@ -62,6 +62,7 @@ def test_experiment_1_starts_its_window_no_earlier_than_the_state_can_be_there(t
         )
 
 
+@pytest.mark.slow
 def test_an_oscillator_needs_the_control_that_its_interior_worst_parameter_asks_for():
     """x'' + omega^2 x = u, omega in [0.9, 1.1], x0 = (1, 0), |x1(2 pi)| <= f 0.8: the smallest set against the runs on
     both sides."""

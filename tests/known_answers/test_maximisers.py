@@ -160,7 +160,9 @@ EXPECTED = {
 }
 
 
-@pytest.mark.parametrize("name", EXPECTED)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name == "deb5" else ()) for name in EXPECTED]
+)
 def test_random_search_needs_as_many_evaluations_as_is_expected_exactly(name):
     goals = targets(name)
     chances = np.array([probability(name, goal) for goal in goals])
@@ -177,7 +179,10 @@ def test_random_search_needs_as_many_evaluations_as_is_expected_exactly(name):
 DLIB_RANDOM = {("holder2", 0.1): (3043, 2901), ("sphere4", 0.1): (1929, 2034), ("deb5", 0.1): (3933, 3869)}
 
 
-@pytest.mark.parametrize(("name", "accuracy"), DLIB_RANDOM)
+@pytest.mark.parametrize(
+    ("name", "accuracy"),
+    [pytest.param(*key, marks=() if key[0] == "sphere4" else pytest.mark.slow) for key in DLIB_RANDOM],
+)
 def test_random_search_needs_as_many_evaluations_as_dlib_s(name, accuracy):
     goal = LANDSCAPES[name].maximum - accuracy
     mean, deviation = DLIB_RANDOM[name, accuracy]
@@ -200,7 +205,9 @@ PUBLISHED = {
 }
 
 
-@pytest.mark.parametrize("name", ["holder2", "sphere4", pytest.param("deb5", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["sphere4", *(pytest.param(name, marks=pytest.mark.slow) for name in ("holder2", "deb5"))]
+)
 def test_adalipo_needs_as_many_evaluations_as_published(name):
     found = counts("adalipo", name, targets(name), 100)
     for column, published in zip(found.T, PUBLISHED[name], strict=True):
