@@ -67,6 +67,10 @@ STUDY = {
         " `object.entry`; numbers can be read back exactly, what is not known is empty; `seconds` is the last column"
     ),
     "columns.csv": "the unit and the meaning of every column of `table.csv`",
+    "sweep.pdf, sweep.png": (
+        "curves of cost and lower bound along one numeric axis, a map of the cost over two, otherwise costs and seconds"
+        " side by side; every status has its mark, seeds are a median with quartiles"
+    ),
 }
 
 

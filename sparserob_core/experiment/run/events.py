@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
@@ -76,12 +76,14 @@ class StudyProgress(Event):
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SweepProgress(StudyProgress):
     """A sweep goes on: ``done`` of ``total`` points, of them ``failed`` without an answer; ``running`` now; about
-    ``left`` seconds to go (``None``: not known yet). ``row``: the row of the table that has just come, if any."""
+    ``left`` seconds to go (``None``: not known yet). ``row``: the row of the table that has just come, if any;
+    ``axes``: its keys that are axes."""
 
     running: int = 0
     failed: int = 0
     left: float | None = None
     row: Mapping[str, Any] | None = None
+    axes: Sequence[str] = ()
 
 
 class Observer(ABC):

@@ -16,10 +16,11 @@ from sparserob_core.experiment.directory.finished import stored_run
 from sparserob_core.experiment.run.replay import stored_result
 from sparserob_core.experiment.run.run import Outcome
 from sparserob_core.experiment.sweep.axes import Axis
-from sparserob_core.experiment.sweep.plan import FILE, read_plan
+from sparserob_core.experiment.sweep.plan import FILE, Arrangement, read_plan
 from sparserob_core.experiment.sweep.table import Row, read_table
 
 RUNS = "runs"
+COLUMNS = ("status", "cost", "relative gap", "active", "seconds")  # beside the axes, on a terminal
 LINES = 50  # rows of a table that a terminal shows
 NAMED = 5  # failures that are told one by one
 
@@ -31,8 +32,8 @@ class Study:
     that has an answer or an error: the keys of the axes, then what ``result.json`` says, ``None`` where nothing is
     known. ``pandas.DataFrame(study.table)`` makes a data frame.
 
-    ``points`` is the number of all points; ``stopped`` says why some have no row; ``remarks`` say what could not be
-    done beside them.
+    ``points`` is the number of all points, ``arrangement`` how they were chosen; ``stopped`` says why some have no
+    row; ``remarks`` say what could not be done beside them.
     """
 
     directory: Path
@@ -40,6 +41,7 @@ class Study:
     axes: Sequence[Axis] = field(repr=False)
     table: list[Row] = field(repr=False)
     points: int
+    arrangement: Arrangement = "grid"
     stopped: str = ""
     remarks: Sequence[str] = ()
 
@@ -76,11 +78,10 @@ def shown(study: Study) -> tuple[list[str], list[list[str]]]:
     if len(study.table) > LINES:
         return _by_status(study.table)
     keys = [axis.key for axis in study.axes]
-    columns = [*keys, "status", "cost", "relative gap", "active", "seconds"]
-    return columns, [[*(value_text(row[key]) for key in keys), *short(row)] for row in study.table]
+    return [*keys, *COLUMNS], [[*(value_text(row[key]) for key in keys), *short(row)] for row in study.table]
 
 
-def short(row: Row) -> list[str]:
+def short(row: Mapping[str, Any]) -> list[str]:
     """What a reader wants to know of a point: status, cost, gap, share of time active, seconds."""
     return [
         str(row["status"]),
@@ -169,4 +170,4 @@ def read_study(directory: str | Path) -> Study:
     for axis in plan.axes:
         if table and axis.key not in table[0]:
             raise InputError(f"{path / 'table.csv'}: expected a column for the axis {axis.key}, got none")
-    return Study(path, str(plan.base.data.get("title") or plan.name), plan.axes, table, len(plan.values()))
+    return Study(path, str(plan.base.data.get("title") or plan.name), plan.axes, table, len(plan.values()), plan.points)

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Future
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, final
@@ -78,7 +79,7 @@ def sweep(
     with create_directory(out, f"{plan.name}-sweep", checked[0].hash[:8], again=FILE) as made:
         _require_same_base(made.path, plan)
         made.write_text(FILE, plan.written())
-        return _Walk(plan, checked, made, figures, notify).run(factory)
+        return _drawn(_Walk(plan, checked, made, figures, notify).run(factory))
 
 
 def _number(points: Arrangement | None, number: int | None) -> int | None:
@@ -129,7 +130,7 @@ class _Walk:
         self.due = self.began
 
     def run(self, factory: ExecutorFactory) -> Study:
-        """Everything that is not finished; then the table and the figure."""
+        """Everything that is not finished; then the table."""
         self._clear()
         waiting = self._left()
         self.pending = set(waiting)
@@ -144,11 +145,15 @@ class _Walk:
         finally:
             self._clear()
             self._write()
-        rows = self._rows()
-        study = Study(
-            self.made.path, str(self.plan.base.data["title"]), self.plan.axes, rows, len(self.points), stopped
+        return Study(
+            directory=self.made.path,
+            title=str(self.plan.base.data["title"]),
+            axes=self.plan.axes,
+            table=self._rows(),
+            points=len(self.points),
+            arrangement=self.plan.points,
+            stopped=stopped,
         )
-        return study if stopped else _drawn(study)
 
     def _left(self) -> list[str]:
         """The hashes of the points that are to be run; of the others the answers are read."""
@@ -278,6 +283,7 @@ class _Walk:
                 failed=self.failed,
                 left=left,
                 row=self._row(self.by_hash[digest]) if digest else None,
+                axes=[axis.key for axis in self.plan.axes],
             )
         )
 
@@ -335,4 +341,13 @@ def _duration(seconds: float) -> str:
 
 def _drawn(study: Study) -> Study:
     """The figure is an extra: where it cannot be drawn, a remark says so."""
+    from sparserob_core.experiment.sweep.figure import write_study_figure
+
+    try:
+        if study.table and not study.stopped:
+            write_study_figure(study)
+    except SparseRobError as error:
+        return replace(study, remarks=(*study.remarks, str(error)))
+    except Exception as error:  # noqa: BLE001  as said above
+        return replace(study, remarks=(*study.remarks, f"the figure could not be drawn: {named(error)}"))
     return study

@@ -9,6 +9,7 @@ import json
 import multiprocessing
 import shutil
 import signal
+import sys
 import time
 from collections import Counter
 from concurrent.futures import Executor, ProcessPoolExecutor
@@ -28,6 +29,7 @@ from tests.support.stub import CONFIG, Command
 COUNTING = '''
 import os
 import signal
+import sys
 import time
 from pathlib import Path
 
@@ -479,6 +481,35 @@ def test_the_command_prints_a_table_and_where_everything_is(counting: Path, comm
     assert "3 of 3 points: 2 certified, 1 failed" in lines
     assert any(line.startswith("failed: method.number=2: ") for line in lines)
     assert lines[-1] == "written to out"
+
+
+def test_on_a_terminal_the_last_rows_are_shown_and_disappear(monkeypatch: pytest.MonkeyPatch) -> None:
+    from sparserob_core.experiment.cli.shell import live_table
+
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    written = Terminal()
+    monkeypatch.setattr(sys, "stderr", written)
+    monkeypatch.setattr(live_table, "RENEWED", 0.0)
+    monkeypatch.setenv("TERM", "xterm")
+    with live_table.LiveTable() as live:
+        for number in range(30):
+            row = {"seed": number, "status": "certified", "cost": 0.5 + number}
+            text = f"{number + 1} of 30 points done \x1b[31m"
+            live.receive(sr.SweepProgress(text=text, done=number + 1, total=30, row=row, axes=["seed"]))
+        shown = written.getvalue().rpartition("relative gap")[2]
+    assert [line.split()[:3] for line in shown.splitlines() if "certified" in line] == [
+        [str(number), "certified", str(0.5 + number)] for number in range(18, 30)
+    ]
+    assert "30 of 30 points done \\x1b[31m" in shown
+    assert written.getvalue().endswith("\x1b[2K")  # the last of the lines is erased
+
+
+def test_a_quiet_sweep_prints_nothing(counting: Path, command: Command) -> None:
+    done = command("sweep", counting, "method.number=1,2", "--out", "out", "--quiet")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 def test_json_is_the_study_and_nothing_else(counting: Path, command: Command) -> None:

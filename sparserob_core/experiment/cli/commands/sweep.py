@@ -54,11 +54,12 @@ def sweep(
     Exit status: 0 every point has an answer, whatever it is; 2 the input is at fault, 5 a point failed, 130
     interrupted.
     """
-    from sparserob_core.experiment.cli.shell.live_line import LiveLine
+    from sparserob_core.experiment.cli.shell.live_table import LiveTable
     from sparserob_core.experiment.config.reader import read_value
     from sparserob_core.experiment.sweep.study import remarks_of, shown
     from sparserob_core.experiment.sweep.sweep import sweep as run_study
     from sparserob_core.experiment.terminal.table import print_table
+    from sparserob_core.sip.events import ignore
 
     if resume is not None and config is not None and "=" in str(config):
         config, axes = None, (str(config), *axes)
@@ -72,7 +73,7 @@ def sweep(
         raise InputError(
             "expected one of --zip, --random and --sobol, got " + " and ".join(f"--{one}" for one in chosen)
         )
-    with LiveLine() as line:
+    with LiveTable() as live:
         study = run_study(
             config if config is not None else resume,  # type: ignore[arg-type]
             axes,
@@ -81,7 +82,7 @@ def sweep(
             executor=None if executor is None else read_value(executor),  # type: ignore[arg-type]
             out=out,
             figures=figures,
-            notify=line.receive,
+            notify=ignore if quiet else live.receive,
         )
     if as_json:
         print_json({**study.summary(), "table": study.table})

@@ -1,0 +1,317 @@
+"""The figure of a study: curves along one numeric axis, a map over two, otherwise costs and seconds side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from textwrap import shorten
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.config.plain import value_text
+from sparserob_core.experiment.figures import style as look
+from sparserob_core.experiment.sweep.axes import Axis
+from sparserob_core.experiment.sweep.study import Study
+from sparserob_core.experiment.sweep.table import Row
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+NAME = "sweep"
+COLOURS = (look.BLUE, look.VERMILLION, look.GREEN, look.PURPLE, look.ORANGE, look.SKY, look.GREY)
+DASHES: tuple[Any, ...] = ("solid", (0, (4, 1.5)), (0, (1, 1)))
+MARKS: Mapping[str, str] = {
+    "certified": "o",
+    "verified": "s",
+    "undecided": "D",
+    "refuted": "v",
+    "infeasible": "x",
+    "failed": "X",
+}
+"""How a status is marked."""
+FILLED = "osDvX"
+LETTERS = 44  # of a label
+CELLS = 5  # values of each axis from which on a map says more than curves
+SEVERAL = 5  # seeds from which on a box says more than the points
+
+
+def write_study_figure(study: Study) -> list[Path]:
+    """Draw a study into ``sweep.pdf`` and ``sweep.png`` of its directory; raises `InputError` when there is nothing to
+    draw, or matplotlib is missing."""
+    look.require_matplotlib()
+    with look.style():
+        return look.write_figure(study.directory / NAME, draw_study(study))
+
+
+def draw_study(study: Study) -> Figure:
+    """The figure; seeds are no axis of it but samples, of which the median and the quartiles are shown."""
+    if not any(row.get("cost") is not None for row in study.table):
+        raise InputError("no figure of the study: no point has a cost")
+    numeric = [axis for axis in study.axes if axis.numeric and not _is_seed(axis)]
+    others = [axis for axis in study.axes if not axis.numeric]
+    if study.arrangement == "zip":  # one line through the values, told by its first axis
+        numeric, others = numeric[:1], others[:1] if not numeric else []
+    drawn = study.arrangement in ("random", "sobol")
+    if len(numeric) == 2 and not others and (drawn or min(_size(study, axis) for axis in numeric) >= CELLS):
+        return _map(study, numeric)
+    if numeric:
+        numeric.sort(key=lambda axis: -_size(study, axis))
+        return _curves(study, numeric[0], [*numeric[1:], *others])
+    return _categories(study, others)
+
+
+@final
+@dataclass(frozen=True)
+class _Spread:
+    """Numbers of rows that differ in the seed only: the median and the quartiles, nan where there are none."""
+
+    middle: float
+    low: float
+    high: float
+
+
+def _spread(values: Sequence[float | None]) -> _Spread:
+    known = [value for value in values if value is not None]
+    if not known:
+        return _Spread(np.nan, np.nan, np.nan)
+    low, middle, high = (float(one) for one in np.quantile(known, (0.25, 0.5, 0.75)))
+    return _Spread(middle, low, high)
+
+
+def _grouped(rows: Sequence[Row], axes: Sequence[Axis]) -> dict[str, list[Row]]:
+    """Rows by the values of axes, in words."""
+    found: dict[str, list[Row]] = {}
+    for row in rows:
+        plain = len(axes) == 1 and not axes[0].numeric
+        said = ", ".join(value_text(row[one.key]) if plain else _named(one, row[one.key]) for one in axes)
+        found.setdefault(shorten(said, LETTERS, placeholder="...") if axes else "", []).append(row)
+    return found
+
+
+def _named(axis: Axis, value: object) -> str:
+    steps = [str(step) for step in axis.path if step != "name"]
+    return f"{steps[-1] if steps else axis.key} {value_text(value)}"
+
+
+def _curves(study: Study, along: Axis, others: Sequence[Axis]) -> Figure:
+    """The cost and the lower bound along an axis, one pair of lines for each combination of the others."""
+    groups = _grouped(study.table, others)
+    legend_rows = -(-(len(groups) + 2) // 2) if len(groups) <= len(COLOURS) * len(DASHES) else 1
+    figure, (ax,) = look.panels(1, 2.9, extra=0.2 * legend_rows)
+    told = len(groups) <= len(COLOURS) * len(DASHES)
+    for number, (label, rows) in enumerate(groups.items()):
+        colour = COLOURS[number % len(COLOURS)] if told else look.GREY
+        dash = DASHES[number // len(COLOURS) % len(DASHES)]
+        by_value: dict[float, list[Row]] = {}
+        for row in rows:
+            by_value.setdefault(float(row[along.key]), []).append(row)
+        x = np.array(sorted(by_value))
+        cost = [_spread([row.get("cost") for row in by_value[value]]) for value in x]
+        lower = [_spread([row.get("lower_bound") for row in by_value[value]]) for value in x]
+        middle, below = _values(cost, "middle"), _values(lower, "middle")
+        ax.fill_between(x, below, middle, color=colour, alpha=0.15, linewidth=0, zorder=1)
+        if max(map(len, by_value.values())) > 1:
+            ax.fill_between(x, _values(cost, "low"), _values(cost, "high"), color=colour, alpha=0.3, linewidth=0)
+        ax.plot(x, middle, color=colour, linestyle=dash, linewidth=1.4, zorder=3, label=label or "cost")
+        ax.plot(x, below, color=colour, linestyle=dash, linewidth=0.8, zorder=2)
+        _marks(ax, x, middle, [_worst_status(by_value[value]) for value in x], colour)
+    ax.plot([], [], color=look.INK, linewidth=0.8, label="proven lower bound (thin)")
+    _scale(ax.set_xscale, along, [float(row[along.key]) for row in study.table])
+    _cost_scale(ax.set_yscale, study.table)
+    ax.set_xlabel(along.key)
+    ax.set_ylabel("cost $J$")
+    _finish(figure, ax, study, told)
+    return figure
+
+
+def _marks(ax: Axes, x: Array, y: Array, statuses: Sequence[str], colour: str) -> None:
+    """The status of every point: on its cost, or where there is none at the lower edge."""
+    edge = ax.get_xaxis_transform()
+    for status in dict.fromkeys(statuses):
+        here = np.array([one == status for one in statuses])
+        known = here & np.isfinite(y)
+        filled = MARKS[status] in FILLED
+        style: dict[str, Any] = {
+            "marker": MARKS[status],
+            "linestyle": "none",
+            "markersize": 4.5 if filled else 6.5,
+            "markerfacecolor": colour if status == "certified" else "white",
+            "markeredgecolor": colour,
+            "clip_on": False,
+            "zorder": 4,
+        }
+        places: list[tuple[Any, Any, dict[str, Any]]] = [
+            (known, y, style),
+            (here & ~known, np.full(x.size, 0.02), {**style, "transform": edge}),
+        ]
+        for which, height, looks in places:
+            if which.any():
+                ax.plot(x[which], height[which], **looks)[0].set_in_layout(False)
+
+
+def _map(study: Study, axes: Sequence[Axis]) -> Figure:
+    """The cost as colour over two axes: cells of a grid, or points that were drawn."""
+    from matplotlib.figure import Figure
+
+    first, second = axes
+    figure = Figure(figsize=(look.WIDTH, 3.9), layout="constrained")
+    ax = figure.subplots()
+    cells: dict[tuple[float, float], list[Row]] = {}
+    for row in study.table:
+        cells.setdefault((float(row[first.key]), float(row[second.key])), []).append(row)
+    x, y = (np.array(sorted({pair[k] for pair in cells})) for k in (0, 1))
+    _scale(ax.set_xscale, first, x)
+    _scale(ax.set_yscale, second, y)
+    if study.arrangement in ("random", "sobol"):
+        at = np.array(list(cells))
+        costs = np.array([_spread([row.get("cost") for row in rows]).middle for rows in cells.values()])
+        known = np.isfinite(costs)
+        drawn: Any = ax.scatter(at[known, 0], at[known, 1], c=costs[known], cmap="viridis", s=26, linewidths=0)
+    else:
+        costs = np.full((y.size, x.size), np.nan)
+        for (value, other), rows in cells.items():
+            costs[np.searchsorted(y, other), np.searchsorted(x, value)] = _spread([r.get("cost") for r in rows]).middle
+        drawn = ax.pcolormesh(_edges(x, first.log), _edges(y, second.log), costs, cmap="viridis", linewidth=0)
+        drawn.set_edgecolor("face")
+    for status in MARKS:
+        marked = [pair for pair, rows in cells.items() if _worst_status(rows) == status]
+        if marked and status != "certified":
+            places = np.array(marked)
+            kind: dict[str, Any] = {"facecolors": "none"} if MARKS[status] in FILLED else {}
+            colour = look.INK if status in ("infeasible", "failed") else "white"
+            edge: dict[str, Any] = {"edgecolors": colour} if kind else {"color": colour}
+            ax.scatter(places[:, 0], places[:, 1], marker=MARKS[status], s=26, linewidths=1.0, **kind, **edge)
+    figure.colorbar(drawn, ax=ax, label="cost $J$")
+    ax.set_xlabel(first.key)
+    ax.set_ylabel(second.key)
+    for spine in ("top", "right"):
+        ax.spines[spine].set_visible(True)
+    _finish(figure, ax, study, told=False, marked=[one for one in MARKS if one != "certified"])
+    return figure
+
+
+def _categories(study: Study, axes: Sequence[Axis]) -> Figure:
+    """Costs down to their lower bounds, and seconds, one line for each combination of values; of several seeds a
+    box."""
+    from matplotlib.figure import Figure
+
+    groups = _grouped(study.table, axes)
+    figure = Figure(figsize=(look.WIDTH, 0.32 * len(groups) + 1.6), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
+    for place, rows in enumerate(groups.values()):
+        shift = np.linspace(-0.22, 0.22, len(rows)) if len(rows) > 1 else np.zeros(1)
+        for offset, row in zip(shift, rows, strict=True):
+            cost, lower = row.get("cost"), row.get("lower_bound")
+            if cost is not None and lower is not None:
+                left.plot([lower, cost], [place + offset] * 2, color=look.SKY, linewidth=2.5, zorder=1)
+            status, edge = str(row["status"]), left.get_yaxis_transform()
+            style: dict[str, Any] = {
+                "marker": MARKS[status],
+                "linestyle": "none",
+                "markersize": 4.5,
+                "markerfacecolor": look.BLUE if status == "certified" else "white",
+                "markeredgecolor": look.BLUE,
+                "clip_on": False,
+                "zorder": 3,
+            }
+            if cost is not None:
+                left.plot([cost], [place + offset], **style)
+            else:
+                left.plot([0.0], [place + offset], transform=edge, **style)
+        seconds = [float(row["seconds"]) for row in rows if row.get("seconds")]
+        if len(seconds) >= SEVERAL:
+            right.boxplot([seconds], positions=[place], orientation="horizontal", widths=0.5, **_BOX)
+        else:
+            right.plot(seconds, [place] * len(seconds), "o", color=look.VERMILLION, markersize=4)
+    left.set_yticks(range(len(groups)), [label or "all" for label in groups])
+    left.set_ylim(len(groups) - 0.5, -0.5)
+    _cost_scale(left.set_xscale, study.table)
+    times = [float(row["seconds"]) for row in study.table if row.get("seconds")]
+    if times and max(times) > 20.0 * min(times):
+        right.set_xscale("log")
+    else:
+        right.set_xlim(left=0.0)
+    left.set_xlabel("cost $J$, down to its proven lower bound")
+    right.set_xlabel("seconds of the method (s)")
+    _finish(figure, left, study, told=False)
+    return figure
+
+
+_BOX: dict[str, Any] = {
+    "manage_ticks": False,
+    "boxprops": {"color": look.VERMILLION},
+    "whiskerprops": {"color": look.VERMILLION},
+    "capprops": {"color": look.VERMILLION},
+    "medianprops": {"color": look.INK},
+    "flierprops": {"marker": ".", "markersize": 3, "markeredgecolor": look.VERMILLION},
+}
+
+
+def _finish(figure: Figure, ax: Axes, study: Study, told: bool, marked: Iterable[str] = MARKS) -> None:
+    """The title, and below the figure what the marks mean, of those that occur."""
+    from matplotlib.lines import Line2D
+
+    ax.set_title(study.title)
+    handles, labels = ax.get_legend_handles_labels() if told else ([], [])
+    for status in (one for one in marked if one in study.counts):
+        filled = MARKS[status] in FILLED
+        handles.append(
+            Line2D(
+                [],
+                [],
+                marker=MARKS[status],
+                linestyle="none",
+                markersize=4.5 if filled else 6.5,
+                markerfacecolor=look.INK if status == "certified" else "white",
+                markeredgecolor=look.INK,
+            )
+        )
+        labels.append(status)
+    columns = 2 if any(len(label) > LETTERS // 2 for label in labels) else 4
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, columnspacing=1.6, handlelength=1.8)
+
+
+def _worst_status(rows: Sequence[Row]) -> str:
+    """Of several seeds the status that proves least is marked."""
+    return max((str(row["status"]) for row in rows), key=list(MARKS).index)
+
+
+def _values(spreads: Sequence[_Spread], name: str) -> Array:
+    return np.array([getattr(one, name) for one in spreads])
+
+
+def _edges(values: Array, log: bool) -> Array:
+    """The edges of cells about values, half-way between them."""
+    at = np.log(values) if log else values
+    if at.size == 1:
+        edges = np.array([at[0] - 0.5, at[0] + 0.5])
+    else:
+        middle = (at[1:] + at[:-1]) / 2
+        edges = np.concatenate([[2 * at[0] - middle[0]], middle, [2 * at[-1] - middle[-1]]])
+    return np.exp(edges) if log else edges
+
+
+def _scale(set_scale: Any, axis: Axis, values: Sequence[float] | Array) -> None:
+    if axis.log and min(values) > 0.0:
+        set_scale("log")
+
+
+def _cost_scale(set_scale: Any, rows: Sequence[Row]) -> None:
+    """A logarithmic axis for costs over three decades and more."""
+    costs = [float(row["cost"]) for row in rows if row.get("cost") is not None]
+    if costs and min(costs) > 0.0 and max(costs) >= 1000.0 * min(costs):
+        set_scale("log")
+
+
+def _size(study: Study, axis: Axis) -> int:
+    """How many values of an axis occur."""
+    return len({float(row[axis.key]) for row in study.table})
+
+
+def _is_seed(axis: Axis) -> bool:
+    return axis.path == ("seed",)
