@@ -139,10 +139,12 @@ def _components() -> list[str]:
     for record in sr.load_registry().records():
         rows = [
             (f"`{row.name}`", row.type, row.default and f"`{row.default}`", row.range, row.meaning)
-            for row in option_rows(record)
+            for row in option_rows(record, ask=False)
         ]
         lines += ["", f"### {record.kind} `{record.name}`", "", record.summary, ""]
-        lines += table(("option", "type", "default", "range", "meaning"), rows) if rows else ["It has no options."]
+        own = f"`sparserob plugins {record.name}` lists the settings of the installed package."
+        lines += table(("option", "type", "default", "range", "meaning"), rows) if rows else []
+        lines += [own] if record.open else [] if rows else ["It has no options."]
     return lines
 
 

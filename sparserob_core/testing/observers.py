@@ -6,6 +6,7 @@ from __future__ import annotations
 import io
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
@@ -20,7 +21,6 @@ from sparserob_core.sip.convex_set import Box
 from sparserob_core.sip.events import Batch, EvaluationsFinished, ProofProgress, RoundFinished
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.result import Result
-from sparserob_core.testing.contract import Contract
 
 CONFIG: Mapping[str, Any] = {
     "title": "A double integrator",
@@ -84,13 +84,17 @@ class Recording(Observer):
             raise
 
 
-class ObserverContract(Contract[Observer], kind="observer"):
+class ObserverContract(ABC):
     """What every observer must keep: subclass it in a test module as ``class TestMine(ObserverContract)`` and give
-    ``component``.
+    ``create``.
 
     The core keeps the order of events, detaches an observer that raises, and closes it; the contract checks that an
     observer can live with that: no event is a surprise, a run may end at any of them, and afterwards nothing is left.
     """
+
+    @abstractmethod
+    def create(self) -> Observer:
+        """A new observer."""
 
     def watched(self, method: str, observer: Recording | None = None, quiet: bool = False) -> tuple[Outcome, Recording]:
         """One run of `METHODS`, watched by a new observer or by the given one."""

@@ -2,36 +2,27 @@
 
 from __future__ import annotations
 
-from typing import cast
+from abc import ABC, abstractmethod
 
 import numpy as np
 
-from sparserob_core.control.sets.sets import SetFactory
 from sparserob_core.sip.convex_set import Array, ConvexSet
-from sparserob_core.testing.contract import Contract
 
 DIRECTIONS = 400
 CLOSE = 1e-7  # relative to the set's extent
 
 
-class SetContract(Contract[ConvexSet], kind="set"):
+class SetContract(ABC):
     """What every convex set must keep: subclass it in a test module as ``class TestMine(SetContract)`` and give
-    ``component``: a `ConvexSet`, or a `SetFactory`, which then builds one in ``dimension`` coordinates (2).
+    ``create``.
 
     The support function is taken as the definition of the set, and is itself tested to be one; a linear program says
     what the half-spaces of a flat set allow, and sampled directions what any set does.
     """
 
-    dimension = 2
-
+    @abstractmethod
     def create(self) -> ConvexSet:
         """A bounded set with an interior, in one to four dimensions."""
-        made: object = super().create()
-        return made.build(self.dimension) if isinstance(made, SetFactory) else cast(ConvexSet, made)
-
-    def expected(self) -> tuple[type, ...]:
-        """A set, or what builds one."""
-        return (ConvexSet, SetFactory)
 
     def directions(self, convex: ConvexSet) -> Array:
         """Random directions ``(k, d)``, not normalised, and the axes both ways."""

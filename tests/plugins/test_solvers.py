@@ -6,47 +6,21 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
-from functools import cache
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-import sparserob_core as sr
 from sparserob_clarabel import Clarabel
-from sparserob_core.sip.finite import FiniteProgram
 from sparserob_core.sip.inner.solve import solve_finite
-from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, rows_at
 from sparserob_core.testing.solvers import regularised, robust_terminal
 from sparserob_dictionaries import PiecewiseConstant, Walsh
 from sparserob_piqp import Piqp
 from sparserob_proxqp import ProxQp
+from tests.support.relaxed import experiment_one
 
 SOLVERS = [Piqp(), ProxQp(), Clarabel()]
 EPSILONS = (1.0, 1e-2, 1e-4, 1e-6, 0.0)
-
-
-@cache
-def experiment_one(dictionary: sr.DictionaryFactory) -> FiniteProgram:
-    """The spring-mass-damper with ``|w| <= 0.06``, its constraints at eight times, tightened for the worst
-    disturbance."""
-    problem = sr.OptimalControlProblem(
-        system=sr.LinearSystem(np.array([[0, 1], [-2, -0.5]]), np.array([[0], [1]])),
-        horizon=5.0,
-        initial_state=[-1, 1],
-        control=sr.Box([-1], [1]),
-        disturbance=sr.Box([-0.06, -0.06], [0.06, 0.06]),
-        path=[sr.PathConstraint(sr.Box([-0.7, -np.inf], [0.7, np.inf]), start=0.3)],
-        terminal=[sr.Box([-0.3, -0.3], [0.3, 0.3])],
-    )
-    built = dictionary.build(5.0)
-    program = sr.transcribe(problem, control=built, disturbance=built)
-    rows = None
-    for family in program.families:
-        times = np.linspace(family.index_set.lower, family.index_set.upper, 8)
-        found = rows_at(program, family.name, np.unique(times, axis=0))
-        rows = found if rows is None else rows.joined(found)
-    return RelaxedProgram(program, SOLVERS[0]).finite(rows.G, rows.h, 0.0)
 
 
 @pytest.mark.parametrize("pieces", [50, 250])

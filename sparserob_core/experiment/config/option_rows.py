@@ -34,10 +34,10 @@ class OptionRow:
     meaning: str
 
 
-def option_rows(record: Plugin) -> list[OptionRow]:
+def option_rows(record: Plugin, ask: bool = True) -> list[OptionRow]:
     """Every option of a component, and what may be below it; keys that several options share are listed below the first
-    of them."""
-    schema = options_schema(record)
+    of them. ``ask``: see `options_schema`."""
+    schema = options_schema(record, ask)
     prefix = f"#/$defs/{record.kind}.{record.name}."
     return list(_Rows({prefix + name: part for name, part in schema.get("$defs", {}).items()}).rows(schema, ""))
 

@@ -21,8 +21,14 @@ class _Lenient(GenerateJsonSchema):
         return {}
 
 
-def options_schema(record: Plugin) -> dict[str, Any]:
-    """The JSON schema of a component's options, with the references of its parts under ``kind.name.``."""
+def options_schema(record: Plugin, ask: bool = True) -> dict[str, Any]:
+    """The JSON schema of a component's options, with the references of its parts under ``kind.name.``.
+
+    ``ask=False``: of an ``open`` record only what is known without asking the package that it needs, whether that is
+    installed or not.
+    """
+    if record.open and not ask:
+        return {} if record.options is None else record.options.model_json_schema(schema_generator=_Lenient)
     template = f"#/$defs/{record.kind}.{record.name}.{{model}}"
     return record.options_type().model_json_schema(ref_template=template, schema_generator=_Lenient)
 
@@ -76,13 +82,14 @@ def _choice(registry: Registry, kind: str, default: str | None, parts: dict[str,
     names = registry.names(kind)
     entries = []
     for name in names:
-        entry = options_schema(registry.get(kind, name))
-        for key, part in components(registry.get(kind, name).options_type()).items():
+        record = registry.get(kind, name)
+        entry = options_schema(record, ask=False)
+        for key, part in ({} if record.open else components(record.options_type())).items():
             described = entry["properties"][key]
             described.pop("component")
             described["anyOf"] = [*_choice(registry, part, None, parts)["anyOf"], {"type": "null"}]
         parts.update({f"{kind}.{name}.{part}": value for part, value in entry.pop("$defs", {}).items()})
-        entries.append(_named(entry, registry.get(kind, name), needs_name=name != default))
+        entries.append(_named(entry, record, needs_name=name != default))
     return {"anyOf": [{"enum": names, "description": f"A {kind} with its default options."}, *entries]}
 
 
@@ -98,5 +105,5 @@ def _named(entry: dict[str, Any], record: Plugin, needs_name: bool) -> dict[str,
         "description": record.summary,
         "properties": properties,
         "required": required,
-        "additionalProperties": False,
+        "additionalProperties": record.open,
     }

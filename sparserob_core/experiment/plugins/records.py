@@ -27,8 +27,10 @@ class Plugin:
     ``summary``  one line for ``sparserob plugins``;
     ``plugin``   who registered it, and ``source``, its file or distribution (both filled in by the registry);
     ``needs``    a module that may be missing, and what pip is to install then, such as
-                 ``("nevergrad", "sparserob[nevergrad]")``; it is looked for where the component is built, before
-                 anything is solved.
+                 ``("nevergrad", "sparserob[nevergrad]")``, or ``""`` where pip cannot; it is looked for where the
+                 component is built, before anything is solved;
+    ``open``     its options, or further ones, are those of the package that it needs, which is imported to ask for
+                 them: schema and reference leave them open.
 
     ``factory(**options)`` builds the component. Raises `PluginError` when a field is malformed. A kind of component is
     a subclass: ``hook`` yields its records, ``component`` is the class of what they build, and ``kind`` its name.
@@ -45,6 +47,7 @@ class Plugin:
     plugin: str = ""
     source: str = ""
     needs: tuple[str, str] | None = None
+    open: bool = False
 
     def __init_subclass__(cls, hook: str, component: str) -> None:
         cls.hook, cls.component = hook, component
@@ -70,10 +73,31 @@ class Plugin:
         source = f", {self.source}" if self.source else ""
         return f"{self} (plugin '{self.plugin}'{source}, hook {self.hook})"
 
+    @property
+    def distribution(self) -> str:
+        """The distribution that it comes with, with its version, or its file."""
+        return self.source.partition(", ")[0] or "sparserob"
+
+    @property
+    def missing(self) -> str:
+        """The package that is not installed and what brings it, as one sentence; empty where nothing is missing."""
+        if self.needs is None or find_spec(self.needs[0]) is not None:
+            return ""
+        package, brings = self.needs
+        return f"{self}: {package} is not installed" + (f"; `pip install '{brings}'` brings it" if brings else "")
+
+    def _refuse_missing(self) -> None:
+        if self.missing:
+            raise UnknownPluginError(self.missing)
+
     def resolved(self) -> Callable[..., object]:
-        """The factory itself; a lazy one is imported now."""
+        """The factory itself; a lazy one is imported now.
+
+        Raises `UnknownPluginError` where the package that it needs is missing.
+        """
         if not isinstance(self.factory, str):
             return self.factory
+        self._refuse_missing()
         module, _, attribute = self.factory.partition(":")
         with attributed(self.origin, f"loading {self.factory!r}", but=()):
             factory = getattr(import_module(module), attribute)
@@ -90,10 +114,7 @@ class Plugin:
 
     def create(self, options: Options) -> object:
         """The component for validated options, checked to be of this kind."""
-        if self.needs is not None and find_spec(self.needs[0]) is None:
-            raise UnknownPluginError(
-                f"{self}: {self.needs[0]} is not installed; `pip install '{self.needs[1]}'` brings it"
-            )
+        self._refuse_missing()
         factory = self.resolved()
         module, _, attribute = self.component.partition(":")
         expected = getattr(import_module(module), attribute)

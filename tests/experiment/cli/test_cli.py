@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -93,6 +94,20 @@ def test_plugins_are_listed_with_who_brings_them(command: Command) -> None:
     rows = [line.split()[:3] for line in done.stdout.splitlines()]
     assert ["solver", "piqp", "piqp"] in rows
     assert ["method", "exchange", "core"] in rows
+
+
+def test_a_component_is_listed_with_its_distribution_and_version_or_its_file(command: Command, tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "import sparserob_core as sr\n\n\nclass Mine(sr.Maximiser, sr.Options):\n"
+        "    def search(self, objective, rng):\n"
+        "        return float('inf')\n\n\n@sr.hookimpl\ndef sparserob_maximisers():\n"
+        "    yield sr.MaximiserPlugin(name='mine', factory=Mine, summary='None.')\n"
+    )
+    lines = command("plugins", "--plugins", file).stdout.splitlines()
+    assert any(line.split()[:5] == ["solver", "piqp", "piqp", "sparserob", version("sparserob")] for line in lines)
+    assert any(line.split()[:3] == ["maximiser", "mine", "mine"] and str(file) in line for line in lines)
+    assert command("plugins", "--plugins", tmp_path / "none.py").returncode == 2
 
 
 @pytest.mark.parametrize("name", ["piqp", "solver.piqp"])

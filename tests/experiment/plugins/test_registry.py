@@ -59,6 +59,8 @@ def test_every_installed_plugin_loads() -> None:
 def test_every_installed_component_has_a_summary_and_documented_options() -> None:
     for record in sr.load_registry().records():
         assert record.summary, record
+        if record.missing and record.open:
+            continue
         for name, field in record.options_type().model_fields.items():
             assert field.description, f"{record}: option {name} has no description"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -12,16 +13,27 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("name", required=False)
-def plugins(name: str | None) -> int:
+@click.option(
+    "--plugins",
+    "files",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    help="A Python file whose components are listed too; may be given several times.",
+)
+def plugins(name: str | None, files: tuple[Path, ...]) -> int:
     """List the components that a config can name, or the options of one: NAME, or KIND.NAME."""
     from sparserob_core.experiment.plugins.registry import load_registry
     from sparserob_core.experiment.terminal.table import print_table
 
-    registry = load_registry()
+    registry = load_registry(files)
     if name is not None:
         return _describe(registry, name)
-    rows = [(record.kind, record.name, record.plugin, record.summary) for record in registry.records()]
-    print_table("Components", ("kind", "name", "plugin", "what it is"), rows)
+    found = list(registry.records())
+    rows = [(one.kind, one.name, one.plugin, one.distribution, one.summary) for one in found if not one.missing]
+    print_table("Components", ("kind", "name", "plugin", "from", "what it is"), rows)
+    for record in found:
+        if record.missing:
+            click.echo(record.missing)
     for failure in registry.failures:
         click.echo(str(failure), err=True)
     return 0
@@ -33,7 +45,7 @@ def _describe(registry: Registry, name: str) -> int:
 
     for record in registry.find(name):
         rows = [(row.name, row.type, row.default, row.range, row.meaning) for row in option_rows(record)]
-        title = f"{record.kind} {record.name} (plugin {record.plugin}): {record.summary}"
+        title = f"{record.kind} {record.name} (plugin {record.plugin}, {record.distribution}): {record.summary}"
         print_table(
             title,
             ("option", "type", "default", "range", "meaning"),

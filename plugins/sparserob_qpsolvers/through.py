@@ -1,0 +1,225 @@
+"""A solver of qpsolvers behind this package's `Solver`; for each of them, a class whose options are its own settings.
+
+`__getattr__` makes the class of a solver when it is first asked for, here by name: ``through:osqp``.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
+
+import numpy as np
+from pydantic import ConfigDict, Field, PrivateAttr, create_model, model_serializer, model_validator
+
+import sparserob_core as sr
+from sparserob_qpsolvers.catalogue import SOLVERS, Known
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_array
+
+UNKNOWN = Known("", "a solver that came to qpsolvers later", {}, {})
+Duals: TypeAlias = tuple[sr.Array, sr.Array, sr.Array]
+
+
+class Through(sr.Solver, sr.Options):
+    """A solver of qpsolvers. What is not given keeps the solver's own default, but for its tolerances, which follow the
+    accuracy that is asked of it."""
+
+    model_config = ConfigDict(use_attribute_docstrings=False)  # there is no source of a class that is made here
+
+    sparse: ClassVar[bool] = True
+    called: ClassVar[str]
+
+    @model_serializer(mode="wrap")
+    def _only_what_was_given(self, plain: Callable[[Any], Mapping[str, Any]]) -> dict[str, Any]:
+        return {key: value for key, value in plain(self).items() if key in self.model_fields_set and value is not None}
+
+    def solve(self, program: sr.QuadraticProgram, accuracy: float) -> sr.Claim:
+        given = {key: getattr(self, key) for key in self.model_fields_set}
+        return claimed(self.called, program, accuracy, {key: it for key, it in given.items() if it is not None})
+
+
+class Unchecked(Through):
+    """A solver that does not say what its settings are: all that is given is passed on."""
+
+    model_config = ConfigDict(extra="allow")
+
+
+class Qpsolvers(sr.Solver, sr.Options):
+    """Any solver that qpsolvers finds, native adapter or not. Importing qpsolvers imports every solver that is
+    installed."""
+
+    model_config = ConfigDict(extra="allow")
+
+    solver: str = Field(min_length=1)
+    """Its name in qpsolvers, such as ``piqp``; further keys are its own settings."""
+
+    _chosen: Through = PrivateAttr()
+
+    @model_validator(mode="after")
+    def _choose(self) -> Qpsolvers:
+        given = dict(self.model_extra or {})
+        kind = _class_of(self.solver)
+        unknown = () if issubclass(kind, Unchecked) else given.keys() - kind.model_fields.keys()
+        for key in sorted(unknown):
+            near = get_close_matches(key, kind.model_fields, 1, 0.0)
+            hint = f"; the nearest is {near[0]!r}" if near else ", which has no settings"
+            raise sr.InputError(f"there is no setting {key!r} of {self.solver}{hint}")
+        self._chosen = kind(**given)
+        return self
+
+    def solve(self, program: sr.QuadraticProgram, accuracy: float) -> sr.Claim:
+        return self._chosen.solve(program, accuracy)
+
+
+def claimed(name: str, program: sr.QuadraticProgram, accuracy: float, given: Mapping[str, Any]) -> sr.Claim:
+    """What qpsolvers' solver of that name says of a program."""
+    import qpsolvers
+
+    if name not in qpsolvers.available_solvers:
+        raise sr.UnknownPluginError(
+            f"qpsolvers {qpsolvers.__version__} finds no solver {name!r}; it finds "
+            + ", ".join(qpsolvers.available_solvers)
+        )
+    known = SOLVERS.get(name, UNKNOWN)
+    settings = {**known.fixed, **{key: factor * accuracy for key, factor in known.asked.items()}, **_own(known, given)}
+    posed, recover = _posed(program, dense=name not in qpsolvers.sparse_solvers)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            solution = qpsolvers.solve_problem(posed, name, **settings)
+        except (
+            qpsolvers.exceptions.QPError,
+            ValueError,
+            ArithmeticError,
+            RuntimeError,
+            np.linalg.LinAlgError,
+        ) as error:
+            nothing = np.full(program.q.size, np.nan)
+            return sr.Claim("failed", nothing, 0 * program.h, 0 * program.b, nothing, f"{name}: {error}")
+    said = _status(solution.extras)
+    # Whether a program is infeasible qpsolvers does not say; where it is, the elastic program will prove it.
+    status: Literal["solved", "failed"] = "solved" if solution.found else "failed"
+    z, y, z_box = recover(solution)
+    return sr.Claim(status, _vector(solution.x, program.q.size), z, y, z_box, f"{name}: {said or status}")
+
+
+def _posed(program: sr.QuadraticProgram, dense: bool) -> tuple[Any, Callable[[Any], Duals]]:
+    """The program as qpsolvers takes it, and the way back for multipliers ``z, y, z_box``.
+
+    Where every bound is finite and leaves room, bounds stay bounds. Otherwise they become rows, those of a variable
+    with a single value an equality: some solvers make rows of infinite bounds, or have no interior between equal ones.
+    """
+    from qpsolvers import Problem
+    from scipy.sparse import csc_matrix, eye_array, vstack
+
+    n, r, e = program.q.size, program.h.size, program.b.size
+    lower, upper = program.lower, program.upper
+    fixed = lower == upper
+    boxed = bool(np.isfinite(lower).all() and np.isfinite(upper).all() and not fixed.any())
+    G, h, A, b = program.G, program.h, program.A, program.b
+    above, below = (np.flatnonzero(np.isfinite(bound) & ~fixed) for bound in (upper, lower))
+    held = np.flatnonzero(fixed)
+    if not boxed:
+        identity = eye_array(n, format="csr")
+        G, h = vstack([G, identity[above], -identity[below]]), np.concatenate([h, upper[above], -lower[below]])
+        A, b = vstack([A, identity[held]]), np.concatenate([b, lower[held]])
+
+    def matrix(rows: csc_array) -> Any:
+        return rows.toarray(order="C") if dense else csc_matrix(rows)  # some factorise Fortran's order in place
+
+    posed = Problem(
+        matrix(program.P),
+        program.q,
+        matrix(G) if h.size else None,
+        h if h.size else None,
+        matrix(A) if b.size else None,
+        b if b.size else None,
+        lower if boxed else None,
+        upper if boxed else None,
+    )
+
+    def recover(solution: Any) -> Duals:
+        z, y = _vector(solution.z, h.size), _vector(solution.y, b.size)
+        if boxed:
+            return z, y, _vector(solution.z_box, n)
+        z_box = np.zeros(n)
+        z_box[above] = z[r : r + above.size]
+        z_box[below] -= z[r + above.size :]
+        z_box[held] = y[e:]
+        return z[:r], y[:e], z_box
+
+    return posed, recover
+
+
+def _vector(found: Any, size: int) -> sr.Array:
+    """What a solver has found, or NaN where it has found nothing of that size."""
+    vector = np.asarray([] if found is None else found, dtype=float).ravel()
+    return vector if vector.size == size else np.full(size, np.nan)
+
+
+def _status(extras: Mapping[str, Any]) -> str:
+    """How the solver itself calls the outcome, where it says so."""
+    told = [extras.get("status"), getattr(extras.get("info"), "status", None), extras.get("infostring")]
+    return next((str(getattr(one, "name", one)) for one in told if one is not None), "")
+
+
+def _own(known: Known, given: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Settings as the solver takes them: names of an enumeration become its members."""
+    if known.settings is None or not given:
+        return given
+    own = known.settings()
+    return {key: _members(own[key])[value] if _members(own[key]) else value for key, value in given.items()}
+
+
+def _members(default: object) -> Mapping[str, Any]:
+    """The members of the enumeration that a default belongs to, by name; none where it is no enumeration."""
+    return dict(getattr(type(default), "__members__", {}))
+
+
+def _class_of(name: str) -> type[Through]:
+    if name not in globals():
+        globals()[name] = _made(name)
+    made: type[Through] = globals()[name]
+    return made
+
+
+def _made(name: str) -> type[Through]:
+    known = SOLVERS.get(name, UNKNOWN)
+    settings = None if known.settings is None else known.settings()
+    fields: dict[str, Any] = {
+        key: (_type(default, known.flags) | None, _field(name, default))
+        for key, default in (settings or {}).items()
+        if not hasattr(Through, key)
+    }
+    parent: type[Through] = Unchecked if settings is None else Through
+    made: Any = create_model(
+        name, __base__=parent, __module__=__name__, __doc__=f"{name}, through qpsolvers.", **fields
+    )
+    made.called = name
+    kind: type[Through] = made
+    return kind
+
+
+def _type(default: object, flags: bool) -> Any:
+    if _members(default):
+        return Literal[tuple(_members(default))]
+    if flags and isinstance(default, int) and default in {0, 1}:
+        return bool | int
+    return type(default) if isinstance(default, bool | int | float | str) else Any
+
+
+def _field(name: str, default: object) -> Any:
+    """None: nothing is given to the solver; its own default is shown where there is a way to write it."""
+    own = getattr(default, "name", default)
+    written = isinstance(own, bool | int | str) or (isinstance(own, float) and np.isfinite(own))
+    shown: Any = {"default": own} if written else {}
+    return Field(default=None, description=f"Setting of {name} itself.", json_schema_extra=shown)
+
+
+def __getattr__(name: str) -> type[Through]:
+    if name not in SOLVERS:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return _class_of(name)
