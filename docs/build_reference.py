@@ -29,7 +29,8 @@ MEANING = {
 FILES = {
     "config.yaml": "the complete, resolved config; `sparserob run` takes it",
     "result.json": (
-        "status, message, cost, value, epsilon, bounds, gap, worst constraint, tolerances (what was proven of each"
+        "status, message, cost, value, epsilon, bounds, gap, worst constraint, equalities (what is missed of them, of"
+        " the numbers that are added up), tolerances (what was proven of each"
         " constraint, and what counts as no violation of its rows, in the user's units), sparsity, counts, seconds (of"
         " the method: solving and proving, neither reading nor drawing), seed, versions; for the scenario approach"
         " `scenario_bound`; `upper_bound` and `gap` are null unless the status is certified or verified; `provenance`:"

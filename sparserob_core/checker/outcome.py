@@ -8,6 +8,7 @@ from time import perf_counter
 from typing import Literal, TypeAlias, final
 
 TOLERANCE = 1e-9  # of a constraint's own unit: a violation of at most this counts as none
+EQUALITY = 1e-12  # of the numbers that are added up: what double precision leaves of an equality, at most
 RESOLVED = 2.0**-18  # of the numbers that are added up, the least unit: TOLERANCE of it is 17 units of rounding
 
 Verdict: TypeAlias = Literal["holds", "fails", "not checked"]

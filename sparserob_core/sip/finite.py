@@ -68,11 +68,21 @@ class FiniteProgram:
         worst = 0.0
         if self.G.shape[0]:
             worst = scaled_violation(self.G @ x - self.h, self.G, self.h, size)
-        if self.A.shape[0]:
-            worst = max(worst, scaled_violation(np.abs(self.A @ x - self.b), self.A, self.b, size))
+        worst = max(worst, self.missed(x))
         image = self.image(x)
         outside = np.maximum(self.lower - image, image - self.upper) / np.maximum(1.0, np.abs(image))
         return max(worst, float(outside.max(initial=0.0)))
+
+    @shaped
+    def missed(self, x: Float[Array, " n"]) -> float:
+        """The largest ``|A x - b|``, each divided by its own scale (see `scaled_violation`); 0 without equalities."""
+        return scaled_violation(np.abs(self.excess(x)), self.A, self.b, np.abs(x)) if self.b.size else 0.0
+
+    @shaped
+    def excess(self, x: Float[Array, " n"]) -> Float[Array, " e"]:
+        """``A x - b``, summed with more digits than it is told with."""
+        wide = np.longdouble
+        return np.asarray(self.A.astype(wide) @ x.astype(wide) - self.b.astype(wide), dtype=float)
 
     def validate(self) -> None:
         """Raise `InputError` when shapes disagree or a number is not one."""

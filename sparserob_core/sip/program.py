@@ -25,6 +25,7 @@ Formulation: TypeAlias = Literal["reduced", "nominal", "literal", "sampled"]
 
 
 TOLERANCE = 1e-9  # of a row's own unit: a violation of at most this counts as none (docs/decisions/0016)
+EQUALITY = 1e-12  # of the numbers that are added up: an equality that is missed by at most this counts as met
 
 
 @dataclass(frozen=True, eq=False)

@@ -113,7 +113,9 @@ class Result:
     behind ``lower_bound``, or behind infeasibility; ``proofs``: what was shown of every constraint family at the
     decision. ``trace``: for a method that searches, every value of ``g``; ``scenario_bound``: for the scenario
     approach, what its theory promises. ``stopped``: the limit or the interrupt that ended the method early, in words.
-    ``ray (n,)``: a direction along which the cost falls for ever, where one was found.
+    ``ray (n,)``: a direction along which the cost falls for ever, where one was found. ``missed``: the most by which
+    the decision misses an equality, relative to the numbers that are added up in it, where there are any; computed, not
+    proven, and at most `EQUALITY` where something is claimed.
     """
 
     status: Status
@@ -137,6 +139,7 @@ class Result:
     cost_scale: float = UNKNOWN_SCALE
     stopped: str = ""
     ray: Array | None = None
+    missed: float | None = None
 
     @property
     def gap(self) -> float:

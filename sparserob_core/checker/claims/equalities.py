@@ -13,13 +13,11 @@ from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.jets import Monomials, expanded
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.claims.units import Units
-from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.outcome import EQUALITY, Broken, Unchecked
 from sparserob_core.checker.reach.flow import Flow
 from sparserob_core.checker.reach.tube import Tube
 from sparserob_core.checker.sets.shapes import radius, support
 from sparserob_core.control.sets.sets import Box
-
-ROUNDING = 1e-12  # of the numbers that are added up: what solving in double precision leaves of an equality
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -39,7 +37,7 @@ def equalities(case: Case) -> str:
         if _reached(case, state):
             raise Unchecked(f"the uncertainty may reach x{state + 1}, which is to be fixed")
         missed = abs(tube.nodes[-1].parts[0][state, 0] - balls([value])[0])
-        most = ROUNDING * max(float(sums[state]), abs(value))
+        most = EQUALITY * max(float(sums[state]), abs(value))
         if not missed <= most:
             raise Broken(f"x{state + 1} is missed by up to {float(missed.upper()):.3g}, rounding is at most {most:.1e}")
         worst = max(worst, float(missed.upper()))

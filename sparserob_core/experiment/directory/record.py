@@ -14,7 +14,7 @@ from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.experiment.directory.sparsity import sparsity
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Proof
-from sparserob_core.sip.program import TOLERANCE, SemiInfiniteProgram, WorstConstraint
+from sparserob_core.sip.program import EQUALITY, TOLERANCE, SemiInfiniteProgram, WorstConstraint
 from sparserob_core.sip.result import Result
 
 PROVEN = ("certified", "verified")
@@ -40,6 +40,7 @@ def summary_of(result: Result, control: Array | None, dictionary: Dictionary | N
         "stopped": result.stopped,
         "worst": _witness(result.worst),
         "tolerances": {proof.family: _tolerance(proof) for proof in result.proofs if proof.verdict == "proven"},
+        **({} if result.missed is None else {"equalities": {"allowed": EQUALITY, "missed": result.missed}}),
         "sparsity": acting or {"active_fraction": None, "switches": None},
         "counts": {
             "relaxed_programs": 0,

@@ -56,6 +56,7 @@ def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("relative gap", _number(summary["gap"], ".2e")),
         ("worst violation", _worst(worst)),
         ("proven to", _tolerances(summary.get("tolerances") or {})),
+        ("equalities", _equalities(summary.get("equalities"))),
         ("active indices", str(counts["active_indices"])),
         ("rounds", str(counts["rounds"])),
         ("share of time active", _number(sparsity["active_fraction"], ".1%")),
@@ -79,6 +80,13 @@ def _tolerances(tolerances: Mapping[str, Any]) -> str:
         least, most = f"{min(rows):.1e}", f"{max(rows):.1e}"
         parts.append(f"{least if least == most else f'{least} to {most}'} in {name}")
     return f"{', '.join(parts)} ({next(iter(tolerances.values()))['own']:g} of each row's own unit)"
+
+
+def _equalities(said: Mapping[str, Any] | None) -> str:
+    """What solving in double precision leaves of the terminal equalities."""
+    if not said:
+        return "unknown"
+    return f"missed by {said['missed']:.1e} of the numbers added up, computed; {said['allowed']:g} counts as none"
 
 
 def _worst(worst: Mapping[str, Any]) -> str:

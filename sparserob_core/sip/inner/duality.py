@@ -15,6 +15,7 @@ import numpy as np
 from sparserob_core.shapes import Bool, Float, shaped
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution, diagonal
+from sparserob_core.sip.inner.equalities import onto_equalities
 from sparserob_core.sip.inner.image import onto_stationary
 
 # Entries of a sum are evaluated with a relative error of at most this (Higham 2002, section 3.1, for sums of up to ~1e2
@@ -123,6 +124,7 @@ def measure(
     """Everything that can be checked about a claim, as a `FiniteSolution` that nobody has judged yet (``failed``)."""
     if program.S is None:
         x = np.clip(x, program.lower, program.upper)
+    x = onto_equalities(program, x) if program.b.size else x
     y = _usable(program, y)
     value, residual = program.objective(x), program.residual(x)
     lower = dual_bound(program, y, mu, z, at=x)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
@@ -15,14 +15,21 @@ from sparserob_core.sip.evidence import NO_BOUND, Cut, Dual, Proof
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
 from sparserob_core.sip.inner.solve import ADVICE
 from sparserob_core.sip.method import Tools
-from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram, Separation, WorstConstraint
+from sparserob_core.sip.program import (
+    EQUALITY,
+    TOLERANCE,
+    ConstraintFamily,
+    SemiInfiniteProgram,
+    Separation,
+    WorstConstraint,
+)
 from sparserob_core.sip.proof.irreducible import irreducible
 from sparserob_core.sip.proof.verdict import as_bad_as_found, infeasible_subsystem, verdict, witness, worst_of
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
 from sparserob_core.sip.result import MEANING, Result, Status, relative_gap
 
 ROUNDING = 1e-13  # of the terms of a cost, with which it is evaluated
-RESIDUAL = 1e-8  # of bounds, fixed rows and equalities, relative to their scale, at a decision that is returned
+CRUDE = 1e-8  # of bounds, rows and equalities, relative to their scale, at a decision of which nothing is claimed
 
 Prover: TypeAlias = Callable[[Array], Sequence[Proof]]
 Found: TypeAlias = Sequence[tuple[ConstraintFamily, Separation]]
@@ -128,13 +135,9 @@ class Ledger:
         ``ending``: why the method came to an end, where it was not by its own rules."""
         x, cost = answer.solution.x, self.program.cost(answer.solution.x)
         status, message = verdict(proofs, self.gap(cost), self.tolerance)
-        residual, beyond = self.program.finite.residual(x), _beyond(self.program, x)
-        if beyond > TOLERANCE and status in ("certified", "verified"):
-            status = "failed"
-            message = f"the decision misses its bounds by {beyond:.1e} of what they compare; {ADVICE}"
-        if residual > RESIDUAL:
-            status = "failed"
-            message = f"the decision misses its bounds or equalities by {residual:.1e}; {ADVICE}"
+        for what, missed, most in self._fixed(x, strictly=status in ("certified", "verified")):
+            if missed > most:
+                status, message = "failed", f"the decision misses {what} by {missed:.1e} of what they compare; {ADVICE}"
         proven = status in ("certified", "verified") and len(proofs) == len(self.program.families)
         wrong = alarm(self.program, self.dual, x) if proven else ""
         if wrong:
@@ -142,6 +145,14 @@ class Ledger:
         message = f"{message}; {ending}" if ending and status != "certified" else message
         result = self.result(status, message, answer, witness(self.program, worst, proofs))
         return replace(result, proofs=tuple(proofs), stopped=ending if ending == self.tools.deadline.reason else "")
+
+    def _fixed(self, x: Array, strictly: bool) -> Iterator[tuple[str, float, float]]:
+        """What is no family: a name, by how much ``x (n,)`` misses it, and by how much it may. ``strictly``: as much as
+        a claim allows, else what a decision may that is worth returning."""
+        finite = self.program.finite
+        yield "its equalities", finite.missed(x), EQUALITY if strictly else CRUDE
+        yield "its bounds or rows", finite.residual(x), TOLERANCE if strictly else CRUDE
+        yield "its bounds", _beyond(self.program, x) if strictly else 0.0, TOLERANCE
 
     def stopped(self, error: KeyboardInterrupt, prover: Prover) -> Result:
         """The result where time is over or a key was pressed: the best decision so far, with what one look at it
@@ -195,6 +206,7 @@ class Ledger:
             lower_bound=min(lower, cost) if proven else lower,
             upper_bound=cost if proven else np.inf,
             cost_scale=self.program.cost_scale,
+            missed=self.program.finite.missed(answer.solution.x) if decided and self.program.finite.b.size else None,
             worst=worst,
             indices=cuts,
             counts=self._counts(len(cuts)),

@@ -1,0 +1,58 @@
+"""Equalities to rounding: what a solver leaves of them is taken away, by moving entries that are free to move."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sparserob_core.shapes import Bool, Float, shaped
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.finite import FiniteProgram
+
+STEPS = 3
+ROUNDED = 2.0**-52  # of the numbers that are added up, what is left to rounding
+NEARLY = 1e-6  # of the numbers that are added up: what misses an equality by more is no answer that rounding spoilt
+TIGHT = 1e-13  # of a bound, a distance from it that is none
+RANK = 1e-12
+
+
+@shaped
+def onto_equalities(program: FiniteProgram, x: Float[Array, " n"]) -> Float[Array, " n"]:
+    """A point that is nearly ``x (n,)`` and meets ``A x = b`` but for rounding; ``x`` itself where there is none.
+
+    The least-norm correction among those that leave every image at 0 and at its bounds where it is: the cost has its
+    kinks there, and an entry of 0 is to stay 0. What is missed is summed in extended precision.
+    """
+    share = program.missed(x)
+    if not ROUNDED < share <= NEARLY:
+        return x
+    still = _still(program, x)
+    rows, free = (program.A[:, ~still], ~still) if program.S is None else (program.A, np.full(program.n, True))
+    if program.S is not None:
+        rows = np.vstack([rows, program.S[np.flatnonzero(still)].toarray()])
+    for _ in range(STEPS):
+        rest = np.zeros(rows.shape[0])
+        rest[: program.b.size] = -program.excess(x)
+        size = np.sqrt(np.einsum("ij,ij->i", rows, rows))
+        size = np.where(size > 0.0, size, 1.0)
+        moved = x.copy()
+        moved[free] += np.linalg.lstsq(rows / size[:, None], rest / size, rcond=RANK)[0]
+        moved = np.clip(moved, program.lower, program.upper) if program.S is None else moved
+        after = program.missed(moved)
+        if not after < share:
+            break
+        x, share = moved, after
+        if share <= ROUNDED:
+            break
+    return x
+
+
+@shaped
+def _still(program: FiniteProgram, x: Float[Array, " n"]) -> Bool[np.ndarray, " k"]:
+    """Images at a bound, and those of 0 that cost something: they are to stay where they are."""
+    image, still = program.image(x), np.zeros(program.weights.size, dtype=bool)
+    terms = np.abs(x) if program.S is None else np.asarray(abs(program.S) @ np.abs(x))
+    for bound in (program.lower, program.upper, np.where(program.weights > 0.0, 0.0, np.inf)):
+        finite = np.isfinite(bound)
+        distance = np.abs(image - np.where(finite, bound, 0.0))
+        still |= finite & (distance <= TIGHT * np.maximum(np.abs(np.where(finite, bound, 0.0)), terms))
+    return still
