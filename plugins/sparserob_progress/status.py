@@ -10,6 +10,8 @@ import sparserob_core as sr
 
 LABEL: Final = 9  # characters
 
+UNSAID = ("stands", "cycle", "move")  # what a walk notes for pictures
+
 
 class Status:
     """The latest events of a run. To receive one costs microseconds; the text is put together when it is shown."""
@@ -125,6 +127,8 @@ def _notes(event: sr.EvaluationsFinished) -> str:
     """The scalars that the maximiser has noted since the last event; of 0 or 1 at every evaluation, the share."""
     said = []
     for name, rows in event.batch.notes.items():
+        if name in UNSAID:
+            continue
         share = name == "accepted"
         value = sum(value for _, value in rows) / len(rows) if share else rows[-1][1]
         said.append(f"{name} {value:.0%}" if share else f"{name} {value:.3g}")

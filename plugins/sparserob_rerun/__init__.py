@@ -46,6 +46,9 @@ class Rerun(sr.Observer, sr.Options):
     landscape: LandscapeOptions | None = LandscapeOptions()
     """The landscape of g that is evaluated in the background; null: none."""
 
+    waits: bool = False
+    """Wait until everything is recorded rather than drop what comes too fast: for a run that is over."""
+
     _outlet: Outlet | None = PrivateAttr(default=None)
 
     @field_validator("connect")
@@ -93,7 +96,7 @@ class Rerun(sr.Observer, sr.Options):
             from sparserob_rerun.recording.outlet import Outlet
             from sparserob_rerun.recording.recorder import Opening
 
-            opening = Opening(event.title, event.directory, event.inspection, self.landscape)
+            opening = Opening(event.title, event.directory, event.inspection, self.landscape, self.waits)
             self._outlet = Outlet(opening, chosen, 0 if event.problem is None else event.problem.system.parameter_count)
 
 

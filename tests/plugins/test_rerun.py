@@ -87,16 +87,47 @@ def texts(chunks: list[Any], component: str) -> list[str]:
 def test_every_evaluation_is_in_the_recording_with_the_value_that_the_trace_has(searched: sr.Outcome) -> None:
     trace = searched.result.trace
     assert trace is not None and trace.value.size > 60
-    evaluations, values = scalars(read(searched.directory / "recording.rrd")["/search/g"], "evaluation")
-    assert (evaluations == np.arange(1, trace.value.size + 1)).all()
-    assert (values[:, 0] == trace.value).all()
+    found = read(searched.directory / "recording.rrd")
+    numbers = np.arange(1, trace.value.size + 1)
+    tried, values = scalars(found["/search/g/tried"], "evaluation")
+    refused, others = scalars(found["/search/g/refused"], "evaluation")
+    assert not set(tried) & set(refused)
+    assert (np.union1d(tried, refused) == numbers[np.isfinite(trace.value)]).all()
+    assert (values[:, 0] == trace.value[tried - 1]).all() and (others[:, 0] == trace.value[refused - 1]).all()
+    assert (refused == numbers[trace.notes["accepted"] == 0.0]).all()
+    evaluations, best = scalars(found["/search/g/best"], "evaluation")
+    assert (evaluations == numbers).all()
     for outer in np.unique(trace.outer):
         mine = trace.outer == outer
-        assert (values[mine, 1] == np.maximum.accumulate(trace.value[mine])).all()
-    proven = values[:, 2][np.isfinite(values[:, 2])]
+        assert (best[mine, 0] == np.maximum.accumulate(trace.value[mine])).all()
+    proven = scalars(found["/search/g/bound"], "evaluation")[1][:, 0]
+    proven = proven[np.isfinite(proven)]
     assert (np.diff(proven) >= 0).all()
     # of the bound that is written, what rounding may do to it is subtracted once more
     assert proven.max() <= searched.result.lower_bound + 1e-12 * searched.result.cost_scale
+
+
+def walk_of(trace: sr.SearchTrace) -> np.ndarray:
+    """The value where the walk stands after each evaluation, by what is noted of it; NaN where nothing is."""
+    first = np.searchsorted(trace.outer, trace.outer)
+    stands = trace.notes["stands"]
+    known = stands >= 1
+    walk = np.full(trace.value.size, np.nan)
+    walk[known] = trace.value[first[known] + stands[known].astype(int) - 1]
+    return walk
+
+
+def test_the_walk_has_the_values_of_the_trace_and_steps_to_what_was_accepted(searched: sr.Outcome) -> None:
+    trace = searched.result.trace
+    assert trace is not None
+    walk = walk_of(trace)
+    evaluations, shown = scalars(read(searched.directory / "recording.rrd")["/search/g/walk"], "evaluation")
+    known = np.isfinite(shown[:, 0])
+    assert known.sum() > 100
+    assert (evaluations[known] == np.flatnonzero(np.isfinite(walk)) + 1).all()
+    assert (shown[known, 0] == walk[np.isfinite(walk)]).all()
+    accepted = trace.notes["accepted"] > 0.0
+    assert (walk[accepted] == trace.value[accepted]).all()
 
 
 def test_rounds_have_the_bounds_of_the_history_on_all_three_timelines(exchanged: sr.Outcome) -> None:
@@ -129,12 +160,12 @@ def test_nothing_that_a_run_has_to_show_is_missing(kind: str, request: pytest.Fi
         "/signals/x1",
     }
     search = {
-        "/search/g",
+        "/search/g/walk",
+        "/search/stages/walk",
         "/search/notes/temperature",
         "/search/notes/accepted",
         "/search/moves/t",
-        "/landscape/map/now",
-        "/landscape/map/visited",
+        "/landscape/map/best",
     }
     assert common | (search if kind == "searched" else set()) <= set(found)
     rows = sum(chunk.num_rows for chunk in found["/physics/plots/curve"])
@@ -171,55 +202,136 @@ def test_the_control_acts_just_where_the_push_of_the_active_constraints_leaves_t
     assert (np.sign(push[acts]) == np.sign(exchanged.control[acts])).all()
 
 
-def test_the_landscape_is_g_and_decided_by_its_anchor_alone() -> None:
+def inspection(config: str = "experiment1_reduced.yaml", changes: dict[str, object] = SEARCH) -> sr.Inspection:
     from sparserob_core.experiment.config.load import load_config
+
+    return sr.Inspection(load_config(CONFIGS / config, changes))
+
+
+def test_the_landscape_is_g_and_decided_by_its_anchor_alone() -> None:
     from sparserob_rerun.search.landscape import Landscape
 
-    loaded = load_config(CONFIGS / "experiment1_reduced.yaml", SEARCH)
     anchor = np.array([[0.5], [0.9], [3.0], [4.9]])
     found = []
     for _ in range(2):
-        landscape = Landscape(sr.Inspection(loaded).relaxed_value(4, 0.01), anchor, (0, 0), (2, 0), 8)
+        landscape = Landscape(inspection().relaxed_value(4, 0.01), anchor, (0, 0), (2, 0), 8, 0.01)
         levels = [complete for complete in landscape.evaluate() if complete]
-        assert len(levels) == 4 and landscape.spent == 64
+        assert len(levels) == 4 and landscape.spent == 81  # eight even lines and that of the anchor, across and up
         found.append(landscape.values)
     assert (found[0] == found[1]).all()
-    fresh = sr.Inspection(loaded).relaxed_value(4, 0.01)
-    for i, j in ((0, 0), (3, 5), (7, 7)):
+    fresh = inspection().relaxed_value(4, 0.01)
+    for i, j in ((0, 0), (3, 5), (7, 7), landscape.at):
         slots = anchor.copy()
         slots[0, 0], slots[2, 0] = landscape.axes[0][i], landscape.axes[1][j]
         assert found[0][i, j] == pytest.approx(fresh.at(slots), abs=1e-7)
+    assert landscape.value == pytest.approx(fresh.at(anchor), abs=1e-9)
     assert np.ptp(found[0]) > 1e-3
+    picture = landscape.picture(50)
+    assert picture.min() >= landscape.limits[0] - 1e-12 and picture.max() <= landscape.limits[1] + 1e-12
+    assert picture[0, 0] == found[0][0, 0] and picture[-1, -1] == found[0][-1, -1]
 
 
-def test_coordinates_of_the_landscape_are_named_or_refused_with_what_there_is() -> None:
-    from sparserob_core.experiment.config.load import load_config
-    from sparserob_rerun.search.landscape import coordinate, influential
+def test_coordinates_of_the_landscape_are_named_as_in_the_config_or_refused_with_what_there_is() -> None:
+    from sparserob_rerun.search.landscape import coordinate
 
-    g = sr.Inspection(
-        load_config(CONFIGS / "experiment2_reduced.yaml", {"dictionaries.control.pieces": 20})
-    ).relaxed_value(3, 0.1)
-    assert g.names == ("t", "p1", "p2", "p3")
+    system = {
+        "problem.system.A": [[0, 1], ["-2 + spring", "-0.5 + p2"]],
+        "problem.system.B": [[0], ["1 + gain"]],
+        "problem.system.parameters": {"spring": [-0.1, 0.1], "p2": [-0.1, 0.1], "gain": [-0.1, 0.1]},
+    }
+    changes = {"dictionaries.control.pieces": 20, **system}
+    g = inspection("experiment2_reduced.yaml", changes).relaxed_value(3, 0.1)
+    assert g.names == ("t", "spring", "p2", "gain")
     assert g.kinds == ("time", "parameter", "parameter", "parameter")
     assert coordinate("p2", g, 3) == (0, 2)
     assert coordinate("t[3]", g, 3) == (2, 0)
-    for wrong in ("q1", "t[4]", "t[0]", "t[x]"):
-        with pytest.raises(sr.InputError, match=r"expected one of t, p1, p2, p3.*t\[1\] to t\[3\]"):
+    for wrong in ("p1", "t[4]", "t[0]", "t[x]"):
+        with pytest.raises(sr.InputError, match=r"expected one of t, spring, p2, gain.*t\[1\] to t\[3\]"):
             coordinate(wrong, g, 3)
-    assert influential(g, np.zeros((3, 4)), np.array([0.0, 2.0, 1.0])) == ((1, 0), (1, 1))
+
+
+class Plain:
+    """A function of tuples in the place of ``g``: its values, its multipliers and its slopes."""
+
+    def __init__(self, value: Any, weights: list[float], width: int = 1) -> None:
+        self.value, self.kept = value, np.array(weights)
+        self.slot = sr.Box(np.zeros(width), np.ones(width))
+        self.names, self.kinds = ("t", "p")[:width], ("time", "parameter")[:width]
+
+    def at(self, slots: np.ndarray) -> float:
+        return float(self.value(slots))
+
+    def weights(self) -> np.ndarray:
+        return self.kept
+
+    def gradient(self) -> np.ndarray:
+        return np.zeros((self.kept.size, self.slot.dimension))
+
+
+def chosen(g: Any, anchor: np.ndarray) -> tuple[tuple[int, int], tuple[int, int]] | None:
+    from sparserob_rerun.search.landscape import Choice
+
+    choice = Choice(g, anchor)
+    list(choice.look())
+    return choice.pair
+
+
+def test_the_slice_is_over_the_coordinates_in_which_g_changes() -> None:
+    anchor = np.array([[0.2, 0.5], [0.4, 0.5], [0.6, 0.5]])
+    # the middle index decides, by its parameter more than by its time; at its maximum all slopes vanish
+    bump = Plain(lambda s: -((s[1, 0] - 0.4) ** 2) - 5 * (s[1, 1] - 0.5) ** 2, [0.0, 2.0, 0.0], 2)
+    assert chosen(bump, anchor) == ((1, 1), (1, 0))
+    # an index at a fixed time: the parameters of two indices
+    fixed = Plain(lambda s: -abs(s[0, 1] - 0.5) - abs(s[2, 1] - 0.5), [1.0, 0.0, 1.0], 2)
+    assert chosen(fixed, anchor) == ((0, 1), (2, 1))
+    # two indices stand in for one another: alone neither changes anything, together they do
+    twins = Plain(lambda s: -min((s[0, 0] - 0.2) ** 2, (s[2, 0] - 0.2) ** 2), [1.0, 0.0, 1.0], 1)
+    assert chosen(twins, np.array([[0.2], [0.9], [0.2]])) == ((0, 0), (2, 0))
+    assert chosen(Plain(lambda s: 1.0, [0.0]), np.array([[0.5]])) is None
+
+
+def test_a_flat_slice_says_so_and_has_no_range_of_its_own() -> None:
+    from sparserob_rerun.search.landscape import Landscape
+    from sparserob_rerun.search.terrain import _said
+
+    constant = Plain(lambda s: 0.632, [1.0, 0.0])
+    pair = chosen(constant, np.array([[0.5], [0.7]]))
+    assert pair is not None
+    landscape = Landscape(constant, np.array([[0.5], [0.7]]), *pair, 8)  # type: ignore[arg-type]
+    list(landscape.evaluate())
+    assert landscape.flat and landscape.limits == (0.632, 0.632)
+    assert _said(landscape) == "g does not depend on these two here: it is 0.632"
+    tilted = Landscape(Plain(lambda s: s[0, 0], [1.0, 0.0]), np.array([[0.5], [0.7]]), (0, 0), (1, 0), 8)  # type: ignore[arg-type]
+    list(tilted.evaluate())
+    assert not tilted.flat and "from 0 (dark) to 1 (bright)" in _said(tilted)
+
+
+def test_g_has_the_value_that_a_search_has_whatever_the_units(tmp_path: Path) -> None:
+    changes = {**SEARCH, "maximiser.budget": 30, "continuation": {"start": 0.1, "stop": 0.1}, "observers": []}
+    for extra in ({}, {"problem.control.box": 2.0**-8, "problem.system.B": [[0], [2.0**8]]}):
+        outcome = sr.run(
+            CONFIGS / "experiment1_reduced.yaml",
+            {**changes, **extra},
+            tmp_path / str(len(extra)),
+            quiet=True,
+            figures=False,
+        )
+        trace = outcome.result.trace
+        assert trace is not None and trace.points.size
+        g = inspection("experiment1_reduced.yaml", {**changes, **extra}).relaxed_value(4, 0.1)
+        for row in (0, 10, int(np.argmax(trace.value))):
+            assert g.at(trace.points[row].reshape(4, -1)) == pytest.approx(trace.value[row], abs=1e-9)
 
 
 @pytest.mark.parametrize(("method", "searches"), [("exchange", False), ("sparserob", True), ("stub", False)])
 def test_a_search_is_shown_of_the_methods_that_say_that_they_search(
     method: str, searches: bool, tmp_path: Path
 ) -> None:
-    from sparserob_core.experiment.config.load import load_config
     from sparserob_rerun.recording.recorder import shown_of
 
     (tmp_path / "stub.py").write_text(STUB)
     changes = {"plugins": [str(tmp_path / "stub.py")], "method": {"name": method}}
-    inspection = sr.Inspection(load_config(CONFIGS / "experiment1_reduced.yaml", changes))
-    assert shown_of(inspection, None).searches == searches
+    assert shown_of(inspection(changes=changes), None).searches == searches
 
 
 @pytest.mark.slow
@@ -366,7 +478,11 @@ def test_an_outcome_can_be_shown_with_all_that_it_knows(searched: sr.Outcome, tm
     searched.show(save=tmp_path / "shown.rrd")
     found = read(tmp_path / "shown.rrd")
     assert searched.result.trace is not None
-    assert (scalars(found["/search/g"], "evaluation")[1][:, 0] == searched.result.trace.value).all()
+    walk = scalars(found["/search/g/walk"], "evaluation")[1][:, 0]
+    assert (
+        walk[np.isfinite(walk)] == walk_of(searched.result.trace)[np.isfinite(walk_of(searched.result.trace))]
+    ).all()
+    assert {"/landscape/map/walk", "/search/notes/temperature", "/search/moves/t"} <= set(found)
     assert sum(chunk.num_rows for chunk in found["/physics/plots/curve"]) == len(searched.result.history) + 1
 
 

@@ -25,6 +25,12 @@ INK: Colour = (225, 225, 225, 255)
 GREY: Colour = (140, 140, 140, 255)
 FAINT: Colour = (90, 90, 90, 255)
 GROUND: Colour = (24, 26, 31, 255)
+FORBIDDEN: Colour = (120, 52, 20, 255)  # where no decision meets the constraints
+TRIED: Colour = (255, 255, 255, 150)  # points that a walk has accepted, or that nobody judged
+REFUSED: Colour = (225, 105, 40, 120)  # points that it has refused
+PAST: Colour = (255, 255, 255, 90)  # a walk before it was heated again
+HALF: Colour = (240, 180, 50, 130)  # the best so far, where it is not on the slice
+SKETCH: Colour = (255, 255, 255, 130)  # cells, balls, regions
 
 _VIRIDIS = np.array(
     [

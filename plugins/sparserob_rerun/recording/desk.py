@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.abc import MetaPathFinder
@@ -21,8 +20,9 @@ from sparserob_rerun.recording.recorder import Opening, Recorder, shown_of
 from sparserob_rerun.recording.sinks import Destinations, open_sinks
 
 IDLE = 0.5  # seconds between two looks at whether the run is still alive
+FLUSHED_EVERY = 1.0  # seconds
 FLUSHING = 5.0
-NICE = 10
+NICE = 5
 
 
 @final
@@ -68,14 +68,13 @@ def _record(messages: Any, opening: Opening, chosen: Destinations, name: str, pa
     ending = Ending()
     try:
         recorder = Recorder(rr, stream, opening, shown, inspection)
-        ending = _listen(
-            messages, recorder, parent, wrong, 1.0 if opening.landscape is None else opening.landscape.share
-        )
+        ending = _listen(messages, recorder, parent, wrong)
         if ending.dropped:
             recorder.say(f"{ending.dropped} events came faster than they could be recorded, and were dropped", "WARN")
         _finish_landscape(recorder, opening)
         if recorder.explorer.wrong:
             recorder.say(recorder.explorer.wrong, "WARN")
+        wrong += recorder.broken.values()
         stream.flush(timeout_sec=FLUSHING)
     except RuntimeError as error:  # of the flush: a viewer that went away
         wrong.append(f"not everything has arrived: {error}")
@@ -83,27 +82,6 @@ def _record(messages: Any, opening: Opening, chosen: Destinations, name: str, pa
         stream.disconnect()
         _serve(servers, ending.keep, parent)
     return wrong
-
-
-@final
-class Pause:
-    """Keeps the background work to a share of the time: after it, as much rest as the share asks for."""
-
-    def __init__(self, share: float) -> None:
-        self.share, self.until = share, 0.0
-
-    @property
-    def left(self) -> float:
-        """Seconds of rest that are left."""
-        return max(0.0, self.until - time.monotonic())
-
-    def work(self, task: Callable[[], None]) -> None:
-        """Do a piece of work, if the rest is over."""
-        if self.left == 0.0:
-            began = time.monotonic()
-            task()
-            now = time.monotonic()
-            self.until = now + (now - began) * (1.0 / self.share - 1.0)
 
 
 def _serve(servers: list[subprocess.Popen[bytes]], keep: float, parent: int) -> None:
@@ -117,40 +95,49 @@ def _serve(servers: list[subprocess.Popen[bytes]], keep: float, parent: int) -> 
             server.terminate()
 
 
-def _listen(messages: Any, recorder: Recorder, parent: int, wrong: list[str], share: float) -> Ending:
+def _listen(messages: Any, recorder: Recorder, parent: int, wrong: list[str]) -> Ending:
     """Log whatever comes until the run is over, or gone; an event that cannot be drawn is left out, and the first of
-    them is shown."""
-    pause = Pause(share)
+    them is shown. What was logged is on the disk a second later."""
+    flushed = time.monotonic()
     while True:
+        explorer = recorder.explorer
+        pause = min(IDLE, explorer.rest) if explorer.busy else IDLE
         try:
-            message = messages.get(timeout=pause.left if recorder.explorer.busy else IDLE)
+            message = messages.get(timeout=pause) if pause > 0.0 else messages.get_nowait()
         except queue.Empty:
-            if os.getppid() != parent:
-                return Ending()
-            pause.work(recorder.idle)
-            continue
+            message = None
         if isinstance(message, Ending):
             return message
-        try:
-            recorder.receive(*message)
-        except Exception as error:  # noqa: BLE001  a picture less is better than no recording
-            if not wrong:
-                wrong.append(f"a {type(message[0]).__name__} could not be drawn: {type(error).__name__}: {error}")
-        if isinstance(message[0], sr.RunFinished):
-            recorder.over = message[0].seconds if message[0].result is not None else -1.0
+        if message is None and os.getppid() != parent:
+            return Ending()
+        if message is not None:
+            recorder.behind = not messages.empty()
+            _receive(message, recorder, wrong)
+        if message is None or explorer.urgent:
+            recorder.idle()
+        if time.monotonic() - flushed > FLUSHED_EVERY:
+            with suppress(RuntimeError):  # a viewer that went away is told of at the end
+                recorder.stream.flush(timeout_sec=FLUSHING)
+            flushed = time.monotonic()
+
+
+def _receive(message: Any, recorder: Recorder, wrong: list[str]) -> None:
+    try:
+        recorder.receive(*message)
+    except Exception as error:  # noqa: BLE001  a picture less is better than no recording
+        if not wrong:
+            wrong.append(f"a {type(message[0]).__name__} could not be drawn: {type(error).__name__}: {error}")
+    if isinstance(message[0], sr.RunFinished):
+        recorder.over = message[0].seconds if message[0].result is not None else -1.0
 
 
 def _finish_landscape(recorder: Recorder, opening: Opening) -> None:
     """A short run waits for its landscape; a long one had it meanwhile, and one that broke off does not wait."""
-    explorer = recorder.explorer
     if opening.landscape is None or recorder.over < 0.0:
         return
     shown = recorder.terrain.known is not None
-    end = time.monotonic() + opening.landscape.patience - (0.5 * recorder.over if shown else 0.0)
-    if time.monotonic() < end:
-        explorer.hurry()
-    while explorer.busy and time.monotonic() < end:
-        recorder.idle()
+    seconds = recorder.patience - (0.5 * recorder.over if shown and not opening.waits else 0.0)
+    recorder.draw("the landscape", recorder.explorer.finish, seconds)
     recorder.mark()
 
 

@@ -19,24 +19,25 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class Shown:
     """What a run has to show: its problem, if it is one of control, how many families, whether tuples are searched, and
-    the landscape."""
+    the landscape; of a search what the maximiser has ``told`` of itself, and the coordinates that have ``moved``."""
 
     problem: sr.OptimalControlProblem | None
     families: int
     searches: bool
     landscape: bool
+    told: frozenset[str] = frozenset()
+    moved: frozenset[str] = frozenset()
 
 
 def layout(shown: Shown) -> Any:
     """The blueprint: an overview first, then a tab for each part of the story."""
     import rerun.blueprint as rrb
 
-    overview = rrb.Horizontal(
-        *_columns(rrb, shown), name="Overview", column_shares=[5, 4, 3] if shown.problem is not None else [4, 3]
-    )
+    shares = ([4, 5, 3] if shown.searches else [5, 4, 3]) if shown.problem is not None else [4, 3]
+    overview = rrb.Horizontal(*_columns(rrb, shown), name="Overview", column_shares=shares)
     tabs = [overview, _exchange(rrb, shown)]
     if shown.searches:
-        tabs.insert(1, search.tab(rrb))
+        tabs.insert(1, search.tab(rrb, shown.told, shown.moved))
     if shown.landscape:
         tabs.append(search.surface(rrb))
     if shown.problem is not None:
@@ -51,9 +52,11 @@ def layout(shown: Shown) -> Any:
 
 
 def _columns(rrb: Any, shown: Shown) -> list[Any]:
-    numbers = [search.climb(rrb), search.notes(rrb)] if shown.searches else [_violation(rrb, shown), _bounds(rrb)]
+    numbers = (
+        [search.climb(), *search.notes(rrb, shown.told)] if shown.searches else [_violation(rrb, shown), _bounds(rrb)]
+    )
     middle = (
-        rrb.Vertical(search.landscape(rrb), *numbers, row_shares=[4, 3, 2])
+        rrb.Vertical(search.landscape(), *numbers, row_shares=[5, 4, 2, 2][: 1 + len(numbers)])
         if shown.landscape
         else rrb.Vertical(*numbers)
     )

@@ -37,6 +37,7 @@ class Outlet:
         self.pending: list[sr.EvaluationsFinished] = []
         self.since = 0.0
         self.kept: np.ndarray | None = None
+        self.waits = opening.waits
         self.messages = context.Queue(capacity)
         self.report, theirs = context.Pipe(duplex=False)
         sent = opening if START == "fork" else replace(opening, inspection=None)
@@ -71,12 +72,14 @@ class Outlet:
             self._put((joined(pending), self.kept))
 
     def _put(self, message: tuple[sr.Event, np.ndarray | None]) -> None:
-        if not self.dead:
+        while not self.dead:
             try:
-                self.messages.put_nowait(message)
+                self.messages.put(message, self.waits, 1.0)
                 return
             except queue.Full:
                 self.dead = not self.process.is_alive()
+                if not self.waits:
+                    break
         self.dropped += 1
 
     def close(self, keep: float = 0.0) -> list[str]:
@@ -130,9 +133,8 @@ class Outlet:
         kept = self.kept = (np.arange(0, event.best_point.size, event.block)[:, np.newaxis] + offsets).ravel()
         batch = event.batch
         origin = None if batch.origin is None else batch.origin[kept]
-        return replace(
-            event, domain=None, batch=replace(batch, points=[piece[:, kept] for piece in batch.points], origin=origin)
-        )
+        thin = replace(batch, points=[piece[:, kept] for piece in batch.points], origin=origin)
+        return replace(event, domain=None, sketches={}, batch=thin)
 
 
 def follows(before: sr.EvaluationsFinished, event: sr.EvaluationsFinished) -> bool:
@@ -151,4 +153,5 @@ def joined(parts: list[sr.EvaluationsFinished]) -> sr.EvaluationsFinished:
     values = [np.concatenate(list(batch.values)) for batch in batches if len(batch.values)]
     moments = [moment for batch in batches for moment in batch.moments]
     whole = replace(first, points=points, values=values, moments=moments, notes=notes)
-    return replace(parts[-1], count=sum(part.count for part in parts), batch=whole)
+    sketches = {role: sketch for part in parts for role, sketch in part.sketches.items()}
+    return replace(parts[-1], count=sum(part.count for part in parts), batch=whole, sketches=sketches)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
 
@@ -16,12 +17,16 @@ from sparserob_rerun.exchange.rounds import Rounds
 from sparserob_rerun.options import LandscapeOptions
 from sparserob_rerun.physics.physics import Physics
 from sparserob_rerun.recording import words
-from sparserob_rerun.recording.layout import Shown
-from sparserob_rerun.search.explorer import Explorer
+from sparserob_rerun.recording.layout import Shown, layout
+from sparserob_rerun.search.climb import Climb
+from sparserob_rerun.search.explorer import Aim, Explorer
+from sparserob_rerun.search.landscape import Landscape
 from sparserob_rerun.search.search import SearchView
 from sparserob_rerun.search.terrain import Terrain
-from sparserob_rerun.search.way import Way
+from sparserob_rerun.search.way import Stage
 
+SEEN = 10  # evaluations between two pictures of the way
+PICTURE_EVERY, SPARE = 0.5, 20.0  # seconds between them, and how many times as long as one took
 PICTURES = 60  # rounds whose physics is drawn; of later ones every tenth
 PROOFS = 12  # lines about the proof of one family
 SLOTS = 16  # active constraints at most that make the tuple of a method without one
@@ -31,12 +36,13 @@ SLOTS = 16  # active constraints at most that make the tuple of a method without
 @dataclass(frozen=True, eq=False)
 class Opening:
     """What a recording knows of its run at the beginning. Without an ``inspection`` it is read from the ``directory``,
-    if there is one."""
+    if there is one. ``waits``: the run is over, and waits for its recording."""
 
     title: str
     directory: Path | None
     inspection: sr.Inspection | None
     landscape: LandscapeOptions | None
+    waits: bool = False
 
     def answers(self) -> sr.Inspection | None:
         """Who answers questions about the run."""
@@ -55,14 +61,16 @@ class Recorder:
         problem = None if inspection is None else inspection.problem
         self.physics = Physics(rr, stream, inspection) if inspection is not None and problem is not None else None
         self.terrain = Terrain(rr, stream)
-        self.explorer = Explorer(self.terrain, inspection, opening.landscape)
+        self.explorer = Explorer(self._landscape, inspection, opening.landscape, opening.waits)
         self.search = SearchView(rr, stream, self.timelines)
-        self.searches, self.began = shown.searches, 0.0
-        self.best, self.best_value, self.block = np.zeros(0), -np.inf, 1
+        self.climb, self.stages = Climb(rr, stream), list[Stage]()
+        self.shown, self.searches, self.began = shown, shown.searches, 0.0
+        self.best_value, self.unseen, self.behind = -np.inf, 0, False
+        self.heard = self.next = time.monotonic()
+        self.patience = 0.0 if opening.landscape is None else opening.landscape.patience
         self.lower, self.upper, self.over = -np.inf, np.inf, -1.0
         self.exact: float | None = None
         self.proofs: dict[str, int] = {}
-        self.way = Way()
         self.broken: dict[str, str] = {}
         self.timelines.move()
         self.say(f"run: {opening.title}")
@@ -70,6 +78,7 @@ class Recorder:
 
     def receive(self, event: sr.Event, kept: np.ndarray | None = None) -> None:
         """Log one event; of evaluated points only the coordinates ``kept`` have come along, or all of them."""
+        self.heard = time.monotonic()
         match event:
             case sr.EvaluationsFinished():
                 self._evaluations(event, np.arange(event.best_point.size) if kept is None else kept)
@@ -95,6 +104,8 @@ class Recorder:
         except Exception as error:  # noqa: BLE001  a panel less is better than no recording
             self.broken[panel] = f"{panel} could not be drawn: {type(error).__name__}: {error}"
             self.say(f"{self.broken[panel]}; the rest goes on", "WARN")
+            if panel == "the landscape":
+                self.explorer.left = 0
 
     def say(self, line: str, level: str = "INFO") -> None:
         """A line of the log."""
@@ -102,10 +113,10 @@ class Recorder:
 
     def mark(self) -> None:
         """Mark on the last landscape where the maximum is, if it was proven."""
-        landscape = self.explorer.landscape
-        if landscape is not None and self.exact is not None and self.explorer.round == self.timelines.round:
-            at = np.array([[landscape.anchor[landscape.first], landscape.anchor[landscape.second]]])
-            self.terrain.mark(at, f"exact maximum {self.exact:.5g}")
+        landscape = self.terrain.known
+        if landscape is not None and self.exact is not None and self.explorer.landscape is landscape:
+            share = ", with the regulariser's share" if landscape.epsilon > 0.0 else ""
+            self.draw("the landscape", self.terrain.mark, f"proven to be the highest: {self.exact:.6g}{share}")
 
     def _evaluations(self, event: sr.EvaluationsFinished, kept: np.ndarray) -> None:
         if event.total == event.count:
@@ -113,16 +124,64 @@ class Recorder:
         if event.family:
             self.draw("the search for violations", self.search.separation, event, self.began)
             return
-        self.draw("the search", self.search.show, event, self.began, self._moving(event.block), kept)
-        if not event.best_point.size:
-            return
-        if event.total == event.count:
-            slots = event.best_point.reshape(-1, event.block)
-            self.explorer.aim(slots, event.epsilon, f"others as in the first tuples of search {max(1, event.round)}")
+        stage = self._stage(event)
+        stage.add(event, kept)
+        self.draw("the search", self.search.show, event, stage, self.began, self._moving(event.block), kept)
+        self.timelines.move(stage.base + event.total, event.round, self.began + event.seconds)
         if event.best_value > self.best_value or event.total == event.count:
             self.say(f"evaluation {self.timelines.evaluation}: best g {event.best_value:.8g}", "TRACE")
-        self.best, self.best_value, self.block = event.best_point, event.best_value, event.block
-        self.draw("the way of the search", self.way.go, event, kept, self.terrain)
+        self.best_value = event.best_value
+        if event.best_point.size:
+            self.draw("the landscape", self.explorer.aim, self._best(stage, max(1, event.round)))
+        self.unseen += event.count
+        if self.opening.waits or (self.unseen >= SEEN and not self.behind and time.monotonic() >= self.next):
+            self._way()
+
+    def _stage(self, event: sr.EvaluationsFinished) -> Stage:
+        """The search that an event belongs to; a new one where it is the first of it."""
+        if not self.stages or event.total == event.count or self.stages[-1].number != event.round:
+            if self.stages:
+                self._way()
+            base = self.timelines.evaluation
+            self.stages.append(Stage(event.round, event.epsilon, base - (event.total - event.count)))
+            weight = f": epsilon {event.epsilon:.3g}" if np.isfinite(event.epsilon) else ""
+            self.say(f"search {max(1, event.round)} begins{weight}")
+        return self.stages[-1]
+
+    def _best(self, stage: Stage, number: int) -> Aim:
+        at = f"others as in the best tuple at evaluation {self.timelines.evaluation}"
+        return Aim(stage.best.reshape(-1, stage.block), stage.epsilon, stage.best_value, at, number)
+
+    def _way(self) -> None:
+        """Draw how far the search has come: the climb, and its way on the landscape."""
+        self.unseen, began = 0, time.monotonic()
+        if not self.stages:
+            return
+        stage = self.stages[-1]
+        self.draw("the climb", self.climb.draw, self.stages, self.exact)
+        self.draw("the way of the search", self.terrain.visit, stage)
+        told, moved = frozenset(self.search.notes), frozenset(self.search.moved)
+        if not (told <= self.shown.told and moved <= self.shown.moved):
+            self.shown = replace(self.shown, told=self.shown.told | told, moved=self.shown.moved | moved)
+            self.draw("the arrangement of the search", self.stream.send_blueprint, layout(self.shown))
+        weight = f"epsilon = {stage.epsilon:.3g}, " if np.isfinite(stage.epsilon) else ""
+        if not self.exact:
+            done = self.timelines.evaluation - stage.base
+            of = f" of {stage.budget}" if stage.budget else ""
+            line = f"search {max(1, stage.number)}: {weight}evaluation {done}{of}; best g {stage.best_value:.8g}"
+            self.lower = max(self.lower, stage.lower_bound)
+            self._page("solving", [line])
+        now = time.monotonic()
+        self.next = now + max(PICTURE_EVERY, SPARE * (now - began))
+
+    def _landscape(self, landscape: Landscape, aim: Aim) -> None:
+        """Draw a landscape at the moment at which it is there, and the way on it."""
+        if not self.opening.waits:
+            self.timelines.move(seconds=self.timelines.seconds + time.monotonic() - self.heard)
+            self.heard = time.monotonic()
+        self.terrain.surface(landscape, aim)
+        if self.stages:
+            self.terrain.visit(self.stages[-1])
 
     def _moving(self, width: int) -> dict[int, str]:
         """The coordinates of an index whose moves are drawn, with their names: neither disturbance nor direction."""
@@ -132,10 +191,8 @@ class Recorder:
         return {k: name for k, (name, kind) in enumerate(named) if kind in ("time", "parameter", "index")}
 
     def idle(self) -> None:
-        """Work on the landscape for a moment; the way of the search comes over to a new one."""
+        """Work on the landscape for a moment."""
         self.draw("the landscape", self.explorer.step)
-        if self.terrain.known is not None and self.terrain.known is not self.way.landscape:
-            self.draw("the way of the search", self.way.project, self.terrain)
 
     def _round(self, event: sr.RoundFinished) -> None:
         self.timelines.move(None if self.searches else event.relaxed_programs, event.round, event.seconds)
@@ -156,18 +213,18 @@ class Recorder:
 
     def _aim(self, event: sr.RoundFinished) -> None:
         """The tuple whose surroundings are worth a look after a round: the best of the search, or the constraints that
-        are active."""
-        if self.searches and self.best.size:
-            self.explorer.aim(
-                self.best.reshape(-1, self.block),
-                event.epsilon,
-                f"others as in the best tuple of round {event.round}",
-                event.round,
-            )
+        are active. A run that is over waits for the one of each search."""
+        if self.searches and self.stages and self.stages[-1].best.size:
+            self.explorer.aim(self._best(self.stages[-1], event.round))
+            if self.opening.waits:
+                began = time.monotonic()
+                self.explorer.finish(0.5 * self.patience, level=4)
+                self.patience -= time.monotonic() - began
         elif not self.searches:
             slots = slots_of(active(event.imposed, event.multipliers), self._formulation)
             if slots.size:
-                self.explorer.aim(slots, event.epsilon, f"others as active in round {event.round}", event.round)
+                words = f"others as active in round {event.round}"
+                self.explorer.aim(Aim(slots, event.epsilon, np.nan, words, event.round))
 
     def _finished(self, event: sr.RunFinished) -> None:
         self.timelines.move(seconds=event.seconds)
@@ -183,16 +240,19 @@ class Recorder:
                 self.draw("the violations", self.rounds.violations, result.decision, result.indices, ())
             # a run that is shown again
             if self.explorer.landscape is None and self.explorer.waiting is None and result.indices:
-                self.explorer.aim(
-                    slots_of(list(result.indices), self._formulation),
-                    result.epsilon,
-                    "others as active at the end",
-                    self.timelines.round,
+                slots = slots_of(list(result.indices), self._formulation)
+                self.draw(
+                    "the landscape",
+                    self.explorer.aim,
+                    Aim(slots, result.epsilon, np.nan, "others as active at the end", self.timelines.round),
                 )
         self.say(
             f"{event.status}: {event.message}",
             {"failed": "ERROR", "refuted": "WARN", "undecided": "WARN"}.get(event.status, "INFO"),
         )
+        if self.exact is not None and self.stages:
+            self.draw("the search", self.search.exact, self.exact, result.epsilon if result is not None else 0.0)
+        self._way()
         self._page(event.status, lines)
 
     @property
@@ -214,8 +274,6 @@ def shown_of(inspection: sr.Inspection | None, landscape: LandscapeOptions | Non
 
 def active(cuts: Any, multipliers: Floats) -> list[sr.Cut]:
     """The cuts that carry a multiplier, with it."""
-    from dataclasses import replace
-
     return [replace(cut, multiplier=float(m)) for cut, m in zip(cuts, multipliers, strict=True) if m > 0.0]
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import final
 
 import numpy as np
@@ -11,91 +12,156 @@ import numpy as np
 import sparserob_core as sr
 from sparserob_rerun.drawing.palette import Floats
 from sparserob_rerun.options import LandscapeOptions
-from sparserob_rerun.search.landscape import Landscape, coordinate, influential
-from sparserob_rerun.search.terrain import Terrain
+from sparserob_rerun.search.landscape import Choice, Landscape, coordinate
 
 SLICE = 0.02  # seconds of work between two looks at the queue
-FEWEST = 32  # evaluations that a first, coarse landscape needs
+LARGE = 0.02  # of the height of a landscape: a gain after which it is drawn anew
+STALE = 10.0  # seconds after which any gain is enough
+RESERVE = 0.25  # of the evaluations, for which landscapes stay coarse
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Aim:
+    """A tuple ``(D, width)`` whose surroundings are worth a look, with the ``value`` that the search has for it.
+    ``round``: the round that it is of, 0 for none."""
+
+    slots: Floats
+    epsilon: float
+    value: float
+    words: str
+    round: int = 0
 
 
 @final
 class Explorer:
-    """Fills one landscape after the other: through the first tuple of a search, then through the best tuple of a round,
-    the newest first.
+    """Draws one landscape after the other, each through the best tuple that is known when it is begun.
 
-    All of them together take no more evaluations than the options allow. What a landscape shows is decided by its
-    anchor alone, not by the clock.
+    A landscape of another weight epsilon is given up at once, for a coarse one of the new weight, which waits for
+    nothing. After a gain of `LARGE` a coarse one follows, as soon as the share of a core that the options allow has
+    grown again; what is left of it refines. The share is of processor time, which is what it takes from others.
     """
 
-    def __init__(self, terrain: Terrain, inspection: sr.Inspection | None, options: LandscapeOptions | None) -> None:
-        self.terrain, self.inspection, self.options = terrain, inspection, options
+    def __init__(
+        self,
+        draw: Callable[[Landscape, Aim], None],
+        inspection: sr.Inspection | None,
+        options: LandscapeOptions | None,
+        hurried: bool = False,
+    ) -> None:
+        self.draw, self.inspection, self.options = draw, inspection, options
         self.left = 0 if options is None or inspection is None else options.evaluations
+        self.share = 1.0 if hurried or options is None else options.share
         self.landscape: Landscape | None = None
-        self.words, self.round = "", 0
+        self.aimed: Aim | None = None
+        self.waiting: Aim | None = None
         self.work: Iterator[bool] = iter(())
-        self.waiting: tuple[Floats, float, str, int] | None = None
-        self.wrong = ""
+        self.began = self.since = time.monotonic()
+        self.used, self.wrong = 0.0, ""
 
     @property
     def busy(self) -> bool:
         """Whether there is something left to evaluate."""
+        return self.left > 0 and (self.waiting is not None or (self.aimed is not None and not self._finished))
+
+    @property
+    def urgent(self) -> bool:
+        """Whether a first, coarse landscape is wanted: the first of a weight."""
         return self.left > 0 and (
-            (self.landscape is not None and self.landscape.level != 1) or self.waiting is not None
+            (self.aimed is not None and not self._coarse)
+            or (self.waiting is not None and (self.aimed is None or self.aimed.epsilon != self.waiting.epsilon))
         )
 
-    def aim(self, slots: Floats, epsilon: float, words: str, number: int = 0) -> None:
-        """Ask for the landscape through a tuple ``(D, width)``, in the middle of the coordinates that it does not say;
-        it is begun when the one in work is complete. ``number``: the round that the tuple is of, 0 for none."""
-        if self.left > 0:
-            self.waiting = (np.array(slots, dtype=float), epsilon, words, number)
+    @property
+    def rest(self) -> float:
+        """Seconds until the share allows more work."""
+        return 0.0 if self.urgent else max(0.0, self.used / self.share - (time.monotonic() - self.began))
 
-    def hurry(self) -> None:
-        """Leave an unfinished landscape for the one that is waiting."""
-        if self.waiting is not None and (self.landscape is None or self.landscape.level != 1):
-            self.landscape = None
-
-    def step(self) -> None:
-        """Work for a moment."""
-        try:
-            self._step()
-        except sr.SparseRobError as error:
-            self.left, self.wrong = 0, f"no landscape: {error}"
-
-    def _step(self) -> None:
-        if (self.landscape is None or self.landscape.level == 1) and not self._begin():
-            self.left = 0 if self.waiting is not None else self.left
+    def aim(self, aim: Aim) -> None:
+        """Ask for the landscape through a tuple, in the middle of the coordinates that it does not say."""
+        if self.left <= 0:
+            return
+        now = self.aimed
+        if now is not None and now.epsilon == aim.epsilon and np.array_equal(now.slots, aim.slots):
             self.waiting = None
             return
-        landscape, end = self.landscape, time.monotonic() + SLICE
-        assert landscape is not None
-        while time.monotonic() < end and self.left > 0:
-            before = landscape.spent
-            if next(self.work, True):
-                if np.isfinite(landscape.values).any():
-                    self.terrain.surface(landscape, self.words)
-                return
-            self.left -= landscape.spent - before
+        self.waiting = aim
+        if now is not None and now.epsilon != aim.epsilon:
+            self.aimed = self.landscape = None
 
-    def _begin(self) -> bool:
-        """Start on the tuple that is waiting; ``False`` where there is none, or nothing in it can move."""
-        if self.waiting is None or self.inspection is None or self.options is None or self.left < FEWEST:
+    def step(self, hurry: bool = False) -> None:
+        """Work for a moment, if the share allows it or in a ``hurry``."""
+        if self.left > 0 and (hurry or self.rest == 0.0):
+            before = time.thread_time()
+            try:
+                self._step()
+            except sr.SparseRobError as error:
+                self.left, self.wrong = 0, f"no landscape: {error}"
+            finally:
+                self.used += time.thread_time() - before
+
+    def finish(self, seconds: float, level: int = 1) -> None:
+        """Work for some seconds, until the landscape of the tuple that was asked for last has a level."""
+        end = time.monotonic() + seconds
+        while self.busy and time.monotonic() < end:
+            if self.waiting is None and self.landscape is not None and 0 < self.landscape.level <= level:
+                return
+            if self.waiting is not None and self._coarse:
+                self.aimed = None
+            self.step(hurry=True)
+
+    @property
+    def _coarse(self) -> bool:
+        return self.landscape is not None and self.landscape.level != 0
+
+    @property
+    def _finished(self) -> bool:
+        return self.landscape is not None and self.landscape.level == 1
+
+    def _step(self) -> None:
+        if self.waiting is not None and self._better(self.waiting):
+            self.aimed, self.waiting, self.landscape = self.waiting, None, None
+            self.since, self.work = time.monotonic(), self._worked(self.aimed)
+        end = time.monotonic() + SLICE
+        while self.left > 0 and self.aimed is not None and not self._finished and time.monotonic() < end:
+            spare = self.options is not None and self.left < RESERVE * self.options.evaluations
+            if spare and self._coarse:
+                return
+            self.left -= 1
+            level = next(self.work, None)
+            if level is None:
+                self.aimed = None
+            elif level and self.landscape is not None and np.isfinite(self.landscape.values).any():
+                self.draw(self.landscape, self.aimed)
+                return
+
+    def _better(self, waiting: Aim) -> bool:
+        """Whether a tuple that is waiting is worth more than the landscape in work."""
+        if self.aimed is None or self._finished or self.landscape is None:
+            return self.aimed is None or self._finished
+        if not self._coarse:
             return False
-        slots, epsilon, self.words, self.round = self.waiting
-        g = self.inspection.relaxed_value(len(slots), epsilon)
-        known, middle = min(slots.shape[1], g.slot.dimension), (g.slot.lower + g.slot.upper) / 2
-        anchor = np.tile(middle, (len(slots), 1))
-        anchor[:, :known] = slots[:, :known]
+        low, high = self.landscape.limits
+        gain = waiting.value - self.aimed.value
+        return not gain <= LARGE * (high - low) or time.monotonic() - self.since > STALE
+
+    def _worked(self, aim: Aim) -> Iterator[bool]:
+        """Choose the coordinates, then fill the landscape; ``True`` where a level is complete."""
+        assert self.inspection is not None and self.options is not None
+        g = self.inspection.relaxed_value(len(aim.slots), aim.epsilon)
+        known, middle = min(aim.slots.shape[1], g.slot.dimension), (g.slot.lower + g.slot.upper) / 2
+        anchor = np.tile(middle, (len(aim.slots), 1))
+        anchor[:, :known] = aim.slots[:, :known]
         anchor = np.clip(anchor, g.slot.lower, g.slot.upper)
-        g.at(anchor)
         if self.options.coordinates is not None:
-            pair = tuple(coordinate(name, g, len(slots)) for name in self.options.coordinates)
+            one, other = (coordinate(name, g, len(anchor)) for name in self.options.coordinates)
+            pair = (one, other)
         else:
-            found = influential(g, anchor, g.weights())
-            if found is None:
-                self.wrong = "no landscape: fewer than two coordinates of the indices can move"
-                return False
-            pair = found
-        self.waiting = None
-        self.landscape = Landscape(g, anchor, pair[0], pair[1], self.options.grid)
-        self.work = self.landscape.evaluate()
-        return True
+            choice = Choice(g, anchor)
+            yield from choice.look()
+            if choice.pair is None:
+                self.left, self.wrong = 0, "no landscape: fewer than two coordinates of the indices can move"
+                return
+            pair = choice.pair
+        self.landscape = Landscape(g, anchor, *pair, self.options.grid, aim.epsilon)
+        yield from self.landscape.evaluate()

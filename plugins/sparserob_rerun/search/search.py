@@ -1,7 +1,8 @@
-"""A maximiser at work: every value, the best of them, its own scalars, and where in the index space it looks."""
+"""A maximiser at work: every value, its walk, the best, its own scalars, and where in the index space it looks."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, final
 
 import numpy as np
@@ -10,26 +11,38 @@ import sparserob_core as sr
 from sparserob_rerun.drawing import palette as ink
 from sparserob_rerun.drawing.palette import Colour, Floats
 from sparserob_rerun.drawing.timelines import Timelines
+from sparserob_rerun.search.way import Stage
 
 MOVES = (
     4  # coordinates of one evaluation that are shown; a search that changes all of them at once would bury the panel
 )
+LOGARITHMIC = ("temperature", "scale", "constant", "radius", "slope", "step", "spread")
 NOTES = {  # what a maximiser notes: the words for it, and its colour
-    "temperature": ("temperature", ink.VERMILLION),
+    "temperature": ("log10 of the temperature", ink.VERMILLION),
     "accepted": ("share of moves accepted (last 50)", ink.GREEN),
-    "scale": ("size of a move", ink.SKY),
+    "scale": ("log10 of the size of a move, in widths of the box", ink.SKY),
+    "move": ("what moves: 0 all anew, 1 one coordinate, 2 several, 3 an index", ink.PURPLE),
     "depth": ("depth of the opened cell", ink.SKY),
     "openings": ("cells opened", ink.GREEN),
     "hmax": ("deepest cells allowed", ink.GREY),
-    "constant": ("Lipschitz constant", ink.VERMILLION),
+    "constant": ("log10 of the Lipschitz constant", ink.VERMILLION),
     "rejected": ("share of points rejected", ink.GREEN),
-    "spread": ("distance from the best point", ink.SKY),
+    "spread": ("log10 of the distance from the best point", ink.SKY),
     "ascent": ("number of the ascent", ink.GREEN),
     "start": ("number of the start", ink.GREEN),
-    "slope": ("norm of the gradient", ink.SKY),
-    "radius": ("radius of the trust region", ink.SKY),
-    "step": ("0: global, 1: local step", ink.GREEN),
+    "slope": ("log10 of the largest slope", ink.SKY),
+    "radius": ("log10 of the radius of the trust region", ink.SKY),
+    "step": ("log10 of the local step", ink.GREEN),
+    "local": ("0: global, 1: local step", ink.GREEN),
+    "cycle": ("how often it was heated again", ink.GREY),
 }
+SILENT = ("stands",)  # what says where the walk is, and is drawn as such
+SERIES: dict[str, tuple[str, Colour, float]] = {
+    "walk": ("g where the walk stands", ink.INK, 1.5),
+    "best": ("best so far", ink.ORANGE, 2.5),
+    "bound": ("proven lower bound", ink.GREEN, 2.0),
+}
+CLOUDS: dict[str, tuple[str, Colour]] = {"tried": ("tried", ink.SKY), "refused": ("tried, refused", ink.VERMILLION)}
 WINDOW = 50
 
 
@@ -39,34 +52,46 @@ class SearchView:
 
     def __init__(self, rr: Any, stream: Any, timelines: Timelines) -> None:
         self.rr, self.stream, self.timelines = rr, stream, timelines
-        self.base, self.known = 0, {"search/g"}
+        self.known = set[str]()
+        self.notes, self.moved = set[str](), set[str]()  # what the maximiser has told, and what has moved
         self.recent = np.empty(0)
-        stream.log(
-            "search/g",
-            rr.SeriesLines(
-                names=["g of the tuple", "best so far", "proven lower bound"],
-                colors=[ink.SKY, ink.ORANGE, ink.GREEN],
-                widths=[1.0, 2.5, 2.0],
-            ),
-            static=True,
-        )
+        self.of: Stage | None = None
 
-    def show(self, event: sr.EvaluationsFinished, began: float, moving: dict[int, str], kept: np.ndarray) -> None:
-        """Log a batch of a search that began ``began`` seconds after the run; of the points the coordinates ``kept``
-        are there."""
+    def show(
+        self, event: sr.EvaluationsFinished, stage: Stage, began: float, moving: dict[int, str], kept: np.ndarray
+    ) -> None:
+        """Log a batch of a search that began ``began`` seconds after the run, of which the stage knows already; of the
+        points the coordinates ``kept`` are there."""
         batch = event.batch.trace
         count = batch.values.size
-        if event.total == event.count:
-            self.base, self.recent = self.timelines.evaluation, np.empty(0)
-        numbers = self.base + event.total - count + 1 + np.arange(count)
-        at = self.timelines.columns(numbers, began + batch.seconds, event.round)
-        values = np.stack(
-            [_shown(batch.values), _shown(batch.best), np.full(count, _finite(event.lower_bound))], axis=1
-        )
-        self.stream.send_columns("search/g", at, self.rr.Scalars.columns(scalars=values.ravel()).partition([3] * count))
-        self._notes(event, numbers, began)
+        if stage is not self.of:
+            self.of, self.recent = stage, np.empty(0)
+        numbers = stage.base + event.total - count + 1 + np.arange(count)
+
+        def at(which: np.ndarray) -> list[Any]:
+            return self.timelines.columns(numbers[which], began + batch.seconds[which], event.round)
+
+        refused = stage.refused[stage.values.size - count :]
+        self._cloud("search/g/tried", at, np.where(refused, np.nan, batch.values), CLOUDS["tried"])
+        self._cloud("search/g/refused", at, np.where(refused, batch.values, np.nan), CLOUDS["refused"])
+        for name, values in (
+            ("walk", stage.walk[stage.values.size - count :]),
+            ("best", batch.best),
+            ("bound", np.full(count, event.lower_bound)),
+        ):
+            if np.isfinite(values).any():
+                self._line(f"search/g/{name}", *SERIES[name])
+                rows = self.rr.Scalars.columns(scalars=_shown(values))
+                self.stream.send_columns(f"search/g/{name}", at(np.arange(count)), rows)
+        self._notes(event, stage, numbers, began)
         self._moves(event, numbers, moving, kept)
-        self.timelines.move(self.base + event.total, event.round, began + event.seconds)
+        self.timelines.move(stage.base + event.total, event.round, began + event.seconds)
+
+    def exact(self, value: float, epsilon: float) -> None:
+        """The proven value, from the first evaluation to the last."""
+        self._line("search/g/exact", f"exact value (epsilon {epsilon:.3g})" if epsilon else "exact value", ink.PURPLE)
+        at = [self.rr.TimeColumn("evaluation", sequence=np.array([1, max(2, self.timelines.evaluation)]))]
+        self.stream.send_columns("search/g/exact", at, self.rr.Scalars.columns(scalars=np.full(2, value)))
 
     def separation(self, event: sr.EvaluationsFinished, began: float) -> None:
         """A search for the worst index of one family: a series of its own, on the timeline of seconds only."""
@@ -75,15 +100,29 @@ class SearchView:
         at = [self.rr.TimeColumn("time", duration=began + batch.seconds)]
         self.stream.send_columns(path, at, self.rr.Scalars.columns(scalars=_shown(batch.values)))
 
-    def _notes(self, event: sr.EvaluationsFinished, numbers: np.ndarray, began: float) -> None:
+    def _notes(self, event: sr.EvaluationsFinished, stage: Stage, numbers: np.ndarray, began: float) -> None:
         batch = event.batch.trace
         for name, rows in batch.notes.items():
+            if name in SILENT:
+                continue
+            self.notes.add(name)
             words, colour = NOTES.get(name, (name, ink.GREY))
-            where = np.clip(rows[:, 0].astype(int) + self.base - numbers[0], 0, numbers.size - 1)
+            where = np.clip(rows[:, 0].astype(int) + stage.base - numbers[0], 0, numbers.size - 1)
             values = self._share(rows[:, 1]) if name == "accepted" else rows[:, 1]
-            self._line(f"search/notes/{name}", words, colour)
-            at = self.timelines.columns(numbers[where], began + batch.seconds[where], event.round)
-            self.stream.send_columns(f"search/notes/{name}", at, self.rr.Scalars.columns(scalars=_shown(values)))
+            if name in LOGARITHMIC:
+                values = np.log10(np.where(values > 0.0, values, np.nan))
+            path = f"search/notes/{name}"
+
+            def at(which: np.ndarray, rows: np.ndarray = where) -> list[Any]:
+                mine = rows[which]
+                return self.timelines.columns(numbers[mine], began + batch.seconds[mine], event.round)
+
+            if name == "move":
+                self._cloud(path, at, values, (words, colour))
+                continue
+            self._line(path, words, colour)
+            rows_shown = self.rr.Scalars.columns(scalars=_shown(values))
+            self.stream.send_columns(path, at(np.arange(values.size)), rows_shown)
 
     def _share(self, accepted: Floats) -> Floats:
         """The mean of the last accepted flags at each of the new ones."""
@@ -99,28 +138,38 @@ class SearchView:
     ) -> None:
         """The value of the coordinates that moved, one series for each kind: to which time, to which parameter."""
         trace, moves = event.batch.trace, event.batch.moves
-        if not len(moves) or trace.points.shape[1:] != kept.shape:
+        if not len(moves) or trace.points.shape[1:] != kept.shape or not kept.size:
             return
         kinds = kept[moves[:, 1]] % event.block
         for kind, name in moving.items():
             mine = _few(moves[kinds == kind])
             if not len(mine):
                 continue
-            path = f"search/moves/{name}"
-            if path not in self.known:
-                self.known.add(path)
-                self.stream.log(
-                    path,
-                    self.rr.SeriesPoints(names=[f"{name} tried"], colors=[ink.PURPLE], marker_sizes=[2.0]),
-                    static=True,
-                )
-            at = [self.rr.TimeColumn("evaluation", sequence=numbers[mine[:, 0]])]
-            self.stream.send_columns(path, at, self.rr.Scalars.columns(scalars=trace.points[mine[:, 0], mine[:, 1]]))
+            self.moved.add(name)
 
-    def _line(self, path: str, words: str, colour: Colour) -> None:
+            def at(which: np.ndarray, rows: np.ndarray = mine) -> list[Any]:
+                return [self.rr.TimeColumn("evaluation", sequence=numbers[rows[which, 0]])]
+
+            values = trace.points[mine[:, 0], mine[:, 1]]
+            self._cloud(f"search/moves/{name}", at, values, (f"{name} tried", ink.PURPLE))
+
+    def _line(self, path: str, words: str, colour: Colour, width: float = 1.5) -> None:
         if path not in self.known:
             self.known.add(path)
-            self.stream.log(path, self.rr.SeriesLines(names=[words], colors=[colour], widths=[1.5]), static=True)
+            self.stream.log(path, self.rr.SeriesLines(names=[words], colors=[colour], widths=[width]), static=True)
+
+    def _cloud(
+        self, path: str, at: Callable[[np.ndarray], list[Any]], values: Floats, style: tuple[str, Colour]
+    ) -> None:
+        """Points at those of the values ``(k,)`` that are finite; ``at`` makes the columns of times of these."""
+        which = np.flatnonzero(np.isfinite(values))
+        if not which.size:
+            return
+        if path not in self.known:
+            self.known.add(path)
+            words, colour = style
+            self.stream.log(path, self.rr.SeriesPoints(names=[words], colors=[colour], marker_sizes=[1.5]), static=True)
+        self.stream.send_columns(path, at(which), self.rr.Scalars.columns(scalars=values[which]))
 
 
 def _few(moves: np.ndarray) -> np.ndarray:
@@ -134,7 +183,3 @@ def _few(moves: np.ndarray) -> np.ndarray:
 def _shown(values: Floats) -> Floats:
     """NaN, which a plot leaves out, in the place of infinite values, which would flatten it."""
     return np.where(np.isfinite(values), values, np.nan)
-
-
-def _finite(value: float) -> float:
-    return value if np.isfinite(value) else np.nan

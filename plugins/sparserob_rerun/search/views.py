@@ -2,60 +2,67 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 from sparserob_rerun.drawing import palette as ink
 from sparserob_rerun.drawing.canvas import view
+from sparserob_rerun.search import climb as stages
+from sparserob_rerun.search.search import LOGARITHMIC, NOTES
+
+FIRST = ("temperature", "depth", "constant", "radius", "spread", "slope")  # of what is noted, for the overview
+SHARES = ("accepted", "rejected")
 
 
-def landscape(rrb: Any) -> Any:
+def landscape() -> Any:
     """The landscape of g as a map."""
-    return view(
-        "/landscape/map",
-        "Landscape of g: how much the constraints at two indices cost",
-        (-50.0, 420.0, -38.0, 440.0),
-    )
+    return view("/landscape/map", "Landscape of g around the best tuple, and the way of the search", EXTENT)
 
 
-def climb(rrb: Any) -> Any:
-    """The values over the evaluations."""
+EXTENT = (-50.0, 420.0, -38.0, 462.0)
+
+
+def climb() -> Any:
+    """The climb, one panel for each weight epsilon."""
+    return view("/search/stages", "g over the evaluations, one panel for each epsilon", stages.EXTENT)
+
+
+def series(rrb: Any, origin: str, name: str, contents: list[str] | None = None) -> Any:
+    """A plot against the timeline that shows the whole of it, however long it is."""
+    from rerun.encodings import TimeRange
+
+    everything = TimeRange(start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
     return rrb.TimeSeriesView(
-        origin="/search/g",
-        name="g over the evaluations; it drops where epsilon is reduced",
-        plot_legend=rrb.Corner2D.RightBottom,
+        origin=origin,
+        contents=contents or ["+ $origin/**"],
+        name=name,
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftBottom, visible=contents is None),
+        axis_x=rrb.TimeAxis(view_range=everything),
     )
 
 
-def notes(rrb: Any) -> Any:
-    """The quiet ones of the maximiser's scalars; all of them are in the tab of the search."""
-    hidden = [f"- /search/notes/{name}" for name in ("scale", "openings", "hmax", "step", "slope")]
-    return rrb.TimeSeriesView(
-        origin="/search/notes",
-        contents=["+ $origin/**", *hidden],
-        name="What the maximiser says of itself",
-        plot_legend=rrb.Corner2D.RightTop,
-    )
+def notes(rrb: Any, told: Collection[str]) -> list[Any]:
+    """The first of what the maximiser says of itself; nothing where it says nothing."""
+    chosen = [name for name in (*FIRST, *SHARES) if name in told][:2]
+    return [_note(rrb, name) for name in chosen]
 
 
-def tab(rrb: Any) -> Any:
-    """The tab of a search."""
-    rest = [f"- /search/notes/{name}" for name in ("temperature", "constant")]
-    notes = rrb.Horizontal(
-        rrb.TimeSeriesView(
-            origin="/search/notes",
-            contents=["/search/notes/temperature", "/search/notes/constant"],
-            name="Temperature; Lipschitz constant",
-        ),
-        rrb.TimeSeriesView(
-            origin="/search/notes", contents=["+ $origin/**", *rest], name="What the maximiser says of itself"
-        ),
-    )
-    return rrb.Vertical(
-        climb(rrb),
-        notes,
-        rrb.TimeSeriesView(origin="/search/moves", name="Where it looks: the coordinates that moved"),
-        name="Search",
-    )
+def _note(rrb: Any, name: str) -> Any:
+    words = NOTES.get(name, (name, ink.GREY))[0]
+    return series(rrb, "/search/notes", words[0].upper() + words[1:], [f"+ /search/notes/{name}"])
+
+
+def tab(rrb: Any, told: Collection[str], moved: Collection[str]) -> Any:
+    """The tab of a search: what the maximiser has ``told`` of itself, and the coordinates that have ``moved``, each on
+    an axis of its own."""
+    order = [name for name in (*LOGARITHMIC, *NOTES) if name in told]
+    mine = [_note(rrb, name) for name in dict.fromkeys([*order, *sorted(told)])]
+    where = [
+        series(rrb, "/search/moves", f"Where it looks: {name}", [f"+ /search/moves/{name}"]) for name in sorted(moved)
+    ]
+    left = rrb.Vertical(climb(), series(rrb, "/search/g", "g, with the share of the regulariser"), row_shares=[3, 2])
+    columns = [rrb.Vertical(*group) for group in (mine, where) if group]
+    return rrb.Horizontal(left, *columns, column_shares=[5, 3, 3][: 1 + len(columns)], name="Search")
 
 
 def surface(rrb: Any) -> Any:

@@ -19,8 +19,8 @@ KEEP = 24 * 3600.0
 
 
 def recorder(save: str | Path | None, serve: bool, connect: str | None, patience: float | None = None) -> Observer:
-    """The observer that records to a viewer, to a browser, to a listener or into a file; raises `InputError` where that
-    cannot be had."""
+    """The observer that records to a viewer, to a browser, to a listener or into a file. ``patience``: of a run that is
+    over, the seconds that its landscapes may take. Raises `InputError` where that cannot be had."""
     if find_spec("rerun_bindings") is None:
         raise InputError("rerun: rerun-sdk is not installed; `pip install 'sparserob[rerun]'` brings it")
     spawn = save is None and not serve and connect is None
@@ -36,7 +36,7 @@ def recorder(save: str | Path | None, serve: bool, connect: str | None, patience
     if save is not None:
         options["save"] = str(_writable(Path(save)))
     if patience is not None:
-        options["landscape"] = {"patience": patience}
+        options.update(landscape={"patience": patience}, waits=True)
     observer: Observer = load_own_registry().build("observer", "rerun", options)
     return observer
 
