@@ -45,6 +45,8 @@ from sparserob_core.experiment.sweep.study import Study as Study
 from sparserob_core.experiment.sweep.sweep import sweep as sweep
 from sparserob_core.experiment.comparison.comparison import Comparison as Comparison
 from sparserob_core.experiment.comparison.compare import compare as compare
+from sparserob_core.experiment.comparison.profiles import Instance as Instance
+from sparserob_core.experiment.comparison.profiles import Profiles as Profiles
 from sparserob_core.sip.result import Result as Result
 from sparserob_core.sip.result import SearchTrace as SearchTrace
 from sparserob_core.sip.evidence import Cut as Cut
