@@ -121,3 +121,4 @@ from sparserob_core.experiment.run.inspection import Inspection as Inspection
 from sparserob_core.experiment.run.inspection import RelaxedValue as RelaxedValue
 from sparserob_core.experiment.figures.figure_data import FigureData as FigureData
 from sparserob_core.experiment.figures.figure_data import Wall as Wall
+from sparserob_core.experiment.figures.clash import Strip as Strip

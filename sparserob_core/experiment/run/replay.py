@@ -17,6 +17,7 @@ from sparserob_core.experiment.run.viewer import recorder
 from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Batch, EvaluationsFinished
+from sparserob_core.sip.evidence import Proof
 from sparserob_core.sip.program import WorstConstraint
 from sparserob_core.sip.result import UNKNOWN_SCALE, Result, SearchTrace
 from sparserob_core.sip.scenario_bound import ScenarioBound
@@ -98,6 +99,10 @@ def stored_result(run: StoredRun) -> Result:
             cost_scale=_number(summary, "cost_scale", UNKNOWN_SCALE),
             stopped=str(summary.get("stopped") or ""),
             worst=_worst(summary["worst"], solution),
+            proofs=[
+                Proof(str(name), "proven", _number(one, "proven"))
+                for name, one in summary.get("tolerances", {}).items()
+            ],
             counts={str(name): int(count) for name, count in summary["counts"].items() if isinstance(count, int)},
             scenario_bound=None
             if summary.get("scenario_bound") is None
@@ -107,7 +112,7 @@ def stored_result(run: StoredRun) -> Result:
             trace=run.evaluations,
             seconds=_number(summary, "seconds", 0.0),
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(
             f"{run.directory}: expected the files of a run, got some that do not fit together: {error}"
         ) from error
