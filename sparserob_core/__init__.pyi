@@ -28,6 +28,7 @@ from sparserob_core.sip.program import SemiInfiniteProgram as SemiInfiniteProgra
 from sparserob_core.sip.program import Separation as Separation
 
 # To solve it, to judge the answer, and what comes back.
+from sparserob_core.experiment.solve import ask_tell as ask_tell
 from sparserob_core.experiment.solve import maximise as maximise
 from sparserob_core.experiment.solve import solve as solve
 from sparserob_core.experiment.run.run import Outcome as Outcome
@@ -45,8 +46,6 @@ from sparserob_core.experiment.sweep.study import Study as Study
 from sparserob_core.experiment.sweep.sweep import sweep as sweep
 from sparserob_core.experiment.comparison.comparison import Comparison as Comparison
 from sparserob_core.experiment.comparison.compare import compare as compare
-from sparserob_core.experiment.comparison.profiles import Instance as Instance
-from sparserob_core.experiment.comparison.profiles import Profiles as Profiles
 from sparserob_core.sip.result import Result as Result
 from sparserob_core.sip.result import SearchTrace as SearchTrace
 from sparserob_core.sip.evidence import Cut as Cut
@@ -93,6 +92,9 @@ from sparserob_core.sip.maximiser import Report as Report
 from sparserob_core.sip.maximiser import SearchEnded as SearchEnded
 from sparserob_core.sip.maximiser import Trace as Trace
 from sparserob_core.sip.search.block_ascent import block_ascent as block_ascent
+from sparserob_core.sip.search.ask_tell import AskTell as AskTell
+from sparserob_core.sip.search.foreign import from_ask_tell as from_ask_tell
+from sparserob_core.sip.search.foreign import from_minimiser as from_minimiser
 from sparserob_core.sip.search.trust_region import TrustRegion as TrustRegion
 from sparserob_core.sip.rules import InnerStop as InnerStop
 from sparserob_core.sip.rules import OuterStep as OuterStep
@@ -121,4 +123,3 @@ from sparserob_core.experiment.run.inspection import Inspection as Inspection
 from sparserob_core.experiment.run.inspection import RelaxedValue as RelaxedValue
 from sparserob_core.experiment.figures.figure_data import FigureData as FigureData
 from sparserob_core.experiment.figures.figure_data import Wall as Wall
-from sparserob_core.experiment.figures.clash import Strip as Strip

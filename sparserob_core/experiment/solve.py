@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import warnings
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from sparserob_core.control.problem.dictionary import Dictionary, DictionaryFactory
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.errors import InputError
+from sparserob_core.errors import InputError, named
 from sparserob_core.experiment.plugins.components import Registry
 from sparserob_core.experiment.plugins.guards import guarded, origin_of
 from sparserob_core.experiment.plugins.registry import load_registry
@@ -26,6 +27,7 @@ from sparserob_core.sip.solver import Solver
 
 if TYPE_CHECKING:
     from sparserob_core.sip.events import Notify
+    from sparserob_core.sip.search.ask_tell import AskTell
 
 Choice: TypeAlias = str | Mapping[str, Any]
 logger = logging.getLogger("sparserob")
@@ -99,34 +101,130 @@ def maximise(
     polish: float = 0.0,
     gradient: Callable[[Array], Array] | None = None,
     notify: Notify = ignore,
+    *,
+    start: Array | None = None,
+    seconds: float | None = None,
+    callback: Callable[[Array, Array], object] | None = None,
     **options: object,
 ) -> Report:
     """Search for the maximum of ``f`` (points ``(k, d)`` to values ``(k,)``) over a box with the maximiser of that
     name.
 
     The last share ``polish`` of the budget goes to a local method, from the best points. ``gradient`` maps a point
-    ``(d,)`` to the gradient ``(d,)`` of ``f``, for maximisers and a polish that use it. ``notify`` is called with
-    `EvaluationsFinished` now and then. Further keywords are the maximiser's options.
+    ``(d,)`` to the gradient ``(d,)`` of ``f``, for maximisers and a polish that use it. ``start (d,)`` or ``(k, d)``:
+    points that are evaluated first; maximisers that walk begin at the best of them. ``seconds``: no evaluation begins
+    after that time. ``callback(points, values)`` is called after every batch of evaluations, ``notify`` with
+    `EvaluationsFinished` at least after every twentieth of the budget; what one of them raises is told in a warning,
+    and it is not called again. Further keywords are the maximiser's options.
     Raises `InputError` when an argument is at fault, and `EvaluationError` when ``f`` fails.
     """
     from sparserob_core.sip.search.search import Rules, Target
     from sparserob_core.sip.search.search import maximise as search
 
+    chosen = _chosen(box, name, options)
+    limit = as_seconds(seconds)
+    return search(
+        Target(f if callback is None else _told(f, _careful("callback", callback)), box, gradient),
+        chosen,
+        _whole("budget", budget, 1),
+        np.random.default_rng(_whole("seed", seed, 0)),
+        Rules(polish=_share(polish), seconds=np.inf if limit is None else limit),
+        notify if notify is ignore else _careful("notify", notify),
+        _placed(start, box),
+    )
+
+
+def ask_tell(
+    box: Box,
+    name: Choice | Maximiser = "direct",
+    budget: int = 1000,
+    seed: int = 0,
+    polish: float = 0.0,
+    *,
+    start: Array | None = None,
+    state: Mapping[str, Any] | None = None,
+    **options: object,
+) -> AskTell:
+    """A search for the maximum of a function that somebody else evaluates: a simulator, a queue, a laboratory.
+
+    The arguments are those of `maximise`, but for the function. ``state``: what `AskTell.state` gave, with the same
+    arguments; what was told is told again, and the search goes on with the points that it would have asked for. Raises
+    `InputError` when an argument is at fault.
+    """
+    from sparserob_core.sip.search.ask_tell import AskTell
+    from sparserob_core.sip.search.search import Rules, Target
+    from sparserob_core.sip.search.search import maximise as search
+
+    chosen = _chosen(box, name, options)
+    first, rules = _placed(start, box), Rules(polish=_share(polish))
+    number, calls = _whole("seed", seed, 0), _whole("budget", budget, 1)
+    entry: object = {"name": name, **options} if isinstance(name, str) else name
+    about = {
+        "maximiser": dict(entry) if isinstance(entry, Mapping) else type(entry).__name__,
+        "budget": calls,
+        "seed": number,
+        "polish": rules.polish,
+        "lower": box.lower.tolist(),
+        "upper": box.upper.tolist(),
+        "start": None if first is None else first.tolist(),
+    }
+    Target(lambda points: points, box)  # a box without bounds is refused here
+
+    def run(function: Callable[[Array], Array]) -> Report:
+        return search(Target(function, box), chosen, calls, np.random.default_rng(number), rules, start=first)
+
+    return AskTell(box, run, about, state)
+
+
+def _chosen(box: object, name: Choice | Maximiser, options: Mapping[str, object]) -> Maximiser:
     if not isinstance(box, Box):
         raise InputError(f"box: expected a sparserob_core.Box, got {type(box).__name__}")
     if options and not isinstance(name, str):
         raise InputError(f"{', '.join(options)}: options as keywords need the maximiser's name, got {name!r}")
-    chosen = component(
-        load_registry(), "maximiser", {"name": name, **options} if isinstance(name, str) else name, Maximiser
-    )
-    return search(
-        Target(f, box, gradient),
-        chosen,
-        _whole("budget", budget, 1),
-        np.random.default_rng(_whole("seed", seed, 0)),
-        Rules(polish=_share(polish)),
-        notify,
-    )
+    entry = {"name": name, **options} if isinstance(name, str) else name
+    chosen: Maximiser = component(load_registry(), "maximiser", entry, Maximiser)
+    return chosen
+
+
+def _placed(start: object, box: Box) -> Array | None:
+    """Points ``(k, d)`` of the box to begin with."""
+    if start is None:
+        return None
+    points = np.atleast_2d(np.array(start, dtype=float))
+    if points.ndim != 2 or points.shape[1] != box.dimension or not len(points):
+        raise InputError(f"start: expected shape ({box.dimension},) or (k, {box.dimension}), got {start!r}")
+    if not ((points >= box.lower) & (points <= box.upper)).all():
+        raise InputError(
+            f"start: expected points of the box, lower {box.lower.tolist()}, upper {box.upper.tolist()}, got "
+            f"{points[~((points >= box.lower) & (points <= box.upper)).all(axis=1)][0].tolist()}"
+        )
+    return points
+
+
+def _told(f: Callable[[Array], object], callback: Callable[..., None]) -> Callable[[Array], object]:
+    def watched(points: Array) -> object:
+        values = f(points)
+        callback(points.copy(), np.array(values, dtype=float))
+        return values
+
+    return watched
+
+
+def _careful(name: str, listener: Callable[..., object]) -> Callable[..., None]:
+    """The listener until it raises for the first time, which is told in a warning; a search outlives it."""
+    deaf = False
+
+    def heard(*arguments: object) -> None:
+        nonlocal deaf
+        if deaf:
+            return
+        try:
+            listener(*arguments)
+        except Exception as error:  # noqa: BLE001  somebody else's function
+            deaf = True
+            warnings.warn(f"{name} raised {named(error)}; it is not called again", stacklevel=2)
+
+    return heard
 
 
 def component(registry: Registry, kind: str, choice: object, expected: type[Any]) -> Any:
@@ -197,10 +295,11 @@ def _with_tolerance(registry: Registry, method: object, tolerance: float | None)
 def _heard(notify: Notify) -> Callable[[Any], None]:
     if notify is ignore:
         return ignore
+    heard = _careful("notify", notify)
 
     def pass_on(event: object) -> None:
         if isinstance(event, Event):
-            notify(event)
+            heard(event)
 
     return pass_on
 

@@ -13,6 +13,7 @@ from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.events import SKETCHED, Batch, EvaluationsFinished, Notify, Sketch, frozen
 
 SECONDS_BETWEEN_EVENTS = 0.05
+EVENTS = 20  # of one search, at least, where it asks for its points one after the other
 NUMBERS_BETWEEN_EVENTS = 2**21  # coordinates that wait for the next event
 
 
@@ -46,10 +47,13 @@ class Notifier:
         self._last: Array | None = None
         self._accepted: Array | None = None
 
-    @property
-    def due(self) -> bool:
-        """Whether it is time for an event."""
-        return time.monotonic() - self.notified_at > SECONDS_BETWEEN_EVENTS or self.numbers > NUMBERS_BETWEEN_EVENTS
+    def due(self, evaluations: int, budget: int) -> bool:
+        """Whether it is time for an event: for the clock, after a share of the budget, or for the memory."""
+        return (
+            time.monotonic() - self.notified_at > SECONDS_BETWEEN_EVENTS
+            or evaluations - self.notified >= max(1, budget // EVENTS)
+            or self.numbers > NUMBERS_BETWEEN_EVENTS
+        )
 
     def add(self, points: Array, values: Array, moment: float) -> None:
         """Collect points ``(k, d)`` and their values ``(k,)``, known ``moment`` seconds after the search began."""

@@ -50,12 +50,13 @@ class Target:
 
 @dataclass(frozen=True, eq=False)
 class Rules:
-    """What a search obeys beside its budget: when it stops (``SC2``), what a walk accepts (``SlCr``), and the share of
-    its budget that goes to a local method at the end."""
+    """What a search obeys beside its budget: when it stops (``SC2``), what a walk accepts (``SlCr``), the share of its
+    budget that goes to a local method at the end, and the ``seconds`` after which no evaluation begins."""
 
     stop: Callable[[Progress], bool] | None = None
     selection: Callable[[float, float, float, np.random.Generator], bool] = field(default_factory=Metropolis)
     polish: float = 0.0
+    seconds: float = np.inf
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.polish < 1.0:
@@ -90,6 +91,12 @@ class CountedObjective:
         self._notes: dict[str, list[tuple[float, float]]] = {}
         self._notifier = None if notify is ignore else Notifier(notify, target.domain)
         self._started = time.monotonic()
+        self._ends = self._started + (rules or Rules()).seconds
+
+    @property
+    def late(self) -> bool:
+        """Whether the time of the search is over."""
+        return time.monotonic() >= self._ends
 
     @property
     def remaining(self) -> int:
@@ -110,7 +117,7 @@ class CountedObjective:
         """See `Objective.evaluate`."""
         if self.ended is not None:
             raise self.ended
-        if self._notifier is not None and self._notifier.due:
+        if self._notifier is not None and self._notifier.due(self.evaluations, self.budget):
             self.notify_observers()
         asked = self._checked(points)
         allowed = asked[: self.remaining]
@@ -122,6 +129,8 @@ class CountedObjective:
             raise self._end(SearchEnded("a value of +inf was found, which nothing can exceed"))
         if self._stopped():
             raise self._end(SearchEnded("the stopping rule of the search says so"))
+        if self.late:
+            raise self._end(SearchEnded("the time limit of the search is reached"))
         if len(allowed) < len(asked):
             raise self._end(SearchEnded("the budget is spent"))
         return values
@@ -289,10 +298,10 @@ def maximise(
     found.
 
     The maximiser sees the coordinates that can move, and is not asked where none can: the value at the only point is
-    then the maximum. ``start (d,)`` is evaluated before it begins. An interrupt from the keyboard ends the search; the
-    report says so. Raises `EvaluationError` when the function raises or does not return numbers, `InputError` for a
-    wrong budget, `PluginError` for a maximiser that raises, leaves the domain, or claims an upper bound that is no
-    number or that an evaluated value refutes.
+    then the maximum. ``start (d,)`` or ``(k, d)`` is evaluated before it begins. An interrupt from the keyboard ends
+    the search; the report says so. Raises `EvaluationError` when the function raises or does not return numbers,
+    `InputError` for a wrong budget, `PluginError` for a maximiser that raises, leaves the domain, or claims an upper
+    bound that is no number or that an evaluated value refutes.
     """
     rules = rules or Rules()
     name = str(getattr(maximiser, "origin", f"maximiser {type(maximiser).__name__}"))
@@ -304,8 +313,9 @@ def maximise(
     try:
         try:
             if start is not None:
-                objective.evaluate(start[np.newaxis])
+                objective.evaluate(np.atleast_2d(start))
             bound = _bound(maximiser, name, shown, rng) if moves.size else _only_value(objective)
+            stopped = stopped if objective.remaining else "the budget is spent"
         except SearchEnded as end:
             stopped = str(end)
         if (
@@ -313,6 +323,7 @@ def maximise(
             and moves.size
             and not isinstance(objective.ended, EvaluationError)
             and np.isfinite(objective.best_value)
+            and not objective.late
         ):
             objective.go_on(objective.evaluations + reserved)
             stopped = f"{stopped}; then polished"

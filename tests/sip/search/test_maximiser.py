@@ -3,6 +3,8 @@ ended."""
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -40,7 +42,7 @@ def test_exactly_the_allowed_prefix_of_a_batch_is_evaluated(budget, sizes):
     calls = []
     report = search(Asking(*sizes), lambda points: calls.append(len(points)) or hill(points), budget)
     assert report.evaluations == sum(calls) == min(budget, sum(sizes))
-    assert (report.stopped == "the budget is spent") == (sum(sizes) > budget)
+    assert (report.stopped == "the budget is spent") == (sum(sizes) >= budget)
 
 
 def test_the_best_point_and_the_running_best_belong_to_the_evaluated_values():
@@ -145,3 +147,68 @@ def test_observers_hear_of_every_evaluation_once():
     maximise(Target(hill, SQUARE), Asking(3, 4), 100, np.random.default_rng(0), notify=events.append)
     assert sum(event.count for event in events) == events[-1].total == 7
     assert events[-1].notes == {"size": 4.0}
+
+
+def test_a_search_that_used_its_budget_to_the_last_says_so_and_one_that_did_not_does_not():
+    assert search(Asking(5), hill, 5).stopped == "the budget is spent"
+    assert search(Asking(4), hill, 5).stopped == "the maximiser found nothing left to gain"
+
+
+def test_no_evaluation_begins_after_the_time_limit_not_even_of_the_polish():
+    calls = []
+
+    def slow(points):
+        time.sleep(0.02)
+        calls.append(len(points))
+        return hill(points)
+
+    report = sr.maximise(slow, sr.Box([0.0], [1.0]), "simulated_annealing", budget=1000, polish=0.2, seconds=0.3)
+    assert report.stopped == "the time limit of the search is reached"
+    assert report.trace.seconds[:-1].max() < 0.3
+    assert report.evaluations == sum(calls) < 100
+    with pytest.raises(sr.InputError, match="seconds: expected a positive number"):
+        sr.maximise(slow, sr.Box([0.0], [1.0]), "direct", seconds=-1.0)
+
+
+def test_initial_points_come_first_and_a_walk_begins_at_the_best_of_them():
+    box = sr.Box([-4.0, -4.0], [4.0, 4.0])
+    first = [[3.0, 3.0], [0.5, 0.4], [-3.0, 1.0]]
+    for name in ("simulated_annealing", "sequool", "random_search"):
+        report = sr.maximise(lambda p: -(p**2).sum(axis=1), box, name, budget=30, start=first)
+        assert report.trace.points[:3].tolist() == first
+        assert report.best_value >= -0.41 - 1e-12
+    assert sr.maximise(lambda p: p[:, 0], box, "direct", budget=1, start=[1.0, 2.0]).best_point.tolist() == [1.0, 2.0]
+    for wrong in ([1.0], [[9.0, 0.0]], [[np.nan, 0.0]], []):
+        with pytest.raises(sr.InputError, match="start: expected"):
+            sr.maximise(lambda p: p[:, 0], box, "direct", budget=10, start=wrong)
+
+
+def test_a_callback_hears_every_batch_and_what_it_raises_costs_a_warning_and_no_result():
+    box, heard = sr.Box([0.0], [1.0]), []
+    report = sr.maximise(
+        lambda p: p[:, 0],
+        box,
+        "simulated_annealing",
+        budget=40,
+        callback=lambda points, values: heard.append((points, values)),
+    )
+    assert np.concatenate([points for points, _ in heard]).tolist() == report.trace.points.tolist()
+    assert np.concatenate([values for _, values in heard]).tolist() == report.trace.values.tolist()
+
+    def failing(*anything):
+        heard.clear()
+        raise RuntimeError("no disk")
+
+    for name in ("callback", "notify"):
+        with pytest.warns(UserWarning, match=f"{name} raised RuntimeError: no disk; it is not called again") as caught:
+            survived = sr.maximise(lambda p: p[:, 0], box, "simulated_annealing", budget=40, **{name: failing})
+        assert len(caught) == 1
+        assert survived.trace.points.tolist() == report.trace.points.tolist()
+
+
+def test_a_quick_search_is_told_of_regularly():
+    heard = []
+    sr.maximise(lambda p: p[:, 0], sr.Box([0.0], [1.0]), "simulated_annealing", budget=500, notify=heard.append)
+    assert 20 <= len(heard) <= 40
+    assert sum(event.count for event in heard) == heard[-1].total == 500
+    assert max(event.count for event in heard) <= 50
