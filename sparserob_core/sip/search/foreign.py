@@ -81,7 +81,7 @@ def from_ask_tell(
 
 
 def from_minimiser(minimise: Callable[[Callable[[Any], float], Array], object]) -> Maximiser:
-    """A maximiser from a function ``minimise(f, x0)``, such as ``scipy.optimize.minimize``.
+    """A maximiser from a function ``minimise(f, x0)``, such as those of scipy.
 
     It minimises over the unit box, from its centre or from the best point so far, and anew from random points until the
     budget is spent; what it returns is not looked at. ``f`` takes one point ``(d,)``; points outside are moved to the
