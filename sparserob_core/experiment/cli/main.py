@@ -15,7 +15,7 @@ from sparserob_core.experiment.cli.commands.compare import compare
 from sparserob_core.experiment.cli.commands.figures import figures
 from sparserob_core.experiment.cli.commands.initial_states import initial_states
 from sparserob_core.experiment.cli.commands.margin import margin
-from sparserob_core.experiment.cli.commands.plugins import plugins
+from sparserob_core.experiment.cli.commands.plugins import new_plugin, plugins
 from sparserob_core.experiment.cli.commands.replay import replay
 from sparserob_core.experiment.cli.commands.run import run
 from sparserob_core.experiment.cli.commands.schema import schema
@@ -77,5 +77,19 @@ def commands() -> None:
     """Sparse robust optimal control of uncertain linear systems, with the proof."""
 
 
-for command in (run, sweep, watch, replay, check, simulate, margin, initial_states, compare, figures, plugins, schema):
+for command in (
+    run,
+    sweep,
+    watch,
+    replay,
+    check,
+    simulate,
+    margin,
+    initial_states,
+    compare,
+    figures,
+    plugins,
+    new_plugin,
+    schema,
+):
     commands.add_command(command)

@@ -1,4 +1,4 @@
-"""``sparserob plugins``: what a config can name."""
+"""``sparserob plugins``: what a config can name; ``sparserob new-plugin``: a package to begin one with."""
 
 from __future__ import annotations
 
@@ -51,4 +51,30 @@ def _describe(registry: Registry, name: str) -> int:
             ("option", "type", "default", "range", "meaning"),
             rows or [("none", "", "", "", "it has no options")],
         )
+    return 0
+
+
+@click.command("new-plugin")
+@click.argument("kind")
+@click.argument("name")
+@click.option(
+    "--out",
+    type=click.Path(file_okay=False),
+    default=".",
+    show_default="the current folder",
+    help="Folder in which the package is made.",
+)
+def new_plugin(kind: str, name: str, out: str) -> int:
+    """Write the package sparserob-NAME with a component of that KIND to begin with.
+
+    It is typed, documented and installable, and has the tests that every component of its kind has to pass. Nothing is
+    overwritten.
+
+    KIND is one of: problem, set, policy, method, dictionary, regulariser, solver, maximiser, schedule, outer-stop,
+    inner-stop, selection, executor, observer.
+    """
+    from sparserob_core.experiment.scaffold.new_plugin import new_plugin as write
+
+    folder = write(kind, name, out)
+    click.echo(f"written to {folder}; next: cd {folder} && pip install -e '.[test]' && pytest")
     return 0

@@ -1,0 +1,1 @@
+"""A package of a plugin to begin with: `sparserob new-plugin`."""

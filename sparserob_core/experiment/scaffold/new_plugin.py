@@ -1,0 +1,93 @@
+"""Writes the package of a plugin to begin with, from the templates beside this file.
+
+A template is one text that holds several files, each below a line ``#### path``. ``package.txt`` has what every package
+has, and for each kind of component one more text has the component, its tests, and a config that names it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from importlib.resources import files
+from importlib.util import find_spec
+from pathlib import Path
+from string import Template
+
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.plugins.hookspecs import record_type
+from sparserob_core.experiment.plugins.records import RECORDS
+from sparserob_core.experiment.plugins.registry import load_registry
+
+LONGEST = 30  # letters of a name: lines of the templates stay within 120 columns
+PACKAGE = "package"
+HEADING = re.compile(r"^#### (\S+)\n", re.MULTILINE)
+
+
+def new_plugin(kind: str, name: str, out: str | Path = ".") -> Path:
+    """Write the package ``sparserob-NAME`` with a component of that kind into the folder ``out``; return its folder.
+
+    Nothing is overwritten. Raises `InputError` for an unknown kind, for a name that is no name, or is taken by an
+    installed component, plugin or module, and for a folder that exists.
+    """
+    record = record_type(kind.replace("-", "_"))
+    _check_name(record.kind, name)
+    package = f"sparserob_{name}"
+    folder = Path(out) / package.replace("_", "-")
+    if folder.exists():
+        raise InputError(path="out", expected="a folder in which the package is not yet", got=f"one with {folder}")
+    words = {
+        "name": name,
+        "package": package,
+        "distribution": package.replace("_", "-"),
+        "kind": record.kind.replace("_", " "),
+        "article": "An" if record.kind[0] in "aeiou" else "A",
+        "hook": record.hook,
+        "Class": _camel(name).removesuffix(_camel(record.kind)) + _camel(record.kind),
+    }
+    texts = {**_files(PACKAGE, words), **_files(record.kind, words)}
+    try:
+        for path, text in texts.items():
+            place = folder / path
+            place.parent.mkdir(parents=True, exist_ok=True)
+            place.write_text(text, encoding="utf-8", newline="\n")
+    except OSError as error:
+        raise InputError(path="out", expected="a folder that can be written to", got=f"{out}: {error}") from error
+    return folder
+
+
+def kinds() -> list[str]:
+    """The kinds of components, in the order of the hooks."""
+    return list(RECORDS)
+
+
+def _check_name(kind: str, name: str) -> None:
+    said = f"{name!r}"
+    if not re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", name) or len(name) > LONGEST:
+        raise InputError(
+            path="name",
+            expected=f"lower-case letters, digits and single underscores, a letter first, at most {LONGEST} of them",
+            got=said,
+        )
+    registry = load_registry()
+    if name in registry.names(kind):
+        taken = registry.get(kind, name)
+        raise InputError(path="name", expected=f"a name that no {kind} has", got=f"{said}, which is {taken.origin}")
+    plugins = {one.plugin: one.source for one in registry.records()}
+    if name in plugins:
+        where = plugins[name] or "the core"
+        raise InputError(path="name", expected="a name that no plugin has", got=f"{said}, which is that of {where}")
+    if find_spec(f"sparserob_{name}") is not None:
+        raise InputError(path="name", expected="a name that is free", got=f"{said}: there is a module sparserob_{name}")
+
+
+def _files(template: str, words: Mapping[str, str]) -> dict[str, str]:
+    """The files that a template holds, by path, with the words put in."""
+    text = (files(__package__) / "templates" / f"{template}.txt").read_text(encoding="utf-8")
+    filled = Template(text).substitute(words)
+    parts = HEADING.split(filled)[1:]
+    bodies = (body.strip("\n") for body in parts[1::2])
+    return {path: f"{body}\n" if body else "" for path, body in zip(parts[::2], bodies, strict=True)}
+
+
+def _camel(name: str) -> str:
+    return "".join(part[:1].upper() + part[1:] for part in name.split("_"))
