@@ -51,6 +51,15 @@ def check(case: Case, gap_tolerance: float | None) -> list[Finding]:
         return [*claims, judged("status", lambda: _status(case, str(status), gap_tolerance, claims))]
 
 
+def derived_bound(case: Case) -> float:
+    """The lower bound of the cost that the certificate's multipliers prove, rounded downwards; raises `Unchecked` and
+    `Broken` where there is none."""
+    from flint import ctx
+
+    with ctx.workprec(_precision(case)):
+        return float(np.nextafter(float(_multiplied(case, priced=True).lower()), -np.inf))
+
+
 def _precision(case: Case) -> int:
     """Bits of a number. The exponential of a matrix is enclosed in a norm, so that its smallest entries need as many
     more bits as the system's numbers differ by, in the units that the user chose."""

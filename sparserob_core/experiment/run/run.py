@@ -10,7 +10,6 @@ from typing import Any, final
 
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.transcription.provable import unprovable
-from sparserob_core.control.transcription.rounding import rounded_down
 from sparserob_core.errors import named
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, assemble, build, name_of, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
@@ -18,6 +17,7 @@ from sparserob_core.experiment.config.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import create_directory
 from sparserob_core.experiment.directory.finished import UNFINISHED
 from sparserob_core.experiment.directory.provenance import git_revision, provenance
+from sparserob_core.experiment.run.bound import bounded
 from sparserob_core.experiment.run.events import Broadcast, Event, Observer, RunFinished, RunStarted
 from sparserob_core.experiment.run.inspection import Inspection
 from sparserob_core.experiment.run.journal import Journal
@@ -150,7 +150,7 @@ def run_loaded(
                 if result is None:
                     raise
             if isinstance(experiment, ControlExperiment):
-                result = rounded_down(experiment.transcription, result, experiment.gap_tolerance)
+                result = bounded(experiment, result)
             ending = RunFinished(status=result.status, message=result.message, seconds=result.seconds, result=result)
             control, summary, remarks = journal.finish(result, figures and complete, certify=complete, notify=broadcast)
             return Outcome(result, directory.path, experiment, control, summary, remarks, deadline.pressed)

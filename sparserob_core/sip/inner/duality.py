@@ -16,12 +16,14 @@ from sparserob_core.shapes import Bool, Float, shaped
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution, diagonal
 from sparserob_core.sip.inner.equalities import onto_equalities
+from sparserob_core.sip.inner.extended import extended_bound
 from sparserob_core.sip.inner.image import onto_stationary
 
 # Entries of a sum are evaluated with a relative error of at most this (Higham 2002, section 3.1, for sums of up to ~1e2
 # terms).
 ROUND_OFF = 1e-14
 
+NOTABLE = 1e-11  # of a bound: where its evaluation may be off by more, it is evaluated with more digits
 NEAR = 1e-6  # a slope this close to its limit, or beyond it, is moved onto the limit
 REPAIRS = 4
 FREE = 1e-7  # an entry further than this from 0 and from both bounds, relative to their distance, is free
@@ -61,9 +63,11 @@ def dual_bound(
     subtracted. Where an unbounded variable asks for a slope of exactly 0, a slope within its own round-off counts as 0.
     """
     y = _usable(program, y)
-    bound = _bound(_terms(program, y, mu, z, at), program)
+    terms = _terms(program, y, mu, z, at)
+    bound = _bound(terms, program)
     if bound > -np.inf:
-        return bound
+        large = ROUND_OFF * terms.magnitude > NOTABLE * abs(bound)
+        return max(bound, extended_bound(program, y, mu)) if large else bound
     better = repaired(program, y, mu, z, at)
     if better is not None:
         bound = _bound(_terms(program, *better), program)

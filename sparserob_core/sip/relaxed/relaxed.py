@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 LAZY = 1e-9  # rows violated by less than this, relative to their norm, are not added
 ROUNDS = 200  # lazy additions at most within one evaluation
-ROUNDING = 1e-12  # of a row's numbers, from which its terms were computed; relative to the sum of their absolute values
+ROUNDING = 2.0**-46  # of the numbers of which a row is made (Higham 2002, section 3.1): 64 units of rounding
 # of them, those that also drop the rows without a multiplier; later rows are only added, so that nothing can cycle
 DROPPING = 20
 

@@ -1,0 +1,69 @@
+"""The lower bound that a run writes: what rounding may have raised is taken off, or it is derived without rounding."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sparserob_core.checker.claims.case import Case
+from sparserob_core.checker.claims.claims import derived_bound
+from sparserob_core.checker.outcome import Broken, Clock, Unchecked
+from sparserob_core.control.transcription.rounding import SMALL_GAP, rounded_down
+from sparserob_core.experiment.assemble import ControlExperiment
+from sparserob_core.experiment.directory.artefacts import finite
+from sparserob_core.experiment.directory.certificate import certificate
+from sparserob_core.sip.inner.solve import ADVICE
+from sparserob_core.sip.program import TOLERANCE
+from sparserob_core.sip.proof.verdict import verdict
+from sparserob_core.sip.result import Result
+
+SECONDS = 10.0  # for a bound in ball arithmetic
+ROUNDING = 1e-12  # of a cost
+CROSSED = (
+    "the lower bound {:.12g} that its multipliers prove is above the cost {:.12g} of a decision that was proven, by"
+    " more than the tolerances of the proofs allow: one of the two is wrong, and neither is claimed; {}"
+)
+INWARDS = 1e-13  # of it, so that whoever derives it with another precision does not find less
+
+
+def bounded(experiment: ControlExperiment, result: Result) -> Result:
+    """The same result with a lower bound that its multipliers prove.
+
+    Running bounds of rounding are cheap, but where multipliers are large, as those of nearly parallel rows are, they
+    may be all that keeps the gap open. There the bound is derived from the same multipliers in ball arithmetic, which
+    leaves out no rounding, in the rows neither.
+    """
+    tolerance = experiment.gap_tolerance
+    safe = rounded_down(experiment.transcription, result, tolerance)
+    if result.status not in ("certified", "verified") or tolerance is None or result.stopped:
+        return safe
+    if safe.gap <= tolerance + SMALL_GAP:
+        return safe
+    data = certificate(experiment, safe)
+    if data is None:
+        return safe
+    case = Case(experiment.problem, experiment.control, experiment.disturbance, finite(data), Clock(SECONDS))
+    try:
+        derived = derived_bound(case)
+    except (Broken, Unchecked, ZeroDivisionError):
+        return safe
+    if derived - result.cost > _allowed(result):
+        return replace(safe, status="failed", message=CROSSED.format(derived, result.cost, ADVICE))
+    lowered = min(derived - INWARDS * abs(derived), result.cost)
+    if not (np.isfinite(lowered) and lowered > safe.lower_bound):
+        return safe
+    closer = replace(safe, lower_bound=lowered, dual=replace(safe.dual, bound=lowered))
+    status, message = verdict(result.proofs, closer.gap, tolerance)
+    return replace(closer, status=status, message=message)
+
+
+def _allowed(result: Result) -> float:
+    """By how much the bound may be above the cost: multiplier times tolerance of every row (`sip.methods.ledger.alarm`,
+    which has judged the bound before, in the program's own units)."""
+    units = {proof.family: proof.units for proof in result.proofs}
+    allowed = np.inf if result.dual.mu.size else ROUNDING * abs(result.cost)
+    for cut in result.dual.cuts:
+        known = units.get(cut.family)
+        allowed += np.inf if known is None else cut.multiplier * TOLERANCE * float(known[cut.row])
+    return allowed
