@@ -1,4 +1,4 @@
-# `make demo` and `make test` set up everything they need in .venv, once; nothing is installed outside this folder.
+# `make demo`, `make live` and `make test` set up everything they need in .venv, once; nothing is installed outside this folder.
 
 VENV      := .venv
 BIN       := $(VENV)/bin
@@ -6,15 +6,18 @@ INSTALLED := $(VENV)/installed
 PEERS     := $(VENV)/peers
 CANDIDATES := $(PYTHON) python3 python3.13 python3.12 python3.11
 DEMO      := configs/experiment1_repaired.yaml
+LIVE      := configs/experiment1_literal.yaml
+LONGER    := method.sc2=null maximiser.budget=1500
 
 # Several test processes share the machine: one thread of linear algebra each.
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help install demo paper test test-slow lint bench docs clean
+.PHONY: help install demo live paper test test-slow lint bench docs clean
 
 help:
 	@echo "make demo        solve the repaired experiment 1, print the bounds, draw the figures"
+	@echo "make live        watch the paper's annealing for a minute: in a viewer, or on a page where there is no display"
 	@echo "make paper       every experiment and figure of the paper, and docs/paper.md (a few minutes)"
 	@echo "make test        lint, types, import rules, tests: the first stage, about five minutes on two processors"
 	@echo "make test-slow   the second stage: larger instances of what the first one tests"
@@ -43,6 +46,11 @@ $(PEERS): $(INSTALLED)
 demo: $(INSTALLED)
 	@$(BIN)/sparserob run $(DEMO)
 	@echo "figures in $$(ls -dt runs/$(basename $(notdir $(DEMO)))/*/figures | head -n 1)"
+
+# A search that has not met the maximum is refuted (4), and Ctrl-C (130) is a good end: neither is a failure of make.
+live: $(INSTALLED)
+	@if [ -n "$$DISPLAY$$WAYLAND_DISPLAY" ] || [ "$$(uname -s)" = Darwin ]; then serve=; else serve=--serve; fi; \
+	$(BIN)/sparserob watch $(LIVE) $(LONGER) $$serve || case $$? in 4|130) ;; *) exit 1;; esac
 
 paper: $(INSTALLED)
 	@$(BIN)/python docs/paper/build.py

@@ -35,7 +35,8 @@ class Rerun(sr.Observer, sr.Options):
     """Send to a viewer that listens at this address, such as 127.0.0.1:9876."""
 
     serve: bool = False
-    """Show it in a browser, at port 9090 of this machine, as long as the run lasts and ``keep`` seconds more."""
+    """Show it in a browser, at port 9090 of this machine or at another one where that is taken, as long as the run
+    lasts and ``keep`` seconds more, unless a key ends both."""
 
     keep: float = Field(default=0.0, ge=0.0)
     """Seconds that a browser is served after the run."""
@@ -50,6 +51,7 @@ class Rerun(sr.Observer, sr.Options):
     """Wait until everything is recorded rather than drop what comes too fast: for a run that is over."""
 
     _outlet: Outlet | None = PrivateAttr(default=None)
+    _pressed: bool = PrivateAttr(default=False)
 
     @field_validator("connect")
     @classmethod
@@ -67,13 +69,16 @@ class Rerun(sr.Observer, sr.Options):
         elif self._outlet is not None:
             self._outlet.send(event)
             if isinstance(event, sr.RunFinished):
+                self._pressed = event.pressed
+                if self.serve and self.keep and not event.pressed:
+                    logger.warning("rerun: the run is over: %s; its page stays until Ctrl-C", event.status)
                 self.close()
 
     def close(self) -> None:
         """See `sparserob_core.Observer`: the recording is complete afterwards."""
         outlet, self._outlet = self._outlet, None
         if outlet is not None:
-            for line in outlet.close(self.keep):
+            for line in outlet.close(0.0 if self._pressed else self.keep):  # who ends a run wants no page of it
                 logger.warning("rerun: %s", line)
 
     def _begin(self, event: sr.RunStarted) -> None:

@@ -6,7 +6,6 @@ from __future__ import annotations
 import os
 import queue
 import signal
-import subprocess
 import sys
 import time
 from contextlib import suppress
@@ -17,7 +16,7 @@ from typing import Any, final
 import sparserob_core as sr
 from sparserob_rerun.recording.layout import layout
 from sparserob_rerun.recording.recorder import Opening, Recorder, shown_of
-from sparserob_rerun.recording.sinks import Destinations, open_sinks
+from sparserob_rerun.recording.sinks import Destinations, Started, open_sinks, servers, start
 
 IDLE = 0.5  # seconds between two looks at whether the run is still alive
 FLUSHED_EVERY = 1.0  # seconds
@@ -58,13 +57,24 @@ def record(messages: Any, report: Any, opening: Opening, chosen: Destinations, n
 
 
 def _record(messages: Any, opening: Opening, chosen: Destinations, name: str, parent: int) -> list[str]:
+    started = start(chosen)
+    try:
+        return _recorded(messages, opening, chosen, name, parent, started)
+    finally:
+        for server in servers(chosen, started):
+            server.terminate()
+
+
+def _recorded(
+    messages: Any, opening: Opening, chosen: Destinations, name: str, parent: int, started: Started
+) -> list[str]:
     sys.meta_path.insert(0, _WithoutPandas())
     import rerun as rr
 
     inspection = opening.answers()
     shown = shown_of(inspection, opening.landscape)
     stream = rr.RecordingStream("sparserob", recording_id=name)
-    wrong, servers = open_sinks(rr, stream, chosen, layout(shown))
+    wrong = open_sinks(rr, stream, chosen, layout(shown), started)
     ending = Ending()
     try:
         recorder = Recorder(rr, stream, opening, shown, inspection)
@@ -80,19 +90,16 @@ def _record(messages: Any, opening: Opening, chosen: Destinations, name: str, pa
         wrong.append(f"not everything has arrived: {error}")
     finally:
         stream.disconnect()
-        _serve(servers, ending.keep, parent)
+        if servers(chosen, started):
+            _look_on(ending.keep, parent)
     return wrong
 
 
-def _serve(servers: list[subprocess.Popen[bytes]], keep: float, parent: int) -> None:
+def _look_on(keep: float, parent: int) -> None:
     """Let a browser look on for a while."""
     end = time.monotonic() + keep
-    try:
-        while servers and time.monotonic() < end and os.getppid() == parent:
-            time.sleep(IDLE)
-    finally:
-        for server in servers:
-            server.terminate()
+    while time.monotonic() < end and os.getppid() == parent:
+        time.sleep(IDLE)
 
 
 def _listen(messages: Any, recorder: Recorder, parent: int, wrong: list[str]) -> Ending:

@@ -11,7 +11,7 @@ import time
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, final
+from typing import Any, TypeAlias, final
 
 PORT, WEB_PORT = 9876, 9090
 STARTING = 15.0  # seconds that a viewer may take until it listens
@@ -22,14 +22,15 @@ MEMORY = "25%"  # of the machine's, for a viewer that is started
 @dataclass(frozen=True)
 class Destinations:
     """What is left of the wishes after looking at the machine: ``save`` a file, ``connect`` a host and port where a
-    viewer listens, ``spawn`` a viewer, ``serve`` to a browser through this port; ``missing`` says in words what could
-    not be had."""
+    viewer listens, ``spawn`` a viewer, ``serve`` to a browser through this port, from a page at the port ``web``;
+    ``missing`` says in words what could not be had."""
 
     save: Path | None
     connect: tuple[str, int] | None
     spawn: bool
     serve: int | None
     missing: tuple[str, ...] = ()
+    web: int = WEB_PORT
 
     @property
     def any(self) -> bool:
@@ -39,7 +40,7 @@ class Destinations:
     @property
     def page(self) -> str:
         """The page that a browser is to open."""
-        return f"http://127.0.0.1:{WEB_PORT}/?url=rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{self.serve}%2Fproxy"
+        return f"http://127.0.0.1:{self.web}/?url=rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{self.serve}%2Fproxy"
 
 
 def look(save: Path | None, connect: str | None, spawn: bool, serve: bool) -> Destinations:
@@ -68,7 +69,8 @@ def look(save: Path | None, connect: str | None, spawn: bool, serve: bool) -> De
             "there is no display for a viewer; `save: recording.rrd` records, `serve: true` shows it in a browser"
         )
         spawn = False
-    return Destinations(save, address, spawn, _free_port() if serve else None, tuple(missing))
+    web = _free_port() if serve and listens(("127.0.0.1", WEB_PORT), 0.2) else WEB_PORT
+    return Destinations(save, address, spawn, _free_port() if serve else None, tuple(missing), web)
 
 
 def address_of(text: str) -> tuple[str, int]:
@@ -99,30 +101,38 @@ def viewer() -> Path:
     return Path(spec.origin).parent / name if spec is not None and spec.origin else Path(name)
 
 
-def open_sinks(
-    rr: Any, stream: Any, chosen: Destinations, blueprint: Any
-) -> tuple[list[str], list[subprocess.Popen[bytes]]]:
-    """Send a stream to its destinations; returns what went wrong, and the servers that were started for a browser."""
+Started: TypeAlias = dict[int, "subprocess.Popen[bytes] | None"]
+
+
+def start(chosen: Destinations) -> Started:
+    """Start the viewers and servers that are wished for, by their ports; ``None`` for one that runs already. They are
+    ready a moment later, while other things are prepared."""
+    started: Started = {}
+    if chosen.spawn:
+        started[PORT] = None if listens(("127.0.0.1", PORT), 0.2) else _started(PORT, [])
+    if chosen.serve is not None:
+        started[chosen.serve] = _started(chosen.serve, ["--serve-web", "--web-viewer-port", str(chosen.web)])
+    return started
+
+
+def servers(chosen: Destinations, started: Started) -> list[subprocess.Popen[bytes]]:
+    """Those that end with the recording: a viewer stays."""
+    return [process for port, process in started.items() if process is not None and port == chosen.serve]
+
+
+def open_sinks(rr: Any, stream: Any, chosen: Destinations, blueprint: Any, started: Started) -> list[str]:
+    """Send a stream to its destinations; returns what went wrong."""
     sinks: list[Any] = [] if chosen.save is None else [rr.FileSink(str(chosen.save))]
-    wrong, servers = [], []
-    addresses = [] if chosen.connect is None else [chosen.connect]
-    for port, extra in (
-        (PORT if chosen.spawn else None, []),
-        (chosen.serve, ["--serve-web", "--web-viewer-port", str(WEB_PORT)]),
-    ):
-        if port is None:
-            continue
-        address = ("127.0.0.1", port)
-        process = None if not extra and listens(address, 0.2) else _started(port, extra)
-        if _waited(address, process):
-            addresses.append(address)
-            servers += [process] if process is not None and extra else []
+    addresses, wrong = [] if chosen.connect is None else [chosen.connect], []
+    for port, process in started.items():
+        if _waited(("127.0.0.1", port), process):
+            addresses.append(("127.0.0.1", port))
         else:
             wrong.append("the viewer did not start")
     sinks += [rr.GrpcSink(f"rerun+http://{host}:{port}/proxy") for host, port in addresses]
     if sinks:
         stream.set_sinks(*sinks, default_blueprint=blueprint)
-    return wrong, servers
+    return wrong
 
 
 def _unwritable(file: Path) -> str:

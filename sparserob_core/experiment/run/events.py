@@ -55,12 +55,13 @@ class RunStarted(Event):
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RunFinished(Event):
     """A run is over, whether well or not; always the last event. ``result`` is ``None`` when an error ended it, or an
-    interrupt before there was a decision."""
+    interrupt before there was a decision; ``pressed``: a key or a signal has ended it."""
 
     status: str
     message: str
     seconds: float
     result: Result | None = None
+    pressed: bool = False
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -151,13 +151,20 @@ def run_loaded(
                     raise
             if isinstance(experiment, ControlExperiment):
                 result = bounded(experiment, result)
-            ending = RunFinished(status=result.status, message=result.message, seconds=result.seconds, result=result)
+            ending = RunFinished(
+                status=result.status,
+                message=result.message,
+                seconds=result.seconds,
+                result=result,
+                pressed=deadline.pressed,
+            )
             control, summary, remarks = journal.finish(result, figures and complete, certify=complete, notify=broadcast)
             return Outcome(result, directory.path, experiment, control, summary, remarks, deadline.pressed)
         except BaseException as error:
             error.add_note(f"what was done until then is in {directory.path}")
             if result is None or not isinstance(error, KeyboardInterrupt):
                 ending = RunFinished(status="failed", message=_said(error), seconds=time.perf_counter() - started)
+            ending = replace(ending, pressed=ending.pressed or isinstance(error, KeyboardInterrupt))
             if result is None:
                 journal.record_unfinished(ending.message, ending.seconds)
             raise

@@ -1,0 +1,107 @@
+"""Guards `make live` and ``watch --serve``: the page is there when its address is told, at a port that is free, and one
+Ctrl-C ends everything."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rerun")
+
+from sparserob_core.experiment.config.load import load_config
+from sparserob_rerun.recording import sinks
+from tests.support.places import ROOT
+
+PATIENCE = 60.0  # seconds; a loaded machine starts slowly
+
+
+def variable(name: str) -> str:
+    found = re.search(rf"^{name}\s*:= (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    assert found is not None
+    return found.group(1)
+
+
+def test_make_live_watches_the_papers_annealing_with_keys_that_exist() -> None:
+    config = load_config(ROOT / variable("LIVE"), variable("LONGER").split()).config
+    assert (config.method.name, config.maximiser.name) == ("sparserob", "simulated_annealing")
+    assert config.method.options["formulation"] == "literal"
+    assert "live: $(INSTALLED)" in (ROOT / "Makefile").read_text()
+
+
+def test_the_page_moves_to_another_port_where_its_own_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        monkeypatch.setattr(sinks, "WEB_PORT", taken.getsockname()[1])
+        chosen = sinks.look(None, None, False, True)
+        assert chosen.web != taken.getsockname()[1]
+        assert f"127.0.0.1:{chosen.web}/" in chosen.page
+    assert sinks.look(None, None, False, True).web == sinks.WEB_PORT
+
+
+@pytest.fixture
+def watching(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    """A search that takes minutes, as `make live` watches it on a machine without a display."""
+    environment = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    command = [sys.executable, "-m", "sparserob_core", "watch", str(ROOT / variable("LIVE")), "--serve", "--no-figures"]
+    process = subprocess.Popen(
+        [*command, "method.sc2=null", "maximiser.budget=100000", "--out", str(tmp_path / "run")],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        cwd=tmp_path,
+        env=environment,
+        start_new_session=True,
+    )
+    yield process
+    if process.poll() is None:
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    if process.stdout is not None:
+        process.stdout.close()
+
+
+def address(process: subprocess.Popen[str]) -> str:
+    assert process.stdout is not None
+    for line in process.stdout:
+        if found := re.search(r"to watch, open (http://127\.0\.0\.1:\d+/)", line):
+            return found.group(1)
+    raise AssertionError("no address was told")
+
+
+def answers(page: str) -> bool:
+    try:
+        with urllib.request.urlopen(page, timeout=5.0) as got:
+            return bool(got.status == 200 and b"<html" in got.read().lower())
+    except OSError:
+        return False
+
+
+@pytest.mark.slow
+def test_the_page_answers_during_the_run_and_one_interrupt_ends_the_run_and_the_page(
+    watching: subprocess.Popen[str],
+) -> None:
+    page, end = address(watching), time.monotonic() + PATIENCE
+    while not answers(page):
+        assert time.monotonic() < end and watching.poll() is None
+        time.sleep(0.2)
+    time.sleep(2.0)  # into the search
+    assert watching.poll() is None
+    os.killpg(watching.pid, signal.SIGINT)
+    said, _ = watching.communicate(timeout=PATIENCE)
+    assert "interrupted from the keyboard" in said and "Traceback" not in said
+    assert watching.returncode in (4, 130)
+    end = time.monotonic() + 10.0
+    while answers(page):
+        assert time.monotonic() < end
+        time.sleep(0.2)
