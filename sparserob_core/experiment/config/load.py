@@ -55,6 +55,8 @@ def load_config(
     Raises `ConfigError`: one line for each key at fault, ``file:line:column: key.path: what is wrong (got ...)``.
     """
     given = read_source(config)
+    if "axes" in given.data and "problem" not in given.data:
+        raise ConfigError(f"{given.name}: expected a config, got a study, which has axes; `sparserob sweep` takes it")
     changes = tuple(parse_overrides(overrides, read_value))
     data = copy.deepcopy(given.data)
     wrong = list(malformed(data))

@@ -56,7 +56,10 @@ def load_registry(extra_paths: Iterable[str | Path] = (), entry_points: bool = T
     paths = tuple(Path(path).resolve() for path in extra_paths)
     if not entry_points:
         return _load(paths, _disabled(), lambda disabled: [])
-    return _load(paths, _disabled(), _entry_points) if paths else _installed(_disabled())
+    installed = _installed(_disabled())
+    if not paths:
+        return installed
+    return Registry([*installed.records(), *_of_files(paths)], installed.failures, _disabled())
 
 
 def _disabled() -> tuple[str, ...]:
@@ -90,10 +93,15 @@ def _load(paths: Sequence[Path], disabled: Sequence[str], installed: Finder) -> 
     for plugin in found:
         with _noted(failures, plugin.name):
             records += list(_records(plugin))
-    for file in paths:  # asked for by name: a failure ends everything
-        records += _records(_Loaded(file.stem, str(file), _module(file)))
+    records += _of_files(paths)
     hint = UNTRUSTED if installed is _own_entry_points else ""
     return Registry(records, failures, disabled, hint)
+
+
+def _of_files(paths: Sequence[Path]) -> Iterator[Plugin]:
+    """The records of files, which are executed anew: they were asked for by name, so a failure ends everything."""
+    for file in paths:
+        yield from _records(_Loaded(file.stem, str(file), _module(file)))
 
 
 @contextmanager

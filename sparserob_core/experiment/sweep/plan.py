@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -17,11 +18,14 @@ from sparserob_core.experiment.config.overrides import parse_overrides
 from sparserob_core.experiment.config.plain import BESIDE, difference, identity, value_text
 from sparserob_core.experiment.config.reader import Source, read_source, read_value, write_yaml
 from sparserob_core.experiment.plugins.messages import nearest, shown
+from sparserob_core.experiment.run.events import StudyProgress
 from sparserob_core.experiment.sweep.axes import FIXED, MOST, Axis, parse_axes
+from sparserob_core.sip.events import Notify, ignore
 
 FILE = "sweep.yaml"
 HEADING = "A study. To go on with it, or to repeat it elsewhere: sparserob sweep sweep.yaml --out DIRECTORY"
 KEYS = ("base", "overrides", "axes", "points", "number", "seed")
+OFTEN = 100  # configs between two words about their check
 Arrangement = Literal["grid", "zip", "random", "sobol"]
 ARRANGEMENTS: tuple[Arrangement, ...] = ("grid", "zip", "random", "sobol")
 
@@ -29,11 +33,18 @@ ARRANGEMENTS: tuple[Arrangement, ...] = ("grid", "zip", "random", "sobol")
 @final
 @dataclass(frozen=True)
 class Point:
-    """One point: a value for every axis, its checked config, and the ``hash`` of what decides its result."""
+    """One point: a value for every axis, its checked config (as JSON: there may be very many points), and the ``hash``
+    of what decides its result."""
 
     values: tuple[Any, ...]
-    loaded: Loaded
+    resolved: str
     hash: str
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The complete, resolved config, as mappings, lists, numbers and text."""
+        config: dict[str, Any] = json.loads(self.resolved)
+        return config
 
 
 @final
@@ -112,16 +123,20 @@ class Plan:
             for row in shares.tolist()
         ]
 
-    def checked(self) -> list[Point]:
-        """Every point with its checked config; raises `ConfigError` for the first one that is at fault."""
+    def checked(self, notify: Notify = ignore) -> list[Point]:
+        """Every point with its checked config; raises `ConfigError` for the first one that is at fault. ``notify``
+        receives `StudyProgress`."""
         points = []
         try:
             rows = self.values()
         except InputError as error:
             raise (ConfigError(f"{self.file}: {error}") if self.file else error) from None
         for values in rows:
-            loaded = self.loaded(values)
-            points.append(Point(values, loaded, identity(loaded.config.plain())))
+            plain = self.loaded(values).config.plain()
+            points.append(Point(values, json.dumps(plain), identity(plain)))
+            if len(points) % OFTEN == 0:
+                said = f"{len(points)} of {len(rows)} configs are checked"
+                notify(StudyProgress(text=said, done=len(points), total=len(rows)))
         return points
 
     def written(self) -> str:
@@ -156,10 +171,14 @@ def make_plan(
     source = read_source(config)
     plan = _stored(source) if {"base", "axes"} & set(source.data) else Plan(_based(source), ())
     kept = list(plan.changes)
-    for axis in parse_axes(list(axes) if isinstance(axes, Iterable) and not isinstance(axes, str | Mapping) else axes):
+    changes = _changes(overrides)
+    given = parse_axes(list(axes) if isinstance(axes, Iterable) and not isinstance(axes, str | Mapping) else axes)
+    for both in {change.path for change in changes} & {axis.path for axis in given}:
+        raise InputError(path=both, expected="an axis or an override", got="both")
+    for axis in given:
         place = next((k for k, other in enumerate(kept) if other.path == axis.path), len(kept))
         kept[place : place + 1] = [axis]
-    for change in reversed(_changes(overrides)):
+    for change in reversed(changes):
         kept = [change, *(other for other in kept if other.path != change.path)]
     plan = replace(
         plan,

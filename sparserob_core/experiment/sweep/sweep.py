@@ -74,7 +74,7 @@ def sweep(
     plan = make_plan(config, axes, overrides, points=points, number=_number(points, number))
     if not plan.axes:
         raise InputError(path="axes", expected="at least one, for example seed=0:19:20", got="none")
-    checked = plan.checked()
+    checked = plan.checked(notify)
     factory = _executors(checked[0], executor)
     with create_directory(out, f"{plan.name}-sweep", checked[0].hash[:8], again=FILE) as made:
         _require_same_base(made.path, plan)
@@ -96,9 +96,7 @@ def _number(points: Arrangement | None, number: int | None) -> int | None:
 
 
 def _executors(point: Point, chosen: str | Mapping[str, Any] | None) -> ExecutorFactory:
-    loaded = point.loaded
-    if chosen is not None:
-        loaded = load_config({**loaded.config.plain(), "executor": None}, {"executor": chosen})
+    loaded = load_config(point.config, None if chosen is None else {"executor": chosen})
     factory: ExecutorFactory = build(loaded, "executor", loaded.config.executor)
     return factory
 
@@ -234,9 +232,8 @@ class _Walk:
             self._write()
 
     def _task(self, digest: str) -> Task:
-        plain = self.by_hash[digest].loaded.config.plain()
         return Task(
-            config={**plain, "executor": {"name": "serial"}},
+            config={**self.by_hash[digest].config, "executor": {"name": "serial"}},
             partial=str(self._partial(digest)),
             final=str(self.directory / RUNS / self.names[digest]),
             git=self.git,

@@ -182,9 +182,25 @@ def test_a_file_names_its_base_and_a_command_adds_to_it(config: Path, tmp_path: 
         ("method.wait", [0.0, 0.5]),
         ("problem.horizon", [1.0, 2.0]),
     ]
-    first = plan.checked()[0].loaded.config
-    assert (first.method.options["rounds"], first.title) == (3, "A double integrator")
-    assert first.plugins == (str((tmp_path / "stub.py").resolve()),)
+    first = plan.checked()[0].config
+    assert (first["method"]["rounds"], first["title"]) == (3, "A double integrator")
+    assert first["plugins"] == [str((tmp_path / "stub.py").resolve())]
+
+
+def test_a_study_is_no_config_and_a_key_is_not_both_an_axis_and_an_override(config: Path, tmp_path: Path) -> None:
+    file = tmp_path / "study.yaml"
+    file.write_text("base: small.yaml\naxes: {seed: [0, 1]}\n")
+    with pytest.raises(sr.ConfigError, match=r"study.yaml: expected a config, got a study, which has axes"):
+        sr.run(file)
+    with pytest.raises(sr.InputError, match="seed: expected an axis or an override, got both"):
+        make_plan(config, {"seed": [0, 1]}, {"seed": 3})
+    assert not make_plan(file, None, {"seed": 3}).axes  # what a call says holds, whatever the file says
+
+
+def test_the_check_of_many_configs_is_told(config: Path) -> None:
+    heard: list[str] = []
+    make_plan(config, ["seed=1:250:250"]).checked(lambda event: heard.append(getattr(event, "text", "")))
+    assert heard == ["100 of 250 configs are checked", "200 of 250 configs are checked"]
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Self, final
 
 from sparserob_core.experiment.cli.shell.live_line import RENEWED, LiveLine
 from sparserob_core.experiment.config.plain import value_text
-from sparserob_core.experiment.run.events import SweepProgress
+from sparserob_core.experiment.run.events import StudyProgress, SweepProgress
 from sparserob_core.experiment.sweep.study import COLUMNS, short
 from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.events import Event
@@ -54,6 +54,8 @@ class LiveTable:
                 self._rows.append([*(value_text(event.row[key]) for key in event.axes), *short(event.row)])
             if time.monotonic() - self._last >= RENEWED:
                 self._show(self._live, event)
+        elif isinstance(event, StudyProgress):
+            self._live.update(printable(event.text), refresh=True)
 
     def _show(self, live: Live, event: SweepProgress) -> None:
         from rich.box import SIMPLE
