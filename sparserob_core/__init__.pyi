@@ -46,6 +46,8 @@ from sparserob_core.experiment.sweep.study import Study as Study
 from sparserob_core.experiment.sweep.sweep import sweep as sweep
 from sparserob_core.experiment.comparison.comparison import Comparison as Comparison
 from sparserob_core.experiment.comparison.compare import compare as compare
+from sparserob_core.experiment.comparison.profiles import Instance as Instance
+from sparserob_core.experiment.comparison.profiles import Profiles as Profiles
 from sparserob_core.sip.result import Result as Result
 from sparserob_core.sip.result import SearchTrace as SearchTrace
 from sparserob_core.sip.evidence import Cut as Cut
@@ -123,3 +125,4 @@ from sparserob_core.experiment.run.inspection import Inspection as Inspection
 from sparserob_core.experiment.run.inspection import RelaxedValue as RelaxedValue
 from sparserob_core.experiment.figures.figure_data import FigureData as FigureData
 from sparserob_core.experiment.figures.figure_data import Wall as Wall
+from sparserob_core.experiment.figures.clash import Strip as Strip

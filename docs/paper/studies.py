@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,18 +15,12 @@ CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 WEIGHTS = (1.0, 1e-1, 1e-2, 1e-3, 1e-4, 1e-6)  # the epsilons of the figure
 BISECTIONS = 13
 
-# The optimiser of the regularised program is wanted, not of the plain one.
-SWEEP = {"method": {"name": "exchange", "exact": False}}
 PRINTED3 = {"problem.disturbance.box": [0.4, 0.4]}
-
-
-def scenarios(count: int) -> dict[str, Any]:
-    """The scenario approach with so many scenarios."""
-    return {"method": {"name": "scenario", "scenarios": count}}
+SCENARIOS = {"method": {"name": "scenario", "scenarios": 1000}}
 
 
 @dataclass(frozen=True)
-class Study:
+class Run:
     """One run: a config, what is changed in it, and what to call it."""
 
     name: str
@@ -35,58 +29,52 @@ class Study:
     overrides: Mapping[str, Any] = field(default_factory=dict)
 
 
-STUDIES = (
-    Study("printed1", "experiment1_printed", "Experiment 1 as printed"),
-    Study(
-        "window1",
-        "experiment1_paper",
-        "Experiment 1, printed disturbance, path constraint from 0.3 on",
-        {"method": "exchange"},
-    ),
-    Study("nominal1", "experiment1_paper", "non-robust", {"method": "nominal"}),
-    Study("scenario1_1000", "experiment1_paper", "1000 scenarios", scenarios(1000)),
-    Study("scenario1_5000", "experiment1_paper", "5000 scenarios", scenarios(5000)),
-    Study("search1", "experiment1_paper", "the paper's search"),
-    Study("repaired1_nominal", "experiment1_repaired", "non-robust", {"method": "nominal"}),
-    Study("repaired1_scenario_1000", "experiment1_repaired", "1000 scenarios", scenarios(1000)),
-    Study("repaired1_scenario_5000", "experiment1_repaired", "5000 scenarios", scenarios(5000)),
-    Study("repaired1", "experiment1_repaired", "robust, proven"),
-    *(
-        Study(
-            f"epsilon_{weight:g}",
-            "experiment1_repaired",
-            f"epsilon = {weight:g}",
-            {**SWEEP, "continuation": {"start": weight, "stop": weight}},
-        )
-        for weight in WEIGHTS
-    ),
-    Study("printed2", "experiment2_printed", "Experiment 2 as printed"),
-    Study("repaired2_nominal", "experiment2_repaired", "non-robust", {"method": "nominal"}),
-    Study("repaired2_scenario_1000", "experiment2_repaired", "1000 scenarios", scenarios(1000)),
-    Study("repaired2_scenario_5000", "experiment2_repaired", "5000 scenarios", scenarios(5000)),
-    Study("repaired2", "experiment2_repaired", "robust, proven"),
-    Study("printed3", "experiment3_printed", "Experiment 3 as printed"),
-    Study("scenario3_1000", "experiment3_repaired", "1000 scenarios", {**scenarios(1000), **PRINTED3}),
-    Study("repaired3_nominal", "experiment3_repaired", "non-robust", {"method": "nominal"}),
-    Study("repaired3", "experiment3_repaired", "robust, proven"),
+RUNS = (
+    Run("printed1", "experiment1_printed", "Experiment 1 as printed"),
+    Run("search1", "experiment1_paper", "the paper's search"),
+    Run("printed2", "experiment2_printed", "Experiment 2 as printed"),
+    Run("printed3", "experiment3_printed", "Experiment 3 as printed"),
+    Run("scenario3_1000", "experiment3_repaired", "1000 scenarios", {**SCENARIOS, **PRINTED3}),
+    Run("repaired3_nominal", "experiment3_repaired", "non-robust", {"method": "nominal"}),
+    Run("repaired3", "experiment3_repaired", "robust, proven"),
 )
+STUDIES: Mapping[str, Sequence[str]] = {
+    "designs1_printed": ("nominal1", "scenario1_1000", "scenario1_5000", "window1"),
+    "designs1": ("repaired1_nominal", "repaired1_scenario_1000", "repaired1_scenario_5000", "repaired1"),
+    "designs2": ("repaired2_nominal", "repaired2_scenario_1000", "repaired2_scenario_5000", "repaired2"),
+    "epsilon": tuple(f"epsilon_{weight:g}" for weight in WEIGHTS),
+}
+"""Files in configs/studies, and what the page calls their points."""
 
 
 def run_all(directory: Path) -> dict[str, sr.Outcome]:
-    """Run every study into ``directory``, one line each; the search at the paper's size takes most of the time."""
+    """Everything that the page is made of, into ``directory``, one line for each run; the search at the paper's size
+    takes most of the time."""
     outcomes = {}
-    for number, study in enumerate(STUDIES, 1):
-        tell(f"{number:2d}/{len(STUDIES)}  {study.config}  {study.title}")
+    for run in RUNS:
+        tell(f"{run.config}  {run.title}")
         started = time.perf_counter()
         outcome = sr.run(
-            CONFIGS / f"{study.config}.yaml",
-            {"observers": [], **study.overrides},
-            out=directory / study.name,
+            CONFIGS / f"{run.config}.yaml",
+            {"observers": [], **run.overrides},
+            out=directory / run.name,
             figures=False,
         )
         tell(f"        {outcome.status}, {time.perf_counter() - started:.1f} s")
-        outcomes[study.name] = outcome
+        outcomes[run.name] = outcome
+    for file, names in STUDIES.items():
+        tell(f"studies/{file}")
+        study = sr.sweep(
+            CONFIGS / "studies" / f"{file}.yaml", overrides={"observers": []}, out=directory / file, notify=told
+        )
+        outcomes |= dict(zip(names, study.outcomes, strict=True))
     return outcomes
+
+
+def told(event: sr.Event) -> None:
+    """One line for every point of a study."""
+    if isinstance(event, sr.SweepProgress) and event.row is not None:
+        tell(f"        {event.row['status']}, {event.row.get('seconds') or 0.0:.1f} s; {event.text}")
 
 
 def largest_disturbance(directory: Path, low: float = 0.06, high: float = 0.08) -> tuple[float, float]:

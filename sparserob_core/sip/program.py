@@ -81,6 +81,10 @@ class Explanation(ABC):
     def witness(self, worst: WorstConstraint) -> WorstConstraint:
         """The worst constraint, which is this one, with what the field knows of it."""
 
+    def short(self) -> str:
+        """What it asks for, without remarks."""
+        return self.text
+
     def beyond(self, amount: float) -> str:
         """No decision enters the constraint, and it is violated by ``amount``."""
         return self.out_of_reach(amount, 0.0)

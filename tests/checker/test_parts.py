@@ -157,6 +157,13 @@ def test_a_point_that_cancels_is_not_said_to_be_inside():
         assert excess(ball, [arb(0.5), blurred])[0] == 0.0
 
 
+def test_of_parallel_rows_the_nearest_one_limits():
+    rows = sr.Polytope(np.array([[1.0], [-1.0], [2.0], [-4.0]]), np.array([0.5, 0.5, 0.4, 0.8]))
+    assert abs(float(limit(rows, np.array([1.0])).mid()) - 0.2) < 1e-15
+    assert abs(float(limit(rows, np.array([-4.0])).mid()) - 0.8) < 1e-15
+    assert abs(float(limit(rows, np.array([-3.0])).mid()) - 0.6) < 1e-15
+
+
 def test_limits_of_flat_sets_are_what_their_facets_say():
     for normal, height in facets(TRIANGLE) or []:
         assert limit(TRIANGLE, normal) == height

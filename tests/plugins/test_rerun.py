@@ -157,7 +157,7 @@ def test_nothing_that_a_run_has_to_show_is_missing(kind: str, request: pytest.Fi
         "/log",
         "/verdict",
         "/signals/control",
-        "/signals/x1",
+        "/signals/states/x1",
     }
     search = {
         "/search/g/walk",
@@ -186,7 +186,7 @@ def test_the_signals_are_the_control_and_the_tube_of_the_figures(exchanged: sr.O
     assert exchanged.control is not None
     assert (control[:, 0] == exchanged.control[0]).all()
     assert (np.diff(times) > 0).all()
-    _, state = scalars(found["/signals/x1"], "t")
+    _, state = scalars(found["/signals/states/x1"], "t")
     assert (state[:, 1] <= state[:, 0] + 1e-12).all() and (state[:, 0] <= state[:, 2] + 1e-12).all()
 
 

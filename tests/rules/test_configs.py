@@ -83,6 +83,15 @@ def test_a_config_comes_back_with_the_expected_answer(name: str, tmp_path: Path)
     assert not failed
 
 
+def test_every_study_of_the_folder_can_be_run_and_says_what_it_shows() -> None:
+    from sparserob_core.experiment.sweep.plan import read_plan
+
+    studies = sorted((CONFIGS / "studies").glob("*"))
+    assert studies
+    assert not [file.name for file in studies if not file.read_text().startswith("# ")]
+    assert not [file.name for file in studies if len({point.hash for point in read_plan(file).checked()}) < 4]
+
+
 COARSE = {"dictionaries.control.pieces": 20, "dictionaries.disturbance.pieces": 20}
 
 

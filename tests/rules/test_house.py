@@ -22,7 +22,7 @@ from tests.support.places import ROOT
 
 CORE = sorted((ROOT / "sparserob_core").rglob("*.py"))
 PLUGINS = sorted((ROOT / "plugins").glob("sparserob_*/**/*.py"))
-WRITTEN = ("*.md", "docs/**/*.md", "configs/*", "tests/**/*.py", "Makefile", "pyproject.toml")
+WRITTEN = ("*.md", "docs/**/*.md", "configs/*.*", "configs/studies/*", "tests/**/*.py", "Makefile", "pyproject.toml")
 PAGES = sorted({path for pattern in WRITTEN for path in ROOT.glob(pattern)} - {Path(__file__).resolve()})
 HEAVY = {
     "scipy", "matplotlib", "rich", "qpsolvers", "piqp", "proxsuite", "clarabel", "cvxpy", "rerun", "nevergrad", "dask",

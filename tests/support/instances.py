@@ -279,7 +279,7 @@ def optimum(
         some = np.isfinite(problem.ends_at)
         last = samples[0].response[-1][some]
         equal, at = np.hstack([last, -last]), problem.ends_at[some] - samples[0].free[-1][some]
-    size, used = len(problem.price), np.zeros(len(h), dtype=bool)
+    size, used, inside = len(problem.price), np.zeros(len(h), dtype=bool), problem.control.rows()[2]
     for _ in range(200):
         both = np.concatenate([rows, G[used]])
         answer = linprog(
@@ -288,7 +288,7 @@ def optimum(
             np.concatenate([limits, h[used]]),
             equal,
             at,
-            bounds=np.stack([np.zeros(2 * size), problem.sides.ravel()], axis=1),
+            bounds=np.stack([np.zeros(2 * size), problem.sides.ravel() * (inside if tight else 1.0)], axis=1),
             method="highs",
             options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
         )

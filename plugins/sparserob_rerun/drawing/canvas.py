@@ -15,6 +15,7 @@ import numpy as np
 from sparserob_rerun.drawing.palette import FAINT, GREY, GROUND, INK, Colour, Floats
 
 HATCHES = 60
+LOW = 150.0  # a plot that is lower has fewer ticks
 LIFT = 9.0  # the viewer writes labels this far below their points
 
 
@@ -68,14 +69,16 @@ class Drawing:
         """Words centred at a pixel."""
         self.labels.append((np.array([x, y - LIFT]), words, colour))
 
-    def frame(self, axes: Axes, title: str, x_label: str = "", ticks_below: bool = True) -> None:
-        """The box, ticks at round numbers, and the name of what is plotted above it."""
+    def frame(self, axes: Axes, title: str, x_label: str = "", ticks_below: bool = True, decades: bool = False) -> None:
+        """The box, ticks at round numbers, the name of what is plotted above it, and that of the axis at its end.
+        ``decades``: the values upwards are decimal logarithms."""
         left, top, right, bottom = axes.left, axes.top, axes.left + axes.width, axes.top + axes.height
         self.line("frame", np.array([[left, top], [left, bottom], [right, bottom]]), GREY, 1.0)
-        for value in ticks(*axes.y):
+        few = ticks(*axes.y, 3) if axes.height < LOW else np.zeros(0)
+        for value in few if few.size > 1 else ticks(*axes.y):
             y = float(axes.at(axes.x[0], value)[0, 1])
             self.line("frame", np.array([[left - 5, y], [left, y]]), GREY, 1.0)
-            self.text(left - 24, y, f"{value:g}", GREY)
+            self.text(left - 24, y, f"1e{value:g}" if decades else f"{value:.6g}", GREY)
         for value in ticks(*axes.x):
             x = float(axes.at(value, axes.y[0])[0, 0])
             self.line("frame", np.array([[x, bottom], [x, bottom + 5]]), GREY, 1.0)
@@ -85,7 +88,7 @@ class Drawing:
             self.line("frame", axes.at(np.array(axes.x), np.zeros(2)), FAINT, 0.7)
         self.text((left + right) / 2, top - 14, title)
         if x_label:
-            self.text((left + right) / 2, bottom + 34, x_label, GREY)
+            self.text(right + 10 + 4 * len(x_label), bottom, x_label, GREY)
 
     def band(self, layer: str, axes: Axes, x: Floats, lower: Floats, upper: Floats, colour: Colour) -> None:
         """The area between two curves, as upright strokes."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import product
 from typing import Any, final
 
@@ -12,11 +13,12 @@ import sparserob_core as sr
 from sparserob_rerun.drawing import palette as ink
 from sparserob_rerun.drawing.canvas import Axes, Drawing
 from sparserob_rerun.drawing.palette import Floats
+from sparserob_rerun.exchange.bounds import Bounds
 
 INSTANTS, PARAMETERS = 97, 15
 FAMILIES = 4
 LATTICE = 27  # points at most for the coordinates that are not drawn
-LEFT, WIDTH, HEIGHT, GAP = 60.0, 640.0, 118.0, 46.0
+LEFT, WIDTH, HEIGHT, GAP = 60.0, 640.0, 118.0, 60.0
 SMALLEST = 1e-12
 SERIES = {
     "rounds/bounds": {"lower bound (proven)": ink.GREEN, "upper bound": ink.VERMILLION},
@@ -27,7 +29,18 @@ SERIES = {
 
 def extent(families: int) -> tuple[float, float, float, float]:
     """Left, right, top and bottom of the violation plots."""
-    return 0.0, LEFT + WIDTH + 30.0, -30.0, min(FAMILIES, families) * (HEIGHT + GAP) + 8.0
+    return 0.0, LEFT + WIDTH + 44.0, -30.0, max(1, min(FAMILIES, families)) * (HEIGHT + GAP) + 8.0
+
+
+@final
+@dataclass(frozen=True)
+class Worst:
+    """What is known of the worst violation of a constraint: its ``value`` and where (``at``), NaN where that is not
+    known, and whether it is ``proven`` that nothing counts as violated."""
+
+    value: float
+    at: float
+    proven: bool = False
 
 
 @final
@@ -36,6 +49,7 @@ class Rounds:
 
     def __init__(self, rr: Any, stream: Any, inspection: sr.Inspection | None) -> None:
         self.rr, self.stream, self.inspection = rr, stream, inspection
+        self.picture = Bounds(rr, stream)
         for path, series in SERIES.items():
             names, colours = list(series), list(series.values())
             stream.log(
@@ -47,27 +61,49 @@ class Rounds:
 
     def bounds(self, event: sr.RoundFinished) -> None:
         """The numbers of one round."""
-        rr, shown = (
-            self.rr,
-            [value if np.isfinite(value) else np.nan for value in (event.lower_bound, event.upper_bound)],
-        )
+        self.picture.add(event)
+        upper = np.inf if event.simplified else event.upper_bound
+        rr, shown = self.rr, [value if np.isfinite(value) else np.nan for value in (event.lower_bound, upper)]
         self.stream.log("rounds/bounds", rr.Scalars(shown))
         gap = event.gap if np.isfinite(event.gap) else np.nan
         self.stream.log("rounds/log10", rr.Scalars([_decades(event.violation), _decades(gap)]))
         self.stream.log("rounds/counts", rr.Scalars([float(event.active_indices), float(event.cuts_added)]))
 
-    def violations(self, decision: Floats, cuts: Sequence[sr.Cut], added: Sequence[sr.Cut]) -> None:
-        """The violation of every family at a decision over its first index, and over the second as a map."""
+    def violations(
+        self, decision: Floats, cuts: Sequence[sr.Cut], added: Sequence[sr.Cut], told: Mapping[str, Worst]
+    ) -> None:
+        """The violation of every family at a decision over its first index, and over the second as a map. ``told``:
+        what a search or a proof says of the worst of it, which a picture on a grid does not know."""
         if self.inspection is None:
             return
-        drawing, families, maps = Drawing(), self.inspection.program.families[:FAMILIES], 0
-        for place, family in enumerate(families):
+        drawing, families, maps = Drawing(), self.inspection.program.families, 0
+        for place, family in enumerate(families[:FAMILIES]):
             across, along, field = violation_field(family, decision)
-            self._plot(drawing, place, family, (across, along, field), (cuts, added))
+            last = place == min(len(families), FAMILIES) - 1
+            words = self._words(family, told.get(family.name), (across, along, field))
+            if last and len(families) > FAMILIES:
+                words += f" ({len(families) - FAMILIES} more constraints are not shown)"
+            self._plot(drawing, place, family, (across, along, field), (cuts, added), words)
             if along.size > 1 and across.size > 1:
-                self._map(maps, family.name, field)
+                self._map(maps, family, (across, along, field))
                 maps += 1
         drawing.log(self.rr, self.stream, "violation/plots", layers=("hatch", "frame", "marks", "curve"))
+
+    def _words(self, family: sr.ConstraintFamily, known: Worst | None, found: tuple[Floats, Floats, Floats]) -> str:
+        """One constraint in words: as search and proof know it, else as the grid shows it."""
+        assert self.inspection is not None
+        across, _, field = found
+        worst = field.max(axis=1)
+        if known is None:
+            value, at, grid = float(worst.max()), float(across[worst.argmax()]), " on this grid"
+        else:
+            value, at, grid = known.value, known.at, ""
+        where = f" at t = {at:.4g}" if self.inspection.problem is not None and np.isfinite(at) else ""
+        proven = known is not None and known.proven
+        if value > self.inspection.tolerance(family.name) and not proven:
+            return f"{family.name}: violated by {value:.3g}{where}{grid}; above 0 is forbidden"
+        margin = f", to within {value:.1e}{where}" if value > 0.0 else f", with {-value:.2g} to spare{where}{grid}"
+        return f"{family.name} {'is proven to hold' if proven else 'holds'}" + (margin if np.isfinite(value) else "")
 
     def _plot(
         self,
@@ -76,47 +112,74 @@ class Rounds:
         family: sr.ConstraintFamily,
         found: tuple[Floats, Floats, Floats],
         marked: tuple[Sequence[sr.Cut], Sequence[sr.Cut]],
+        words: str,
     ) -> None:
         across, _, field = found
         worst, box = field.max(axis=1), family.index_set
-        ends = (float(box.lower[0]), float(box.upper[0]))
-        if across.size == 1:
+        problem = None if self.inspection is None else self.inspection.problem
+        ends = (0.0, problem.horizon) if problem is not None else (float(box.lower[0]), float(box.upper[0]))
+        if ends[0] == ends[1]:
             ends = (ends[0] - 1.0, ends[1] + 1.0)
         low = float(np.quantile(worst, 0.02))
         reach = max(abs(low), abs(float(worst.max())), 1e-9)
         axes = Axes(
             LEFT, place * (HEIGHT + GAP), WIDTH, HEIGHT, ends, (-reach, max(0.35 * reach, 1.15 * float(worst.max())))
         )
-        drawing.frame(
-            axes,
-            f"{family.name}: worst violation {worst.max():.2e} at {across[worst.argmax()]:.4g}; above 0 is forbidden",
-        )
+        drawing.frame(axes, words, "t" if problem is not None else "index")
         drawing.hatched("hatch", axes, axes.x, (0.0, axes.y[1]), ink.HATCH)
         if across.size > 1:
             drawing.line("curve", axes.at(across, worst), ink.SKY, 2.0)
         else:
+            drawing.dashed("marks", axes.at(np.full(2, across[0]), np.array(axes.y)), ink.GREY)
             drawing.dot(axes.at(across, worst), ink.SKY, 6.0)
         for cuts, colour, size in zip(marked, (ink.PURPLE, ink.ORANGE), (5.0, 7.0), strict=True):
             times = np.array([cut.index[0] for cut in cuts if cut.family == family.name])
             if times.size:
                 drawing.dot(axes.at(times, 0.0), colour, size)
 
-    def _map(self, place: int, name: str, field: Floats) -> None:
+    def _map(self, place: int, family: sr.ConstraintFamily, found: tuple[Floats, Floats, Floats]) -> None:
         """Time from left to right, the first parameter upwards; red is violated."""
-        rr, reach, top = self.rr, max(float(np.abs(field).max()), SMALLEST), place * (16.0 * PARAMETERS + 50.0)
+        assert self.inspection is not None
+        across, along, field = found
+        rr, reach, top = self.rr, max(float(np.abs(field).max()), SMALLEST), place * (16.0 * PARAMETERS + 70.0)
         image = np.ascontiguousarray(ink.diverging(np.flipud(field.T) / reach)[:, :, :3])
-        path = f"violation/maps/{name.replace('[', '_').replace(']', '')}"
+        path = f"violation/maps/{family.name.replace('[', '_').replace(']', '')}"
         self.stream.log(path, rr.Transform3D(translation=(0.0, top, 0.0), scale=(4.0, 16.0, 1.0)), rr.Image(image))
+        one, other = self.inspection.names(family.index_set.dimension)[:2]
+        words = (
+            f"{family.name}: {one} from {across[0]:.4g} to {across[-1]:.4g}, "
+            f"upwards {other} from {along[0]:.4g} to {along[-1]:.4g}"
+        )
         self.stream.log(
             f"violation/names/{place}",
             rr.Points2D(
                 [(2.0 * INSTANTS, top - 20.0)],
-                labels=[name],
+                labels=[words],
                 colors=[ink.INK],
                 radii=rr.Radius.ui_points(0.0),
                 show_labels=True,
             ),
         )
+
+
+def told_by_round(event: sr.RoundFinished) -> dict[str, Worst]:
+    """What the searches of a round found."""
+    return {
+        name: Worst(float(one.violations[0]), float(one.indices[0, 0]))
+        for name, one in event.separations.items()
+        if one.violations.size and one.indices.size
+    }
+
+
+def told_by_result(result: sr.Result) -> dict[str, Worst]:
+    """What a result says: what its proofs exclude, and the worst constraint that it names."""
+    found = {proof.family: Worst(np.nan, np.nan, True) for proof in result.proofs if proof.verdict == "proven"}
+    worst = result.worst
+    if worst is not None and worst.constraint:
+        time = worst.time if isinstance(worst, sr.Witness) else worst.index[0] if worst.index.size else None
+        proven = worst.constraint in found
+        found[worst.constraint] = Worst(worst.violation, np.nan if time is None else float(time), proven)
+    return found
 
 
 def violation_field(family: sr.ConstraintFamily, decision: Floats) -> tuple[Floats, Floats, Floats]:

@@ -11,24 +11,20 @@ import sparserob_core as sr
 from sparserob_rerun.drawing import palette as ink
 from sparserob_rerun.drawing.canvas import Axes, Drawing
 from sparserob_rerun.drawing.palette import Floats
+from sparserob_rerun.physics.pages import pages
 from sparserob_rerun.physics.switching import Switching
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
 LEFT, WIDTH, HEIGHT, GAP = 60.0, 640.0, 118.0, 46.0
-MOST_CONTROLS, MOST_STATES = 2, 4
-SERIES = {"nominal": ink.SKY, "worst case from below": ink.GREY, "worst case from above": ink.GREY}
+SHADES = (ink.SKY, ink.ORANGE, ink.GREEN, ink.PURPLE, ink.VERMILLION, ink.INK)  # one for each signal
+LAYERS = ("hatch", "tube", "frame", "marks", "worst", "curve", "wall")
 
 
 def extent(count: int) -> tuple[float, float, float, float]:
     """Left, right, top and bottom of ``count`` plots above one another."""
-    return 0.0, LEFT + WIDTH + 30.0, -30.0, count * (HEIGHT + GAP) + 8.0
-
-
-def plots(problem: sr.OptimalControlProblem) -> int:
-    """How many plots a problem has: two for every control, one for every state."""
-    return 2 * min(MOST_CONTROLS, problem.system.controls) + min(MOST_STATES, problem.system.states)
+    return 0.0, LEFT + WIDTH + 44.0, -30.0, count * (HEIGHT + GAP) + 8.0
 
 
 @final
@@ -38,6 +34,8 @@ class Physics:
     def __init__(self, rr: Any, stream: Any, view: sr.Inspection) -> None:
         self.rr, self.stream, self.view = rr, stream, view
         self.switching = Switching(view.program)
+        assert view.problem is not None
+        self.problem = view.problem
 
     def draw(self, decision: Floats, cuts: Sequence[sr.Cut], mu: Floats | None) -> None:
         """One decision with the constraints that carry a multiplier; ``mu`` are the multipliers of the equalities, if
@@ -48,18 +46,19 @@ class Physics:
         times = np.unique([cut.index[0] for cut in active])
         data = self.view.picture(decision, times)
         worst = self.view.worst_cases(decision)
-        drawing = Drawing()
-        tops = iter(range(100))
         push = self.switching.push(active, mu)
-        for channel in range(min(MOST_CONTROLS, len(data.control))):
-            self._control(drawing, _axes(next(tops), data, _control_limits(data, channel)), data, channel)
-            self._push(drawing, _axes(next(tops), data, (-2.0, 2.0)), data, push, channel)
-        for state in range(min(MOST_STATES, len(data.state))):
-            self._state(drawing, _axes(next(tops), data, _state_limits(data, state)), data, worst, state)
-        self._marks(drawing, data, times, next(tops))
-        drawing.log(
-            self.rr, self.stream, "physics/plots", layers=("hatch", "tube", "frame", "marks", "worst", "curve", "wall")
-        )
+        for page in pages(self.problem):
+            drawing = Drawing()
+            for top, (kind, place) in enumerate(page.plots):
+                last = top == len(page.plots) - 1
+                if kind == "control":
+                    self._control(drawing, _axes(top, data, _control_limits(data, place)), data, place, last)
+                elif kind == "push":
+                    self._push(drawing, _axes(top, data, (-2.0, 2.0)), data, push, place, last)
+                else:
+                    self._state(drawing, _axes(top, data, _state_limits(data, place)), data, worst, place, last)
+            self._marks(drawing, data, times, len(page.plots))
+            drawing.log(self.rr, self.stream, page.path, layers=LAYERS)
         draw_phase(self.rr, self.stream, data, worst)
 
     def signals(self, decision: Floats) -> None:
@@ -67,32 +66,49 @@ class Physics:
         seconds."""
         rr, data = self.rr, self.view.picture(decision, np.empty(0))
         at = [rr.TimeColumn("t", duration=data.breakpoints[:-1])]
-        channels = len(data.control)
+        channels, states = len(data.control), len(data.state)
         names = [_name("u", channel, channels) for channel in range(channels)]
-        self.stream.log("signals/control", rr.SeriesLines(names=names, interpolation_mode="StepAfter"), static=True)
+        colours = [SHADES[channel % len(SHADES)] for channel in range(channels)]
+        self.stream.log(
+            "signals/control",
+            rr.SeriesLines(names=names, colors=colours, interpolation_mode="StepAfter"),
+            static=True,
+        )
         rows = rr.Scalars.columns(scalars=data.control.T.ravel()).partition([channels] * data.control.shape[1])
         self.stream.send_columns("signals/control", at, rows)
         at = [rr.TimeColumn("t", duration=data.times)]
-        for state in range(len(data.state)):
-            path = f"signals/{_name('x', state, len(data.state))}"
-            self.stream.log(path, rr.SeriesLines(names=list(SERIES), colors=list(SERIES.values())), static=True)
+        for state in range(states):
+            name, colour = _name("x", state, states), SHADES[state % len(SHADES)]
+            pale = (*colour[:3], 110)
+            self.stream.log(
+                f"signals/states/{name}",
+                rr.SeriesLines(
+                    names=[f"{name} nominal", f"{name} at least", f"{name} at most"],
+                    colors=[colour, pale, pale],
+                    widths=[2.0, 1.0, 1.0],
+                ),
+                static=True,
+            )
             values = np.stack([data.state[state], data.tube_lower[state], data.tube_upper[state]], axis=1)
-            self.stream.send_columns(path, at, rr.Scalars.columns(scalars=values.ravel()).partition([3] * len(values)))
+            rows = rr.Scalars.columns(scalars=values.ravel()).partition([3] * len(values))
+            self.stream.send_columns(f"signals/states/{name}", at, rows)
 
-    def _control(self, drawing: Drawing, axes: Axes, data: sr.FigureData, channel: int) -> None:
+    def _control(self, drawing: Drawing, axes: Axes, data: sr.FigureData, channel: int, last: bool) -> None:
         name = _name("u", channel, len(data.control))
-        drawing.frame(axes, f"control {name}(t): dashed, its bounds", ticks_below=False)
+        drawing.frame(axes, f"control {name}(t): dashed, its bounds", "t", ticks_below=last)
         for bound in (data.control_lower[channel], data.control_upper[channel]):
             drawing.dashed("marks", axes.at(np.array(axes.x), np.full(2, bound)), ink.VERMILLION)
         steps, edges = data.control[channel], data.breakpoints
         drawing.band("tube", axes, *_fill(edges, steps), ink.TUBE)
         drawing.line("curve", axes.at(np.repeat(edges, 2)[1:-1], np.repeat(steps, 2)), ink.SKY, 2.0)
 
-    def _push(self, drawing: Drawing, axes: Axes, data: sr.FigureData, push: Floats | None, channel: int) -> None:
+    def _push(
+        self, drawing: Drawing, axes: Axes, data: sr.FigureData, push: Floats | None, channel: int, last: bool
+    ) -> None:
         name = _name("u", channel, len(data.control))
         if push is None or not push.any():
             drawing.frame(
-                axes, f"why {name} switches: no constraint pushes, or its push is not known", ticks_below=False
+                axes, f"why {name} switches: no constraint pushes, or its push is not known", "t", ticks_below=last
             )
             return
         values = push[channel]
@@ -101,7 +117,8 @@ class Physics:
         drawing.frame(
             axes,
             f"why {name} switches: the active constraints' push on it; {name} acts where the push leaves the band",
-            ticks_below=False,
+            "t",
+            ticks_below=last,
         )
         for price in (-1.0, 1.0):
             drawing.dashed("marks", axes.at(np.array(axes.x), np.full(2, price)), ink.GREY)
@@ -112,13 +129,11 @@ class Physics:
             drawing.band("tube", axes, middles, np.full(middles.size, side), beyond, ink.TUBE)
         drawing.line("curve", axes.at(middles, values), ink.PURPLE, 2.0)
 
-    def _state(self, drawing: Drawing, axes: Axes, data: sr.FigureData, worst: Mapping[str, Any], state: int) -> None:
+    def _state(
+        self, drawing: Drawing, axes: Axes, data: sr.FigureData, worst: Mapping[str, Any], state: int, last: bool
+    ) -> None:
         name = _name("x", state, len(data.state))
-        drawing.frame(
-            axes,
-            f"state {name}(t): nominal, worst-case tube, walls",
-            ticks_below=state == min(MOST_STATES, len(data.state)) - 1,
-        )
+        drawing.frame(axes, f"state {name}(t): nominal, worst-case tube, walls", "t", ticks_below=last)
         drawing.band("tube", axes, data.times, data.tube_lower[state], data.tube_upper[state], ink.TUBE)
         for wall in data.walls:
             if wall.state == state:
@@ -166,8 +181,10 @@ def _wall(drawing: Drawing, axes: Axes, lower: float, upper: float, start: float
 
 
 def _fill(edges: Floats, steps: Floats) -> tuple[Floats, Floats, Floats]:
-    middles = (edges[:-1] + edges[1:]) / 2
-    return middles, np.minimum(steps, 0.0), np.maximum(steps, 0.0)
+    """The steps as a curve with all but upright flanks."""
+    inside = 1e-9 * (edges[-1] - edges[0])
+    places, values = np.stack([edges[:-1] + inside, edges[1:] - inside], axis=1).ravel(), np.repeat(steps, 2)
+    return places, np.minimum(values, 0.0), np.maximum(values, 0.0)
 
 
 def _control_limits(data: sr.FigureData, channel: int) -> tuple[float, float]:

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any, final
 
 from sparserob_rerun.drawing import palette as ink
 from sparserob_rerun.drawing.canvas import view
-from sparserob_rerun.exchange import rounds
+from sparserob_rerun.exchange import bounds, rounds
 from sparserob_rerun.physics import physics
+from sparserob_rerun.physics.pages import heading, pages
 from sparserob_rerun.search import views as search
 
 if TYPE_CHECKING:
@@ -19,7 +20,9 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class Shown:
     """What a run has to show: its problem, if it is one of control, how many families, whether tuples are searched, and
-    the landscape; of a search what the maximiser has ``told`` of itself, and the coordinates that have ``moved``."""
+    the landscape; of a search what the maximiser has ``told`` of itself, and the coordinates that have ``moved``.
+    ``clash``, once a run is infeasible: the limits of the drawing of what clashes, empty where it cannot be drawn;
+    ``drawn``: whether there were decisions before that."""
 
     problem: sr.OptimalControlProblem | None
     families: int
@@ -27,6 +30,8 @@ class Shown:
     landscape: bool
     told: frozenset[str] = frozenset()
     moved: frozenset[str] = frozenset()
+    clash: tuple[float, ...] | None = None
+    drawn: bool = True
 
 
 def layout(shown: Shown) -> Any:
@@ -38,10 +43,16 @@ def layout(shown: Shown) -> Any:
     tabs = [overview, _exchange(rrb, shown)]
     if shown.searches:
         tabs.insert(1, search.tab(rrb, shown.told, shown.moved))
+    if shown.problem is not None and len(pages(shown.problem)) > 1:
+        tabs.insert(1, _further(rrb, shown.problem))
     if shown.landscape:
         tabs.append(search.surface(rrb))
-    if shown.problem is not None:
-        tabs.append(rrb.TimeSeriesView(origin="/signals", name="Signals (choose the timeline t)"))
+    if shown.clash is not None:
+        overview.name = "Before it was known that nothing is feasible"
+        tabs = [_infeasible(rrb, shown, shown.clash), *(tabs if shown.drawn else [])]
+    elif shown.problem is not None:
+        tabs.append(_signals(rrb))
+    tabs.append(_log(rrb, shown))
     return rrb.Blueprint(
         rrb.Tabs(*tabs, active_tab=0),
         rrb.TimePanel(state="collapsed", timeline="evaluation" if shown.searches else "round", play_state="following"),
@@ -60,23 +71,24 @@ def _columns(rrb: Any, shown: Shown) -> list[Any]:
         if shown.landscape
         else rrb.Vertical(*numbers)
     )
-    words = [rrb.TextDocumentView(origin="/verdict", name="What is known"), _log(rrb, shown)]
+    words = [rrb.TextDocumentView(origin="/verdict", name="What is known"), _decisions(rrb)]
     if shown.problem is None:
         return [middle, rrb.Vertical(*words, row_shares=[2, 3])]
     if shown.problem.system.states > 1:
         words.insert(1, _phase(rrb, shown.problem))
-    plots = view(
-        "/physics/plots",
-        "Control and states against the time of the system",
-        physics.extent(physics.plots(shown.problem)),
-    )
-    return [plots, middle, rrb.Vertical(*words, row_shares=[3, 3, 2] if len(words) == 3 else [1, 1])]
+    first = pages(shown.problem)[0]
+    plots = view(f"/{first.path}", heading(shown.problem), physics.extent(len(first.plots)))
+    return [plots, middle, rrb.Vertical(*words, row_shares=[4, 3, 3] if len(words) == 3 else [1, 1])]
+
+
+def _decisions(rrb: Any) -> Any:
+    return rrb.TextDocumentView(origin="/decisions", name="Decisions, the newest first")
 
 
 def _log(rrb: Any, shown: Shown) -> Any:
     return rrb.TextLogView(
         origin="/log",
-        name="Decisions",
+        name="Log",
         columns=rrb.TextLogColumns(
             timeline_columns=["evaluation" if shown.searches else "round"], text_log_columns=["Body"]
         ),
@@ -85,18 +97,48 @@ def _log(rrb: Any, shown: Shown) -> Any:
 
 def _phase(rrb: Any, problem: sr.OptimalControlProblem) -> Any:
     if problem.system.states == 2:
-        return view("/physics/phase", "Phase plane", (10.0, 500.0, -30.0, 470.0))
-    return rrb.Spatial3DView(origin="/physics/phase", name="State space", background=list(ink.GROUND[:3]))
+        return view("/physics/phase", "Phase plane", (-10.0, 520.0, -40.0, 470.0))
+    states = problem.system.states
+    name = "State space" if states == 3 else f"State space: x1, x2, x3 of {states} states"
+    return rrb.Spatial3DView(origin="/physics/phase", name=name, background=list(ink.GROUND[:3]))
+
+
+def _further(rrb: Any, problem: sr.OptimalControlProblem) -> Any:
+    """The controls and states that the first screen has no room for."""
+    more = [view(f"/{page.path}", page.name, physics.extent(len(page.plots))) for page in pages(problem)[1:]]
+    return rrb.Horizontal(*more, name="Further signals") if len(more) < 4 else rrb.Grid(*more, name="Further signals")
+
+
+def _signals(rrb: Any) -> Any:
+    legend = rrb.Corner2D.RightTop
+    return rrb.Vertical(
+        rrb.TextDocumentView(origin="/howto", name="These series have a timeline of their own"),
+        rrb.TimeSeriesView(origin="/signals/control", name="Controls over t, in seconds", plot_legend=legend),
+        rrb.TimeSeriesView(origin="/signals/states", name="States over t, in seconds", plot_legend=legend),
+        row_shares=[1, 5, 5],
+        name="Signals (choose the timeline t)",
+    )
+
+
+def _infeasible(rrb: Any, shown: Shown, clash: tuple[float, ...]) -> Any:
+    """Instead of a control that there is not: why there is none."""
+    words = rrb.Vertical(
+        rrb.TextDocumentView(origin="/verdict", name="What is known"), _decisions(rrb), row_shares=[3, 2]
+    )
+    if not clash:
+        return rrb.Horizontal(words, name="Overview")
+    left, right, top, bottom = clash
+    drawing = view(
+        "/clash",
+        "What clashes: red is forbidden; blue, where the control can bring it; "
+        "yellow, what the worst disturbance makes of the best",
+        (left, right, top, bottom),
+    )
+    return rrb.Horizontal(drawing, words, name="Overview", column_shares=[5, 3])
 
 
 def _bounds(rrb: Any) -> Any:
-    return rrb.TimeSeriesView(origin="/rounds/bounds", name="Bounds on the cost", plot_legend=rrb.Corner2D.RightBottom)
-
-
-def _decades(rrb: Any) -> Any:
-    return rrb.TimeSeriesView(
-        origin="/rounds/log10", name="Violation and gap, decimal logarithms", plot_legend=rrb.Corner2D.LeftBottom
-    )
+    return view("/rounds/picture/bounds", "Bounds on the cost, round by round", bounds.ONE)
 
 
 def _violation(rrb: Any, shown: Shown) -> Any:
@@ -106,16 +148,18 @@ def _violation(rrb: Any, shown: Shown) -> Any:
 
 
 def _exchange(rrb: Any, shown: Shown) -> Any:
-    left = rrb.Vertical(
-        _bounds(rrb), _decades(rrb), rrb.TimeSeriesView(origin="/rounds/counts", name="Active indices and new cuts")
+    counts = rrb.TimeSeriesView(
+        origin="/rounds/counts", name="Active indices and new cuts", plot_legend=rrb.Corner2D.LeftTop
     )
+    both = view("/rounds/picture", "Bounds on the cost, the gap and the violation, round by round", bounds.BOTH)
+    left = rrb.Vertical(both, counts, row_shares=[2, 1])
     right = [_violation(rrb, shown)]
     if shown.problem is not None and shown.problem.system.parameter_count:
         right.append(
             rrb.Spatial2DView(
                 origin="/violation",
                 contents=["/violation/maps/**", "/violation/names/**"],
-                name="Violation over t and p1 (up): red is forbidden",
+                name="Violation over time and the first parameter: red is forbidden",
             )
         )
     return rrb.Horizontal(left, rrb.Vertical(*right), name="Exchange")

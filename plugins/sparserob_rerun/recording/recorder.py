@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +14,8 @@ import numpy as np
 import sparserob_core as sr
 from sparserob_rerun.drawing.palette import Floats
 from sparserob_rerun.drawing.timelines import Timelines
-from sparserob_rerun.exchange.rounds import Rounds
+from sparserob_rerun.exchange.clash import draw_clash, extent
+from sparserob_rerun.exchange.rounds import Rounds, told_by_result, told_by_round
 from sparserob_rerun.options import LandscapeOptions
 from sparserob_rerun.physics.physics import Physics
 from sparserob_rerun.recording import words
@@ -28,6 +30,7 @@ from sparserob_rerun.search.way import Stage
 SEEN = 10  # evaluations between two pictures of the way
 PICTURE_EVERY, SPARE = 0.5, 20.0  # seconds between them, and how many times as long as one took
 PICTURES = 60  # rounds whose physics is drawn; of later ones every tenth
+LINES = 24  # of the log that are on the first screen
 PROOFS = 12  # lines about the proof of one family
 SLOTS = 16  # active constraints at most that make the tuple of a method without one
 
@@ -72,6 +75,8 @@ class Recorder:
         self.exact: float | None = None
         self.proofs: dict[str, int] = {}
         self.broken: dict[str, str] = {}
+        self.drawn, self.said = False, deque[str](maxlen=LINES)
+        stream.log("howto", rr.TextDocument(words.SIGNALS), static=True)
         self.timelines.move()
         self.say(f"run: {opening.title}")
         self._page("solving", [])
@@ -110,6 +115,9 @@ class Recorder:
     def say(self, line: str, level: str = "INFO") -> None:
         """A line of the log."""
         self.stream.log("log", self.rr.TextLog(line, level=level))
+        if level != "TRACE":  # the log cuts off what is longer than its column; this page does not
+            self.said.appendleft(line)
+            self.stream.log("decisions", self.rr.TextDocument("\n".join(self.said)))
 
     def mark(self) -> None:
         """Mark on the last landscape where the maximum is, if it was proven."""
@@ -199,17 +207,18 @@ class Recorder:
         self.lower = max(self.lower, event.lower_bound)
         self.upper = min(self.upper, np.inf if event.simplified else event.upper_bound)
         self.draw("the bounds", self.rounds.bounds, event)
-        lines = words.round_lines(event)
+        lines = words.round_lines(event, self.inspection)
         for line in lines:
             self.say(line, "INFO" if line is lines[0] else "DEBUG")
         self._page("solving", lines[:1])
         self.draw("the landscape", self._aim, event)
         if event.decision is None or (event.round > PICTURES and event.round % 10):
             return
-        cuts = active(event.imposed, event.multipliers)
+        cuts, self.drawn = active(event.imposed, event.multipliers), True
         if self.physics is not None:
             self.draw("control and states", self.physics.draw, event.decision, cuts, None)
-        self.draw("the violations", self.rounds.violations, event.decision, cuts, event.added)
+        told = told_by_round(event)
+        self.draw("the violations", self.rounds.violations, event.decision, cuts, event.added, told)
 
     def _aim(self, event: sr.RoundFinished) -> None:
         """The tuple whose surroundings are worth a look after a round: the best of the search, or the constraints that
@@ -233,11 +242,15 @@ class Recorder:
         if result is not None:
             self.lower, self.upper = result.lower_bound, result.upper_bound
             self.exact = result.value if event.status == "certified" else None
+            if event.status != "infeasible":
+                self.draw("the bounds", self.rounds.picture.end, result.lower_bound, result.upper_bound)
+            self.draw("what clashes", self._clash, result)
             if result.decision is not None and self.physics is not None:
                 self.draw("control and states", self.physics.draw, result.decision, result.indices, result.dual.mu)
                 self.draw("the signals", self.physics.signals, result.decision)
             if result.decision is not None:
-                self.draw("the violations", self.rounds.violations, result.decision, result.indices, ())
+                told = told_by_result(result)
+                self.draw("the violations", self.rounds.violations, result.decision, result.indices, (), told)
             # a run that is shown again
             if self.explorer.landscape is None and self.explorer.waiting is None and result.indices:
                 slots = slots_of(list(result.indices), self._formulation)
@@ -254,6 +267,16 @@ class Recorder:
             self.draw("the search", self.search.exact, self.exact, result.epsilon if result is not None else 0.0)
         self._way()
         self._page(event.status, lines)
+
+    def _clash(self, result: sr.Result) -> None:
+        """Of an infeasible run: what clashes in the place of a control that there is not."""
+        strips = [] if self.inspection is None else self.inspection.clash(result)
+        if strips:
+            draw_clash(self.rr, self.stream, strips)
+        if result.status == "infeasible":
+            drawn = self.drawn or bool(self.stages)
+            self.shown = replace(self.shown, clash=extent(strips) if strips else (), drawn=drawn)
+            self.stream.send_blueprint(layout(self.shown))
 
     @property
     def _formulation(self) -> str:

@@ -3,48 +3,62 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import sparserob_core as sr
 
 CUTS = 12  # cuts of one round that are listed one by one
 
+SIGNALS = (
+    "The controls and states of the final decision are series over the time of the system. Choose the timeline t at"
+    " the lower left, where now another one is chosen, and they appear."
+)
 LEGEND = """
-**Reading the pictures.** Blue: the control and the states. Blue band: where disturbance and parameters can push them.
-Hatched red: forbidden. Yellow: what the worst case does. Pink: the moments at which a constraint is active; they are
-why the control is not zero. The pink curve is how hard these constraints push the control: it acts where the push
-leaves the dashed band, and switches where it comes back.
+**Reading the pictures.** Blue: the control and the states; the band: where disturbance and parameters can push them.
+Hatched red: forbidden. Yellow: the worst case. Pink: when a constraint is active, and how hard the active ones push the
+control: it acts where the push leaves the dashed band, and nowhere else.
 """
 
 
-def round_lines(event: sr.RoundFinished) -> list[str]:
+def round_lines(event: sr.RoundFinished, inspection: sr.Inspection | None) -> list[str]:
     """One round in words: its bounds, what is violated, and the cuts that come of it."""
-    violated = (
-        f"{event.worst_family} is violated by {event.violation:.2e}"
-        if event.violation > 0
-        else f"margin {-event.violation:.2e}"
-    )
+    known = inspection is not None and any(family.name == event.worst_family for family in inspection.program.families)
+    tolerance = inspection.tolerance(event.worst_family) if inspection is not None and known else 0.0
+    if event.violation > tolerance:
+        violated = f"{event.worst_family} is violated by {event.violation:.2e}"
+    elif event.violation > 0.0:
+        violated = f"every constraint holds, {event.worst_family} to within {event.violation:.1e}"
+    else:
+        violated = f"every constraint holds with {-event.violation:.2e} to spare"
     bound = f"lower bound {event.lower_bound:.7g}" + (
         f", upper bound {event.upper_bound:.7g}" if math.isfinite(event.upper_bound) else ""
     )
     lines = [f"round {event.round}: {bound}; {violated}; epsilon {event.epsilon:.1e}"]
     for word, cuts in (("+", event.added), ("-", event.dropped)):
-        lines += [f"{word} {cut_words(cut)}" for cut in cuts[:CUTS]]
+        lines += [f"{word} {cut_words(cut, inspection)}" for cut in cuts[:CUTS]]
         if len(cuts) > CUTS:
             lines.append(f"{word} and {len(cuts) - CUTS} more")
     return lines
 
 
-def cut_words(cut: sr.Cut) -> str:
-    """A constraint at an index."""
+def cut_words(cut: sr.Cut, inspection: sr.Inspection | None) -> str:
+    """A constraint at an index, as its family tells it: ``path: x1(1.55) <= 0.7``."""
+    families = () if inspection is None else inspection.program.families
+    family = next((one.formulated(cut.formulation) for one in families if one.name == cut.family), None)
+    if family is not None and family.explain is not None:
+        return family.explanation(cut.index, cut.row).short()
     shown = ", ".join(f"{value:.5g}" for value in cut.index[:4]) + (", ..." if len(cut.index) > 4 else "")
-    return f"{cut.family} at ({shown}), side {cut.row + 1}"
+    return f"{cut.family} at ({shown}), row {cut.row + 1}"
 
 
 def page(title: str, status: str, lower: float, upper: float, more: list[str]) -> str:
     """The page in Markdown."""
-    bounds = (
-        f"{_number(lower)} ≤ J* ≤ {_number(upper)}" if math.isfinite(lower) or math.isfinite(upper) else "no bound yet"
-    )
+    if status == "infeasible":
+        bounds = "no control meets the constraints, so there is no J*"
+    elif math.isfinite(lower) or math.isfinite(upper):
+        bounds = f"{_number(lower)} ≤ J* ≤ {_number(upper)}"
+    else:
+        bounds = "no bound yet" if status == "solving" else "no bound is known"
     return "\n\n".join([f"### {title}", f"**{status}**: {bounds}", *more, LEGEND])
 
 
@@ -60,9 +74,22 @@ def verdict_lines(event: sr.RunFinished) -> list[str]:
         lines.append(
             f"cost J = {result.cost:.8g}; {len(result.indices)} constraints decide, found in {event.seconds:.2f} s"
         )
-    if result is not None and result.worst is not None:
-        worst = result.worst
-        side = "violated by" if worst.violation > 0 else "kept with a margin of"
-        at = f" at t = {worst.time:.5g}" if isinstance(worst, sr.Witness) and worst.time is not None else ""
-        lines.append(f"worst case: {worst.constraint} {side} {abs(worst.violation):.2e}{at}")
+    if result is not None and result.worst is not None and result.worst.constraint:
+        lines.append(_worst_words(result, result.worst))
     return lines
+
+
+def _worst_words(result: sr.Result, worst: Any) -> str:
+    """The worst case, in agreement with what was proven of it."""
+    at = f" at t = {worst.time:.5g}" if isinstance(worst, sr.Witness) and worst.time is not None else ""
+    if result.status == "infeasible":
+        return f"nearest to feasible: {worst.constraint} is still missed by {worst.violation:.3g}{at}"
+    proven = any(proof.family == worst.constraint and proof.verdict == "proven" for proof in result.proofs)
+    if worst.violation <= 0.0:
+        return f"worst case: {worst.constraint} holds with {-worst.violation:.2e} to spare{at}"
+    if proven or result.status in ("certified", "verified"):
+        return (
+            f"worst case: {worst.constraint} holds to within {worst.violation:.1e}{at}; "
+            "at most 1e-9 of its own unit counts as none"
+        )
+    return f"worst case: {worst.constraint} is violated by {worst.violation:.3g}{at}"

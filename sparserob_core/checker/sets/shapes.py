@@ -253,15 +253,19 @@ def limit(shape: ConvexSet, direction: Array) -> arb:
 
 
 def facet(flat: Sequence[tuple[Array, arb]], direction: Array) -> tuple[int, Fraction]:
-    """Which facet a direction is the normal of, and its length in terms of that normal; exact, and `Broken` if none."""
-    place = int(np.abs(direction).argmax())
-    for number, (c, _) in enumerate(flat):
+    """Which facet a direction is the normal of, the nearest of parallel ones, and its length in terms of that normal;
+    exact, and `Broken` if none."""
+    place, best = int(np.abs(direction).argmax()), None
+    for number, (c, b) in enumerate(flat):
         if c[place] * direction[place] <= 0.0:
             continue
         factor = Fraction(float(direction[place])) / Fraction(float(c[place]))
         if all(Fraction(float(a)) == factor * Fraction(float(b)) for a, b in zip(direction, c, strict=True)):
-            return number, factor
-    raise Broken(f"{np.asarray(direction).tolist()} is not the normal of a facet")
+            height = float(b.mid()) * float(factor)
+            best = min((height, number, factor), best or (np.inf, number, factor))
+    if best is None:
+        raise Broken(f"{np.asarray(direction).tolist()} is not the normal of a facet")
+    return best[1:]
 
 
 def excess(shape: ConvexSet, point: Sequence[arb]) -> tuple[float, str]:

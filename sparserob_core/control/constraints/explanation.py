@@ -65,6 +65,9 @@ class TimedExplanation(Explanation):
             self.disturbance,
         )
 
+    def short(self) -> str:
+        return f"{self.statement}{self._at}"
+
     def from_any_state(self) -> TimedExplanation:
         """The same where the initial state is free: at time 0 without what the given one says."""
         return replace(self, text=self.statement) if self.time == 0.0 else self

@@ -4,7 +4,9 @@ these take."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,24 +15,58 @@ from sparserob_core.experiment.comparison.comparison import Comparison
 from sparserob_core.experiment.comparison.curve import WITHOUT_CURVE, Curve, read_curve
 from sparserob_core.experiment.comparison.figure import write_comparison
 from sparserob_core.experiment.comparison.labels import labels
+from sparserob_core.experiment.comparison.profiles import Measure, Profiles
+from sparserob_core.experiment.comparison.profiles_figure import write_profiles
+from sparserob_core.experiment.comparison.studies import ACCURACY, SLACK, is_study, read_profiles
 from sparserob_core.experiment.config.plain import difference, value_text
+from sparserob_core.experiment.figures.style import missing_matplotlib, require_writable
 
 SHARES = (0.1, 0.01, 0.001)
-SLACK = 1e-7
-"""By how much a proven bound may exceed another run's before one of them is called wrong, relative to the larger of 1
-and its size."""
 
 
-def compare(runs: Sequence[str | Path], out: str | Path | None = None) -> Comparison:
-    """Read run directories, and draw them into the picture ``out`` (.png, .pdf or .svg) when it is given: what
-    ``sparserob compare`` does.
+def compare(
+    runs: Sequence[str | Path],
+    out: str | Path | None = None,
+    *,
+    accuracy: float = ACCURACY,
+    measure: Measure | None = None,
+) -> Comparison | Profiles:
+    """Read run directories, or studies, and draw them into the picture ``out`` (.png, .pdf or .svg) when it is given:
+    what ``sparserob compare`` does.
 
-    Raises `InputError` when one of them is no run directory, when they are not all of one problem on the same
-    dictionaries, when there is nothing to draw, and when the picture cannot be written.
+    Runs of one problem give a `Comparison`. Studies (what ``sparserob sweep`` leaves) give `Profiles` of their
+    contenders over all of their problems: a run has solved its problem within ``accuracy``, relative to the exact
+    value, and what it took is measured in evaluations, or in seconds; unless ``measure`` says which, in evaluations
+    where all runs search. Where matplotlib is missing there is no picture, and the remarks say so.
+
+    Raises `InputError` when one of them is no run directory and no study, when runs are not all of one problem on the
+    same dictionaries, when studies are not finished or have one contender only, when there is nothing to draw, and when
+    the picture cannot be written.
     """
     if isinstance(runs, str | Path) or not runs:
         raise InputError(f"runs: expected a list of at least one run directory, got {runs!r}")
-    curves = [read_curve(Path(run)) for run in runs]
+    if out is not None:
+        require_writable(Path(out))
+    places = [Path(run) for run in runs]
+    studies = [place for place in places if is_study(place)]
+    if studies and len(studies) < len(places):
+        other = next(place for place in places if place not in studies)
+        raise InputError(f"{other}: expected a study beside {studies[0]}; a study is compared with studies only")
+    found: Comparison | Profiles
+    found = read_profiles(studies, accuracy, measure) if studies else _side_by_side(places)
+    if out is None:
+        return found
+    if missing := missing_matplotlib():
+        return replace(found, undrawn=missing)
+    if isinstance(found, Profiles):
+        write_profiles(Path(out), found)
+    else:
+        write_comparison(Path(out), found)
+    return found
+
+
+def _side_by_side(places: Sequence[Path]) -> Comparison:
+    curves = [read_curve(place) for place in places]
     for curve in curves[1:]:
         _require_same_problem(curves[0], curve)
     names = labels([curve.config for curve in curves], [curve.searched for curve in curves])
@@ -40,10 +76,7 @@ def compare(runs: Sequence[str | Path], out: str | Path | None = None) -> Compar
         default=None,
     )
     exact = np.nan if certified is None else (curves[certified].lower_bound + curves[certified].upper_bound) / 2
-    comparison = Comparison(curves, names, exact, certified)
-    if out is not None:
-        write_comparison(Path(out), comparison)
-    return comparison
+    return Comparison(curves, names, exact, certified)
 
 
 def comparison_table(comparison: Comparison) -> tuple[list[str], list[list[str]]]:
@@ -99,6 +132,34 @@ def comparison_remarks(comparison: Comparison) -> Iterator[str]:
                 f"the lower bound of {label} exceeds the certified upper bound {best.upper_bound:.9g}: one of the two"
                 " is wrong"
             )
+    if comparison.undrawn:
+        yield comparison.undrawn
+
+
+def comparison_summary(comparison: Comparison) -> dict[str, Any]:
+    """The comparison as plain data; what is not known is null."""
+    known = np.isfinite(comparison.exact)
+    runs = [
+        {
+            "label": label,
+            "directory": str(curve.directory),
+            "status": curve.status,
+            "lower_bound": curve.lower_bound,
+            "upper_bound": curve.upper_bound,
+            "cost": curve.cost,
+            "violation": curve.violation,
+            "evaluations": curve.all_evaluations,
+            "seconds": curve.all_seconds,
+            "evaluations_within": {str(share): comparison.within(curve, share) for share in SHARES} if known else {},
+        }
+        for curve, label in zip(comparison.curves, comparison.labels, strict=True)
+    ]
+    return {
+        "title": comparison.title,
+        "exact": comparison.exact,
+        "runs": runs,
+        "remarks": list(comparison_remarks(comparison)),
+    }
 
 
 def _reason(curve: Curve) -> str:

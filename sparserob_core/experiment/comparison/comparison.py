@@ -21,6 +21,8 @@ class Comparison:
     labels: Sequence[str]
     exact: float = np.nan
     certified: int | None = None
+    undrawn: str = ""
+    """Why there is no figure, where one was asked for."""
 
     @property
     def title(self) -> str:

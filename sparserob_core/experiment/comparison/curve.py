@@ -50,6 +50,13 @@ class Curve:
     violation: float
     all_evaluations: float
     all_seconds: float
+    dimension: int = 0
+    """Coordinates of what is searched, or variables of a decision; 0: it is not known."""
+
+    def reached_after(self, target: float) -> float:
+        """The seconds after which the bound was at least ``target``; nan when it never was."""
+        there = np.flatnonzero(self.bound >= target)
+        return float(self.seconds[there[0]]) if there.size else np.nan
 
     def reached(self, target: float) -> float:
         """The evaluations after which the bound was at least ``target``; nan when it never was."""
@@ -84,7 +91,16 @@ def read_curve(directory: Path) -> Curve:
         violation=_number(worst, "violation"),
         all_evaluations=spent,
         all_seconds=seconds,
+        dimension=_dimension(directory, searched) if status not in WITHOUT_CURVE else 0,
     )
+
+
+def _dimension(directory: Path, searched: bool) -> int:
+    """The last dimension of the points that were searched, or else of the decision."""
+    for name, column in (("evaluations.npz", "points"), ("solution.npz", "decision"))[0 if searched else 1 :]:
+        if (directory / name).is_file() and (found := read_arrays(directory / name).get(column)) is not None:
+            return int(found.shape[-1]) if found.ndim else 0
+    return 0
 
 
 def _points(directory: Path, searched: bool) -> tuple[Array, Array, Array]:

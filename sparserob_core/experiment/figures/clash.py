@@ -46,6 +46,11 @@ class Strip:
     sigma_high: float
 
     @property
+    def short(self) -> float:
+        """By how much the best that the control does still misses what is allowed; 0 where it can be met."""
+        return max(self.low - (self.best - self.sigma_low), self.best + self.sigma_high - self.high, 0.0)
+
+    @property
     def best(self) -> float:
         """Where the control does best to bring it: in the middle of what is allowed and possible once the disturbance
         has taken its part."""
@@ -73,9 +78,7 @@ def draw_clash(experiment: Experiment, result: Result, directory: Path) -> list[
     with look.style():
         figure, axes = look.panels(1, 0.62 * len(strips) + 0.5, extra=0.35)
         _draw(axes[0], strips)
-        alone = any(
-            strip.best - strip.sigma_low < strip.low or strip.best + strip.sigma_high > strip.high for strip in strips
-        )
+        alone = any(strip.short > 0.0 for strip in strips)
         axes[0].set_title(printable(experiment.title), pad=8 if alone else 22)
         if not alone:
             axes[0].text(
@@ -162,6 +165,18 @@ def _draw(ax: Axes, strips: Sequence[Strip]) -> None:
         )
         _bar(ax, strip.reach_low, strip.reach_high, y + 0.17, look.BLUE, "where the control can bring it")
         ax.plot([strip.best], [y - 0.17], "|", color=look.INK, markersize=9, zorder=4, linewidth=0, label="its best")
+        if strip.short > 0.0:
+            ax.annotate(
+                f"misses by {strip.short:.3g}",
+                (right, y - 0.3),
+                xytext=(-3, 0),
+                textcoords="offset points",
+                ha="right",
+                va="center",
+                fontsize=9,
+                bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0},
+                zorder=5,
+            )
     ax.set_yticks([len(strips) - 1.0 - k for k in range(len(strips))], [strip.label for strip in strips])
     ax.set_ylim(-0.6, len(strips) - 0.4)
     ax.tick_params(axis="y", length=0)

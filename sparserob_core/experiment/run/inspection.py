@@ -14,13 +14,16 @@ from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, assemble, tools_of
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.methods.own_units import UsersUnits
+from sparserob_core.sip.program import TOLERANCE
 
 if TYPE_CHECKING:
     from sparserob_core.control.problem.problem import OptimalControlProblem
     from sparserob_core.experiment.config.load import Loaded
+    from sparserob_core.experiment.figures.clash import Strip
     from sparserob_core.experiment.figures.figure_data import FigureData
     from sparserob_core.sip.method import Method
     from sparserob_core.sip.program import SemiInfiniteProgram
+    from sparserob_core.sip.result import Result
 
 CoordinateKind: TypeAlias = Literal["time", "parameter", "disturbance", "direction", "index"]
 LETTERS: Mapping[str, str] = {
@@ -104,6 +107,20 @@ class Inspection:
         if isinstance(experiment, ControlExperiment):
             theta = theta.reshape(-1, experiment.control.functions)
         return figure_data(experiment, theta, np.empty(0) if active_times is None else active_times, (), None)
+
+    def clash(self, result: Result) -> list[Strip]:
+        """Of an infeasible result the quantities that clash: what is allowed, where the control can bring them, and
+        what the disturbance makes of that; none for a program that is no control problem."""
+        from sparserob_core.experiment.figures.clash import clash_strips
+
+        infeasible = self.problem is not None and result.status == "infeasible"
+        return clash_strips(self.program, result) if infeasible else []
+
+    def tolerance(self, family: str, row: int = 0) -> float:
+        """What counts as no violation of a row, in the user's units (decision 16)."""
+        own = self.program.own_units
+        program = self.program if own is None else own.program
+        return TOLERANCE * program.family(family).row_unit(row)
 
     def worst_cases(self, decision: Array) -> dict[str, Array]:
         """The worst parameter and disturbance of every state constraint at a decision, and the states that they cause,

@@ -8,14 +8,19 @@ from typing import Any
 
 import numpy as np
 
+from sparserob_core.control.constraints.explanation import Witness
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.directory.finished import UNFINISHED, StoredRun, stored_run
 from sparserob_core.experiment.run.events import Event, RunFinished, RunStarted
 from sparserob_core.experiment.run.inspection import Inspection
 from sparserob_core.experiment.run.viewer import recorder
 from sparserob_core.experiment.terminal.printing import printable
+from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Batch, EvaluationsFinished
+from sparserob_core.sip.evidence import Proof
+from sparserob_core.sip.program import WorstConstraint
 from sparserob_core.sip.result import UNKNOWN_SCALE, Result, SearchTrace
+from sparserob_core.sip.scenario_bound import ScenarioBound
 
 BATCHES = 100  # of the evaluations of a run
 PATIENCE = 60.0  # seconds that the landscape may take
@@ -93,15 +98,41 @@ def stored_result(run: StoredRun) -> Result:
             upper_bound=_number(summary, "upper_bound", np.inf),
             cost_scale=_number(summary, "cost_scale", UNKNOWN_SCALE),
             stopped=str(summary.get("stopped") or ""),
+            worst=_worst(summary["worst"], solution),
+            proofs=[
+                Proof(str(name), "proven", _number(one, "proven"))
+                for name, one in summary.get("tolerances", {}).items()
+            ],
+            counts={str(name): int(count) for name, count in summary["counts"].items() if isinstance(count, int)},
+            scenario_bound=None
+            if summary.get("scenario_bound") is None
+            else ScenarioBound(**summary["scenario_bound"]),
             indices=run.cuts,
             history=run.history,
             trace=run.evaluations,
             seconds=_number(summary, "seconds", 0.0),
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(
             f"{run.directory}: expected the files of a run, got some that do not fit together: {error}"
         ) from error
+
+
+def _worst(said: Mapping[str, Any], solution: Mapping[str, Array]) -> WorstConstraint | None:
+    """The worst constraint; its index is empty, for no file keeps it."""
+    if said.get("violation") is None:
+        return None
+    violation, constraint, nowhere = float(said["violation"]), str(said["constraint"]), np.empty(0)
+    if said.get("time") is None:
+        return WorstConstraint(violation, constraint, nowhere)
+    return Witness(
+        violation,
+        constraint,
+        nowhere,
+        time=float(said["time"]),
+        parameter=None if said.get("parameter") is None else np.asarray(said["parameter"], dtype=float),
+        disturbance=solution.get("worst_disturbance"),
+    )
 
 
 def _number(summary: Mapping[str, Any], name: str, missing: float = np.nan) -> float:

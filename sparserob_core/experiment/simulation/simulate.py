@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -54,18 +55,18 @@ def simulate(
 
     ``law`` is one of ``iid``, ``vertices``, ``slow``, ``neighbours``, or ``adversary``, which replays the worst case of
     every constraint and takes no number of ``trajectories`` (10 000 otherwise). The result is written to
-    ``simulation-<law>.json`` in the run's directory, and drawn into the file ``out`` when given. ``notify`` receives
+    ``simulation-<law>.json`` in the run's directory, and drawn into the file ``out`` when given; where matplotlib is
+    missing it is not, and its ``remarks`` say so. ``notify`` receives
     `StudyProgress`. ``plugins``: files that offer what the run was made with; the directory itself
     is data, and no plugin that it names is loaded. Raises `InputError` for a directory that is no finished run with a
     control, or another argument at fault, before anything is written.
     """
-    from sparserob_core.experiment.figures.style import require_matplotlib, require_writable
+    from sparserob_core.experiment.figures.style import missing_matplotlib, require_writable
     from sparserob_core.experiment.simulation.figure import write_simulation
 
     count = _checked(law, trajectories, seed)
     if out is not None:
         require_writable(Path(out))
-        require_matplotlib()
     finished = read_finished(_directory(run), plugins, getattr(run, "experiment", None))
     model = finished.experiment.transcription
     if not model.constraints:
@@ -83,6 +84,8 @@ def simulate(
     else:
         found = _sampled(finished, worst, cast(LawName, law), count, seed, notify, started)
     RunDirectory(finished.directory).write_json(f"simulation-{law}.json", found.summary())
+    if out is not None and (missing := missing_matplotlib()):
+        return replace(found, undrawn=missing)
     if out is not None:
         write_simulation(Path(out), found, finished, replayed)
     return found

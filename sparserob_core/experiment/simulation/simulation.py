@@ -81,6 +81,8 @@ class Simulation:
     lower: Array = field(repr=False)
     upper: Array = field(repr=False)
     seconds: float
+    undrawn: str = ""
+    """Why there is no figure, where one was asked for."""
 
     @property
     def contradicts(self) -> bool:
@@ -177,6 +179,8 @@ class Simulation:
                 f"the run proves nothing of its constraints (status {self.status}): the worst case found is a violation"
                 f" of {worst:.3g}"
             )
+        if self.undrawn:
+            yield self.undrawn
 
 
 def clopper_pearson(successes: int, trials: int, confidence: float = CONFIDENCE) -> tuple[float, float]:

@@ -51,6 +51,8 @@ def run_point(task: Task) -> Answer:
     """Run a point. What it leaves stands under its final name only when it is complete, so that a process that dies
     loses nothing but the points that it was about to finish. Nothing is raised but an interrupt."""
     partial, ends = Path(task.partial), Path(task.final)
+    while partial.exists():  # of a worker that died, on a cluster that gave its call to another one
+        partial = partial.with_name(f"{partial.name}+")
     try:
         partial.parent.mkdir(parents=True, exist_ok=True)
         outcome = run_loaded(load_config(task.config), task.git, partial, quiet=True, figures=task.figures)

@@ -246,6 +246,21 @@ def test_tables_do_not_depend_on_the_executor(counting: Path, tmp_path: Path, mo
     assert (serial.directory / "columns.csv").read_bytes() == (parallel.directory / "columns.csv").read_bytes()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("executor", [{"name": "processes", "workers": 2}, {"name": "dask", "workers": 2}])
+def test_neither_do_they_on_the_executors_that_are_offered_nor_when_a_worker_dies(
+    counting: Path, tmp_path: Path, executor: dict[str, Any]
+) -> None:
+    if executor["name"] == "dask":
+        pytest.importorskip("distributed")
+    axes = {"method.number": "1:6:6", "seed": [0, 1]}
+    serial = sr.sweep(counting, axes, out=tmp_path / "serial")
+    (tmp_path / "kill3").write_text("once")
+    parallel = sr.sweep(counting, axes, executor=executor, out=tmp_path / "parallel")
+    assert parallel.failed == 0
+    assert timeless(serial.directory) == timeless(parallel.directory)
+
+
 def test_a_worker_that_dies_costs_nobody_else_anything(
     counting: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -55,21 +55,18 @@ def simulate(
     """
     from sparserob_core.experiment.cli.shell.live_line import LiveLine
     from sparserob_core.experiment.directory.artefacts import finite
-    from sparserob_core.experiment.figures.style import missing_matplotlib
     from sparserob_core.experiment.simulation.simulate import simulate as propagate
     from sparserob_core.experiment.terminal.table import print_table
 
-    missing = "" if out is None else missing_matplotlib()
-    picture = None if missing else out
     with LiveLine() as line:
-        found = propagate(directory, trajectories, law, seed, out=picture, plugins=plugins, notify=line.receive)
+        found = propagate(directory, trajectories, law, seed, out=out, plugins=plugins, notify=line.receive)
     if as_json:
         print_json(finite(found.summary()))
     else:
         print_table(f"{found.title}: {found.law}", *found.table())
         for remark in (
             *found.remarks(),
-            *([missing] if missing else [] if out is None else [f"drawn into {out}"]),
+            *([] if out is None or found.undrawn else [f"drawn into {out}"]),
             f"written to {found.directory / f'simulation-{found.law}.json'}",
         ):
             click.echo(printable(remark))

@@ -1,0 +1,65 @@
+"""Why nothing is feasible: every quantity of the reason between its walls, where the control can bring it, and what the
+worst disturbance makes of its best."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sparserob_rerun.drawing import palette as ink
+from sparserob_rerun.drawing.canvas import Axes, Drawing
+
+if TYPE_CHECKING:
+    import sparserob_core as sr
+
+LEFT, WIDTH, HEIGHT, GAP = 40.0, 640.0, 84.0, 104.0
+BAR = 11.0  # pixels
+
+
+def extent(strips: Sequence[sr.Strip]) -> tuple[float, float, float, float]:
+    """Left, right, top and bottom of the drawing."""
+    return 0.0, LEFT + WIDTH + 40.0, -64.0, max(len(strips), 2) * (HEIGHT + GAP)
+
+
+def draw_clash(rr: Any, stream: Any, strips: Sequence[sr.Strip]) -> None:
+    """Draw the strips below ``/clash``, each on an axis of its own."""
+    drawing = Drawing()
+    for place, strip in enumerate(strips):
+        _strip(drawing, place, strip)
+    drawing.log(rr, stream, "clash", layers=("hatch", "frame", "marks", "reach", "worst", "curve", "wall"))
+
+
+def _strip(drawing: Drawing, place: int, strip: sr.Strip) -> None:
+    worst = (strip.best - strip.sigma_low, strip.best + strip.sigma_high)
+    shown = [v for v in (strip.low, strip.high, strip.reach_low, strip.reach_high, *worst) if np.isfinite(v)]
+    room = 0.1 * max(max(shown) - min(shown), 1e-9)
+    axes = Axes(LEFT, place * (HEIGHT + GAP), WIDTH, HEIGHT, (min(shown) - room, max(shown) + room), (0.0, 3.0))
+    (left, top), (right, bottom) = axes.at(axes.x[0], 3.0)[0], axes.at(axes.x[1], 0.0)[0]
+    drawing.text((left + right) / 2, top - 34.0, strip.label.replace("\n", ", "))
+    drawing.text((left + right) / 2, top - 14.0, _said(strip), ink.ORANGE)
+    drawing.line("frame", np.array([[left, bottom], [right, bottom]]), ink.GREY, 1.0)
+    for value in sorted({v for v in (strip.low, strip.high) if np.isfinite(v)}):
+        drawing.text(float(axes.at(value, 0.0)[0, 0]), bottom + 16.0, f"{value:.4g}", ink.VERMILLION)
+    for edge, end in ((strip.low, axes.x[0]), (strip.high, axes.x[1])):
+        if np.isfinite(edge):
+            drawing.hatched("hatch", axes, (min(edge, end), max(edge, end)), (0.0, 3.0), ink.HATCH)
+            drawing.line("wall", axes.at(np.full(2, edge), np.array([0.0, 3.0])), ink.VERMILLION, 2.0)
+    for layer, (low, high), height, colour in (
+        ("reach", (strip.reach_low, strip.reach_high), 2.1, ink.SKY),
+        ("worst", worst, 0.9, ink.ORANGE),
+    ):
+        if high > low:
+            drawing.line(layer, axes.at(np.array([low, high]), np.full(2, height)), colour, BAR)
+        else:
+            drawing.dot(axes.at(low, height), colour, BAR / 2)
+    drawing.line("curve", axes.at(np.full(2, strip.best), np.array([0.4, 1.4])), ink.INK, 2.0)
+
+
+def _said(strip: sr.Strip) -> str:
+    moved = strip.sigma_low + strip.sigma_high
+    alone = f"the disturbance alone moves it over {moved:.4g}; " if moved > 0.0 else ""
+    if strip.short > 0.0:
+        return f"{alone}the best that the control does, {strip.best:.4g}, still misses by {strip.short:.4g}"
+    return f"{alone}it can be met, but not together with the others"

@@ -1,0 +1,239 @@
+"""Guards plugins/sparserob_rerun: the screens of physics, bounds and infeasible runs say everything once, and nothing
+that contradicts another line."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sparserob_core as sr
+
+pytest.importorskip("rerun")
+
+import rerun as rr
+
+from sparserob_core.experiment.run.replay import stored_result, stored_run
+from sparserob_rerun.drawing.canvas import Axes
+from sparserob_rerun.exchange.bounds import Bounds
+from sparserob_rerun.exchange.clash import draw_clash, extent
+from sparserob_rerun.exchange.rounds import Rounds, Worst, told_by_result
+from sparserob_rerun.physics.pages import heading, pages
+from sparserob_rerun.physics.physics import Physics
+from sparserob_rerun.recording import words
+from sparserob_rerun.recording.layout import Shown, layout
+
+SIX: dict[str, Any] = {
+    "title": "Three carts",
+    "problem": {
+        "name": "linear",
+        "system": {
+            "A": np.diag([1.0, 0.0, 1.0, 0.0, 1.0], 1).tolist(),
+            "B": np.eye(6)[:, 1::2].tolist(),
+            "parameters": {},
+        },
+        "horizon": 2.0,
+        "initial_state": [1, 0, -0.5, 0, 0.8, 0],
+        "control": {"box": 1.0},
+        "disturbance": {"box": [0, 0.02, 0, 0.02, 0, 0.02]},
+        "path": [{"box": [None, None, None, None, 0.9, 5.0], "from": 0.5}],
+        "terminal": [{"box": [0.9, 2, 2, 2, 2, 2]}],
+    },
+    "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 4}},
+    "method": {"name": "exchange"},
+}
+SMALL: dict[str, Any] = {
+    "problem": {
+        "name": "linear",
+        "system": {"A": [[0, 1], [0, 0]], "B": [[0], [1]]},
+        "horizon": 2.0,
+        "initial_state": [1, 0],
+        "control": {"box": 1.0},
+        "disturbance": {"box": [0.0, 0.05]},
+        "terminal": [{"box": [0.5, 0.5]}],
+    },
+    "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 4}},
+    "method": {"name": "exchange"},
+}
+
+
+class Paper:
+    """A stream that keeps what is logged, the last of every entity."""
+
+    def __init__(self) -> None:
+        self.kept: dict[str, list[Any]] = {}
+
+    def log(self, path: str, *parts: Any, **_: Any) -> None:
+        self.kept[path] = list(parts)
+
+    def send_columns(self, path: str, *_: Any, **__: Any) -> None:
+        self.kept.setdefault(path, [])
+
+    def labels(self, path: str) -> list[str]:
+        return [str(label) for label in self.kept[path][0].labels.as_arrow_array().to_pylist()]
+
+    def strips(self, path: str) -> list[np.ndarray]:
+        return [np.array(strip) for strip in self.kept[path][0].strips.as_arrow_array().to_pylist()]
+
+
+@pytest.fixture(scope="module")
+def six(tmp_path_factory: pytest.TempPathFactory) -> sr.Outcome:
+    return sr.run(SIX, out=tmp_path_factory.mktemp("runs") / "six", quiet=True, figures=False)
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> sr.Outcome:
+    return sr.run(SMALL, out=tmp_path_factory.mktemp("runs") / "small", quiet=True, figures=False)
+
+
+@pytest.fixture(scope="module")
+def infeasible(tmp_path_factory: pytest.TempPathFactory) -> sr.Outcome:
+    changes = {"problem.terminal": [{"box": [0.01, 0.01]}]}
+    return sr.run(SMALL, changes, out=tmp_path_factory.mktemp("runs") / "none", quiet=True, figures=False)
+
+
+def test_every_control_and_state_is_on_one_page_and_those_with_walls_on_the_first(six: sr.Outcome) -> None:
+    assert six.problem is not None
+    found = pages(six.problem)
+    plots = [plot for page in found for plot in page.plots]
+    assert sorted(plots) == sorted(
+        [(kind, k) for kind in ("control", "push") for k in range(3)] + [("state", k) for k in range(6)]
+    )
+    assert {("state", 4), ("state", 5)} <= set(found[0].plots)
+    for page in found[1:]:
+        assert page.name in heading(six.problem)
+    assert all(len(page.plots) <= 8 for page in found)
+
+
+def test_what_is_on_a_further_page_is_drawn_there(six: sr.Outcome) -> None:
+    paper = Paper()
+    assert six.problem is not None
+    Physics(rr, paper, sr.Inspection.read(six.directory)).draw(
+        np.asarray(six.result.decision), six.result.indices, six.result.dual.mu
+    )
+    for page in pages(six.problem):
+        titles = " ".join(paper.labels(f"{page.path}/labels"))
+        for kind, k in page.plots:
+            assert f"{'state x' if kind == 'state' else 'u'}{k + 1}" in titles
+        assert "t" in paper.labels(f"{page.path}/labels")
+
+
+def test_every_signal_has_a_name_and_a_colour_of_its_own(six: sr.Outcome) -> None:
+    paper = Paper()
+    Physics(rr, paper, sr.Inspection.read(six.directory)).signals(np.asarray(six.result.decision))
+    lines = [parts[0] for path, parts in paper.kept.items() if path.startswith("signals/states")]
+    names = [name for line in lines for name in line.names.as_arrow_array().to_pylist()]
+    colours = [line.colors.as_arrow_array().to_pylist()[0] for line in lines]
+    assert len(lines) == 6 and len(set(names)) == 18 and len(set(colours)) == 6
+
+
+def entry(number: int, lower: float, upper: float) -> sr.RoundFinished:
+    return sr.RoundFinished(round=number, epsilon=1.0, lower_bound=lower, upper_bound=upper, violation=0.5**number)
+
+
+def test_the_bounds_are_drawn_where_they_are_with_the_gap_between_them() -> None:
+    paper = Paper()
+    picture = Bounds(rr, paper)
+    for one in (entry(1, -np.inf, np.inf), entry(2, 0.5, np.inf), entry(3, 0.9, 1.2), entry(4, 0.95, 1.0)):
+        picture.add(one)
+    lower, upper = paper.strips("rounds/picture/bounds/curve")
+    assert len(lower) == 3 and len(upper) == 2
+    assert (np.diff(lower[:, 1]) < 0).all()  # pixels count downwards
+    assert upper[-1, 1] < lower[-1, 1]
+    gap = paper.strips("rounds/picture/bounds/tube")
+    tops = {round(float(strip[:, 1].min()), 3) for strip in gap}
+    assert tops == {round(float(upper[-1, 1]), 3)}  # up to the best upper bound
+    assert "0.95 ≤ J* ≤ 1" in " ".join(paper.labels("rounds/picture/bounds/labels"))
+    picture.end(0.99, 1.0)
+    assert "0.99 ≤ J* ≤ 1" in " ".join(paper.labels("rounds/picture/bounds/labels"))
+
+
+def test_an_upper_bound_of_a_simpler_program_is_none() -> None:
+    paper = Paper()
+    Bounds(rr, paper).add(replace(entry(1, 0.5, 0.7), simplified=True))
+    assert "0.5 ≤ J* ≤ unknown" in " ".join(paper.labels("rounds/picture/bounds/labels"))
+
+
+def test_the_strip_of_a_clash_is_as_far_from_its_wall_as_it_misses(infeasible: sr.Outcome) -> None:
+    assert infeasible.status == "infeasible"
+    strips = sr.Inspection.read(infeasible.directory).clash(infeasible.result)
+    assert strips and strips[0].short > 0.0
+    paper = Paper()
+    draw_clash(rr, paper, strips)
+    said = " ".join(paper.labels("clash/labels"))
+    assert f"misses by {strips[0].short:.4g}" in said
+    assert f"the disturbance alone moves it over {strips[0].sigma_low + strips[0].sigma_high:.4g}" in said
+    assert extent(strips)[3] >= len(strips) * 100
+
+
+def test_an_infeasible_run_has_no_empty_panel_and_no_bound(infeasible: sr.Outcome) -> None:
+    shown = Shown(infeasible.problem, 1, False, False, clash=(0.0, 1.0, 0.0, 1.0), drawn=False)
+    tabs = layout(shown).root_container.contents
+    assert [tab.name for tab in tabs] == ["Overview", "Log"]
+    event = sr.RunFinished(status="infeasible", message="why", seconds=1.0, result=infeasible.result)
+    page = words.page("T", "infeasible", 0.3, np.inf, words.verdict_lines(event))
+    assert "no bound yet" not in page and "≤" not in page
+    assert "is still missed by" in page
+
+
+def test_what_is_proven_is_never_called_violated(small: sr.Outcome) -> None:
+    event = sr.RunFinished(status=small.status, message="", seconds=1.0, result=small.result)
+    assert small.result.worst is not None
+    for violation in (1e-11, -1e-11, 0.0):
+        result = replace(small.result, worst=replace(small.result.worst, violation=violation))
+        said = " ".join(words.verdict_lines(replace(event, result=result)))
+        assert "violated" not in said and "holds" in said
+    inspection = sr.Inspection.read(small.directory)
+    for value, proven, word in ((1e-11, True, "proven"), (1e-11, False, "holds"), (1e-3, False, "violated")):
+        rounds = Rounds(rr, Paper(), inspection)
+        said = rounds._words(inspection.program.families[0], Worst(value, 2.0, proven), fake_field())
+        assert word in said and ("violated" in said) == (word == "violated")
+
+
+def fake_field() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return np.array([2.0]), np.array([0.0]), np.array([[-1.0]])
+
+
+def test_a_constraint_that_only_the_grid_knows_says_so(small: sr.Outcome) -> None:
+    inspection = sr.Inspection.read(small.directory)
+    said = Rounds(rr, Paper(), inspection)._words(inspection.program.families[0], None, fake_field())
+    assert said.endswith("on this grid")
+
+
+def test_a_terminal_constraint_stands_at_the_end_of_the_time_axis(small: sr.Outcome) -> None:
+    paper = Paper()
+    rounds = Rounds(rr, paper, sr.Inspection.read(small.directory))
+    told = told_by_result(small.result)
+    rounds.violations(np.asarray(small.result.decision), small.result.indices, (), told)
+    labels = paper.labels("violation/plots/labels")
+    assert {"0", "2", "t"} <= set(labels) and "3" not in labels
+    assert any("proven to hold" in label for label in labels)
+
+
+def test_a_cut_is_told_as_its_constraint(small: sr.Outcome) -> None:
+    inspection = sr.Inspection.read(small.directory)
+    (first, *_) = [words.cut_words(cut, inspection) for cut in small.result.indices]
+    assert first.startswith("terminal: x1(2) <= 0.5") and "side" not in first
+    assert "row 1" in words.cut_words(small.result.indices[0], None)
+
+
+def test_the_worst_case_and_the_proofs_of_a_run_are_known_when_it_is_shown_again(small: sr.Outcome) -> None:
+    again = stored_result(stored_run(small.directory))
+    assert again.worst is not None and small.result.worst is not None
+    assert again.worst.violation == small.result.worst.violation
+    assert again.worst.constraint == small.result.worst.constraint
+    assert {proof.family for proof in again.proofs} == {"terminal"}
+    assert words.verdict_lines(sr.RunFinished(status="certified", message="", seconds=1.0, result=again)) == (
+        words.verdict_lines(sr.RunFinished(status="certified", message="", seconds=1.0, result=small.result))
+    )
+
+
+def test_a_low_plot_has_two_ticks_at_least() -> None:
+    from sparserob_rerun.drawing.canvas import Drawing
+
+    for high in (0.9, 1.1, 3.0, 0.08):
+        drawing = Drawing()
+        drawing.frame(Axes(0.0, 0.0, 100.0, 100.0, (0.0, 1.0), (-high, high)), "", ticks_below=False)
+        assert sum(text != "" for _, text, _ in drawing.labels) >= 2
