@@ -72,7 +72,11 @@ def row_units(constraint: StateConstraint, control: ConvexSet) -> Array:
     box = constraint.index_set
     z = sampled(box.dimension - 1 - constraint.parameters.count)
     indices = np.hstack([np.tile(box.lower[: box.dimension - z.shape[1]], (z.shape[0], 1)), z])
-    _, added = reaches(functionals, constraint.parameters, control, constraint.functionals_at(indices)[1], times)
+    directions = constraint.functionals_at(indices)[1]
+    _, added = reaches(functionals, constraint.parameters, control, np.eye(directions.shape[1]), times)
+    if (np.abs(directions) @ added).max() <= 1.0 / RESOLVED:  # a sum along c is at most |c| times those along the axes
+        return np.ones(1)
+    _, added = reaches(functionals, constraint.parameters, control, directions, times)
     return np.maximum(1.0, power_of_two(np.array([RESOLVED * added.max()])))
 
 

@@ -85,7 +85,7 @@ class InitialStates:
         """Whether a point ``(2,)`` is proven to be in the set, proven not to be, or between the polygons."""
         x = _point(point)
         if not self.outer.shape[0]:
-            return "outside"
+            return "outside" if self.status == "infeasible" else "open"
         added = np.abs(self.directions) @ np.abs(self.outer).max(axis=0)  # what is added up to a bound
         if (self.directions @ x > self.bounds + ROUNDING * np.maximum(added, np.abs(self.bounds))).any():
             return "outside"

@@ -25,7 +25,7 @@ from sparserob_core.experiment.initial_states.search import InitialStatesSearch
 from sparserob_core.experiment.initial_states.section import section
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
-from sparserob_core.sip.method import GAP_TOLERANCE, OutOfTime
+from sparserob_core.sip.method import GAP_TOLERANCE
 
 __all__ = ["InitialStates", "initial_states"]
 FAR = 1e4  # times the numbers in the problem: a coordinate that may be as large as this is called unbounded
@@ -51,9 +51,9 @@ def initial_states(
     or of ``about (d,)``. ``directions``: support functions asked for at most, at least 4. ``values``: costs are
     measured on a lattice of so many points each way, 0 for none. ``within``: only coordinates of at most this size are
     looked at; needed where the set is unbounded. ``out``: a new or empty directory for the config,
-    ``initial_states.json``, ``.npz`` and ``.png``. ``notify`` receives `StudyProgress`. An interrupt, once the
-    set is bounded, ends the search with what it has proven by then. Raises `InputError` when an argument or the config
-    is at fault, and when the set is unbounded.
+    ``initial_states.json``, ``.npz`` and ``.png``. ``notify`` receives `StudyProgress`. An interrupt, and the limit
+    ``limits.seconds`` of the config, end the search with what it has proven by then. Raises
+    `InputError` when an argument or the config is at fault, and when the set is unbounded.
     """
     _whole("directions", directions, 4)
     _whole("values", values, 0)
@@ -74,11 +74,7 @@ def initial_states(
     search = InitialStatesSearch(plane, tools_of(loaded), _tolerance(loaded), notify, least, x, limit is not None)
 
     def find() -> InitialStates:
-        try:
-            found = search.states(experiment.title, directions, values)
-        except OutOfTime as error:
-            bounded = "time until the set is known to be bounded"
-            raise InputError(path="limits.seconds", expected=bounded, got=str(error)) from error
+        found = search.states(experiment.title, directions, values)
         return _in_users_units(replace(found, path=_path(own.problem, found)), units, limit)
 
     if out is None:

@@ -59,6 +59,7 @@ class InitialStatesSearch:
     remarks: list[str] = field(default_factory=list)
     asked: list[Support] = field(default_factory=list)
     interrupted: str = ""
+    frame: tuple[InitialPlane, list[Support]] | None = None
     programs: int = 0
     directions: int = 0
     started: float = field(default_factory=time.perf_counter)
@@ -67,7 +68,14 @@ class InitialStatesSearch:
         self.directions = directions
         origin = np.asarray(self.plane.model.problem.initial_state, dtype=float)
         bare = InitialStates(title=title, states=self.plane.states, status="undecided", message="", origin=origin)
-        limit, framed = self._size(self.plane.radius), self._framed()
+        limit = self._size(self.plane.radius)
+        try:
+            framed = self._framed()
+        except KeyboardInterrupt as pressed:
+            self._interrupt(pressed)
+            if self.frame is None:
+                return self._finished(bare, message="nothing is known of the set yet")
+            self.plane, framed = self.frame
         if isinstance(framed, Result):
             # amounts would be relative to rows that hold the initial state in units of the box: of no use
             why = framed.message if framed.infeasible is None else framed.infeasible.sentence(amounts=False)
@@ -75,7 +83,7 @@ class InitialStatesSearch:
             return self._finished(bare, status="infeasible", message=message)
         try:
             self._tell("direction", len(framed), directions)
-            supports = sandwich(self._ask, framed, directions, 0.1 * CLOSED)
+            supports = sandwich(self._ask, framed, 0 if self.interrupted else directions, 0.1 * CLOSED)
         except KeyboardInterrupt as pressed:
             self._interrupt(pressed)
             supports = sorted([*framed, *self.asked], key=lambda one: float(np.arctan2(*one.direction[::-1])))
@@ -155,6 +163,7 @@ class InitialStatesSearch:
             high, low = np.array([s.bound for s in supports[:2]]), -np.array([s.bound for s in supports[2:]])
             if not number and not self.bounded:
                 self._require_bounded(np.concatenate([high, -low]))
+            self.frame = self.plane, supports
             lower, upper = self.plane.point(low), self.plane.point(high)
             fits = (high - low > 1.0) | (self.plane.radius <= least)
             if number == FRAMES - 1 or (number and fits.all()):

@@ -41,15 +41,17 @@ def critical_factor(
     tools: Tools,
     width: float,
     notify: Notify,
+    seen: dict[float, str],
 ) -> Critical:
     """Find the critical factor to about ``width``, which is what ordinary runs then have to prove.
 
-    ``joined``: the programs in units that do not depend on the factor, where that enters linearly."""
+    ``joined``: the programs in units that do not depend on the factor, where that enters linearly. ``seen`` takes what
+    each factor that is looked at seems to be."""
     if joined is not None:
         found = _by_one_program(joined, scaling, tools, width)
         if found.status != "unknown" or not scaling.nested:
             return found
-    return _by_slack(programs, scaling, tools, width, notify)
+    return _by_slack(programs, scaling, tools, width, notify, seen)
 
 
 def _by_one_program(programs: ParametricProgram, scaling: Scaling, tools: Tools, width: float) -> Critical:
@@ -71,12 +73,15 @@ def _by_one_program(programs: ParametricProgram, scaling: Scaling, tools: Tools,
     )
 
 
-def _by_slack(programs: ParametricProgram, scaling: Scaling, tools: Tools, width: float, notify: Notify) -> Critical:
+def _by_slack(
+    programs: ParametricProgram, scaling: Scaling, tools: Tools, width: float, notify: Notify, seen: dict[float, str]
+) -> Critical:
     """A bracket of the factor at which the least relaxation that leaves something feasible changes its sign."""
 
     def slack(factor: float) -> float:
         value = _slack(programs, factor, tools)
         answer = "feasible" if value <= 0 else "infeasible"
+        seen[factor] = answer
         notify(StudyProgress(text=f"{scaling.of} at {factor:.9g}: {answer}"))
         return value
 

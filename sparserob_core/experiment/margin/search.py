@@ -97,6 +97,7 @@ class MarginSearch:
     width: float
     notify: Notify
     points: list[Point] = field(default_factory=list)
+    seen: dict[float, str] = field(default_factory=dict)
 
     def margin(self, count: int) -> Margin:
         """The margin, with a curve of ``count`` points."""
@@ -104,7 +105,9 @@ class MarginSearch:
         sides: Sides | None = None
         try:
             self._tell(f"looking for the {self.scaling.sense} factor of {self.scaling.of}")
-            found = critical_factor(self.programs, self.joined, self.scaling, self.tools, self.width, self.notify)
+            found = critical_factor(
+                self.programs, self.joined, self.scaling, self.tools, self.width, self.notify, self.seen
+            )
             sides = self._sides(found)
             feasible = sides[2]
             curve = self._curve(feasible, sides[0], count) if feasible is not None else ()
@@ -146,7 +149,9 @@ class MarginSearch:
         refused = sorted((one for one in self.points if one.status == "infeasible"), key=lambda one: one.factor)
         last, first = (-1, 0) if self.scaling.sense == "largest" else (0, -1)
         feasible, infeasible = proven[last] if proven else None, refused[first] if refused else None
-        return ("undecided", f"{said} after {len(self.points)} runs", feasible, infeasible), tuple(proven)
+        looked = [f"{answer} at {factor:.4g}" for factor, answer in sorted(self.seen.items())]
+        seems = f"; not proven: it seems {', '.join(looked)}" if looked else ""
+        return ("undecided", f"{said} after {len(self.points)} runs{seems}", feasible, infeasible), tuple(proven)
 
     def _sides(self, found: Critical) -> Sides:
         largest = self.scaling.sense == "largest"

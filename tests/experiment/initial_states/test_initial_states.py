@@ -24,6 +24,7 @@ from sparserob_core.control.studies.polygon_approximation import (
 )
 from sparserob_core.control.transcription.transcribe import prepare
 from sparserob_core.experiment.initial_states.figure import draw_initial_states, envelope
+from sparserob_core.experiment.initial_states.search import InitialStatesSearch
 from sparserob_core.experiment.initial_states.section import section
 from tests.support.plants import uniform
 from tests.support.stub import Command
@@ -266,3 +267,32 @@ def test_the_command_ends_with_3_for_an_empty_set_and_2_for_a_fault(tmp_path: Pa
     assert empty.returncode == 3 and "infeasible" in empty.stdout
     wrong = command("initial-states", "cart.yaml", "--states", "1,1")
     assert wrong.returncode == 2 and wrong.stderr.count("\n") == 1 and "states" in wrong.stderr
+
+
+@pytest.mark.parametrize(("programs", "known"), [(0, False), (3, False), (4, True), (6, True)])
+def test_an_interrupt_before_the_box_fits_returns_what_is_known(programs, known, monkeypatch) -> None:
+    """Four programs bound the set; the box is then fitted to it by others."""
+    supported, asked = InitialStatesSearch._supported, []
+
+    def pressed(self: InitialStatesSearch, direction: np.ndarray) -> sr.Result:
+        if len(asked) >= programs:
+            raise KeyboardInterrupt("interrupted by SIGTERM")
+        asked.append(direction)
+        return supported(self, direction)
+
+    whole = sr.initial_states(CART, directions=4, values=0)
+    monkeypatch.setattr(InitialStatesSearch, "_supported", pressed)
+    found = sr.initial_states(CART, directions=12, values=3)
+    assert "interrupted by SIGTERM" in found.message
+    assert found.where(whole.inner.mean(axis=0)) != "outside"
+    assert (found.outer.shape[0] > 0) == known
+    if known:  # a point that is proven to be outside is outside
+        assert (whole.inner @ found.directions.T <= found.bounds + 1e-9).all()
+        assert found.where([50.0, 0.0]) == "outside"
+    else:
+        assert found.status == "undecided" and found.where([50.0, 0.0]) == "open"
+
+
+def test_a_limit_of_time_ends_the_search_with_what_it_knows() -> None:
+    found = sr.initial_states(CART, {"limits.seconds": 1e-3}, directions=4, values=0)
+    assert found.status == "undecided" and "the limit of 0.001 s is reached" in found.message
