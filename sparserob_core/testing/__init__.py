@@ -10,6 +10,7 @@ from sparserob_core.testing.maximisers import MaximiserContract
 from sparserob_core.testing.methods import MethodContract
 from sparserob_core.testing.observers import ObserverContract
 from sparserob_core.testing.policies import PolicyContract
+from sparserob_core.testing.problems import ProblemContract
 from sparserob_core.testing.regularisers import RegulariserContract
 from sparserob_core.testing.rules import InnerStopContract, OuterStopContract, ScheduleContract, SelectionContract
 from sparserob_core.testing.sets import SetContract
@@ -26,6 +27,7 @@ __all__ = [
     "ObserverContract",
     "OuterStopContract",
     "PolicyContract",
+    "ProblemContract",
     "RegulariserContract",
     "ScheduleContract",
     "SelectionContract",

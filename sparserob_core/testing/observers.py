@@ -6,7 +6,6 @@ from __future__ import annotations
 import io
 import threading
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
@@ -21,6 +20,7 @@ from sparserob_core.sip.convex_set import Box
 from sparserob_core.sip.events import Batch, EvaluationsFinished, ProofProgress, RoundFinished
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.result import Result
+from sparserob_core.testing.contract import Contract, broken, demand
 
 CONFIG: Mapping[str, Any] = {
     "title": "A double integrator",
@@ -51,6 +51,7 @@ METHODS: Mapping[str, Mapping[str, Any]] = {
 BROKEN_OFF = (1, 2, 4)  # the events after which a run is interrupted: at once, and in the middle
 EVENTS = 300
 GRACE = 5.0  # seconds that an observer may take to end its threads
+FRAMEWORK = "this is a fault of the framework, or of the contract; please report it"
 ALLOWED = 2e-3  # seconds that an event may take on the solver's thread, the median of many
 
 
@@ -84,17 +85,13 @@ class Recording(Observer):
             raise
 
 
-class ObserverContract(ABC):
+class ObserverContract(Contract[Observer], kind="observer"):
     """What every observer must keep: subclass it in a test module as ``class TestMine(ObserverContract)`` and give
-    ``create``.
+    ``component``.
 
     The core keeps the order of events, detaches an observer that raises, and closes it; the contract checks that an
     observer can live with that: no event is a surprise, a run may end at any of them, and afterwards nothing is left.
     """
-
-    @abstractmethod
-    def create(self) -> Observer:
-        """A new observer."""
 
     def watched(self, method: str, observer: Recording | None = None, quiet: bool = False) -> tuple[Outcome, Recording]:
         """One run of `METHODS`, watched by a new observer or by the given one."""
@@ -115,19 +112,28 @@ class ObserverContract(ABC):
         kinds: set[type[Event]] = set()
         for method in METHODS:
             _, recording = self.watched(method)
-            assert not recording.errors, f"{method}: {recording.errors[0]!r}"
-            assert isinstance(recording.events[0], RunStarted)
-            assert isinstance(recording.events[-1], RunFinished)
-            assert recording.closed == 1
+            _unharmed(recording, f"a run of {method}")
+            first, last = recording.events[0], recording.events[-1]
+            demand(isinstance(first, RunStarted) and isinstance(last, RunFinished), f"{method}: {first}", FRAMEWORK)
+            demand(recording.closed == 1, f"{method}: it was closed {recording.closed} times", FRAMEWORK)
             kinds |= {type(event) for event in recording.events}
-        assert kinds >= {RoundFinished, EvaluationsFinished, ProofProgress}, "not every event was there to be heard"
+        demand(
+            kinds >= {RoundFinished, EvaluationsFinished, ProofProgress},
+            "not every event was there to be heard",
+            FRAMEWORK,
+        )
 
     def test_the_run_is_the_same_with_and_without_it(self) -> None:
         for method in METHODS:
             watched, recording = self.watched(method)
             alone, _ = self.watched(method, Recording(_Ignoring()))
-            assert numbers(watched.result) == numbers(alone.result), f"{method}: the observer has changed the result"
-            assert not recording.errors
+            _unharmed(recording, f"a run of {method}")
+            demand(
+                numbers(watched.result) == numbers(alone.result),
+                f"{method}: the observer has changed the result",
+                "only look at what an event holds: copy arrays before you change them, and ask `inspection` for the "
+                "rest, which has a copy of its own",
+            )
 
     def test_it_ends_with_a_run_that_is_interrupted(self) -> None:
         for count in (0, *BROKEN_OFF):  # before anything is solved there is no result, later there is what is known
@@ -135,9 +141,9 @@ class ObserverContract(ABC):
                 recording = Recording(self.create(), count, KeyboardInterrupt())
                 with suppress(KeyboardInterrupt):
                     self.watched("sparserob", recording)
-                assert isinstance(recording.events[-1], RunFinished)
-                assert not recording.errors, f"interrupted after {count} events: {recording.errors[0]!r}"
-                assert recording.closed == 1
+                _unharmed(recording, f"a run that is interrupted after {count} events")
+                demand(isinstance(recording.events[-1], RunFinished), "the last event is missing", FRAMEWORK)
+                demand(recording.closed == 1, f"it was closed {recording.closed} times", FRAMEWORK)
 
     def test_it_lets_go_when_it_is_detached_before_the_end(self) -> None:
         for count in (0, *BROKEN_OFF):
@@ -145,10 +151,10 @@ class ObserverContract(ABC):
                 outcome, recording = self.watched(
                     "sparserob", Recording(self.create(), count, RuntimeError("detached by the contract"))
                 )
-                assert len(recording.events) == count + 1
-                assert recording.closed == 1
-                assert not recording.errors, f"closed after {count} events: {recording.errors[0]!r}"
-                assert outcome.result.decision is not None
+                _unharmed(recording, f"a run from which it is detached after {count} events")
+                demand(len(recording.events) == count + 1, "it heard more after it was detached", FRAMEWORK)
+                demand(recording.closed == 1, f"it was closed {recording.closed} times", FRAMEWORK)
+                demand(outcome.result.decision is not None, "the run did not go on without it", FRAMEWORK)
 
     def test_nothing_of_it_is_left_after_a_run(self) -> None:
         for method in METHODS:
@@ -157,26 +163,33 @@ class ObserverContract(ABC):
 
     def test_it_leaves_the_standard_output_alone_and_a_quiet_terminal_too(self) -> None:
         for quiet in (False, True):
-            with redirect_stdout(io.StringIO()) as output, redirect_stderr(io.StringIO()) as errors:
+            with redirect_stdout(io.StringIO()) as output, redirect_stderr(_Terminal()) as errors:
                 self.watched("sparserob", quiet=quiet)
-            assert output.getvalue() == "", "the standard output belongs to the result"
-            assert not (quiet and errors.getvalue()), "a quiet run shows nothing"
+            demand(
+                output.getvalue() == "",
+                f"it writes to the standard output, which belongs to the result: {output.getvalue()[:60]!r}",
+                "write to a file of the run's directory, or to the standard error stream",
+            )
+            demand(
+                not (quiet and errors.getvalue()),
+                f"it writes to the standard error stream of a quiet run: {errors.getvalue()[:60]!r}",
+                "look at `RunStarted.quiet`, and leave the terminal alone where it is true",
+            )
 
     def test_events_of_an_unknown_kind_and_in_an_unknown_order_are_ignored(self) -> None:
-        observer = self.create()
-        try:
-            for event in (_New(), *bare_events(), _New(), *bare_events()[-1:]):
-                observer.receive(event)
-        finally:
-            observer.close()
+        self._hears((_New(), *bare_events(), _New(), *bare_events()[-1:]), "events of later versions, and out of order")
 
     def test_a_program_that_is_no_control_problem_is_watched_too(self) -> None:
-        observer = self.create()
-        try:
-            for event in (started(), *bare_events()):
-                observer.receive(event)
-        finally:
-            observer.close()
+        self._hears((started(), *bare_events()), "a program that is no control problem")
+
+    def _hears(self, events: Sequence[Event], what: str) -> None:
+        recording = Recording(self.create())
+        with suppress(Exception):
+            for event in events:
+                recording.receive(event)
+        with suppress(Exception):
+            recording.close()
+        _unharmed(recording, what)
 
     def test_it_does_not_hold_up_the_solver(self) -> None:
         observer, seconds = self.create(), []
@@ -190,7 +203,33 @@ class ObserverContract(ABC):
             observer.receive(RunFinished(status="failed", message="broken off", seconds=1.0))
         finally:
             observer.close()
-        assert float(np.median(seconds)) < ALLOWED, f"an event takes {1e3 * float(np.median(seconds)):.1f} ms"
+        demand(
+            float(np.median(seconds)) < ALLOWED,
+            f"an event takes {1e3 * float(np.median(seconds)):.1f} ms on the solver's thread",
+            "put events into a `queue.SimpleQueue`, and let a thread of your own, begun at `RunStarted` and joined in "
+            "`close`, do the work",
+        )
+
+
+def _unharmed(recording: Recording, what: str) -> None:
+    """Raise `ContractBroken` where the observer raised."""
+    if recording.errors:
+        error, count = recording.errors[0], len(recording.events)
+        event = type(recording.events[-1]).__name__ if recording.events else "nothing"
+        broken(
+            f"{what}: after {count} events, the last of them {event}, it raised {type(error).__name__}: {error}",
+            "any event may be the last or the first; results, directories, problems and decisions may be None; events "
+            "of kinds that you do not know are to be ignored, and arrays of events cannot be written to",
+        )
+
+
+@final
+class _Terminal(io.StringIO):
+    """A standard error stream that somebody looks at."""
+
+    def isatty(self) -> bool:
+        """It is one."""
+        return True
 
 
 @final
@@ -244,7 +283,11 @@ def nothing_left() -> Iterator[None]:
     deadline = time.monotonic() + GRACE
     while (left := set(threading.enumerate()) - before) and time.monotonic() < deadline:
         time.sleep(0.01)
-    assert not left, f"still running: {', '.join(thread.name for thread in left)}"
+    demand(
+        not left,
+        f"threads are still running after the run: {', '.join(thread.name for thread in left)}",
+        "end and join them in `close`, which is called however a run ends, with or without `RunFinished`",
+    )
 
 
 def numbers(result: Result) -> list[object]:

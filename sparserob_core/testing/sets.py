@@ -2,27 +2,36 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from typing import cast
 
 import numpy as np
 
+from sparserob_core.control.sets.sets import SetFactory
 from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.testing.contract import Contract, demand
 
 DIRECTIONS = 400
 CLOSE = 1e-7  # relative to the set's extent
 
 
-class SetContract(ABC):
+class SetContract(Contract[ConvexSet], kind="set"):
     """What every convex set must keep: subclass it in a test module as ``class TestMine(SetContract)`` and give
-    ``create``.
+    ``component``: a `ConvexSet`, or a `SetFactory`, which then builds one in ``dimension`` coordinates (2).
 
     The support function is taken as the definition of the set, and is itself tested to be one; a linear program says
     what the half-spaces of a flat set allow, and sampled directions what any set does.
     """
 
-    @abstractmethod
+    dimension = 2
+
     def create(self) -> ConvexSet:
         """A bounded set with an interior, in one to four dimensions."""
+        made: object = super().create()
+        return made.build(self.dimension) if isinstance(made, SetFactory) else cast(ConvexSet, made)
+
+    def expected(self) -> tuple[type, ...]:
+        """A set, or what builds one."""
+        return (ConvexSet, SetFactory)
 
     def directions(self, convex: ConvexSet) -> Array:
         """Random directions ``(k, d)``, not normalised, and the axes both ways."""
@@ -50,27 +59,71 @@ class SetContract(ABC):
         convex = self.create()
         c = self.directions(convex)
         points, tolerance = convex.support_point(c), CLOSE * self.extent(convex)
-        assert (np.abs((c * points).sum(axis=1) - convex.support(c)) <= tolerance * np.linalg.norm(c, axis=1)).all()
-        assert (self.excess(convex, points) <= tolerance).all(), "a support point is outside of the set"
+        missed = np.abs((c * points).sum(axis=1) - convex.support(c)) / np.linalg.norm(c, axis=1)
+        demand(
+            (missed <= tolerance).all(),
+            f"at its support point `c'x` is not the support function, but off by {missed.max():.2g} |c|",
+            "return the point of the set that goes furthest in the direction c, which need not have length 1",
+        )
+        beyond = float(self.excess(convex, points).max())
+        demand(
+            beyond <= tolerance,
+            f"a support point is outside of the set, by {beyond:.2g}",
+            "see that `support` and `support_point` are about the same set",
+        )
 
     def test_the_support_function_is_sublinear(self) -> None:
         convex = self.create()
         c = self.directions(convex)
         e = c[::-1]
         tolerance = CLOSE * self.extent(convex) * (1.0 + np.abs(c).max())
-        assert (convex.support(c + e) <= convex.support(c) + convex.support(e) + tolerance).all()
-        assert (np.abs(convex.support(2.5 * c) - 2.5 * convex.support(c)) <= tolerance).all()
-        assert (convex.support(c) + convex.support(-c) >= -tolerance).all()
-        assert np.abs(convex.support(np.zeros((1, convex.dimension)))).max() <= tolerance
+        demand(
+            (convex.support(c + e) <= convex.support(c) + convex.support(e) + tolerance).all(),
+            "h(c + e) is above h(c) + h(e) somewhere: this is the support function of no set",
+            "take `max {c'x}` over a convex set; a gauge, or a square, is something else",
+        )
+        demand(
+            (np.abs(convex.support(2.5 * c) - 2.5 * convex.support(c)) <= tolerance).all(),
+            "h(2.5 c) is not 2.5 h(c): this is the support function of no set",
+            "directions have any length: divide by none, and square none",
+        )
+        demand(
+            (convex.support(c) + convex.support(-c) >= -tolerance).all(),
+            "h(c) + h(-c) is negative somewhere: the set would be empty",
+            "see that bounds are not exchanged, and radii not negative",
+        )
+        demand(
+            np.abs(convex.support(np.zeros((1, convex.dimension)))).max() <= tolerance,
+            "h(0) is not 0",
+            "the direction 0 is allowed: divide by no length without asking whether it is 0",
+        )
 
     def test_leading_axes_are_kept(self) -> None:
         convex = self.create()
         block = self.directions(convex)[:6].reshape(2, 3, -1)
         for answer in (convex.support, convex.gauge, convex.violation):
-            assert answer(block).shape == (2, 3)
-            assert np.allclose(answer(block)[1, 2], answer(block[1, 2][None])[0], rtol=1e-9, atol=1e-12)
-        assert convex.support_point(block).shape == convex.normal(block).shape == block.shape
-        assert convex.linearisation_excess(block, np.zeros((2, 3, 1, convex.dimension))).shape == (2, 3)
+            name = answer.__name__
+            demand(
+                answer(block).shape == (2, 3),
+                f"{name} returned the shape {answer(block).shape} for an array of shape {block.shape}",
+                f"work along the last axis only (`axis=-1`, `x @ M.T`): (..., d) becomes (...,) in {name}",
+            )
+            demand(
+                np.allclose(answer(block)[1, 2], answer(block[1, 2][None])[0], rtol=1e-9, atol=1e-12),
+                f"{name} has another answer for one of many than for the same alone",
+                "compute each answer from its own row: no mean, maximum or order over the others",
+            )
+        demand(
+            convex.support_point(block).shape == convex.normal(block).shape == block.shape,
+            f"support_point returned the shape {convex.support_point(block).shape}, normal "
+            f"{convex.normal(block).shape}, for an array of shape {block.shape}",
+            "work along the last axis only: (..., d) stays (..., d)",
+        )
+        demand(
+            convex.linearisation_excess(block, np.zeros((2, 3, 1, convex.dimension))).shape == (2, 3),
+            "linearisation_excess does not return one number for each centre",
+            "centres (..., d) and spreads (..., k, d) become (...,)",
+        )
 
     def test_half_spaces_allow_what_the_support_function_says(self) -> None:
         from scipy.optimize import linprog
@@ -81,38 +134,80 @@ class SetContract(ABC):
             return
         for c in self.directions(convex)[-6:]:
             best = linprog(-c, flat[0], flat[1], bounds=(None, None))
-            assert best.status == 0, "the half-spaces leave a direction open, the support function does not"
-            assert abs(-best.fun - convex.support(c[None])[0]) <= 10 * CLOSE * self.extent(convex)
+            demand(
+                best.status == 0,
+                "the half-spaces leave a direction open, the support function does not",
+                "return every side of the set, or None for a set that is not flat",
+            )
+            demand(
+                abs(-best.fun - convex.support(c[None])[0]) <= 10 * CLOSE * self.extent(convex),
+                f"in the direction {c} the half-spaces allow {-best.fun:.9g}, the support function "
+                f"{convex.support(c[None])[0]:.9g}",
+                "`halfspaces` returns H (r, d) and h (r,) of `H x <= h`, with all sides of the set and no others",
+            )
 
     def test_the_bounding_box_touches_the_set_on_every_side(self) -> None:
         convex = self.create()
         box, axes, tolerance = convex.bounding_box(), np.eye(convex.dimension), CLOSE * self.extent(convex)
-        assert np.abs(box.upper - convex.support(axes)).max() <= tolerance
-        assert np.abs(box.lower + convex.support(-axes)).max() <= tolerance
-        assert convex.is_bounded
+        demand(
+            np.abs(box.upper - convex.support(axes)).max() <= tolerance
+            and np.abs(box.lower + convex.support(-axes)).max() <= tolerance,
+            f"the bounding box from {box.lower} to {box.upper} does not touch the set on every side",
+            "leave `bounding_box` out: the default asks the support function",
+        )
+        demand(convex.is_bounded, "it says that it is not bounded", "the contract is for bounded sets")
         if convex.is_box:
             c = self.directions(convex)
-            assert np.allclose(box.support(c), convex.support(c)), "it is no box"
+            demand(
+                np.allclose(box.support(c), convex.support(c)),
+                "it says that it is a box, and is none",
+                "leave `is_box` out unless the set is its bounding box",
+            )
 
     def test_the_interior_point_is_strictly_inside(self) -> None:
         convex = self.create()
         c = self.directions(convex)
-        assert (c @ convex.interior_point() < convex.support(c)).all()
-        assert convex.gauge(convex.interior_point()) <= 1e-12
+        demand(
+            (c @ convex.interior_point() < convex.support(c)).all(),
+            f"the interior point {convex.interior_point()} is on the boundary, or outside",
+            "return a point around which there is room in every direction; a set without interior is no set here",
+        )
+        demand(
+            convex.gauge(convex.interior_point()) <= 1e-12,
+            f"the gauge of the interior point is {float(convex.gauge(convex.interior_point())):.3g}",
+            "the gauge is measured from the interior point: 0 there, and 1 on the boundary",
+        )
 
     def test_the_gauge_is_1_on_the_boundary_and_grows_in_proportion(self) -> None:
         convex = self.create()
         middle, boundary = convex.interior_point(), convex.support_point(self.directions(convex))
-        assert np.abs(convex.gauge(boundary) - 1.0).max() <= 1e-6
+        demand(
+            np.abs(convex.gauge(boundary) - 1.0).max() <= 1e-6,
+            f"the gauge of points of the boundary lies between {convex.gauge(boundary).min():.6g} and "
+            f"{convex.gauge(boundary).max():.6g}",
+            "the gauge is measured from `interior_point`: 1 on the boundary; or leave `gauge` out",
+        )
         for factor in (0.3, 1.0, 4.0):
             points = middle + factor * (self.around(convex) - middle)
             sizes = convex.gauge(points)
-            assert np.allclose(sizes, factor * convex.gauge(self.around(convex)), rtol=1e-6)
+            demand(
+                np.allclose(sizes, factor * convex.gauge(self.around(convex)), rtol=1e-6),
+                f"the gauge of a point {factor:g} times as far from the interior point is not {factor:g} times it",
+                "the gauge is measured from `interior_point`, and grows in proportion",
+            )
             drawn = middle + (points - middle) / np.maximum(sizes, 1e-9)[:, None]
-            assert (self.excess(convex, drawn) <= 1e-6 * self.extent(convex)).all(), "a drawn point is outside"
+            demand(
+                (self.excess(convex, drawn) <= 1e-6 * self.extent(convex)).all(),
+                "a point that is drawn towards the interior point by its gauge is outside: the gauge is too small",
+                "1 on the boundary, for every direction; or leave `gauge` out",
+            )
             c = self.directions(convex)
             least = ((points - middle) @ c.T / (convex.support(c) - c @ middle)).max(axis=1)
-            assert (sizes >= least * (1.0 - 1e-6)).all(), "the gauge says inside where a half-space says outside"
+            demand(
+                (sizes >= least * (1.0 - 1e-6)).all(),
+                "the gauge says inside where the support function says outside",
+                "1 on the boundary, for every direction; or leave `gauge` out",
+            )
 
     def test_a_normal_supports_the_set_where_it_stands(self) -> None:
         convex = self.create()
@@ -120,54 +215,109 @@ class SetContract(ABC):
         boundary = middle + (around - middle) / convex.gauge(around)[:, None]
         normals = convex.normal(boundary)
         lengths = np.linalg.norm(normals, axis=1)
-        assert (lengths > 0).all()
+        demand((lengths > 0).all(), "a normal is 0", "a normal of any length but 0, for points outside as well")
         height = (normals * boundary).sum(axis=1)
-        assert (np.abs(height - convex.support(normals)) <= 1e-4 * self.extent(convex) * lengths).all()
+        demand(
+            (np.abs(height - convex.support(normals)) <= 1e-4 * self.extent(convex) * lengths).all(),
+            "a normal c at a point x of the boundary has `c'x` below the support function of c",
+            "return the direction in which the set goes no further than x, outwards; or leave `normal` out",
+        )
 
     def test_violation_is_positive_outside_only_and_never_below_the_excess(self) -> None:
         convex = self.create()
         points = np.vstack([self.around(convex), convex.support_point(self.directions(convex)[:20])])
         found, least, size = convex.violation(points), self.excess(convex, points), self.extent(convex)
         if convex.halfspaces() is None:
-            assert (found >= least - 1e-6 * size).all()
+            demand(
+                (found >= least - 1e-6 * size).all(),
+                "a violation is smaller than what the point sticks out in some direction",
+                "`violation` is at least `max c'x - h(c)` over directions of length 1; or leave it out",
+            )
         sizes = convex.gauge(points)
         clear = np.abs(sizes - 1.0) > 1e-5
-        assert ((found > 0) == (sizes > 1))[clear].all()
-        assert (convex.contains(points, 1e-6 * size) == (sizes <= 1.0))[clear & (np.abs(found) > 1e-5 * size)].all()
+        demand(
+            ((found > 0) == (sizes > 1))[clear].all(),
+            "the violation is positive for a point inside, or not for one outside",
+            "positive outside, at most 0 inside; or leave `violation` out",
+        )
+        demand(
+            (convex.contains(points, 1e-6 * size) == (sizes <= 1.0))[clear & (np.abs(found) > 1e-5 * size)].all(),
+            "contains does not say the same as the gauge",
+            "leave `contains` out: the default asks `violation`",
+        )
 
     def test_samples_are_in_the_set_on_all_sides_and_the_same_for_the_same_seed(self) -> None:
         convex = self.create()
         points = convex.sample(300, np.random.default_rng(1))
-        assert points.shape == (300, convex.dimension)
-        assert points.tolist() == convex.sample(300, np.random.default_rng(1)).tolist()
-        assert (self.excess(convex, points) <= CLOSE * self.extent(convex)).all(), "a sample is outside"
+        demand(
+            points.shape == (300, convex.dimension),
+            f"sample(300, rng) returned the shape {points.shape}",
+            f"one point of {convex.dimension} coordinates for each of the count",
+        )
+        demand(
+            points.tolist() == convex.sample(300, np.random.default_rng(1)).tolist(),
+            "the same seed gives other samples",
+            "draw from the `rng` that is given only",
+        )
+        demand(
+            (self.excess(convex, points) <= CLOSE * self.extent(convex)).all(),
+            "a sample is outside of the set",
+            "draw points of the set, not of its box; or leave `sample` out",
+        )
         sides = (points - points.mean(axis=0)) @ self.directions(convex).T
-        assert (sides.max(axis=0) > 0).all() and np.unique(points, axis=0).shape[0] > 250
+        demand(
+            (sides.max(axis=0) > 0).all() and np.unique(points, axis=0).shape[0] > 250,
+            "samples do not lie on all sides of their mean, or are the same point again and again",
+            "draw from the whole set; or leave `sample` out",
+        )
 
     def test_extreme_samples_are_on_the_boundary(self) -> None:
         convex = self.create()
         points = convex.sample_extreme(50, np.random.default_rng(2))
-        assert points.shape == (50, convex.dimension)
-        assert np.abs(convex.gauge(points) - 1.0).max() <= 1e-6
-        assert np.unique(np.round(points, 9), axis=0).shape[0] > 1
+        demand(
+            points.shape == (50, convex.dimension) and np.abs(convex.gauge(points) - 1.0).max() <= 1e-6,
+            "an extreme sample is not on the boundary",
+            "return support points of drawn directions; or leave `sample_extreme` out",
+        )
+        demand(
+            np.unique(np.round(points, 9), axis=0).shape[0] > 1,
+            "all extreme samples are the same point",
+            "draw a direction for each; or leave `sample_extreme` out",
+        )
 
     def test_scaled_about_its_middle_it_is_larger_in_proportion(self) -> None:
         convex = self.create()
         c, middle = self.directions(convex), convex.middle()
-        assert self.excess(convex, middle[None])[0] <= CLOSE * self.extent(convex)
+        demand(
+            self.excess(convex, middle[None])[0] <= CLOSE * self.extent(convex),
+            f"the middle {middle} is outside of the set",
+            "leave `middle` out",
+        )
         for factor in (0.25, 1.0, 3.0):
             expected = factor * convex.support(c) + (1.0 - factor) * (c @ middle)
-            assert np.allclose(convex.scaled(factor).support(c), expected, rtol=1e-9, atol=1e-9 * self.extent(convex))
+            demand(
+                np.allclose(convex.scaled(factor).support(c), expected, rtol=1e-9, atol=1e-9 * self.extent(convex)),
+                f"scaled({factor:g}) is not the set that is {factor:g} times as large about its middle",
+                "scale about `middle`, not about the origin; or leave `scaled` out",
+            )
 
     def test_in_other_units_it_is_the_same_set(self) -> None:
         convex = self.create()
         units = np.ldexp(1.0, np.arange(convex.dimension) - 1)
         other, c = convex.in_units(units), self.directions(convex)
-        assert np.allclose(other.support(c), convex.support(c / units), rtol=1e-12)
+        demand(
+            np.allclose(other.support(c), convex.support(c / units), rtol=1e-12),
+            f"in_units({units}) is not the set of all x / units",
+            "h(c) becomes h(c / units); or leave `in_units` out",
+        )
         points = self.around(convex)
         sizes = convex.gauge(points)
         clear = np.abs(sizes - 1.0) > 1e-5  # about another interior point, perhaps
-        assert ((other.gauge(points / units) > 1) == (sizes > 1))[clear].all()
+        demand(
+            ((other.gauge(points / units) > 1) == (sizes > 1))[clear].all(),
+            "in other units another point is inside",
+            "points become x / units; or leave `in_units` out",
+        )
 
     def test_the_support_function_stays_between_its_bounds_around_a_direction(self) -> None:
         convex, rng = self.create(), np.random.default_rng(3)
@@ -177,14 +327,27 @@ class SetContract(ABC):
             spread = rng.uniform(0.01, 1.0) * rng.normal(size=(2, convex.dimension))
             truth = convex.support(centre + shifts @ spread)
             tangent = (centre + shifts @ spread) @ convex.support_point(centre[None])[0]
-            assert (truth - tangent).max() <= convex.linearisation_excess(centre, spread) + tolerance
+            demand(
+                (truth - tangent).max() <= convex.linearisation_excess(centre, spread) + tolerance,
+                "around a direction the support function is further above its linearisation than "
+                "linearisation_excess says: what it proves is not true",
+                "bound `h(c + s'D) - (c + s'D)'x(c)` for all s in [-1, 1]^k, from above; or leave it out",
+            )
             value, gradient, hessian = convex.support_minorant(centre, spread)
             below = value + shifts @ gradient + np.einsum("si,ij,sj->s", shifts, hessian, shifts) / 2
-            assert (below <= truth + tolerance).all(), "the quadratic is above the support function"
+            demand(
+                (below <= truth + tolerance).all(),
+                "around a direction the quadratic of support_minorant is above the support function",
+                "a minorant lies below for all s in [-1, 1]^k; or leave it out",
+            )
 
     def test_an_image_of_the_ball_has_the_support_function_of_one(self) -> None:
         convex = self.create()
         image, c = convex.unit_ball_image(), self.directions(convex)
         if image is not None:
             height = c @ image[0] + np.linalg.norm(c @ image[1], axis=1)
-            assert np.allclose(height, convex.support(c), rtol=1e-9, atol=CLOSE * self.extent(convex))
+            demand(
+                np.allclose(height, convex.support(c), rtol=1e-9, atol=CLOSE * self.extent(convex)),
+                "the image of the ball has another support function than the set",
+                "return the centre (d,) and M (d, k) of the set `centre + M ball`, or None for what is no such image",
+            )

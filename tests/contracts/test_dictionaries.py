@@ -182,7 +182,7 @@ FAULTS = {
 }
 
 
-@pytest.mark.parametrize(("flawed", "test"), FAULTS.items(), ids=lambda value: getattr(value, "__name__", ""))
+@pytest.mark.parametrize(("flawed", "test"), FAULTS.items(), ids=[one.__name__ for one in FAULTS])
 def test_the_contract_catches_a_dictionary_that_is_wrong_on_purpose(flawed, test):
     fails(DictionaryContract, flawed, test)
 

@@ -226,7 +226,7 @@ class TestAMaximiserThatTakesTheEndForABadPoint(MaximiserContract):
     test_the_same_seed_gives_the_same_points_in_a_fresh_process = None  # seconds, for what is tested above
 
 
-@pytest.mark.parametrize(("flawed", "test"), FAULTS.items(), ids=lambda value: getattr(value, "__name__", ""))
+@pytest.mark.parametrize(("flawed", "test"), FAULTS.items(), ids=[one.__name__ for one in FAULTS])
 def test_the_contract_catches_a_maximiser_that_is_bad_on_purpose(flawed, test):
     fails(MaximiserContract, flawed, test)
 

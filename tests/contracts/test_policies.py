@@ -175,7 +175,7 @@ FAULTS = {
 }
 
 
-@pytest.mark.parametrize(("flawed", "test"), FAULTS.items(), ids=lambda value: getattr(value, "__name__", ""))
+@pytest.mark.parametrize(("flawed", "test"), FAULTS.items(), ids=[one.__name__ for one in FAULTS])
 def test_the_contract_catches_a_policy_that_is_wrong_on_purpose(flawed, test):
     error = fails(PolicyContract, flawed, test)
     if flawed is Clairvoyant:

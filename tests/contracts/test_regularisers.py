@@ -178,6 +178,6 @@ FAULTS = {
 
 
 @pytest.mark.filterwarnings("ignore:divide by zero")
-@pytest.mark.parametrize(("flawed", "test"), FAULTS.items(), ids=lambda value: getattr(value, "__name__", ""))
+@pytest.mark.parametrize(("flawed", "test"), FAULTS.items(), ids=[one.__name__ for one in FAULTS])
 def test_the_contract_catches_a_regulariser_that_is_wrong_on_purpose(flawed, test):
     fails(RegulariserContract, flawed, test)

@@ -265,7 +265,7 @@ FAULTS = {
 }
 
 
-@pytest.mark.parametrize(("flawed", "test"), FAULTS.items(), ids=lambda value: getattr(value, "__name__", ""))
+@pytest.mark.parametrize(("flawed", "test"), FAULTS.items(), ids=[one.__name__ for one in FAULTS])
 def test_the_contract_catches_a_solver_that_is_bad_on_purpose(flawed, test):
     fails(SolverContract, flawed, test)
 

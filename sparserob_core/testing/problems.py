@@ -1,0 +1,415 @@
+"""The contract of a problem: its rows, derivatives, separations and enclosures are about one and the same family."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.problem import OptimalControlProblem, ProblemFactory
+from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.program import ConstraintFamily, Explanation, SemiInfiniteProgram
+from sparserob_core.testing.contract import Contract, broken, demand, same
+
+if TYPE_CHECKING:
+    from sparserob_core.sip.program import Separation
+
+DECISIONS = 4  # decisions at which families are looked at
+POINTS = 60  # indices that are drawn
+CELLS = 10  # cells that are drawn, with `INSIDE` indices in each
+INSIDE = 25
+STEP = 1e-6  # of the box's side, for differences
+SLOPE = 1e-3  # relative accuracy of a derivative
+CLOSE = 1e-8  # relative to the terms of a row
+SMALL = 1e-7  # cells whose enclosure must be close to the violation: of the side of the box
+CLOSES = 1e-3  # how close, relative to the terms of a row
+PIECES = 12  # of the dictionaries in which a control problem is looked at
+SECONDS = 20.0  # that a solve may take
+
+
+class ProblemContract(Contract[ProblemFactory], kind="problem"):
+    """What every problem must keep: subclass it as ``class TestMine(ProblemContract)`` and give ``component``, with
+    options where it needs some (``{"name": "linear", "horizon": ...}``, or a ``functools.partial`` of the class).
+
+    ``build()`` returns an `OptimalControlProblem`, or a `SemiInfiniteProgram` with its families. The program, or what
+    becomes of the control problem in dictionaries of 12 pieces, is looked at family by family: ``rows`` maps indices
+    ``(k, d)`` to ``(G (k, r, n), h (k, r))``, one index like the other; and whatever a family offers beside them
+    (gradient, worst, enclosure, cells, nominal, sample, literal, explain) has to agree with its rows. ``provable``:
+    whether a decision can be proven; set it to False for a problem that cannot.
+    """
+
+    provable = True
+
+    def built(self) -> OptimalControlProblem | SemiInfiniteProgram:
+        """The problem; a broken contract where something else comes back, or something is raised."""
+        factory = self.create()
+        try:
+            made: object = factory.build()
+        except Exception as error:  # noqa: BLE001  a component may raise anything, and must not
+            broken(
+                f"build raised {type(error).__name__}: {error}",
+                "build the problem of the options that the contract is given; `InputError` is for options at fault",
+            )
+        if not isinstance(made, OptimalControlProblem | SemiInfiniteProgram):
+            broken(
+                f"build returned {made!r}", "return a `sparserob_core.OptimalControlProblem` or a `SemiInfiniteProgram`"
+            )
+        return made
+
+    def program(self) -> SemiInfiniteProgram:
+        """The program, or that of the control problem in dictionaries of 12 pieces."""
+        from sparserob_core.control.transcription.transcribe import transcribe
+
+        made = self.built()
+        if isinstance(made, SemiInfiniteProgram):
+            return made
+        pieces = Dictionary(np.linspace(0.0, made.horizon, PIECES + 1), np.eye(PIECES))
+        return transcribe(made, control=pieces, disturbance=pieces)
+
+    def families(self) -> Iterator[tuple[ConstraintFamily, list[Array]]]:
+        """Every family, with decisions ``(n,)`` at which it is looked at."""
+        program, rng = self.program(), np.random.default_rng(2)
+        low = np.where(np.isfinite(program.finite.lower), program.finite.lower, -1.0)
+        high = np.where(np.isfinite(program.finite.upper), program.finite.upper, 1.0)
+        low, high = (low, high) if program.finite.S is None else (-np.ones(program.n), np.ones(program.n))
+        decisions = [low + rng.random(program.n) * (high - low) for _ in range(DECISIONS)]
+        for family in program.families:
+            yield family, decisions
+
+    def test_it_is_built_the_same_each_time(self) -> None:
+        first, second = self.program(), self.program()
+        names = ("q", "weights", "lower", "upper", "G", "h", "A", "b")
+        changed = [name for name in names if not same(getattr(first.finite, name), getattr(second.finite, name))]
+        demand(
+            not changed and [one.name for one in first.families] == [one.name for one in second.families],
+            f"two builds with the same options differ in {', '.join(changed) or 'their families'}",
+            "let nothing but the options decide: no clock, and no random numbers without a seed among the options",
+        )
+        for one, other in zip(first.families, second.families, strict=True):
+            points = _points(one.index_set, np.random.default_rng(1), POINTS)
+            demand(
+                all(same(a, b) for a, b in zip(one.rows(points), other.rows(points), strict=True)),
+                f"two builds with the same options have different rows of {one.name}",
+                "let nothing but the options decide",
+            )
+
+    def test_its_cost_is_convex(self) -> None:
+        program = self.program().finite
+        if program.P is not None:
+            dense = program.P.toarray()
+            least, largest = np.linalg.eigvalsh((dense + dense.T) / 2)[[0, -1]]
+            demand(
+                least >= -1e-10 * max(1.0, largest) and np.abs(dense - dense.T).max() <= 1e-12 * max(1.0, largest),
+                f"P is not symmetric and positive semidefinite: its eigenvalues begin at {least:.3g}",
+                "the cost is `1/2 x'P x`: give the matrix of second derivatives of a convex function",
+            )
+
+    def test_rows_have_their_shapes_for_one_index_and_for_many(self) -> None:
+        n = self.program().n
+        for family, _ in self.families():
+            box = family.index_set
+            demand(
+                np.isfinite(box.lower).all() and np.isfinite(box.upper).all(),
+                f"{family.name}: the index set is not bounded",
+                "the index set of a family is a bounded box: transform what runs to infinity",
+            )
+            points = _points(box, np.random.default_rng(3), POINTS)
+            G, h = _rows(family, points)
+            demand(
+                G.shape == (len(points), h.shape[-1], n) and h.shape == (len(points), G.shape[1]),
+                f"{family.name}: rows returned {G.shape} and {h.shape} for {len(points)} indices of {box.dimension} "
+                f"coordinates",
+                f"return G of shape (k, r, {n}) and h of shape (k, r) for indices (k, {box.dimension})",
+            )
+            demand(
+                np.isfinite(G).all() and not np.isnan(h).any() and not np.isneginf(h).any(),
+                f"{family.name}: rows has numbers that are not finite",
+                "look for a division by zero, or a root of a negative number, at the ends of the index set",
+            )
+            order = np.random.default_rng(4).permutation(len(points))
+            singly = [_rows(family, points[[k]]) for k in order]
+            for k, (one, side) in zip(order, singly, strict=True):
+                demand(
+                    np.allclose(one[0], G[k], rtol=1e-9, atol=1e-12) and np.allclose(side[0], h[k], rtol=1e-9),
+                    f"{family.name}: an index has other rows alone than among others",
+                    "compute each row from its own index: no mean, maximum or order over the batch",
+                )
+
+    def test_a_gradient_is_the_derivative_of_its_row(self) -> None:
+        for family, decisions in self.families():
+            if family.gradient is None:
+                continue
+            box, rng = family.index_set, np.random.default_rng(5)
+            points = _points(box, rng, POINTS, margin=0.01)
+            for x in decisions:
+                rows = rng.integers(0, _rows(family, points)[1].shape[1], len(points))
+                told = _asked(family, "gradient", lambda f=family, x=x, p=points, r=rows: f.gradient(x, p, r))
+                wrong = _wrong_slopes(family, x, points, rows, np.asarray(told))
+                demand(
+                    wrong.mean() <= 0.1,
+                    f"{family.name}: at {wrong.mean():.0%} of the indices the gradient is not the derivative of "
+                    "`row x - rhs` in the index",
+                    "differentiate the violation of the row that is asked for; mind the sign of the right-hand side",
+                )
+
+    def test_a_separation_names_what_is_violated_most(self) -> None:
+        for family, decisions in self.families():
+            if family.worst is None:
+                continue
+            points = _points(family.index_set, np.random.default_rng(6), 50 * POINTS)
+            for x in decisions:
+                found = _asked(family, "worst", lambda f=family, x=x: f.worst(x))
+                size = _size(family, x, points)
+                self._look_at(family, x, found, size)
+                sampled = float(family.violations(x, points).max())
+                demand(
+                    sampled <= found.bound + CLOSE * size,
+                    f"{family.name}: worst says that no violation is above {found.bound:.9g}, and one is {sampled:.9g}",
+                    "`bound` holds for the whole index set; give inf where none is proven",
+                )
+                top = float(found.violations.max(initial=-np.inf))
+                demand(
+                    sampled <= top + CLOSE * size,
+                    f"{family.name}: worst finds at most {top:.9g}, and a drawn index has {sampled:.9g}",
+                    "name the most violated index of the whole set; leave `worst` out where it is not known exactly",
+                )
+
+    def _look_at(self, family: ConstraintFamily, x: Array, found: Separation, size: float) -> None:
+        box, count = family.index_set, len(found.violations)
+        demand(
+            found.indices.shape == (count, box.dimension) and found.rows.shape == (count,),
+            f"{family.name}: worst has indices {found.indices.shape}, rows {found.rows.shape} and {count} violations",
+            f"one index of {box.dimension} coordinates and one row for each violation",
+        )
+        inside = 1e-9 * (box.upper - box.lower)
+        demand(
+            (found.indices >= box.lower - inside).all() and (found.indices <= box.upper + inside).all(),
+            f"{family.name}: worst names an index outside of the index set",
+            "clip the indices to `index_set`",
+        )
+        real = family.violations(x, found.indices)[np.arange(count), found.rows] if count else np.zeros(0)
+        demand(
+            np.abs(real - found.violations).max(initial=0.0) <= CLOSE * size,
+            f"{family.name}: worst says {found.violations[:3]} where the rows say {real[:3]}",
+            "a violation is `row x - rhs` at the index and row that are named with it",
+        )
+        demand(
+            (np.diff(found.violations) <= CLOSE * size).all(),
+            f"{family.name}: worst does not begin with the most violated constraint",
+            "sort by falling violation",
+        )
+
+    def test_an_enclosure_is_never_below_the_violation_and_closes(self) -> None:
+        for family, decisions in self.families():
+            if family.enclosure is None:
+                continue
+            box, rng = family.index_set, np.random.default_rng(7)
+            for x in decisions[:2]:
+                for share in (1.0, 0.2, 0.01, SMALL):
+                    lower, upper = _cells(family, rng, share)
+                    told = _asked(family, "enclosure", lambda f=family, x=x, a=lower, b=upper: f.enclosure(x, a, b))
+                    drawn = lower[:, None] + rng.random((len(lower), INSIDE, box.dimension)) * (upper - lower)[:, None]
+                    inside = family.violations(x, drawn.reshape(-1, box.dimension))
+                    most = inside.reshape(len(lower), INSIDE, -1).max(axis=(1, 2))
+                    size = _size(family, x, drawn.reshape(-1, box.dimension))
+                    demand(
+                        np.shape(told.bounds) == np.shape(told.split) == (len(lower),),
+                        f"{family.name}: enclosure has bounds {np.shape(told.bounds)} and split {np.shape(told.split)} "
+                        f"for {len(lower)} cells",
+                        "one bound and one coordinate for each cell",
+                    )
+                    # Below 0 the scale of a row is its own affair: rows of a curved set are those of directions.
+                    below = float((most - np.maximum(told.bounds, 0.0)).max())
+                    demand(
+                        below <= CLOSE * size,
+                        f"{family.name}: an enclosure is {below:.3g} below a violation in "
+                        "its cell: what it proves is not true",
+                        "bound every term of the row over the whole cell: the least of what is subtracted, the most of "
+                        "what is added",
+                    )
+                    split = np.asarray(told.split)
+                    demand(
+                        (split >= 0).all() and (split < max(1, box.dimension)).all() and split.dtype.kind in "iu",
+                        f"{family.name}: enclosure wants coordinate {split.max()} of {box.dimension} to be halved",
+                        "name coordinates from 0, as whole numbers",
+                    )
+                    if share == SMALL and self.provable:
+                        gap = float((told.bounds - most).max())
+                        demand(
+                            gap <= CLOSES * size,
+                            f"{family.name}: on cells of {SMALL:g} of the index set the enclosure is still {gap:.3g} "
+                            "above the violation: no proof comes to its end",
+                            "the bound has to approach the violation as the cell shrinks; see that `cells` begin where "
+                            "a row has a jump or a kink, or set `provable = False`",
+                        )
+
+    def test_cells_cover_the_index_set_once(self) -> None:
+        for family, _ in self.families():
+            if family.cells is None:
+                continue
+            lower, upper = family.cells
+            box = family.index_set
+            moves = box.lower < box.upper
+            sides = np.asarray(upper - lower)[:, moves] / (box.upper - box.lower)[moves]
+            demand(
+                (upper >= lower).all() and (lower >= box.lower - 1e-12).all() and (upper <= box.upper + 1e-12).all(),
+                f"{family.name}: a cell leaves the index set, or its ends are exchanged",
+                "`cells` are the lower and upper corners (k, d) of boxes inside of `index_set`",
+            )
+            if not sides.prod(axis=1).any():
+                continue  # directions: the faces of a cube, of which every inner point is a multiple of another
+            volume = float(sides.prod(axis=1).sum())
+            demand(
+                abs(volume - 1.0) <= 1e-6,
+                f"{family.name}: the cells fill {volume:.6g} of the index set",
+                "cells cover the index set without a gap, and do not overlap but at their sides",
+            )
+            points = _points(box, np.random.default_rng(8), POINTS)
+            inside = np.all((points[:, None] >= lower) & (points[:, None] <= upper), axis=2)
+            demand(
+                np.any(inside, axis=1).all(),
+                f"{family.name}: an index is in no cell",
+                "cells cover the index set without a gap",
+            )
+
+    def test_other_forms_of_a_family_ask_for_no_more_than_it_does(self) -> None:
+        for family, decisions in self.families():
+            if family.worst is None:
+                continue
+            others = {"nominal": family.nominal, "literal": family.literal}
+            if family.sample is not None:
+                with suppress(InputError):
+                    others["sampled"] = family.sample(POINTS, np.random.default_rng(9))
+            for name, other in others.items():
+                if other is None:
+                    continue
+                points = _points(other.index_set, np.random.default_rng(10), POINTS)
+                for x in decisions:
+                    bound, drawn = family.worst(x).bound, float(other.violations(x, points).max())
+                    demand(
+                        drawn <= bound + CLOSE * _size(other, x, points),
+                        f"{family.name}: its {name} form has a violation of {drawn:.9g}, the family itself at most "
+                        f"{bound:.9g}",
+                        "the nominal, the sampled and the literal form have some of the constraints, and no others",
+                    )
+
+    def test_a_constraint_is_explained_in_words(self) -> None:
+        for family, _ in self.families():
+            points = _points(family.index_set, np.random.default_rng(11), 5)
+            for point in points:
+                told = _asked(family, "explain", lambda f=family, p=point: f.explanation(p, 0))
+                demand(
+                    isinstance(told, Explanation) and bool(told.text.strip()),
+                    f"{family.name}: a constraint is explained by {told!r}",
+                    "return an `Explanation` whose text says what the constraint asks for, or leave `explain` out",
+                )
+
+    def test_a_decision_can_be_proven(self) -> None:
+        from sparserob_core.control.transcription.provable import unprovable
+
+        made = self.built()
+        why = unprovable(made) if isinstance(made, OptimalControlProblem) else None
+        without = [one.name for one, _ in self.families() if one.enclosure is None and one.reduced is None]
+        demand(
+            not self.provable or (why is None and not without),
+            f"nothing can be certified: {why or f'{without} has no enclosure'}",
+            "write A, B and E as arithmetic of numpy functions of p, give families an `enclosure`, or set "
+            "`provable = False` here and tell your users",
+        )
+
+    def test_it_is_solved_or_says_why_not(self) -> None:
+        from sparserob_core.experiment.solve import solve
+
+        made = self.built()
+        control = {"name": "piecewise_constant", "pieces": PIECES}
+        given: dict[str, Any] = {"control": control} if isinstance(made, OptimalControlProblem) else {}
+        try:
+            result = solve(made, seconds=SECONDS, **given)
+        except InputError as error:
+            broken(f"the exchange method refuses it: {error}", "see what the message says of the problem")
+        demand(
+            result.status != "failed",
+            f"the exchange method fails: {result.message}",
+            "state the problem in units in which its numbers are of ordinary size",
+        )
+        demand(
+            result.status not in ("refuted", "undecided") or result.stopped or not self.provable,
+            f"the exchange method ends with {result.status}: {result.message}",
+            "rows and enclosure, or rows and `worst`, may not be about the same constraint",
+        )
+
+
+def _points(box: Box, rng: np.random.Generator, count: int, margin: float = 0.0) -> Array:
+    """Indices ``(count, d)`` in a box, its corners among them where no margin is asked for."""
+    sides = box.upper - box.lower
+    points = box.lower + (margin + (1.0 - 2.0 * margin) * rng.random((count, box.dimension))) * sides
+    if not margin and count >= 2:
+        points[0], points[1] = box.lower, box.upper
+    return np.asarray(points)
+
+
+def _asked(family: ConstraintFamily, what: str, call: Any) -> Any:
+    try:
+        return call()
+    except Exception as error:  # noqa: BLE001  a component may raise anything, and must not
+        broken(
+            f"{family.name}: {what} raised {type(error).__name__}: {error}",
+            f"`{what}` answers for every decision (n,), and for any number of indices or cells (k, d) in the index set",
+        )
+
+
+def _rows(family: ConstraintFamily, points: Array) -> tuple[Array, Array]:
+    G, h = _asked(family, "rows", lambda: family.rows(points))
+    G, h = np.asarray(G, dtype=float), np.asarray(h, dtype=float)
+    demand(
+        G.ndim == 3 and h.ndim == 2,
+        f"{family.name}: rows returned {G.shape} and {h.shape} for {len(points)} indices",
+        "return G of shape (k, r, n) and h of shape (k, r) for indices (k, d), with r = 1 for a single row",
+    )
+    return G, h
+
+
+def _size(family: ConstraintFamily, x: Array, points: Array) -> float:
+    """The largest sum of the terms of a row."""
+    G, h = family.rows(points)
+    terms = np.abs(G) @ np.abs(x) + np.where(np.isfinite(h), np.abs(h), 0.0)
+    return float(terms.max(initial=0.0)) or 1.0
+
+
+def _cells(family: ConstraintFamily, rng: np.random.Generator, share: float) -> tuple[Array, Array]:
+    """Cells whose sides are a share of those of the family's own cells, or of its index set."""
+    box = family.index_set
+    lower, upper = (box.lower[None], box.upper[None]) if family.cells is None else family.cells
+    chosen = rng.integers(0, len(lower), CELLS)
+    low, sides = lower[chosen], (upper - lower)[chosen]
+    first = low + rng.random(low.shape) * (1.0 - share) * sides
+    return first, np.minimum(first + share * sides, low + sides)
+
+
+def _wrong_slopes(family: ConstraintFamily, x: Array, points: Array, rows: np.ndarray, told: Array) -> np.ndarray:
+    """Where ``told (k, d)`` is no derivative: neither of the two one-sided differences, for a row may have kinks."""
+    box, k = family.index_set, np.arange(len(points))
+    sides = box.upper - box.lower
+    size, wrong = _size(family, x, points), np.zeros(len(points), dtype=bool)
+    demand(
+        told.shape == points.shape,
+        f"{family.name}: gradient returned the shape {told.shape} for {len(points)} indices",
+        "return one derivative for each coordinate of each index",
+    )
+    here = family.violations(x, points)[k, rows]
+    for i in np.flatnonzero(sides > 0.0):
+        ahead, behind = points.copy(), points.copy()
+        ahead[:, i] += STEP * sides[i]
+        behind[:, i] -= STEP * sides[i]
+        slopes = [
+            (family.violations(x, ahead)[k, rows] - here) / STEP,
+            (here - family.violations(x, behind)[k, rows]) / STEP,
+        ]
+        apart = np.min([np.abs(told[:, i] * sides[i] - slope) for slope in slopes], axis=0)
+        largest = np.max(np.abs(slopes), axis=0)
+        wrong |= apart > SLOPE * (largest + np.abs(told[:, i] * sides[i])) + 1e-6 * size
+    return wrong
