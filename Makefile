@@ -4,6 +4,7 @@ VENV      := .venv
 BIN       := $(VENV)/bin
 INSTALLED := $(VENV)/installed
 PEERS     := $(VENV)/peers
+WRITERS   := $(VENV)/writers
 CANDIDATES := $(PYTHON) python3 python3.13 python3.12 python3.11
 DEMO      := configs/experiment1_repaired.yaml
 LIVE      := configs/experiment1_literal.yaml
@@ -22,7 +23,7 @@ help:
 	@echo "make test        lint, types, import rules, tests: the first stage, about five minutes on two processors"
 	@echo "make test-slow   the second stage: larger instances of what the first one tests"
 	@echo "make bench       time the certified solve and the maximisers beside other people's"
-	@echo "make docs        write the reference and the schema anew, execute README.md and docs/"
+	@echo "make docs        write the reference and the schema anew, and build the site (minutes, the first time)"
 	@echo "make install     set up $(VENV) only"
 	@echo "make clean       remove $(VENV) and every cache"
 
@@ -42,6 +43,10 @@ $(INSTALLED): pyproject.toml
 $(PEERS): $(INSTALLED)
 	@if $(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check --editable '.[all,bench]'; then touch $@; \
 	else echo "not every peer can be installed here; the benchmark names those that it goes without" >&2; fi
+
+$(WRITERS): $(INSTALLED)
+	@$(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check --editable '.[all,docs]'
+	@touch $@
 
 demo: $(INSTALLED)
 	@$(BIN)/sparserob run $(DEMO)
@@ -70,9 +75,11 @@ test-slow: $(INSTALLED)
 bench: $(PEERS)
 	$(BIN)/python -m pytest -m benchmark tests/benchmarks
 
-docs: $(INSTALLED)
+# The site, every warning an error; pictures and notebooks are kept in .docs_cache until what they show has changed.
+docs: $(WRITERS)
 	$(BIN)/python docs/build_reference.py
-	$(BIN)/python -m pytest tests/rules/test_docs.py
+	$(BIN)/python -m sphinx -b html -W --keep-going -q docs site/html
+	@echo "the site is site/html/index.html"
 
 clean:
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache .benchmarks
+	rm -rf $(VENV) site docs/generated .docs_cache .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache .benchmarks

@@ -39,7 +39,8 @@ class Fence:
 
 def fences(page: Path) -> Iterator[Fence]:
     for language, attributes, text in FENCE.findall(page.read_text()):
-        yield Fence(language, dict(item.split("=", 1) for item in attributes.split()), text)
+        if not attributes.startswith("{"):  # a directive of the site
+            yield Fence(language, dict(item.split("=", 1) for item in attributes.split()), text)
 
 
 def relative(path: Path) -> str:

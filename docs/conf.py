@@ -1,0 +1,51 @@
+"""The site: the pages of this folder, executed notebooks, and pages made of what the program says of itself.
+
+``make docs`` builds it into ``site/``, with every warning as an error and without a network.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+from make_site import docstrings, generated
+
+project = "SparseRob"
+author = "SparseRob contributors"
+html_title = "SparseRob"
+
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx_design", "sphinx_copybutton"]
+exclude_patterns = ["paper", "make_site", "figures", "**/.ipynb_checkpoints"]
+source_suffix = {".md": "myst-nb"}
+
+myst_enable_extensions = ["colon_fence", "dollarmath"]
+myst_heading_anchors = 4
+# Pages also stand on their own in the repository: they link to files and folders beside docs/.
+suppress_warnings = ["myst.xref_missing", "misc.highlighting_failure"]
+
+nb_execution_mode = "cache"
+nb_execution_cache_path = str(Path(__file__).resolve().parents[1] / ".docs_cache")
+nb_execution_timeout = 300
+nb_execution_raise_on_error = True
+nb_merge_streams = True
+
+default_role = "py:obj"
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"
+autodoc_default_options = {"members": True, "show-inheritance": True}
+
+html_theme = "furo"
+html_static_path: list[str] = []
+html_theme_options = {
+    "light_css_variables": {"color-brand-primary": "#0072b2", "color-brand-content": "#0072b2"},
+    "dark_css_variables": {"color-brand-primary": "#56b4e9", "color-brand-content": "#56b4e9"},
+}
+pygments_style, pygments_dark_style = "default", "github-dark"
+
+
+def setup(app: object) -> None:
+    """The generated pages are written before the sources are read; docstrings are plain text, and are made safe."""
+    generated.write()
+    app.connect("autodoc-process-docstring", docstrings.made_safe)  # type: ignore[attr-defined]
