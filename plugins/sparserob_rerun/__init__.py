@@ -50,6 +50,7 @@ class Rerun(sr.Observer, sr.Options):
     waits: bool = False
     """Wait until everything is recorded rather than drop what comes too fast: for a run that is over."""
 
+    _incomplete: str = PrivateAttr(default="")
     _outlet: Outlet | None = PrivateAttr(default=None)
     _pressed: bool = PrivateAttr(default=False)
 
@@ -74,12 +75,18 @@ class Rerun(sr.Observer, sr.Options):
                     logger.warning("rerun: the run is over: %s; its page stays until Ctrl-C", event.status)
                 self.close()
 
+    @property
+    def incomplete(self) -> str:
+        """See `sparserob_core.Observer`."""
+        return self._incomplete
+
     def close(self) -> None:
         """See `sparserob_core.Observer`: the recording is complete afterwards."""
         outlet, self._outlet = self._outlet, None
         if outlet is not None:
             for line in outlet.close(0.0 if self._pressed else self.keep):  # who ends a run wants no page of it
                 logger.warning("rerun: %s", line)
+            self._incomplete = outlet.incomplete
 
     def _begin(self, event: sr.RunStarted) -> None:
         from sparserob_rerun.recording.sinks import look

@@ -8,7 +8,6 @@ import shutil
 import socket
 import subprocess
 import time
-from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.experiment.cli.main import main
 from tests.support.places import CONFIGS
+from tests.support.recordings import read, scalars, texts, viewer, walk_of
 from tests.support.stub import STUB
 
 pytest.importorskip("rerun", reason="a recording needs the extra rerun")
@@ -31,12 +31,6 @@ SEARCH = {
 }
 QUICK = {"dictionaries.control.pieces": 50, "dictionaries.disturbance.pieces": 50}
 SMALL = {"name": "rerun", "landscape": {"grid": 8, "evaluations": 200}}
-
-
-def viewer() -> Path:
-    import rerun_cli
-
-    return Path(rerun_cli.__file__).parent / "rerun"
 
 
 def recorded(directory: Path, config: str, changes: dict[str, object], **options: object) -> sr.Outcome:
@@ -56,32 +50,6 @@ def searched(tmp_path_factory: pytest.TempPathFactory) -> sr.Outcome:
 def exchanged(tmp_path_factory: pytest.TempPathFactory) -> sr.Outcome:
     """A recorded exchange that ends certified."""
     return recorded(tmp_path_factory.mktemp("exchange") / "run", "experiment1_repaired.yaml", QUICK)
-
-
-def read(file: Path) -> dict[str, list[Any]]:
-    """The chunks of a recording by entity, without the static ones."""
-    from rerun.chunk import RrdReader
-
-    found: dict[str, list[Any]] = defaultdict(list)
-    for chunk in RrdReader(str(file)).stream():
-        if not chunk.is_static:
-            found[chunk.entity_path].append(chunk)
-    return found
-
-
-def scalars(chunks: list[Any], timeline: str) -> tuple[np.ndarray, np.ndarray]:
-    """Times ``(k,)`` and values ``(k, series)`` of an entity, in the order of a timeline."""
-    times, values = [], []
-    for chunk in chunks:
-        batch = chunk.to_record_batch()
-        times += np.asarray(batch.column(timeline)).astype(np.int64).tolist()
-        values += [np.array(row, dtype=float) for row in batch.column("Scalars:scalars").to_pylist()]
-    order = np.argsort(times, kind="stable")
-    return np.array(times)[order], np.array(values)[order]
-
-
-def texts(chunks: list[Any], component: str) -> list[str]:
-    return [row[0] for chunk in chunks for row in chunk.to_record_batch().column(component).to_pylist()]
 
 
 def test_every_evaluation_is_in_the_recording_with_the_value_that_the_trace_has(searched: sr.Outcome) -> None:
@@ -105,16 +73,6 @@ def test_every_evaluation_is_in_the_recording_with_the_value_that_the_trace_has(
     assert (np.diff(proven) >= 0).all()
     # of the bound that is written, what rounding may do to it is subtracted once more
     assert proven.max() <= searched.result.lower_bound + 1e-12 * searched.result.cost_scale
-
-
-def walk_of(trace: sr.SearchTrace) -> np.ndarray:
-    """The value where the walk stands after each evaluation, by what is noted of it; NaN where nothing is."""
-    first = np.searchsorted(trace.outer, trace.outer)
-    stands = trace.notes["stands"]
-    known = stands >= 1
-    walk = np.full(trace.value.size, np.nan)
-    walk[known] = trace.value[first[known] + stands[known].astype(int) - 1]
-    return walk
 
 
 def test_the_walk_has_the_values_of_the_trace_and_steps_to_what_was_accepted(searched: sr.Outcome) -> None:
@@ -294,16 +252,28 @@ def test_a_flat_slice_says_so_and_has_no_range_of_its_own() -> None:
     from sparserob_rerun.search.landscape import Landscape
     from sparserob_rerun.search.terrain import _said
 
-    constant = Plain(lambda s: 0.632, [1.0, 0.0])
+    constant: Any = Plain(lambda s: 0.632, [1.0, 0.0])
     pair = chosen(constant, np.array([[0.5], [0.7]]))
     assert pair is not None
-    landscape = Landscape(constant, np.array([[0.5], [0.7]]), *pair, 8)  # type: ignore[arg-type]
+    landscape = Landscape(constant, np.array([[0.5], [0.7]]), *pair, 8)
     list(landscape.evaluate())
     assert landscape.flat and landscape.limits == (0.632, 0.632)
     assert _said(landscape) == "g does not depend on these two here: it is 0.632"
     tilted = Landscape(Plain(lambda s: s[0, 0], [1.0, 0.0]), np.array([[0.5], [0.7]]), (0, 0), (1, 0), 8)  # type: ignore[arg-type]
     list(tilted.evaluate())
     assert not tilted.flat and "from 0 (dark) to 1 (bright)" in _said(tilted)
+
+
+@pytest.mark.parametrize("place", [0.0, 1e-17, 1.0 / 7.0 + 1e-15, 0.5, 1.0])
+def test_a_tuple_beside_a_line_of_the_grid_takes_its_place(place: float) -> None:
+    from sparserob_rerun.search.landscape import Landscape
+
+    tilted: Any = Plain(lambda s: s[0, 0] + s[1, 0], [1.0, 1.0])
+    landscape = Landscape(tilted, np.array([[place], [0.3]]), (0, 0), (1, 0), 8)
+    list(landscape.evaluate())
+    assert landscape.axes[0][landscape.at[0]] == place and landscape.value == place + 0.3
+    assert np.diff(landscape.axes[0]).min() > 1e-3
+    assert landscape.axes[0].size == (8 if place != 0.5 else 9)
 
 
 def test_g_has_the_value_that_a_search_has_whatever_the_units(tmp_path: Path) -> None:
@@ -438,7 +408,7 @@ def test_a_process_that_dies_is_noticed_and_costs_nothing(tmp_path: Path, caplog
     started = time.perf_counter()
     for _ in range(2000):
         outlet.send(sr.ProofProgress(family="path", cells=1, bound=0.0))
-    assert any("ended early" in line for line in outlet.close())
+    assert any("ended early" in line and "x.rrd holds what was" in line for line in outlet.close())
     assert time.perf_counter() - started < 5.0
 
 

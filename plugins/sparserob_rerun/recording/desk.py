@@ -40,19 +40,20 @@ class Account:
     """What the process says of itself at the end."""
 
     wrong: list[str] = field(default_factory=list)
+    broke_off: str = ""
     addresses: list[str] = field(default_factory=list)
 
 
 def record(messages: Any, report: Any, opening: Opening, chosen: Destinations, name: str) -> None:
     """The whole life of the process. Nothing that it does can reach the run: neither its signals nor its failures."""
     _settle()
-    parent, wrong = os.getppid(), []
+    account = Account()
     try:
-        wrong = _record(messages, opening, chosen, name, parent)
+        account = Account(_record(messages, opening, chosen, name, os.getppid()))
     except Exception as error:  # noqa: BLE001  shown at the end, by the process that has a terminal
-        wrong = [f"the recording broke off: {type(error).__name__}: {error}"]
+        account = Account(broke_off=f"the recording broke off: {type(error).__name__}: {error}")
     with suppress(OSError):
-        report.send(Account(wrong))
+        report.send(account)
         report.close()
 
 
@@ -139,12 +140,16 @@ def _receive(message: Any, recorder: Recorder, wrong: list[str]) -> None:
 
 
 def _finish_landscape(recorder: Recorder, opening: Opening) -> None:
-    """A short run waits for its landscape; a long one had it meanwhile, and one that broke off does not wait."""
+    """A short run waits for its landscape; a long one had it meanwhile, and waits for a coarse one of its last tuple;
+    one that broke off does not wait."""
     if opening.landscape is None or recorder.over < 0.0:
         return
+    explorer = recorder.explorer
     shown = recorder.terrain.known is not None
     seconds = recorder.patience - (0.5 * recorder.over if shown and not opening.waits else 0.0)
-    recorder.draw("the landscape", recorder.explorer.finish, seconds)
+    recorder.draw("the landscape", explorer.finish, seconds)
+    if explorer.waiting is not None or explorer.urgent:
+        recorder.draw("the landscape", explorer.finish, recorder.patience, 8)
     recorder.mark()
 
 

@@ -23,6 +23,7 @@ CAPACITY = 512  # events that may wait
 COLLECTING = 0.4  # seconds for which evaluations are collected before they are sent
 LARGE = 64  # coordinates of one index from which on only times and parameters are sent
 CLOSING = 20.0  # seconds that the process may take to finish its files, beyond the patience of the landscape
+OVER = 600.0  # the same for a run that is over, and has nothing else to wait for
 START = "fork" if sys.platform.startswith("linux") else "spawn"
 
 
@@ -33,6 +34,8 @@ class Outlet:
     def __init__(self, opening: Opening, chosen: Destinations, parameters: int, capacity: int = CAPACITY) -> None:
         context: Any = multiprocessing.get_context(START)
         self.patience = 0.0 if opening.landscape is None else opening.landscape.patience
+        self.file, self.incomplete = chosen.save, ""
+        self.closing = OVER if opening.waits else CLOSING
         self.parameters, self.dropped, self.dead = parameters, 0, False
         self.pending: list[sr.EvaluationsFinished] = []
         self.since = 0.0
@@ -83,13 +86,14 @@ class Outlet:
         self.dropped += 1
 
     def close(self, keep: float = 0.0) -> list[str]:
-        """End the recording; returns what there is to complain about. An interrupt ends the waiting, not more."""
+        """End the recording; returns what there is to complain about, and keeps in ``incomplete`` why the recording is
+        not whole, if it is not. An interrupt ends the waiting, not more."""
         wrong = []
         self._flush()
         try:
             wrong = self._closed(keep)
         except KeyboardInterrupt:
-            wrong = [] if keep else ["interrupted while the recording was being finished"]
+            self.incomplete = "" if keep else "interrupted while the recording was being finished"
         finally:
             if self.process.is_alive():
                 self.process.terminate()
@@ -98,12 +102,12 @@ class Outlet:
                 self.process.kill()
             self.messages.cancel_join_thread()
             self.messages.close()
-        if self.dropped:
-            wrong.append(f"{self.dropped} events came faster than they could be recorded, and were dropped")
-        return wrong
+        if self.dropped and not self.incomplete:
+            self.incomplete = f"{self.dropped} events came faster than they could be recorded, and were dropped"
+        return [*([self.incomplete] if self.incomplete else []), *wrong]
 
     def _closed(self, keep: float) -> list[str]:
-        end = time.monotonic() + self.patience + CLOSING
+        end = time.monotonic() + self.patience + self.closing
         while self.process.is_alive() and time.monotonic() < end:
             with suppress(queue.Full):
                 self.messages.put(Ending(self.dropped, keep), timeout=0.2)
@@ -113,15 +117,14 @@ class Outlet:
                 with suppress(EOFError, OSError):
                     account = self.report.recv()
                     self.process.join(CLOSING)
-                    return list(account.wrong) if isinstance(account, Account) else []
+                    if isinstance(account, Account):
+                        self.incomplete = account.broke_off
+                        return list(account.wrong)
                 break
-        return [
-            (
-                "the process that records ended early"
-                if not self.process.is_alive()
-                else "the recording could not be finished in time"
-            )
-        ]
+        holds = f"; {self.file} holds what was recorded until then" if self.file is not None else ""
+        why = "could not be finished in time" if self.process.is_alive() else "broke off: its process ended early"
+        self.incomplete = f"the recording {why}{holds}"
+        return []
 
     def _thin(self, event: sr.EvaluationsFinished) -> sr.EvaluationsFinished:
         """The event without what is too much: of an index with many coordinates the time and the parameters are

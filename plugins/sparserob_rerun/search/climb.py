@@ -13,7 +13,7 @@ from sparserob_rerun.drawing.canvas import Axes, Drawing, ticks
 from sparserob_rerun.drawing.palette import Floats
 from sparserob_rerun.search.way import Stage
 
-WIDTH, HEIGHT, GAP = 900.0, 300.0, 66.0
+WIDTH, HEIGHT, GAP = 1150.0, 300.0, 80.0
 EXTENT = (-70.0, WIDTH + 20.0, -62.0, HEIGHT + 62.0)
 CORNERS, POINTS = 500, 300  # of a curve, and of a cloud, in one panel
 MOST = 6  # panels beside one another; of more stages the last ones
@@ -39,7 +39,7 @@ class Climb:
         words = "across: evaluations of g" + (f"; {hidden} earlier searches are not shown" if hidden > 0 else "")
         drawing.text(WIDTH / 2, HEIGHT + 36.0, words, ink.GREY)
         drawing.log(
-            self.rr, self.stream, "search/stages", layers=("frame", "restart", "bound", "exact", "walk", "best")
+            self.rr, self.stream, "search/stages", layers=("frame", "restart", "bound", "exact", "best", "walk")
         )
         for name, colour, size in (("tried", ink.SKY, 1.4), ("refused", ink.REFUSED, 1.2)):
             points = np.concatenate([np.zeros((0, 2)), *clouds[name]])
@@ -72,7 +72,7 @@ class Climb:
             if level is not None and low <= level <= high:
                 drawing.line(layer, axes.at(np.array(axes.x), np.full(2, level)), colour, 2.0)
         if np.isfinite(stage.lower_bound) and not low <= stage.lower_bound <= high:
-            drawing.text(place[0] + place[1] / 2, HEIGHT - 12.0, f"proven: at least {stage.lower_bound:.5g}", ink.GREEN)
+            drawing.text(place[0] + place[1] / 2, HEIGHT - 12.0, f"proven ≥ {stage.lower_bound:.5g}", ink.GREEN)
         few = _corners(best)
         drawing.line("best", axes.at(numbers[few], best[few]), ink.ORANGE, 2.5)
         known = np.flatnonzero(~np.isnan(walk))

@@ -18,6 +18,7 @@ from sparserob_rerun.drawing.palette import Floats
 
 STRIDES = (8, 4, 2, 1)
 FLAT = 1e-9  # of g: smaller differences are the solver's
+CLOSE = 0.01  # of the distance of two lines of the grid
 PROBES = (0.06, 0.5, 0.94)  # where in its range a coordinate is tried
 MOST = 6  # coordinates that are tried
 
@@ -55,8 +56,12 @@ class Landscape:
         self.values = np.full((self.axes[0].size, self.axes[1].size), np.nan)
 
     def _axis(self, place: Place) -> tuple[Floats, int, np.ndarray]:
-        """The values along an axis, which of them is the anchor's, and which are those of the even grid."""
+        """The values along an axis, which of them is the anchor's, and which are those of the even grid; where one of
+        these is close to the anchor, it moves there."""
         even = np.linspace(self.g.slot.lower[place[1]], self.g.slot.upper[place[1]], self.grid)
+        nearest = int(np.abs(even - self.anchor[place]).argmin())
+        if abs(even[nearest] - self.anchor[place]) < CLOSE * (even[-1] - even[0]) / self.grid:
+            even[nearest] = self.anchor[place]
         values = np.union1d(even, [self.anchor[place]])
         return values, int(np.searchsorted(values, self.anchor[place])), np.searchsorted(values, even)
 

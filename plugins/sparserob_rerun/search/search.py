@@ -84,7 +84,7 @@ class SearchView:
                 rows = self.rr.Scalars.columns(scalars=_shown(values))
                 self.stream.send_columns(f"search/g/{name}", at(np.arange(count)), rows)
         self._notes(event, stage, numbers, began)
-        self._moves(event, numbers, moving, kept)
+        self._moves(event, stage, numbers, moving, kept)
         self.timelines.move(stage.base + event.total, event.round, began + event.seconds)
 
     def exact(self, value: float, epsilon: float) -> None:
@@ -134,12 +134,14 @@ class SearchView:
         return np.asarray((sums[ends] - sums[starts]) / (ends - starts))
 
     def _moves(
-        self, event: sr.EvaluationsFinished, numbers: np.ndarray, moving: dict[int, str], kept: np.ndarray
+        self, event: sr.EvaluationsFinished, stage: Stage, numbers: np.ndarray, moving: dict[int, str], kept: np.ndarray
     ) -> None:
-        """The value of the coordinates that moved, one series for each kind: to which time, to which parameter."""
+        """Where the coordinates went that moved, one series for each kind: to which time, to which parameter. Of a walk
+        the moves that it accepted."""
         trace, moves = event.batch.trace, event.batch.moves
         if not len(moves) or trace.points.shape[1:] != kept.shape or not kept.size:
             return
+        moves = moves[~stage.refused[stage.values.size - trace.values.size :][moves[:, 0]]]
         kinds = kept[moves[:, 1]] % event.block
         for kind, name in moving.items():
             mine = _few(moves[kinds == kind])
@@ -151,7 +153,7 @@ class SearchView:
                 return [self.rr.TimeColumn("evaluation", sequence=numbers[rows[which, 0]])]
 
             values = trace.points[mine[:, 0], mine[:, 1]]
-            self._cloud(f"search/moves/{name}", at, values, (f"{name} tried", ink.PURPLE))
+            self._cloud(f"search/moves/{name}", at, values, (f"{name} of what moved", ink.PURPLE))
 
     def _line(self, path: str, words: str, colour: Colour, width: float = 1.5) -> None:
         if path not in self.known:

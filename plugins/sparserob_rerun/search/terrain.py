@@ -47,7 +47,7 @@ class Terrain:
         weight = f"epsilon {landscape.epsilon:.3g}: " if landscape.epsilon > 0.0 else ""
         drawing.frame(axes, f"{weight}{aim.words}")
         drawing.text(axes.width / 2, axes.height + 34.0, f"across: {one}, up: {other}", ink.INK)
-        drawing.text(axes.width / 2, axes.height + 54.0, _said(landscape), ink.GREY)
+        drawing.text(axes.width / 2, axes.height + 56.0, _said(landscape), ink.GREY)
         drawing.log(self.rr, self.stream, "landscape/map/axes", layers=("frame",))
         self._anchor(landscape, axes)
         across, up, values = landscape.shown
@@ -122,16 +122,16 @@ class Terrain:
         )
         marks = [axes.at(path.now[0], path.now[1])]
         labels, colours, sizes = ["now"], [ink.INK], [4.0]
-        for number, place in enumerate(path.restarts[-6:], start=max(0, len(path.restarts) - 6) + 1):
+        for place in path.restarts[-6:]:
             marks.append(axes.at(place[0], place[1]))
-            labels.append(f"restart {number}")
+            labels.append("")
             colours.append(ink.PURPLE)
             sizes.append(3.5)
         landscape = self.known
         slots = stage.best.reshape(-1, stage.block) if stage.best.size else np.zeros((0, 1))
         if slots.shape == landscape.anchor.shape and not np.array_equal(slots, landscape.anchor):
             marks.append(axes.at(slots[landscape.first], slots[landscape.second]))
-            labels.append(f"better since, {stage.best_value:.6g}, beside this slice")
+            labels.append(f"since: {stage.best_value:.6g}, beside the slice")
             colours.append(ink.HALF)
             sizes.append(4.5)
         self.stream.log(

@@ -58,7 +58,7 @@ def tab(rrb: Any, told: Collection[str], moved: Collection[str]) -> Any:
     order = [name for name in (*LOGARITHMIC, *NOTES) if name in told]
     mine = [_note(rrb, name) for name in dict.fromkeys([*order, *sorted(told)])]
     where = [
-        series(rrb, "/search/moves", f"Where it looks: {name}", [f"+ /search/moves/{name}"]) for name in sorted(moved)
+        series(rrb, "/search/moves", f"Where it moves: {name}", [f"+ /search/moves/{name}"]) for name in sorted(moved)
     ]
     left = rrb.Vertical(climb(), series(rrb, "/search/g", "g, with the share of the regulariser"), row_shares=[3, 2])
     columns = [rrb.Vertical(*group) for group in (mine, where) if group]

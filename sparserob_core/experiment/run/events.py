@@ -91,6 +91,11 @@ class Observer(ABC):
     """Watches a run. It receives `RunStarted` first and `RunFinished` last, each once, and in between whatever happens,
     on the solver's thread: what takes long belongs into a thread or a process of its own, begun at `RunStarted`."""
 
+    @property
+    def incomplete(self) -> str:
+        """Why what it was to leave is not complete, in words; empty as long as it is."""
+        return ""
+
     @abstractmethod
     def receive(self, event: Event) -> None:
         """Take note of an event; ignore those of unknown type. Whatever this raises only detaches the observer."""

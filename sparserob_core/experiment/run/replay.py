@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.experiment.directory.finished import UNFINISHED, StoredRun, stored_run
 from sparserob_core.experiment.run.events import Event, RunFinished, RunStarted
 from sparserob_core.experiment.run.inspection import Inspection
-from sparserob_core.experiment.run.viewer import recorder
+from sparserob_core.experiment.run.viewer import recorded, recorder
 from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Batch, EvaluationsFinished
@@ -33,6 +33,7 @@ def replay(
     serve: bool = False,
     connect: str | None = None,
     plugins: Iterable[str | Path] = (),
+    remark: Callable[[str], object] = lambda line: None,
 ) -> Path:
     """Send a finished run to the viewer of Rerun, as `watch` does: what ``sparserob replay RUN`` does. Returns the
     run's directory.
@@ -40,7 +41,8 @@ def replay(
     The controls of all rounds come from ``rounds.npz``, the evaluations of g, with their tuples and with what the
     maximiser noted, from ``evaluations.npz``; of the searches for violated constraints, and of what a maximiser shows
     beside its points, a run directory keeps nothing. ``plugins``: files that offer what the run was made with;
-    the directory itself is data, and no plugin that it names is loaded. Raises `InputError` for a directory that holds
+    the directory itself is data, and no plugin that it names is loaded.
+    ``remark`` is told what was recorded into ``save``. Raises `InputError` for a directory that holds
     no finished run.
     """
     run = stored_run(directory)
@@ -48,18 +50,21 @@ def replay(
         raise InputError(f"{directory}: expected a finished run, got one that is still going on or was killed")
     title = printable(run.summary["title"] or run.directory.name)
     inspection, result = Inspection(run.config(plugins)), stored_result(run)
-    play(events(inspection, title, run.directory, result), save=save, serve=serve, connect=connect)
+    said = play(events(inspection, title, run.directory, result), save=save, serve=serve, connect=connect)
+    for line in said:
+        remark(line)
     return run.directory
 
 
-def play(recorded: Iterator[Event], *, save: str | Path | None, serve: bool, connect: str | None) -> None:
-    """Hand events to a recorder."""
+def play(told: Iterator[Event], *, save: str | Path | None, serve: bool, connect: str | None) -> tuple[str, ...]:
+    """Hand events to a recorder; returns what was recorded, in words."""
     observer = recorder(save, serve, connect, PATIENCE)
     try:
-        for event in recorded:
+        for event in told:
             observer.receive(event)
     finally:
         observer.close()
+    return recorded(observer, save)
 
 
 def events(inspection: Inspection, title: str, directory: Path | None, result: Result) -> Iterator[Event]:

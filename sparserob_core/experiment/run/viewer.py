@@ -41,6 +41,13 @@ def recorder(save: str | Path | None, serve: bool, connect: str | None, patience
     return observer
 
 
+def recorded(observer: Observer, save: str | Path | None) -> tuple[str, ...]:
+    """What the file holds that was to be recorded into, in words; nothing where there was to be none."""
+    if save is None:
+        return ()
+    return (f"{save} is not complete: {observer.incomplete}" if observer.incomplete else f"recorded into {save}",)
+
+
 def _writable(file: Path) -> Path:
     """The absolute path of a file that can be written."""
     path = file.absolute()

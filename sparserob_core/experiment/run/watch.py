@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from sparserob_core.experiment.run.run import Outcome, run
-from sparserob_core.experiment.run.viewer import recorder
+from sparserob_core.experiment.run.viewer import recorded, recorder
 
 
 def watch(
@@ -26,6 +27,8 @@ def watch(
 
     A viewer is started, unless it is to be recorded into the file ``save``, shown in a browser of this machine
     (``serve``), or sent to a viewer that listens at ``connect``. Raises `InputError` before anything is solved where
-    that cannot be had.
+    that cannot be had. The outcome's ``remarks`` say whether all of it was recorded.
     """
-    return run(config, overrides, out, quiet=quiet, figures=figures, observers=[recorder(save, serve, connect)])
+    watching = recorder(save, serve, connect)
+    outcome = run(config, overrides, out, quiet=quiet, figures=figures, observers=[watching])
+    return replace(outcome, remarks=(*outcome.remarks, *recorded(watching, save)))

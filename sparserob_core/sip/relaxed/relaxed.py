@@ -256,7 +256,8 @@ class RelaxedProgram:
             imposed = Imposed(positions, multipliers, solution)
             if solution.status == "infeasible" or not np.isfinite(solution.x).all():
                 break
-            excess = (G @ solution.x - h) / norms
+            with np.errstate(over="ignore"):  # a row that is zero, with a right-hand side that nothing keeps
+                excess = (G @ solution.x - h) / norms
             excess[positions] = -np.inf
             fresh = _most_violated(excess, kinds)
             if not fresh.size:

@@ -29,7 +29,5 @@ def replay(directory: Path, save: Path | None, serve: bool, connect: str | None,
     """
     from sparserob_core.experiment.run.replay import replay as replay_run
 
-    replay_run(directory, save=save, serve=serve, connect=connect, plugins=plugins)
-    if save is not None:
-        click.echo(f"recorded into {save}")
+    replay_run(directory, save=save, serve=serve, connect=connect, plugins=plugins, remark=click.echo)
     return 0

@@ -43,10 +43,6 @@ def watch(
 
     outcome = watch_run(config, overrides, out, save=save, serve=serve, connect=connect, figures=figures)
     print_table(outcome.experiment.title, (), result_rows(finite(outcome.summary)))
-    for line in (
-        *outcome.remarks,
-        f"written to {outcome.directory}",
-        *([] if save is None else [f"recorded into {save}"]),
-    ):
+    for line in (f"written to {outcome.directory}", *outcome.remarks):
         click.echo(printable(line))
     return EXIT[outcome.status] if serve else status_unless_interrupted(EXIT[outcome.status])

@@ -1,0 +1,67 @@
+"""Recordings of the viewer of Rerun, read back as numbers and text."""
+
+from __future__ import annotations
+
+import warnings
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import sparserob_core as sr
+
+
+def viewer() -> Path:
+    import rerun_cli
+
+    return Path(rerun_cli.__file__).parent / "rerun"
+
+
+def read(file: Path) -> dict[str, list[Any]]:
+    """The chunks of a recording by entity, without the static ones."""
+    from rerun.chunk import RrdReader
+
+    found: dict[str, list[Any]] = defaultdict(list)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a file that nobody closed
+        for chunk in RrdReader(str(file)).stream():
+            if not chunk.is_static:
+                found[chunk.entity_path].append(chunk)
+    return found
+
+
+def scalars(chunks: list[Any], timeline: str) -> tuple[np.ndarray, np.ndarray]:
+    """Times ``(k,)`` and values ``(k, series)`` of an entity, in the order of a timeline."""
+    times, values = [], []
+    for chunk in chunks:
+        batch = chunk.to_record_batch()
+        times += np.asarray(batch.column(timeline)).astype(np.int64).tolist()
+        values += [np.array(row, dtype=float) for row in batch.column("Scalars:scalars").to_pylist()]
+    order = np.argsort(times, kind="stable")
+    return np.array(times)[order], np.array(values)[order]
+
+
+def texts(chunks: list[Any], component: str) -> list[str]:
+    return [row[0] for chunk in chunks for row in chunk.to_record_batch().column(component).to_pylist()]
+
+
+def rows(chunks: list[Any], *columns: str) -> list[dict[str, np.ndarray]]:
+    """The rows of an entity, each column as an array, in the order in which they were logged."""
+    found = []
+    for chunk in chunks:
+        batch = chunk.to_record_batch()
+        for place in range(batch.num_rows):
+            entries = {name: batch.column(name)[place].as_py() for name in columns if name in batch.schema.names}
+            found.append({name: np.asarray(entry) for name, entry in entries.items()})
+    return found
+
+
+def walk_of(trace: sr.SearchTrace) -> np.ndarray:
+    """The value where the walk stands after each evaluation, by what is noted of it; NaN where nothing is."""
+    first = np.searchsorted(trace.outer, trace.outer)
+    stands = trace.notes["stands"]
+    known = stands >= 1
+    walk = np.full(trace.value.size, np.nan)
+    walk[known] = trace.value[first[known] + stands[known].astype(int) - 1]
+    return walk
