@@ -21,6 +21,11 @@ class Serial(sr.ExecutorFactory, sr.Options):
     from the keyboard goes through at once. Linear algebra has one thread until the executor is closed, as it has in the
     workers of other executors: sums are then added up in the same order everywhere."""
 
+    @property
+    def parallel(self) -> bool:
+        """Nothing is made side by side."""
+        return False
+
     @contextmanager
     def open(self) -> Iterator[Executor]:
         """See `sparserob_core.ExecutorFactory`."""
@@ -29,7 +34,7 @@ class Serial(sr.ExecutorFactory, sr.Options):
 
 
 class Processes(sr.ExecutorFactory, sr.Options):
-    """Processes of this machine, each with one thread of linear algebra.
+    """Processes of this machine, each with one thread of linear algebra, as this one has meanwhile.
 
     A worker is a fresh Python (``spawn``): what is submitted is sent there, so it must be possible to pickle it, and
     the script that is run here does not run there again; functions belong into a module, or into a file that the config
@@ -46,7 +51,7 @@ class Processes(sr.ExecutorFactory, sr.Options):
         """See `sparserob_core.ExecutorFactory`."""
         from sparserob_executors.processes import Pool, processors
 
-        with Pool(self.workers or processors()) as executor:
+        with one_thread(), Pool(self.workers or processors()) as executor:
             yield executor
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,11 +15,13 @@ from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.config.load import Loaded
+from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.plugins.guards import guarded
 from sparserob_core.experiment.solve import indicators
 from sparserob_core.sip.method import Deadline, Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
+from sparserob_core.sip.regulariser import Regulariser
+from sparserob_core.sip.solver import Solver
 
 if TYPE_CHECKING:
     from sparserob_core.experiment.config.run_config import Entry
@@ -153,6 +156,27 @@ def _dictionary(loaded: Loaded, which: str, entry: Entry, horizon: float) -> Dic
     except InputError as error:
         raise loaded.located(("dictionaries", which), error) from error
     return dictionary
+
+
+@final
+@dataclass(frozen=True)
+class Anew:
+    """The program of a resolved ``config`` (its JSON) in its own units, its solver and its regulariser, made anew
+    wherever it is called."""
+
+    config: str
+
+    @staticmethod
+    def of(loaded: Loaded) -> Anew:
+        """What makes the program of a config."""
+        plain = {**loaded.config.plain(), "executor": {"name": "serial"}, "observers": []}
+        return Anew(json.dumps(plain))
+
+    def __call__(self) -> tuple[SemiInfiniteProgram, Solver, Regulariser | None]:
+        loaded = load_config(json.loads(self.config))
+        program, tools = assemble(loaded).program, tools_of(loaded)
+        own = program.own_units
+        return program if own is None else own.program, tools.solver, tools.regulariser
 
 
 def tools_of(loaded: Loaded) -> Tools:

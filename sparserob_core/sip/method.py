@@ -11,7 +11,7 @@ from concurrent.futures import Executor
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from types import FrameType
-from typing import ClassVar, final
+from typing import ClassVar, TypeAlias, final
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -100,6 +100,11 @@ class Deadline:
         return f"the limit of {self.seconds:g} s is reached" if time.monotonic() >= self._ends else ""
 
     @property
+    def left(self) -> float | None:
+        """The seconds that are left, a millisecond at least; none without a limit."""
+        return None if self.seconds is None else max(1e-3, self._ends - time.monotonic())
+
+    @property
     def passed(self) -> bool:
         """Whether the time is over."""
         return bool(self._interrupted) or time.monotonic() >= self._ends
@@ -156,6 +161,10 @@ def as_seconds(seconds: object) -> float | None:
     return float(seconds)
 
 
+Rebuild: TypeAlias = Callable[[], tuple[SemiInfiniteProgram, Solver, Regulariser | None]]
+"""Makes a program, the solver and the regulariser anew; it can be pickled, and equal ones make the same."""
+
+
 @dataclass(frozen=True, eq=False)
 class Tools:
     """The components that a config has chosen. ``regulariser`` may be ``None``: the unregularised program is then
@@ -163,6 +172,8 @@ class Tools:
 
     ``budget``: evaluations that one search of the maximiser may spend, of which the share ``polish`` goes to a local
     method at its end. ``executor``: workers for programs that do not depend on one another; ``None``: solve them here.
+    ``rebuild`` makes the program that the method is handed, its solver and its regulariser anew on a worker, since a
+    program with functions of a user cannot be sent; ``None``: it cannot be made there.
     ``deadline``: when a method has to end with what it knows.
     """
 
@@ -173,6 +184,7 @@ class Tools:
     budget: int = 2000
     polish: float = 0.0
     executor: Executor | None = None
+    rebuild: Rebuild | None = None
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
     notify: Notify = ignore
     deadline: Deadline = field(default_factory=Deadline)
@@ -180,6 +192,11 @@ class Tools:
 
 class ExecutorFactory(ABC):
     """Opens the workers on which independent programs are solved."""
+
+    @property
+    def parallel(self) -> bool:
+        """Whether calls are made side by side; if not, it is of no use to send them."""
+        return True
 
     @abstractmethod
     def open(self) -> AbstractContextManager[Executor]:

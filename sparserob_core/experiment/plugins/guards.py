@@ -106,6 +106,10 @@ class _Executors(ExecutorFactory):
     def __init__(self, executors: ExecutorFactory, origin: str) -> None:
         self._executors, self.origin = executors, origin
 
+    @property
+    def parallel(self) -> bool:
+        return asked(self.origin, "parallel", lambda: self._executors.parallel, bool)
+
     @contextmanager
     def open(self) -> Iterator[Executor]:
         with ExitStack() as stack:

@@ -11,7 +11,7 @@ from typing import Any, final
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.transcription.provable import unprovable
 from sparserob_core.errors import named
-from sparserob_core.experiment.assemble import ControlExperiment, Experiment, assemble, build, name_of, tools_of
+from sparserob_core.experiment.assemble import Anew, ControlExperiment, Experiment, assemble, build, name_of, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import create_directory
@@ -112,14 +112,28 @@ def run_loaded(
 ) -> Outcome:
     """`run`, of a config that was loaded; ``git``: the revision of its folder, as `git_revision` has it."""
     origin = provenance(loaded.config.plain(), git)
-    deadline = Deadline(loaded.config.limits.seconds)  # the transcription counts too
-    experiment = assemble(loaded)
-    tools, watching = (
-        replace(tools_of(loaded), deadline=deadline),
-        [*_observers(loaded), *((type(observer).__name__, observer) for observer in observers)],
-    )
-    method: Method = build(loaded, "method", loaded.config.method)
     executors: ExecutorFactory = build(loaded, "executor", loaded.config.executor)
+    with executors.open() as executor:  # first: what is added up from here on is added up as on the workers
+        rebuild = Anew.of(loaded) if executors.parallel else None
+        tools = replace(tools_of(loaded), executor=executor, rebuild=rebuild)
+        return _run(loaded, tools, origin, out, quiet=quiet, figures=figures, observers=observers)
+
+
+def _run(
+    loaded: Loaded,
+    tools: Tools,
+    origin: Mapping[str, Any],
+    out: str | Path | None,
+    *,
+    quiet: bool,
+    figures: bool,
+    observers: Iterable[Observer],
+) -> Outcome:
+    deadline = Deadline(loaded.config.limits.seconds)  # the transcription counts too
+    tools = replace(tools, deadline=deadline)
+    experiment = assemble(loaded)
+    watching = [*_observers(loaded), *((type(observer).__name__, observer) for observer in observers)]
+    method: Method = build(loaded, "method", loaded.config.method)
     with create_directory(out, name_of(loaded), loaded.config.digest()) as directory:
         journal = Journal(directory, experiment, origin)
         broadcast = Broadcast([("journal", journal), *watching])
@@ -141,9 +155,7 @@ def run_loaded(
                 )
             )
             try:
-                with executors.open() as executor:
-                    handed = replace(_notifying(tools, broadcast), executor=executor)
-                    result = solve_in_own_units(method, experiment.program, handed)
+                result = solve_in_own_units(method, experiment.program, _notifying(tools, broadcast))
             except KeyboardInterrupt as pressed:  # a method that does not return what it knows
                 deadline.interrupt(pressed)
                 result, complete = journal.known(_said(pressed), time.perf_counter() - started), False

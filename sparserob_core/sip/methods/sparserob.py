@@ -21,11 +21,13 @@ from sparserob_core.errors import InputError
 from sparserob_core.options import Options, part
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import EvaluationsFinished, forwarded
+from sparserob_core.sip.evidence import Dual
 from sparserob_core.sip.method import GAP_TOLERANCE, Deadline, Method, Tools
 from sparserob_core.sip.methods.ledger import Answer, Ledger
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.proof.branch_and_bound import prove
 from sparserob_core.sip.proof.verdict import as_bad_as_found, worst_of
+from sparserob_core.sip.relaxed.batches import Batches, Oracle
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram
 from sparserob_core.sip.relaxed.tuples import TupleValue, imposed_program
 from sparserob_core.sip.result import Result, SearchTrace
@@ -146,19 +148,18 @@ def _searched(
     far the multipliers are turned into a lower bound. An interrupt leaves the optimiser of the best tuple with the
     ledger, and goes on."""
     tools, began = ledger.tools, time.perf_counter() - ledger.started
-    best, proven = -np.inf, []
+    proven: list[float] = []
     g.epsilon = epsilon
+    oracle = None if tools.rebuild is None else Oracle(tools.rebuild, method.formulation, g.layout.count)
+    batches = Batches(g, oracle, tools.executor, tools.budget)
+
+    def tell(value: float, bound: Dual | None) -> None:
+        if bound is not None:
+            ledger.improve(bound)
+        proven.append(ledger.lower)
 
     def values(points: Array) -> Array:
-        nonlocal best
-        found = np.empty(len(points))
-        for i, one in enumerate(points):
-            found[i] = g.at(one)
-            if np.isfinite(found[i]) and found[i] > best:
-                best = found[i]
-                ledger.improve(ledger.relaxed.lower_bound(g.rows(), g.solution))
-            proven.append(ledger.lower)
-        return found
+        return batches.values(points, tell)
 
     def completed(event: EvaluationsFinished) -> EvaluationsFinished:
         return replace(event, round=j + 1, epsilon=epsilon, lower_bound=ledger.lower)

@@ -94,6 +94,7 @@ class TupleValue:
         self.slots = np.full((count, self.block), np.nan)
         self.imposed, self.solution = Imposed(np.zeros(0, dtype=int), np.zeros(0)), _nothing(program.n)
         self._solved_for = np.nan
+        self._owed: Array | None = None
         first = [self._family_rows(family, self.layout.slot.lower[np.newaxis]) for family in program.families]
         ends = np.cumsum([h.shape[1] for _, h in first], dtype=int)
         self._columns = list(zip(program.families, ends - [h.shape[1] for _, h in first], ends, strict=True))
@@ -108,8 +109,21 @@ class TupleValue:
     def __call__(self, points: Array) -> Array:
         return np.array([self.at(point) for point in points])
 
+    def forget(self, point: Array | None = None) -> None:
+        """Let the next evaluation start from nothing. Whoever asks about the last tuple is answered about ``point``,
+        which is then evaluated for it."""
+        self.slots = np.full_like(self.slots, np.nan)
+        self.imposed, self.solution = Imposed(np.zeros(0, dtype=int), np.zeros(0)), _nothing(self.program.n)
+        self._before = _Before(np.zeros(0, dtype=int), self.slots[:0], self._G[:0], self._h[:0])
+        self._owed = None if point is None else point.copy()
+
+    def _settle(self) -> None:
+        if self._owed is not None:
+            self.at(self._owed)
+
     def at(self, point: Array) -> float:
         """``g`` at one point ``(D width,)``."""
+        self._owed = None
         changed = self._move(point.reshape(self.slots.shape))
         if self._unmoved(changed):
             return value_of(self.solution)
@@ -163,6 +177,7 @@ class TupleValue:
 
     def _acting(self) -> np.ndarray:
         """Which indices ``(D,)`` of the last tuple have a multiplier."""
+        self._settle()
         acts = np.zeros(self.layout.count, dtype=bool)
         acts[self.imposed.positions[self.imposed.multipliers > 0.0] // self._h.shape[1]] = True
         return acts
@@ -170,6 +185,7 @@ class TupleValue:
     def _steepest(self, point: Array) -> Array:
         """The tuple with the linear coordinates of every index where the row is violated most by the last optimum: the
         row that the index acts by, or else the one of any family that is then violated most."""
+        self._settle()
         slots, x = point.reshape(self.slots.shape).copy(), self.solution.x
         kinds = np.full(len(slots), -1)
         for position in self.imposed.positions[np.argsort(self.imposed.multipliers, kind="stable")]:
@@ -189,6 +205,7 @@ class TupleValue:
 
     def rows(self) -> Rows:
         """The rows that were imposed in the last evaluation, in the order of its multipliers."""
+        self._settle()
         slots, kinds = np.divmod(self.imposed.positions, self._h.shape[1])
         cuts = []
         for slot, kind, multiplier in zip(slots, kinds, self.imposed.multipliers, strict=True):

@@ -1,0 +1,167 @@
+"""``g`` at many tuples, here or on workers, to the same last bit.
+
+A relaxed program starts from the solution of the one before, so a value depends, within the solver's accuracy, on what
+was evaluated before it. A long batch is therefore cut into chunks of `CHUNK` tuples, each begun from nothing: what a
+chunk gives depends on nothing but its tuples, and not on where, when or beside what it is evaluated.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, Future
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.evidence import Dual
+from sparserob_core.sip.method import Deadline, OutOfTime, Rebuild
+from sparserob_core.sip.relaxed.relaxed import RelaxedProgram
+from sparserob_core.sip.relaxed.tuples import TupleValue, imposed_program
+
+CHUNK = 16
+"""Tuples that are evaluated one after the other from nothing."""
+LONG = 2 * CHUNK
+"""Tuples of a batch that is cut into chunks; in a shorter one each starts from the one before, which is quicker."""
+WORTH = 0.1
+"""Seconds of work that a batch must have left to be sent to workers."""
+START = 5.0
+"""Seconds of work that a search must have left for workers to be started, who build the program anew."""
+
+
+@dataclass(frozen=True, eq=False)
+class Valued:
+    """What a chunk gave: ``values (k,)``; ``duals``, the lower bound from the multipliers of each tuple whose value was
+    the best so far in its chunk, by its place in it; and how many programs were solved, by how many ``calls`` of the
+    solver. ``late``: why the time was over, if it was."""
+
+    values: Array
+    duals: dict[int, Dual]
+    solves: int
+    calls: int
+    late: str = ""
+
+
+def value_chunk(g: TupleValue, points: Array, best: float) -> Valued:
+    """Evaluate a chunk ``(k, D width)`` from nothing; ``best``: the best value before its batch, below which no bound
+    is of use."""
+    g.forget()
+    relaxed, duals = g.relaxed, dict[int, Dual]()
+    solves, calls = relaxed.solves, relaxed.counted.calls
+    values = np.empty(len(points))
+    for k, point in enumerate(points):
+        values[k] = g.at(point)
+        if np.isfinite(values[k]) and values[k] > best:
+            best = float(values[k])
+            duals[k] = relaxed.lower_bound(g.rows(), g.solution)
+    return Valued(values, duals, relaxed.solves - solves, relaxed.counted.calls - calls)
+
+
+@dataclass(frozen=True)
+class Oracle:
+    """How a worker makes ``g`` anew: the program and its components by ``rebuild``, in a ``formulation``, over tuples
+    of ``count`` indices. Equal oracles give equal values, and a worker keeps the last one that it has made."""
+
+    rebuild: Rebuild
+    formulation: Literal["reduced", "literal"]
+    count: int
+
+    def build(self) -> TupleValue:
+        """A new ``g``."""
+        program, solver, regulariser = self.rebuild()
+        imposed = imposed_program(program, self.formulation)
+        return TupleValue(imposed, RelaxedProgram(imposed, solver, regulariser), self.count)
+
+
+_kept: list[tuple[Oracle, TupleValue]] = []
+
+
+def on_worker(oracle: Oracle, points: Array, epsilon: float, best: float, seconds: float | None) -> Valued:
+    """`value_chunk` in a worker, who has ``seconds`` for it."""
+    if not _kept or _kept[0][0] != oracle:
+        _kept[:] = [(oracle, oracle.build())]
+    g = _kept[0][1]
+    g.epsilon, g.relaxed.deadline = epsilon, Deadline(seconds)
+    try:
+        return value_chunk(g, points, best)
+    except OutOfTime as over:
+        return Valued(np.empty(0), {}, 0, 0, late=str(over))
+
+
+class Batches:
+    """The values of ``g`` at batches of tuples: short ones one after the other, long ones in chunks, on the workers of
+    ``executor`` where there are some and the work is worth it.
+
+    ``budget``: evaluations that one search may still make, from which the work that is left is guessed. A worker that
+    fails costs nothing but its help: its chunks are evaluated here.
+    """
+
+    def __init__(self, g: TupleValue, oracle: Oracle | None, executor: Executor | None, budget: int) -> None:
+        self.g, self.oracle, self.executor, self.budget = g, oracle, executor, budget
+        self.sent = 0
+        self._best, self._started = -np.inf, False
+
+    def values(self, points: Array, tell: Callable[[float, Dual | None], None]) -> Array:
+        """``g`` at points ``(k, D width)``; ``tell`` is told each value in order, with the lower bound that its
+        multipliers prove where it is the best one so far."""
+        if len(points) < LONG:
+            return np.concatenate([self._told(self._next(point), tell) for point in points])
+        best = self._best
+        chunks = [points[first : first + CHUNK] for first in range(0, len(points), CHUNK)]
+        began = time.perf_counter()
+        found = [self._told(value_chunk(self.g, chunks[0], best), tell)]
+        seconds = time.perf_counter() - began
+        if self._worth(seconds, len(chunks) - 1, len(points)):
+            found += [self._told(one, tell) for one in self._elsewhere(chunks[1:], best)]
+        else:
+            found += [self._told(value_chunk(self.g, chunk, best), tell) for chunk in chunks[1:]]
+        self.g.forget(points[-1])
+        return np.concatenate(found)
+
+    def _next(self, point: Array) -> Valued:
+        """One value, from the solution of the one before."""
+        value = self.g.at(point)
+        better = np.isfinite(value) and value > self._best
+        bound = self.g.relaxed.lower_bound(self.g.rows(), self.g.solution) if better else None
+        return Valued(np.array([value]), {} if bound is None else {0: bound}, 0, 0)
+
+    def _told(self, chunk: Valued, tell: Callable[[float, Dual | None], None]) -> Array:
+        for k, value in enumerate(chunk.values):
+            better = np.isfinite(value) and value > self._best
+            if better:
+                self._best = float(value)
+            tell(float(value), chunk.duals[k] if better else None)
+        return chunk.values
+
+    def _worth(self, seconds: float, chunks: int, points: int) -> bool:
+        """Whether workers are to be asked: ``seconds`` is what a chunk has taken."""
+        self.budget -= points
+        if self.executor is None or self.oracle is None or seconds * chunks < WORTH:
+            return False
+        self._started = self._started or seconds * (chunks + max(self.budget, 0) / CHUNK) >= START
+        return self._started
+
+    def _elsewhere(self, chunks: Sequence[Array], best: float) -> Sequence[Valued]:
+        g, left = self.g, self.g.relaxed.deadline.left
+        assert self.executor is not None
+        assert self.oracle is not None
+        found, futures = list[Valued](), list[Future[Valued]]()
+        try:
+            for chunk in chunks:
+                futures.append(self.executor.submit(on_worker, self.oracle, chunk, g.epsilon, best, left))
+            for chunk, future in zip(chunks, futures, strict=True):
+                one = future.result()
+                if one.late:
+                    raise OutOfTime(g.relaxed.deadline.reason or one.late)
+                self.sent += len(chunk)
+                g.relaxed.solves += one.solves
+                g.relaxed.counted.calls += one.calls
+                found.append(one)
+        except Exception:  # noqa: BLE001  whatever it was: what is missing is done here, or raised here
+            self.executor = None
+        finally:
+            for future in futures:
+                future.cancel()
+        return [*found, *(value_chunk(g, chunk, best) for chunk in chunks[len(found) :])]
