@@ -37,6 +37,11 @@ class Lipo(sr.Maximiser, sr.Options):
     ``null``: none is known, so nothing can be excluded, and the search is pure random search; ``adalipo`` estimates
     one."""
 
+    @property
+    def polished(self) -> float:
+        """Nothing: its evaluations make the upper bound."""
+        return 0.0
+
     def search(self, objective: sr.Objective, rng: np.random.Generator) -> float:
         """See `sparserob_core.Maximiser`."""
         walk = Walk(objective, rng, uniform_scale=True)

@@ -26,10 +26,9 @@ class Nevergrad(sr.Maximiser, sr.Options):
     how many dimensions it is of use, nevergrad's documentation says for each; in a space of tuples nearly all of them
     change every block at each step. It proves no upper bound.
 
-    An optimiser that raises does not end the run. With numpy 2.4 or later NGOpt and its relatives do so for many pairs
-    of dimension and budget ("only 0-dimensional arrays can be converted to Python scalars"). The exception is reported
-    in one warning, and the search goes on with ``fallback``, which is given all that was evaluated, or else the
-    best of it.
+    An optimiser that raises does not end the run. The exception is reported in one warning, and the search goes on with
+    ``fallback``, which is given all that was evaluated, or else the best of it. (That NGOpt and its relatives raise
+    with numpy 2.4 or later, for an array of one number, is mended here.)
 
     Its own time is 0.2 to 20 milliseconds for each evaluation, and importing it takes seconds. Notes ``spread``: the
     distance, root mean square over the coordinates and in widths of the box, of each evaluated point from the best one.
@@ -128,12 +127,19 @@ def _registry() -> Any:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            from nevergrad.optimization import registry
+            from nevergrad.optimization import metamodel, registry
     except ImportError as error:
         raise sr.UnknownPluginError(
             "nevergrad: the package is not installed; `pip install 'sparserob[nevergrad]'` brings it"
         ) from error
+    # It calls float() with an array of one number, which numpy 2.4 and later refuse, and so fails in NGOpt.
+    metamodel.float = _number
     return registry
+
+
+def _number(value: Any) -> float:
+    """The only entry of an array, or the number itself, as a float."""
+    return float(np.asarray(value).item()) if isinstance(value, np.ndarray) else float(value)
 
 
 @sr.hookimpl

@@ -98,7 +98,7 @@ def maximise(
     name: Choice | Maximiser = "direct",
     budget: int = 1000,
     seed: int = 0,
-    polish: float = 0.0,
+    polish: float | None = None,
     gradient: Callable[[Array], Array] | None = None,
     notify: Notify = ignore,
     *,
@@ -110,7 +110,8 @@ def maximise(
     """Search for the maximum of ``f`` (points ``(k, d)`` to values ``(k,)``) over a box with the maximiser of that
     name.
 
-    The last share ``polish`` of the budget goes to a local method, from the best points. ``gradient`` maps a point
+    The last share ``polish`` of the budget goes to a local method, from the best points: a fifth unless given, nothing
+    for ``lipo``, ``random_search`` and ``sobol`` (`Maximiser.polished`). ``gradient`` maps a point
     ``(d,)`` to the gradient ``(d,)`` of ``f``, for maximisers and a polish that use it. ``start (d,)`` or ``(k, d)``:
     points that are evaluated first; maximisers that walk begin at the best of them. ``seconds``: no evaluation begins
     after that time. ``callback(points, values)`` is called after every batch of evaluations, ``notify`` with
@@ -121,14 +122,14 @@ def maximise(
     from sparserob_core.sip.search.search import Rules, Target
     from sparserob_core.sip.search.search import maximise as search
 
-    chosen = _chosen(box, name, options)
+    chosen, share = _chosen(box, name, options, polish)
     limit = as_seconds(seconds)
     return search(
         Target(f if callback is None else _told(f, _careful("callback", callback)), box, gradient),
         chosen,
         _whole("budget", budget, 1),
         np.random.default_rng(_whole("seed", seed, 0)),
-        Rules(polish=_share(polish), seconds=np.inf if limit is None else limit),
+        Rules(polish=share, seconds=np.inf if limit is None else limit),
         notify if notify is ignore else _careful("notify", notify),
         _placed(start, box),
     )
@@ -139,7 +140,7 @@ def ask_tell(
     name: Choice | Maximiser = "direct",
     budget: int = 1000,
     seed: int = 0,
-    polish: float = 0.0,
+    polish: float | None = None,
     *,
     start: Array | None = None,
     state: Mapping[str, Any] | None = None,
@@ -155,8 +156,8 @@ def ask_tell(
     from sparserob_core.sip.search.search import Rules, Target
     from sparserob_core.sip.search.search import maximise as search
 
-    chosen = _chosen(box, name, options)
-    first, rules = _placed(start, box), Rules(polish=_share(polish))
+    chosen, share = _chosen(box, name, options, polish)
+    first, rules = _placed(start, box), Rules(polish=share)
     number, calls = _whole("seed", seed, 0), _whole("budget", budget, 1)
     entry: object = {"name": name, **options} if isinstance(name, str) else name
     about = {
@@ -176,14 +177,17 @@ def ask_tell(
     return AskTell(box, run, about, state)
 
 
-def _chosen(box: object, name: Choice | Maximiser, options: Mapping[str, object]) -> Maximiser:
+def _chosen(
+    box: object, name: Choice | Maximiser, options: Mapping[str, object], polish: float | None
+) -> tuple[Maximiser, float]:
+    """The maximiser, and the share of its budget that goes to a polish."""
     if not isinstance(box, Box):
         raise InputError(f"box: expected a sparserob_core.Box, got {type(box).__name__}")
     if options and not isinstance(name, str):
         raise InputError(f"{', '.join(options)}: options as keywords need the maximiser's name, got {name!r}")
     entry = {"name": name, **options} if isinstance(name, str) else name
     chosen: Maximiser = component(load_registry(), "maximiser", entry, Maximiser)
-    return chosen
+    return chosen, chosen.polished if polish is None else _share(polish)
 
 
 def _placed(start: object, box: Box) -> Array | None:

@@ -117,6 +117,13 @@ class Objective(Protocol):
 class Maximiser(ABC):
     """A global maximiser over a box."""
 
+    @property
+    def polished(self) -> float:
+        """The share of a budget that goes to a local method at the end of `sparserob_core.maximise` and
+        `sparserob_core.ask_tell`, unless the user says otherwise; 0 where that would spoil what the maximiser is for,
+        such as an upper bound, or being a yardstick."""
+        return 0.2
+
     @abstractmethod
     def search(self, objective: Objective, rng: np.random.Generator) -> float:
         """Evaluate until the budget is spent or nothing is left to gain; return a proven upper bound of the maximum, or

@@ -92,7 +92,8 @@ class Ours:
 
     def search(self, counted, budget, seed):
         landscape = counted.landscape
-        options = {key: value(landscape) if callable(value) else value for key, value in self.options.items()}
+        own = {key: value(landscape) if callable(value) else value for key, value in self.options.items()}
+        options = {"polish": 0.0, **own}
         quietly(partial(sr.maximise, counted.batch, landscape.box, self.maximiser, budget=budget, seed=seed, **options))
 
 

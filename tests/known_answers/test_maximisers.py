@@ -57,7 +57,7 @@ FLOORS = {"garland1": GARLAND_FLOOR, "inverse_e": 0.0, "holder2": 2e-14}
 def test_sequool_has_the_known_regret_after_n_openings(name):
     landscape = LANDSCAPES[name]
     for (openings, (hmax, evaluations)), expected in zip(OPENINGS.items(), REGRETS[name], strict=True):
-        report = sr.maximise(landscape.function, landscape.box, "sequool", budget=2000, openings=openings)
+        report = sr.maximise(landscape.function, landscape.box, "sequool", budget=2000, openings=openings, polish=0.0)
         assert report.evaluations == evaluations
         assert (report.trace.notes["hmax"][:, 1] == hmax).all()
         regret = landscape.regret(report.best_value)
@@ -72,7 +72,7 @@ def test_sequool_has_the_known_regret_after_n_openings(name):
 )
 def test_sequool_fills_the_budget_with_the_largest_depth_that_fits(budget, hmax, evaluations):
     landscape = LANDSCAPES["holder2"]
-    report = sr.maximise(landscape.function, landscape.box, "sequool", budget=budget)
+    report = sr.maximise(landscape.function, landscape.box, "sequool", budget=budget, polish=0.0)
     assert report.evaluations == evaluations
     assert report.trace.notes["hmax"][-1, 1] == hmax
 
@@ -80,7 +80,7 @@ def test_sequool_fills_the_budget_with_the_largest_depth_that_fits(budget, hmax,
 @pytest.mark.parametrize(("openings", "hmax", "evaluations"), [(499, 73, 465), (1000, 133, 945), (5000, 549, 5055)])
 def test_sequool_under_the_paper_s_rule_evaluates_as_often_as_is_known(openings, hmax, evaluations):
     landscape = LANDSCAPES["rosenbrock2"]
-    report = sr.maximise(landscape.function, landscape.box, "sequool", budget=6000, openings=openings)
+    report = sr.maximise(landscape.function, landscape.box, "sequool", budget=6000, openings=openings, polish=0.0)
     assert (report.evaluations, report.trace.notes["hmax"][-1, 1]) == (evaluations, hmax)
 
 
@@ -100,7 +100,8 @@ PEER = {
 def test_sequool_is_no_worse_than_its_peer_after_1000_evaluations(name):
     landscape = LANDSCAPES[name]
     assert (
-        landscape.regret(sr.maximise(landscape.function, landscape.box, "sequool", budget=CAP).best_value) <= PEER[name]
+        landscape.regret(sr.maximise(landscape.function, landscape.box, "sequool", budget=CAP, polish=0.0).best_value)
+        <= PEER[name]
     )
 
 
@@ -146,7 +147,8 @@ def counts(maximiser, name, goals, seeds, cap=CAP):
         return np.where(values >= goals[-1], np.inf, values)
 
     traces = [
-        sr.maximise(until_the_last, landscape.box, maximiser, budget=cap, seed=seed).trace for seed in range(seeds)
+        sr.maximise(until_the_last, landscape.box, maximiser, budget=cap, seed=seed, polish=0.0).trace
+        for seed in range(seeds)
     ]
     return np.array([[first_reached(trace, goal, cap) for goal in goals] for trace in traces])
 

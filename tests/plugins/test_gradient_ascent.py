@@ -21,11 +21,11 @@ def valley_slope(point):
 
 
 def test_a_gradient_replaces_an_evaluation_per_coordinate():
-    with_gradient = sr.maximise(valley, BOX, "gradient_ascent", budget=30, gradient=valley_slope)
-    without = sr.maximise(valley, BOX, "gradient_ascent", budget=30)
+    with_gradient = sr.maximise(valley, BOX, "gradient_ascent", budget=30, gradient=valley_slope, polish=0.0)
+    without = sr.maximise(valley, BOX, "gradient_ascent", budget=30, polish=0.0)
     assert with_gradient.best_value >= -1e-8
     assert with_gradient.best_value > without.best_value
-    assert sr.maximise(valley, BOX, "gradient_ascent", budget=300).best_value >= -1e-6
+    assert sr.maximise(valley, BOX, "gradient_ascent", budget=300, polish=0.0).best_value >= -1e-6
 
 
 def test_a_maximum_on_the_boundary_is_met_exactly():
@@ -35,6 +35,7 @@ def test_a_maximum_on_the_boundary_is_met_exactly():
         "gradient_ascent",
         budget=40,
         gradient=lambda p: np.arange(1.0, 7.0),
+        polish=0.0,
     )
     np.testing.assert_array_equal(report.best_point, BOX.upper)
 
@@ -48,7 +49,7 @@ def test_restarts_leave_a_local_maximum():
 
     box = sr.Box([-3.0], [3.0])
     values = [
-        sr.maximise(hills, box, "gradient_ascent", budget=300, gradient=slope, seed=seed).best_value
+        sr.maximise(hills, box, "gradient_ascent", budget=300, gradient=slope, seed=seed, polish=0.0).best_value
         for seed in range(5)
     ]
     assert min(values) >= 1.0 - 1e-3

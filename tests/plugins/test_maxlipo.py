@@ -92,16 +92,16 @@ def test_the_early_exit_finds_the_candidate_that_a_full_search_finds(count):
 
 
 def test_the_first_point_is_the_centre():
-    report = sr.maximise(lambda x: -(x**2).sum(axis=1), SQUARE, "maxlipo", budget=5)
+    report = sr.maximise(lambda x: -(x**2).sum(axis=1), SQUARE, "maxlipo", budget=5, polish=0.0)
     assert report.trace.points[0].tolist() == [-0.5, 1.0]
 
 
 def test_nothing_is_claimed_to_be_proven():
-    assert sr.maximise(lambda x: -(x**2).sum(axis=1), SQUARE, "maxlipo", budget=40).upper_bound == np.inf
+    assert sr.maximise(lambda x: -(x**2).sum(axis=1), SQUARE, "maxlipo", budget=40, polish=0.0).upper_bound == np.inf
 
 
 def test_ten_evaluations_suffice_for_a_parabola():
-    report = sr.maximise(lambda x: -((x[:, 0] - 2) ** 2), sr.Box([-10.0], [10.0]), "maxlipo", budget=10)
+    report = sr.maximise(lambda x: -((x[:, 0] - 2) ** 2), sr.Box([-10.0], [10.0]), "maxlipo", budget=10, polish=0.0)
     assert report.best_value > -1e-9
 
 
@@ -110,12 +110,12 @@ def test_a_hundred_evaluations_suffice_for_a_curved_valley():
         return -(100 * (x[:, 1] - x[:, 0] ** 2) ** 2 + (x[:, 0] - 1) ** 2)
 
     for upper, budget, best in ((2.0, 100, [1.0, 1.0]), (0.9, 140, [0.9, 0.81])):
-        report = sr.maximise(valley, sr.Box([0.1, 0.1], [upper, upper]), "maxlipo", budget=budget)
+        report = sr.maximise(valley, sr.Box([0.1, 0.1], [upper, upper]), "maxlipo", budget=budget, polish=0.0)
         np.testing.assert_allclose(report.best_point, best, atol=1e-5)
 
 
 def test_no_point_is_evaluated_twice():
-    report = sr.maximise(lambda x: np.sin(5 * x).sum(axis=1), SQUARE, "maxlipo", budget=150)
+    report = sr.maximise(lambda x: np.sin(5 * x).sum(axis=1), SQUARE, "maxlipo", budget=150, polish=0.0)
     assert len(np.unique(report.trace.points, axis=0)) == 150
 
 
@@ -125,15 +125,15 @@ def test_in_high_dimension_it_still_climbs_by_changing_few_coordinates(dimension
         return -((x - 0.3) ** 2).sum(axis=1)
 
     box = sr.Box([-1.0] * dimension, [1.0] * dimension)
-    climbed = sr.maximise(hill, box, "maxlipo", budget=300).best_value
-    assert climbed > sr.maximise(hill, box, "random_search", budget=300).best_value
+    climbed = sr.maximise(hill, box, "maxlipo", budget=300, polish=0.0).best_value
+    assert climbed > sr.maximise(hill, box, "random_search", budget=300, polish=0.0).best_value
 
 
 def test_values_of_any_size_and_minus_infinity_are_survived():
     def wild(x):
         return np.where(x[:, 0] < -1, -np.inf, np.where(x[:, 1] < 0, -1e200, np.where(x[:, 1] > 3, -1e308, -x[:, 1])))
 
-    assert sr.maximise(wild, SQUARE, "maxlipo", budget=120).best_value > -0.1
+    assert sr.maximise(wild, SQUARE, "maxlipo", budget=120, polish=0.0).best_value > -0.1
 
 
 def test_the_time_per_evaluation_stays_below_a_fifth_of_that_of_dlib():
@@ -144,5 +144,5 @@ def test_the_time_per_evaluation_stays_below_a_fifth_of_that_of_dlib():
         ticks.append(time.process_time())
         return np.abs(np.sin(x[:, 0]) * np.cos(x[:, 1]) * np.exp(np.abs(1 - np.hypot(x[:, 0], x[:, 1]) / np.pi)))
 
-    sr.maximise(holder, sr.Box([-10.0] * 2, [10.0] * 2), "maxlipo", budget=1000)
+    sr.maximise(holder, sr.Box([-10.0] * 2, [10.0] * 2), "maxlipo", budget=1000, polish=0.0)
     assert (ticks[-1] - ticks[0]) / len(ticks) < 2.5e-3

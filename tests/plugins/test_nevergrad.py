@@ -212,13 +212,36 @@ def test_what_the_function_raises_is_not_taken_for_a_fault_of_the_optimiser():
     assert len(calls) == 1
 
 
-@pytest.mark.filterwarnings("ignore:nevergrad's NGOpt failed")
-@pytest.mark.parametrize("dimension", [1, 2, 3, 5])
-def test_ngopt_never_ends_a_run_whatever_the_version_of_numpy(dimension):
+PORTFOLIO = ("NGOpt", "CMA", "OnePlusOne", "DE", "TBPSA")
+FIRST = {("NGOpt", 1, 10), ("NGOpt", 1, 100), ("NGOpt", 2, 100), ("NGOpt", 20, 100), ("TBPSA", 20, 100), ("DE", 1, 10)}
+CASES = [
+    pytest.param(name, dimension, budget, marks=[] if (name, dimension, budget) in FIRST else pytest.mark.slow)
+    for name in PORTFOLIO
+    for dimension in (1, 2, 3, 5, 10, 20)
+    for budget in (10, 100, 500, 2000)
+    if budget < 2000 or dimension in {1, 3, 20}
+]
+
+
+@pytest.mark.parametrize(("name", "dimension", "budget"), CASES)
+def test_they_spend_every_budget_in_every_dimension_without_a_fallback(name, dimension, budget):
     box = sr.Box(np.full(dimension, -2.0), np.full(dimension, 3.0))
-    report = search(domain=box, budget=300, optimiser="NGOpt")
-    assert report.evaluations == 300
-    assert report.best_value > -1e-2
+    report = search(domain=box, budget=budget, optimiser=name, fallback=None)
+    assert report.evaluations == budget
+    assert report.stopped == "the budget is spent"
+    at_random = maximise(
+        Target(bowl, box), sr.load_registry().build("maximiser", "random_search"), budget, np.random.default_rng(0)
+    )
+    assert budget < 500 or report.best_value >= at_random.best_value
+
+
+def test_an_array_of_one_number_is_a_number_to_the_model_of_ngopt():
+    search(budget=2)
+    from nevergrad.optimization import metamodel
+
+    assert metamodel.float(np.array([[0.25]])) == metamodel.float(0.25) == metamodel.float("0.25") == 0.25
+    with pytest.raises(ValueError, match="size 1"):
+        metamodel.float(np.zeros(2))
 
 
 def test_an_optimiser_with_a_thread_of_its_own_leaves_none_behind_and_warns_of_nothing():

@@ -46,7 +46,7 @@ def reference(function, box, hmax):
 @pytest.mark.parametrize("box", [SQUARE, sr.Box([0.1], [0.7]), sr.Box([-1.0, 0.5, 3.0], [2.0, 0.5, 9.0])])
 @pytest.mark.parametrize(("budget", "hmax"), [(9, 2), (99, 20), (300, 51)])
 def test_the_points_are_those_of_the_rule_written_cell_by_cell(box, budget, hmax):
-    report = sr.maximise(bumps, box, "sequool", budget=budget)
+    report = sr.maximise(bumps, box, "sequool", budget=budget, polish=0.0)
     expected = reference(bumps, box, hmax)
     np.testing.assert_allclose(report.trace.points, expected, atol=1e-12)
 
@@ -61,7 +61,7 @@ def test_the_budget_is_filled_with_the_largest_depth_that_fits(budget):
             total += opened
         return 1 + 2 * total
 
-    report = sr.maximise(bumps, SQUARE, "sequool", budget=budget)
+    report = sr.maximise(bumps, SQUARE, "sequool", budget=budget, polish=0.0)
     if budget < 3:
         assert report.evaluations == budget
         return
@@ -74,39 +74,43 @@ def test_the_budget_is_filled_with_the_largest_depth_that_fits(budget):
 @pytest.mark.parametrize("budget", range(1, 7))
 def test_a_tiny_budget_buys_the_centre_and_then_the_outer_thirds(budget):
     box = sr.Box([0.0], [3.0])
-    report = sr.maximise(bumps, box, "sequool", budget=budget)
+    report = sr.maximise(bumps, box, "sequool", budget=budget, polish=0.0)
     np.testing.assert_allclose(report.trace.points[:3, 0], [1.5, 0.5, 2.5][:budget])
 
 
 def test_openings_beyond_the_budget_are_ended_by_it():
-    report = sr.maximise(bumps, SQUARE, "sequool", budget=100, openings=1000)
+    report = sr.maximise(bumps, SQUARE, "sequool", budget=100, openings=1000, polish=0.0)
     assert report.evaluations == 100
-    longer = sr.maximise(bumps, SQUARE, "sequool", budget=2000, openings=1000)
+    longer = sr.maximise(bumps, SQUARE, "sequool", budget=2000, openings=1000, polish=0.0)
     np.testing.assert_array_equal(report.trace.points, longer.trace.points[:100])
 
 
 def test_the_generator_is_not_used():
-    first, second = (sr.maximise(bumps, SQUARE, "sequool", budget=200, seed=seed) for seed in (0, 1))
+    first, second = (sr.maximise(bumps, SQUARE, "sequool", budget=200, seed=seed, polish=0.0) for seed in (0, 1))
     np.testing.assert_array_equal(first.trace.points, second.trace.points)
 
 
 def test_scaling_and_shifting_box_and_value_changes_nothing():
     lower, sides = np.array([-1e6, 1e-7]), np.array([4e6, 2e-7])
     scaled = sr.maximise(
-        lambda x: 1e9 * bumps((x - lower) / sides) - 1e7, sr.Box(lower, lower + sides), "sequool", budget=200
+        lambda x: 1e9 * bumps((x - lower) / sides) - 1e7,
+        sr.Box(lower, lower + sides),
+        "sequool",
+        budget=200,
+        polish=0.0,
     )
-    plain = sr.maximise(bumps, sr.Box([0.0, 0.0], [1.0, 1.0]), "sequool", budget=200)
+    plain = sr.maximise(bumps, sr.Box([0.0, 0.0], [1.0, 1.0]), "sequool", budget=200, polish=0.0)
     np.testing.assert_allclose((scaled.trace.points - lower) / sides, plain.trace.points, atol=1e-8)
 
 
 def test_equal_values_are_opened_left_first():
-    report = sr.maximise(lambda points: np.zeros(len(points)), sr.Box([0.0], [27.0]), "sequool", budget=9)
+    report = sr.maximise(lambda points: np.zeros(len(points)), sr.Box([0.0], [27.0]), "sequool", budget=9, polish=0.0)
     np.testing.assert_allclose(report.trace.points[:, 0], [13.5, 4.5, 22.5, 1.5, 7.5, 19.5, 25.5, 0.5, 2.5])
 
 
 def test_values_that_are_not_defined_are_opened_last():
     report = sr.maximise(
-        lambda x: np.where(x[:, 0] > 1.0, -np.inf, x[:, 0]), sr.Box([0.0], [3.0]), "sequool", budget=300
+        lambda x: np.where(x[:, 0] > 1.0, -np.inf, x[:, 0]), sr.Box([0.0], [3.0]), "sequool", budget=300, polish=0.0
     )
     assert 1 - 1e-6 < report.best_value <= 1.0
 
@@ -118,7 +122,7 @@ def test_each_depth_is_one_batch():
         batches.append(len(points))
         return bumps(points)
 
-    report = sr.maximise(recorded, SQUARE, "sequool", budget=1000)
+    report = sr.maximise(recorded, SQUARE, "sequool", budget=1000, polish=0.0)
     assert len(batches) == report.trace.notes["hmax"][-1, 1] + 2 == 141
     assert sum(batches) == report.evaluations == 987
 
@@ -127,7 +131,11 @@ def test_memory_is_that_of_a_batch_in_a_hundred_thousand_dimensions():
     d = 100_000
     tracemalloc.start()
     report = sr.maximise(
-        lambda points: -np.abs(points[:, :50] - 0.3).sum(axis=1), sr.Box(np.zeros(d), np.ones(d)), "sequool", budget=500
+        lambda points: -np.abs(points[:, :50] - 0.3).sum(axis=1),
+        sr.Box(np.zeros(d), np.ones(d)),
+        "sequool",
+        budget=500,
+        polish=0.0,
     )
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()

@@ -146,6 +146,10 @@ class _Maximiser(Maximiser):
     def __init__(self, maximiser: Maximiser, origin: str) -> None:
         self._maximiser, self.origin = maximiser, origin
 
+    @property
+    def polished(self) -> float:
+        return self._maximiser.polished
+
     def search(self, objective: Objective, rng: np.random.Generator) -> float:
         return self._maximiser.search(objective, rng)
 

@@ -260,17 +260,22 @@ def test_nothing_is_collected_where_nobody_listens(monkeypatch: pytest.MonkeyPat
         raise AssertionError("collected for nobody")
 
     monkeypatch.setattr("sparserob_core.sip.search.notifier.Notifier.__init__", collected)
-    assert sr.maximise(lambda x: -x[:, 0], SQUARE, "random_search", budget=50).evaluations == 50
+    assert sr.maximise(lambda x: -x[:, 0], SQUARE, "random_search", budget=50, polish=0.0).evaluations == 50
     with pytest.raises(AssertionError, match="for nobody"):
-        sr.maximise(lambda x: -x[:, 0], SQUARE, "random_search", budget=50, notify=lambda event: None)
+        sr.maximise(lambda x: -x[:, 0], SQUARE, "random_search", budget=50, notify=lambda event: None, polish=0.0)
 
 
 def test_there_are_few_events_for_many_evaluations_and_all_of_them_are_told() -> None:
     heard: list[sr.EvaluationsFinished] = []
     report = sr.maximise(
-        lambda x: -((x - 0.3) ** 2).sum(axis=1), SQUARE, "simulated_annealing", budget=20_000, notify=heard.append
+        lambda x: -((x - 0.3) ** 2).sum(axis=1),
+        SQUARE,
+        "simulated_annealing",
+        budget=20_000,
+        notify=heard.append,
+        polish=0.0,
     )
-    assert 1 <= len(heard) <= 2 + report.trace.seconds[-1] / 0.05
+    assert 20 <= len(heard) <= 22 + report.trace.seconds[-1] / 0.05
     assert np.concatenate([event.batch.trace.points for event in heard]).tolist() == report.trace.points.tolist()
     assert np.concatenate([event.batch.trace.best for event in heard]).tolist() == report.trace.best.tolist()
     for name, rows in report.trace.notes.items():
@@ -300,7 +305,7 @@ def test_the_moves_are_those_of_the_walk() -> None:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("sparserob_core.sip.search.notifier.SECONDS_BETWEEN_EVENTS", pause)
             patch.setattr("sparserob_core.sip.search.notifier.EVENTS", 1)
-            sr.maximise(lambda x: x[:, 0], SQUARE, Walking(), budget=13, notify=heard.append)
+            sr.maximise(lambda x: x[:, 0], SQUARE, Walking(), budget=13, notify=heard.append, polish=0.0)
     assert [event.count for event in heard] == [13] + [1] * 13
     together = [tuple(row) for row in heard[0].batch.moves.tolist()]
     singly = [(event.batch.first + row, column) for event in heard[1:] for row, column in event.batch.moves.tolist()]
@@ -317,7 +322,7 @@ def test_large_points_are_not_kept_for_long() -> None:
     box = sr.Box(np.zeros(2**18), np.ones(2**18))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sparserob_core.sip.search.notifier.SECONDS_BETWEEN_EVENTS", 1e9)
-        sr.maximise(lambda x: x[:, 0], box, "simulated_annealing", budget=100, notify=heard.append)
+        sr.maximise(lambda x: x[:, 0], box, "simulated_annealing", budget=100, notify=heard.append, polish=0.0)
     assert len(heard) > 100 / 12
     assert max(event.batch.trace.points.size for event in heard) <= 2 * 2**21
 
@@ -337,7 +342,7 @@ def test_maximisers_tell_how_they_stand_in_their_own_terms(maximiser: str, names
     if maximiser == "nevergrad":
         pytest.importorskip("nevergrad")
     heard: list[sr.EvaluationsFinished] = []
-    sr.maximise(lambda x: -((x - 0.3) ** 2).sum(axis=1), SQUARE, maximiser, budget=60, notify=heard.append)
+    sr.maximise(lambda x: -((x - 0.3) ** 2).sum(axis=1), SQUARE, maximiser, budget=60, notify=heard.append, polish=0.0)
     assert set(heard[-1].notes) == names
     assert all(np.isfinite(value) for value in heard[-1].notes.values())
 

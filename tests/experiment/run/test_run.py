@@ -152,11 +152,17 @@ def test_an_argument_of_solve_at_fault_is_named(arguments: dict[str, object], sa
 
 def test_maximise_resolves_the_name_and_its_options() -> None:
     report = sr.maximise(
-        lambda x: -((x - 0.3) ** 2).sum(axis=1), sr.Box([0.0, 0.0], [1.0, 1.0]), "direct", budget=500, seed=0, eps=1e-6
+        lambda x: -((x - 0.3) ** 2).sum(axis=1),
+        sr.Box([0.0, 0.0], [1.0, 1.0]),
+        "direct",
+        budget=500,
+        seed=0,
+        eps=1e-6,
+        polish=0.0,
     )
     assert report.best_value == pytest.approx(0.0, abs=1e-4)
     with pytest.raises(sr.InputError, match="maximiser direct: epz: unknown key"):
-        sr.maximise(lambda x: x[:, 0], sr.Box([0.0], [1.0]), "direct", epz=3)
+        sr.maximise(lambda x: x[:, 0], sr.Box([0.0], [1.0]), "direct", epz=3, polish=0.0)
 
 
 def test_what_can_never_be_certified_is_said_before_anything_is_solved(caplog: pytest.LogCaptureFixture) -> None:

@@ -60,7 +60,7 @@ def test_populations_are_told_as_lists_and_made_anew_when_they_stop():
     pytest.importorskip("cma")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        report = sr.maximise(bowl, BOX, sr.from_ask_tell(evolution), budget=1500)
+        report = sr.maximise(bowl, BOX, sr.from_ask_tell(evolution), budget=1500, polish=0.0)
     assert report.evaluations == 1500
     assert report.best_value > -1e-12
 
@@ -90,7 +90,7 @@ def test_points_outside_are_moved_to_the_box_and_no_value_is_a_large_loss():
             told.append(loss)
 
     report = sr.maximise(
-        lambda points: np.where(points[:, 0] < -1.0, -np.inf, 1.0), BOX, sr.from_ask_tell(Wild), budget=10
+        lambda points: np.where(points[:, 0] < -1.0, -np.inf, 1.0), BOX, sr.from_ask_tell(Wild), budget=10, polish=0.0
     )
     assert set(told) == {1e20, -1.0}
     assert np.unique(report.trace.points, axis=0).tolist() == [[-1.7, -1.0], [-0.5, 3.0]]

@@ -208,7 +208,33 @@ def test_a_callback_hears_every_batch_and_what_it_raises_costs_a_warning_and_no_
 
 def test_a_quick_search_is_told_of_regularly():
     heard = []
-    sr.maximise(lambda p: p[:, 0], sr.Box([0.0], [1.0]), "simulated_annealing", budget=500, notify=heard.append)
+    sr.maximise(
+        lambda p: p[:, 0], sr.Box([0.0], [1.0]), "simulated_annealing", budget=500, notify=heard.append, polish=0.0
+    )
     assert 20 <= len(heard) <= 40
     assert sum(event.count for event in heard) == heard[-1].total == 500
     assert max(event.count for event in heard) <= 50
+
+
+@pytest.mark.parametrize("name", ["sequool", "simulated_annealing", "direct"])
+def test_a_fifth_of_the_budget_polishes_unless_told_otherwise(name):
+    box = sr.Box([-2.0, -1.0], [1.5, 3.0])
+
+    def valley(points):
+        return -((1.0 - points[:, 0]) ** 2) - 30.0 * (points[:, 1] - points[:, 0] ** 2) ** 2
+
+    by_default, given, none = (
+        sr.maximise(valley, box, name, budget=200, **kind) for kind in ({}, {"polish": 0.2}, {"polish": 0.0})
+    )
+    assert by_default.trace.points.tolist() == given.trace.points.tolist()
+    assert by_default.best_value > none.best_value
+    assert by_default.stopped.endswith("; then polished")
+    assert by_default.evaluations <= 200
+
+
+def test_a_yardstick_and_a_proof_are_not_polished_unless_asked():
+    box = sr.Box([0.0], [1.0])
+    for name, options in (("random_search", {}), ("sobol", {}), ("lipo", {"constant": 1.0})):
+        report = sr.maximise(lambda p: p[:, 0], box, name, budget=30, **options)
+        assert "polished" not in report.stopped
+        assert "polished" in sr.maximise(lambda p: p[:, 0], box, name, budget=30, polish=0.5, **options).stopped
