@@ -60,10 +60,13 @@ def solve(
     ``regulariser`` is by default the ridge for control problems, whose optimisers are to be unique, and none for other
     programs, so that ``value`` is the cost. ``budget``: evaluations per search of the maximiser, of which the share
     ``polish`` goes to a local method at its end. ``seconds``: the time after which it returns what it knows, as it does
-    at an interrupt from the keyboard; ``Result.stopped`` then says so. Raises `InputError` when an argument is at
+    at an interrupt from the keyboard; ``Result.stopped`` then says so; where no control can ever be certified it is 30
+    unless given. Raises `InputError` when an argument is at
     fault.
     """
     deadline, registry = Deadline(as_seconds(seconds)), load_registry()
+    if isinstance(problem, OptimalControlProblem):
+        deadline = _announced(problem, deadline)
     program = _program(registry, problem, control, disturbance)
     if regulariser == "default":
         regulariser = None if program.lengths is None else "ridge"
@@ -83,13 +86,16 @@ def solve(
     return solve_in_own_units(chosen, program, tools)
 
 
-def _announce(problem: OptimalControlProblem) -> None:
-    """Warn at once where no control of a problem can ever be certified, before anything is solved."""
-    from sparserob_core.control.transcription.provable import unprovable
+def _announced(problem: OptimalControlProblem, deadline: Deadline) -> Deadline:
+    """Warn at once where no control of a problem can ever be certified, before anything is solved; the search for a
+    witness then has an end."""
+    from sparserob_core.control.transcription.provable import SECONDS, announced, unprovable
 
     why = unprovable(problem)
-    if why is not None:
-        logger.warning("no control of this problem can be certified: %s", why)
+    if why is None:
+        return deadline
+    logger.warning("no control of this problem can be certified: %s", announced(why, deadline.bounded))
+    return deadline if deadline.bounded else Deadline(SECONDS)
 
 
 def maximise(
@@ -269,7 +275,6 @@ def _program(registry: Registry, problem: object, control: object, disturbance: 
         )
     from sparserob_core.control.transcription.transcribe import transcribe
 
-    _announce(problem)
     controls = dictionary(registry, PIECES if control is None else control, problem.horizon)
     disturbances = indicators(controls) if disturbance is None else dictionary(registry, disturbance, problem.horizon)
     return transcribe(problem, control=controls, disturbance=disturbances)

@@ -22,6 +22,7 @@ LEGENDRE = np.polynomial.legendre.Legendre.basis(5)
 NODES = np.concatenate([[-1.0], LEGENDRE.deriv().roots(), [1.0]])
 WEIGHTS = 1.0 / (15.0 * LEGENDRE(NODES) ** 2)
 ACCURACY = 1e-14  # of an integral over one interval, relative to the largest integrand times the horizon
+MISSED = 1e-12  # of a support function, the error of its quadrature that a proof allows for; estimated, not enclosed
 TINY = float(np.finfo(float).tiny)
 TABLES_KEPT = 4096  # directions and parameters whose integrals are remembered
 MOST_SHORT = 4096  # intervals that one is cut into before any is halved
@@ -165,10 +166,11 @@ class MeasurableCellSupport:
     def at(
         self, times: Float[Array, " k"], ends: Float[Array, "k r 0"]
     ) -> tuple[Float[Array, "k r 1"], Float[Array, "k r"]]:
-        """The support function ``(k, r, 1)`` and an excess of zero ``(k, r)``; ``ends (k, r, 0)``."""
+        """The support function ``(k, r, 1)`` and what its quadrature is allowed to miss, ``(k, r)``;
+        ``ends (k, r, 0)``."""
         k, r = times.size, self.rows.shape[0]
-        sigma = self.support(np.repeat(times, r), np.tile(self.rows, (k, 1)), np.zeros((k * r, 0)))
-        return sigma.reshape(k, r, 1), np.zeros((k, r))
+        sigma = self.support(np.repeat(times, r), np.tile(self.rows, (k, 1)), np.zeros((k * r, 0))).reshape(k, r)
+        return sigma[..., None], MISSED * np.abs(sigma)
 
     @shaped
     def deviation(self, start: Float[Array, " k"], widths: Float[Array, " k"]) -> Float[Array, "k r"]:

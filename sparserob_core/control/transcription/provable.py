@@ -12,6 +12,7 @@ from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.sets.sets import Equality
 from sparserob_core.errors import NotEnclosable
 
+SECONDS = 30.0  # that the search takes for a problem that cannot be proven, unless a limit is given: for a witness
 TINY = 1e-6  # of the parameters: a cell on which a system that can be enclosed at all will be
 NOTABLE = 10.0  # logarithm of a growth from which rounding may be what hinders a proof
 
@@ -41,6 +42,22 @@ def unprovable(problem: OptimalControlProblem) -> str | None:
     except NotEnclosable as error:
         return str(error)
     return None
+
+
+def announced(why: str, limited: bool) -> str:
+    """What is said at the beginning of a run that cannot end with a certificate."""
+    ends = "" if limited else f"; the search for a witness ends after {SECONDS:g} s, unless limits.seconds is given"
+    return f"{why}{ends}"
+
+
+def remark(problem: OptimalControlProblem) -> str:
+    """What a claim about a problem rests on that is not proven; empty where there is nothing of the kind."""
+    if problem.disturbance is None or problem.disturbance_class != "measurable":
+        return ""
+    return (
+        "the integrals over measurable disturbances are allowed a relative error of 1e-12, which is estimated, not"
+        " enclosed"
+    )
 
 
 def growth(system: LinearSystem, horizon: float) -> float:

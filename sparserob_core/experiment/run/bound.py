@@ -9,6 +9,7 @@ import numpy as np
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.claims.claims import derived_bound
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
+from sparserob_core.control.transcription.provable import remark
 from sparserob_core.control.transcription.rounding import SMALL_GAP, rounded_down
 from sparserob_core.experiment.assemble import ControlExperiment
 from sparserob_core.experiment.directory.artefacts import finite
@@ -28,6 +29,14 @@ INWARDS = 1e-13  # of it, so that whoever derives it with another precision does
 
 
 def bounded(experiment: ControlExperiment, result: Result) -> Result:
+    """The same result with a lower bound that its multipliers prove, and with a word on what is not proven of it."""
+    found, rests = _bounded(experiment, result), remark(experiment.problem)
+    if not rests or found.status not in ("certified", "verified"):
+        return found
+    return replace(found, message=f"{found.message}; {rests}")
+
+
+def _bounded(experiment: ControlExperiment, result: Result) -> Result:
     """The same result with a lower bound that its multipliers prove.
 
     Running bounds of rounding are cheap, but where multipliers are large, as those of nearly parallel rows are, they

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, final
 
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.transcription.provable import unprovable
+from sparserob_core.control.transcription.provable import SECONDS, announced, unprovable
 from sparserob_core.errors import named
 from sparserob_core.experiment.assemble import Anew, ControlExperiment, Experiment, assemble, build, name_of, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
@@ -130,8 +130,11 @@ def _run(
     observers: Iterable[Observer],
 ) -> Outcome:
     deadline = Deadline(loaded.config.limits.seconds)  # the transcription counts too
-    tools = replace(tools, deadline=deadline)
     experiment = assemble(loaded)
+    why = unprovable(experiment.problem) if isinstance(experiment, ControlExperiment) else None
+    if why is not None:
+        deadline, why = (deadline if deadline.bounded else Deadline(SECONDS)), announced(why, deadline.bounded)
+    tools = replace(tools, deadline=deadline)
     watching = [*_observers(loaded), *((type(observer).__name__, observer) for observer in observers)]
     method: Method = build(loaded, "method", loaded.config.method)
     with create_directory(out, name_of(loaded), loaded.config.digest()) as directory:
@@ -148,7 +151,7 @@ def _run(
                     title=printable(experiment.title),
                     directory=directory.path,
                     problem=experiment.problem if isinstance(experiment, ControlExperiment) else None,
-                    unprovable=unprovable(experiment.problem) if isinstance(experiment, ControlExperiment) else None,
+                    unprovable=why,
                     program=experiment.program,
                     quiet=quiet,
                     inspection=Inspection(loaded),

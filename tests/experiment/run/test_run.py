@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.control.transcription import provable
 from sparserob_core.experiment.run.events import Broadcast, Event
 
 KEYS = {
@@ -165,7 +166,9 @@ def test_maximise_resolves_the_name_and_its_options() -> None:
         sr.maximise(lambda x: x[:, 0], sr.Box([0.0], [1.0]), "direct", epz=3, polish=0.0)
 
 
-def test_what_can_never_be_certified_is_said_before_anything_is_solved(caplog: pytest.LogCaptureFixture) -> None:
+def test_what_can_never_be_certified_is_said_before_anything_is_solved(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     ball = sr.Ellipsoid([0.0, 0.0], [[0.25, 0.0], [0.0, 0.25]])
     problem = sr.OptimalControlProblem(
         system=sr.LinearSystem([[0, 1], [0, 0]], [[0.0], [1.0]]),
@@ -180,5 +183,33 @@ def test_what_can_never_be_certified_is_said_before_anything_is_solved(caplog: p
         result = sr.solve(problem, control={"name": "piecewise_constant", "pieces": 4}, seconds=1e-6)
     assert "before there was a decision" in result.message
     assert len(caplog.records) == 1
+    assert "the search for a witness" not in caplog.text
     assert "no control of this problem can be certified" in caplog.text
     assert "piecewise_constant" in caplog.text
+    monkeypatch.setattr(provable, "SECONDS", 1e-3)
+    result = sr.solve(problem, control={"name": "piecewise_constant", "pieces": 4})
+    assert result.stopped == "the limit of 0.001 s is reached"
+    assert "the search for a witness ends after 0.001 s" in caplog.text
+
+
+def test_a_claim_that_rests_on_quadrature_says_so(tmp_path: Path) -> None:
+    measurable = {
+        "problem": {
+            "name": "linear",
+            "system": {"A": [[0, 1], [0, 0]], "B": [[0], [1]]},
+            "horizon": 2.0,
+            "initial_state": [0.6, 0.0],
+            "control": {"box": 1.0},
+            "disturbance": {"box": [0.01, 0.01]},
+            "disturbance_class": "measurable",
+            "terminal": [{"box": [0.3, 0.3]}],
+        },
+        "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 4}},
+        "observers": [],
+    }
+    found = sr.run(measurable, out=tmp_path / "one", quiet=True, figures=False).result
+    assert found.status == "certified" and "not enclosed" in found.message
+    known = sr.run(
+        measurable, {"problem.disturbance_class": "piecewise_constant"}, out=tmp_path / "two", quiet=True, figures=False
+    ).result
+    assert known.status == "certified" and "not enclosed" not in known.message
