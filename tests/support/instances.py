@@ -477,7 +477,8 @@ def drawn(rng: np.random.Generator) -> Instance:
         start = 0.0 if rng.random() < 0.2 else start
         stop = start if rng.random() < 0.1 else horizon if rng.random() < 0.3 else stop
         which = np.flatnonzero((some.times >= start - some.times[1]) & (some.times <= stop + some.times[1]))
-        problem = replace(problem, path=[(about(which, rng.uniform(0.7, 1.5)), float(start), float(stop))])
+        if which.size:
+            problem = replace(problem, path=[(about(which, rng.uniform(0.7, 1.5)), float(start), float(stop))])
     return problem
 
 

@@ -160,9 +160,15 @@ class Propagator:
         rows = rows @ Phi[order]
         which, sorted_pieces = which[order], pieces[order]
         known = steps.Phi.shape[0] == 1
-        for piece in range(int(sorted_pieces[0]) - 1, -1, -1):
-            active = int(np.searchsorted(-sorted_pieces, -piece))
-            over = steps.side_by_side[0 if known else which[:active], self._which[piece]]
+        last = int(sorted_pieces[0])
+        begun = np.searchsorted(-sorted_pieces, -np.arange(last)).tolist()  # how many functionals reach back to a piece
+        alike = steps.side_by_side[which, 0] if self.uniform and not known else None
+        for piece in range(last - 1, -1, -1):
+            active = begun[piece]
+            if alike is not None:
+                over = alike[:active]
+            else:
+                over = steps.side_by_side[0 if known else which[:active], self._which[piece]]
             both = rows[:active] @ over
             gains[:active, piece], rows[:active] = both[:, 0, :d], both[..., d:]
         back = np.empty_like(order)

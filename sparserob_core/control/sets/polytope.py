@@ -16,6 +16,7 @@ _VERTEX_ROWS = 200
 _SWEEPS = 12
 _ORDINARY = 10  # binary orders of magnitude between which rows and columns are left as they are
 _TOGETHER = 64  # linear programs that are solved as one
+_CLEAR, _NOTHING = 1e-6, 1e-14  # shares of the largest that are no rounding, and that are
 _PROGRAMS = 96  # extreme points that are computed where the vertices are not known, one linear program each
 
 
@@ -67,7 +68,10 @@ class Polytope(ConvexSet):
         H = self.H * units
         sizes = np.abs(H).max(axis=1, initial=0.0)
         factors = np.ldexp(1.0, -np.frexp(np.where(sizes > 0.0, sizes, 1.0))[1])
-        return Polytope(H * factors[:, None], self.h * factors)
+        made = object.__new__(Polytope)  # it holds a point since this one does: no program is solved again
+        object.__setattr__(made, "H", H * factors[:, None])
+        object.__setattr__(made, "h", self.h * factors)
+        return made
 
     @cached_property
     def _balanced(self) -> tuple[Array, Array, Array]:
@@ -192,7 +196,9 @@ class Polytope(ConvexSet):
 
         H, h, units = self._balanced
         values, points = np.zeros(len(directions)), np.tile(self.interior_point(), (len(directions), 1))
-        asking = np.flatnonzero(np.abs(directions).max(axis=1, initial=0.0) > 0)
+        endless = self._endless(directions * units)
+        values[endless] = np.inf
+        asking = np.flatnonzero((np.abs(directions).max(axis=1, initial=0.0) > 0) & ~endless)
         for start in range(0, asking.size, _TOGETHER):
             part = asking[start : start + _TOGETHER]
             scaled = directions[part] * units
@@ -211,6 +217,23 @@ class Polytope(ConvexSet):
             for position in part:
                 values[position], points[position] = self._maximise(directions[position])
         return values, points
+
+    def _endless(self, directions: Array) -> Array:
+        """Which directions ``(k, d)`` in balanced coordinates have a part along a line that no row bounds, clearly."""
+        along = np.linalg.norm(directions @ self._lines.T, axis=1)
+        return np.asarray(along > _CLEAR * np.linalg.norm(directions, axis=1))
+
+    @cached_property
+    def _lines(self) -> Array:
+        """The lines that the set contains, ``(l, d)`` orthonormal in balanced coordinates; none where rounding leaves
+        any doubt."""
+        _, sizes, turned = np.linalg.svd(self._balanced[0])
+        sizes = np.concatenate([sizes, np.zeros(self.dimension - sizes.size)]) / max(
+            float(sizes.max(initial=0.0)), 1e-300
+        )
+        if ((sizes > _NOTHING) & (sizes < _CLEAR)).any():
+            return np.zeros((0, self.dimension))
+        return np.asarray(turned[sizes <= _NOTHING])
 
     @shaped
     def _maximise(self, direction: Float[Array, " d"]) -> tuple[float, Float[Array, " d"]]:

@@ -132,6 +132,17 @@ def test_an_unbounded_polytope_has_infinite_support_where_it_is_unbounded() -> N
     assert np.isfinite(wedge.support_point(np.array([[1.0, 0.0]]))).all()
 
 
+@pytest.mark.parametrize("tilt", [0.0, 1e-3, 1e-9, 1e-12])
+def test_a_polytope_that_contains_a_line_is_bounded_across_it_only_and_almost_a_line_is_none(tilt: float) -> None:
+    """``|x1 - x2| <= 1/2``, and ``|x1 + x2| <= 1`` told in rows that are ``tilt`` long, if there are any."""
+    rows = np.array([[1.0, -1.0], [-1.0, 1.0], [tilt, tilt], [-tilt, -tilt]])
+    strip = Polytope(rows, np.array([0.5, 0.5, tilt, tilt]))
+    directions = np.array([[1.0, -1.0], [1.0, 1.0], [1.0, 0.0]])
+    expected = [0.5, 1.0, 0.75] if tilt else [0.5, np.inf, np.inf]
+    np.testing.assert_allclose(strip.support(directions), expected, rtol=1e-9)
+    np.testing.assert_allclose(strip.in_units(np.array([8.0, 8.0])).support(directions) * 8.0, expected, rtol=1e-9)
+
+
 def test_a_polytope_without_interior_still_has_its_support_function() -> None:
     segment = Polytope(np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, 0.0], [-1.0, 0.0]]), np.array([1.0, -1.0, 1.0, 0.0]))
     assert segment.vertices is None
