@@ -14,7 +14,7 @@ LONGER    := method.sc2=null maximiser.budget=1500
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help install demo live paper test test-slow lint bench docs clean
+.PHONY: help install demo live paper test test-slow lint bench docs docs-pictures clean
 
 help:
 	@echo "make demo        solve the repaired experiment 1, print the bounds, draw the figures"
@@ -24,6 +24,7 @@ help:
 	@echo "make test-slow   the second stage: larger instances of what the first one tests"
 	@echo "make bench       time the certified solve and the maximisers beside other people's"
 	@echo "make docs        write the reference and the schema anew, and build the site (minutes, the first time)"
+	@echo "make docs-pictures  the pictures of docs/live.md anew (minutes; needs a Vulkan driver, no display)"
 	@echo "make install     set up $(VENV) only"
 	@echo "make clean       remove $(VENV) and every cache"
 
@@ -80,6 +81,9 @@ docs: $(WRITERS)
 	$(BIN)/python docs/build_reference.py
 	$(BIN)/python -m sphinx -b html -W --keep-going -q docs site/html
 	@echo "the site is site/html/index.html"
+
+docs-pictures: $(INSTALLED)
+	$(BIN)/python docs/build_pictures.py
 
 clean:
 	rm -rf $(VENV) site docs/generated .docs_cache .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache .benchmarks

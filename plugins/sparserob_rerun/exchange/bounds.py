@@ -101,4 +101,4 @@ def _decades(values: Floats) -> Floats:
 
 
 def _number(value: float) -> str:
-    return f"{value:.7g}" if np.isfinite(value) else "unknown"
+    return f"{value:.8g}" if np.isfinite(value) else "unknown"

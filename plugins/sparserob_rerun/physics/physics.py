@@ -116,7 +116,7 @@ class Physics:
         axes = Axes(axes.left, axes.top, axes.width, axes.height, axes.x, (-reach, reach))
         drawing.frame(
             axes,
-            f"why {name} switches: the active constraints' push on it; {name} acts where the push leaves the band",
+            f"why {name} switches: it acts where the push of the constraints leaves the band",
             "t",
             ticks_below=last,
         )

@@ -30,6 +30,7 @@ from sparserob_rerun.search.way import Stage
 SEEN = 10  # evaluations between two pictures of the way
 PICTURE_EVERY, SPARE = 0.5, 20.0  # seconds between them, and how many times as long as one took
 PICTURES = 60  # rounds whose physics is drawn; of later ones every tenth
+PROOF = "proof of"
 LINES = 24  # of the log that are on the first screen
 PROOFS = 12  # lines about the proof of one family
 SLOTS = 16  # active constraints at most that make the tuple of a method without one
@@ -94,7 +95,7 @@ class Recorder:
                 self.proofs[event.family] = self.proofs.get(event.family, 0) + 1
                 if self.proofs[event.family] <= PROOFS:
                     self.say(
-                        f"proof of {event.family}: {event.cells} cells open, violation not excluded {event.bound:.1e}",
+                        f"{PROOF} {event.family}: {event.cells} cells open, violation not excluded {event.bound:.1e}",
                         "DEBUG",
                     )
             case sr.RunFinished():
@@ -116,6 +117,8 @@ class Recorder:
         """A line of the log."""
         self.stream.log("log", self.rr.TextLog(line, level=level))
         if level != "TRACE":  # the log cuts off what is longer than its column; this page does not
+            if self.said and line.startswith(PROOF) and self.said[0].startswith(PROOF):
+                self.said.popleft()  # of a proof that goes on, the last line
             self.said.appendleft(line)
             self.stream.log("decisions", self.rr.TextDocument("\n".join(self.said)))
 
