@@ -142,6 +142,7 @@ class _Walk:
             stopped = str(pressed) or "interrupted from the keyboard"
         finally:
             self._clear()
+            self._read(sorted(self.pending))  # a run that was over, whose worker was not heard any more
             self._write()
         return Study(
             directory=self.made.path,
@@ -155,16 +156,22 @@ class _Walk:
 
     def _left(self) -> list[str]:
         """The hashes of the points that are to be run; of the others the answers are read."""
-        found = {one.rpartition("-")[2]: one for one in _directories(self.directory / RUNS)}
+        self._read(dict.fromkeys(point.hash for point in self.points))
         left = []
         for digest in dict.fromkeys(point.hash for point in self.points):
+            summary = self.answers[digest].summary if digest in self.answers else None
+            if summary is None or summary["status"] == "failed" or summary.get("stopped"):
+                left.append(digest)
+        return left
+
+    def _read(self, digests: Iterable[str]) -> None:
+        """Take the answers to these points that stand in the directory."""
+        found = {one.rpartition("-")[2]: one for one in _directories(self.directory / RUNS)}
+        for digest in digests:
             name = found.get(digest[:DIGITS])
             summary = None if name is None else _readable(self.directory / RUNS / name, digest)
             if name is not None and summary is not None:
                 self.names[digest], self.answers[digest] = name, Answer(summary)
-            if summary is None or summary["status"] == "failed" or summary.get("stopped"):
-                left.append(digest)
-        return left
 
     def _solve(self, factory: ExecutorFactory, waiting: list[str]) -> None:
         """Hand out points until each has an answer. Where a worker dies, its executor is replaced, and the points that
