@@ -14,23 +14,58 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class QuadraticProgram:
-    """minimise ``1/2 x'P x + q'x`` subject to ``G x <= h``, ``A x = b``, ``lower <= x <= upper``; bounds may be
-    infinite."""
+    """minimise ``1/2 x'P x + q'x`` subject to ``G x <= h``, ``A x = b``, ``lower <= x <= upper``.
+
+    ``n`` variables, ``r`` rows, ``e`` equalities; ``r`` and ``e`` may be 0, the arrays are then empty and none is
+    missing. ``P`` is the whole symmetric matrix, not one triangle of it, positive semidefinite, and often 0. ``h`` and
+    ``b`` are finite; bounds may be infinite, and equal. Matrices are of scipy's sparse class ``csc_array``; some
+    solvers want ``csc_matrix`` or ``toarray()``. Nothing of it is to be changed.
+    """
 
     P: csc_array
+    """``(n, n)``."""
     q: Array
+    """``(n,)``."""
     G: csc_array
+    """``(r, n)``."""
     h: Array
+    """``(r,)``."""
     A: csc_array
+    """``(e, n)``."""
     b: Array
+    """``(e,)``."""
     lower: Array
+    """``(n,)``, ``-inf`` where there is no bound."""
     upper: Array
+    """``(n,)``, ``inf`` where there is no bound."""
 
 
 @dataclass(frozen=True, eq=False)
 class Claim:
-    """What a solver says. Multipliers follow ``P x + q + G'z + A'y + z_box = 0``, ``z >= 0``, ``z_box <= 0`` at lower
-    bounds."""
+    """What a solver says: ``x (n,)``, and multipliers with ``P x + q + G'z + A'y + z_box = 0``.
+
+    ``z (r,)`` of the rows is at least 0, and 0 where a row is not active. ``y (e,)`` of the equalities has any sign.
+    ``z_box (n,)`` of the bounds is at most 0 at a lower and at least 0 at an upper bound, and 0 between them. Solvers
+    that maximise, or that write ``G x >= h``, have some of these signs reversed.
+
+    ``status`` is ``solved``, ``infeasible`` (then ``z, y`` may carry the Farkas ray: ``z >= 0``, and ``G'z + A'y``
+    together with the bounds proves that no ``x`` exists), or ``failed`` for everything else, an unbounded program too.
+    Arrays of a claim that is not ``solved`` may hold NaN; ``message`` is for a reader.
+
+    An example: minimise ``x1^2/2 + x2^2/2 - 5 x1 + x2`` subject to ``x1 + x2 <= 1``, ``x1 - x2 = 1``,
+    ``0 <= x <= 2``. The optimum is ``x = (1, 0)``, where ``P x + q = (-4, 1)``; ``z = 1.5`` and ``y = 2.5`` balance it:
+
+    >>> import numpy as np
+    >>> P, q = np.eye(2), np.array([-5.0, 1.0])
+    >>> G, A = np.array([[1.0, 1.0]]), np.array([[1.0, -1.0]])
+    >>> claim = Claim("solved", np.array([1.0, 0.0]), np.array([1.5]), np.array([2.5]), np.zeros(2))
+    >>> (P @ claim.x + q + G.T @ claim.z + A.T @ claim.y + claim.z_box).tolist()
+    [0.0, 0.0]
+
+    Without the row: ``x = (2, 1)``, ``y = 2``, ``z_box = (1, 0)``. Without the equality: ``x = (1, 0)``, ``z = 4``,
+    ``z_box = (0, -5)``. With the bounds alone: ``x = (2, 0)``, ``z_box = (3, -1)``, positive at the upper bound of
+    ``x1`` and negative at the lower one of ``x2``.
+    """
 
     status: Literal["solved", "infeasible", "failed"]
     x: Array

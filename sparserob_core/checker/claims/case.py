@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 
 from sparserob_core.checker.claims.duality import Duality
-from sparserob_core.checker.claims.units import Units
+from sparserob_core.checker.claims.units import RowUnits
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import stacked
@@ -148,14 +148,14 @@ class Case:
             changes or [],
         )
 
-    def units(self, window: Window) -> Units:
+    def units(self, window: Window) -> RowUnits:
         """What violations of a constraint are judged by."""
         if window not in self._units:
-            self._units[window] = Units(self.problem, self.scene, window.shape, window.start, window.stop)
+            self._units[window] = RowUnits(self.problem, self.scene, window.shape, window.start, window.stop)
         return self._units[window]
 
     @cached_property
-    def _units(self) -> dict[Window, Units]:
+    def _units(self) -> dict[Window, RowUnits]:
         return {}
 
     @cached_property

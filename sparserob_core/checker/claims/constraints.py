@@ -12,7 +12,7 @@ from sparserob_core.checker.arithmetic.balls import balls, below
 from sparserob_core.checker.claims.case import Case, Window, number, numbers
 from sparserob_core.checker.claims.cells import Interval, Work, prove
 from sparserob_core.checker.claims.subdivision import fill
-from sparserob_core.checker.claims.units import Units
+from sparserob_core.checker.claims.units import RowUnits
 from sparserob_core.checker.outcome import TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.reach.flow import Flow
 from sparserob_core.checker.reach.tube import Tube
@@ -129,7 +129,7 @@ def _work(case: Case, window: Window, normals: Array, lower: Array, upper: Array
     return normals if curved is not None else basis, work
 
 
-def _facets(window: Window, units: Units) -> tuple[Array, Sides | None]:
+def _facets(window: Window, units: RowUnits) -> tuple[Array, Sides | None]:
     """The normals of a flat set's facets up to the sign, and its rows; no rows for a curved one."""
     found, flat = flat_basis(window.shape), facets(window.shape)
     if found is None or flat is None:

@@ -12,7 +12,7 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.jets import Monomials, expanded
 from sparserob_core.checker.claims.case import Case
-from sparserob_core.checker.claims.units import Units
+from sparserob_core.checker.claims.units import RowUnits
 from sparserob_core.checker.outcome import EQUALITY, Broken, Unchecked
 from sparserob_core.checker.reach.flow import Flow
 from sparserob_core.checker.reach.tube import Tube
@@ -31,7 +31,7 @@ def equalities(case: Case) -> str:
     scene, d = replace(case.scene, disturbance=None), case.problem.system.states
     tube = Tube(Flow(case.problem.system, tuple(middle), (0.0,) * len(middle), 0), scene, np.eye(d))
     horizon, everything = case.problem.horizon, Box(np.full(d, -np.inf), np.full(d, np.inf))
-    sums = Units(case.problem, scene, everything, horizon, horizon).sums
+    sums = RowUnits(case.problem, scene, everything, horizon, horizon).sums
     worst = 0.0
     for state, value in case.equalities:
         if _reached(case, state):

@@ -26,7 +26,7 @@ MOST_AXES = 4  # of the parameters, at whose ends a window is looked at
 
 @final
 @dataclass(frozen=True, eq=False)
-class Units:
+class RowUnits:
     """The units of the constraint ``x(t)`` in ``shape`` from ``start`` to ``stop``.
 
     That of a row ``c'x <= b`` is the smallest that is not zero of: how far ``c'x`` can reach over the window (any

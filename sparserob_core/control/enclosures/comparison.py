@@ -58,7 +58,7 @@ class Reach(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class ComparisonSystem:
     """Bounds for ``z' = A z``: ``metzler (q, q)`` is ``M``, ``sizes (q, q)`` the norms of the blocks of ``A``."""
 
     metzler: Array

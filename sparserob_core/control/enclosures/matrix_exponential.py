@@ -63,7 +63,7 @@ def rounding(terms: int) -> float:
 
 def exponential_rounding(terms: int, sizes: Array) -> Array:
     """The relative error of `exponential` and of both parts of `transitions`, for ``||A|| r`` of ``sizes (...)``, in
-    the exponential of any matrix of bounds that compares with ``A`` (`Comparison`).
+    the exponential of any matrix of bounds that compares with ``A`` (`ComparisonSystem`).
 
     On the unit ball, each of eight products errs by ``rounding(terms)`` in a polynomial of ``|A|``, which is at most
     ``e^2`` times the exponential of the bounds; every squaring doubles the relative error and adds one product.

@@ -23,7 +23,7 @@ from sparserob_core.control.enclosures.algebra import (
 )
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.comparison import (
-    Comparison,
+    ComparisonSystem,
     block_norms,
     block_sizes,
     comparison_matrix,
@@ -86,11 +86,11 @@ class LiftedSystem:
         return int(self.A.shape[1])
 
     @cached_property
-    def comparison(self) -> Comparison:
+    def comparison(self) -> ComparisonSystem:
         """Bounds of the lifted system: of its Taylor coefficients, the norms of every block summed over them."""
         sizes = block_sizes(self.A, self.starts)
         rest = sizes[1:].sum(axis=0) + self.slack_A
-        return Comparison(comparison_matrix(self.A[0], self.starts) + rest, sizes[0] + rest)
+        return ComparisonSystem(comparison_matrix(self.A[0], self.starts) + rest, sizes[0] + rest)
 
     @cached_property
     def norm(self) -> float:
@@ -245,7 +245,7 @@ class LiftedSystem:
 
     def _majorants(self, lengths: Array, rows: bool) -> tuple[Array, Array]:
         """What bounds ``int |e^{lifted s}| ds`` and ``|e^{lifted r}|`` on every fine piece, coefficient by coefficient,
-        ``(L', M q, M q)``; as in `Comparison.over`."""
+        ``(L', M q, M q)``; as in `ComparisonSystem.over`."""
         if rows not in self._majorised:
             distinct, which = self.fine.distinct(lengths)
             growths = block_sizes(self.A, self.starts)
@@ -283,8 +283,8 @@ class LiftedSystem:
         whole, within = self._rounded(reached, driven, rows)
 
         slack = self.slack_A.T if rows else self.slack_A
-        slips = Comparison(comparison.metzler.T, comparison.sizes.T) if rows else comparison
-        rising = Comparison(
+        slips = ComparisonSystem(comparison.metzler.T, comparison.sizes.T) if rows else comparison
+        rising = ComparisonSystem(
             slips.rising, slips.sizes
         )  # whose slips grow with the time, so that the last is the largest
         slipped, largest = (

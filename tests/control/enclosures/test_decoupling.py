@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from sparserob_core.control.enclosures.comparison import Comparison, block_norms, block_sizes, comparison_matrix
+from sparserob_core.control.enclosures.comparison import ComparisonSystem, block_norms, block_sizes, comparison_matrix
 from sparserob_core.control.enclosures.decoupling import decoupled, decoupled_transitions
 
 MATRICES = {
@@ -94,7 +94,7 @@ def test_no_trajectory_is_larger_than_the_comparison_system_allows(seed, d, stif
     if stiff:
         A = A @ np.diag(-(10.0 ** rng.uniform(0, 3, d)))
     basis, D, _ = made(A)
-    comparison = Comparison(comparison_matrix(D, basis.starts), block_sizes(D, basis.starts))
+    comparison = ComparisonSystem(comparison_matrix(D, basis.starts), block_sizes(D, basis.starts))
     z, width = rng.normal(size=d), 10.0 ** rng.uniform(-4, 0)
     if np.abs(np.linalg.eigvals(A).real).max() * width > 200:
         width = 200 / np.abs(np.linalg.eigvals(A).real).max()
@@ -114,5 +114,5 @@ def test_no_trajectory_is_larger_than_the_comparison_system_allows(seed, d, stif
 
 def test_a_stable_system_stays_bounded_however_long_it_runs():
     basis, D, _ = made(np.array(MATRICES["a defective fast mode"]))
-    comparison = Comparison(comparison_matrix(D, basis.starts), block_sizes(D, basis.starts))
+    comparison = ComparisonSystem(comparison_matrix(D, basis.starts), block_sizes(D, basis.starts))
     assert comparison.over(np.array([1e3])).peak.max() <= 20.0
