@@ -22,7 +22,7 @@ help:
 	@echo "make paper       every experiment and figure of the paper, and docs/paper.md (a few minutes)"
 	@echo "make test        lint, types, import rules, tests: the first stage, about five minutes on two processors"
 	@echo "make test-slow   the second stage: larger instances of what the first one tests"
-	@echo "make bench       time the certified solve and the maximisers beside other people's"
+	@echo "make bench       time the certified solve, and solvers and maximisers beside other people's"
 	@echo "make docs        write the reference and the schema anew, and build the site (minutes, the first time)"
 	@echo "make docs-pictures  the pictures of docs/live.md anew (minutes; needs a Vulkan driver, no display)"
 	@echo "make install     set up $(VENV) only"
@@ -42,7 +42,7 @@ $(INSTALLED): pyproject.toml
 	@touch $@
 
 $(PEERS): $(INSTALLED)
-	@if $(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check --editable '.[all,bench]'; then touch $@; \
+	@if $(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check --editable '.[all,bench,solvers]'; then touch $@; \
 	else echo "not every peer can be installed here; the benchmark names those that it goes without" >&2; fi
 
 $(WRITERS): $(INSTALLED)

@@ -77,6 +77,7 @@ class ProxQp(sr.Solver, sr.Options):
     # (80 s at N = 250).
     def _tune(self, settings: Any, accuracy: float) -> None:
         settings.eps_abs, settings.eps_rel = accuracy, 0.0
+        settings.check_duality_gap, settings.eps_duality_gap_abs, settings.eps_duality_gap_rel = True, accuracy, 0.0
         settings.max_iter, settings.max_iter_in = self.max_iterations, self.max_inner_iterations
         settings.eps_primal_inf = settings.eps_dual_inf = 1e-8
 
