@@ -145,3 +145,32 @@ def test_the_templates_are_in_the_wheel(tmp_path):
         inside = set(wheel.namelist())
     place = "sparserob_core/experiment/scaffold/templates"
     assert not {f"{place}/{kind}.txt" for kind in [*KINDS, "package"]} - inside
+
+
+ROUNDED = """
+problem:
+  name: linear
+  system: {A: [[0, 1], [0, 0]], B: [[0], [1]]}
+  horizon: 3.0
+  initial_state: [0.5, 0]
+  control: {rounded: 0.9}
+  disturbance: {rounded: {half: 0.005, radius: 0.005}}
+  path: [{rounded: {half: 1.5, radius: 0.5}}]
+  terminal: [{rounded: 0.2}]
+dictionaries:
+  control: {name: piecewise_constant, pieces: 10}
+"""
+
+
+@pytest.mark.slow
+def test_a_set_of_three_members_serves_everywhere_and_the_checker_says_that_it_does_not_know_it(tmp_path):
+    plugin = new_plugin("set", "rounded", tmp_path) / "sparserob_rounded" / "__init__.py"
+    (tmp_path / "rounded.yaml").write_text(f"plugins: [{plugin}]\n{ROUNDED}")
+    outcome = sr.run(tmp_path / "rounded.yaml", out=tmp_path / "run", figures=False)
+    assert outcome.result.status == "certified"
+    said = sr.check(tmp_path / "run", plugins=[plugin])
+    verdicts = {claim.name: (claim.verdict, claim.text) for claim in said.claims}
+    for name in ("control", "path", "terminal", "lower bound"):
+        assert verdicts[name][0] == "not checked"
+        assert "the checker does not know sets of the kind roundedbox" in verdicts[name][1]
+    assert verdicts["status"][0] == "not checked"
