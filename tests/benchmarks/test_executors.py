@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,10 +17,10 @@ from sparserob_core.experiment.assemble import Anew
 from sparserob_core.experiment.config.load import load_config
 from sparserob_core.sip.relaxed import batches
 from sparserob_core.sip.relaxed.batches import Batches, Oracle
-from tests.support.places import CONFIGS, ROOT
 
 pytestmark = pytest.mark.benchmark
 PIECES = 250
+CONFIG = Path(__file__).parents[2] / "configs/experiment1_repaired.yaml"
 
 
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two processors")
@@ -27,8 +28,8 @@ PIECES = 250
 def test_two_workers_gain_once_they_stand(indices, count, capsys):
     """In processor time, as other programs may be busy here: the busiest worker does about half of the work."""
     pytest.importorskip("psutil")
-    script = f"from tests.benchmarks.test_executors import measured; measured({indices}, {count})"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT, check=True)
+    command = [sys.executable, __file__, str(indices), str(count)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
     told = json.loads(done.stdout)
     with capsys.disabled():
         print(f"\n{indices} indices, {count} values of g: {done.stdout.strip()}")
@@ -42,7 +43,7 @@ def measured(indices, count):
 
     batches.WORTH = batches.START = 0.0
     pieces = {"dictionaries.control.pieces": PIECES, "dictionaries.disturbance.pieces": PIECES}
-    oracle = Oracle(Anew.of(load_config(CONFIGS / "experiment1_repaired.yaml", pieces)), "reduced", indices)
+    oracle = Oracle(Anew.of(load_config(CONFIG, pieces)), "reduced", indices)
     domain = oracle.build().domain
     points = np.random.default_rng(0).uniform(domain.lower, domain.upper, (count, domain.dimension))
 
@@ -76,3 +77,7 @@ def measured(indices, count):
         "here meanwhile, processor": own,
     }
     print(json.dumps({name: value if value is True else round(value, 3) for name, value in told.items()}))
+
+
+if __name__ == "__main__":
+    measured(*map(int, sys.argv[1:]))

@@ -124,6 +124,8 @@ class Profiles:
                 f"no certified run of {_some(guessed)}: the best bound of any run stands for the exact value, which"
                 " favours whoever found it; runs of the method exchange beside the others give the exact one"
             )
+        if self.measure == "seconds":
+            yield "seconds are those of a clock: the first run of a process includes its imports; seeds even that out"
         if len(self.problems) * len(self.contenders) > LISTED:
             yield "medians and quartiles of every problem: --json"
         yield from self.notes

@@ -7,6 +7,7 @@ chunk gives depends on nothing but its tuples, and not on where, when or beside 
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future
@@ -75,14 +76,21 @@ class Oracle:
         return TupleValue(imposed, RelaxedProgram(imposed, solver, regulariser), self.count)
 
 
-_kept: list[tuple[Oracle, TupleValue]] = []
+class _Kept(threading.local):
+    """What a worker has made last; g changes with every value, so each thread of a worker has its own."""
+
+    oracle: Oracle | None = None
+    g: TupleValue | None = None
+
+
+_kept = _Kept()
 
 
 def on_worker(oracle: Oracle, points: Array, epsilon: float, best: float, seconds: float | None) -> Valued:
     """`value_chunk` in a worker, who has ``seconds`` for it."""
-    if not _kept or _kept[0][0] != oracle:
-        _kept[:] = [(oracle, oracle.build())]
-    g = _kept[0][1]
+    if _kept.oracle != oracle or _kept.g is None:
+        _kept.oracle, _kept.g = oracle, oracle.build()
+    g = _kept.g
     g.epsilon, g.relaxed.deadline = epsilon, Deadline(seconds)
     try:
         return value_chunk(g, points, best)

@@ -4,7 +4,7 @@ fails costs nothing but its help."""
 from __future__ import annotations
 
 import pickle
-from concurrent.futures import BrokenExecutor, Executor, Future
+from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -45,7 +45,7 @@ class Elsewhere(Executor):
         if self.broken is not None and self.calls > self.broken:
             future.set_exception(BrokenExecutor("a worker has died"))
         else:
-            batches._kept.clear()  # as on a worker that is new
+            batches._kept.g = None  # as on a worker that is new
             fn, args, kwargs = pickle.loads(call)
             future.set_result(pickle.loads(pickle.dumps(fn(*args, **kwargs))))
         return future
@@ -176,6 +176,14 @@ def test_a_deadline_on_a_worker_is_one_here(oracle, worth):
     g.relaxed.deadline = Deadline(3600.0)
     with pytest.raises(OutOfTime):
         Batches(g, oracle, Late(), 10**6).values(points, lambda value, dual: None)
+
+
+def test_threads_of_a_worker_do_not_share_what_changes(oracle, worth):
+    points = points_of(oracle, 4 * LONG)
+    _, expected, _ = valued(oracle, points)
+    with ThreadPoolExecutor(3) as executor:
+        _, found, _ = valued(oracle, points, executor)
+    assert found.tobytes() == expected.tobytes()
 
 
 def test_chunks_are_shorter_than_long_batches():
