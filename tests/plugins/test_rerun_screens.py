@@ -219,6 +219,15 @@ def test_a_cut_is_told_as_its_constraint(small: sr.Outcome) -> None:
     assert "row 1" in words.cut_words(small.result.indices[0], None)
 
 
+def test_a_round_with_some_of_the_uncertainty_says_so_and_claims_no_upper_bound() -> None:
+    (said,) = words.round_lines(replace(entry(1, 0.5, 0.7), simplified=True, violation=-1.0), None)
+    assert "some of the uncertainty only" in said and "upper bound" not in said
+    (plain,) = words.round_lines(replace(entry(1, 0.5, 0.7), violation=-1.0), None)
+    assert "some of the uncertainty" not in plain and "upper bound 0.7" in plain
+    cut = sr.Cut("path", np.array([1.5, 17.0]), 0, 1.0, "sampled")
+    assert words.cut_words(cut, None) == "path at t = 1.5 in scenario 17, row 1"
+
+
 def test_the_worst_case_and_the_proofs_of_a_run_are_known_when_it_is_shown_again(small: sr.Outcome) -> None:
     again = stored_result(stored_run(small.directory))
     assert again.worst is not None and small.result.worst is not None

@@ -30,9 +30,10 @@ def round_lines(event: sr.RoundFinished, inspection: sr.Inspection | None) -> li
         violated = f"every constraint holds, {event.worst_family} to within {event.violation:.1e}"
     else:
         violated = f"every constraint holds with {-event.violation:.2e} to spare"
-    bound = f"lower bound {event.lower_bound:.7g}" + (
-        f", upper bound {event.upper_bound:.7g}" if math.isfinite(event.upper_bound) else ""
-    )
+    if event.simplified:
+        violated += ", with some of the uncertainty only"
+    known_above = math.isfinite(event.upper_bound) and not event.simplified
+    bound = f"lower bound {event.lower_bound:.7g}" + (f", upper bound {event.upper_bound:.7g}" if known_above else "")
     lines = [f"round {event.round}: {bound}; {violated}; epsilon {event.epsilon:.1e}"]
     for word, cuts in (("+", event.added), ("-", event.dropped)):
         lines += [f"{word} {cut_words(cut, inspection)}" for cut in cuts[:CUTS]]
@@ -47,6 +48,8 @@ def cut_words(cut: sr.Cut, inspection: sr.Inspection | None) -> str:
     family = next((one.formulated(cut.formulation) for one in families if one.name == cut.family), None)
     if family is not None and family.explain is not None:
         return family.explanation(cut.index, cut.row).short()
+    if cut.formulation == "sampled" and len(cut.index) > 1:
+        return f"{cut.family} at t = {cut.index[0]:.5g} in scenario {cut.index[1]:.0f}, row {cut.row + 1}"
     shown = ", ".join(f"{value:.5g}" for value in cut.index[:4]) + (", ..." if len(cut.index) > 4 else "")
     return f"{cut.family} at ({shown}), row {cut.row + 1}"
 

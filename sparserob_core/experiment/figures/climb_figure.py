@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 NOTES = 3  # of the maximiser, at most, each in a panel of its own
 MEAN = 50  # evaluations over which the share of accepted ones is taken
+ROOM = 0.11  # share of the evaluations from which on a stage has room for words
 FINEST = 1e-10  # of the highest value: what is nearer to it is drawn there
 VIEW = 1.5  # the view of the bound reaches down by this many times the size of the optimum
 MANY = 3000  # dots beyond which a figure for print holds them as a picture
@@ -127,11 +128,12 @@ def _deepest(below: Sequence[float]) -> float:
 def _stage_words(ax: Axes, k: int, stages: list[tuple[float, int, int]], top: float) -> None:
     """The weight and the highest value above a stage, where there is room for them."""
     epsilon, first, last = stages[k]
-    if last - first >= 0.11 * stages[-1][2]:
+    share = (last - first) / stages[-1][2]
+    if share >= ROOM:
         ax.text(
             (first + last + 1) / 2,
             1.02,
-            rf"$\varepsilon$ = {epsilon:.3g}" + "\n" + rf"$g$ = {top:.6g}",
+            rf"$\varepsilon$ = {epsilon:.3g}" + "\n" + rf"$g$ = {top:.{6 if share >= 1.4 * ROOM else 4}g}",
             transform=ax.get_xaxis_transform(),
             fontsize=8.5,
             color=look.GREY,

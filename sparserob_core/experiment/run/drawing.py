@@ -74,7 +74,7 @@ def drawings(
         decision = np.asarray(result.decision).reshape(-1, experiment.control.functions)
         yield lambda: draw_experiment(experiment, decision, active, result.history, directory, result.cost, worst)
     trace = result.trace
-    if trace is not None and trace.value.size:
+    if trace is not None and np.isfinite(trace.value).any():
         exact = result.status == "certified"
         yield lambda: write_climb(
             directory / "figures", trace, printable(experiment.title), result.upper_bound, exact=exact

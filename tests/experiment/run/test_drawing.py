@@ -4,6 +4,7 @@ slice of g that is shown is one that varies, where any does."""
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.experiment.directory.finished import stored_run
 from sparserob_core.experiment.run import landscape
-from sparserob_core.experiment.run.drawing import draw_run, drawn
+from sparserob_core.experiment.run.drawing import draw_run, drawings, drawn
 from sparserob_core.experiment.run.landscape import Place, chosen, landscape_of
 
 pytest.importorskip("matplotlib")
@@ -144,3 +145,11 @@ def test_why_an_infeasible_run_is_one_is_drawn_again(tmp_path: Path) -> None:
     )
     assert outcome.status == "infeasible"
     assert {file.name for file in draw_run(outcome.directory)} == {"clash.pdf", "clash.png"}
+
+
+def test_a_search_that_met_no_finite_value_has_no_climb(searched: sr.Outcome, tmp_path: Path) -> None:
+    trace = searched.result.trace
+    assert trace is not None
+    lost = replace(trace, value=np.full_like(trace.value, np.inf))
+    result = replace(searched.result, trace=lost, decision=None, status="undecided")
+    assert list(drawings(searched.experiment, result, tmp_path, {})) == []
