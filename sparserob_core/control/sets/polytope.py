@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, shaped
@@ -218,7 +219,7 @@ class Polytope(ConvexSet):
                 values[position], points[position] = self._maximise(directions[position])
         return values, points
 
-    def _endless(self, directions: Array) -> Array:
+    def _endless(self, directions: Array) -> npt.NDArray[np.bool_]:
         """Which directions ``(k, d)`` in balanced coordinates have a part along a line that no row bounds, clearly."""
         along = np.linalg.norm(directions @ self._lines.T, axis=1)
         return np.asarray(along > _CLEAR * np.linalg.norm(directions, axis=1))
