@@ -6,9 +6,10 @@ import subprocess
 import sys
 
 import pytest
+from threadpoolctl import threadpool_limits
 
 import sparserob_core as sr
-from sparserob_core.testing.executors import echo
+from sparserob_core.testing.executors import echo, threads
 from tests.support.places import ROOT
 
 REGISTRY = sr.load_registry()
@@ -55,8 +56,9 @@ def test_a_scheduler_that_does_not_answer_is_an_error_of_the_input(address):
 @pytest.mark.slow
 def test_the_dashboard_is_told_and_nothing_listens_beyond_this_machine(capfd):
     pytest.importorskip("distributed")
-    with opened(workers=1) as executor:
+    with threadpool_limits(2), opened(workers=1) as executor:
         assert executor.submit(echo, 3).result(60) == 3
+        assert set(threads()) == {1}, "this process adds up in another order than the workers"
         listening = executor._client.scheduler_info()["address"]
     said = capfd.readouterr()
     assert said.out == ""
