@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import click
 
 from sparserob_core.errors import SparseRobError, named
+from sparserob_core.experiment.cli.commands.benchmark import benchmark
 from sparserob_core.experiment.cli.commands.check import check
 from sparserob_core.experiment.cli.commands.compare import compare
 from sparserob_core.experiment.cli.commands.figures import figures
@@ -87,6 +88,7 @@ for command in (
     margin,
     initial_states,
     compare,
+    benchmark,
     figures,
     plugins,
     new_plugin,

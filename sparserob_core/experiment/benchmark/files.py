@@ -1,0 +1,104 @@
+"""What a benchmark leaves: the profiles as a picture, all numbers, and files that IOHanalyzer reads."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import sparserob_core
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.comparison.profiles_figure import write_profiles
+from sparserob_core.experiment.directory.artefacts import RunDirectory, finite
+from sparserob_core.experiment.figures.style import missing_matplotlib
+
+if TYPE_CHECKING:
+    from sparserob_core.experiment.benchmark.benchmark import Benchmark, Search
+
+IOH = "0.3.22"  # the version of IOHexperimenter whose files these look like
+
+
+def shipped(name: str) -> Path:
+    """The file of a config of this distribution: beside the package where it is installed, in the repository else."""
+    package = Path(str(sparserob_core.__file__)).parent
+    places = [folder / "configs" / f"{name}.yaml" for folder in (package, package.parent)]
+    return next((place for place in places if place.exists()), places[-1])
+
+
+def prepared(place: Path) -> Path:
+    """The directory, made where it is missing; raises `InputError` for one that holds something."""
+    if place.exists() and (not place.is_dir() or any(place.iterdir())):
+        raise InputError(f"out: expected a new or empty directory, got {place}")
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"out: {place} cannot be made: {error.strerror}") from error
+    return place
+
+
+def write(found: Benchmark, place: Path) -> Benchmark:
+    """Write everything; where matplotlib is missing the remarks say so."""
+    directory = RunDirectory(place)
+    directory.write_json("benchmark.json", found.summary())
+    for name, text in ioh_files(found):
+        directory.write_text(name, text)
+    if missing := missing_matplotlib():
+        return replace(found, profiles=replace(found.profiles, undrawn=missing))
+    write_profiles(place / "profiles.png", found.profiles)
+    return found
+
+
+def ioh_files(found: Benchmark) -> Iterator[tuple[str, str]]:
+    """Names and texts in the format of IOHprofiler (de Nobel and others 2024): for every contender and function one
+    file of facts, and one table for every dimension, in which a line is an improvement."""
+    for name in found.profiles.contenders:
+        folder = f"ioh/{_plain(name)}"
+        mine = sorted((one for one in found.searches if one.contender == name), key=_function)
+        for (number, title), group in groupby(mine, key=_function):
+            searches, scenarios = list(group), []
+            for size, runs in groupby(
+                sorted(searches, key=lambda one: one.landscape.box.dimension), lambda one: one.landscape.box.dimension
+            ):
+                table = f"data_f{number}_{title}/IOHprofiler_f{number}_DIM{size}.dat"
+                kept = list(runs)
+                yield f"{folder}/{table}", "".join(_table(one) for one in kept)
+                scenarios.append({"dimension": size, "path": table, "runs": [_facts(one) for one in kept]})
+            facts = {
+                "version": IOH,
+                "suite": searches[0].landscape.suite,
+                "function_id": number,
+                "function_name": title,
+                "maximization": True,
+                "algorithm": {"name": name, "info": "SparseRob"},
+                "attributes": ["evaluations", "raw_y"],
+                "scenarios": scenarios,
+            }
+            yield f"{folder}/IOHprofiler_f{number}_{title}.json", json.dumps(finite(facts), indent="\t") + "\n"
+
+
+def _function(one: Search) -> tuple[int, str]:
+    return one.landscape.number, _plain(re.sub(r" \d+D$", "", one.landscape.name))
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"\W+", "_", name).strip("_")
+
+
+def _table(one: Search) -> str:
+    better = np.flatnonzero(np.diff(one.best, prepend=-np.inf) > 0.0)
+    rows = [f"{at + 1} {one.best[at]:.12g}" for at in better]
+    if better.size and better[-1] + 1 < one.best.size:
+        rows.append(f"{one.best.size} {one.best[-1]:.12g}")
+    return "\n".join(["evaluations raw_y", *rows]) + "\n"
+
+
+def _facts(one: Search) -> dict[str, Any]:
+    first = int(np.argmax(one.best)) + 1 if one.best.size else 0
+    best = {"evals": first, "y": float(one.best[-1]) if one.best.size else None, "x": one.point.tolist()}
+    return {"instance": one.landscape.instance, "evals": int(one.best.size), "best": best}

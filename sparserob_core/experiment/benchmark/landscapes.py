@@ -1,0 +1,159 @@
+"""What maximisers are compared on: standard functions, the BBOB suite, and landscapes of ``g`` of configs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.maximiser import LinearBlocks
+
+SUITES = ("standard", "bbob", "g")
+BBOB_DIMENSIONS = (2, 5)
+INDICES = 8  # of a tuple of a landscape of g
+EPSILON = 1e-3  # the weight of the regulariser in a landscape of g
+SAMPLE = 1000  # uniform points whose median is where a search is said to begin
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Landscape:
+    """A function to be maximised over a box ``(d,)``: points ``(k, d)`` to values ``(k,)``, its ``maximum``, and the
+    number and the instance under which IOHprofiler knows it.
+
+    ``gradient``, ``block`` and ``linear`` as in a search (`Objective`). ``fresh`` makes the same function anew, where
+    it remembers what it was asked before.
+    """
+
+    name: str
+    function: Callable[[Array], Array]
+    box: Box
+    maximum: float
+    number: int
+    suite: str
+    instance: int = 1
+    gradient: Callable[[Array], Array] | None = None
+    block: int = 1
+    linear: LinearBlocks | None = None
+    fresh: Callable[[], Landscape] | None = None
+
+    def begin(self, seed: int) -> float:
+        """The median of the function at uniform points: what a search begins with."""
+        points = np.random.default_rng([seed, self.number]).uniform(
+            self.box.lower, self.box.upper, (SAMPLE if self.fresh is None else 50, self.box.dimension)
+        )
+        values = np.asarray(self.function(points), dtype=float)
+        return float(np.median(values[np.isfinite(values)], axis=0)) if np.isfinite(values).any() else -np.inf
+
+
+def landscapes(suites: Sequence[str], configs: Sequence[Path], instance: int = 1) -> Iterator[Landscape]:
+    """The landscapes of the suites; ``configs`` for the suite ``g``. Raises `InputError` for an unknown suite, one that
+    needs a package that is missing, and a config without a certified value."""
+    for suite in suites:
+        if suite not in SUITES:
+            raise InputError(f"suite: expected one of {', '.join(SUITES)}, got {suite!r}")
+    if "standard" in suites:
+        yield from standard()
+    if "bbob" in suites:
+        yield from bbob(instance)
+    if "g" in suites:
+        for number, config in enumerate(configs):
+            yield landscape_of(config, 301 + number)
+
+
+def standard() -> Iterator[Landscape]:
+    """Six functions with their maxima off the centre of the box, where a method that begins there would meet them by
+    luck."""
+    shift = np.array([0.7123, -1.3391, 1.0417, 0.2718, -0.5772])
+
+    def garland(x: Array) -> Array:
+        return np.asarray((x * (1 - x) * (4 - np.sqrt(np.abs(np.sin(60 * x))))).sum(axis=1))
+
+    def holder(x: Array) -> Array:
+        wave = np.sin(x[:, 0]) * np.cos(x[:, 1])
+        return np.asarray(np.abs(wave * np.exp(np.abs(1 - np.hypot(x[:, 0], x[:, 1]) / math.pi))))
+
+    def himmelblau(x: Array) -> Array:
+        return -((x[:, 0] ** 2 + x[:, 1] - 11) ** 2) - (x[:, 0] + x[:, 1] ** 2 - 7) ** 2
+
+    def ackley(x: Array) -> Array:
+        z = x - shift[: x.shape[1]]
+        flat = 20 * np.exp(-0.2 * np.sqrt((z**2).mean(axis=1)))
+        return np.asarray(flat + np.exp(np.cos(2 * math.pi * z).mean(axis=1)) - 20 - math.e)
+
+    def rastrigin(x: Array) -> Array:
+        z = x - shift[: x.shape[1]]
+        return np.asarray(-(z**2 - 10 * np.cos(2 * math.pi * z) + 10).sum(axis=1))
+
+    def rosenbrock(x: Array) -> Array:
+        return np.asarray(-(100 * (x[:, 1:] - x[:, :-1] ** 2) ** 2 + (1 - x[:, :-1]) ** 2).sum(axis=1))
+
+    # the maxima of the first two are known to these digits only: a value above them by that much is no fault
+    yield Landscape("garland", garland, Box(np.zeros(1), np.ones(1)), 0.9977723, 101, "standard")
+    yield Landscape("holder table", holder, _cube(10.0, 2), 19.2085026, 102, "standard")
+    yield Landscape("himmelblau", himmelblau, _cube(5.0, 2), 0.0, 103, "standard")
+    yield Landscape("ackley", ackley, _cube(32.0, 2), 0.0, 104, "standard")
+    yield Landscape("rastrigin", rastrigin, _cube(5.12, 3), 0.0, 105, "standard")
+    yield Landscape("rosenbrock", rosenbrock, _cube(2.048, 5), 0.0, 106, "standard")
+
+
+def bbob(instance: int = 1) -> Iterator[Landscape]:
+    """The 24 functions of BBOB (Hansen, Finck, Ros and Auger 2009), negated, in dimensions 2 and 5, by ioh."""
+    if find_spec("ioh") is None:
+        raise InputError("suite: bbob needs ioh, which is not installed; `pip install 'sparserob[bench]'` brings it")
+    import ioh
+
+    for number in range(1, 25):
+        for dimension in BBOB_DIMENSIONS:
+            problem: Any = ioh.get_problem(
+                number, instance=instance, dimension=dimension, problem_class=ioh.ProblemClass.BBOB
+            )
+
+            def negated(x: Array, problem: Any = problem) -> Array:
+                return -np.array([problem(point) for point in x], dtype=float)
+
+            name = f"{problem.meta_data.name} {dimension}D"
+            yield Landscape(name, negated, _cube(5.0, dimension), -float(problem.optimum.y), number, "bbob", instance)
+
+
+def landscape_of(config: Path, number: int) -> Landscape:
+    """``g`` at tuples of reduced indices of a config, at a small weight of the regulariser; its maximum is the value
+    that the exchange certifies at that weight.
+
+    Raises `InputError` where the exchange certifies none, for then the maximum is not known.
+    """
+    from sparserob_core.experiment.assemble import assemble, tools_of
+    from sparserob_core.experiment.config.load import load_config
+    from sparserob_core.sip.methods.own_units import solve_in_own_units
+    from sparserob_core.sip.relaxed.relaxed import RelaxedProgram
+    from sparserob_core.sip.relaxed.tuples import TupleValue
+
+    fixed = {"start": EPSILON, "stop": EPSILON}
+    loaded = load_config(str(config), {"method": {"name": "exchange", "exact": False}, "continuation": fixed})
+    experiment, tools = assemble(loaded), tools_of(loaded)
+    method = loaded.registry.build("method", "exchange", {"exact": False})
+    result = solve_in_own_units(method, experiment.program, tools)
+    if result.status not in ("certified", "verified") or not experiment.program.families:
+        raise InputError(f"{config}: expected a config whose value is certified, got {result.status}: {result.message}")
+
+    def made() -> Landscape:
+        relaxed = RelaxedProgram(experiment.program, tools.solver, tools.regulariser)
+        g = TupleValue(experiment.program, relaxed, INDICES)
+        g.epsilon = EPSILON
+        name = f"g of {config.stem}"
+        return Landscape(
+            name, g, g.domain, float(result.value), number, "g", 1, g.gradient, g.block, g.linear, fresh=made
+        )
+
+    return made()
+
+
+def _cube(half: float, dimension: int) -> Box:
+    return Box(np.full(dimension, -half), np.full(dimension, half))

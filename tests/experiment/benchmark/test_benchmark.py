@@ -1,0 +1,126 @@
+"""Guards experiment/benchmark: known maxima, expected running times as they are defined, files that IOHanalyzer reads,
+and landscapes of g whose maximum nobody exceeds."""
+
+from __future__ import annotations
+
+import json
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+
+import sparserob_core as sr
+from sparserob_core.experiment.benchmark.benchmark import Benchmark, Search
+from sparserob_core.experiment.benchmark.landscapes import Landscape, bbob, landscape_of, landscapes, standard
+from sparserob_core.experiment.comparison.profiles import Instance, Profiles
+from tests.support.places import CONFIGS
+
+
+@pytest.mark.parametrize("landscape", list(standard()), ids=lambda one: one.name)
+def test_no_point_of_a_standard_function_exceeds_its_maximum_and_a_search_comes_near(landscape):
+    report = sr.maximise(landscape.function, landscape.box, "simulated_annealing", 3000, 0, 0.3)
+    slack = 1e-6 * max(1.0, abs(landscape.maximum))
+    assert report.best_value <= landscape.maximum + slack
+    assert report.best_value >= landscape.maximum - 0.01 * (landscape.maximum - landscape.begin(0))
+
+
+@pytest.mark.skipif(find_spec("ioh") is None, reason="ioh, of the extra bench, is not installed")
+def test_bbob_functions_have_their_maximum_where_ioh_says():
+    found = list(bbob())
+    assert len(found) == 48
+    for landscape in found[:8]:
+        values = landscape.function(np.random.default_rng(0).uniform(-5.0, 5.0, (50, landscape.box.dimension)))
+        assert (values <= landscape.maximum).all()
+
+
+def searched(bests, budget=10, target=1.0):
+    """A benchmark of one contender on one landscape, with these running best values."""
+    landscape = Landscape("hill", lambda x: x[:, 0], sr.Box([0.0], [1.0]), 1.0, 1, "standard")
+    searches = [Search(landscape, "a", seed, np.array(best), 0.001, np.zeros(1)) for seed, best in enumerate(bests)]
+    times = [[np.array([one.needed(target) for one in searches])]]
+    profiles = Profiles("", "evaluations", 1e-3, ["a"], [Instance("hill", 1.0, True, 2.0)], [[0, 1]], times, [0])
+    return Benchmark(profiles, searches, [target], budget)
+
+
+def test_the_expected_running_time_counts_what_failures_spent():
+    found = searched([[0.2, 1.0, 1.0, 1.0], [0.1, 0.2, 0.3, 0.4]])
+    assert found.expected_running_time(0, "a") == 2 + 4  # one success after 2, one failure after 4
+    assert searched([[0.1], [0.2]]).expected_running_time(0, "a") == np.inf
+    assert found.own_microseconds("a") == pytest.approx(1e6 * 0.002 / 8)
+
+
+def test_a_benchmark_is_the_same_twice_and_leaves_its_files(tmp_path):
+    names = ["random_search", "sequool"]
+    first = sr.benchmark(names, budget=60, seeds=2, out=tmp_path / "one")
+    again = sr.benchmark(names, budget=60, seeds=2)
+    for one, other in zip(first.searches, again.searches, strict=True):
+        assert (one.best == other.best).all()
+    written = json.loads((tmp_path / "one" / "benchmark.json").read_text())
+    assert [one["label"] for one in written["contenders"]] == names
+    facts = json.loads((tmp_path / "one" / "ioh" / "sequool" / "IOHprofiler_f101_garland.json").read_text())
+    assert facts["maximization"] and facts["scenarios"][0]["dimension"] == 1
+    table = (tmp_path / "one" / "ioh" / "sequool" / facts["scenarios"][0]["path"]).read_text().splitlines()
+    assert table.count("evaluations raw_y") == 2
+    last = float(table[-1].split()[1])
+    assert last == pytest.approx(facts["scenarios"][0]["runs"][-1]["best"]["y"], rel=1e-11)
+    with pytest.raises(sr.InputError, match="new or empty directory"):
+        sr.benchmark(names, budget=60, seeds=2, out=tmp_path / "one")
+
+
+@pytest.mark.skipif(find_spec("ioh") is None, reason="ioh, of the extra bench, is not installed")
+def test_the_files_have_the_same_keys_as_those_that_ioh_writes(tmp_path):
+    import ioh
+
+    problem = ioh.get_problem("Sphere", instance=1, dimension=2, problem_class=ioh.ProblemClass.BBOB)
+    logger = ioh.logger.Analyzer(root=str(tmp_path), folder_name="theirs", algorithm_name="a")
+    problem.attach_logger(logger)
+    problem([0.0, 0.0])
+    problem.reset()
+    logger.close()
+    theirs = json.loads((tmp_path / "theirs" / "IOHprofiler_f1_Sphere.json").read_text())
+    sr.benchmark(["random_search"], budget=5, seeds=1, out=tmp_path / "ours")
+    ours = json.loads((tmp_path / "ours" / "ioh" / "random_search" / "IOHprofiler_f101_garland.json").read_text())
+    assert set(theirs) == set(ours)
+    assert set(theirs["scenarios"][0]) == set(ours["scenarios"][0])
+    assert set(theirs["scenarios"][0]["runs"][0]) == set(ours["scenarios"][0]["runs"][0])
+
+
+def test_nobody_exceeds_the_certified_maximum_of_a_landscape_of_g_and_the_gradient_meets_it():
+    found = sr.benchmark(
+        ["gradient_ascent"], ["g"], budget=200, seeds=1, configs=[CONFIGS / "double_integrator.yaml"], polish=0.2
+    )
+    assert found.expected_running_time(0, "gradient_ascent") <= 200
+    assert found.searches[0].best[-1] <= found.searches[0].landscape.maximum * (1 + 1e-6)
+
+
+@pytest.mark.parametrize(
+    "changed, said",
+    [
+        ({"suites": ["standart"]}, "suite: expected one of"),
+        ({"budget": 0}, "budget: expected a whole number"),
+        ({"seeds": 1.5}, "seeds: expected a whole number"),
+        ({"accuracy": 0.0}, "accuracy: expected a number above 0"),
+        ({"maximisers": []}, "maximisers: expected at least one"),
+        ({"maximisers": ["sobol", "sobol"]}, "expected each one once"),
+    ],
+)
+def test_wrong_input_is_one_error_that_names_the_argument(changed, said):
+    arguments = {"maximisers": ["sobol"], "suites": ["standard"], "budget": 10, "seeds": 1, **changed}
+    with pytest.raises(sr.InputError, match=said):
+        sr.benchmark(arguments.pop("maximisers"), arguments.pop("suites"), **arguments)
+
+
+def test_a_config_whose_value_is_not_certified_is_refused():
+    with pytest.raises(sr.InputError, match="expected a config whose value is certified, got infeasible"):
+        landscape_of(CONFIGS / "experiment1_printed.yaml", 1)
+
+
+def test_unknown_suites_are_refused_before_anything_is_built():
+    with pytest.raises(sr.InputError, match="suite"):
+        list(landscapes(["unknown"], ()))
+
+
+def test_the_command_prints_two_tables(command):
+    done = command("benchmark", "sobol", "--budget", "20", "--seeds", "1")
+    assert done.returncode == 0
+    assert "own us / evaluation" in done.stdout and "expected evaluations" in done.stdout
