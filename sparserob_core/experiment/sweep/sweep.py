@@ -298,7 +298,7 @@ def run_name(axes: Sequence[Axis], point: Point) -> str:
     for axis, value in zip(axes, point.values, strict=True):
         steps = [str(step) for step in axis.path if step != "name"]
         parts.append(f"{steps[-1] if steps else axis.key}={value_text(value)}")
-    text = re.sub(r"[^A-Za-z0-9=.,+_-]+", "-", re.sub(r"[][(){}\s]", "", "_".join(parts)))
+    text = re.sub(r"[^A-Za-z0-9=.,+_-]+", "-", re.sub(r"[][(){}]|(?<=,)\s", "", "_".join(parts)))
     return f"{text[:LETTERS].strip('-.,')}-{point.hash[:DIGITS]}"
 
 
@@ -350,6 +350,8 @@ def _drawn(study: Study) -> Study:
     try:
         if study.table and not study.stopped:
             write_study_figure(study)
+    except KeyboardInterrupt:
+        return replace(study, remarks=(*study.remarks, "no figure: it was interrupted"))
     except SparseRobError as error:
         return replace(study, remarks=(*study.remarks, str(error)))
     except Exception as error:  # noqa: BLE001  as said above

@@ -469,6 +469,25 @@ def test_an_interrupt_in_python_returns_what_is_known(counting: Path, tmp_path: 
     assert calls(counting) == {1: 1, 2: 1, 3: 1}
 
 
+def test_an_interrupt_while_the_figure_is_drawn_costs_the_figure_only(
+    counting: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def press(study: sr.Study) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sparserob_core.experiment.sweep.figure.write_study_figure", press)
+    study = sr.sweep(counting, {"method.number": [1, 2]}, out=tmp_path / "out")
+    assert (len(study.table), study.remarks) == (2, ("no figure: it was interrupted",))
+
+
+def test_the_directory_of_a_run_has_a_name_for_readers(counting: Path, tmp_path: Path) -> None:
+    axes = {"problem.terminal.0.box": [[0.5, 0.5]], "solver": [{"name": "piqp"}, "clarabel"], "method.number": [1]}
+    study = sr.sweep(counting, {**axes, "title": "a/../b", "method.wait": [0.0, 1e-3]}, out=tmp_path / "out")
+    names = [row["run"].rpartition("-")[0] for row in study.table]
+    solvers, waits = ("piqp", "clarabel"), ("0", "0.001")
+    assert names == [f"solver={solver}_wait={wait}" for solver in solvers for wait in waits]
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
