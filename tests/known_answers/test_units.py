@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.sip.methods.own_units import UsersUnits
 
 FILES = Path(__file__).parent / "units"
 INFEASIBLE = ("01", "11", "15", "16", "18", "21", "22", "23", "25", "27")
@@ -285,3 +286,31 @@ def test_a_margin_changes_by_its_units_only(of):
 )
 def test_margins_of_everything_change_by_their_units_only(of, curved):
     same_margin(of, curved, seed=11, binary=True)
+
+
+def test_bounds_of_proofs_are_in_the_users_units_and_shares_in_each_rows_own():
+    f = Factors(time=4.0, states=np.array([2.0**-20, 2.0**7]), control=2.0, noise=np.array([2.0**-5, 8.0]))
+    one, other = solved(oscillator("known", Factors())), solved(oscillator("known", f))
+    for mine, theirs in zip(one.proofs, other.proofs, strict=True):
+        assert theirs.share == mine.share is not None and mine.share <= 1e-9
+        for proof in (mine, theirs):
+            assert proof.bound == proof.share * (proof.units.max() if proof.share > 0.0 else proof.units.min())
+    program = sr.transcribe(oscillator("known", f), control=sr.Dictionary(np.linspace(0.0, 0.75, 4), np.eye(3)))
+    told = UsersUnits(program.own_units).event(sr.ProofProgress(family="path", cells=1, bound=2.0))
+    assert told.bound == 2.0 * program.own_units.program.family("path").row_units.max()
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-9])
+def test_a_tangent_of_a_curved_set_is_told_in_numbers_of_the_states(size):
+    """Why x1 cannot come into a ball of half its size, in metres and in nanometres: no number is the inverse of a
+    size."""
+    problem = sr.OptimalControlProblem(
+        system=sr.LinearSystem([[0, size], [0, 0]], [[0.0], [1.0]]),
+        horizon=1.0,
+        initial_state=[size, 0.0],
+        control=sr.Box([-0.1], [0.1]),
+        path=[sr.Ellipsoid([0.0, 0.0], np.diag([0.25 * size**2, 0.25]))],
+    )
+    result = solved(problem)
+    assert result.status == "infeasible" and "x1(0)" in result.message
+    assert "e+0" not in result.message

@@ -146,7 +146,8 @@ class CurvedConstraint(StateConstraint):
     @shaped
     def explain(self, index: Float[Array, " j"], row: int) -> Explanation:
         times, directions, parameters, rhs = self.functionals_at(index[None])
-        said = explanation(self.name, self.functionals, directions, rhs, 0, float(times[0]), parameters[0])
+        at = (float(times[0]), parameters[0])
+        said = explanation(self.name, self.functionals, directions, rhs, 0, *at, scale=float(np.abs(directions).max()))
         tangent = f" (a tangent of the {self.set.kind})"
         return replace(said, text=said.text + tangent, statement=said.statement + tangent)
 

@@ -34,7 +34,8 @@ class TimedExplanation(Explanation):
     ``statement`` is what it asks for, ``text`` the same with remarks. A constraint on the state compares a ``quantity``
     such as ``x1(5)`` with a ``limit``: ``bound`` is what the quantity may be (``|x1| <= 0.3``), ``free`` its value
     without control and disturbance, ``sign`` -1 for a lower limit, ``sigma`` how far the disturbance alone moves it
-    towards the limit, ``where`` the parameter in words. ``constraint``: the name of the constraint.
+    towards the limit, ``where`` the parameter in words. ``constraint``: the name of the constraint. Words say all of
+    these, and the ``direction``, divided by ``scale``.
     """
 
     decides: ClassVar[str] = "control"
@@ -52,6 +53,7 @@ class TimedExplanation(Explanation):
     sigma: float = 0.0
     sign: float = 1.0
     where: str = ""
+    scale: float = 1.0
 
     def witness(self, worst: WorstConstraint) -> WorstConstraint:
         return Witness(
@@ -75,8 +77,8 @@ class TimedExplanation(Explanation):
     def beyond(self, amount: float) -> str:
         if not self.quantity:
             return super().beyond(amount)
-        reached = self.free + self.sign * self.sigma
-        moved = f" under the worst disturbance, which moves it by {self.sigma:.4g}," if self.sigma > 0 else ""
+        reached, pushed = (self.free + self.sign * self.sigma) / self.scale, self.sigma / self.scale
+        moved = f" under the worst disturbance, which moves it by {pushed:.4g}," if self.sigma > 0 else ""
         return (
             f"{self.quantity} = {reached:.6g}{moved} is outside {self.bound} ({self.constraint}), "
             f"whatever the decision{self._at}"
@@ -92,14 +94,15 @@ class TimedExplanation(Explanation):
         if rest.any():
             return self._uncontrollable(other, rest, share, allowed, moved) + self._at
         if moved > 0:
-            more, less = told_apart(moved / 2, allowed / 2)
+            more, less = told_apart(moved / 2 / self.scale, allowed / 2 / self.scale)
             return f"the disturbance alone moves {self.quantity} by {more}, {self._set} allows {less}{self._at}"
         return f"{self.text} and {other.text} leave nothing between them{self._at}"
 
     def _uncontrollable(self, other: TimedExplanation, rest: Array, share: float, allowed: float, moved: float) -> str:
         """The control moves both quantities alike, so that it cannot change ``rest'x``, a combination of them."""
         side = -1.0 if rest[np.flatnonzero(rest)[0]] < 0 else 1.0
-        free = self.sign * self.free + share * other.sign * other.free
+        free = (self.sign * self.free + share * other.sign * other.free) / self.scale
+        rest, allowed, moved = rest / self.scale, allowed / self.scale, moved / self.scale
         most = "at least" if side < 0 else "at most"
         taken = f" less {moved:.4g} for the worst disturbances" if moved > 0 and side > 0 else ""
         taken = f" and {moved:.4g} more for the worst disturbances" if moved > 0 and side < 0 else taken
@@ -112,14 +115,15 @@ class TimedExplanation(Explanation):
     def out_of_reach(self, amount: float, needed: float) -> str:
         if not self.quantity:
             return super().out_of_reach(amount, needed)
+        amount, needed = amount / self.scale, needed / self.scale
         if needed - amount < 0:
             return f"{self.text} is violated by at least {amount:.4g}, whatever the control{self._at}"
         verb = "raise" if self.sign < 0 else "lower"
-        pushed = f", {self.sigma:.4g} of it for the worst disturbance" if self.sigma > 0 else ""
+        pushed = f", {self.sigma / self.scale:.4g} of it for the worst disturbance" if self.sigma > 0 else ""
         can, must = told_apart(needed - amount, needed)
         return (
             f"the control can {verb} {self.quantity} by at most {can}, and {must} is needed{pushed}: "
-            f"without control it is {self.free:.4g}, {self._set} asks for {self.bound}{self._at}"
+            f"without control it is {self.free / self.scale:.4g}, {self._set} asks for {self.bound}{self._at}"
         )
 
     @property
@@ -132,23 +136,31 @@ class TimedExplanation(Explanation):
 
 
 def explanation(
-    name: str, functionals: WorstCase, H: Array, h: Array, row: int, time: float, parameter: Array
+    name: str,
+    functionals: WorstCase,
+    H: Array,
+    h: Array,
+    row: int,
+    time: float,
+    parameter: Array,
+    scale: float = 1.0,
 ) -> TimedExplanation:
     """Row ``row`` of ``H x(t) <= h`` at a time and a parameter ``(nu,)``: what is bounded, when, and what the
-    uncertainty does to it."""
+    uncertainty does to it; in words divided by ``scale``."""
     direction, system = H[row], functionals.response.system
     sign = -1.0 if np.count_nonzero(direction) == 1 and direction.sum() < 0 else 1.0
     at = (np.array([time]), direction[None], parameter[None])
     sigma = float(functionals.offsets(*at)[0])
     free, limit = sign * float(functionals.rows(*at)[1][0] - sigma) + 0.0, sign * float(h[row])
     quantity, where = (
-        combination(sign * direction, f"({time:.6g})"),
+        combination(sign * direction / scale, f"({time:.6g})"),
         system.describe(parameter) if parameter.size else "",
     )
-    remarks = [f"the initial state gives {free:.6g}"] if time <= 0 else []
-    remarks += [f"the disturbance alone moves it by {sigma:.4g}"] if sigma > 0 else []
+    remarks = [f"the initial state gives {free / scale:.6g}"] if time <= 0 else []
+    remarks += [f"the disturbance alone moves it by {sigma / scale:.4g}"] if sigma > 0 else []
     remarks += [f"at {where}"] if where else []
-    statement = f"{name}: {quantity} {'>=' if sign < 0 else '<='} {limit:.6g}"
+    statement = f"{name}: {quantity} {'>=' if sign < 0 else '<='} {limit / scale:.6g}"
+    opposite = _opposite(H, h, row)
     return TimedExplanation(
         f"{statement} ({', '.join(remarks)})" if remarks else statement,
         name,
@@ -158,12 +170,13 @@ def explanation(
         parameter,
         functionals.worst_disturbance(time, direction, parameter),
         quantity=quantity,
-        bound=_bound(sign * direction, limit, _opposite(H, h, row), sign),
+        bound=_bound(sign * direction / scale, limit / scale, None if opposite is None else opposite / scale, sign),
         limit=limit,
         free=free,
         sigma=sigma,
         sign=sign,
         where=where,
+        scale=scale,
     )
 
 

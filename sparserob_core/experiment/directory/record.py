@@ -59,7 +59,7 @@ def _tolerance(proof: Proof) -> dict[str, Any]:
     margin). ``rows``: what counts as no violation, at most `TOLERANCE` of its own unit, of every row in the user's."""
     return {
         "own": TOLERANCE,
-        "proven": proof.bound,
+        "proven": proof.bound if proof.share is None else proof.share,
         "rows": None if proof.units is None else TOLERANCE * proof.units,
     }
 

@@ -15,7 +15,17 @@ from typing import final
 import numpy as np
 
 from sparserob_core.sip.convex_set import Array, Box
-from sparserob_core.sip.events import Batch, EvaluationsFinished, Event, Notify, RoundFinished, Sketch, frozen, ignore
+from sparserob_core.sip.events import (
+    Batch,
+    EvaluationsFinished,
+    Event,
+    Notify,
+    ProofProgress,
+    RoundFinished,
+    Sketch,
+    frozen,
+    ignore,
+)
 from sparserob_core.sip.evidence import Cut, Dual, Proof
 from sparserob_core.sip.method import Method, Tools
 from sparserob_core.sip.program import (
@@ -72,7 +82,17 @@ class UsersUnits:
             return self._round(own)
         if isinstance(own, EvaluationsFinished):
             return self._evaluations(own)
+        if isinstance(own, ProofProgress):
+            before = self._bounded(own.family, own.bound_before)
+            return replace(own, bound=self._bounded(own.family, own.bound), bound_before=before)
         return own
+
+    def _bounded(self, name: str, bound: float) -> float:
+        """The least bound in the user's units that holds for every row of a family that is bounded in their own."""
+        family = self._family(name)
+        if family is None or family.row_units is None:
+            return bound
+        return bound * float(family.row_units.max() if bound > 0.0 else family.row_units.min())
 
     def _round(self, own: RoundFinished) -> RoundFinished:
         decision = None if own.decision is None else frozen(own.decision * self.decision)
@@ -190,6 +210,8 @@ class UsersUnits:
 
         return replace(
             own,
+            bound=self._bounded(own.family, own.bound),
+            share=own.bound,
             violation=own.violation * own.unit,
             unit=1.0,
             units=None if (family := self._family(own.family)) is None else family.row_units,

@@ -109,9 +109,14 @@ class Course:
         )
 
     def hindrance(self, bound: float, lower: Array, upper: Array) -> str:
-        """What hinders the proof, and what would help: at the worst cell."""
+        """What hinders the proof, and what would help: at the worst cell, in the user's units."""
         advice = "" if self.family.hindrance is None else self.family.hindrance(lower, upper)
-        cell = f"the cell from {_shown(lower)} to {_shown(upper)} still allows {bound:.1e}"
+        if self.deadline.passed:
+            advice = "there was no time to halve it"
+        known = self.family.index_units
+        lower, upper = (lower, upper) if known is None or known.size != lower.size else (lower * known, upper * known)
+        allowed = bound * (1.0 if self.family.row_units is None else float(self.family.row_units.max()))
+        cell = f"the cell from {_shown(lower)} to {_shown(upper)} still allows {allowed:.1e}"
         return f"{self.family.name}: {cell}; {advice or 'narrower index sets, or numbers of one size, would help'}"
 
 
