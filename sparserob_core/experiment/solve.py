@@ -200,7 +200,10 @@ def _placed(start: object, box: Box) -> Array | None:
     """Points ``(k, d)`` of the box to begin with."""
     if start is None:
         return None
-    points = np.atleast_2d(np.array(start, dtype=float))
+    try:
+        points = np.atleast_2d(np.array(start, dtype=float))
+    except (TypeError, ValueError):
+        raise InputError(f"start: expected points of numbers, got {start!r}") from None
     if points.ndim != 2 or points.shape[1] != box.dimension or not len(points):
         raise InputError(f"start: expected shape ({box.dimension},) or (k, {box.dimension}), got {start!r}")
     if not ((points >= box.lower) & (points <= box.upper)).all():

@@ -145,17 +145,20 @@ class AskTell:
         """
         if not self._asked or self._batch is None:
             raise InputError("tell: nothing was asked since the last tell")
-        told = np.array(values, dtype=float)
+        try:
+            given, told = np.array(points, dtype=float), np.array(values, dtype=float)
+        except (TypeError, ValueError):
+            raise InputError(f"tell: expected points and numbers, got {_short(points)} and {_short(values)}") from None
         wanted = self._batch[len(self._answered) :][: self._asked]
-        if np.shape(points) != wanted.shape or told.shape != (len(wanted),):
+        if given.shape != wanted.shape or told.shape != (len(wanted),):
             raise InputError(
                 f"tell: expected the {len(wanted)} points of the last ask, shape {wanted.shape}, and as many values, "
-                f"got shapes {np.shape(points)} and {told.shape}"
+                f"got shapes {given.shape} and {told.shape}"
             )
-        if not np.array_equal(np.asarray(points, dtype=float), wanted):
-            row = int(np.argmax((np.asarray(points, dtype=float) != wanted).any(axis=1)))
+        if not np.array_equal(given, wanted):
+            row = int(np.argmax((given != wanted).any(axis=1)))
             raise InputError(
-                f"tell: expected the points of the last ask in their order, got {np.asarray(points)[row].tolist()} "
+                f"tell: expected the points of the last ask in their order, got {given[row].tolist()} "
                 f"where {wanted[row].tolist()} was asked"
             )
         for point, value in zip(wanted, told.tolist(), strict=True):

@@ -129,6 +129,8 @@ def test_what_was_not_asked_is_refused_and_nothing_is_taken():
         (points, np.zeros(2), r"got shapes \(3, 2\) and \(2,\)"),
         (points[::-1], np.zeros(3), "expected the points of the last ask in their order, got "),
         (points + 0.1, np.zeros(3), "in their order"),
+        (points, ["many", "few", "none"], "tell: expected points and numbers, got "),
+        (points, None, "as many values"),
     ):
         with pytest.raises(sr.InputError, match=words):
             search.tell(wrong, values)

@@ -178,7 +178,7 @@ def test_initial_points_come_first_and_a_walk_begins_at_the_best_of_them():
         assert report.trace.points[:3].tolist() == first
         assert report.best_value >= -0.41 - 1e-12
     assert sr.maximise(lambda p: p[:, 0], box, "direct", budget=1, start=[1.0, 2.0]).best_point.tolist() == [1.0, 2.0]
-    for wrong in ([1.0], [[9.0, 0.0]], [[np.nan, 0.0]], []):
+    for wrong in ([1.0], [[9.0, 0.0]], [[np.nan, 0.0]], [], "here", [[0.0], [1.0, 2.0]]):
         with pytest.raises(sr.InputError, match="start: expected"):
             sr.maximise(lambda p: p[:, 0], box, "direct", budget=10, start=wrong)
 
