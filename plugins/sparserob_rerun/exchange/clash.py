@@ -58,8 +58,9 @@ def _strip(drawing: Drawing, place: int, strip: sr.Strip) -> None:
 
 
 def _said(strip: sr.Strip) -> str:
-    moved = strip.sigma_low + strip.sigma_high
-    alone = f"the disturbance alone moves it over {moved:.4g}; " if moved > 0.0 else ""
+    down, up = f"{strip.sigma_low:.4g}", f"{strip.sigma_high:.4g}"
+    moved = down if up in ("0", down) else up if down == "0" else f"{down} downwards and {up} upwards"
+    alone = f"the disturbance alone moves it by {moved}; " if moved != "0" else ""
     if strip.short > 0.0:
         return f"{alone}the best that the control does, {strip.best:.4g}, still misses by {strip.short:.4g}"
     return f"{alone}it can be met, but not together with the others"

@@ -278,7 +278,8 @@ class Recorder:
             draw_clash(self.rr, self.stream, strips)
         if result.status == "infeasible":
             drawn = self.drawn or bool(self.stages)
-            self.shown = replace(self.shown, clash=extent(strips) if strips else (), drawn=drawn)
+            seen = self.shown.landscape and self.terrain.known is not None
+            self.shown = replace(self.shown, clash=extent(strips) if strips else (), drawn=drawn, landscape=seen)
             self.stream.send_blueprint(layout(self.shown))
 
     @property

@@ -77,7 +77,8 @@ def verdict_lines(event: sr.RunFinished) -> list[str]:
         lines.append(
             f"cost J = {result.cost:.8g}; {len(result.indices)} constraints decide, found in {event.seconds:.2f} s"
         )
-    if result is not None and result.worst is not None and result.worst.constraint:
+    # of an infeasible result the drawing says what is missed; of two sides the worst constraint has the sum
+    if result is not None and result.worst is not None and result.worst.constraint and result.status != "infeasible":
         lines.append(_worst_words(result, result.worst))
     return lines
 
@@ -85,8 +86,6 @@ def verdict_lines(event: sr.RunFinished) -> list[str]:
 def _worst_words(result: sr.Result, worst: Any) -> str:
     """The worst case, in agreement with what was proven of it."""
     at = f" at t = {worst.time:.5g}" if isinstance(worst, sr.Witness) and worst.time is not None else ""
-    if result.status == "infeasible":
-        return f"nearest to feasible: {worst.constraint} is still missed by {worst.violation:.3g}{at}"
     proven = any(proof.family == worst.constraint and proof.verdict == "proven" for proof in result.proofs)
     if worst.violation <= 0.0:
         return f"worst case: {worst.constraint} holds with {-worst.violation:.2e} to spare{at}"
