@@ -21,7 +21,7 @@ from tests.support.stub import Command
 
 REGISTRY = sr.load_registry()
 ALL = [name for name in SOLVERS if name in NATIVE or not REGISTRY.get("solver", name).missing]
-QUICK = {"daqp", "quadprog", "osqp", "piqp"}
+QUICK = {"daqp", "quadprog"}
 NEEDS_CURVATURE = {"ecos", "pyqpmad", "quadprog"}
 COARSE = {"ecos": 1e-5, "highs": 1e-6}  # what they reach when they are asked for 1e-10
 
