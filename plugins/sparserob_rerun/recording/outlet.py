@@ -22,7 +22,7 @@ from sparserob_rerun.recording.sinks import Destinations
 CAPACITY = 512  # events that may wait
 COLLECTING = 0.4  # seconds for which evaluations are collected before they are sent
 LARGE = 64  # coordinates of one index from which on only times and parameters are sent
-CLOSING = 20.0  # seconds that the process may take to finish its files, beyond the patience of the landscape
+CLOSING = 60.0  # seconds that the process may take to finish its files, beyond the patience of the landscape
 OVER = 600.0  # the same for a run that is over, and has nothing else to wait for
 START = "fork" if sys.platform.startswith("linux") else "spawn"
 

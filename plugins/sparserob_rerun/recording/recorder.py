@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, final
 
@@ -31,6 +31,7 @@ SEEN = 10  # evaluations between two pictures of the way
 PICTURE_EVERY, SPARE = 0.5, 20.0  # seconds between them, and how many times as long as one took
 PICTURES = 60  # rounds whose physics is drawn; of later ones every tenth
 PROOF = "proof of"
+LATE = 8.0  # seconds behind the run from which on rounds have no pictures
 LINES = 24  # of the log that are on the first screen
 PROOFS = 12  # lines about the proof of one family
 SLOTS = 16  # active constraints at most that make the tuple of a method without one
@@ -40,13 +41,15 @@ SLOTS = 16  # active constraints at most that make the tuple of a method without
 @dataclass(frozen=True, eq=False)
 class Opening:
     """What a recording knows of its run at the beginning. Without an ``inspection`` it is read from the ``directory``,
-    if there is one. ``waits``: the run is over, and waits for its recording."""
+    if there is one. ``waits``: the run is over, and waits for its recording; else it ``began`` at
+    this moment of the machine's clock."""
 
     title: str
     directory: Path | None
     inspection: sr.Inspection | None
     landscape: LandscapeOptions | None
     waits: bool = False
+    began: float = field(default_factory=time.monotonic)
 
     def answers(self) -> sr.Inspection | None:
         """Who answers questions about the run."""
@@ -215,13 +218,17 @@ class Recorder:
             self.say(line, "INFO" if line is lines[0] else "DEBUG")
         self._page("solving", lines[:1])
         self.draw("the landscape", self._aim, event)
-        if event.decision is None or (event.round > PICTURES and event.round % 10):
+        if event.decision is None or (event.round > PICTURES and event.round % 10) or self._late(event.seconds):
             return
         cuts, self.drawn = active(event.imposed, event.multipliers), True
         if self.physics is not None:
             self.draw("control and states", self.physics.draw, event.decision, cuts, None)
         told = told_by_round(event)
         self.draw("the violations", self.rounds.violations, event.decision, cuts, event.added, told)
+
+    def _late(self, seconds: float) -> bool:
+        """Whether the recording is so far behind the run that its pictures have to wait for the last one."""
+        return not self.opening.waits and time.monotonic() - self.opening.began - seconds > LATE
 
     def _aim(self, event: sr.RoundFinished) -> None:
         """The tuple whose surroundings are worth a look after a round: the best of the search, or the constraints that
@@ -245,6 +252,8 @@ class Recorder:
         if result is not None:
             self.lower, self.upper = result.lower_bound, result.upper_bound
             self.exact = result.value if event.status == "certified" else None
+        self._page(event.status, lines)  # before anything that takes time
+        if result is not None:
             if event.status != "infeasible":
                 self.draw("the bounds", self.rounds.picture.end, result.lower_bound, result.upper_bound)
             self.draw("what clashes", self._clash, result)
