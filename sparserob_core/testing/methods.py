@@ -25,7 +25,7 @@ from sparserob_core.testing.contract import Contract, broken, demand, same
 
 DIP, WIDTH = 0.73713, 0.003  # where the narrow dip of `dipping` is, and how narrow
 CLOSE = 1e-6  # relative accuracy with which a claim is compared with what is known
-SAMPLES = 20_000
+SAMPLES = 4_000
 HONEST = "claim no more than was proven: `certified` and `verified` only where every family is proven at the decision"
 
 
