@@ -52,6 +52,8 @@ def test_what_is_feasible_in_its_own_unit_is_certified(name, tmp_path):
         assert result.cost == pytest.approx(1.606 * 10.0 ** -int(name[-1]), rel=1e-3)
         return
     assert result.status == "certified", result.message
+    if name.startswith("02"):  # controls of 1e12 are admissible: the gap is closed by definition, the interval narrow
+        assert result.cost - result.lower_bound <= 0.025 * result.cost
     if name in COSTS:
         assert result.cost == pytest.approx(COSTS[name], rel=2e-8, abs=1e-12)
 

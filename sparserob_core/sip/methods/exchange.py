@@ -107,7 +107,7 @@ class Exchange(Method, Options):
                 continue
 
             # Sharpen: nothing is violated but the bounds have not met, so do without the regulariser.
-            if not last and self.exact and ledger.open(x) and working.sharpen(ledger, x):
+            if not last and self.exact and ledger.wide(x) and working.sharpen(ledger, x):
                 continue
 
             # Prove: over the whole continuum; a witness that the proof meets is one more index to impose.
@@ -182,7 +182,7 @@ class Working:
         if self.epsilon == 0.0:
             return False
         plain = self.plain_bound(ledger)
-        if not ledger.open(x) or not _usable(plain):
+        if not ledger.wide(x) or not _usable(plain):
             return False
         self.epsilon, self.guess = 0.0, None
         return True

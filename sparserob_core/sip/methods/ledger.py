@@ -90,6 +90,13 @@ class Ledger:
         """Whether the gap between the lower bound and the cost of ``x (n,)`` is open."""
         return self.gap(self.program.cost(x)) > self.tolerance
 
+    def wide(self, x: Array) -> bool:
+        """Whether the bounds are apart by more than the tolerance of the cost itself. Where bounds of the control that
+        no control comes near make the largest possible cost huge, a gap is closed that still is wide; it is worth a
+        relaxed program without the regulariser, though nothing depends on that."""
+        cost = self.program.cost(x)
+        return cost - self.lower > self.tolerance * abs(cost)
+
     def gap(self, upper: float) -> float:
         """The relative gap of the lower bound to an upper one."""
         return relative_gap(self.lower, upper, self.program.cost_scale)
