@@ -265,9 +265,11 @@ def _said(landscape: Landscape) -> str:
     nowhere = bool((landscape.shown[2] == np.inf).any())
     if not np.isfinite(low):
         return "no control meets the constraints anywhere here: g is infinite"
-    if landscape.flat:
+    if landscape.flat or high == low:
         return f"g does not depend on these two here: it is {low:.6g}"
-    return f"g from {low:.5g} (dark) to {high:.5g} (bright)" + ("; red: no control meets them" if nowhere else "")
+    digits = int(np.clip(2 - np.floor(np.log10((high - low) / max(abs(low), abs(high)))), 5, 12))  # that differ
+    said = f"g from {low:.{digits}g} (dark) to {high:.{digits}g} (bright)"
+    return said + ("; brown: no control meets the constraints" if nowhere else "")
 
 
 def _weight(epsilon: float) -> float:
