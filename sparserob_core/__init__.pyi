@@ -48,7 +48,7 @@ from sparserob_core.experiment.comparison.comparison import Comparison as Compar
 from sparserob_core.experiment.comparison.compare import compare as compare
 from sparserob_core.experiment.comparison.profiles import Instance as Instance
 from sparserob_core.experiment.comparison.profiles import Profiles as Profiles
-from sparserob_core.experiment.benchmark.benchmark import Benchmark as Benchmark
+from sparserob_core.experiment.benchmark.searches import Benchmark as Benchmark
 from sparserob_core.experiment.benchmark.benchmark import benchmark as benchmark
 from sparserob_core.sip.result import Result as Result
 from sparserob_core.sip.result import SearchTrace as SearchTrace

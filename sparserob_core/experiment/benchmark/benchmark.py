@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, final
 
 import numpy as np
 
 from sparserob_core.errors import InputError
+from sparserob_core.experiment.benchmark.files import prepared, shipped, write
 from sparserob_core.experiment.benchmark.landscapes import SUITES, Landscape, landscapes
+from sparserob_core.experiment.benchmark.searches import Benchmark, Search
 from sparserob_core.experiment.comparison.profiles import Instance, Profiles
 from sparserob_core.experiment.plugins.registry import load_registry
 from sparserob_core.experiment.run.events import StudyProgress
@@ -23,96 +23,6 @@ from sparserob_core.sip.search.search import Rules, Target, maximise
 
 CONFIGS = ("coupled_masses", "experiment1_repaired", "experiment2_repaired")
 DIGITS = 1e-6  # of the maximum: to so many digits the maxima of the standard functions are known
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Search:
-    """One search of one contender on one landscape: the running best value, and what it thought beside."""
-
-    landscape: Landscape
-    contender: str
-    seed: int
-    best: Array
-    own_seconds: float
-    """CPU time that the maximiser itself took: that of the search without the function's."""
-    point: Array = field(repr=False)
-
-    def needed(self, target: float) -> float:
-        """Evaluations until a value; infinite where it was not reached."""
-        reached = np.flatnonzero(self.best >= target)
-        return float(reached[0] + 1) if reached.size else float("inf")
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Benchmark:
-    """Searches of some maximisers on some landscapes, ``profiles`` of the evaluations that they needed, and the
-    targets ``(P,)`` at which a landscape counts as solved."""
-
-    profiles: Profiles
-    searches: Sequence[Search]
-    targets: Sequence[float]
-    budget: int
-
-    def expected_running_time(self, landscape: int, contender: str) -> float:
-        """All evaluations of a contender on a landscape, up to the target or the end, divided by the searches that
-        reached the target: the ERT of Hansen and others (2009); infinite where none did."""
-        label = self.profiles.problems[landscape].label
-        mine = [one for one in self.searches if one.contender == contender and one.landscape.name == label]
-        needed = np.array([one.needed(self.targets[landscape]) for one in mine])
-        spent = np.where(np.isfinite(needed), needed, [float(one.best.size) for one in mine])
-        return float(spent.sum() / np.isfinite(needed).sum()) if np.isfinite(needed).any() else float("inf")
-
-    def own_microseconds(self, contender: str) -> float:
-        """CPU time of the maximiser itself for one evaluation, in microseconds, over all of its searches."""
-        mine = [one for one in self.searches if one.contender == contender]
-        return 1e6 * sum(one.own_seconds for one in mine) / max(1, sum(one.best.size for one in mine))
-
-    def table(self) -> tuple[list[str], list[list[str]]]:
-        """Column names, and one row per contender."""
-        columns, rows = self.profiles.table()
-        keep = [columns.index(name) for name in ("contender", "runs solved", "fastest", "within 2x", "within 10x")]
-        told = [
-            [*(row[at] for at in keep), f"{self.own_microseconds(name):.1f}"]
-            for row, name in zip(rows, self.profiles.contenders, strict=True)
-        ]
-        return [*(columns[at] for at in keep), "own us / evaluation"], told
-
-    def times_table(self) -> tuple[list[str], list[list[str]]]:
-        """Column names, and one row per landscape: the expected running time of every contender, in evaluations."""
-        names = self.profiles.contenders
-        rows = [
-            [problem.label, *(_count(self.expected_running_time(at, name)) for name in names)]
-            for at, problem in enumerate(self.profiles.problems)
-        ]
-        return ["expected evaluations", *names], rows
-
-    def remarks(self) -> Iterator[str]:
-        """What is to be said beside the tables."""
-        count = "1 landscape" if len(self.targets) == 1 else f"{len(self.targets)} landscapes"
-        yield (
-            f"solved: within {self.profiles.accuracy:.3g} of the way from the median of uniform points to the maximum; "
-            f"{count}, {self.budget} evaluations each, {len(self.profiles.seeds[0])} seed(s); expected evaluations: all"
-            " that were spent for each success"
-        )
-        if self.profiles.undrawn:
-            yield self.profiles.undrawn
-
-    def summary(self) -> Mapping[str, Any]:
-        """All of it as plain data."""
-        names = self.profiles.contenders
-        return {
-            **self.profiles.summary(),
-            "remarks": list(self.remarks()),
-            "budget": self.budget,
-            "targets": list(self.targets),
-            "own_microseconds": {name: self.own_microseconds(name) for name in names},
-            "expected_running_time": {
-                problem.label: {name: self.expected_running_time(at, name) for name in names}
-                for at, problem in enumerate(self.profiles.problems)
-            },
-        }
 
 
 def benchmark(
@@ -136,8 +46,6 @@ def benchmark(
     median of the function at uniform points. ``out``: a new or empty directory for ``profiles.png``,
     ``benchmark.json`` and ``ioh/``, files that IOHanalyzer reads. Raises `InputError` when an argument is at fault.
     """
-    from sparserob_core.experiment.benchmark.files import prepared, write
-
     if not maximisers:
         raise InputError("maximisers: expected at least one, got none")
     calls, repeats = _whole("budget", budget), _whole("seeds", seeds)
@@ -223,8 +131,6 @@ def _whole(name: str, value: object) -> int:
 def _configs(configs: Sequence[str | Path] | None) -> list[Path]:
     if configs is not None:
         return [Path(config) for config in configs]
-    from sparserob_core.experiment.benchmark.files import shipped
-
     return [shipped(name) for name in CONFIGS]
 
 
@@ -240,7 +146,3 @@ def _labels(maximisers: Sequence[Choice | Maximiser]) -> list[str]:
     if twice:
         raise InputError(f"maximisers: expected each one once, got {', '.join(sorted(twice))} more than once")
     return names
-
-
-def _count(value: float) -> str:
-    return f"{value:.0f}" if np.isfinite(value) else "never"

@@ -5,28 +5,41 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-import sparserob_core
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.comparison.profiles_figure import write_profiles
 from sparserob_core.experiment.directory.artefacts import RunDirectory, finite
 from sparserob_core.experiment.figures.style import missing_matplotlib
 
 if TYPE_CHECKING:
-    from sparserob_core.experiment.benchmark.benchmark import Benchmark, Search
+    from sparserob_core.experiment.benchmark.searches import Benchmark, Search
 
 IOH = "0.3.22"  # the version of IOHexperimenter whose files these look like
 
 
+@dataclass(frozen=True, kw_only=True)
+class Facts:
+    """What IOHprofiler keeps of one function, by its own names."""
+
+    version: str
+    suite: str
+    function_id: int
+    function_name: str
+    maximization: bool = True
+    algorithm: dict[str, str]
+    attributes: tuple[str, ...] = ("evaluations", "raw_y")
+    scenarios: list[dict[str, Any]]
+
+
 def shipped(name: str) -> Path:
     """The file of a config of this distribution: beside the package where it is installed, in the repository else."""
-    package = Path(str(sparserob_core.__file__)).parent
+    package = Path(__file__).resolve().parents[2]
     places = [folder / "configs" / f"{name}.yaml" for folder in (package, package.parent)]
     return next((place for place in places if place.exists()), places[-1])
 
@@ -69,17 +82,15 @@ def ioh_files(found: Benchmark) -> Iterator[tuple[str, str]]:
                 kept = list(runs)
                 yield f"{folder}/{table}", "".join(_table(one) for one in kept)
                 scenarios.append({"dimension": size, "path": table, "runs": [_facts(one) for one in kept]})
-            facts = {
-                "version": IOH,
-                "suite": searches[0].landscape.suite,
-                "function_id": number,
-                "function_name": title,
-                "maximization": True,
-                "algorithm": {"name": name, "info": "SparseRob"},
-                "attributes": ["evaluations", "raw_y"],
-                "scenarios": scenarios,
-            }
-            yield f"{folder}/IOHprofiler_f{number}_{title}.json", json.dumps(finite(facts), indent="\t") + "\n"
+            facts = Facts(
+                version=IOH,
+                suite=searches[0].landscape.suite,
+                function_id=number,
+                function_name=title,
+                algorithm={"name": name, "info": "SparseRob"},
+                scenarios=scenarios,
+            )
+            yield f"{folder}/IOHprofiler_f{number}_{title}.json", json.dumps(finite(asdict(facts)), indent="\t") + "\n"
 
 
 def _function(one: Search) -> tuple[int, str]:

@@ -10,9 +10,8 @@ from collections.abc import Sequence
 import click
 
 from sparserob_core.errors import SparseRobError, named
-from sparserob_core.experiment.cli.commands.benchmark import benchmark
 from sparserob_core.experiment.cli.commands.check import check
-from sparserob_core.experiment.cli.commands.compare import compare
+from sparserob_core.experiment.cli.commands.compare import benchmark, compare
 from sparserob_core.experiment.cli.commands.figures import figures
 from sparserob_core.experiment.cli.commands.initial_states import initial_states
 from sparserob_core.experiment.cli.commands.margin import margin

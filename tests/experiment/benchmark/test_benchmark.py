@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.experiment.benchmark.benchmark import Benchmark, Search
 from sparserob_core.experiment.benchmark.landscapes import Landscape, bbob, landscape_of, landscapes, standard
+from sparserob_core.experiment.benchmark.searches import Benchmark, Search
 from sparserob_core.experiment.comparison.profiles import Instance, Profiles
 from tests.support.places import CONFIGS
 

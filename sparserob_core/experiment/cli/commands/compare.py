@@ -1,12 +1,15 @@
-"""``sparserob compare``: runs of one problem side by side, or contenders over the problems of studies."""
+"""``sparserob compare`` and ``sparserob benchmark``: runs of one problem, contenders over the problems of studies, and
+maximisers where the maximum is known, side by side."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import click
 
+from sparserob_core.errors import InputError
 from sparserob_core.experiment.terminal.printing import print_json, printable
 
 
@@ -63,3 +66,80 @@ def compare(runs: tuple[Path, ...], out: Path, accuracy: float | None, measure: 
     if not found.undrawn:
         click.echo(f"written to {out}")
     return 0
+
+
+@click.command()
+@click.argument("maximisers", metavar="MAXIMISER...", nargs=-1, required=True)
+@click.option(
+    "--suite",
+    "suites",
+    multiple=True,
+    type=click.Choice(["standard", "bbob", "g"]),
+    help="What to maximise: six functions, the 24 of BBOB, g of configs; may be repeated; standard unless given.",
+)
+@click.option("--config", "configs", multiple=True, type=click.Path(path_type=Path), help="A config for the suite g.")
+@click.option("--budget", type=int, default=1000, show_default=True, help="Evaluations of every search.")
+@click.option("--seeds", type=int, default=5, show_default=True, help="Searches of each on each landscape.")
+@click.option("--accuracy", type=float, default=1e-3, show_default=True, help="What counts as solved.")
+@click.option("--polish", type=float, default=0.0, show_default=True, help="Share of the budget for a local method.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    help="A new or empty directory for profiles.png, benchmark.json and ioh/, which IOHanalyzer reads.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print everything as JSON instead of the tables.")
+def benchmark(
+    maximisers: tuple[str, ...],
+    suites: tuple[str, ...],
+    configs: tuple[Path, ...],
+    budget: int,
+    seeds: int,
+    accuracy: float,
+    polish: float,
+    out: Path | None,
+    as_json: bool,
+) -> int:
+    """Compare maximisers where the maximum is known: data profiles over the landscapes, the expected number of
+    evaluations until success, and the time that each takes for itself.
+
+    MAXIMISER is a name, or a mapping with options such as '{name: lipo, constant: 30}'. The landscapes of g are those
+    of the paper's algorithm, tuples of eight reduced indices, and their maximum is certified by the exchange.
+    """
+    from sparserob_core.experiment.benchmark.benchmark import benchmark as side_by_side
+    from sparserob_core.experiment.cli.shell.live_line import LiveLine
+    from sparserob_core.experiment.directory.artefacts import finite
+    from sparserob_core.experiment.terminal.table import print_table
+
+    named = [_choice(text) for text in maximisers]
+    with LiveLine() as line:
+        found = side_by_side(
+            named,
+            suites or ("standard",),
+            budget=budget,
+            seeds=seeds,
+            accuracy=accuracy,
+            polish=polish,
+            configs=configs or None,
+            out=out,
+            notify=line.receive,
+        )
+    if as_json:
+        print_json(finite(found.summary()))
+        return 0
+    for title, (columns, rows) in ((found.profiles.title, found.table()), ("", found.times_table())):
+        print_table(title, columns, rows)
+    for remark in found.remarks():
+        click.echo(printable(remark))
+    if out is not None:
+        click.echo(f"written to {out}")
+    return 0
+
+
+def _choice(text: str) -> str | Mapping[str, Any]:
+    """A name, or a mapping with a name and options."""
+    from sparserob_core.experiment.config.reader import read_value
+
+    value = read_value(text) if text.strip().startswith("{") else text
+    if isinstance(value, str | Mapping):
+        return value
+    raise InputError(f"maximisers: expected a name or a mapping with a name, got {text!r}")

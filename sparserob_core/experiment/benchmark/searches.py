@@ -1,0 +1,107 @@
+"""What a benchmark has found: every search, and what it amounts to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, final
+
+import numpy as np
+
+from sparserob_core.experiment.benchmark.landscapes import Landscape
+from sparserob_core.experiment.comparison.profiles import Profiles
+from sparserob_core.sip.convex_set import Array
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Search:
+    """One search of one contender on one landscape: the running best value, and what it thought beside."""
+
+    landscape: Landscape
+    contender: str
+    seed: int
+    best: Array
+    own_seconds: float
+    """CPU time that the maximiser itself took: that of the search without the function's."""
+    point: Array = field(repr=False)
+
+    def needed(self, target: float) -> float:
+        """Evaluations until a value; infinite where it was not reached."""
+        reached = np.flatnonzero(self.best >= target)
+        return float(reached[0] + 1) if reached.size else float("inf")
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Benchmark:
+    """Searches of some maximisers on some landscapes, ``profiles`` of the evaluations that they needed, and the
+    targets ``(P,)`` at which a landscape counts as solved."""
+
+    profiles: Profiles
+    searches: Sequence[Search]
+    targets: Sequence[float]
+    budget: int
+
+    def expected_running_time(self, landscape: int, contender: str) -> float:
+        """All evaluations of a contender on a landscape, up to the target or the end, divided by the searches that
+        reached the target: the ERT of Hansen and others (2009); infinite where none did."""
+        label = self.profiles.problems[landscape].label
+        mine = [one for one in self.searches if one.contender == contender and one.landscape.name == label]
+        needed = np.array([one.needed(self.targets[landscape]) for one in mine])
+        spent = np.where(np.isfinite(needed), needed, [float(one.best.size) for one in mine])
+        return float(spent.sum() / np.isfinite(needed).sum()) if np.isfinite(needed).any() else float("inf")
+
+    def own_microseconds(self, contender: str) -> float:
+        """CPU time of the maximiser itself for one evaluation, in microseconds, over all of its searches."""
+        mine = [one for one in self.searches if one.contender == contender]
+        return 1e6 * sum(one.own_seconds for one in mine) / max(1, sum(one.best.size for one in mine))
+
+    def table(self) -> tuple[list[str], list[list[str]]]:
+        """Column names, and one row per contender."""
+        columns, rows = self.profiles.table()
+        keep = [columns.index(name) for name in ("contender", "runs solved", "fastest", "within 2x", "within 10x")]
+        told = [
+            [*(row[at] for at in keep), f"{self.own_microseconds(name):.1f}"]
+            for row, name in zip(rows, self.profiles.contenders, strict=True)
+        ]
+        return [*(columns[at] for at in keep), "own us / evaluation"], told
+
+    def times_table(self) -> tuple[list[str], list[list[str]]]:
+        """Column names, and one row per landscape: the expected running time of every contender, in evaluations."""
+        names = self.profiles.contenders
+        rows = [
+            [problem.label, *(_count(self.expected_running_time(at, name)) for name in names)]
+            for at, problem in enumerate(self.profiles.problems)
+        ]
+        return ["expected evaluations", *names], rows
+
+    def remarks(self) -> Iterator[str]:
+        """What is to be said beside the tables."""
+        count = "1 landscape" if len(self.targets) == 1 else f"{len(self.targets)} landscapes"
+        yield (
+            f"solved: within {self.profiles.accuracy:.3g} of the way from the median of uniform points to the maximum; "
+            f"{count}, {self.budget} evaluations each, {len(self.profiles.seeds[0])} seed(s); expected evaluations: all"
+            " that were spent for each success"
+        )
+        if self.profiles.undrawn:
+            yield self.profiles.undrawn
+
+    def summary(self) -> Mapping[str, Any]:
+        """All of it as plain data."""
+        names = self.profiles.contenders
+        return {
+            **self.profiles.summary(),
+            "remarks": list(self.remarks()),
+            "budget": self.budget,
+            "targets": list(self.targets),
+            "own_microseconds": {name: self.own_microseconds(name) for name in names},
+            "expected_running_time": {
+                problem.label: {name: self.expected_running_time(at, name) for name in names}
+                for at, problem in enumerate(self.profiles.problems)
+            },
+        }
+
+
+def _count(value: float) -> str:
+    return f"{value:.0f}" if np.isfinite(value) else "never"
