@@ -62,18 +62,31 @@ def dual_bound(
     ``S'z + G'y + A'mu + q + P at = 0``, so any guess will do. An allowance for the round-off of this very evaluation is
     subtracted. Where an unbounded variable asks for a slope of exactly 0, a slope within its own round-off counts as 0.
     """
+    return proving(program, y, mu, z, at)[0]
+
+
+@shaped
+def proving(
+    program: FiniteProgram,
+    y: Float[Array, " r"],
+    mu: Float[Array, " e"],
+    z: Float[Array, " k"] | None = None,
+    at: Float[Array, " n"] | None = None,
+) -> tuple[float, Float[Array, " r"], Float[Array, " e"], Float[Array, " k"] | None]:
+    """`dual_bound` with the ``y``, ``mu`` and ``z`` that prove it: those given, or where these prove nothing the ones
+    that they were moved to. Whoever writes the bound down must write these."""
     y = _usable(program, y)
     terms = _terms(program, y, mu, z, at)
     bound = _bound(terms, program)
     if bound > -np.inf:
         large = ROUND_OFF * terms.magnitude > NOTABLE * abs(bound)
-        return max(bound, extended_bound(program, y, mu)) if large else bound
+        return max(bound, extended_bound(program, y, mu)) if large else bound, y, mu, z
     better = repaired(program, y, mu, z, at)
     if better is not None:
         bound = _bound(_terms(program, *better), program)
     if bound == -np.inf and not program.q.any():
         return _shrunk_bound(program, y, mu, z, at)
-    return bound
+    return (bound, y, mu, z) if better is None else (bound, *better[:3])
 
 
 @shaped
@@ -223,9 +236,9 @@ def _shrunk_bound(
     mu: Float[Array, " e"],
     z: Float[Array, " k"] | None,
     at: Float[Array, " n"] | None,
-) -> float:
-    """Without a linear cost, multipliers may be scaled towards 0 until every unbounded entry's slope is within its
-    weight."""
+) -> tuple[float, Float[Array, " r"], Float[Array, " e"], Float[Array, " k"] | None]:
+    """`proving`: without a linear cost, multipliers may be scaled towards 0 until every unbounded entry's slope is
+    within its weight."""
     slope = _terms(program, y, mu, z, at).slope
     unbounded = np.isinf(program.lower) & (slope > program.weights) | np.isinf(program.upper) & (
         slope < -program.weights
@@ -233,8 +246,9 @@ def _shrunk_bound(
     with np.errstate(invalid="ignore"):
         factor = float((program.weights[unbounded] / np.abs(slope[unbounded])).min(initial=1.0)) * (1 - ROUND_OFF)
     factor = factor if np.isfinite(factor) and np.isfinite(slope).all() else 0.0
-    scaled = [None if v is None else factor * v for v in (z, at)]
-    return _bound(_terms(program, factor * y, factor * mu, *scaled), program)
+    y, mu = factor * y, factor * mu
+    z, at = (None if v is None else factor * v for v in (z, at))
+    return _bound(_terms(program, y, mu, z, at), program), y, mu, z
 
 
 @shaped

@@ -12,7 +12,7 @@ from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Cut, Dual
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
-from sparserob_core.sip.inner.duality import dual_bound, vertex_multipliers
+from sparserob_core.sip.inner.duality import proving, vertex_multipliers
 from sparserob_core.sip.inner.image import onto_stationary
 from sparserob_core.sip.inner.solve import solve_finite
 from sparserob_core.sip.method import Deadline
@@ -180,11 +180,11 @@ class RelaxedProgram:
         ]
         if plain.P is None and np.isfinite(solution.x).all():
             offers.append((*vertex_multipliers(plain, solution.x, solution.y, solution.mu), solution.z))
-        bounds = [
-            dual_bound(plain, y, mu, z, at=solution.x) - self._rounding(plain, y, mu, solution.x) for y, mu, z in offers
-        ]
+        proven = [proving(plain, y, mu, z, at=solution.x) for y, mu, z in offers]
+        bounds = [bound - self._rounding(plain, y, mu, solution.x) for bound, y, mu, _ in proven]
         best = int(np.argmax(bounds))
-        return self.dual(rows, *offers[best], bounds[best])
+        _, y, mu, z = proven[best]
+        return self.dual(rows, y, mu, solution.z if z is None else z, bounds[best])
 
     @shaped
     def _rounding(

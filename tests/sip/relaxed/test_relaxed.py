@@ -3,14 +3,18 @@ same with lazy rows as with all of them."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
+from scipy.sparse import csc_array
 
 import sparserob_core as sr
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows, rows_at
+from sparserob_core.testing.solvers import by_linear_programming
 
 EMPTY = np.zeros((0, 1))
 
@@ -198,3 +202,36 @@ def test_rows_remember_where_they_come_from():
     both = Rows.none(5).joined(rows).take(np.array([False, True]))
     assert both.cuts[0].index[0] == 1.5
     assert np.array_equal(both.G[0], program.family("b").rows(at)[0][1, 0])
+
+
+def test_a_bound_is_recorded_with_the_very_multipliers_that_prove_it(piqp):
+    """Slanted sides of the controls are images without a lower bound; multipliers of the wrong sign, by the accuracy of
+    a solver, prove nothing there and are moved."""
+    rng = np.random.default_rng(3)
+    n, moved = 3, 0
+    for _ in range(20):
+        sides = rng.normal(size=(2, n))
+        program = sr.SemiInfiniteProgram(
+            n=n,
+            q=rng.normal(size=n),
+            weights=np.concatenate([rng.uniform(0, 1, n), np.zeros(2)]),
+            lower=np.concatenate([-np.ones(n), np.full(2, -np.inf)]),
+            upper=np.concatenate([np.ones(n), np.full(2, 0.3)]),
+            S=csc_array(np.vstack([np.eye(n), sides])),
+            families=[],
+        )
+        rows = Rows(
+            rng.normal(size=(2, n)), rng.uniform(0.1, 0.3, 2), tuple(sr.Cut("a", np.zeros(1), i) for i in range(2))
+        )
+        relaxed = RelaxedProgram(program, piqp)
+        solution = relaxed.solve(rows, 0.0)
+        off = replace(solution, z=solution.z + 1e-4 * rng.normal(size=n + 2))
+        off = replace(off, y=np.abs(solution.y + 1e-4 * rng.normal(size=2)))
+        dual = relaxed.lower_bound(rows, off)
+        y = np.zeros(2)
+        y[[cut.row for cut in dual.cuts]] = [cut.multiplier for cut in dual.cuts]
+        moved += bool(dual.cuts and np.abs(y - off.y).max() > 0.0)
+        free = relaxed.finite(np.zeros((0, n)), np.zeros(0), 0.0)
+        priced = by_linear_programming("", replace(free, q=free.q + y @ rows.G))
+        assert dual.bound <= priced.highest - y @ rows.h
+    assert moved >= 5
