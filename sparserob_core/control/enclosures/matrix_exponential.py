@@ -35,7 +35,8 @@ def exponential(matrices: Float[Array, "*k d d"]) -> Float[Array, "*k d d"]:
     powers = (np.broadcast_to(np.eye(matrices.shape[-1]), matrices.shape), scaled, second)
     result: Array = COEFFICIENTS[18] * powers[0]
     for block in (15, 12, 9, 6, 3, 0):  # in blocks of three: Paterson and Stockmeyer 1973
-        result = result @ third + sum(COEFFICIENTS[block + i] * powers[i] for i in range(3))
+        one, first, square = COEFFICIENTS[block : block + 3]
+        result = result @ third + (one * powers[0] + first * scaled + square * second)
     for done in range(int(squarings.max(initial=0))):
         result = np.where((squarings > done)[..., None, None], result @ result, result)
     return result

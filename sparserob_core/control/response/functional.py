@@ -137,7 +137,7 @@ class WorstCase:
         result = np.empty(times.size)
         for part in self._chunks(times.size):
             free, gains, B, W = self.response.adjoint(times[part], directions[part], parameters[part])
-            driven = np.einsum("kld,kdm,ml->k", gains, B, control, optimize=True)
+            driven = np.einsum("klm,ml->k", gains @ B, control)
             support = self._support(gains, W, times[part], directions[part], parameters[part])
             result[part] = free @ self.response.initial_state + driven + support
         return result

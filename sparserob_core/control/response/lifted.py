@@ -218,8 +218,8 @@ class LiftedSystem:
         steps, pieces = response.steps(KNOWN), self.fine.pieces
         rows = np.zeros((pieces + 1, directions.shape[0], self.row_matrix.shape[0]))
         rows[0, :, : self.states] = directions
-        for piece in range(pieces):
-            rows[piece + 1] = rows[piece] @ steps.Phi[0, response.length_of(piece)]
+        for piece, length in enumerate(response.which.tolist()):
+            rows[piece + 1] = rows[piece] @ steps.Phi[0, length]
         return np.moveaxis(rows, 0, 1).reshape(directions.shape[0], pieces + 1, self.space.size, self.states)
 
     def _sizes(self, nodes: Array, driven: Array, rows: bool) -> Array:

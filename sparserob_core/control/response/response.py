@@ -113,15 +113,15 @@ class Propagator:
     _steps: dict[bytes, Steps] = field(default_factory=dict, repr=False)
 
     @cached_property
-    def _which(self) -> np.ndarray:
-        """Which of the distinct lengths every piece has, ``(L,)``."""
+    def which(self) -> np.ndarray:
+        """Which of the distinct lengths, in the order of `Steps`, every piece has, ``(L,)``."""
         _, which = np.unique(np.round(self.grid.lengths / self.grid.breakpoints[-1], 13), return_inverse=True)
         return which
 
     @cached_property
     def _lengths(self) -> Array:
         """The distinct lengths ``(q,)``, as means: the rounding must not add up."""
-        means: Array = np.bincount(self._which, self.grid.lengths) / np.bincount(self._which)
+        means: Array = np.bincount(self.which, self.grid.lengths) / np.bincount(self.which)
         return means
 
     @shaped
@@ -168,7 +168,7 @@ class Propagator:
             if alike is not None:
                 over = alike[:active]
             else:
-                over = steps.side_by_side[0 if known else which[:active], self._which[piece]]
+                over = steps.side_by_side[0 if known else which[:active], self.which[piece]]
             both = rows[:active] @ over
             gains[:active, piece], rows[:active] = both[:, 0, :d], both[..., d:]
         back = np.empty_like(order)
@@ -194,8 +194,13 @@ class Propagator:
 
     def _partial(self, steps: Steps, which: np.ndarray, within: Array) -> tuple[Array, Array]:
         horizon = self.grid.breakpoints[-1]
-        distinct, inverse = np.unique(np.stack([which, np.round(within / horizon, 15)]), axis=1, return_inverse=True)
-        Phi, Gamma = self._transitions(steps.A[distinct[0].astype(int)], distinct[1] * horizon)
+        shares = np.round(within / horizon, 15)
+        if steps.A.shape[0] == 1:
+            distinct, inverse = np.unique(shares, return_inverse=True)
+            Phi, Gamma = self._transitions(steps.A, distinct * horizon)
+        else:
+            pairs, inverse = np.unique(np.stack([which, shares]), axis=1, return_inverse=True)
+            Phi, Gamma = self._transitions(steps.A[pairs[0].astype(int)], pairs[1] * horizon)
         return Phi[inverse.reshape(-1)], Gamma[inverse.reshape(-1)]
 
     @property
@@ -234,12 +239,8 @@ class Propagator:
     def lateness(self) -> tuple[float, float]:
         """How far durations that are used may be from those that are meant: of pieces, where nearly equal ones are
         taken for equal, and within a piece, where they are rounded (`TimeGrid.distinct`)."""
-        unequal = np.abs(self.grid.lengths - self._lengths[self._which]).max()
+        unequal = np.abs(self.grid.lengths - self._lengths[self.which]).max()
         return float(unequal), float(SAME_DURATION * self.grid.breakpoints[-1])
-
-    def length_of(self, piece: int) -> int:
-        """Which of the distinct lengths, in the order of `Steps`, a piece has."""
-        return int(self._which[piece])
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,9 +301,10 @@ class Response:
         """`Propagator.kernel`."""
         return self.propagator.kernel
 
-    def length_of(self, piece: int) -> int:
-        """`Propagator.length_of`."""
-        return self.propagator.length_of(piece)
+    @property
+    def which(self) -> np.ndarray:
+        """`Propagator.which`."""
+        return self.propagator.which
 
     @shaped
     def states(
@@ -327,14 +329,17 @@ class Response:
             )
         path = np.empty((count, self.grid.pieces + 1, self.initial_state.size))
         path[:, 0] = self.initial_state
+        which = self.which
+        for length in range(steps.Phi.shape[1]):
+            alike = which == length
+            path[:, 1:][:, alike] = drive[:, alike] @ steps.Gamma[:, length].swapaxes(1, 2)
         shared = steps.Phi.shape[0] == 1
-        for piece in range(self.grid.pieces):
-            length = self.propagator.length_of(piece)
-            Phi, Gamma = steps.Phi[:, length], steps.Gamma[:, length]
+        forward = steps.Phi[0].swapaxes(1, 2)
+        for piece, length in enumerate(which.tolist()):
             if shared:
-                path[:, piece + 1] = path[:, piece] @ Phi[0].T + drive[:, piece] @ Gamma[0].T
+                path[:, piece + 1] += path[:, piece] @ forward[length]
             else:
-                path[:, piece + 1] = (Phi @ path[:, piece, :, None] + Gamma @ drive[:, piece, :, None])[..., 0]
+                path[:, piece + 1] += (steps.Phi[:, length] @ path[:, piece, :, None])[..., 0]
         return path
 
 
