@@ -10,7 +10,7 @@ from typing import final
 import numpy as np
 
 from sparserob_core.control.constraints.explanation import explanation
-from sparserob_core.control.constraints.local_maxima import climb, local_maxima, step_out, vertices
+from sparserob_core.control.constraints.local_maxima import TINY, climb, local_maxima, step_out, vertices
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.matrix_exponential import transitions
@@ -26,6 +26,8 @@ from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.program import Enclosure, Explanation, Separation
 
 SURE = 1e-8  # a vertex that is predicted to this accuracy is one
+NEARER, LOOKS = 8, 4  # an unsure vertex is predicted from samples so many times nearer, and so often
+ARRIVED = 1e-11  # what a vertex that was arrived at may still promise
 INSIDE, MOST_INSIDE = 3, 64  # times sampled inside every piece, beside its ends: more where the system moves on it
 SMOOTH = 0.1  # norm of A times the spacing of samples between which a parabola is a good guide
 CLIMBED = 10  # of them, those that parameters are climbed for
@@ -64,12 +66,8 @@ class Samples:
         grid, (start, stop) = self._response.grid, self.window
         pace = float(np.linalg.norm(self._response.steps(self.lattice[0]).A, axis=(1, 2)).max())
         counts = np.clip(np.ceil(pace * grid.lengths / SMOOTH), INSIDE + 1, MOST_INSIDE).astype(int)
-        inside = np.concatenate(
-            [
-                np.linspace(left, right, count, endpoint=False)
-                for left, right, count in zip(grid.breakpoints[:-1], grid.breakpoints[1:], counts, strict=True)
-            ]
-        )
+        which = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+        inside = np.repeat(grid.breakpoints[:-1], counts) + which * np.repeat(grid.lengths / counts, counts)
         inside = inside[(inside > start) & (inside < stop)]
         return distinct_times(np.concatenate([[start], inside, [stop]]), float(grid.breakpoints[-1]))
 
@@ -193,7 +191,7 @@ class FlatConstraint(StateConstraint):
             )
             unsure = unsure[np.argsort(-found[unsure], kind="stable")][:CLIMBED]
             if unsure.size:
-                indices[unsure], found[unsure] = self._climbed(x, indices[unsure], rows[unsure])
+                indices[unsure], found[unsure] = self._refined(x, indices[unsure], rows[unsure])
         order = np.argsort(-found, kind="stable")
         return Separation(indices[order], rows[order], found[order])
 
@@ -314,6 +312,32 @@ class FlatConstraint(StateConstraint):
         )
         answer: Array = np.einsum("ri,vti->vrt", self.H, states) - self.samples.margins
         return answer
+
+    @shaped
+    def _refined(
+        self, x: Float[Array, " n"], indices: Float[Array, "k 1"], rows: Int[np.ndarray, " k"]
+    ) -> tuple[Float[Array, "k 1"], Float[Array, " k"]]:
+        """The vertices of parabolas through nearer and nearer samples; where these are no guide, at a kink or beyond
+        one, the candidate is climbed from."""
+        count, spacing = rows.size, float(np.diff(self.times).max(initial=0.0))
+        width = np.full(count, min(spacing / NEARER, (self.stop - self.start) / 2))
+        middle = indices[:, 0]
+        for _ in range(LOOKS):
+            middle = np.clip(middle, self.start + width, self.stop - width)
+            around = middle[:, None] + width[:, None] * np.array([-1.0, 0.0, 1.0])
+            before, found, after = self.violations(x, around.reshape(-1, 1), rows.repeat(3)).reshape(count, 3).T
+            slope, bend = (after - before) / 2, 2 * found - before - after
+            inside = np.abs(slope) < bend
+            share = slope / np.where(inside, bend, np.maximum(np.abs(slope), TINY))
+            sure = inside & (share * slope <= 2 * ARRIVED * np.maximum(1.0, np.abs(found)))
+            if sure.all():
+                break
+            middle = np.where(sure, middle, middle + width * share)
+            width = np.where(inside & ~sure, width / NEARER, width)
+        points, kinks = middle[:, None], np.flatnonzero(~sure)
+        if kinks.size:
+            points[kinks], found[kinks] = self._climbed(x, indices[kinks], rows[kinks])
+        return points, found
 
     @shaped
     def _climbed(
