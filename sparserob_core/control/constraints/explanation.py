@@ -149,9 +149,8 @@ def explanation(
     uncertainty does to it; in words divided by ``scale``."""
     direction, system = H[row], functionals.response.system
     sign = -1.0 if np.count_nonzero(direction) == 1 and direction.sum() < 0 else 1.0
-    at = (np.array([time]), direction[None], parameter[None])
-    sigma = float(functionals.offsets(*at)[0])
-    free, limit = sign * float(functionals.rows(*at)[1][0] - sigma) + 0.0, sign * float(h[row])
+    free, sigma, worst = functionals.parts(time, direction, parameter)
+    free, limit = sign * free + 0.0, sign * float(h[row])
     quantity, where = (
         combination(sign * direction / scale, f"({time:.6g})"),
         system.describe(parameter) if parameter.size else "",
@@ -168,7 +167,7 @@ def explanation(
         time,
         direction,
         parameter,
-        functionals.worst_disturbance(time, direction, parameter),
+        worst,
         quantity=quantity,
         bound=_bound(sign * direction / scale, limit / scale, None if opposite is None else opposite / scale, sign),
         limit=limit,

@@ -191,11 +191,18 @@ class WorstCase:
         self, time: float, direction: Float[Array, " d"], parameter: Float[Array, " nu"]
     ) -> Float[Array, "mw L"] | None:
         """A disturbance ``(mw, L)`` on the pieces of the merged grid that attains the worst case at one index."""
-        if self.disturbance is None:
-            return None
-        _, gains, _, W = self.response.adjoint(np.array([time]), direction[None], parameter[None])
-        answer: Array | None = self.disturbance.worst(gains @ W)[0]
-        return answer
+        return self.parts(time, direction, parameter)[2]
+
+    @shaped
+    def parts(
+        self, time: float, direction: Float[Array, " d"], parameter: Float[Array, " nu"]
+    ) -> tuple[float, float, Float[Array, "mw L"] | None]:
+        """What ``max_w c'x(t)`` is made of at one index, beside the control: what the initial state gives, what the
+        worst disturbance adds, and such a disturbance (`worst_disturbance`)."""
+        at = (np.array([time]), direction[None], parameter[None])
+        free, gains, _, W = self.response.adjoint(*at)
+        worst: Array | None = None if self.disturbance is None else self.disturbance.worst(gains @ W)[0]
+        return float(free[0] @ self.response.initial_state), float(self._support(gains, W, *at)[0]), worst
 
     @cached_property
     def measurable(self) -> MeasurableSupport:

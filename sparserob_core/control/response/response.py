@@ -19,7 +19,7 @@ from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 
-FEW = 64  # indices for which a table beats the loop over the pieces
+FEW = 128  # indices for which a table beats the loop over the pieces
 STEPS_KEPT = 16  # sets of parameters whose transitions are remembered
 SAME_DURATION = 1e-15  # of the horizon: durations that differ by less are computed once
 SAME_TIME = 1e-12  # times closer than this share of the horizon are one
@@ -180,14 +180,13 @@ class Propagator:
     ) -> tuple[Array, Array, Array, Array]:
         """`adjoint` of a known system on equal pieces, without a loop over them: what a piece still gives depends on
         its age only."""
-        count, last = np.zeros(times.size, dtype=int), int(pieces.max())
-        Phi, Gamma = self._partial(steps, count, np.clip(times - self.grid.breakpoints[pieces], 0.0, None))
+        within = np.clip(times - self.grid.breakpoints[pieces], 0.0, None)
+        Phi, Gamma = self._partial(steps, np.zeros_like(pieces), within)
         rows = np.einsum("kd,kde->ke", directions, Phi)
         gains = np.zeros((times.size, self.grid.pieces, directions.shape[1]))
-        age = pieces[:, None] - 1 - np.arange(last)
-        gains[:, :last] = np.where(
-            (age >= 0)[..., None], np.einsum("kd,klde->kle", rows, self.kernel[np.maximum(age, 0)]), 0.0
-        )
+        by_age = np.einsum("kd,dle->kle", rows, self._kernel_of_rows[:, : pieces.max()])
+        for number, piece in enumerate(pieces.tolist()):
+            gains[number, :piece] = by_age[number, :piece][::-1]
         gains[np.arange(times.size), pieces] = np.einsum("kd,kde->ke", directions, Gamma)
         free = np.einsum("kd,kde->ke", rows, self._powers[pieces])
         return free, gains, np.repeat(steps.B, times.size, axis=0), np.repeat(steps.E, times.size, axis=0)
@@ -234,6 +233,11 @@ class Propagator:
             powers[done : done + count] = leap @ powers[:count]
             done += count
         return powers
+
+    @cached_property
+    def _kernel_of_rows(self) -> Array:
+        """The `kernel` as ``(d, L, d)``: along its second and third axes a product with rows runs through memory."""
+        return np.ascontiguousarray(self.kernel.swapaxes(0, 1))
 
     @cached_property
     def lateness(self) -> tuple[float, float]:
