@@ -135,9 +135,8 @@ class DisturbanceSupport:
         flow, driven = backward.flows(within)
         young = self._weights(start @ driven)[..., None, :]
         moved = np.einsum("rd,qde->qre", start, flow)
-        old = np.moveaxis(
-            self._weights(np.einsum("qre,aef->qraf", moved, backward.kernel[: int(pieces.max(initial=0))])), -2, -3
-        )
+        kernel = backward.kernel[:, : int(pieces.max(initial=0))]
+        old = np.moveaxis(self._weights(np.einsum("qre,eaf->qraf", moved, kernel)), -2, -3)
         parts = np.concatenate([of_blocks(combined(young)), of_blocks(combined(old))], axis=2)
         return np.asarray(np.cumsum(parts, axis=2)[which, :, pieces])
 
@@ -198,9 +197,9 @@ class DisturbanceSupport:
         until then can have made of every block."""
         grid, gains = self.lifted.grid, np.zeros((self.lifted.grid.pieces + 1, self.lifted.starts.size))
         reach = self.lifted.comparison.over(grid.lengths)
-        for piece in range(1, grid.pieces + 1):
-            step = product(reach.flow[piece - 1], gains[piece - 1][:, None])
-            gains[piece] = (step + product(reach.integral[piece - 1], self._drive[:, None]))[:, 0]
+        gains[1:] = product(reach.integral, self._drive[:, None])[..., 0]
+        for piece in range(grid.pieces):
+            gains[piece + 1] += product(reach.flow[piece], gains[piece][:, None])[:, 0]
         return gains
 
 

@@ -184,7 +184,7 @@ class Propagator:
         Phi, Gamma = self._partial(steps, np.zeros_like(pieces), within)
         rows = np.einsum("kd,kde->ke", directions, Phi)
         gains = np.zeros((times.size, self.grid.pieces, directions.shape[1]))
-        by_age = np.einsum("kd,dle->kle", rows, self._kernel_of_rows[:, : pieces.max()])
+        by_age = np.einsum("kd,dle->kle", rows, self.kernel[:, : pieces.max()])
         for number, piece in enumerate(pieces.tolist()):
             gains[number, :piece] = by_age[number, :piece][::-1]
         gains[np.arange(times.size), pieces] = np.einsum("kd,kde->ke", directions, Gamma)
@@ -221,8 +221,9 @@ class Propagator:
 
     @cached_property
     def kernel(self) -> Array:
-        """``e^{A i h} Gamma(h)`` for ``i = 0, ..., L - 1``, ``(L, d, d)``: what a piece of age ``i`` still gives; for a
-        known system and equal pieces, whose response is a convolution (a Toeplitz matrix) with this kernel."""
+        """``e^{A i h} Gamma(h)`` for ``i = 0, ..., L - 1``: what a piece of age ``i`` still gives; for a known system
+        and equal pieces, whose response is a convolution (a Toeplitz matrix) with this kernel. ``(d, L, d)``, so that
+        products with rows run through memory."""
         steps = self.steps(np.zeros((1, 0)))
         powers = np.empty((self.grid.pieces, *steps.A.shape[1:]))
         powers[0] = steps.Gamma[0, 0]
@@ -232,12 +233,7 @@ class Propagator:
             leap = self._transitions(steps.A[0], np.array(done * self._lengths[0]))[0]
             powers[done : done + count] = leap @ powers[:count]
             done += count
-        return powers
-
-    @cached_property
-    def _kernel_of_rows(self) -> Array:
-        """The `kernel` as ``(d, L, d)``: along its second and third axes a product with rows runs through memory."""
-        return np.ascontiguousarray(self.kernel.swapaxes(0, 1))
+        return np.ascontiguousarray(powers.swapaxes(0, 1))
 
     @cached_property
     def lateness(self) -> tuple[float, float]:

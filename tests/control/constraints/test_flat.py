@@ -108,6 +108,27 @@ def test_the_worst_violation_of_any_path_is_found_within_a_millionth(seed, grid,
     assert constraint.worst(x).violations[0] >= polished(constraint, x) - 1e-6
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_smooth_peak_between_coarse_samples_is_found_to_round_off_in_few_looks(seed, monkeypatch):
+    """A parabola through samples as coarse as these misses the peak by far more than is allowed."""
+    rng = np.random.default_rng(seed)
+    system = LinearSystem([[0.0, 1.0], [-rng.uniform(1, 4), -rng.uniform(0, 0.5)]], [[0.0], [1.0]], np.eye(2))
+    functionals = worst_case(system, uniform(6, HORIZON), None, BOUNDS["box"], initial_state=rng.normal(size=2))
+    constraint = FlatConstraint(
+        "path", functionals, np.array([[1.0, 0.0], [-1.0, 0.0]]), np.ones(2), 0.0, HORIZON, ParameterIndex(None)
+    )
+    x = 0.1 * rng.normal(size=functionals.variables)
+    looks, violations_at = [], FlatConstraint.violations
+    monkeypatch.setattr(
+        FlatConstraint, "violations", lambda self, *given: looks.append(1) or violations_at(self, *given)
+    )
+    found = constraint.worst(x)
+    assert 2 <= len(looks) <= 5
+    near = found.indices[0, 0] + 1e-3 * np.linspace(-1.0, 1.0, 201)
+    beside = violations_at(constraint, x, np.clip(near, 0.0, HORIZON)[:, None], np.full(201, found.rows[0]))
+    assert found.violations[0] >= beside.max() - 1e-11
+
+
 def test_a_path_that_peaks_at_a_kink_is_separated_at_the_kink():
     """``x' = u`` with u = 1 and then -1/3: the largest state is at the breakpoint."""
     functionals = worst_case(LinearSystem([[0.0]], [[1.0]]), uniform(2, 2.0), initial_state=[0.0])

@@ -17,7 +17,7 @@ from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.disturbance_support import DisturbanceSupport
 from sparserob_core.control.response.lifted import lift
-from sparserob_core.control.response.response import Response, merge_grids
+from sparserob_core.control.response.response import FEW, Response, merge_grids
 from sparserob_core.sip.convex_set import Box
 from tests.support.plants import indicators, random_system, simulated, uniform, walsh, worst_case
 
@@ -174,7 +174,20 @@ def test_ages_are_powers_of_the_transition():
     A = response.system.matrices(np.zeros((1, 0)))[0][0]
     _, F = transitions(A[None], np.array([2 / 11]))
     for age in range(11):
-        assert np.allclose(response.kernel[age], expm(A * age * 2 / 11) @ F[0], rtol=1e-11, atol=1e-12)
+        assert np.allclose(response.kernel[:, age], expm(A * age * 2 / 11) @ F[0], rtol=1e-11, atol=1e-12)
+
+
+@pytest.mark.parametrize("states", [1, 2, 4])
+def test_functionals_asked_for_one_by_one_are_those_asked_for_all_at_once(states):
+    """Few of them are read off the kernel, many are carried from piece to piece; at breakpoints and ends too."""
+    rng, breaks = np.random.default_rng(states), np.linspace(0, 2, 12)
+    response = Response(random_system(rng, states), merge_grids(breaks, breaks), np.zeros(states))
+    times = np.concatenate([breaks, rng.uniform(0, 2, FEW)])
+    given = (times, rng.normal(size=(times.size, states)), np.zeros((times.size, 0)))
+    every = response.adjoint(*given)
+    for one in range(times.size):
+        for alone, among in zip(response.adjoint(*(part[one : one + 1] for part in given)), every, strict=True):
+            assert np.allclose(alone[0], among[one], rtol=1e-11, atol=1e-12)
 
 
 @pytest.mark.parametrize("pieces", [7, 999, 3001])
