@@ -42,8 +42,7 @@ def load_own_registry(extra_paths: Iterable[str | Path] = ()) -> Registry:
     points of other distributions. A component that is missing for that reason is an unknown name, and the message
     says how to load it. A file of ``extra_paths`` that fails is a `PluginError`.
     """
-    paths = tuple(Path(path).resolve() for path in extra_paths)
-    return _load(paths, _disabled(), _own_entry_points)
+    return _with_files(_own(_disabled()), extra_paths, UNTRUSTED)
 
 
 def load_registry(extra_paths: Iterable[str | Path] = (), entry_points: bool = True) -> Registry:
@@ -53,13 +52,14 @@ def load_registry(extra_paths: Iterable[str | Path] = (), entry_points: bool = T
     asked for by name, so its failure is a `PluginError`. Plugins named in the environment variable
     ``SPARSEROB_DISABLE_PLUGINS`` (entry point or distribution, separated by commas) are not even imported.
     """
-    paths = tuple(Path(path).resolve() for path in extra_paths)
     if not entry_points:
-        return _load(paths, _disabled(), lambda disabled: [])
-    installed = _installed(_disabled())
-    if not paths:
-        return installed
-    return Registry([*installed.records(), *_of_files(paths)], installed.failures, _disabled())
+        return _with_files(_load(_disabled(), lambda disabled: []), extra_paths)
+    return _with_files(_installed(_disabled()), extra_paths)
+
+
+def _with_files(known: Registry, extra_paths: Iterable[str | Path], hint: str = "") -> Registry:
+    paths = tuple(Path(path).resolve() for path in extra_paths)
+    return Registry([*known.records(), *_of_files(paths)], known.failures, _disabled(), hint) if paths else known
 
 
 def _disabled() -> tuple[str, ...]:
@@ -68,7 +68,12 @@ def _disabled() -> tuple[str, ...]:
 
 @cache
 def _installed(disabled: tuple[str, ...]) -> Registry:
-    return _load((), disabled, _entry_points)
+    return _load(disabled, _entry_points)
+
+
+@cache
+def _own(disabled: tuple[str, ...]) -> Registry:
+    return _load(disabled, _own_entry_points, UNTRUSTED)
 
 
 @dataclass(frozen=True)
@@ -80,7 +85,7 @@ class _Loaded:
     module: ModuleType
 
 
-def _load(paths: Sequence[Path], disabled: Sequence[str], installed: Finder) -> Registry:
+def _load(disabled: Sequence[str], installed: Finder, hint: str = "") -> Registry:
     from sparserob_core.experiment.plugins import builtin
 
     found, failures = [_Loaded("core", "", builtin)], list[Failure]()
@@ -93,8 +98,6 @@ def _load(paths: Sequence[Path], disabled: Sequence[str], installed: Finder) -> 
     for plugin in found:
         with _noted(failures, plugin.name):
             records += list(_records(plugin))
-    records += _of_files(paths)
-    hint = UNTRUSTED if installed is _own_entry_points else ""
     return Registry(records, failures, disabled, hint)
 
 

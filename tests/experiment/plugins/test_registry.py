@@ -146,10 +146,12 @@ def entry_points(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     def use(*entries: Entry) -> None:
         monkeypatch.setattr(metadata, "entry_points", lambda group: list(entries))
         discovery._installed.cache_clear()
+        discovery._own.cache_clear()
 
     yield use
     monkeypatch.undo()
     discovery._installed.cache_clear()
+    discovery._own.cache_clear()
 
 
 def broken() -> object:
