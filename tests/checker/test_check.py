@@ -33,6 +33,7 @@ from tests.support.tampering import (
     Change,
     Forgery,
     copied,
+    entry,
     forged,
 )
 
@@ -364,11 +365,35 @@ def test_what_nothing_was_compared_with_is_named_and_changes_no_verdict(runs: Ru
     (directory / "notes.txt").write_text("certified, I swear")
     found = check(directory)
     assert found.status == "verified"
-    named = dict(entry.partition(": ")[::2] for entry in found.not_compared)
+    named = dict(one.partition(": ")[::2] for one in found.not_compared)
     assert {"message", "seconds", "counts", "own"} <= set(named["result.json"].split(", "))
     assert not {"status", "cost", "worst", "sparsity", "gap", "seed"} & set(named["result.json"].split(", "))
     assert {"indices", "multipliers", "times"} <= set(named["solution.npz"].split(", "))
     assert {"notes.txt", "trace.npz", "rounds.npz"} <= set(named)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "place"),
+    [
+        ("refuted", entry(proof={"path": {"tolerance": 1e-9}}), "proof"),
+        ("infeasible", entry(witness={"time": 1.0}), "witness"),
+        ("infeasible", entry(cost=1.0), "cost"),
+        ("known", entry(witness={"time": 1.0}), "witness"),
+        ("known", lambda files: files.multipliers.update(pieces=[[0.0]]), "multipliers.pieces"),
+        ("walsh", lambda files: files.heaviest.update(weight=1.0), "multipliers.constraints.weight"),
+        ("ellipsoidal", lambda files: files.proof("terminal").update(kind="round"), "proof.terminal.kind"),
+        ("refuted", lambda files: files.certificate["witness"].update(by="search"), "witness.by"),
+    ],
+)
+def test_what_a_certificate_says_besides_what_its_claims_rest_on_is_named(
+    name: str, change: Change, place: str, runs: Runs, tmp_path: Path
+) -> None:
+    found = check(forged(runs(name), tmp_path / "forged", change, consistent=False))
+    assert found.status == "verified"
+    named = dict(one.partition(": ")[::2] for one in found.not_compared)
+    assert place in named["certificate.json"].split(", ")
+    honest = dict(one.partition(": ")[::2] for one in check(runs(name)).not_compared)
+    assert place not in honest.get("certificate.json", "").split(", ")
 
 
 def test_a_check_stops_in_time_with_what_was_decided(runs: Runs, command: Callable[..., Any]) -> None:

@@ -691,6 +691,20 @@ FILES: dict[str, tuple[str, Change]] = {
         "refuted",
         lambda files: files.result["worst"].update(violation=1e-12),
     ),
+    "the worst parameter is another than the witness shows": (
+        "refuted parameter",
+        lambda files: files.result["worst"].update(parameter=[1.5 - files.result["worst"]["parameter"][0]]),
+    ),
+    "the largest cost of the result is larger": (
+        "known",
+        lambda files: files.result.update(cost_scale=files.result["cost_scale"] * (1 + 1e-6)),
+    ),
+    "the seed of the result is a truth value": ("known", lambda files: files.result.update(seed=False)),
+    "the stored decision is missing": ("known", stored(lambda arrays: arrays.pop("decision"))),
+    "the stored decision is of another shape": (
+        "known",
+        stored(lambda arrays: arrays.update(decision=arrays["decision"].reshape(1, -1))),
+    ),
     "the result is empty": ("known", lambda files: files.result.clear()),
 }
 KINDS = {**DECISION, **FIGURES, **MULTIPLIERS, **PROOF, **CONFIG, **WITNESS}

@@ -9,15 +9,18 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 
 from sparserob_core.checker.outcome import Broken, Finding, Unchecked
+from sparserob_core.checker.sets.shapes import facets
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.directory.finished import StoredRun
 from sparserob_core.experiment.directory.sparsity import sparsity
 
 if TYPE_CHECKING:
     from sparserob_core.checker.claims.case import Case
+    from sparserob_core.control.sets.sets import ConvexSet
     from sparserob_core.experiment.config.load import Loaded
 
 FIGURES = 1e-12  # how closely figures that were computed anew must agree
+CLOSE = 1e-9  # the same for what was rounded on the way: the largest cost, points that were drawn into their sets
 READ = {"config.yaml", "certificate.json", "result.json", "solution.npz"}
 
 
@@ -45,25 +48,69 @@ def compared(stored: StoredRun, loaded: Loaded, case: Case, summary: Mapping[str
         found.claims.append(Finding(name, "fails" if different else "holds", "; ".join(different) or agrees))
         if left:
             found.left[name] = left
-    unknown = sorted(set(case.certificate) - CERTIFICATE)
-    if unknown:
-        found.left["certificate.json"] = unknown
+    unread = sorted(_unread(case))
+    if unread:
+        found.left["certificate.json"] = unread
     found.left |= {path.name: [] for path in sorted(stored.directory.iterdir()) if path.name not in READ}
     return found
 
 
+ALWAYS = {"format", "config", "status", "multipliers"}
+FIGURED = ALWAYS | {"cost", "lower_bound", "decision"}
 CERTIFICATE = {
-    "format",
-    "config",
-    "status",
-    "cost",
-    "lower_bound",
-    "gap_tolerance",
-    "decision",
-    "multipliers",
-    "proof",
-    "witness",
+    "certified": FIGURED | {"gap_tolerance", "proof"},
+    "verified": FIGURED | {"proof"},
+    "undecided": FIGURED | {"proof"},
+    "refuted": FIGURED | {"witness"},
+    "infeasible": ALWAYS | {"lower_bound"},
 }
+"""What is looked at of a certificate, by its status."""
+SOMETIMES = frozenset[str]().union(*CERTIFICATE.values())
+NOTHING: tuple[object, ...] = (None, {}, [])
+MULTIPLIER = {"constraint", "time", "parameter", "direction", "multiplier"}
+CELLS = {"tolerance", "lower", "upper"}
+WITNESS = {"constraint", "time", "parameter", "direction", "disturbance", "violation"}
+
+
+def _unread(case: Case) -> set[str]:
+    """The names ``key.key`` of what a certificate says besides what its claims rest on."""
+    data = case.certificate
+    read = CERTIFICATE.get(str(data.get("status")), FIGURED)
+    left = {name for name, value in data.items() if name not in read and not (name in SOMETIMES and value in NOTHING)}
+    multipliers, proof, witness = (data.get(name) for name in ("multipliers", "proof", "witness"))
+    if isinstance(multipliers, Mapping):
+        unused = case.control.functions >= case.control.pieces and multipliers.get("pieces") is not None
+        left |= _besides("multipliers", multipliers, {"constraints", "equalities", *(() if unused else ("pieces",))})
+        entries = multipliers.get("constraints")
+        for entry in entries if isinstance(entries, list) else []:
+            left |= _besides("multipliers.constraints", entry, MULTIPLIER)
+            left |= {"multipliers.constraints.parameter"} if _of_a_curved_set_of_controls(case, entry) else set()
+    if "proof" in read and isinstance(proof, Mapping):
+        shapes = {window.name: window.shape for window in case.windows}
+        left |= _besides("proof", proof, set(shapes))
+        for name, shape in shapes.items():
+            left |= _besides(f"proof.{name}", proof.get(name), CELLS if _flat(shape) else CELLS | {"normals"})
+    return left | (_besides("witness", witness, WITNESS) if "witness" in read else set())
+
+
+def _besides(name: str, data: object, read: set[str]) -> set[str]:
+    return {f"{name}.{key}" for key in data if key not in read} if isinstance(data, Mapping) else set()
+
+
+def _of_a_curved_set_of_controls(case: Case, entry: object) -> bool:
+    """Whether a multiplier is one of a control's own set, which no parameter changes, and yet has a parameter."""
+    own = not any(window.name == "control" for window in case.windows)
+    return own and isinstance(entry, Mapping) and entry.get("constraint") == "control" and bool(entry.get("parameter"))
+
+
+def _flat(shape: ConvexSet) -> bool:
+    """Whether the directions of a set are its own; a certificate's are not looked at then."""
+    try:
+        return facets(shape) is not None
+    except Unchecked:
+        return True
+
+
 Verdicts = tuple[list[str], str, list[str]]
 """What is different, what to say when nothing is, and what was not compared."""
 
@@ -87,9 +134,9 @@ def _result(loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Verdicts:
         "title": (loaded.config.title, loaded.config.title or summary.get("title")),
     }
     different = [
-        f"{name} is {summary.get(name)!r}, not {' or '.join(map(repr, dict.fromkeys(values)))}"
+        f"{name} is {summary.get(name)!r}, not {' or '.join(dict.fromkeys(map(repr, values)))}"
         for name, values in wanted.items()
-        if summary.get(name) not in values
+        if not any(_equal(summary.get(name), value) for value in values)
     ]
     left, known = [], set(wanted)
     for name, compare in COMPARED.items():
@@ -102,7 +149,10 @@ def _result(loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Verdicts:
         else:
             different += verdict
         known.add(name)
-    return different, "it says what the certificate says", [*left, *(name for name in summary if name not in known)]
+    left += [name for name in summary if name not in known]
+    for name, read in (("worst", WORST), ("sparsity", SPARSITY)):
+        left += sorted(_besides(name, summary.get(name), read)) if name not in left else []
+    return different, "it says what the certificate says", left
 
 
 def _gap(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
@@ -120,10 +170,13 @@ def _gap(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
 
 
 def _largest_cost(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
-    """The largest possible cost; where a program knows no bound of it, the file says something else."""
+    """The largest possible cost; earlier versions did not write it."""
     from sparserob_core.checker.claims.claims import largest_cost
 
-    return [] if _same(summary.get("cost_scale"), largest_cost(case)) else None
+    if "cost_scale" not in summary:
+        return None
+    said, derived = summary["cost_scale"], largest_cost(case)
+    return [] if _same(said, derived, CLOSE) else [f"cost_scale is {said!r}, not {derived!r}"]
 
 
 def _sparsity(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
@@ -165,12 +218,10 @@ def _worst(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
         witness = case.certificate.get("witness")
         if not isinstance(witness, Mapping):
             return None
-        names = ("violation", "constraint", "time")
-        return [
-            f"worst: {name} is {said.get(name)!r}, that of the witness {witness.get(name)!r}"
-            for name in names
-            if not _same(said.get(name), witness.get(name))
-        ]
+        names = [name for name in ("violation", "constraint", "time") if not _same(said.get(name), witness.get(name))]
+        if said.get("parameter") and not _near(said["parameter"], witness.get("parameter")):
+            names.append("parameter")
+        return [f"worst: {name} is {said.get(name)!r}, that of the witness {witness.get(name)!r}" for name in names]
     if status not in ("certified", "verified"):
         return None
     if said.get("constraint") in (None, ""):  # a problem without constraints that can be violated
@@ -187,6 +238,15 @@ def _worst(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     return []
 
 
+def _near(said: object, point: object) -> bool:
+    """Whether two points agree, one of which was drawn into its set by rounding."""
+    if not (isinstance(said, list) and isinstance(point, list) and len(said) == len(point)):
+        return False
+    return all(_same(a, b, CLOSE) for a, b in zip(said, point, strict=True))
+
+
+WORST = {"violation", "constraint", "time", "parameter"}
+SPARSITY = {"active_fraction", "switches"}
 COMPARED: dict[str, Callable[[Case, Mapping[str, Any]], list[str] | None]] = {
     "gap": _gap,
     "cost_scale": _largest_cost,
@@ -196,12 +256,20 @@ COMPARED: dict[str, Callable[[Case, Mapping[str, Any]], list[str] | None]] = {
 }
 
 
-def _same(said: object, value: object) -> bool:
+def _equal(said: object, value: object) -> bool:
+    """Whether two entries of JSON are the same; a truth value is no number."""
+    return said == value and isinstance(said, bool) is isinstance(value, bool)
+
+
+def _same(said: object, value: object, figures: float = FIGURES) -> bool:
     """Whether two entries of JSON agree, numbers to rounding."""
     numbers = [one for one in (said, value) if isinstance(one, int | float) and not isinstance(one, bool)]
     if len(numbers) == 2:
-        return abs(numbers[0] - numbers[1]) <= FIGURES * max(abs(numbers[0]), abs(numbers[1]))
+        return abs(numbers[0] - numbers[1]) <= figures * max(abs(numbers[0]), abs(numbers[1]))
     return type(said) is type(value) and said == value
+
+
+STORED = ("theta", "control", "breakpoints", "decision")
 
 
 def _solution(stored: StoredRun, case: Case) -> Verdicts:
@@ -210,12 +278,12 @@ def _solution(stored: StoredRun, case: Case) -> Verdicts:
         return [], "there is no decision", []
     try:
         arrays = stored.solution
-        theta, control, breakpoints = (arrays[name] for name in ("theta", "control", "breakpoints"))
+        theta, control, breakpoints, flat = (arrays[name] for name in STORED)
         decision = np.array(case.certificate["decision"], dtype=float)
         size = np.abs(decision) @ np.abs(case.control.values)
         same = (
             np.array_equal(theta, decision)
-            and np.array_equal(arrays.get("decision", theta).ravel(), decision.ravel())
+            and np.array_equal(flat, decision.ravel())
             and np.array_equal(breakpoints, case.control.breakpoints)
             and control.shape == size.shape
             and bool((np.abs(control - decision @ case.control.values) <= FIGURES * size).all())
@@ -226,7 +294,7 @@ def _solution(stored: StoredRun, case: Case) -> Verdicts:
         return [f"it holds no array {error}"], "", []
     except (ValueError, TypeError, OverflowError):
         return ["its control and the certificate's are no arrays of one shape"], "", []
-    left = sorted(set(arrays) - {"theta", "control", "breakpoints", "decision"} - set(_witnessed(case, arrays)))
+    left = sorted(set(arrays) - {*STORED} - set(_witnessed(case, arrays)))
     different = [] if same else ["its control is not the certificate's"]
     different += [text for text in _witnessed(case, arrays).values() if text]
     return different, "it holds the certificate's control", left

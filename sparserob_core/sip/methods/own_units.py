@@ -66,7 +66,7 @@ class UsersUnits:
             value=own.value * self.cost,
             lower_bound=own.lower_bound * self.cost,
             upper_bound=own.upper_bound * self.cost,
-            cost_scale=own.cost_scale * self.cost,
+            cost_scale=self.program.cost_scale * self.cost,
             ray=None if own.ray is None else own.ray * self.decision,
             worst=None if own.worst is None else self._witness(own.worst),
             indices=self._cuts(own.indices),
