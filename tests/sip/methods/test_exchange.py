@@ -85,9 +85,7 @@ def assert_sound(result, program, truth, slack=1e-5):
     assert program.finite.residual(result.decision) <= 1e-8
 
 
-@settings(max_examples=4, deadline=None)
-@given(seed=st.integers(0, 10**6), equality=st.booleans())
-def test_the_bounds_enclose_the_value_of_random_programs(options, seed, equality):
+def assert_enclosed(options, seed, equality):
     program = random_program(np.random.default_rng(seed), equality=equality)
     result = sr.solve(program, **options)
     assert result.status in STATUSES, result.message
@@ -95,10 +93,21 @@ def test_the_bounds_enclose_the_value_of_random_programs(options, seed, equality
     assert result.cost - result.lower_bound <= 1e-6 * max(1.0, abs(result.cost))
 
 
-@settings(max_examples=1, deadline=None)
-@given(seed=st.integers(0, 10**6))
-def test_the_order_of_the_families_changes_nothing(options, seed):
-    program = random_program(np.random.default_rng(seed), families=2)
+@settings(max_examples=4, deadline=None)
+@given(seed=st.integers(0, 10**6), equality=st.booleans())
+def test_the_bounds_enclose_the_value_of_random_programs(options, seed, equality):
+    assert_enclosed(options, seed, equality)
+
+
+@pytest.mark.slow
+@settings(max_examples=6, deadline=None)
+@given(seed=st.integers(0, 10**6), equality=st.booleans())
+def test_the_bounds_enclose_the_value_of_more_random_programs(options, seed, equality):
+    assert_enclosed(options, seed, equality)
+
+
+def assert_the_same_in_another_order(options, seed, families):
+    program = random_program(np.random.default_rng(seed), families=families)
     base = program.finite
     other = sr.SemiInfiniteProgram(
         n=program.n, q=base.q, weights=base.weights, lower=-1.0, upper=1.0, families=program.families[::-1]
@@ -106,6 +115,19 @@ def test_the_order_of_the_families_changes_nothing(options, seed):
     first, second = sr.solve(program, **options), sr.solve(other, **options)
     assert first.status == second.status
     assert abs(first.cost - second.cost) <= 2e-7 * max(1.0, abs(first.cost))
+
+
+@settings(max_examples=1, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_the_order_of_the_families_changes_nothing(options, seed):
+    assert_the_same_in_another_order(options, seed, families=2)
+
+
+@pytest.mark.slow
+@settings(max_examples=3, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_the_order_of_three_families_changes_nothing(options, seed):
+    assert_the_same_in_another_order(options, seed, families=3)
 
 
 def test_a_family_given_twice_changes_nothing(options):
@@ -188,9 +210,7 @@ def test_an_infeasible_program_comes_back_infeasible_with_a_reason(options, seed
     assert result.message
 
 
-@settings(max_examples=5, deadline=None)
-@given(seed=st.integers(0, 10**6), amount=st.floats(0.0, 1.5))
-def test_feasible_and_infeasible_programs_are_told_apart(options, seed, amount):
+def assert_told_apart(options, seed, amount):
     program = shifted(random_program(np.random.default_rng(seed), n=3), amount)
     result = sr.solve(program, **options)
     if gridded(program) == np.inf:
@@ -198,6 +218,19 @@ def test_feasible_and_infeasible_programs_are_told_apart(options, seed, amount):
     elif np.isfinite(gridded(program, slack=-1e-4)) and np.isfinite(gridded(program, slack=1e-4)):
         assert result.status in STATUSES
         assert_sound(result, program, gridded(program), 1e-4)
+
+
+@settings(max_examples=5, deadline=None)
+@given(seed=st.integers(0, 10**6), amount=st.floats(0.0, 1.5))
+def test_feasible_and_infeasible_programs_are_told_apart(options, seed, amount):
+    assert_told_apart(options, seed, amount)
+
+
+@pytest.mark.slow
+@settings(max_examples=8, deadline=None)
+@given(seed=st.integers(0, 10**6), amount=st.floats(0.0, 1.5))
+def test_more_feasible_and_infeasible_programs_are_told_apart(options, seed, amount):
+    assert_told_apart(options, seed, amount)
 
 
 # Optimal control problems, where separation and proof are the package's own.
