@@ -227,12 +227,10 @@ class Propagator:
         steps = self.steps(np.zeros((1, 0)))
         powers = np.empty((self.grid.pieces, *steps.A.shape[1:]))
         powers[0] = steps.Gamma[0, 0]
-        done = 1
-        while done < powers.shape[0]:  # doubling: e^{A (done + i) h} = e^{A done h} e^{A i h}
+        doublings = 2 ** np.arange((self.grid.pieces - 1).bit_length())  # e^{A (done + i) h} = e^{A done h} e^{A i h}
+        for done, leap in zip(doublings.tolist(), self.flows(doublings * self._lengths[0])[0], strict=True):
             count = min(done, powers.shape[0] - done)
-            leap = self._transitions(steps.A[0], np.array(done * self._lengths[0]))[0]
             powers[done : done + count] = leap @ powers[:count]
-            done += count
         return np.ascontiguousarray(powers.swapaxes(0, 1))
 
     @cached_property
