@@ -1,4 +1,4 @@
-"""``make docs-pictures``: the pictures of docs/live.md, from runs as a user has them, tens of seconds each.
+"""``make docs-pictures``: the pictures of docs/live.md, from runs and a study as a user has them, tens of seconds each.
 
 Needs the extra ``rerun`` and a Vulkan driver, which a machine without a graphics card has in software (Debian and
 Ubuntu: ``apt install mesa-vulkan-drivers``); no display. The viewer is started without a window, and told what to show.
@@ -26,17 +26,20 @@ SIZE = "1600x1000"
 BLANK = 40_000  # bytes: a picture that is smaller shows an empty window
 STARTING, LOADING, DRAWING = 30.0, 9.0, 4.0  # seconds
 
-EXCHANGE = ["configs/experiment1_repaired.yaml"]
+EXCHANGE = ["watch", "configs/experiment1_repaired.yaml"]
 SEARCH = [
+    "watch",
     "configs/experiment1_reduced.yaml",
     "maximiser={name: simulated_annealing, budget: 1500}",
     "method.sc2=null",
 ]
-INFEASIBLE = ["configs/experiment2_repaired.yaml", "problem.path.0.from=1.0"]
+INFEASIBLE = ["watch", "configs/experiment2_repaired.yaml", "problem.path.0.from=1.0"]
+STUDY = ["sweep", "configs/double_integrator.yaml", "problem.horizon=3:6:7", "problem.control.box=0.6:1.6:6"]
 RUNS: dict[str, tuple[list[str], dict[str, str]]] = {
     "exchange": (EXCHANGE, {"Overview": "exchange", "Exchange": "exchange_tab"}),
     "search": (SEARCH, {"Overview": "search", "Search": "search_tab", "Landscape as a surface": "surface"}),
     "infeasible": (INFEASIBLE, {"Overview": "infeasible"}),
+    "study": (STUDY, {"Study": "study"}),
 }
 """What is run, and which of its tabs become which pictures."""
 
@@ -49,9 +52,9 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as place:
         for name, (arguments, tabs) in RUNS.items():
             file = Path(place) / f"{name}.rrd"
-            click.echo(f"{name}: sparserob watch {' '.join(arguments)}")
+            click.echo(f"{name}: sparserob {' '.join(arguments)}")
             began = time.monotonic()
-            command = [sys.executable, "-m", "sparserob_core", "watch", *arguments, "--save", str(file)]
+            command = [sys.executable, "-m", "sparserob_core", *arguments, "--save", str(file)]
             command += ["--out", f"{place}/{name}", "--no-figures"]
             done = subprocess.run(command, cwd=ROOT, capture_output=True, check=False)  # its status is its verdict
             if not file.is_file():

@@ -113,10 +113,13 @@ from sparserob_core.experiment.config.set_options import SetOptions as SetOption
 
 # To watch a run.
 from sparserob_core.experiment.run.events import Observer as Observer
+from sparserob_core.experiment.run.events import PointProgress as PointProgress
 from sparserob_core.experiment.run.events import RunFinished as RunFinished
 from sparserob_core.experiment.run.events import RunStarted as RunStarted
 from sparserob_core.experiment.run.events import StudyProgress as StudyProgress
+from sparserob_core.experiment.run.events import SweepFinished as SweepFinished
 from sparserob_core.experiment.run.events import SweepProgress as SweepProgress
+from sparserob_core.experiment.run.events import SweepStarted as SweepStarted
 from sparserob_core.sip.events import Batch as Batch
 from sparserob_core.sip.events import EvaluationsFinished as EvaluationsFinished
 from sparserob_core.sip.events import Sketch as Sketch

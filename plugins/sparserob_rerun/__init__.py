@@ -20,7 +20,8 @@ logger = logging.getLogger("sparserob")
 
 
 class Rerun(sr.Observer, sr.Options):
-    """A recording for the viewer of Rerun (rerun.io), an optional extra: ``pip install 'sparserob[rerun]'``.
+    """A recording for the viewer of Rerun (rerun.io), an optional extra: ``pip install 'sparserob[rerun]'``. Given to a
+    sweep, it shows the study: the status of every point, what runs, and the bounds.
 
     Destinations can be combined; with none of them, ``recording.rrd`` in the run's directory. A missing package, viewer
     or listener is one warning, and the run goes on without. Everything happens in a process of its own, on one core and
@@ -65,14 +66,15 @@ class Rerun(sr.Observer, sr.Options):
 
     def receive(self, event: sr.Event) -> None:
         """See `sparserob_core.Observer`."""
-        if isinstance(event, sr.RunStarted):
+        if isinstance(event, sr.RunStarted | sr.SweepStarted):
             self._begin(event)
         elif self._outlet is not None:
             self._outlet.send(event)
-            if isinstance(event, sr.RunFinished):
+            if isinstance(event, sr.RunFinished | sr.SweepFinished):
                 self._pressed = event.pressed
                 if self.serve and self.keep and not event.pressed:
-                    logger.warning("rerun: the run is over: %s; its page stays until Ctrl-C", event.status)
+                    over = f"run is over: {event.status}" if isinstance(event, sr.RunFinished) else "study is over"
+                    logger.warning("rerun: the %s; its page stays until Ctrl-C", over)
                 self.close()
 
     @property
@@ -88,7 +90,7 @@ class Rerun(sr.Observer, sr.Options):
                 logger.warning("rerun: %s", line)
             self._incomplete = outlet.incomplete
 
-    def _begin(self, event: sr.RunStarted) -> None:
+    def _begin(self, event: sr.RunStarted | sr.SweepStarted) -> None:
         from sparserob_rerun.recording.sinks import look
 
         self.close()
@@ -100,14 +102,18 @@ class Rerun(sr.Observer, sr.Options):
         if chosen.missing or not chosen.any:
             logger.warning(
                 "rerun: %s",
-                "; ".join(chosen.missing) or "there is no run directory to record into; give it a place with save",
+                "; ".join(chosen.missing) or "there is no directory to record into; give it a place with save",
             )
         if chosen.serve is not None:
             logger.warning("rerun: to watch, open %s", chosen.page)
         if chosen.any:
             from sparserob_rerun.recording.outlet import Outlet
             from sparserob_rerun.recording.recorder import Opening
+            from sparserob_rerun.study.recorder import StudyOpening
 
+            if isinstance(event, sr.SweepStarted):
+                self._outlet = Outlet(StudyOpening(event), chosen)
+                return
             opening = Opening(event.title, event.directory, event.inspection, self.landscape, self.waits)
             self._outlet = Outlet(opening, chosen, 0 if event.problem is None else event.problem.system.parameter_count)
 

@@ -14,7 +14,16 @@ from typing import Any, final
 
 import numpy as np
 
-from sparserob_core.experiment.run.events import Event, Observer, RunFinished, RunStarted
+from sparserob_core.experiment.run.events import (
+    Event,
+    Observer,
+    PointProgress,
+    RunFinished,
+    RunStarted,
+    SweepFinished,
+    SweepProgress,
+    SweepStarted,
+)
 from sparserob_core.experiment.run.run import Outcome, run
 from sparserob_core.sip.convex_set import Box
 from sparserob_core.sip.events import Batch, EvaluationsFinished, ProofProgress, RoundFinished
@@ -182,6 +191,10 @@ class ObserverContract(Contract[Observer], kind="observer"):
     def test_a_program_that_is_no_control_problem_is_watched_too(self) -> None:
         self._hears((started(), *bare_events()), "a program that is no control problem")
 
+    def test_a_study_is_watched_or_ignored(self) -> None:
+        with TemporaryDirectory() as directory:
+            self._hears(study_events(Path(directory)), "a study")
+
     def _hears(self, events: Sequence[Event], what: str) -> None:
         recording = Recording(self.create())
         with suppress(Exception):
@@ -249,6 +262,25 @@ def started() -> RunStarted:
     """The start of a run that is no control problem and has no directory."""
     program = SemiInfiniteProgram(n=2, q=np.ones(2), lower=-1.0, upper=1.0)
     return RunStarted(title="a program", directory=None, problem=None, program=program)
+
+
+def study_events(directory: Path) -> Sequence[Event]:
+    """A study of two points, of which the second one failed."""
+    rows: dict[int, dict[str, Any]] = {
+        0: {"status": "certified", "cost": 1.0, "lower_bound": 1.0, "upper_bound": 1.0},
+        1: {"status": "failed", "message": "no answer"},
+    }
+    opening = SweepStarted(
+        title="two", directory=directory, axes=["seed"], logarithmic=[False], points=[[0], [1]], arrangement="grid"
+    )
+    return (
+        opening,
+        SweepProgress(text="0 of 2 points done", total=2),
+        PointProgress(point=0),
+        PointProgress(point=0, round=1, lower_bound=0.5),
+        SweepProgress(text="1 of 2 points done", done=1, total=2, row=rows[0], axes=["seed"], places=[0]),
+        SweepFinished(rows=rows, seconds=1.0, stopped="interrupted from the keyboard", pressed=True),
+    )
 
 
 def bare_events() -> Sequence[Event]:

@@ -8,8 +8,10 @@ import queue
 import signal
 import sys
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from importlib.abc import MetaPathFinder
 from typing import Any, final
 
@@ -17,6 +19,8 @@ import sparserob_core as sr
 from sparserob_rerun.recording.layout import layout
 from sparserob_rerun.recording.recorder import Opening, Recorder, shown_of
 from sparserob_rerun.recording.sinks import Destinations, Started, open_sinks, servers, start
+from sparserob_rerun.study.recorder import StudyOpening, StudyRecorder
+from sparserob_rerun.study.recorder import layout as study_layout
 
 IDLE = 0.5  # seconds between two looks at whether the run is still alive
 FLUSHED_EVERY = 1.0  # seconds
@@ -44,7 +48,7 @@ class Account:
     addresses: list[str] = field(default_factory=list)
 
 
-def record(messages: Any, report: Any, opening: Opening, chosen: Destinations, name: str) -> None:
+def record(messages: Any, report: Any, opening: Opening | StudyOpening, chosen: Destinations, name: str) -> None:
     """The whole life of the process. Nothing that it does can reach the run: neither its signals nor its failures."""
     _settle()
     account = Account()
@@ -57,7 +61,7 @@ def record(messages: Any, report: Any, opening: Opening, chosen: Destinations, n
         report.close()
 
 
-def _record(messages: Any, opening: Opening, chosen: Destinations, name: str, parent: int) -> list[str]:
+def _record(messages: Any, opening: Opening | StudyOpening, chosen: Destinations, name: str, parent: int) -> list[str]:
     started = start(chosen)
     try:
         return _recorded(messages, opening, chosen, name, parent, started)
@@ -67,24 +71,32 @@ def _record(messages: Any, opening: Opening, chosen: Destinations, name: str, pa
 
 
 def _recorded(
-    messages: Any, opening: Opening, chosen: Destinations, name: str, parent: int, started: Started
+    messages: Any,
+    opening: Opening | StudyOpening,
+    chosen: Destinations,
+    name: str,
+    parent: int,
+    started: Started,
 ) -> list[str]:
     sys.meta_path.insert(0, _WithoutPandas())
     import rerun as rr
 
-    inspection = opening.answers()
-    shown = shown_of(inspection, opening.landscape)
     stream = rr.RecordingStream("sparserob", recording_id=name)
-    wrong = open_sinks(rr, stream, chosen, layout(shown), started)
+    if isinstance(opening, StudyOpening):
+        begin: Callable[[], Recorder | StudyRecorder] = partial(StudyRecorder, rr, stream, opening)
+        blueprint = study_layout(opening)
+    else:
+        inspection = opening.answers()
+        shown = shown_of(inspection, opening.landscape)
+        begin, blueprint = partial(Recorder, rr, stream, opening, shown, inspection), layout(shown)
+    wrong = open_sinks(rr, stream, chosen, blueprint, started)
     ending = Ending()
     try:
-        recorder = Recorder(rr, stream, opening, shown, inspection)
+        recorder = begin()
         ending = _listen(messages, recorder, parent, wrong)
         if ending.dropped:
             recorder.say(f"{ending.dropped} events came faster than they could be recorded, and were dropped", "WARN")
-        _finish_landscape(recorder, opening)
-        if recorder.explorer.wrong:
-            recorder.say(recorder.explorer.wrong, "WARN")
+        recorder.finish()
         wrong += recorder.broken.values()
         stream.flush(timeout_sec=FLUSHING)
     except RuntimeError as error:  # of the flush: a viewer that went away
@@ -103,13 +115,12 @@ def _look_on(keep: float, parent: int) -> None:
         time.sleep(IDLE)
 
 
-def _listen(messages: Any, recorder: Recorder, parent: int, wrong: list[str]) -> Ending:
+def _listen(messages: Any, recorder: Recorder | StudyRecorder, parent: int, wrong: list[str]) -> Ending:
     """Log whatever comes until the run is over, or gone; an event that cannot be drawn is left out, and the first of
     them is shown. What was logged is on the disk a second later."""
     flushed = time.monotonic()
     while True:
-        explorer = recorder.explorer
-        pause = min(IDLE, explorer.rest) if explorer.busy else IDLE
+        pause = min(IDLE, recorder.rest)
         try:
             message = messages.get(timeout=pause) if pause > 0.0 else messages.get_nowait()
         except queue.Empty:
@@ -121,7 +132,7 @@ def _listen(messages: Any, recorder: Recorder, parent: int, wrong: list[str]) ->
         if message is not None:
             recorder.behind = not messages.empty()
             _receive(message, recorder, wrong)
-        if message is None or explorer.urgent:
+        if message is None or recorder.urgent:
             recorder.idle()
         if time.monotonic() - flushed > FLUSHED_EVERY:
             with suppress(RuntimeError):  # a viewer that went away is told of at the end
@@ -129,28 +140,14 @@ def _listen(messages: Any, recorder: Recorder, parent: int, wrong: list[str]) ->
             flushed = time.monotonic()
 
 
-def _receive(message: Any, recorder: Recorder, wrong: list[str]) -> None:
+def _receive(message: Any, recorder: Recorder | StudyRecorder, wrong: list[str]) -> None:
     try:
         recorder.receive(*message)
     except Exception as error:  # noqa: BLE001  a picture less is better than no recording
         if not wrong:
             wrong.append(f"a {type(message[0]).__name__} could not be drawn: {type(error).__name__}: {error}")
-    if isinstance(message[0], sr.RunFinished):
+    if isinstance(message[0], sr.RunFinished) and isinstance(recorder, Recorder):
         recorder.over = message[0].seconds if message[0].result is not None else -1.0
-
-
-def _finish_landscape(recorder: Recorder, opening: Opening) -> None:
-    """A short run waits for its landscape; a long one had it meanwhile, and waits for a coarse one of its last tuple;
-    one that broke off does not wait."""
-    if opening.landscape is None or recorder.over < 0.0:
-        return
-    explorer = recorder.explorer
-    shown = recorder.terrain.known is not None
-    seconds = recorder.patience - (0.5 * recorder.over if shown and not opening.waits else 0.0)
-    recorder.draw("the landscape", explorer.finish, seconds)
-    if explorer.waiting is not None or explorer.urgent:
-        recorder.draw("the landscape", explorer.finish, recorder.patience, 8)
-    recorder.mark()
 
 
 @final

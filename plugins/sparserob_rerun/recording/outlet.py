@@ -18,10 +18,12 @@ import sparserob_core as sr
 from sparserob_rerun.recording.desk import Account, Ending, record
 from sparserob_rerun.recording.recorder import Opening
 from sparserob_rerun.recording.sinks import Destinations
+from sparserob_rerun.study.recorder import StudyOpening
 
 CAPACITY = 512  # events that may wait
 COLLECTING = 0.4  # seconds for which evaluations are collected before they are sent
 LARGE = 64  # coordinates of one index from which on only times and parameters are sent
+LASTING = 10  # seconds that the last event may wait for its place in the queue
 CLOSING = 60.0  # seconds that the process may take to finish its files, beyond the patience of the landscape
 OVER = 600.0  # the same for a run that is over, and has nothing else to wait for
 START = "fork" if sys.platform.startswith("linux") else "spawn"
@@ -29,11 +31,14 @@ START = "fork" if sys.platform.startswith("linux") else "spawn"
 
 @final
 class Outlet:
-    """One process that records one run. Everything about it may fail, and the run does not notice."""
+    """One process that records one run, or one study. Everything about it may fail, and the run does not notice."""
 
-    def __init__(self, opening: Opening, chosen: Destinations, parameters: int, capacity: int = CAPACITY) -> None:
+    def __init__(
+        self, opening: Opening | StudyOpening, chosen: Destinations, parameters: int = 0, capacity: int = CAPACITY
+    ) -> None:
         context: Any = multiprocessing.get_context(START)
-        self.patience = 0.0 if opening.landscape is None else opening.landscape.patience
+        landscape = opening.landscape if isinstance(opening, Opening) else None
+        self.patience = 0.0 if landscape is None else landscape.patience
         self.file, self.incomplete = chosen.save, ""
         self.closing = OVER if opening.waits else CLOSING
         self.parameters, self.dropped, self.dead = parameters, 0, False
@@ -43,7 +48,9 @@ class Outlet:
         self.waits = opening.waits
         self.messages = context.Queue(capacity)
         self.report, theirs = context.Pipe(duplex=False)
-        sent = opening if START == "fork" else replace(opening, inspection=None)
+        sent = opening
+        if START != "fork" and isinstance(opening, Opening):
+            sent = replace(opening, inspection=None)
         self.process = context.Process(
             target=record, args=(self.messages, theirs, sent, chosen, uuid.uuid4().hex), daemon=True
         )
@@ -75,13 +82,14 @@ class Outlet:
             self._put((joined(pending), self.kept))
 
     def _put(self, message: tuple[sr.Event, np.ndarray | None]) -> None:
+        last, tries = isinstance(message[0], sr.RunFinished | sr.SweepFinished), LASTING
         while not self.dead:
             try:
-                self.messages.put(message, self.waits, 1.0)
+                self.messages.put(message, self.waits or last, 1.0)
                 return
             except queue.Full:
-                self.dead = not self.process.is_alive()
-                if not self.waits:
+                self.dead, tries = not self.process.is_alive(), tries - 1
+                if not self.waits and not (last and tries):
                     break
         self.dropped += 1
 

@@ -208,6 +208,30 @@ class Recorder:
         """Work on the landscape for a moment."""
         self.draw("the landscape", self.explorer.step)
 
+    @property
+    def rest(self) -> float:
+        """Seconds until there is work on the landscape; infinite where there is none."""
+        return self.explorer.rest if self.explorer.busy else np.inf
+
+    @property
+    def urgent(self) -> bool:
+        """Whether the landscape does not wait for a moment without events."""
+        return self.explorer.urgent
+
+    def finish(self) -> None:
+        """A short run waits for its landscape; a long one had it meanwhile, and waits for a coarse one of its last
+        tuple; one that broke off does not wait."""
+        explorer = self.explorer
+        if self.opening.landscape is not None and self.over >= 0.0:
+            shown = self.terrain.known is not None
+            seconds = self.patience - (0.5 * self.over if shown and not self.opening.waits else 0.0)
+            self.draw("the landscape", explorer.finish, seconds)
+            if explorer.waiting is not None or explorer.urgent:
+                self.draw("the landscape", explorer.finish, self.patience, 8)
+            self.mark()
+        if explorer.wrong:
+            self.say(explorer.wrong, "WARN")
+
     def _round(self, event: sr.RoundFinished) -> None:
         self.timelines.move(None if self.searches else event.relaxed_programs, event.round, event.seconds)
         self.lower = max(self.lower, event.lower_bound)

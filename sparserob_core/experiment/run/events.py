@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
@@ -22,12 +23,15 @@ __all__ = [
     "EvaluationsFinished",
     "Event",
     "Observer",
+    "PointProgress",
     "ProofProgress",
     "RoundFinished",
     "RunFinished",
     "RunStarted",
     "StudyProgress",
+    "SweepFinished",
     "SweepProgress",
+    "SweepStarted",
 ]
 
 logger = logging.getLogger("sparserob")
@@ -77,19 +81,72 @@ class StudyProgress(Event):
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SweepProgress(StudyProgress):
     """A sweep goes on: ``done`` of ``total`` points, of them ``failed`` without an answer; ``running`` now; about
-    ``left`` seconds to go (``None``: not known yet). ``row``: the row of the table that has just come, if any;
-    ``axes``: its keys that are axes."""
+    ``left`` seconds to go (``None``: not known yet), ``seconds`` since it began. ``row``: the row of the table that has
+    just come, if any; ``axes``: its keys that are axes. Points by their place in `SweepStarted.points`: ``places`` are
+    those of the row (several where configs are equal), ``now`` those that run."""
 
     running: int = 0
     failed: int = 0
     left: float | None = None
     row: Mapping[str, Any] | None = None
     axes: Sequence[str] = ()
+    places: Sequence[int] = ()
+    now: Sequence[int] = ()
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SweepStarted(Event):
+    """A sweep begins: its title, its directory, the keys of its ``axes``, which of them are ``logarithmic``, and the
+    values of all ``points`` on them, in the order of the table.
+
+    The first event for an observer of a study. ``rows``: what was finished before, by the place of the point.
+    ``arrangement``: how the points were chosen (``grid``, ``zip``, ``random``, ``sobol``). ``parallel``: the runs are
+    made elsewhere, and nothing is heard of them (`PointProgress`) before they end."""
+
+    title: str
+    directory: Path
+    axes: Sequence[str]
+    logarithmic: Sequence[bool]
+    points: Sequence[Sequence[Any]]
+    arrangement: str
+    rows: Mapping[int, Mapping[str, Any]] = field(default_factory=dict)
+    parallel: bool = False
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PointProgress(Event):
+    """A point of a study that runs in this process has begun (``round`` 0), or has moved its bounds in some round:
+    ``-inf`` and ``inf`` while unknown, in the units of the config. ``seconds`` since the study began."""
+
+    point: int
+    round: int = 0
+    lower_bound: float = -math.inf
+    upper_bound: float = math.inf
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SweepFinished(Event):
+    """A sweep is over; the last event for an observer of a study. ``rows``: all rows of the table by the place of the
+    point; ``stopped``: what ended the study early, if anything did; ``pressed``: it was a key or a signal."""
+
+    rows: Mapping[int, Mapping[str, Any]]
+    seconds: float
+    stopped: str = ""
+    pressed: bool = False
+
+
+FIRST, LAST = (RunStarted, SweepStarted), (RunFinished, SweepFinished)
+"""What an observer hears first, and last."""
 
 
 class Observer(ABC):
     """Watches a run. It receives `RunStarted` first and `RunFinished` last, each once, and in between whatever happens,
-    on the solver's thread: what takes long belongs into a thread or a process of its own, begun at `RunStarted`."""
+    on the solver's thread: what takes long belongs into a thread or a process of its own, begun at `RunStarted`.
+
+    One that is given to a sweep watches the study: it receives `SweepStarted` first, `SweepProgress` and
+    `PointProgress`, and `SweepFinished` last, and no event of the runs themselves."""
 
     @property
     def incomplete(self) -> str:
@@ -101,15 +158,15 @@ class Observer(ABC):
         """Take note of an event; ignore those of unknown type. Whatever this raises only detaches the observer."""
 
     def close(self) -> None:  # noqa: B027  most hold nothing
-        """Let go of files, threads and the terminal: called once, after `RunFinished`, or when the observer is detached
-        before it."""
+        """Let go of files, threads and the terminal: called once, after the last event, or when the observer is
+        detached before it."""
 
 
 @final
 class Broadcast:
     """Passes every event on to every observer; one that raises is detached with one warning, and the run goes on.
 
-    Every observer that received `RunStarted` receives `RunFinished`, once, and is closed; nothing is sent after that.
+    Every observer that received the first event receives the last one, once, and is closed; nothing is sent after that.
     An interrupt from the keyboard is not the observer's failure: it is raised, at the end of a run only after all
     observers have received the last event.
     """
@@ -117,8 +174,13 @@ class Broadcast:
     def __init__(self, observers: Iterable[tuple[str, Observer]]) -> None:
         self._observers = [_Listener(name, observer) for name, observer in observers]
 
+    @property
+    def heard(self) -> bool:
+        """Whether anybody listens."""
+        return bool(self._observers)
+
     def __call__(self, event: Event) -> None:
-        last, interrupt = isinstance(event, RunFinished), None
+        last, interrupt = isinstance(event, LAST), None
         for listener in tuple(self._observers):
             try:
                 if not listener.receive(event):
@@ -135,15 +197,15 @@ class Broadcast:
 
 @final
 class _Listener:
-    """One observer of one run."""
+    """One observer of one run, or of one study."""
 
     def __init__(self, name: str, observer: Observer) -> None:
         self.name, self.observer, self.began = name, observer, False
 
     def receive(self, event: Event) -> bool:
         """Pass an event on; returns whether the observer takes further events."""
-        last = isinstance(event, RunFinished)
-        self.began |= isinstance(event, RunStarted)
+        last = isinstance(event, LAST)
+        self.began |= isinstance(event, FIRST)
         try:
             if self.began or not last:
                 self.observer.receive(event)

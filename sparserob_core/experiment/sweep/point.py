@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
@@ -11,6 +12,7 @@ from typing import Any, final
 from sparserob_core.errors import SparseRobError, named
 from sparserob_core.experiment.config.load import load_config
 from sparserob_core.experiment.directory.artefacts import finite
+from sparserob_core.experiment.run.events import EvaluationsFinished, Event, Observer, RoundFinished
 from sparserob_core.experiment.run.run import run_loaded
 from sparserob_core.sip.method import OutOfTime
 
@@ -47,7 +49,29 @@ class Answer:
         return self.summary is None or self.summary["status"] == "failed"
 
 
-def run_point(task: Task) -> Answer:
+@final
+class Bounds(Observer):
+    """Watches the run of a point in this process: calls ``tell(round, lower, upper)`` at its first event, and whenever
+    its bounds have moved."""
+
+    def __init__(self, tell: Callable[[int, float, float], object]) -> None:
+        self.tell, self.told = tell, (-1, -math.inf, math.inf)
+
+    def receive(self, event: Event) -> None:
+        """See `Observer`."""
+        number, lower, upper = self.told
+        number = max(number, 0)
+        if isinstance(event, RoundFinished):
+            number, lower = event.round, max(lower, event.lower_bound)
+            upper = upper if event.simplified else min(upper, event.upper_bound)
+        elif isinstance(event, EvaluationsFinished) and not event.family:
+            lower = max(lower, event.lower_bound)
+        if (number, lower, upper) != self.told:
+            self.told = (number, lower, upper)
+            self.tell(number, lower, upper)
+
+
+def run_point(task: Task, observers: Iterable[Observer] = ()) -> Answer:
     """Run a point. What it leaves stands under its final name only when it is complete, so that a process that dies
     loses nothing but the points that it was about to finish. Nothing is raised but an interrupt."""
     partial, ends = Path(task.partial), Path(task.final)
@@ -55,7 +79,8 @@ def run_point(task: Task) -> Answer:
         partial = partial.with_name(f"{partial.name}+")
     try:
         partial.parent.mkdir(parents=True, exist_ok=True)
-        outcome = run_loaded(load_config(task.config), task.git, partial, quiet=True, figures=task.figures)
+        loaded = load_config(task.config)
+        outcome = run_loaded(loaded, task.git, partial, quiet=True, figures=task.figures, observers=observers)
         if outcome.interrupted and outcome.result.stopped:
             raise KeyboardInterrupt(outcome.result.stopped)
         keep(partial, ends)

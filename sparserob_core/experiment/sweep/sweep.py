@@ -7,9 +7,9 @@ import re
 import shutil
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Future
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -23,10 +23,17 @@ from sparserob_core.experiment.directory.artefacts import RunDirectory, create_d
 from sparserob_core.experiment.directory.finished import UNFINISHED, read_summary
 from sparserob_core.experiment.directory.lock import is_dead, owner_of
 from sparserob_core.experiment.directory.provenance import git_revision
-from sparserob_core.experiment.run.events import SweepProgress
+from sparserob_core.experiment.run.events import (
+    Broadcast,
+    Observer,
+    PointProgress,
+    SweepFinished,
+    SweepProgress,
+    SweepStarted,
+)
 from sparserob_core.experiment.sweep.axes import Axis
 from sparserob_core.experiment.sweep.plan import FILE, Arrangement, Plan, Point, make_plan, read_plan
-from sparserob_core.experiment.sweep.point import Answer, Task, run_point
+from sparserob_core.experiment.sweep.point import Answer, Bounds, Task, run_point
 from sparserob_core.experiment.sweep.study import RUNS, Study
 from sparserob_core.experiment.sweep.table import COLUMNS, TABLE, Row, columns_of, columns_text, row_of, table_text
 from sparserob_core.sip.events import Notify, ignore
@@ -51,6 +58,7 @@ def sweep(
     out: str | Path | None = None,
     figures: bool = False,
     notify: Notify = ignore,
+    observers: Iterable[Observer] = (),
 ) -> Study:
     """Run a config at every point of some axes: what ``sparserob sweep CONFIG key=a,b,c key=start:stop:count`` does.
 
@@ -59,7 +67,8 @@ def sweep(
     ``key=values``. ``overrides`` hold for all points. ``points``: all combinations (``"grid"``, the default),
     ``"zip"``, or ``number`` points at ``"random"`` or along ``"sobol"``. ``executor``: a name, or a mapping with a
     name, unless the config's own is meant; the runs themselves are serial, and no result depends on it. ``figures``:
-    whether to draw every run. ``notify`` receives `SweepProgress`.
+    whether to draw every run. ``notify`` receives `SweepProgress`. ``observers`` watch the study, from `SweepStarted`
+    to `SweepFinished`; one that raises is detached with a warning, and the study goes on.
 
     In ``out`` (``runs/NAME-sweep/STAMP-HASH`` unless given) a study of the same base is gone on with: what is finished
     there, by the hash of its config, is not run again; what failed or ended at a time limit is. A point that fails is a
@@ -76,10 +85,22 @@ def sweep(
         raise InputError(path="axes", expected="at least one, for example seed=0:19:20", got="none")
     checked = plan.checked(notify)
     factory = _executors(checked[0], executor)
-    with create_directory(out, f"{plan.name}-sweep", checked[0].hash[:8], again=FILE) as made:
-        _require_same_base(made.path, plan)
-        made.write_text(FILE, plan.written())
-        return _drawn(_Walk(plan, checked, made, figures, notify).run(factory))
+    broadcast = Broadcast([(type(observer).__name__, observer) for observer in observers])
+    walk = None
+    try:
+        with create_directory(out, f"{plan.name}-sweep", checked[0].hash[:8], again=FILE) as made:
+            _require_same_base(made.path, plan)
+            made.write_text(FILE, plan.written())
+            walk = _Walk(plan, checked, made, figures, notify, broadcast)
+            return _drawn(walk.run(factory))
+    except BaseException as error:
+        if walk is not None:
+            walk.stopped = walk.stopped or named(error)
+        raise
+    finally:
+        if walk is not None:
+            with suppress(KeyboardInterrupt):  # it ends the observers; the study is over
+                broadcast(walk.ending())  # the directory is free by then, for a page may stay for hours
 
 
 def _number(points: Arrangement | None, number: int | None) -> int | None:
@@ -114,8 +135,20 @@ def _require_same_base(directory: Path, plan: Plan) -> None:
 class _Walk:
     """One call of `sweep`: the points by their hash, and what is known of each."""
 
-    def __init__(self, plan: Plan, points: Sequence[Point], made: RunDirectory, figures: bool, notify: Notify) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        points: Sequence[Point],
+        made: RunDirectory,
+        figures: bool,
+        notify: Notify,
+        broadcast: Broadcast,
+    ) -> None:
         self.plan, self.points, self.made, self.figures, self.notify = plan, points, made, figures, notify
+        self.broadcast, self.parallel, self.stopped, self.pressed = broadcast, True, "", False
+        self.places: dict[str, list[int]] = {}
+        for place, point in enumerate(points):
+            self.places.setdefault(point.hash, []).append(place)
         self.directory = made.path.resolve()
         self.git = git_revision(plan.base.folder)
         self.by_hash = {point.hash: point for point in reversed(points)}  # of equal configs the first one names the run
@@ -134,12 +167,13 @@ class _Walk:
         self.pending = set(waiting)
         self.done = sum(self.copies[digest] for digest in self.answers if digest not in self.pending)
         self._write()
-        stopped = ""
+        self.parallel = factory.parallel
         try:
+            self.broadcast(self._opening())
             self._tell("")
             self._solve(factory, waiting)
         except KeyboardInterrupt as pressed:
-            stopped = str(pressed) or "interrupted from the keyboard"
+            self.stopped, self.pressed = str(pressed) or "interrupted from the keyboard", True
         finally:
             self._clear()
             self._read(sorted(self.pending))  # a run that was over, whose worker was not heard any more
@@ -151,8 +185,31 @@ class _Walk:
             table=self._rows(),
             points=len(self.points),
             arrangement=self.plan.points,
-            stopped=stopped,
+            stopped=self.stopped,
         )
+
+    def _opening(self) -> SweepStarted:
+        return SweepStarted(
+            title=str(self.plan.base.data["title"]),
+            directory=self.directory,
+            axes=[axis.key for axis in self.plan.axes],
+            logarithmic=[axis.log for axis in self.plan.axes],
+            points=[point.values for point in self.points],
+            arrangement=self.plan.points,
+            rows=self._known(self.pending),
+            parallel=self.parallel,
+        )
+
+    def ending(self) -> SweepFinished:
+        """What its observers hear last."""
+        return SweepFinished(
+            rows=self._known(), seconds=time.monotonic() - self.began, stopped=self.stopped, pressed=self.pressed
+        )
+
+    def _known(self, but: Collection[str] = ()) -> dict[int, Row]:
+        """The rows that are known, by the places of their points, without those of some hashes."""
+        known = [digest for digest in self.answers if digest not in but and digest in self.places]
+        return {place: self._row(self.points[place]) for digest in known for place in self.places[digest]}
 
     def _left(self) -> list[str]:
         """The hashes of the points that are to be run; of the others the answers are read."""
@@ -199,7 +256,7 @@ class _Walk:
             for digest in batch:
                 shutil.rmtree(self._partial(digest), ignore_errors=True)
                 try:
-                    future = executor.submit(run_point, self._task(digest))
+                    future = executor.submit(run_point, self._task(digest), self._watching(digest))
                 except BrokenExecutor:
                     lost.append(digest)
                     continue
@@ -213,6 +270,20 @@ class _Walk:
                 except Empty:
                     self._tell("", open_ones)
         return lost
+
+    def _watching(self, digest: str) -> list[Observer]:
+        """Who watches the run of a point: somebody, where it is made in this process and the study is watched."""
+        if self.parallel or not self.broadcast.heard:
+            return []
+        place = self.places[digest][0]
+
+        def tell(number: int, lower: float, upper: float) -> None:
+            seconds = time.monotonic() - self.began
+            self.broadcast(
+                PointProgress(point=place, round=number, lower_bound=lower, upper_bound=upper, seconds=seconds)
+            )
+
+        return [Bounds(tell)]
 
     def _collect(self, future: Future[Answer], open_ones: dict[Future[Answer], str], lost: list[str]) -> None:
         digest = open_ones.pop(future)
@@ -276,20 +347,23 @@ class _Walk:
                 shutil.rmtree(path, ignore_errors=True)
 
     def _tell(self, digest: str, open_ones: Mapping[Future[Answer], str] | None = None) -> None:
-        running = sum(future.running() and self._partial(one).exists() for future, one in (open_ones or {}).items())
+        now = [one for future, one in (open_ones or {}).items() if future.running() and self._partial(one).exists()]
         left = (time.monotonic() - self.began) / self.new * len(self.pending) if self.new else None
-        self.notify(
-            SweepProgress(
-                text=_said(self.done, len(self.points), running, self.failed, left),
-                done=self.done,
-                total=len(self.points),
-                running=running,
-                failed=self.failed,
-                left=left,
-                row=self._row(self.by_hash[digest]) if digest else None,
-                axes=[axis.key for axis in self.plan.axes],
-            )
+        event = SweepProgress(
+            text=_said(self.done, len(self.points), len(now), self.failed, left),
+            done=self.done,
+            total=len(self.points),
+            running=len(now),
+            failed=self.failed,
+            left=left,
+            row=self._row(self.by_hash[digest]) if digest else None,
+            axes=[axis.key for axis in self.plan.axes],
+            places=self.places[digest] if digest else (),
+            now=[self.places[one][0] for one in now],
+            seconds=time.monotonic() - self.began,
         )
+        self.notify(event)
+        self.broadcast(event)
 
 
 def run_name(axes: Sequence[Axis], point: Point) -> str:

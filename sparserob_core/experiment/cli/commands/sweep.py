@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -29,6 +30,12 @@ from sparserob_core.experiment.terminal.printing import print_json, printable
 )
 @click.option("--resume", type=click.Path(path_type=Path), metavar="DIR", help="Go on with the study in DIR.")
 @click.option("--figures/--no-figures", default=False, help="Whether to draw every run too.", show_default=True)
+@click.option("--watch", is_flag=True, help="Show the study in the viewer of Rerun while it goes on.")
+@click.option(
+    "--save", type=click.Path(path_type=Path), help="Watch: record into this file, for a machine without a display."
+)
+@click.option("--serve", is_flag=True, help="Watch: show it in a browser of this machine, until Ctrl-C.")
+@click.option("--connect", metavar="ADDRESS", help="Watch: send it to a viewer that listens there.")
 @click.option("--quiet", is_flag=True, help="Print nothing but errors.")
 @click.option("--json", "as_json", is_flag=True, help="Print the table as JSON instead.")
 def sweep(
@@ -41,6 +48,10 @@ def sweep(
     out: Path | None,
     resume: Path | None,
     figures: bool,
+    watch: bool,
+    save: Path | None,
+    serve: bool,
+    connect: str | None,
     quiet: bool,
     as_json: bool,
 ) -> int:
@@ -49,13 +60,15 @@ def sweep(
     KEY=VALUES is an axis: values (method=exchange,scenario), start:stop:count (seed=0:19:20), or
     log:start:stop:count (continuation.stop=log:1e-6:1:13); commas inside brackets do not split. One value changes the
     config for all points. CONFIG may also be a study's file, with the keys base and axes. What is finished in the
-    directory is not run again; a point that fails is a row that says why.
+    directory is not run again; a point that fails is a row that says why. With --watch, or --save, --serve or
+    --connect, as those of sparserob watch, it is shown as it goes on: an optional extra, sparserob[rerun].
 
     Exit status: 0 every point has an answer, whatever it is; 2 the input is at fault, 5 a point failed, 130
     interrupted.
     """
     from sparserob_core.experiment.cli.shell.live_table import LiveTable
     from sparserob_core.experiment.config.reader import read_value
+    from sparserob_core.experiment.run.viewer import recorded, recorder
     from sparserob_core.experiment.sweep.study import remarks_of, shown
     from sparserob_core.experiment.sweep.sweep import sweep as run_study
     from sparserob_core.experiment.terminal.table import print_table
@@ -73,6 +86,7 @@ def sweep(
         raise InputError(
             "expected one of --zip, --random and --sobol, got " + " and ".join(f"--{one}" for one in chosen)
         )
+    watching = [recorder(save, serve, connect)] if watch or serve or save is not None or connect is not None else []
     with LiveTable() as live:
         study = run_study(
             config if config is not None else resume,  # type: ignore[arg-type]
@@ -83,11 +97,15 @@ def sweep(
             out=out,
             figures=figures,
             notify=ignore if quiet else live.receive,
+            observers=watching,
         )
+    study = replace(study, remarks=(*study.remarks, *(line for one in watching for line in recorded(one, save))))
     if as_json:
         print_json({**study.summary(), "table": study.table})
     elif not quiet:
         print_table(study.title, *shown(study))
         for remark in (*remarks_of(study), f"written to {study.directory}"):
             click.echo(printable(remark))
-    return status_unless_interrupted(5 if study.failed else 0)
+    status = 5 if study.failed else 0
+    # the Ctrl-C that ends a page has cut nothing short
+    return status if serve and not study.stopped else status_unless_interrupted(status)

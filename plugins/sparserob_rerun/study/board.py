@@ -1,0 +1,215 @@
+"""The status map of a study: costs along one axis, cells over two, points that were drawn, or a table."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+
+from sparserob_rerun.drawing import palette as ink
+from sparserob_rerun.drawing.canvas import Axes, Drawing
+from sparserob_rerun.drawing.canvas import ticks as round_numbers
+from sparserob_rerun.drawing.palette import Floats
+from sparserob_rerun.study.statuses import COLOURS, legend, mark, plainly, said
+
+if TYPE_CHECKING:
+    import sparserob_core as sr
+
+LEFT, WIDTH, HEIGHT = 150.0, 620.0, 330.0
+EXTENT = (0.0, LEFT + WIDTH + 40.0, -62.0, HEIGHT + 116.0)
+"""Left, right, top and bottom of the map."""
+LETTER = 8.0  # pixels, about
+LINE = 22.0  # pixels between two labels above one another
+MARKED = 14.0  # pixels of a cell from which on it has room for a mark
+LINES = 60  # of the table
+EMPTY: ink.Colour = (48, 52, 60, 255)
+DECADES = 3.0  # between costs from which on their axis is logarithmic
+
+
+@final
+class Scale:
+    """One axis of a study as an axis of a picture: numbers by their size or their logarithm, others, and those of
+    cells, in a ``row``."""
+
+    def __init__(self, key: str, values: Sequence[Any], logarithmic: bool, drawn: bool, row: bool) -> None:
+        numbers = all(isinstance(one, int | float) and not isinstance(one, bool) for one in values)
+        self.key, self.drawn, self.numeric = key, drawn, numbers and not row
+        self.log = self.numeric and logarithmic and min(values) > 0
+        distinct = {repr(one): one for one in values}
+        self.values = sorted(distinct.values()) if numbers else list(distinct.values())
+        self.places = {repr(one): place for place, one in enumerate(self.values)}
+        at = [self.at(one) for one in self.values]
+        rim = (0.06 * (max(at) - min(at)) if self.numeric else 0.5) or 0.5
+        self.limits = (min(at) - rim, max(at) + rim)
+
+    def at(self, value: Any) -> float:
+        """Where a value is."""
+        if not self.numeric:
+            return float(self.places[repr(value)])
+        return float(np.log10(value)) if self.log else float(value)
+
+    def ticks(self, at: Any, room: float) -> list[tuple[float, str]]:
+        """The pixels, by ``at``, of values that are not too close to one another, and what is written there."""
+        shown = [(self.at(one), said(one)) for one in self.values]
+        if self.drawn and self.numeric:
+            shown = [(float(one), f"{10.0**one if self.log else one:.6g}") for one in round_numbers(*self.limits)]
+        found = list[tuple[float, str]]()
+        for place, words in shown:
+            pixel = float(at(place))
+            wide = max(room, LETTER * len(words) if room > LINE else 0.0)
+            if not found or abs(pixel - found[-1][0]) >= wide:
+                found.append((pixel, words))
+        return found
+
+
+@final
+class Board:
+    """The map of one study."""
+
+    def __init__(self, event: sr.SweepStarted) -> None:
+        self.event, self.drawn = event, event.arrangement in ("random", "sobol")
+        count = 1 if event.arrangement == "zip" else len(event.axes)
+        columns = list(zip(*event.points, strict=True)) if event.points else []
+        self.scales = [
+            Scale(key, values, log, self.drawn, row=count == 2 and not self.drawn)
+            for key, values, log in zip(event.axes[:count], columns[:count], event.logarithmic[:count], strict=True)
+        ]
+        self.kind = "table"
+        if len(self.scales) == 1:
+            self.kind = "line"
+        elif len(self.scales) == 2:
+            self.kind = "points" if self.drawn else "cells"
+        self.boxes: tuple[list[Floats], list[ink.Colour]] = ([], [])
+        self.half, self.thick = np.zeros(2), 0.0
+
+    def statuses(self, rows: Mapping[int, Mapping[str, Any]], now: Sequence[int]) -> list[str]:
+        """The status of every point, in their order."""
+        running = set(now)
+        return [
+            "running" if place in running else str(rows[place]["status"]) if place in rows else "waiting"
+            for place in range(len(self.event.points))
+        ]
+
+    def draw(self, rows: Mapping[int, Mapping[str, Any]], now: Sequence[int]) -> Drawing:
+        """The picture of what is known; ``boxes`` holds the cells, as centres and colours; they are filled by
+        lines ``thick`` to each side about rectangles of ``half`` the size."""
+        drawing, statuses = Drawing(), self.statuses(rows, now)
+        below = HEIGHT + 66.0
+        if self.kind == "line":
+            self._line(drawing, rows, statuses)
+        elif self.kind == "cells":
+            self._cells(drawing, statuses)
+        else:
+            axes = self._axes(self.scales[1].limits)
+            self._upwards(drawing, axes, self.scales[1])
+            for values, status in zip(self.event.points, statuses, strict=True):
+                mark(drawing, axes.at(*self._at(values))[0], status)
+        legend(drawing, LEFT, below, Counter(statuses))
+        return drawing
+
+    def table(self, rows: Mapping[int, Mapping[str, Any]], newest: Sequence[int]) -> str:
+        """The newest points as a table in Markdown, for a study with many axes."""
+        head = [*map(plainly, self.event.axes), "status", "cost J", "proven lower bound"]
+        lines = [" | ".join(head), " | ".join("---" for _ in head)]
+        for place in newest[:LINES]:
+            row = rows[place]
+            cells = [*(plainly(said(one)) for one in self.event.points[place]), str(row["status"])]
+            lines.append(" | ".join([*cells, number(row.get("cost")), number(row.get("lower_bound"))]))
+        if not newest:
+            lines.append(" | ".join(["no point is finished yet", *("" for _ in head[1:])]))
+        return "\n".join(f"| {line} |" for line in lines)
+
+    def _at(self, values: Sequence[Any]) -> tuple[float, float]:
+        return self.scales[0].at(values[0]), self.scales[1].at(values[1])
+
+    def _axes(self, y: tuple[float, float]) -> Axes:
+        return Axes(LEFT, 0.0, WIDTH, HEIGHT, self.scales[0].limits, y)
+
+    def _along(self, drawing: Drawing, axes: Axes) -> None:
+        """The box, and the axis at the bottom."""
+        right, bottom = axes.left + axes.width, axes.top + axes.height
+        drawing.line("frame", np.array([[axes.left, axes.top], [axes.left, bottom], [right, bottom]]), ink.GREY, 1.0)
+        for x, words in self.scales[0].ticks(lambda one: axes.at(one, axes.y[0])[0, 0], 40.0):
+            drawing.line("frame", np.array([[x, bottom], [x, bottom + 5]]), ink.GREY, 1.0)
+            drawing.text(x, bottom + 15, words, ink.GREY)
+        also = f" (with {', '.join(self.event.axes[1:])})" if self.event.arrangement == "zip" else ""
+        key = self.scales[0].key + also + (", logarithmic" if self.scales[0].log else "")
+        drawing.text((axes.left + right) / 2, bottom + 36, key, ink.GREY)
+
+    def _upwards(self, drawing: Drawing, axes: Axes, scale: Scale) -> None:
+        """Both axes, the second of them upwards."""
+        self._along(drawing, axes)
+        for y, words in scale.ticks(lambda one: axes.at(axes.x[0], one)[0, 1], LINE):
+            drawing.line("frame", np.array([[axes.left - 5, y], [axes.left, y]]), ink.GREY, 1.0)
+            drawing.text(axes.left - 14 - LETTER * len(words) / 2, y, words, ink.GREY)
+        key = scale.key + (", logarithmic" if scale.log else "")
+        drawing.text(max(axes.left, LETTER * len(key) / 2), axes.top - 34, key, ink.GREY)
+
+    def _cells(self, drawing: Drawing, statuses: Sequence[str]) -> None:
+        """A cell for each pair of values, in rows and columns of equal width."""
+        across, up = (len(scale.values) for scale in self.scales)
+        axes = self._axes(self.scales[1].limits)
+        half = np.array([axes.width / across, axes.height / up]) / 2.0 * 0.92
+        self.thick = float(half.min()) / 2.0
+        self.half = half - self.thick
+        self._upwards(drawing, axes, self.scales[1])
+        self.boxes = ([], [])
+        for values, status in zip(self.event.points, statuses, strict=True):
+            at = axes.at(*self._at(values))[0]
+            self.boxes[0].append(at)
+            self.boxes[1].append(EMPTY if status in ("waiting", "running") else COLOURS.get(status, ink.INK))
+            if half.min() * 2.0 >= MARKED and status != "waiting":
+                mark(drawing, at, status, None if status == "running" else ink.GROUND)
+            elif status == "running":
+                drawing.dot(at[np.newaxis], ink.INK, 2.0)
+
+    def _line(self, drawing: Drawing, rows: Mapping[int, Mapping[str, Any]], statuses: Sequence[str]) -> None:
+        """Costs and proven lower bounds against the first axis; points without a cost at the lower edge."""
+        scale = self.scales[0]
+        costs = {place: float(row["cost"]) for place, row in rows.items() if row.get("cost") is not None}
+        lower = {place: float(rows[place]["lower_bound"]) for place in costs if _known(rows[place].get("lower_bound"))}
+        decades = bool(costs) and min(costs.values()) > 0.0
+        decades = decades and max(costs.values()) >= 10.0**DECADES * min(costs.values())
+        shown, least = list(costs.values()), min(costs.values(), default=0.0)
+        span = max(max(shown, default=0.0) - least, 0.5 * max(map(abs, shown), default=0.0))
+        shown += [max(one, least if decades else least - span) for one in lower.values()]
+        heights = [float(np.log10(max(one, least))) if decades else one for one in shown]
+        low, high = min(heights, default=0.0), max(heights, default=1.0)
+        rim = 0.12 * (high - low) or 0.1 * abs(high) or 0.5
+        axes = self._axes((low - rim, high + rim))
+        what = "cost J, down to its proven lower bound" if costs else "cost J: no point has one yet"
+        self._along(drawing, axes)
+        for value in round_numbers(*axes.y) if costs else ():
+            y = float(axes.at(axes.x[0], value)[0, 1])
+            drawing.line("frame", np.array([[LEFT - 5, y], [LEFT, y]]), ink.GREY, 1.0)
+            drawing.text(LEFT - 34, y, f"{10.0**value if decades else value:.6g}", ink.GREY)
+        drawing.text(LEFT + WIDTH / 2, -14.0, what)
+
+        def height(value: float) -> float:
+            return float(np.log10(max(value, 10.0 ** axes.y[0]))) if decades else value
+
+        joined = sorted((scale.at(self.event.points[place][0]), height(cost)) for place, cost in costs.items())
+        if scale.numeric and len(joined) > 1 and not self.drawn:
+            drawing.line("curve", axes.at(*np.array(joined).T), ink.FAINT, 1.0)
+        for place, status in enumerate(statuses):
+            x = scale.at(self.event.points[place][0])
+            if place in costs and status != "running":
+                at = axes.at(x, height(costs[place]))[0]
+                if place in lower:
+                    foot = axes.at(x, height(lower[place]))[0]
+                    drawing.line("bounds", np.array([at, foot]), ink.GREEN, 1.5)
+                    drawing.line("bounds", foot + np.array([[-5.0, 0.0], [5.0, 0.0]]), ink.GREEN, 1.5)
+            else:
+                at = axes.at(x, axes.y[0])[0] - np.array([0.0, 8.0])
+            mark(drawing, at, status)
+
+
+def number(value: Any, unknown: str = "-") -> str:
+    """A number in a few digits, or what stands for one that is not known."""
+    return f"{value:.7g}" if _known(value) else unknown
+
+
+def _known(value: Any) -> bool:
+    return isinstance(value, int | float) and bool(np.isfinite(value))

@@ -1,0 +1,309 @@
+"""From the events of a study to a recording: what happens in the process that does all the work."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter, deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from textwrap import shorten
+from typing import Any, final
+
+import numpy as np
+
+import sparserob_core as sr
+from sparserob_rerun.drawing import palette as ink
+from sparserob_rerun.drawing.canvas import Axes, Drawing, view
+from sparserob_rerun.study import board
+from sparserob_rerun.study.board import Board, number
+from sparserob_rerun.study.statuses import mark, named, plainly, said
+
+LAYERS = ("curve", "frame", "bounds", "marks")
+PICTURE_EVERY, SHARE, RAREST, SPARE = 0.5, 0.005, 60.0, 20.0
+"""Seconds between two pictures; a share of the study's time, and these seconds at most; and how many times as long as
+one took."""
+LARGE = 1000.0  # points from which on pictures are rarer, for they are larger
+SHOWN = 8  # points whose bounds are drawn
+LETTERS, NAME = 300, 32  # of why a point failed, and of its name beside its bounds
+LISTED = 24  # points that are listed as running, or as the newest ones
+LEFT, WIDTH, ROW = 250.0, 440.0, 26.0
+EXTENT = (0.0, LEFT + WIDTH + 130.0, -50.0, SHOWN * ROW + 60.0)
+MAP = "**Reading the map.** Each point has the colour and the mark of its status, as named below the map."
+COLOURS = "Green: a proven lower bound of the least cost J\\*; red: an upper bound."
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class StudyOpening:
+    """What a recording knows of a study at the beginning; it never makes the study wait."""
+
+    event: sr.SweepStarted
+    waits: bool = False
+
+
+@final
+class StudyRecorder:
+    """Logs the events of one study to a stream that is already open."""
+
+    rest, urgent, behind = math.inf, False, False
+
+    def __init__(self, rr: Any, stream: Any, opening: StudyOpening) -> None:
+        self.rr, self.stream, self.event = rr, stream, opening.event
+        self.board, self.broken = Board(self.event), dict[str, str]()
+        self.rows: dict[int, Mapping[str, Any]] = dict(self.event.rows)
+        self.newest: deque[int] = deque(self.rows, maxlen=board.LINES)
+        self.running: dict[int, tuple[int, float, float]] = {}
+        self.text, self.over = f"{len(self.rows)} of {len(self.event.points)} points done", ""
+        self.seconds, self.next, self.seen = 0.0, 0.0, dict[str, set[str]]()
+        self._tell(f"study: {self.event.title}")
+        if self.rows:
+            self._tell(f"{len(self.rows)} points were finished before")
+        self._picture()
+
+    def receive(self, event: sr.Event, kept: object = None) -> None:
+        """Log one event."""
+        match event:
+            case sr.SweepProgress():
+                self.text = event.text
+                self.running = {place: self.running.get(place, (0, -np.inf, np.inf)) for place in event.now}
+                self._move(event.seconds)
+                if event.row is not None:
+                    self._row(event.places, event.row)
+            case sr.PointProgress():
+                self.running[event.point] = (event.round, event.lower_bound, event.upper_bound)
+                self._move(event.seconds)
+            case sr.SweepFinished():
+                self._finished(event)
+                return
+        if time.monotonic() >= self.next:
+            self._picture()
+        else:
+            self.rest = max(0.0, self.next - time.monotonic())
+
+    def idle(self) -> None:
+        """Draw what came since the last picture."""
+        if math.isfinite(self.rest) and time.monotonic() >= self.next:
+            self._picture()
+
+    def say(self, line: str, level: str = "INFO") -> None:
+        """A line of the log."""
+        self.stream.log("log", self.rr.TextLog(line, level=level))
+
+    def finish(self) -> None:
+        """Nothing is left to be done after the last event."""
+
+    def _tell(self, line: str) -> None:
+        self._move(self.seconds)
+        self.say(line)
+
+    def _move(self, seconds: float) -> None:
+        """Go on, never back."""
+        self.seconds = max(self.seconds, seconds)
+        self.stream.set_time("points", sequence=len(self.rows))
+        self.stream.set_time("time", duration=self.seconds)
+
+    def _row(self, places: Sequence[int], row: Mapping[str, Any]) -> None:
+        for place in places:
+            self.rows[place] = row
+            self.running.pop(place, None)
+            if place in self.newest:
+                self.newest.remove(place)
+            self.newest.appendleft(place)
+        self._move(self.seconds)
+        self.say(
+            self._line(places[0]),
+            {"failed": "ERROR", "refuted": "WARN", "undecided": "WARN"}.get(str(row["status"]), "INFO"),
+        )
+
+    def _finished(self, event: sr.SweepFinished) -> None:
+        """Whatever was lost on the way: what the study ended with is all here."""
+        fresh = [place for place in event.rows if place not in self.rows]
+        self.rows, self.running = dict(event.rows), {}
+        self.newest = deque([*fresh, *(one for one in self.newest if one in self.rows)], maxlen=board.LINES)
+        self.over = f"stopped: {event.stopped}" if event.stopped else "the study is over"
+        self.text = f"{len(self.rows)} of {len(self.event.points)} points have an answer or an error"
+        self._move(event.seconds)
+        self._picture()
+        self.say(f"{self.over}; {self.text}: {self._counts()}", "WARN" if event.stopped else "INFO")
+
+    def _picture(self) -> None:
+        """Everything anew, and the moment from which on the next one may come."""
+        began, self.rest = time.monotonic(), math.inf
+        for panel, task in (
+            ("the map", self._map),
+            ("the bounds", self._bounds),
+            ("what is known", self._page),
+            ("the newest points", self._lists),
+        ):
+            if panel not in self.broken:
+                try:
+                    task()
+                except Exception as error:  # noqa: BLE001  a panel less is better than no recording
+                    self.broken[panel] = f"{panel} could not be drawn: {type(error).__name__}: {error}"
+                    self.say(f"{self.broken[panel]}; the rest goes on", "WARN")
+        now = time.monotonic()
+        large = max(1.0, len(self.event.points) / LARGE)
+        self.next = now + max(PICTURE_EVERY, large * min(SHARE * self.seconds, RAREST), SPARE * (now - began))
+
+    def _map(self) -> None:
+        if self.board.kind == "table":
+            self._markdown("study/table", self.board.table(self.rows, list(self.newest)))
+            return
+        self._log("study/map", self.board.draw(self.rows, list(self.running)))
+        centres, colours = self.board.boxes
+        if centres:
+            self.stream.log(
+                "study/map/cells",
+                self.rr.Boxes2D(
+                    centers=np.array(centres),
+                    half_sizes=np.tile(self.board.half, (len(centres), 1)),
+                    colors=colours,
+                    radii=self.board.thick,
+                    draw_order=1.0,
+                ),
+            )
+
+    def _bounds(self) -> None:
+        """The ranges of those that run, and of those that have just finished, on one axis of costs."""
+        drawing = Drawing()
+        running = list(self.running)[:SHOWN]
+        shown = [*running, *(place for place in self.newest if place not in self.running)][:SHOWN]
+        known = [one for place in shown for one in self._range(place) if math.isfinite(one)]
+        low, high = (min(known), max(known)) if known else (0.0, 1.0)
+        rim = 0.08 * (high - low) or 0.1 * abs(high) or 0.5
+        axes = Axes(LEFT, 0.0, WIDTH, SHOWN * ROW, (low - rim, high + rim), (0.0, 1.0))
+        bottom = axes.top + axes.height
+        drawing.line("frame", np.array([[LEFT, bottom], [LEFT + WIDTH, bottom]]), ink.GREY, 1.0)
+        if known:
+            for value in (low, high) if high > low else (low,):
+                x = float(axes.at(value, 0.0)[0, 0])
+                drawing.line("frame", np.array([[x, bottom], [x, bottom + 5]]), ink.GREY, 1.0)
+                drawing.text(x, bottom + 15, f"{value:.6g}", ink.GREY)
+        drawing.text(LEFT + WIDTH / 2, bottom + 36, "bounds on the least cost J*", ink.GREY)
+        for line, place in enumerate(shown):
+            self._one(drawing, axes, (line + 0.5) * ROW, place)
+        drawing.text((LEFT + WIDTH) / 2, -20.0, self._heading(len(shown)))
+        self._log("study/bounds", drawing)
+
+    def _heading(self, shown: int) -> str:
+        if not shown:
+            return "no point has begun yet" if not self.over else "no point was finished"
+        if self.over:
+            return "the points that were finished last"
+        if self.event.parallel:
+            return "bounds of points that run are known when they end; those of the newest"
+        return "the point that runs, and those that were finished before it"
+
+    def _one(self, drawing: Drawing, axes: Axes, y: float, place: int) -> None:
+        """The range of one point: its name at the left, its status at the right."""
+        lower, upper = self._range(place)
+        status = "running" if place in self.running else str(self.rows[place]["status"])
+        name = named(self.event.axes, self.event.points[place])
+        if len(name) > NAME:  # the values tell points apart, the keys do not
+            name = ", ".join(map(said, self.event.points[place]))
+        drawing.text(LEFT / 2 - 5, y, name if len(name) <= NAME else f"{name[: NAME - 3]}...")
+        mark(drawing, np.array([LEFT + WIDTH + 24.0, y]), status)
+        drawing.text(LEFT + WIDTH + 44.0 + 4.0 * len(status), y, status)
+        ends = [float(axes.at(one, 0.0)[0, 0]) if math.isfinite(one) else math.nan for one in (lower, upper)]
+        if not any(map(math.isfinite, ends)):
+            words = "no bound" if status != "running" else "no bound yet"
+            words = "no control meets the constraints" if status == "infeasible" else words
+            drawing.text(LEFT + WIDTH / 2, y, words, ink.GREY)
+            return
+        left, right = (
+            one if math.isfinite(one) else edge for one, edge in zip(ends, (LEFT, LEFT + WIDTH), strict=True)
+        )
+        line = np.array([[left, y], [right, y]])
+        if all(map(math.isfinite, ends)):
+            drawing.line("bounds", line, ink.SKY, 2.0)
+        else:
+            drawing.dashed("bounds", line, ink.SKY)
+        for end, colour, reach in zip(ends, (ink.GREEN, ink.VERMILLION), (9.0, -9.0), strict=True):
+            if math.isfinite(end):  # one below the line and one above it, for they meet
+                drawing.line("marks", np.array([[end, y], [end, y + reach]]), colour, 3.0)
+
+    def _range(self, place: int) -> tuple[float, float]:
+        """The bounds of a point, infinite where there are none."""
+        if place in self.running:
+            return self.running[place][1:]
+        row = self.rows[place]
+        if row["status"] == "infeasible":
+            return -math.inf, math.inf
+        lower, upper = row.get("lower_bound"), row.get("upper_bound")
+        return -math.inf if lower is None else lower, math.inf if upper is None else upper
+
+    def _page(self) -> None:
+        state = self.over or self.text
+        more = [self.text] if self.over else []
+        more += [self._counts()] if self.rows else []
+        if not self.over:
+            names = [self._line(place) for place in list(self.running)[:LISTED]]
+            running = f"**Running now: {len(self.running)}**"
+            more += [running if names else "No point is known to run at this moment."]
+            more += ["\n".join(f"- {plainly(one)}" for one in names)] if names else []
+        title = f"### {plainly(self.event.title)}"
+        legend = [COLOURS] if self.board.kind == "table" else [f"{MAP} {COLOURS}"]
+        self._markdown("study/state", "\n\n".join([title, f"**{plainly(state)}**", *more, *legend]))
+
+    def _lists(self) -> None:
+        lines = [self._line(place) for place in list(self.newest)[:LISTED]]
+        self.stream.log("study/newest", self.rr.TextDocument("\n".join(lines) or "no point is finished yet"))
+
+    def _line(self, place: int) -> str:
+        """A point in words."""
+        name = named(self.event.axes, self.event.points[place])
+        if place in self.running:
+            turn, lower, upper = self.running[place]
+            if self.event.parallel:
+                return name
+            known = math.isfinite(lower) or math.isfinite(upper)
+            bounds = f"{number(lower, '−∞')} ≤ J* ≤ {number(upper, '∞')}" if known else "no bound yet"
+            return f"{name}: round {turn}, {bounds}"
+        row = self.rows[place]
+        told = f", cost {number(row['cost'])}" if row.get("cost") is not None else ""
+        why = f": {shorten(str(row.get('message')), LETTERS)}" if row["status"] == "failed" else ""
+        return f"{name}: {row['status']}{told}{why}"
+
+    def _counts(self) -> str:
+        counts = Counter(str(row["status"]) for row in self.rows.values())
+        return ", ".join(f"{count} {status}" for status, count in sorted(counts.items())) or "none"
+
+    def _markdown(self, path: str, text: str) -> None:
+        self.stream.log(path, self.rr.TextDocument(text, media_type="text/markdown"))
+
+    def _log(self, path: str, drawing: Drawing) -> None:
+        """Log a drawing, and take away what the one before had and this one has not."""
+        names = {*drawing.strips, *(["dots"] if drawing.dots else []), *(["labels"] if drawing.labels else [])}
+        for name in self.seen.get(path, set()) - names:
+            self.stream.log(f"{path}/{name}", self.rr.Clear(recursive=False))
+        self.seen[path] = names
+        drawing.log(self.rr, self.stream, path, layers=LAYERS)
+
+
+def layout(opening: StudyOpening) -> Any:
+    """The blueprint: the map and the bounds, beside them what is known in words; the log."""
+    import rerun.blueprint as rrb
+
+    if Board(opening.event).kind == "table":
+        first = rrb.TextDocumentView(origin="/study/table", name="The newest points of the study")
+    else:
+        first = view("/study/map", "Status of every point", board.EXTENT)
+    words = rrb.Vertical(
+        rrb.TextDocumentView(origin="/study/state", name="What is known"),
+        rrb.TextDocumentView(origin="/study/newest", name="Finished points, the newest first"),
+        row_shares=[1, 1],
+    )
+    pictures = rrb.Vertical(first, view("/study/bounds", "Bounds on the cost", EXTENT), row_shares=[3, 2])
+    log = rrb.TextLogView(
+        origin="/log",
+        name="Log",
+        columns=rrb.TextLogColumns(timeline_columns=["points"], text_log_columns=["Body"]),
+    )
+    return rrb.Blueprint(
+        rrb.Tabs(rrb.Horizontal(pictures, words, name="Study", column_shares=[5, 3]), log, active_tab=0),
+        rrb.TimePanel(state="collapsed", timeline="time", play_state="following"),
+        auto_layout=False,
+        auto_views=False,
+        collapse_panels=True,
+    )
