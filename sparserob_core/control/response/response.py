@@ -327,17 +327,18 @@ class Response:
             )
         path = np.empty((count, self.grid.pieces + 1, self.initial_state.size))
         path[:, 0] = self.initial_state
-        which = self.which
-        for length in range(steps.Phi.shape[1]):
-            alike = which == length
-            path[:, 1:][:, alike] = drive[:, alike] @ steps.Gamma[:, length].swapaxes(1, 2)
-        shared = steps.Phi.shape[0] == 1
-        forward = steps.Phi[0].swapaxes(1, 2)
-        for piece, length in enumerate(which.tolist()):
-            if shared:
-                path[:, piece + 1] += path[:, piece] @ forward[length]
-            else:
-                path[:, piece + 1] += (steps.Phi[:, length] @ path[:, piece, :, None])[..., 0]
+        shared, lengths = steps.Phi.shape[0] == 1, self.which.tolist()
+
+        def moved(matrices: Array, vectors: Array) -> Array:
+            return np.asarray(vectors @ matrices[0].T if shared else (matrices @ vectors[..., None])[..., 0])
+
+        if self.uniform:
+            path[:, 1:] = drive @ steps.Gamma[:, 0].swapaxes(1, 2)
+        else:
+            for piece, length in enumerate(lengths):
+                path[:, piece + 1] = moved(steps.Gamma[:, length], drive[:, piece])
+        for piece, length in enumerate(lengths):
+            path[:, piece + 1] += moved(steps.Phi[:, length], path[:, piece])
         return path
 
 
