@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 import click
 
@@ -71,7 +72,19 @@ def _end(message: str, error: BaseException, status: int) -> int:
     return status
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+class Commands(click.Group):
+    """The group of all commands. A reader that has stopped reading is met here, before click would end with 1."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """The command's exit status."""
+        try:
+            return super().invoke(ctx)
+        except BrokenPipeError:
+            drop_output()
+            return 0
+
+
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="sparserob", message="%(prog)s %(version)s")
 def commands() -> None:
     """Sparse robust optimal control of uncertain linear systems, with the proof."""
