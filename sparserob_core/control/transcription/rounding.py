@@ -10,6 +10,7 @@ import numpy as np
 from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.transcription.record import Transcription
+from sparserob_core.control.transcription.transcribe import slanted
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.result import Result
 
@@ -24,11 +25,13 @@ def rounded_down(model: Transcription, result: Result, tolerance: float | None) 
 
     A row ``c'x(t) <= b`` is a sum of what the initial state, every piece of the control and every piece of the
     disturbance bring to ``c'x(t)``. The absolute values of these, at their largest, times the multipliers of the rows
-    and `SHARE`, bound what the rounding of all of them does to the bound (Higham 2002, section 3.1).
+    and `SHARE`, bound what the rounding of all of them does to the bound (Higham 2002, section 3.1). What a multiplier
+    of the wrong sign may be off by is subtracted too (`_neglected`).
     """
     if not np.isfinite(result.lower_bound) or result.lower_bound <= 0.0:  # without multipliers 0 is exact
         return result
-    lowered = max(0.0, result.lower_bound - SHARE * (_added(model, result) + result.lower_bound))
+    lost = SHARE * (_added(model, result) + result.lower_bound) + _neglected(model, result)
+    lowered = max(0.0, result.lower_bound - lost)
     dual = replace(result.dual, bound=min(result.dual.bound, lowered))
     answer = replace(result, lower_bound=lowered, dual=dual)
     if answer.status != "certified" or tolerance is None or answer.gap <= tolerance + SMALL_GAP:
@@ -64,6 +67,19 @@ def _added(model: Transcription, result: Result) -> float:
     if model.problem.disturbance is not None:
         sizes += (np.abs(gains @ E) @ _far(model.problem.disturbance)).sum(axis=1)
     return float(multipliers @ sizes)
+
+
+def _neglected(model: Transcription, result: Result) -> float:
+    """What multipliers of the wrong sign cost on slanted sides ``H u <= h`` of the controls' set, at most.
+
+    To the program ``s = H u`` has no lower bound, so that only ``z >= 0`` proves anything of ``-z s``; a negative ``z``
+    within its own rounding counts as 0 there. On the set ``-z s`` is at least ``z`` times the largest ``-H u``.
+    """
+    H, h = slanted(model.problem.control)
+    if result.dual.z is None or not h.size:
+        return 0.0
+    sides = result.dual.z.reshape(model.problem.system.controls + h.size, -1)[-h.size :]
+    return float(np.maximum(-sides, 0.0).sum(axis=1) @ np.maximum(model.problem.control.support(-H), 0.0))
 
 
 def _far(convex: ConvexSet) -> Array:
