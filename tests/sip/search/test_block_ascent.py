@@ -196,16 +196,21 @@ def test_literal_tuples_meet_the_value_in_tens_of_evaluations(tmp_path):
     assert share(tmp_path, 30, 8, {"name": "gradient_ascent", "budget": 100}) >= 0.9999
 
 
+ASCENT = {"name": "gradient_ascent", "budget": 200}
+ANNEALING = {"name": "simulated_annealing", "budget": 500, "polish": 0.2}
+SEQUOOL = {"name": "sequool", "budget": 500, "polish": 0.2}
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("indices, seed", [(8, 0), (8, 1), (8, 2), (250, 0)])
 @pytest.mark.parametrize(
-    "maximiser",
+    "indices, seed, maximiser",
     [
-        {"name": "gradient_ascent", "budget": 200},
-        {"name": "simulated_annealing", "budget": 500, "polish": 0.2},
-        {"name": "sequool", "budget": 500, "polish": 0.2},
+        *((8, seed, maximiser) for seed in range(3) for maximiser in (ASCENT, ANNEALING)),
+        (8, 0, SEQUOOL),  # 125 250 coordinates one after another take it minutes
+        (250, 0, ASCENT),
+        (250, 0, ANNEALING),
     ],
-    ids=lambda options: options["name"],
+    ids=str,
 )
 def test_at_the_paper_s_size_literal_tuples_meet_the_value(indices, seed, maximiser, tmp_path):
     assert share(tmp_path, 250, indices, maximiser, seed) >= 0.9999
