@@ -22,11 +22,21 @@ FOUND = (301955, 420593, 420815)  # problems whose honest runs `check` once refu
 SETS_THAT_ARE_NOT_CHECKED = "the checker has no bound of the support function of this"
 
 
+OPEN = {
+    300270: [
+        pytest.mark.xfail(
+            strict=True,
+            reason="the checker's cells of directions do not close on this ball of a p-norm, an honest `not checked`",
+        )
+    ]
+}
+
+
 def numbers():
     return [
         *range(FIRST, FIRST + QUICK),
         *(
-            pytest.param(seed, marks=pytest.mark.slow)
+            pytest.param(seed, marks=[pytest.mark.slow, *OPEN.get(seed, ())])
             for seed in sorted({*FOUND, *range(FIRST + QUICK, FIRST + COUNT)})
         ),
     ]

@@ -220,8 +220,9 @@ def written(f: Factors, curved: bool = False, uncertain: bool = False) -> dict[s
     }
 
 
-def same_set(plain: sr.InitialStates, other: sr.InitialStates, f: Factors) -> None:
-    """Each one's proven points are in the other's proven half-planes, and it is as large."""
+def same_set(plain: sr.InitialStates, other: sr.InitialStates, f: Factors, unique: bool = True) -> None:
+    """Each one's proven points are in the other's proven half-planes, and it is as large; so are the controls that
+    prove it, where they are ``unique``."""
     assert other.status == plain.status in ("certified", "verified"), other.message
     x = f.states[list(plain.states)]
     size = np.abs(plain.outer).max()
@@ -229,7 +230,8 @@ def same_set(plain: sr.InitialStates, other: sr.InitialStates, f: Factors) -> No
     room = 1e-6 * np.abs(other.directions) @ (size / x)
     assert (other.directions @ (plain.inner / x).T <= (other.bounds + room)[:, None]).all()
     np.testing.assert_allclose(np.ptp(other.outer, axis=0) * x, np.ptp(plain.outer, axis=0), rtol=1e-5)
-    np.testing.assert_allclose(np.abs(other.controls).max() * f.control, np.abs(plain.controls).max(), rtol=1e-6)
+    if unique:
+        np.testing.assert_allclose(np.abs(other.controls).max() * f.control, np.abs(plain.controls).max(), rtol=1e-6)
     middle = plain.inner.mean(axis=0)
     assert other.where(middle / x) == "inside" and other.where((9.0 * size + middle) / x) == "outside"
     if plain.costs.size:
@@ -258,7 +260,7 @@ def test_a_set_of_initial_states_with_costs_changes_by_its_units_only(curved):
 def test_a_set_of_initial_states_of_an_uncertain_system_changes_by_its_units_only():
     plain = sr.initial_states(written(Factors(), uncertain=True), directions=4, values=0)
     f = Factors.drawn(np.random.default_rng(5), binary=False)
-    same_set(plain, sr.initial_states(written(f, uncertain=True), directions=4, values=0), f)
+    same_set(plain, sr.initial_states(written(f, uncertain=True), directions=4, values=0), f, unique=False)
 
 
 def same_margin(of: str, curved: bool, seed: int, binary: bool) -> None:
