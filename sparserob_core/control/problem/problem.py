@@ -42,7 +42,8 @@ class OptimalControlProblem:
     ``disturbance``: the bounded set of ``w``, or ``None``; ``disturbance_class`` says which functions it makes:
     ``piecewise_constant`` (every piece of the disturbance's dictionary in the set), ``measurable`` (any measurable
     function into the set), or ``l1_ball`` (the coefficients of channel ``i`` in the dictionary have absolute sum at
-    most ``upper_i`` of a symmetric box: a far smaller set). After construction ``weights`` is ``(m,)``, ``path`` and
+    most ``upper_i`` of a symmetric box: a far smaller set). ``initial_control``: the control ``(m,)`` before time 0, or
+    ``None`` where it does not matter. After construction ``weights`` is ``(m,)``, ``path`` and
     ``terminal`` are tuples, every window has its ``stop``, and constraints that restrict nothing are gone. An initial
     state outside a path set is legal: that problem is infeasible. Raises `InputError`.
     """
@@ -57,6 +58,7 @@ class OptimalControlProblem:
     path: Sequence[PathConstraint | ConvexSet] = ()
     terminal: Sequence[ConvexSet | Equality] = ()
     title: str = ""
+    initial_control: npt.ArrayLike | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.system, LinearSystem):
@@ -67,6 +69,7 @@ class OptimalControlProblem:
         self._set("horizon", float(horizon[0]))
         self._set("initial_state", self._state())
         self._set("weights", self._weights())
+        self._set("initial_control", self._control_before())
         _checked_set("control", self.control, self.system.controls, "controls", bounded=True)
         self._check_disturbance()
         windows = [self._windowed(f"path.{i}", entry) for i, entry in enumerate(_listed("path", self.path))]
@@ -93,6 +96,17 @@ class OptimalControlProblem:
                 path="weights", expected=f"{m} positive numbers, one per control", got=f"{weights.tolist()}"
             )
         return weights
+
+    def _control_before(self) -> Array | None:
+        if self.initial_control is None:
+            return None
+        m = self.system.controls
+        control = np.atleast_1d(as_bound("initial_control", self.initial_control))
+        if control.shape != (m,) or not np.isfinite(control).all():
+            raise InputError(
+                path="initial_control", expected=f"{m} finite numbers, one per control", got=f"{control.tolist()}"
+            )
+        return control
 
     def _check_disturbance(self) -> None:
         if self.disturbance_class not in get_args(DisturbanceClass):

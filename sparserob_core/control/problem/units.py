@@ -54,6 +54,9 @@ class Units:
             path=[self._window(entry) for entry in problem.path if isinstance(entry, PathConstraint)],
             terminal=[end.in_units(self.states) for end in problem.terminal],
             title=problem.title,
+            initial_control=(
+                None if problem.initial_control is None else np.asarray(problem.initial_control) / self.controls
+            ),
         )
 
     def _window(self, entry: PathConstraint) -> PathConstraint:

@@ -193,6 +193,9 @@ class LinearProblem(LinearKeys):
     control: SetOptions
     """Set that the control takes its values in, bounded."""
 
+    initial_control: OneOrMore | None = None
+    """Control before time 0, one number per control; a number serves every control. Not told unless given."""
+
     def build(self) -> OptimalControlProblem:
         """The problem; raises `InputError` that begins with the key at fault."""
         system = self.system.build()
@@ -206,4 +209,11 @@ class LinearProblem(LinearKeys):
             disturbance_class=self.disturbance_class,
             path=self.windows(system.states),
             terminal=self.ends(system.states),
+            initial_control=self._control_before(system.controls),
         )
+
+    def _control_before(self, controls: int) -> list[float] | None:
+        given = self.initial_control
+        if given is None or isinstance(given, list):
+            return given
+        return [given] * controls

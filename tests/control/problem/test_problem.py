@@ -31,6 +31,11 @@ def test_weights_windows_and_lists_are_filled_in() -> None:
     assert len(made.terminal) == 2
 
 
+def test_the_control_before_time_0_is_told_or_is_not() -> None:
+    assert problem().initial_control is None
+    np.testing.assert_array_equal(problem(initial_control=0.5).initial_control, [0.5])
+
+
 def test_constraints_that_restrict_nothing_are_dropped() -> None:
     free = Box([-np.inf, -np.inf], [np.inf, np.inf])
     made = problem(path=[free], terminal=[free, Equality([np.nan, np.nan])])
@@ -50,6 +55,8 @@ def test_an_initial_state_outside_the_path_set_is_legal() -> None:
         ({"horizon": "soon"}, "horizon: expected a number"),
         ({"initial_state": [1, 2, 3]}, "initial_state: expected 2 finite numbers"),
         ({"initial_state": [1, np.inf]}, "initial_state: expected 2 finite numbers"),
+        ({"initial_control": [1, 2]}, "initial_control: expected 1 finite numbers, one per control"),
+        ({"initial_control": [np.nan]}, "initial_control: expected"),
         ({"control": SQUARE}, "control: expected a set of dimension 1, the number of controls"),
         ({"control": Box([-np.inf], [1.0])}, "control: the set must be bounded"),
         ({"control": 1.0}, "control: expected a convex set"),
