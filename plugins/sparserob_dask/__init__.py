@@ -40,7 +40,7 @@ class Dask(sr.ExecutorFactory, sr.Options):
     reach."""
 
     timeout: float = Field(default=60.0, gt=0.0)
-    """Seconds to wait until a worker is there."""
+    """Seconds to wait until dask has begun, and as many until a worker is there."""
 
     @model_validator(mode="after")
     def _one_cluster(self) -> Dask:

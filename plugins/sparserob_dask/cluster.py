@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
 import sys
@@ -20,6 +21,7 @@ import cloudpickle
 import dask
 from distributed import Client, KilledWorker, LocalCluster, Nanny, WorkerPlugin
 from distributed.core import Status
+from tornado.ioloop import IOLoop
 
 import sparserob_core as sr
 
@@ -41,29 +43,75 @@ SETTINGS = {
 def started(workers: int | None, host: str, timeout: float) -> Iterator[Executor]:
     """A cluster of this machine, which ends with the context."""
     count = workers or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
-    with dask.config.set(SETTINGS), _without_script():
-        cluster = LocalCluster(
-            n_workers=count,
-            threads_per_worker=1,
-            host=host,
-            dashboard_address=f"{host}:0",
-            worker_class=_Mortal,
-            memory_limit=0,
-            silence_logs=LOUD,
-        )
-    try:
-        with connected(cluster.scheduler_address, timeout, breaks=True) as executor:
-            yield executor
-    finally:
-        cluster.close(timeout=timeout)
+    with _event_loop(timeout) as loop:
+        with dask.config.set(SETTINGS), _without_script():
+            cluster = LocalCluster(
+                n_workers=count,
+                threads_per_worker=1,
+                host=host,
+                dashboard_address=f"{host}:0",
+                worker_class=_Mortal,
+                memory_limit=0,
+                silence_logs=LOUD,
+                loop=loop,
+            )
+        try:
+            with _connected(cluster.scheduler_address, timeout, loop, breaks=True) as executor:
+                yield executor
+        finally:
+            cluster.close(timeout=timeout)
 
 
 @contextmanager
-def connected(address: str, timeout: float, breaks: bool = False) -> Iterator[Executor]:
-    """The workers of the cluster whose scheduler listens at ``address``; ``breaks``: whether a worker that dies ends
-    the executor."""
+def connected(address: str, timeout: float) -> Iterator[Executor]:
+    """The workers of the cluster whose scheduler listens at ``address``."""
+    with _event_loop(timeout) as loop, _connected(address, timeout, loop, breaks=False) as executor:
+        yield executor
+
+
+@contextmanager
+def _event_loop(timeout: float) -> Iterator[IOLoop]:
+    """The loop on which dask works, in a thread of its own; the one that dask would start by itself is given ten
+    seconds, whatever is asked for, and then fails without a word."""
+    ready: Future[tuple[IOLoop, asyncio.Event]] = Future()
+
+    async def work() -> None:
+        ended = asyncio.Event()
+        if ready.set_running_or_notify_cancel():
+            ready.set_result((IOLoop.current(), ended))
+            await ended.wait()
+
+    def run() -> None:
+        try:
+            asyncio.run(work())
+        except BaseException as error:
+            if ready.done():
+                raise
+            ready.set_exception(error)
+
+    thread = threading.Thread(target=run, name="dask", daemon=True)
+    thread.start()
     try:
-        client = Client(address, timeout=timeout, set_as_default=False)
+        try:
+            yield ready.result(timeout)[0]
+        except TimeoutError:
+            if ready.done():
+                raise
+            raise sr.InputError(
+                f"executor dask: its event loop has not begun within {timeout:g} s; give it a longer timeout"
+            ) from None
+    finally:
+        if not ready.cancel():
+            loop, ended = ready.result()
+            loop.add_callback(ended.set)
+            thread.join(timeout)
+
+
+@contextmanager
+def _connected(address: str, timeout: float, loop: IOLoop, breaks: bool) -> Iterator[Executor]:
+    """The same; ``breaks``: whether a worker that dies ends the executor."""
+    try:
+        client = _Client(address, timeout=timeout, set_as_default=False, loop=loop)
     except (OSError, TimeoutError, ValueError) as error:
         raise sr.InputError(
             path="executor.address", expected="the address of a dask scheduler that answers", got=f"{address} ({error})"
@@ -203,6 +251,23 @@ def _called(call: bytes) -> bytes:
     except Exception as error:  # noqa: BLE001  whatever the class of the answer does
         name = getattr(fn, "__qualname__", None) or repr(fn)
         raise PicklingError(f"the answer of {name} cannot be sent between processes: {error}") from None
+
+
+@final
+class _Client(Client):  # type: ignore[misc]
+    """Closes itself if it cannot begin.
+
+    Dask leaves that to the collection of garbage, which comes in whatever thread it likes: in that of another loop that
+    is just beginning, it waits for the lock that is held until this loop has begun.
+    """
+
+    def start(self, **options: Any) -> None:
+        """See dask."""
+        try:
+            super().start(**options)
+        except BaseException:
+            self.close()
+            raise
 
 
 @final

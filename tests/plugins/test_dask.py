@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
+import gc
 import subprocess
 import sys
+import threading
+import time
 
 import pytest
 from threadpoolctl import threadpool_limits
@@ -51,6 +55,10 @@ def test_a_scheduler_that_does_not_answer_is_an_error_of_the_input(address):
         opened(address=address, timeout=1.0),
     ):
         pass
+    from distributed import Client
+
+    left = [one.status for one in gc.get_objects() if isinstance(one, Client)]
+    assert set(left) <= {"closed"}, "the garbage collector would close it, and wait for locks of whatever it interrupts"
 
 
 @pytest.mark.slow
@@ -80,3 +88,25 @@ def test_a_script_without_a_guard_starts_its_work_once(tmp_path):
         [sys.executable, str(tmp_path / "study.py")], capture_output=True, text=True, timeout=120, cwd=ROOT, check=True
     )
     assert done.stdout.splitlines() == ["begins", "[0, 2, 4]"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("late", [0.2, 2.0])
+def test_dask_is_given_the_time_that_was_asked_for_to_begin(late, monkeypatch):
+    pytest.importorskip("distributed")
+    begin = asyncio.Runner.run
+
+    def begins_late(self, *args, **kwargs):
+        time.sleep(late)
+        return begin(self, *args, **kwargs)
+
+    monkeypatch.setattr(asyncio.Runner, "run", begins_late)
+    reason = "a dask scheduler that answers" if late < 1.0 else "its event loop has not begun within 1 s"
+    started = time.monotonic()
+    with pytest.raises(sr.InputError, match=reason), opened(address="tcp://127.0.0.1:1", timeout=1.0):
+        pass
+    assert time.monotonic() - started < 10.0
+    for thread in threading.enumerate():
+        if thread.name == "dask":
+            thread.join(10.0)
+            assert not thread.is_alive(), "a loop that begins too late goes on"
