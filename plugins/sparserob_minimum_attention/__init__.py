@@ -16,7 +16,7 @@ import sparserob_core as sr
 
 @final
 class MinimumAttention(sr.LinearKeys):
-    """Steer ``x' = A(p) x + B(p) u + E w`` with ``u(0)`` given and ``u(T) = 0``, at the least weighted integral of
+    """Steer ``x' = A(p) x + B(p) u + E w + c`` with ``u(0)`` given and ``u(T) = 0``, at the least weighted integral of
     ``|u'|``."""
 
     rate: sr.SetOptions
@@ -30,6 +30,12 @@ class MinimumAttention(sr.LinearKeys):
 
     def build(self) -> sr.OptimalControlProblem:
         """The problem of the augmented system; raises `InputError` that begins with the key at fault."""
+        if self.system.delay:
+            raise sr.InputError(
+                path="system.delay",
+                expected="none: minimum_attention makes the control a state, which acts without delay",
+                got=f"{self.system.delay:g}",
+            )
         plain = self.system.build()
         d, m = plain.states, plain.controls
         path = [
@@ -59,6 +65,7 @@ class MinimumAttention(sr.LinearKeys):
                 "A": rows + np.zeros((m, d + m)).tolist(),
                 "B": np.eye(d + m, m, -d).tolist(),
                 "E": E + np.zeros((m, len(E[0]))).tolist(),
+                "c": None if system.c is None else [*system.c, *np.zeros(m).tolist()],
             }
         ).build()
 

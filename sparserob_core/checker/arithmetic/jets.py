@@ -188,7 +188,7 @@ def expanded(
     system: LinearSystem, monomials: Monomials, base: Sequence[arb], radius: Sequence[float]
 ) -> dict[str, list[arb_mat]]:
     """Taylor coefficients of ``A``, ``B``, ``E`` at ``base (nu,)`` in ``delta``, ``p = base + radius * delta``: a
-    matrix per monomial.
+    matrix per monomial. A drift ``c`` is one more column of ``B``, whose input is always 1.
 
     ``base`` may be wide balls: then every coefficient holds those at every parameter in them.
     """
@@ -204,8 +204,9 @@ def expanded(
         variables[i] = Jet(monomials, coefficients)
     found = {}
     for name in ("A", "B", "E"):
-        entry = getattr(system, name)
-        values = _values(name, entry, variables)
+        values = _values(name, getattr(system, name), variables)
+        if name == "B" and system.c is not None:
+            values = np.hstack([values, _values("c", system.c, variables)])
         tables = [[[arb(0)] * values.shape[1] for _ in range(values.shape[0])] for _ in range(monomials.size)]
         for (row, column), value in np.ndenumerate(values):
             parts = value.coefficients if isinstance(value, Jet) else [arb(float(value)), *zeros[1:]]

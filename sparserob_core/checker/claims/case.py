@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from sparserob_core.checker.claims.duality import Duality
+from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.claims.duality import Duality, before
 from sparserob_core.checker.claims.units import RowUnits
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.checker.reach.disturbance_support import Scene
@@ -103,11 +104,17 @@ class Case:
 
     @cached_property
     def grid(self) -> list[float]:
-        """Every breakpoint of either dictionary."""
+        """Every breakpoint of either dictionary, those of the control as late as it acts."""
         ends = {float(self.control.breakpoints[-1]), float(self.disturbance.breakpoints[-1])}
         last = max(*ends, self.problem.horizon)
-        inner = {float(t) for t in (*self.control.breakpoints, *self.disturbance.breakpoints)} - ends
+        inner = {float(t) for t in (*self.acting, *self.disturbance.breakpoints)} - ends
         return sorted({t for t in inner if t < last} | {last})
+
+    @cached_property
+    def acting(self) -> list[float]:
+        """When every piece of the control begins to act; from 0 on."""
+        delay = self.problem.system.delay
+        return sorted({0.0, *(float(t) + delay for t in self.control.breakpoints[:-1])})
 
     @cached_property
     def theta(self) -> Array:
@@ -136,13 +143,15 @@ class Case:
     def scene(self) -> Scene:
         """The control and the disturbance on the common grid."""
         middles = [(a + b) / 2 for a, b in zip(self.grid[:-1], self.grid[1:], strict=True)]
-        which = np.clip(
-            np.searchsorted(self.control.breakpoints, middles, side="right") - 1, 0, self.control.pieces - 1
-        )
-        changes = self.changes
+        which = np.clip(np.searchsorted(self.acting, middles, side="right") - 1, 0, len(self.acting) - 1)
+        changes, constants = self.changes, 0 if self.problem.system.c is None else 1
+        known = [stacked([[v] for v in balls([*before(self.problem)])])] if self.problem.system.delay > 0.0 else []
+        inputs = [
+            stacked([[v] for v in (*piece.entries(), *balls([1.0] * constants))]) for piece in (*known, *self.pieces)
+        ]
         return Scene(
             self.grid,
-            [self.pieces[k] for k in which],
+            [inputs[k] for k in which],
             [float(v) for v in np.asarray(self.problem.initial_state)],
             None if changes is None else self.problem.disturbance,
             changes or [],

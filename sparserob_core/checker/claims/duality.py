@@ -60,19 +60,23 @@ class Duality:
     def row(self, direction: Array, time: float, parameter: Sequence[float], limit: arb, disturbed: bool = True) -> Row:
         """``c'x(t) <= limit`` at one parameter, for the worst disturbance, or where none reaches the state."""
         flow = Flow(self.problem.system, tuple(map(float, parameter)), (0.0,) * len(parameter), 0)
-        d, m = flow.parts["A"][0].nrows(), flow.parts["B"][0].ncols()
-        matrix = _joined(flow)
-        breaks = [float(s) for s in self.control.breakpoints[:-1]]
+        d, m, columns = flow.parts["A"][0].nrows(), self.problem.system.controls, flow.parts["B"][0].ncols()
+        matrix, delay = _joined(flow), self.problem.system.delay
+        breaks = [float(s) + delay for s in self.control.breakpoints[:-1]]  # when a piece begins to act
         jumps = self.changes if self.changes is not None else []
         lags = {s: self._lag(matrix, direction, time, s) for s in {0.0, *(s for s in (*breaks, *jumps) if s < time)}}
         constant = (
             sum((lags[0.0][i] * _exact(x) for i, x in enumerate(np.asarray(self.problem.initial_state))), _exact(0.0))
             - limit
         )
+        constant = sum(lags[0.0][d + m : d + columns], constant)  # a drift, whose input is 1
+        if delay > 0.0:
+            early = _differences([lags[s][d : d + m] if s < time else None for s in (0.0, breaks[0])], m)[0]
+            constant = sum((w * _exact(u) for w, u in zip(early, before(self.problem), strict=True)), constant)
         slope = _differences([lags[s][d : d + m] if s < time else None for s in breaks], m)
         if disturbed and self.changes is not None and self.problem.disturbance is not None:
             mw = flow.parts["E"][0].ncols()
-            for weights in _differences([lags[s][d + m :] if s < time else None for s in jumps], mw):
+            for weights in _differences([lags[s][d + columns :] if s < time else None for s in jumps], mw):
                 if any(not w.is_zero() for w in weights):
                     constant = constant + support(self.problem.disturbance, weights)
         return Row(constant, slope)
@@ -167,6 +171,12 @@ class Duality:
             for w, s in zip(weights, slope, strict=True)
         ]
         return -support(bound, [-t for t in tilt])  # |u_i| >= v_i u_i for any |v_i| <= 1
+
+
+def before(problem: OptimalControlProblem) -> list[float]:
+    """The control that acts until the first one of a delayed system does, ``(m,)``."""
+    given = problem.initial_control
+    return [0.0] * problem.system.controls if given is None else [float(u) for u in np.asarray(given)]
 
 
 def _joined(flow: Flow) -> arb_mat:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.checker.claims.duality import before
 from sparserob_core.checker.outcome import RESOLVED, TOLERANCE, Unchecked
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import Flow, held, stacked
@@ -107,13 +108,14 @@ class RowUnits:
         return {}
 
     def _walked(self, parameter: tuple[float, ...]) -> tuple[Array, Array]:
-        d, m, bound = self.problem.system.states, self.problem.system.controls, self.problem.disturbance
+        system, bound = self.problem.system, self.problem.disturbance
+        d, m, columns = system.states, system.controls, system.controls + (system.c is not None)
         normals = np.array([c for c, _ in facets(self.shape) or []]).reshape(-1, d)
-        (nodes, places), step = self._nodes(), _Steps(self.problem, parameter, m, self.scene.tick)
+        (nodes, places), step = self._nodes(), _Steps(self.problem, parameter, columns, self.scene.tick)
         v = np.tile(np.vstack([normals, np.eye(d)]), (len(places), 1, 1))
         count = len(nodes) - 1
-        driven = np.zeros((count, *v.shape[:2], m))
-        pushed = np.zeros((count, *v.shape[:2], self.problem.system.disturbances))
+        driven = np.zeros((count, *v.shape[:2], columns))
+        pushed = np.zeros((count, *v.shape[:2], system.disturbances))
         for k in range(count - 1, -1, -1):
             first = int(np.searchsorted(places, k, side="right"))
             if first < len(places):
@@ -122,8 +124,16 @@ class RowUnits:
                 v[first:] = v[first:] @ Phi
         start = np.asarray(self.problem.initial_state, dtype=float)
         high, low, sums = v @ start, -(v @ start), np.abs(v) @ np.abs(start)
-        for convex, weights in ((self.problem.control, driven), (bound, self._joined(nodes, pushed))):
-            if convex is not None and count:
+        waiting, given = int(np.searchsorted(nodes[:-1], system.delay)), np.ones(columns)
+        given[:m] = before(self.problem)
+        known = np.concatenate([driven[:waiting] * given, driven[waiting:] * np.append(np.zeros(m), given[m:])])
+        high, low = high + known.sum(axis=(0, 3)), low - known.sum(axis=(0, 3))
+        sums = sums + np.abs(known).sum(axis=(0, 3))
+        for convex, weights in (
+            (self.problem.control, driven[waiting:, ..., :m]),
+            (bound, self._joined(nodes, pushed)),
+        ):
+            if convex is not None and len(weights):
                 high, low = high + convex.support(weights).sum(axis=0), low + convex.support(-weights).sum(axis=0)
                 axes = np.eye(convex.dimension)
                 far = np.maximum(np.abs(convex.support(axes)), np.abs(convex.support(-axes)))

@@ -89,12 +89,12 @@ class Remainder:
     """``n_j``, the summed norms of all coefficients of degree ``j`` anywhere in the box, obey
     ``n' <= growth n + source |u|``.
 
-    ``growth (D+2, D+2)``; ``control``, ``disturbance``: per degree, the norms of ``B``, and of every column of ``E``.
-    ``transform`` ``T``: norms are those of ``T^-1 x``.
+    ``growth (D+2, D+2)``; ``control (D+2, m)``, ``disturbance``: per degree, the norms of every column of ``B``, and of
+    ``E``. ``transform`` ``T``: norms are those of ``T^-1 x``.
     """
 
     growth: arb_mat
-    control: list[arb]
+    control: arb_mat
     disturbance: list[list[arb]]
     transform: Array
     inverse: arb_mat
@@ -122,8 +122,11 @@ class Remainder:
         A = per_degree([inverse * a * exact for a in parts["A"]])
         A[0] = upper(logarithmic_norm(inverse * parts["A"][0] * exact))
         growth = stacked([[A[i - j] if j <= i else arb(0) for j in range(degree + 1)] for i in range(degree + 1)])
-        columns = [per_degree([inverse * column(e, c) for e in parts["E"]]) for c in range(parts["E"][0].ncols())]
-        return Remainder(growth, per_degree([inverse * b for b in parts["B"]]), columns, T, inverse)
+        driven, columns = (
+            [per_degree([inverse * column(e, c) for e in parts[name]]) for c in range(parts[name][0].ncols())]
+            for name in ("B", "E")
+        )
+        return Remainder(growth, stacked(driven).transpose(), columns, T, inverse)
 
     def start(self, size: arb) -> arb_mat:
         """The norms at the beginning, where nothing depends on the parameters."""

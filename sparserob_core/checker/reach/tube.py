@@ -86,7 +86,7 @@ class Tube:
         found = [n]
         for k, u in enumerate(self.scene.control):
             growth, driven = self._growth(self._span(self.scene.grid[k], self.scene.grid[k + 1]))
-            n = self._up(growth * n + driven * upper(norm(u)))
+            n = self._up(growth * n + driven * _absolute(u))
             found.append(n)
         return found
 
@@ -119,7 +119,7 @@ class Tube:
         if key not in self._growths:
             rest = self.remainder
             assert rest is not None
-            self._growths[key] = held(rest.growth, stacked([[b] for b in rest.control]), self._lengths[key])
+            self._growths[key] = held(rest.growth, rest.control, self._lengths[key])
         return self._growths[key]
 
     def cells(self, piece: int, start: float, stop: float, z: Array) -> list[Polynomial]:
@@ -181,8 +181,8 @@ class Tube:
         if rest is None:
             return np.zeros(z.shape[0])
         u = self.scene.control[min(piece, len(self.scene.control) - 1)]
-        growth, driven = held(rest.growth, stacked([[b] for b in rest.control]), up_to(offset + length))
-        last = upper((growth * self.norms[piece] + driven * upper(norm(u)))[rest.growth.nrows() - 1, 0])
+        growth, driven = held(rest.growth, rest.control, up_to(offset + length))
+        last = upper((growth * self.norms[piece] + driven * _absolute(u))[rest.growth.nrows() - 1, 0])
         per_size = float((last + self._support_out).upper()) * OUTWARD
         table = self.basis @ rest.transform  # rounded, which the second term covers
         terms = rounding(sum(self.basis.shape)) * np.abs(z) @ (np.abs(self.basis) @ np.abs(rest.transform))
@@ -206,6 +206,11 @@ class Tube:
         last = rest.growth.nrows() - 1
         columns = zip(radius(self.scene.disturbance), rest.disturbance, strict=True)
         return sum((arb(w) * total[last - i, 0] * e for w, per in columns for i, e in enumerate(per)), arb(0))
+
+
+def _absolute(inputs: arb_mat) -> arb_mat:
+    """Upper bounds of the absolute values of inputs ``(m, 1)``."""
+    return stacked([[upper(abs(u))] for u in inputs.entries()])
 
 
 def _sizes(matrix: arb_mat) -> Array:

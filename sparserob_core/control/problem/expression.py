@@ -182,6 +182,44 @@ class ExpressionMatrix:
         return out
 
 
+Entries: TypeAlias = "Array | Callable[..., object] | ExpressionMatrix"
+
+
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """Functions of the parameters, or arrays, that make one matrix side by side."""
+
+    parts: tuple[Entries, ...]
+
+    def __call__(self, p: Iterable[Value]) -> Value:
+        """The matrix at one parameter vector."""
+        return np.hstack([np.asarray(part(p) if callable(part) else part) for part in self.parts])
+
+
+def beside(left: Entries, right: Entries) -> Entries:
+    """Two matrices with as many rows side by side, each an array, expressions or a function of the parameters."""
+    if isinstance(left, np.ndarray) and isinstance(right, np.ndarray):
+        return np.hstack([left, right])
+    names = next((part.names for part in (left, right) if isinstance(part, ExpressionMatrix)), ())
+    rows = [_written(part) for part in (left, right)]
+    if rows[0] is None or rows[1] is None:
+        return Beside((left, right))
+    return ExpressionMatrix(tuple(a + b for a, b in zip(rows[0], rows[1], strict=True)), names)
+
+
+def _written(part: Entries) -> tuple[tuple[Expression, ...], ...] | None:
+    """The entries of a matrix as expressions; ``None`` for a function."""
+    if isinstance(part, ExpressionMatrix):
+        return part.entries
+    if not isinstance(part, np.ndarray):
+        return None
+    return tuple(tuple(_number(value) for value in row) for row in part)
+
+
+def _number(value: np.float64) -> Expression:
+    return Expression(repr(float(value)), frozenset(), lambda values: value)
+
+
 def parse_matrix(name: str, rows: Sequence[Sequence[str | float]], names: Sequence[str]) -> ExpressionMatrix:
     """A matrix of numbers and expressions, given row by row; ``name`` is for the errors (`InputError`)."""
     if not rows or not rows[0] or len({len(row) for row in rows}) > 1:
@@ -197,6 +235,15 @@ def parse_matrix(name: str, rows: Sequence[Sequence[str | float]], names: Sequen
             except InputError as error:
                 raise error.under(name, i, j) from None
     return ExpressionMatrix(tuple(map(tuple, entries)), tuple(names))
+
+
+def parse_column(name: str, entries: Sequence[str | float], names: Sequence[str]) -> ExpressionMatrix:
+    """A matrix of one column; as `parse_matrix`."""
+    try:
+        return parse_matrix(name, [[entry] for entry in entries], names)
+    except InputError as error:
+        error.path = error.path[:-1]  # every row has one entry
+        raise
 
 
 def _finite(expression: Expression) -> Expression:

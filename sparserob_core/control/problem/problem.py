@@ -18,6 +18,7 @@ from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound
 if TYPE_CHECKING:
     from sparserob_core.sip.program import SemiInfiniteProgram
 
+SHORTEST = 1e-12  # of the horizon: a delay that is not rounding
 DisturbanceClass: TypeAlias = Literal["piecewise_constant", "measurable", "l1_ball"]
 
 
@@ -35,7 +36,7 @@ class PathConstraint:
 class OptimalControlProblem:
     """Minimise ``sum_i weights_i int_0^T |u_i(t)| dt`` such that for every disturbance and every parameter
 
-    ``x' = A(p) x + B(p) u + E(p) w``, ``x(0) = initial_state (d,)``, ``u(t)`` in ``control``, ``x(t)`` in every
+    ``x' = A(p) x + B(p) u + E(p) w + c(p)``, ``x(0) = initial_state (d,)``, ``u(t)`` in ``control``, ``x(t)`` in every
     ``path`` set during its window, and ``x(T)`` in every ``terminal`` set, where ``T = horizon`` (in the time unit of
     the system).
 
@@ -67,6 +68,12 @@ class OptimalControlProblem:
         if horizon.shape != (1,) or not 0.0 < horizon[0] < np.inf:
             raise InputError(path="horizon", expected="a positive, finite time", got=f"{self.horizon!r}")
         self._set("horizon", float(horizon[0]))
+        if not (self.system.delay == 0.0 or SHORTEST * self.horizon < self.system.delay < self.horizon):
+            raise InputError(
+                path="system.delay",
+                expected=f"less than {self.horizon:g} (the horizon), or no control ever acts, and more than rounding",
+                got=f"{self.system.delay:g}",
+            )
         self._set("initial_state", self._state())
         self._set("weights", self._weights())
         self._set("initial_control", self._control_before())

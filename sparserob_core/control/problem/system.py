@@ -1,16 +1,17 @@
-"""Uncertain linear systems ``x' = A(p) x + B(p) u + E(p) w``."""
+"""Uncertain linear systems ``x' = A(p) x + B(p) u + E(p) w + c(p)``."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeAlias, final
 
 import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.control.enclosures.taylor import TaylorModel, TaylorSpace
-from sparserob_core.control.problem.expression import ExpressionMatrix
+from sparserob_core.control.problem.expression import ExpressionMatrix, beside
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
@@ -21,14 +22,16 @@ _Entry: TypeAlias = Array | Callable[..., object] | ExpressionMatrix
 
 @dataclass(frozen=True, eq=False)
 class LinearSystem:
-    """``x' = A(p) x + B(p) u + E(p) w`` with state ``x (d,)``, control ``u (m,)``, disturbance ``w (mw,)`` and a
-    constant, unknown parameter ``p (nu,)`` in ``parameters``.
+    """``x'(t) = A(p) x(t) + B(p) u(t - delay) + E(p) w(t) + c(p)`` with state ``x (d,)``, control ``u (m,)``,
+    disturbance ``w (mw,)`` and a constant, unknown parameter ``p (nu,)`` in ``parameters``.
 
     ``A (d, d)``, ``B (d, m)``, ``E (d, mw)`` are arrays, or functions of ``p`` that return such arrays; ``E`` is the
     identity unless given. ``parameters`` is a bounded set, or ``None`` when everything is known; ``names`` are for
-    messages, p1, p2, ... unless given. A function should be arithmetic with numpy functions: then it can be enclosed
-    over cells of parameters, for proofs. Raises `InputError` when shapes disagree or an entry is not finite somewhere
-    that was looked at.
+    messages, p1, p2, ... unless given. ``c (d,)``, an array or a function of ``p``, is a constant drift such as
+    gravity, in units of the state per time; none unless given. ``delay``: by how much later the control acts, in the
+    time unit of the system; until then ``initial_control`` of the problem acts. A function should be arithmetic with
+    numpy functions: then it can be enclosed over cells of parameters, for proofs. Raises `InputError` when shapes
+    disagree or an entry is not finite somewhere that was looked at.
     """
 
     A: Matrix
@@ -36,9 +39,12 @@ class LinearSystem:
     E: Matrix | None = None
     parameters: ConvexSet | None = None
     names: Sequence[str] = ()
+    c: Matrix | None = None
+    delay: float = 0.0
 
     def __post_init__(self) -> None:
         self._check_parameters()
+        object.__setattr__(self, "delay", _duration(self.delay))
         for name in ("A", "B"):
             object.__setattr__(self, name, self._matrix(name, getattr(self, name)))
         d, columns = self._shape("A")
@@ -48,6 +54,8 @@ class LinearSystem:
         for name in ("B", "E"):
             if self._shape(name)[0] != d:
                 raise InputError(f"{name} must have {d} rows, as A has, got shape {self._shape(name)}", path="system")
+        if self.c is not None:
+            self._check_drift(d)
         self.matrices(self._probes())
 
     @property
@@ -64,6 +72,14 @@ class LinearSystem:
     def disturbances(self) -> int:
         """Number ``mw`` of disturbances that ``E`` takes."""
         return self._shape("E")[1]
+
+    @cached_property
+    def forced(self) -> LinearSystem:
+        """The same system with its drift as one more column of ``B``, whose control is always 1; itself without a
+        drift. It has no delay: that belongs to the times at which the controls act."""
+        if self.c is None:
+            return self
+        return LinearSystem(self.A, beside(self._entry("B"), self._entry("c")), self.E, self.parameters, self.names)
 
     @property
     def parameter_count(self) -> int:
@@ -107,21 +123,31 @@ class LinearSystem:
 
     @shaped
     def in_units(
-        self, A: Float[Array, "d d"], B: Float[Array, "d m"], E: Float[Array, "d mw"], parameters: Float[Array, " nu"]
+        self,
+        A: Float[Array, "d d"],
+        B: Float[Array, "d m"],
+        E: Float[Array, "d mw"],
+        parameters: Float[Array, " nu"],
+        c: Float[Array, "d 1"] | float = 1.0,
+        time: float = 1.0,
     ) -> LinearSystem:
-        """The system whose matrices are ``A``, ``B``, ``E`` times these factors, entry by entry, and whose parameter is
-        this one's divided by ``parameters (nu,)``; exact for powers of two."""
+        """The system whose matrices are ``A``, ``B``, ``E``, ``c`` times these factors, entry by entry, and whose
+        parameter and delay are this one's divided by ``parameters (nu,)`` and ``time``; exact for powers of two."""
+        delay = self.delay / time
         if self.parameters is None:
             ours = [matrix[0] for matrix in self.matrices(np.zeros((1, 0)))]
-            return LinearSystem(ours[0] * A, ours[1] * B, ours[2] * E)
+            drift = None if self.c is None else self._values("c", np.zeros((1, 0)))[0] * c
+            return LinearSystem(ours[0] * A, ours[1] * B, ours[2] * E, c=drift, delay=delay)
         return SystemInUnits(
             self.A,
             self.B,
             self.E,
             self.parameters.in_units(parameters),
             self.names,
+            self.c,
+            delay,
             base=self,
-            factors={"A": A, "B": B, "E": E},
+            factors={"A": A, "B": B, "E": E, "c": np.broadcast_to(c, (A.shape[0], 1))},
             units=parameters,
         )
 
@@ -152,6 +178,21 @@ class LinearSystem:
                 got=f"{len(names)}: {', '.join(names)}",
             )
         object.__setattr__(self, "names", names)
+
+    def _check_drift(self, d: int) -> None:
+        """``c`` as a matrix of one column; raises `InputError` when it has not one number per state."""
+        given = self.c
+        if callable(given) and not isinstance(given, ExpressionMatrix | _AsColumn):
+            given = _AsColumn(given)
+        elif not callable(given):
+            array = np.asarray(given, dtype=object)
+            given = array[:, None].tolist() if array.ndim == 1 else given
+        object.__setattr__(self, "c", self._matrix("c", given))
+        if self._shape("c") != (d, 1):
+            rows, columns = self._shape("c")
+            got = f"{rows}" if columns == 1 else f"shape {(rows, columns)}"
+            raise InputError(path="system.c", expected=f"{d} numbers, one per state", got=got)
+        self._values("c", self._probes())
 
     def _matrix(self, name: str, value: object) -> _Entry:
         if isinstance(value, ExpressionMatrix):
@@ -274,6 +315,33 @@ class LinearSystem:
 
 
 @final
+@dataclass(frozen=True, eq=False)
+class _AsColumn:
+    """A function of the parameters that returns ``(d,)`` as one that returns ``(d, 1)``."""
+
+    function: Callable[..., object]
+
+    def __call__(self, parameter: object) -> object:
+        value = self.function(parameter)
+        array = np.array(value, dtype=object if _holds_models(value) else float)
+        return array[:, None] if array.ndim == 1 else array
+
+
+def _holds_models(value: object) -> bool:
+    return np.asarray(value, dtype=object).dtype == object and not all(
+        isinstance(entry, int | float | np.integer | np.floating) for entry in np.asarray(value, dtype=object).flat
+    )
+
+
+def _duration(value: object) -> float:
+    """A finite number that is not negative; raises `InputError`."""
+    usable = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+    if not usable or not 0.0 <= float(value) < np.inf:  # type: ignore[arg-type]
+        raise InputError(path="system.delay", expected="a finite time, not negative", got=f"{value!r}")
+    return float(value)  # type: ignore[arg-type]
+
+
+@final
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SystemInUnits(LinearSystem):
     """An uncertain system in other units: ``base`` at parameters times ``units (nu,)``, its matrices times
@@ -286,16 +354,33 @@ class SystemInUnits(LinearSystem):
     def __post_init__(self) -> None:
         pass  # the base was checked
 
+    @cached_property
+    def forced(self) -> LinearSystem:
+        if self.c is None:
+            return self
+        base, factors = self.base.forced, self.factors
+        joined = {"A": factors["A"], "B": np.hstack([factors["B"], factors["c"]]), "E": factors["E"]}
+        return SystemInUnits(
+            base.A, base.B, base.E, self.parameters, self.names, base=base, factors=joined, units=self.units
+        )
+
     @shaped
     def describe(self, parameter: Float[Array, " nu"]) -> str:
         return self.base.describe(parameter * self.units)
 
     @shaped
     def in_units(
-        self, A: Float[Array, "d d"], B: Float[Array, "d m"], E: Float[Array, "d mw"], parameters: Float[Array, " nu"]
+        self,
+        A: Float[Array, "d d"],
+        B: Float[Array, "d m"],
+        E: Float[Array, "d mw"],
+        parameters: Float[Array, " nu"],
+        c: Float[Array, "d 1"] | float = 1.0,
+        time: float = 1.0,
     ) -> LinearSystem:
-        mine = self.factors
-        return self.base.in_units(A * mine["A"], B * mine["B"], E * mine["E"], parameters * self.units)
+        mine, units = self.factors, parameters * self.units
+        earlier = self.base.delay / self.delay if self.delay else 1.0
+        return self.base.in_units(A * mine["A"], B * mine["B"], E * mine["E"], units, c * mine["c"], time * earlier)
 
     def _shape(self, name: str) -> tuple[int, int]:
         return self.base._shape(name)

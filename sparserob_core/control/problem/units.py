@@ -64,8 +64,8 @@ class Units:
         return replace(entry, set=entry.set.in_units(self.states), start=entry.start / self.time, stop=stop)
 
     def of_system(self, system: LinearSystem) -> LinearSystem:
-        """``x' = A x + B u + E w`` with all of it in these units."""
+        """``x' = A x + B u + E w + c`` with all of it in these units."""
         rate = self.time / self.states[:, None]
-        return system.in_units(
-            rate * self.states, rate * self.controls, rate * self.disturbances[: system.disturbances], self.parameters
-        )
+        disturbances = self.disturbances[: system.disturbances]
+        factors = (rate * self.states, rate * self.controls, rate * disturbances)
+        return system.in_units(*factors, self.parameters, rate, self.time)

@@ -191,7 +191,7 @@ class CellEnclosure:
 
     @cached_property
     def _drive(self) -> Array:
-        inputs = self.control[:, self.lifted.grid.control_piece]
+        inputs = self.lifted.grid.inputs(self.control)
         return np.asarray(inputs.T @ self.lifted.B.reshape(-1, self.lifted.B.shape[2]).T)
 
     @cached_property

@@ -47,8 +47,19 @@ class WorstCase:
         return WorstCase(self.response.from_state(initial_state), self.dictionary, self.disturbance, support)
 
     @property
+    def channels(self) -> int:
+        """Number ``m`` of controls; ``B`` may have columns of constants beyond them."""
+        return self.response.system.controls - self.response.grid.constants
+
+    @property
     def variables(self) -> int:
-        return self.response.system.controls * self.dictionary.functions
+        return self.channels * self.dictionary.functions
+
+    @cached_property
+    def known(self) -> Array:
+        """What acts through the columns of ``B`` where nothing is decided, ``(m + constants, L)``: a drift, and the
+        control before the first one acts; 0 elsewhere."""
+        return self.response.grid.inputs(np.zeros((self.channels, self.dictionary.pieces)))
 
     def nominal(self) -> WorstCase:
         """The functionals of the system at an interior point of its parameters, under one admissible disturbance: none,
@@ -111,8 +122,9 @@ class WorstCase:
         G, offset = np.empty((times.size, self.variables)), np.empty(times.size)
         for part in self._chunks(times.size):
             free, gains, B, W = self.response.adjoint(times[part], directions[part], parameters[part])
-            G[part] = self.on_decision(gains @ B)
-            offset[part] = free @ self.response.initial_state + pushed(part, gains, W)
+            weights = gains @ B
+            G[part] = self.on_decision(weights)
+            offset[part] = free @ self.response.initial_state + self.given(weights) + pushed(part, gains, W)
         return G, offset
 
     @shaped
@@ -197,12 +209,13 @@ class WorstCase:
     def parts(
         self, time: float, direction: Float[Array, " d"], parameter: Float[Array, " nu"]
     ) -> tuple[float, float, Float[Array, "mw L"] | None]:
-        """What ``max_w c'x(t)`` is made of at one index, beside the control: what the initial state gives, what the
-        worst disturbance adds, and such a disturbance (`worst_disturbance`)."""
+        """What ``max_w c'x(t)`` is made of at one index, beside the control: what the initial state and all that is not
+        decided give, what the worst disturbance adds, and such a disturbance (`worst_disturbance`)."""
         at = (np.array([time]), direction[None], parameter[None])
-        free, gains, _, W = self.response.adjoint(*at)
+        free, gains, B, W = self.response.adjoint(*at)
+        rest = float(free[0] @ self.response.initial_state + self.given(gains @ B)[0])
         worst: Array | None = None if self.disturbance is None else self.disturbance.worst(gains @ W)[0]
-        return float(free[0] @ self.response.initial_state), float(self._support(gains, W, *at)[0]), worst
+        return rest, float(self._support(gains, W, *at)[0]), worst
 
     @cached_property
     def measurable(self) -> MeasurableSupport:
@@ -214,16 +227,35 @@ class WorstCase:
         return MeasurableSupport(self.response, self.disturbance.bound)
 
     @shaped
-    def on_decision(self, weights: Float[Array, "k L m"]) -> Float[Array, "k n"]:
-        """Weights ``(k, L, m)`` on the control of every grid piece, as rows ``(k, n)`` of the decision."""
-        on_pieces = np.add.reduceat(weights, self._control_starts(), axis=1)
+    def given(self, weights: Float[Array, "k L mc"]) -> Float[Array, " k"]:
+        """What weights ``(k, L, m + constants)`` on the columns of ``B`` make of all that is not decided, ``(k,)``."""
+        return np.einsum("klm,ml->k", weights, self.known) if self._gives else np.zeros(weights.shape[0])
+
+    @shaped
+    def decided(self, weights: Float[Array, "k L mc"]) -> Float[Array, "k J m"]:
+        """Of weights on the columns of ``B``, those on the control, on the grid pieces on which one acts."""
+        grid = self.response.grid
+        return weights[:, grid.decided, : self.channels] if self._gives or grid.before is not None else weights
+
+    @shaped
+    def on_decision(self, weights: Float[Array, "k L mc"]) -> Float[Array, "k n"]:
+        """Weights ``(k, L, m + constants)`` on the columns of ``B`` on every grid piece, as rows ``(k, n)`` of the
+        decision."""
+        acting = self.response.grid.control_piece[self.response.grid.decided]
+        starts = np.flatnonzero(np.diff(acting, prepend=-1))
+        on_pieces = np.add.reduceat(self.decided(weights), starts, axis=1)
+        if starts.size < self.dictionary.pieces:  # the last ones act after the horizon
+            every = np.zeros((weights.shape[0], self.dictionary.pieces, self.channels))
+            every[:, acting[starts]] = on_pieces
+            on_pieces = every
         coefficients = on_pieces if self.dictionary.is_indicators else self.dictionary.values @ on_pieces
         return coefficients.swapaxes(1, 2).reshape(-1, self.variables)
 
     @shaped
-    def on_grid(self, theta: Float[Array, " n"]) -> Float[Array, "m L"]:
-        """The control ``(m, L)`` on the pieces of the merged grid."""
-        return self.dictionary.control(theta)[:, self.response.grid.control_piece]
+    def on_grid(self, theta: Float[Array, " n"]) -> Float[Array, "mc L"]:
+        """What acts through the columns of ``B`` on the pieces of the merged grid, ``(m + constants, L)``: the control,
+        and all that is not decided."""
+        return self.response.grid.inputs(self.dictionary.control(theta))
 
     @shaped
     def _support(
@@ -240,8 +272,9 @@ class WorstCase:
             return self.measurable(times, directions, parameters)
         return self.disturbance.support(gains @ W)
 
-    def _control_starts(self) -> np.ndarray:
-        return np.flatnonzero(np.diff(self.response.grid.control_piece, prepend=-1))
+    @cached_property
+    def _gives(self) -> bool:
+        return bool(self.known.any())
 
     def _chunks(self, count: int) -> list[slice]:
         size = max(1, CHUNK // (self.response.grid.pieces * self.response.initial_state.size))

@@ -130,6 +130,8 @@ class LiftedSystem:
             np.concatenate([*inner, breaks[-1:]]),
             np.repeat(self.grid.control_piece, counts),
             np.repeat(self.grid.disturbance_piece, counts),
+            self.grid.before,
+            self.grid.constants,
         )
 
     @cached_property
@@ -179,7 +181,7 @@ class LiftedSystem:
     def state_remainder(self, control: Array) -> tuple[Array, Array]:
         """Norm bounds ``(L, q)``, per piece and block, of the part of the state that the Taylor models leave out,
         rounding included; and of the Taylor models themselves, summed over their coefficients."""
-        inputs = control[:, self.fine.control_piece]
+        inputs = self.fine.inputs(control)
         driven = inputs.T @ self.forward.system.matrices(KNOWN)[1][0].T
         nodes = self._path(control)[None]
         sizes = self._sizes(nodes, driven, rows=False)

@@ -27,15 +27,18 @@ SAME_TIME = 1e-12  # times closer than this share of the horizon are one
 
 @dataclass(frozen=True, eq=False)
 class TimeGrid:
-    """The union of the breakpoints of control and disturbance.
+    """The union of the times at which control and disturbance may change what they do.
 
-    ``breakpoints (L+1,)``; ``control_piece (L,)`` and ``disturbance_piece (L,)``: which piece of each dictionary a
-    piece of the grid lies in.
+    ``breakpoints (L+1,)``; ``control_piece (L,)`` and ``disturbance_piece (L,)``: which piece of each dictionary acts
+    on a piece of the grid; -1 where the control ``before (m,)`` still does. ``constants``: columns of ``B`` beyond
+    those of the control, whose input is always 1 (a drift).
     """
 
     breakpoints: Array
     control_piece: np.ndarray
     disturbance_piece: np.ndarray
+    before: Array | None = None
+    constants: int = 0
 
     @property
     def pieces(self) -> int:
@@ -44,6 +47,19 @@ class TimeGrid:
     @property
     def lengths(self) -> Array:
         return np.diff(self.breakpoints)
+
+    @cached_property
+    def decided(self) -> np.ndarray:
+        """The pieces ``(J,)`` on which a piece of the control acts."""
+        return np.flatnonzero(self.control_piece >= 0)
+
+    @shaped
+    def inputs(self, control: Float[Array, "m K"]) -> Float[Array, "mc L"]:
+        """What acts through every column of ``B`` on the pieces of this grid, from the control on its own pieces."""
+        acting = control[:, np.maximum(self.control_piece, 0)]
+        if self.before is not None:
+            acting = np.where(self.control_piece >= 0, acting, self.before[:, None])
+        return np.vstack([acting, np.ones((self.constants, self.pieces))]) if self.constants else acting
 
     @shaped
     def distinct(self, durations: Float[Array, " k"]) -> tuple[Float[Array, " u"], Int[np.ndarray, " k"]]:
@@ -70,19 +86,31 @@ def distinct_times(times: Float[Array, " k"], horizon: float) -> Float[Array, " 
 
 
 @shaped
-def merge_grids(control: Float[Array, " K"], disturbance: Float[Array, " M"]) -> TimeGrid:
-    """The merged grid of two sets of breakpoints over the same horizon.
+def merge_grids(
+    control: Float[Array, " K"],
+    disturbance: Float[Array, " M"],
+    delay: float = 0.0,
+    before: Float[Array, " m"] | None = None,
+    constants: int = 0,
+) -> TimeGrid:
+    """The merged grid of two sets of breakpoints over the same horizon; a control acts later by ``delay``, less than
+    the horizon, and ``before (m,)`` acts until then.
 
     A breakpoint of the disturbance that is one of the control's but for rounding is taken for it. Two breakpoints of
     one set are never taken for one, however near they are, so that no piece of either is lost.
     """
+    begin = control
+    if delay > 0.0:
+        begin, horizon = control + delay, float(control[-1])
+        control = np.concatenate([[0.0], begin[begin < horizon - SAME_TIME * horizon], [horizon]])
     after = np.clip(np.searchsorted(control, disturbance), 1, control.size - 1)
     nearest = np.where(disturbance - control[after - 1] <= control[after] - disturbance, after - 1, after)
     near = np.abs(disturbance - control[nearest]) <= SAME_TIME * float(control[-1])
     same = near & (np.diff(np.where(near, nearest, -1), prepend=-1) != 0)  # the first of those near one breakpoint
     points = np.union1d(control, disturbance[~same])
     middles = (points[:-1] + points[1:]) / 2
-    return TimeGrid(points, np.searchsorted(control, middles) - 1, np.searchsorted(disturbance, middles) - 1)
+    acting, pushing = np.searchsorted(begin, middles) - 1, np.searchsorted(disturbance, middles) - 1
+    return TimeGrid(points, acting, pushing, before if delay > 0.0 else None, constants)
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,12 +341,12 @@ class Response:
     ) -> Float[Array, "vx points d"]:
         """States ``(v, L+1, d)`` at the breakpoints of the grid.
 
-        ``control (m, K)`` on the control's pieces, ``parameters (v, nu)`` (one row serves all disturbances),
-        ``disturbance (v, mw, M)`` on the disturbance's pieces or ``None``.
+        ``control (m, K)`` on the control's pieces (`TimeGrid.inputs`), ``parameters (v, nu)`` (one row serves all
+        disturbances), ``disturbance (v, mw, M)`` on the disturbance's pieces or ``None``.
         """
         steps = self.steps(parameters)
         count = parameters.shape[0] if disturbance is None else max(parameters.shape[0], disturbance.shape[0])
-        drive = np.einsum("vdm,ml->vld", steps.B, control[:, self.grid.control_piece])
+        drive = np.einsum("vdm,ml->vld", steps.B, self.grid.inputs(control))
         if disturbance is not None:
             drive = drive + np.einsum(
                 "vdi,vil->vld",

@@ -32,12 +32,14 @@ def rough_units(problem: OptimalControlProblem) -> Units:
         disturbances = power_of_two(extent(bound))
     index = ParameterIndex(system.parameters)
     parameters = np.ones(0) if system.parameters is None else power_of_two(_widths(system.parameters))
-    A, B, E = (np.abs(matrix) for matrix in system.matrices(looked_at(index)))
+    A, B, E = (np.abs(matrix) for matrix in system.forced.matrices(looked_at(index)))
     A, B, E = A.max(axis=0), B.max(axis=0), E.max(axis=0)
     # a fast system is coupled through for a time of about 1/norm only; the eigenvalues do not depend on the units
     fastest = float(np.abs(np.linalg.eigvals(system.matrices(looked_at(index))[0])).max())  # LAPACK balances
     lasting = float(power_of_two(np.array(min(time, 1.0 / fastest if fastest > 0.0 else np.inf))))
-    reach = np.maximum(np.abs(np.asarray(problem.initial_state)), time * (B * controls).max(axis=1, initial=0.0))
+    inputs = controls if problem.initial_control is None else np.maximum(controls, np.abs(problem.initial_control))
+    inputs = np.concatenate([inputs, np.ones(B.shape[1] - inputs.size)])  # that of a drift is 1
+    reach = np.maximum(np.abs(np.asarray(problem.initial_state)), time * (B * inputs).max(axis=1, initial=0.0))
     if bound is not None:
         reach = np.maximum(reach, time * (E * disturbances).max(axis=1, initial=0.0))
     for _ in range(system.states - 1):
@@ -105,13 +107,15 @@ def reaches(
     for begin in range(0, at.size, size):
         part = slice(begin, begin + size)
         free, gains, B, W = functionals.response.adjoint(at[part], directions[part], p[part])
-        rest = free @ functionals.response.initial_state
-        on_control = gains @ B
+        every = gains @ B
+        on_control, known = functionals.decided(every), functionals.given(every)
+        rest = free @ functionals.response.initial_state + known
         up[part], down[part] = (
             rest + control.support(on_control).sum(axis=1),
             control.support(-on_control).sum(axis=1) - rest,
         )
         added[part] = np.abs(free) @ np.abs(functionals.response.initial_state)
+        added[part] += np.einsum("klm,ml->k", np.abs(every), np.abs(functionals.known))
         added[part] += np.abs(on_control @ np.diag(extent(control))).sum(axis=(1, 2))
         model = functionals.disturbance
         if model is not None:

@@ -38,7 +38,7 @@ def unprovable(problem: OptimalControlProblem) -> str | None:
     box = ParameterIndex(parameters).box
     try:
         space = TaylorSpace(problem.system.parameter_count, 1)
-        problem.system.taylor(space, parameters.interior_point(), TINY * (box.upper - box.lower) / 2)
+        problem.system.forced.taylor(space, parameters.interior_point(), TINY * (box.upper - box.lower) / 2)
     except NotEnclosable as error:
         return str(error)
     return None

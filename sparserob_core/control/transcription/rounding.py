@@ -63,7 +63,9 @@ def _added(model: Transcription, result: Result) -> float:
     multipliers, times, directions, parameters = (np.array(column, dtype=float) for column in zip(*rows, strict=True))
     free, gains, B, E = model.response.adjoint(times, directions, parameters.reshape(len(rows), -1))
     sizes = np.abs(free) @ np.abs(model.response.initial_state)
-    sizes += (np.abs(gains @ B) @ _far(model.problem.control)).sum(axis=1)
+    weights, functionals = gains @ B, model.functionals
+    sizes += np.einsum("klm,ml->k", np.abs(weights), np.abs(functionals.known))
+    sizes += (np.abs(functionals.decided(weights)) @ _far(model.problem.control)).sum(axis=1)
     if model.problem.disturbance is not None:
         sizes += (np.abs(gains @ E) @ _far(model.problem.disturbance)).sum(axis=1)
     return float(multipliers @ sizes)

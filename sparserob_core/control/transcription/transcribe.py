@@ -89,11 +89,14 @@ def prepare(
 def _functionals(
     problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary
 ) -> tuple[WorstCase, ParameterIndex]:
-    grid = merge_grids(control.breakpoints, disturbance.breakpoints)
+    system, before = problem.system.forced, np.zeros(problem.system.controls)
+    before = before if problem.initial_control is None else np.asarray(problem.initial_control, dtype=float)
+    constants = system.controls - problem.system.controls
+    grid = merge_grids(control.breakpoints, disturbance.breakpoints, problem.system.delay, before, constants)
     model: DisturbanceModel | None = None
     if problem.disturbance is not None:
         model = disturbance_model(problem.disturbance_class, problem.disturbance, disturbance, grid)
-    response = Response(problem.system, grid, np.asarray(problem.initial_state, dtype=float))
+    response = Response(system, grid, np.asarray(problem.initial_state, dtype=float))
     return WorstCase(response, control, model), ParameterIndex(problem.system.parameters)
 
 
@@ -416,7 +419,7 @@ def _reached(problem: OptimalControlProblem, parameters: ParameterIndex, state: 
     over all parameters."""
     if parameters.set is None:
         return False
-    system, box = problem.system, parameters.box
+    system, box = problem.system.forced, parameters.box
     try:
         parts = system.taylor(
             TaylorSpace(parameters.count, 1), (box.lower + box.upper) / 2, (box.upper - box.lower) / 2

@@ -9,7 +9,7 @@ from typing import Annotated, Literal, TypeAlias, final
 import numpy as np
 from pydantic import BeforeValidator, Discriminator, Field, Tag
 
-from sparserob_core.control.problem.expression import CONSTANTS, FUNCTIONS, parse_matrix
+from sparserob_core.control.problem.expression import CONSTANTS, FUNCTIONS, parse_column, parse_matrix
 from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint, ProblemFactory
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, ConvexSet, Equality
@@ -64,7 +64,8 @@ Parameters: TypeAlias = Annotated[
 
 @final
 class SystemOptions(Options):
-    """``x' = A(p) x + B(p) u + E(p) w``; entries are numbers, or arithmetic expressions in the parameters."""
+    """``x'(t) = A(p) x(t) + B(p) u(t - delay) + E(p) w(t) + c(p)``; entries are numbers, or arithmetic expressions in
+    the parameters."""
 
     A: Rows
     """Square matrix, row by row."""
@@ -78,6 +79,12 @@ class SystemOptions(Options):
     parameters: Parameters | None = None
     """Intervals ``{name: [lower, upper]}``, or names and a set, as ``{names: [...], polytope: {H: ..., h: ...}}``; none
     if known."""
+
+    c: Annotated[list[Entry], Field(min_length=1)] | None = None
+    """Constant drift such as gravity, one entry per state, in units of the state per time; none unless given."""
+
+    delay: float = Field(default=0.0, ge=0.0)
+    """By how much later the control acts, less than the horizon; until then ``initial_control`` acts."""
 
     def names(self) -> tuple[str, ...]:
         """Names of the parameters; raises `InputError` when one cannot stand in an expression."""
@@ -110,7 +117,10 @@ class SystemOptions(Options):
             )
         A, B = parse_matrix("system.A", self.A, names), parse_matrix("system.B", self.B, names)
         E = None if self.E is None else parse_matrix("system.E", self.E, names)
-        return LinearSystem(A, B, E, parameters=self._parameter_set(names), names=names)
+        if self.c is not None and len(self.c) != d:
+            raise InputError(path="system.c", expected=f"{d} entries, one per state", got=f"{len(self.c)}")
+        c = None if self.c is None else parse_column("system.c", self.c, names)
+        return LinearSystem(A, B, E, self._parameter_set(names), names, c, self.delay)
 
     def _parameter_set(self, names: tuple[str, ...]) -> ConvexSet | None:
         if isinstance(self.parameters, ParameterSetOptions):
