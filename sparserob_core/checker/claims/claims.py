@@ -45,6 +45,8 @@ def check(case: Case, gap_tolerance: float | None) -> list[Finding]:
         claims += [judged("lower bound", lambda: _lower(case))]
         if status == "refuted":
             return [*claims, judged("violation", lambda: _witness(case))]
+        if case.problem.control_step is not None:
+            claims.append(judged("control_step", lambda: _steps(case)))
         if case.equalities:
             claims.append(judged("equalities", lambda: equalities(case)))
         claims += [judged(window.name, lambda window=window: bounded(case, window)) for window in case.windows]  # type: ignore[misc]
@@ -98,6 +100,24 @@ def _control(case: Case) -> str:
             raise Broken(f"{where} leaves its set by {over:.3g} of its own unit, from t = {float(start):.6g} on")
         worst = max(worst, over)
     return f"{case.control.pieces} pieces in their set" + (f", to {worst:.1e} of its own units" if worst > 0 else "")
+
+
+def _steps(case: Case) -> str:
+    """Every change of the control from piece to piece in its set."""
+    bound, worst = case.problem.control_step, 0.0
+    assert bound is not None
+    steps = case.duality.steps
+    for k in steps:
+        case.clock.check()
+        before = case.duality.before if k == 0 else case.pieces[k - 1].entries()
+        over, where = excess(bound, [u - v for u, v in zip(case.pieces[k].entries(), before, strict=True)])
+        if over > TOLERANCE:
+            where = "the change of the control" if where == "it" else f"the change of {where}"
+            raise Broken(
+                f"{where} leaves its set by {over:.3g} of its own unit, at t = {float(case.control.breakpoints[k]):.6g}"
+            )
+        worst = max(worst, over)
+    return f"{len(steps)} steps in their set" + (f", to {worst:.1e} of its own units" if worst > 0 else "")
 
 
 def cost_of(case: Case) -> arb:
@@ -175,6 +195,9 @@ def _row(case: Case, entry: object) -> tuple[float, Row]:
     if name == "control" and not any(window.name == name for window in case.windows):
         _sized(direction, case.problem.system.controls, name)
         return y, case.duality.control_row(direction, time)
+    if name == "control_step" and not any(window.name == name for window in case.windows):
+        _sized(direction, case.problem.system.controls, name)
+        return y, case.duality.step_row(direction, time)
     window, parameter = case.window(name), numbers(entry.get("parameter"), f"{name}: parameter")
     _sized(direction, case.problem.system.states, name)
     if not window.start <= time <= window.stop:

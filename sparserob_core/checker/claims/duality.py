@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import rational
-from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.reach.flow import Flow, stacked
-from sparserob_core.checker.sets.shapes import arrangement, boxed, facets, support
+from sparserob_core.checker.sets.shapes import arrangement, boxed, facets, limit, support
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.sets.sets import Box
@@ -56,6 +56,33 @@ class Duality:
         slope = [[_exact(0.0)] * direction.size for _ in range(self.control.pieces)]
         slope[piece] = [_exact(c) for c in direction]
         return Row(-support(self.problem.control, slope[piece]), slope)
+
+    @property
+    def before(self) -> list[arb]:
+        """The control before time 0."""
+        return [_exact(float(u)) for u in np.asarray(self.problem.initial_control, dtype=float)]
+
+    @property
+    def steps(self) -> range:
+        """The pieces whose beginning is a step from what was before."""
+        return range(0 if self.problem.initial_control is not None else 1, self.control.pieces)
+
+    def step_row(self, direction: Array, time: float) -> Row:
+        """``c'(u_k - u_{k-1}) <= h(c)`` for the step at a breakpoint, ``u_{-1}`` the control before time 0."""
+        if self.problem.control_step is None:
+            raise Broken("the problem has no constraint 'control_step'")
+        found = [k for k in self.steps if float(self.control.breakpoints[k]) == time]
+        if not found:
+            raise Broken(f"control_step: there is no step at t = {time!r}")
+        (k,) = found
+        slope = [[_exact(0.0)] * direction.size for _ in range(self.control.pieces)]
+        slope[k] = [_exact(c) for c in direction]
+        constant = -limit(self.problem.control_step, direction)
+        if k > 0:
+            slope[k - 1] = [-_exact(c) for c in direction]
+        else:
+            constant -= sum((_exact(c) * u for c, u in zip(direction, self.before, strict=True)), _exact(0.0))
+        return Row(constant, slope)
 
     def row(self, direction: Array, time: float, parameter: Sequence[float], limit: arb, disturbed: bool = True) -> Row:
         """``c'x(t) <= limit`` at one parameter, for the worst disturbance, or where none reaches the state."""

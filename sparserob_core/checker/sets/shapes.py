@@ -304,15 +304,22 @@ def _named(shape: ConvexSet, normal: Array, number: int) -> str:
 
 
 def units(shape: ConvexSet) -> list[float]:
-    """The own unit of every facet of a bounded flat set: the smallest that is not zero of how far it reaches over the
+    """The own unit of every facet of a flat set: the smallest that is not zero of how far it reaches over the
     set, the width between it and the opposite facet, and for a row of a polytope its right-hand side."""
     flat = facets(shape)
     assert flat is not None
     answer = []
     for (c, b), width in zip(flat, widths(flat), strict=True):
-        reach = max(abs(float(support(shape, balls(c)).mid())), abs(float(support(shape, balls(-c)).mid())))
+        reach = max(_reach(shape, c), _reach(shape, -c))
         answer.append(smallest([width, reach, *([abs(float(b.mid()))] if isinstance(shape, Polytope) else [])]))
     return answer
+
+
+def _reach(shape: ConvexSet, direction: Array) -> float:
+    try:
+        return abs(float(support(shape, balls(direction)).mid()))
+    except Broken:  # unbounded there
+        return math.inf
 
 
 def widths(flat: Sequence[tuple[Array, arb]]) -> list[float]:

@@ -1,4 +1,4 @@
-"""Curved control sets: ``c'u(t) <= h(c)`` on every piece, with the normal direction as an index."""
+"""Curved sets of controls, and of their steps: ``c'u(t) <= h(c)``, with the normal direction as an index."""
 
 from __future__ import annotations
 
@@ -18,18 +18,57 @@ CLIMBED = 16  # pieces, those furthest outside, whose direction is refined per r
 
 @dataclass(frozen=True, eq=False)
 class ControlConstraint:
-    """``u(t)`` in a curved set on every piece; the index is ``(t, z)`` with ``z`` in ``[-1, 1]^m`` a direction, not
-    normalised."""
+    """What the control does at some places in time, in a curved set: its value on every piece, or its change at every
+    step. The index is ``(t, z)`` with ``z`` in ``[-1, 1]^m`` a direction, not normalised.
 
+    ``values (N, q)``: what every function of the dictionary is at the ``q`` places; ``offset (q, m)`` is added.
+    ``starts (q,)``: from when on a time stands for each place, until the next, or the end, ``stop``. ``times (q,)``:
+    the time of each place that is told. ``words``: what is in the set, with a place for the time.
+    """
+
+    name: str
     set: ConvexSet
-    dictionary: Dictionary
+    values: Array
+    offset: Array
+    starts: Array
+    stop: float
+    times: Array
+    words: str
+
+    @staticmethod
+    def of_values(convex: ConvexSet, dictionary: Dictionary) -> ControlConstraint:
+        """``u(t)`` in the set on every piece."""
+        ends = dictionary.breakpoints
+        return ControlConstraint(
+            "control",
+            convex,
+            dictionary.values,
+            np.zeros((dictionary.pieces, convex.dimension)),
+            ends[:-1],
+            float(ends[-1]),
+            (ends[:-1] + ends[1:]) / 2,
+            "u({})",
+        )
+
+    @staticmethod
+    def of_steps(convex: ConvexSet, dictionary: Dictionary, before: Array | None) -> ControlConstraint:
+        """``u_{k+1} - u_k`` in the set at every step, and ``u_0 - before`` at time 0 unless ``before`` is ``None``."""
+        first = 0 if before is not None else 1
+        steps = dictionary.breakpoints[first:-1]
+        offset = np.zeros((steps.size, convex.dimension))
+        if before is not None:
+            offset[0] = -before
+        values = np.diff(dictionary.values, axis=1, **({} if first else {"prepend": 0.0}))
+        return ControlConstraint(
+            "control_step", convex, values, offset, steps, dictionary.horizon, steps, "the change of u at {}"
+        )
 
     def family(self) -> ConstraintFamily:
         """The constraint as a family; it does not depend on any uncertainty."""
         m = self.set.dimension
-        index_set = Box(np.concatenate([[0.0], -np.ones(m)]), np.concatenate([[self.dictionary.horizon], np.ones(m)]))
+        index_set = Box(np.concatenate([self.starts[:1], -np.ones(m)]), np.concatenate([[self.stop], np.ones(m)]))
         family = ConstraintFamily(
-            name="control",
+            name=self.name,
             index_set=index_set,
             rows=self.rows,
             worst=self.worst,
@@ -41,48 +80,48 @@ class ControlConstraint:
 
     def rows(self, indices: Array) -> tuple[Array, Array]:
         """``G (k, 1, n)``, ``rhs (k, 1)`` at indices ``(k, 1 + m)``."""
-        directions = unit(self.set, indices[:, 1:])
-        values = self.dictionary.values[:, self._piece(indices[:, 0])].T
-        G = np.einsum("kc,kn->kcn", directions, values).reshape(indices.shape[0], 1, -1)
-        return G, self.set.support(directions)[:, None]
+        directions, places = unit(self.set, indices[:, 1:]), self._places(indices[:, 0])
+        G = np.einsum("kc,kn->kcn", directions, self.values[:, places].T).reshape(indices.shape[0], 1, -1)
+        return G, (self.set.support(directions) - (directions * self.offset[places]).sum(axis=1))[:, None]
 
     def gradient(self, x: Array, indices: Array, rows: Array) -> Array:
         """The derivative ``(k, 1 + m)`` of ``row x - rhs`` in the index: 0 in time, since the control is constant on
         every piece."""
         z = np.asarray(indices, dtype=float)[:, 1:]
-        control = self.dictionary.control(x)[:, self._piece(indices[:, 0])].T
-        turned = across(self.set, z, (control - self.set.support_point(unit(self.set, z))) @ self.set.frame.T)
+        point = self._points(x)[self._places(indices[:, 0])]
+        turned = across(self.set, z, (point - self.set.support_point(unit(self.set, z))) @ self.set.frame.T)
         return np.hstack([np.zeros((z.shape[0], 1)), turned])
 
     def worst(self, x: Array) -> Separation:
-        """The pieces furthest outside, each with its worst direction; the bound is exact, since the pieces are finitely
+        """The places furthest outside, each with its worst direction; the bound is exact, since the places are finitely
         many."""
-        control = self.dictionary.control(x).T
-        outside = self.set.gauge(control) - 1.0
-        pieces = np.argsort(-outside, kind="stable")[:CLIMBED]
+        points = self._points(x)
+        outside = self.set.gauge(points) - 1.0
+        places = np.argsort(-outside, kind="stable")[:CLIMBED]
         z = sampled(self.set.dimension)
         c = unit(self.set, z)
-        start = z[(control[pieces] @ c.T - self.set.support(c)).argmax(axis=1)]
+        start = z[(points[places] @ c.T - self.set.support(c)).argmax(axis=1)]
 
-        def excess(points: Array, which: np.ndarray) -> Array:
-            directions = unit(self.set, points)
-            answer: Array = np.einsum("kc,kc->k", directions, control[pieces[which]]) - self.set.support(directions)
+        def excess(at: Array, which: np.ndarray) -> Array:
+            directions = unit(self.set, at)
+            answer: Array = np.einsum("kc,kc->k", directions, points[places[which]]) - self.set.support(directions)
             return answer
 
-        z, found = climb(
-            excess, start, np.full(self.set.dimension, 0.1), lambda points: on_surface(np.clip(points, -1.0, 1.0))
-        )
+        z, found = climb(excess, start, np.full(self.set.dimension, 0.1), lambda at: on_surface(np.clip(at, -1.0, 1.0)))
         order = np.argsort(-found, kind="stable")
-        middles = (self.dictionary.breakpoints[:-1] + self.dictionary.breakpoints[1:]) / 2
-        indices = np.hstack([middles[pieces[order], None], z[order]])
+        indices = np.hstack([self.times[places[order], None], z[order]])
         return Separation(indices, np.zeros(order.size, dtype=int), found[order], float(outside.max()))
 
     def explain(self, index: Array, row: int) -> Explanation:
         """One constraint for people."""
-        text = f"control: u({index[0]:.6g}) in the {self.set.kind}"
-        return TimedExplanation(text, "control", text, float(index[0]), unit(self.set, index[None, 1:])[0])
+        time = float(self.times[self._places(index[:1])[0]])
+        text = f"{self.name}: {self.words.format(f'{time:.6g}')} in the {self.set.kind}"
+        return TimedExplanation(text, self.name, text, time, unit(self.set, index[None, 1:])[0])
 
-    def _piece(self, times: Array) -> np.ndarray:
-        return np.clip(
-            np.searchsorted(self.dictionary.breakpoints, times, side="right") - 1, 0, self.dictionary.pieces - 1
-        )
+    def _points(self, x: Array) -> Array:
+        """What the control does at every place, ``(q, m)``."""
+        answer: Array = (x.reshape(self.set.dimension, -1) @ self.values).T + self.offset
+        return answer
+
+    def _places(self, times: Array) -> np.ndarray:
+        return np.clip(np.searchsorted(self.starts, times, side="right") - 1, 0, self.starts.size - 1)

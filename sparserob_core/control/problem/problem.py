@@ -44,7 +44,8 @@ class OptimalControlProblem:
     ``piecewise_constant`` (every piece of the disturbance's dictionary in the set), ``measurable`` (any measurable
     function into the set), or ``l1_ball`` (the coefficients of channel ``i`` in the dictionary have absolute sum at
     most ``upper_i`` of a symmetric box: a far smaller set). ``initial_control``: the control ``(m,)`` before time 0, or
-    ``None`` where it does not matter. After construction ``weights`` is ``(m,)``, ``path`` and
+    ``None`` where it does not matter. ``control_step``: the set of every change ``u_{k+1} - u_k`` from one piece of the
+    control's dictionary to the next, of ``u_0 - initial_control`` too where that is told; ``None``: any. After construction ``weights`` is ``(m,)``, ``path`` and
     ``terminal`` are tuples, every window has its ``stop``, and constraints that restrict nothing are gone. An initial
     state outside a path set is legal: that problem is infeasible. Raises `InputError`.
     """
@@ -60,6 +61,7 @@ class OptimalControlProblem:
     terminal: Sequence[ConvexSet | Equality] = ()
     title: str = ""
     initial_control: npt.ArrayLike | None = None
+    control_step: ConvexSet | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.system, LinearSystem):
@@ -78,6 +80,9 @@ class OptimalControlProblem:
         self._set("weights", self._weights())
         self._set("initial_control", self._control_before())
         _checked_set("control", self.control, self.system.controls, "controls", bounded=True)
+        if self.control_step is not None:
+            step = _checked_set("control_step", self.control_step, self.system.controls, "controls")
+            self._set("control_step", None if _restricts_nothing(step) else step)
         self._check_disturbance()
         windows = [self._windowed(f"path.{i}", entry) for i, entry in enumerate(_listed("path", self.path))]
         self._set("path", tuple(window for window in windows if not _restricts_nothing(window.set)))

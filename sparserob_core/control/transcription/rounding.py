@@ -10,6 +10,7 @@ import numpy as np
 from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.transcription.record import Transcription
+from sparserob_core.control.transcription.steps import Steps
 from sparserob_core.control.transcription.transcribe import slanted
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.result import Result
@@ -72,16 +73,25 @@ def _added(model: Transcription, result: Result) -> float:
 
 
 def _neglected(model: Transcription, result: Result) -> float:
-    """What multipliers of the wrong sign cost on slanted sides ``H u <= h`` of the controls' set, at most.
+    """What multipliers of the wrong sign cost on slanted sides ``H u <= h`` of the controls' set, and of that of their
+    steps, at most; of steps with the rounding of what is added up to them.
 
     To the program ``s = H u`` has no lower bound, so that only ``z >= 0`` proves anything of ``-z s``; a negative ``z``
     within its own rounding counts as 0 there. On the set ``-z s`` is at least ``z`` times the largest ``-H u``.
     """
-    H, h = slanted(model.problem.control)
-    if result.dual.z is None or not h.size:
+    if result.dual.z is None:
         return 0.0
-    sides = result.dual.z.reshape(model.problem.system.controls + h.size, -1)[-h.size :]
-    return float(np.maximum(-sides, 0.0).sum(axis=1) @ np.maximum(model.problem.control.support(-H), 0.0))
+    (H, h), bound = slanted(model.problem.control), model.problem.control
+    controls, pieces = model.problem.system.controls, model.control.pieces
+    sides, others = np.split(result.dual.z[controls * pieces :], [h.size * pieces])
+    lost = float(np.maximum(-sides, 0.0).reshape(h.size, pieces).sum(axis=1) @ np.maximum(bound.support(-H), 0.0))
+    steps = Steps.of(model.problem, model.control)
+    if steps.count:
+        table, far = others.reshape(steps.upper.size, steps.times.size), 2.0 * np.abs(steps.H) @ _far(bound)
+        wrong = np.where(np.isfinite(steps.upper), 0.0, np.maximum(table, 0.0).sum(axis=1))
+        wrong += np.where(np.isfinite(steps.lower), 0.0, np.maximum(-table, 0.0).sum(axis=1))
+        lost += float((wrong + SHARE * np.abs(table).sum(axis=1)) @ far)
+    return lost
 
 
 def _far(convex: ConvexSet) -> Array:

@@ -35,6 +35,7 @@ from sparserob_core.control.transcription.own_units import (
 )
 from sparserob_core.control.transcription.provable import hindrance
 from sparserob_core.control.transcription.record import RowUnits, Transcription
+from sparserob_core.control.transcription.steps import Steps, paired
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, Formulation, OwnUnits, SemiInfiniteProgram
@@ -127,7 +128,10 @@ def _assembled(
         b = np.where(A.any(axis=1) | (np.abs(b) > TOLERANCE), b, 0.0)  # no control enters, and rounding is missing
     families = [family_of(constraint) for constraint in constraints]
     if problem.control.halfspaces() is None:
-        families.append(ControlConstraint(problem.control, control).family())
+        families.append(ControlConstraint.of_values(problem.control, control).family())
+    step, before = problem.control_step, problem.initial_control
+    if step is not None and step.halfspaces() is None and (control.pieces > 1 or before is not None):
+        families.append(ControlConstraint.of_steps(step, control, before).family())
     if formulation == "literal":
         families = [family.literal or family for family in families]
     program = SemiInfiniteProgram(
@@ -183,10 +187,12 @@ def _in_own_units(model: Transcription) -> OwnUnits:
     assert rows is not None
     theirs, ours = slanted(model.problem.control)[0], slanted(own.problem.control)[0]
     sides = _ratio(theirs, ours / rows.sides[:, None], units.controls)
+    steps, mine = Steps.of(model.problem, model.control), Steps.of(own.problem, own.control).divided(rows.steps)
+    pieces = np.repeat(np.concatenate([units.controls, sides]), own.control.pieces)
     return OwnUnits(
         program=own.program,
         decision=np.repeat(units.controls, own.control.functions),
-        image=np.repeat(np.concatenate([units.controls, sides]), own.control.pieces),
+        image=np.concatenate([pieces, np.repeat(_ratio(steps.H, mine.H, units.controls), steps.times.size)]),
         equalities=_fixed(model.problem) @ units.states * rows.fixed,
         cost=units.cost,
     )
@@ -200,7 +206,17 @@ def _row_units(problem: OptimalControlProblem, functionals: WorstCase, A: Array)
     H, h = slanted(problem.control)
     size = np.abs(H) @ extent(problem.control)
     sides = units_of_sides(H, h, problem.control.reach(H), size) if h.size else h
-    return RowUnits(sides, power_of_two(np.where(entered, 1.0, RESOLVED) * added), entered)
+    return RowUnits(sides, _step_units(problem), power_of_two(np.where(entered, 1.0, RESOLVED) * added), entered)
+
+
+def _step_units(problem: OptimalControlProblem) -> Array:
+    """The unit ``(r,)`` of every row of the control's steps, the least of those of its two sides."""
+    H, lower, upper = paired(problem.control_step, problem.system.controls)
+    if problem.control_step is None or not upper.size:
+        return upper
+    both, far = np.vstack([H, -H]), 2.0 * np.abs(H) @ extent(problem.control)
+    reach = np.minimum(problem.control_step.reach(both), np.tile(far, 2))
+    return units_of_sides(both, np.concatenate([upper, -lower]), reach, np.tile(far, 2)).reshape(2, -1).min(axis=0)
 
 
 def _shares(one: StateConstraint, other: StateConstraint) -> Array:
@@ -331,7 +347,8 @@ def _name(kind: str, position: int, count: int) -> str:
 def _image(
     problem: OptimalControlProblem, dictionary: Dictionary, rows: RowUnits | None
 ) -> tuple[csc_array | None, Array, Array, Array]:
-    """The control on every piece, its bounds and weights, and one more image per piece and side of a polytope."""
+    """The control on every piece, its bounds and weights, one more image per piece and side of a polytope, and one per
+    step and side of the set of its changes."""
     from scipy.sparse import csc_array, eye_array, kron, vstack
 
     bound, channels = problem.control, problem.system.controls
@@ -344,20 +361,25 @@ def _image(
     values = csc_array(dictionary.values.T)
     H, h = slanted(bound)
     H, h = (H, h) if rows is None else (H / rows.sides[:, None], h / rows.sides)
-    if not h.size:
+    steps = Steps.of(problem, dictionary)
+    steps = steps if rows is None else steps.divided(rows.steps)
+    if not h.size and not steps.count:
         return (
             (None if dictionary.is_indicators else csc_array(kron(eye_array(channels), values))),
             lower,
             upper,
             weights,
         )
-    S = csc_array(vstack([kron(eye_array(channels), values), kron(csc_array(H), values)]))
-    extra = np.repeat(h, dictionary.pieces)
+    blocks = [kron(eye_array(channels), values)]
+    blocks += [kron(csc_array(H), values)] if h.size else []
+    blocks += [steps.rows] if steps.count else []
+    S = csc_array(vstack(blocks))
+    extra, (least, most) = np.repeat(h, dictionary.pieces), steps.bounds()
     return (
         S,
-        np.concatenate([lower, np.full(extra.size, -np.inf)]),
-        np.concatenate([upper, extra]),
-        np.concatenate([weights, np.zeros(extra.size)]),
+        np.concatenate([lower, np.full(extra.size, -np.inf), least]),
+        np.concatenate([upper, extra, most]),
+        np.concatenate([weights, np.zeros(extra.size + steps.count)]),
     )
 
 

@@ -98,9 +98,12 @@ def _besides(name: str, data: object, read: set[str]) -> set[str]:
 
 
 def _of_a_curved_set_of_controls(case: Case, entry: object) -> bool:
-    """Whether a multiplier is one of a control's own set, which no parameter changes, and yet has a parameter."""
-    own = not any(window.name == "control" for window in case.windows)
-    return own and isinstance(entry, Mapping) and entry.get("constraint") == "control" and bool(entry.get("parameter"))
+    """Whether a multiplier is one of a control's own set or its steps', which no parameter changes, and yet has a
+    parameter."""
+    if not isinstance(entry, Mapping) or entry.get("constraint") not in ("control", "control_step"):
+        return False
+    own = not any(window.name == entry["constraint"] for window in case.windows)
+    return own and bool(entry.get("parameter"))
 
 
 def _flat(shape: ConvexSet) -> bool:

@@ -206,6 +206,10 @@ class LinearProblem(LinearKeys):
     initial_control: OneOrMore | None = None
     """Control before time 0, one number per control; a number serves every control. Not told unless given."""
 
+    control_step: SetOptions | None = None
+    """Set of the change of the control from one piece of its dictionary to the next, and from ``initial_control`` to
+    the first piece where that is given; any change unless given."""
+
     def build(self) -> OptimalControlProblem:
         """The problem; raises `InputError` that begins with the key at fault."""
         system = self.system.build()
@@ -220,6 +224,9 @@ class LinearProblem(LinearKeys):
             path=self.windows(system.states),
             terminal=self.ends(system.states),
             initial_control=self._control_before(system.controls),
+            control_step=(
+                None if self.control_step is None else self.control_step.build("control_step", system.controls)
+            ),
         )
 
     def _control_before(self, controls: int) -> list[float] | None:

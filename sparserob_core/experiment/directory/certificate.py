@@ -11,6 +11,7 @@ import numpy as np
 from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.sets.sets import ConvexSet
+from sparserob_core.control.transcription.steps import Steps
 from sparserob_core.control.transcription.transcribe import slanted
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment
 from sparserob_core.sip.convex_set import Array
@@ -27,7 +28,7 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
     was reached.
 
     ``cost`` and ``lower_bound`` are as in ``result.json``. ``multipliers``: of constraints at a time, a parameter and a
-    normal direction, of equalities, and of the control's pieces where the dictionary is not that of their indicators.
+    normal direction (of the state, or of the control and its steps), of equalities, and of the control's pieces where the dictionary is not that of their indicators.
     ``proof``: per constraint the cells ``[lower, upper]`` of (time, parameters, directions) on which it was shown, to
     ``tolerance`` in each row's own unit (decision 0016); a direction ``z`` of a curved set stands for ``z normals``.
     ``witness``: what refutes the decision.
@@ -50,14 +51,16 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
         "lower_bound": result.lower_bound,
         "gap_tolerance": experiment.gap_tolerance,
         "decision": theta,
-        "multipliers": _multipliers(problem, program, result),
+        "multipliers": _multipliers(experiment, result),
         "proof": {proof.family: _cells(experiment, proof) for proof in result.proofs if proof.verdict == "proven"},
         "witness": _witness(problem, program, result) if result.status == "refuted" else None,
     }
 
 
-def _multipliers(problem: OptimalControlProblem, program: SemiInfiniteProgram, result: Result) -> dict[str, Any] | None:
+def _multipliers(experiment: ControlExperiment, result: Result) -> dict[str, Any] | None:
     """``None`` unless every constraint can be stated in numbers: a sampled one, of the scenario approach, cannot."""
+    problem, program, z = experiment.problem, experiment.program, result.dual.z
+    steps = Steps.of(problem, experiment.control)
     explained = [
         (cut, said)
         for cut in result.dual.cuts
@@ -70,23 +73,27 @@ def _multipliers(problem: OptimalControlProblem, program: SemiInfiniteProgram, r
             {
                 "constraint": cut.family,
                 "time": said.time,
-                "parameter": _parameter(problem, said),
+                "parameter": [] if cut.family == "control_step" else _parameter(problem, said),
                 "direction": _direction(said),
                 "multiplier": cut.multiplier,
             }
             for cut, said in explained
+        ]
+        + [
+            {"constraint": "control_step", "time": t, "parameter": [], "direction": c + 0.0, "multiplier": y}
+            for t, c, y in ([] if z is None or not steps.count else steps.priced(z[-steps.count :]))
         ],
         "equalities": result.dual.mu,
-        "pieces": _on_pieces(problem, result.dual.z),
+        "pieces": _on_pieces(problem, z, experiment.control.pieces),
     }
 
 
-def _on_pieces(problem: OptimalControlProblem, z: Array | None) -> Array | None:
-    """The multipliers of the control ``(m, K)`` on its pieces, those of its set's slanted sides folded in."""
+def _on_pieces(problem: OptimalControlProblem, z: Array | None, pieces: int) -> Array | None:
+    """The multipliers of the control ``(m, K)`` on its ``pieces``, those of its set's slanted sides folded in."""
     if z is None:
         return None
     m, (sides, _) = problem.system.controls, slanted(problem.control)
-    rows = z.reshape(m + sides.shape[0], -1)
+    rows = z[: (m + sides.shape[0]) * pieces].reshape(-1, pieces)
     answer: Array = rows[:m] + sides.T @ rows[m:]
     return answer
 

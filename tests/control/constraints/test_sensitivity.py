@@ -261,7 +261,7 @@ def test_the_slope_at_a_breakpoint_is_from_the_left_and_at_the_start_from_the_ri
 @pytest.mark.parametrize("sets", sorted(CURVED))
 def test_a_curved_set_of_controls_has_slopes_in_its_direction(sets):
     rng = np.random.default_rng(15)
-    family = ControlConstraint(CURVED[sets], GRIDS["uneven"]).family()
+    family = ControlConstraint.of_values(CURVED[sets], GRIDS["uneven"]).family()
     indices = indices_in(rng, family, 20)
     assert_it_is_the_derivative(family, rng.normal(size=12), indices, np.zeros(20, dtype=int))
 
