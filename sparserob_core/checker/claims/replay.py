@@ -48,7 +48,8 @@ def exceeded(case: Case, said: Mapping[str, object]) -> tuple[list[float], float
     that is known: `said` holds the names ``constraint``, ``time``, ``parameter`` and ``violation``. Raises `Broken`
     where these are none, `Unchecked` for a curved set."""
     name = str(said.get("constraint"))
-    if name == "control" and facets(case.problem.control) is None:
+    of_control = {"control": case.problem.control, "control_step": case.problem.control_step}.get(name)
+    if of_control is not None and facets(of_control) is None:
         raise Unchecked("the worst direction of a curved set is not told")
     window, time = case.window(name), number(said, "time")
     parameter = numbers(said.get("parameter"), "parameter")

@@ -318,7 +318,7 @@ def units(shape: ConvexSet) -> list[float]:
 def _reach(shape: ConvexSet, direction: Array) -> float:
     try:
         return abs(float(support(shape, balls(direction)).mid()))
-    except Broken:  # unbounded there
+    except (Broken, Unchecked):  # unbounded there, or nowhere cornered
         return math.inf
 
 

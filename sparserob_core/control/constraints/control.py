@@ -58,7 +58,7 @@ class ControlConstraint:
         offset = np.zeros((steps.size, convex.dimension))
         if before is not None:
             offset[0] = -before
-        values = np.diff(dictionary.values, axis=1, **({} if first else {"prepend": 0.0}))
+        values = changes(dictionary.values, before is not None)
         return ControlConstraint(
             "control_step", convex, values, offset, steps, dictionary.horizon, steps, "the change of u at {}"
         )
@@ -125,3 +125,10 @@ class ControlConstraint:
 
     def _places(self, times: Array) -> np.ndarray:
         return np.clip(np.searchsorted(self.starts, times, side="right") - 1, 0, self.starts.size - 1)
+
+
+def changes(values: Array, at_start: bool) -> Array:
+    """What rows of values ``(N, K)`` change by from one to the next, ``(N, q)``; ``at_start``: from 0 before the first
+    too."""
+    answer: Array = np.diff(np.hstack([np.zeros((values.shape[0], int(at_start))), values]), axis=1)
+    return answer

@@ -45,7 +45,8 @@ class OptimalControlProblem:
     function into the set), or ``l1_ball`` (the coefficients of channel ``i`` in the dictionary have absolute sum at
     most ``upper_i`` of a symmetric box: a far smaller set). ``initial_control``: the control ``(m,)`` before time 0, or
     ``None`` where it does not matter. ``control_step``: the set of every change ``u_{k+1} - u_k`` from one piece of the
-    control's dictionary to the next, of ``u_0 - initial_control`` too where that is told; ``None``: any. After construction ``weights`` is ``(m,)``, ``path`` and
+    control's dictionary to the next, of ``u_0 - initial_control`` too where that is told; ``None``: any. After
+    construction ``weights`` is ``(m,)``, ``path`` and
     ``terminal`` are tuples, every window has its ``stop``, and constraints that restrict nothing are gone. An initial
     state outside a path set is legal: that problem is infeasible. Raises `InputError`.
     """

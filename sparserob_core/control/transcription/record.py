@@ -19,7 +19,8 @@ from sparserob_core.sip.program import ConstraintFamily, Formulation, SemiInfini
 @dataclass(frozen=True, eq=False)
 class RowUnits:
     """What the rows of a program in own units were divided by, beside those of its constraints: the slanted ``sides``
-    of the controls, those of their ``steps``, and the terminal equalities, ``fixed (e,)``. ``entered (e,)``: whether a control enters that."""
+    of the controls, those of their ``steps``, and the terminal equalities, ``fixed (e,)``. ``entered (e,)``: whether a
+    control enters that."""
 
     sides: Array
     steps: Array

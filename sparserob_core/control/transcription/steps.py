@@ -8,12 +8,18 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
+from sparserob_core.control.constraints.control import changes
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.problem.units import power_of_two
+from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
+
+MOST_CUTS = 60  # rounds of tangents
+CLOSE = 1e-7  # of the control's range, a point that is as good as inside
 
 
 @final
@@ -36,8 +42,7 @@ class Steps:
     def of(problem: OptimalControlProblem, dictionary: Dictionary) -> Steps:
         """Those of a problem: none where its steps are free, or their set is curved."""
         H, lower, upper = paired(problem.control_step, problem.system.controls)
-        before = None if problem.initial_control is None else np.asarray(problem.initial_control, dtype=float)
-        return Steps(H, lower, upper, dictionary, before)
+        return Steps(H, lower, upper, dictionary, before(problem))
 
     def divided(self, units: Array) -> Steps:
         """The same with rows divided by ``units (r,)``."""
@@ -58,7 +63,7 @@ class Steps:
         """The entries as rows of the decision, ``(r q, m N)``."""
         from scipy.sparse import csc_array, kron
 
-        return csc_array(kron(csc_array(self.H), csc_array(changes(self.dictionary, self.before is not None).T)))
+        return csc_array(kron(csc_array(self.H), csc_array(changes(self.dictionary.values, self.before is not None).T)))
 
     def bounds(self) -> tuple[Array, Array]:
         """The least and the largest value of every entry, ``(r q,)`` each."""
@@ -76,9 +81,9 @@ class Steps:
         ]
 
 
-def changes(dictionary: Dictionary, at_start: bool) -> Array:
-    """What every function of a dictionary changes by at its steps, ``(N, q)``; ``at_start``: from 0 before time 0."""
-    return np.diff(dictionary.values, axis=1, **({"prepend": 0.0} if at_start else {}))
+def before(problem: OptimalControlProblem) -> Array | None:
+    """The control ``(m,)`` before time 0, where it is told."""
+    return None if problem.initial_control is None else np.asarray(problem.initial_control, dtype=float)
 
 
 def paired(convex: ConvexSet | None, dimension: int) -> tuple[Array, Array, Array]:
@@ -98,3 +103,56 @@ def paired(convex: ConvexSet | None, dimension: int) -> tuple[Array, Array, Arra
         kept.append((normal, -np.inf, float(height)))
     H, lower, upper = zip(*kept, strict=True)
     return np.array(H), np.array(lower), np.array(upper)
+
+
+def refuse_without_steps(problem: OptimalControlProblem, dictionary: Dictionary) -> None:
+    """Raise `InputError` where no control in its set takes steps within theirs, whatever the state does.
+
+    A control that never changes takes steps of 0, so that this is looked at only where 0 is no step, or the control
+    before time 0 is none of the set. By cutting planes (Kelley 1960): what is refused here is proven.
+    """
+    step, m = problem.control_step, problem.system.controls
+    start = before(problem)
+    still = step is None or bool(step.contains(np.zeros(m)))
+    if step is None or (still and (start is None or bool(problem.control.contains(start)))):
+        return
+    K, units = 1 if still else dictionary.pieces, power_of_two(problem.control.reach(np.eye(m)))
+    steps = changes(np.eye(K), start is not None).T
+    first = np.zeros((len(steps), m)) if start is None else np.vstack([-start / units, np.zeros((K - 1, m))])
+    held = [(problem.control.in_units(units), np.eye(K), np.zeros((K, m))), (step.in_units(units), steps, first)]
+    if _cut_off(held, K, m):
+        known = "" if start is None else f" and begins at the initial_control {start.tolist()}"
+        raise InputError(f"no control that stays in its set{known} changes by such steps only", path="control_step")
+
+
+def _cut_off(held: list[tuple[ConvexSet, Array, Array]], K: int, m: int) -> bool:
+    """Whether tangents show that no ``u (K, m)`` has every row of ``M u + offset`` in its set, for all ``(set, M,
+    offset)``."""
+    from scipy.optimize import linprog
+
+    rows: list[Array] = []
+    heights: list[float] = []
+    axes = np.vstack([np.eye(m), -np.eye(m)])
+    cuts = [(convex, M, offset, place, c) for convex, M, offset in held for place in range(len(M)) for c in axes]
+    for _ in range(MOST_CUTS):
+        for convex, M, offset, place, c in cuts:
+            height = float(convex.support(c[None])[0])
+            if np.isfinite(height):
+                rows.append(np.kron(M[place], c))
+                heights.append(height - float(c @ offset[place]))
+        found = linprog(np.zeros(K * m), rows, heights, bounds=(None, None), method="highs")
+        if found.status == 2:
+            return True
+        if found.x is None:
+            return False
+        points = [(convex, M, offset, M @ found.x.reshape(K, m) + offset) for convex, M, offset in held]
+        cuts = []
+        for convex, M, offset, at in points:
+            flat = convex.halfspaces()
+            outside = np.flatnonzero(convex.violation(at) > CLOSE * (1.0 + np.abs(at).max(initial=0.0)))
+            for number in outside.tolist():
+                normals = convex.normal(at[[number]]) if flat is None else flat[0]
+                cuts += [(convex, M, offset, number, c) for c in normals]
+        if not cuts:
+            return False
+    return False

@@ -35,7 +35,7 @@ from sparserob_core.control.transcription.own_units import (
 )
 from sparserob_core.control.transcription.provable import hindrance
 from sparserob_core.control.transcription.record import RowUnits, Transcription
-from sparserob_core.control.transcription.steps import Steps, paired
+from sparserob_core.control.transcription.steps import Steps, before, paired, refuse_without_steps
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, Formulation, OwnUnits, SemiInfiniteProgram
@@ -72,7 +72,8 @@ def prepare(
     formulation: Literal["reduced", "literal"] = "reduced",
 ) -> Transcription:
     """The program of a problem on its dictionaries, with everything that it was made of. Raises `InputError` when a
-    dictionary does not span the horizon, and for terminal equalities that no control can meet."""
+    dictionary does not span the horizon, and for terminal equalities that no control can meet, or steps that none can
+    take."""
     for name, dictionary in (("control", control), ("disturbance", disturbance)):
         if abs(dictionary.horizon - problem.horizon) > 1e-12 * problem.horizon:
             raise InputError(
@@ -83,6 +84,7 @@ def prepare(
                 f"{name} dictionary: a piece is {dictionary.lengths.min():.2g} long, "
                 f"which is rounding for a horizon of {problem.horizon:g}"
             )
+    refuse_without_steps(problem, control)
     model = _assembled(problem, control, disturbance, formulation)
     return replace(model, program=model.program.mirrored(lambda _: _in_own_units(model)))
 
@@ -129,9 +131,9 @@ def _assembled(
     families = [family_of(constraint) for constraint in constraints]
     if problem.control.halfspaces() is None:
         families.append(ControlConstraint.of_values(problem.control, control).family())
-    step, before = problem.control_step, problem.initial_control
-    if step is not None and step.halfspaces() is None and (control.pieces > 1 or before is not None):
-        families.append(ControlConstraint.of_steps(step, control, before).family())
+    step, first = problem.control_step, before(problem)
+    if step is not None and step.halfspaces() is None and (control.pieces > 1 or first is not None):
+        families.append(ControlConstraint.of_steps(step, control, first).family())
     if formulation == "literal":
         families = [family.literal or family for family in families]
     program = SemiInfiniteProgram(
@@ -216,7 +218,8 @@ def _step_units(problem: OptimalControlProblem) -> Array:
         return upper
     both, far = np.vstack([H, -H]), 2.0 * np.abs(H) @ extent(problem.control)
     reach = np.minimum(problem.control_step.reach(both), np.tile(far, 2))
-    return units_of_sides(both, np.concatenate([upper, -lower]), reach, np.tile(far, 2)).reshape(2, -1).min(axis=0)
+    units = units_of_sides(both, np.concatenate([upper, -lower]), reach, np.tile(far, 2))
+    return np.asarray(units.reshape(2, -1).min(axis=0))
 
 
 def _shares(one: StateConstraint, other: StateConstraint) -> Array:

@@ -28,7 +28,8 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
     was reached.
 
     ``cost`` and ``lower_bound`` are as in ``result.json``. ``multipliers``: of constraints at a time, a parameter and a
-    normal direction (of the state, or of the control and its steps), of equalities, and of the control's pieces where the dictionary is not that of their indicators.
+    normal direction (of the state, or of the control and its steps), of equalities, and of the control's pieces where
+    the dictionary is not that of their indicators.
     ``proof``: per constraint the cells ``[lower, upper]`` of (time, parameters, directions) on which it was shown, to
     ``tolerance`` in each row's own unit (decision 0016); a direction ``z`` of a curved set stands for ``z normals``.
     ``witness``: what refutes the decision.
