@@ -428,3 +428,32 @@ def test_cells_that_fill_a_box_are_accepted():
 def test_holes_and_overlaps_are_refused(rows):
     with pytest.raises(Broken):
         fill(*cells(rows), np.zeros(2), np.array([1.0, 3.0]))
+
+
+def test_the_remainder_is_as_small_as_the_last_coefficients_of_the_state():
+    """A control that changes its sign faster than the oscillation moves it little: a bound by the control's size alone
+    leaves 1.4e-4 here."""
+    system = LinearSystem(
+        parse_matrix("A", [["0", "1"], ["-1 - p1", "-0.1"]], ("p1",)),
+        np.array([[0.0], [1.0]]),
+        parameters=Box(np.array([-0.02]), np.array([0.02])),
+    )
+    control, none = uniform(80, 10.0), np.zeros(2)
+    with ctx.workprec(96):
+        tube, _, _ = tube_of(system, control, control, None, 3, (-1.0) ** np.arange(80), none)
+        found = tube.cells(79, 10.0, 10.0, np.eye(2))
+        coefficients = np.abs(np.array([poly.coefficients[0] for poly in found]))
+    assert max(poly.expansion for poly in found) < 0.2 * coefficients[:, 3].max()
+
+
+def test_a_series_leaves_out_no_more_than_its_precision_resolves():
+    """Entries of a matrix in units that are far apart: a small one beside a large one is known to many digits."""
+    known = Monomials(1, 1)
+    with ctx.workprec(200):
+        matrix = stacked([[arb(-0.5), arb(2.0**40)], [arb(2.0**-45), arb(-0.25)]])
+        found = Series(known, [matrix, matrix * 0]).exp().parts[0]
+        truth = matrix.exp()
+        assert all(
+            float(a.rad()) < 1e-30 * abs(float(b.mid())) for a, b in zip(found.entries(), truth.entries(), strict=True)
+        )
+        assert all(a.overlaps(b) for a, b in zip(found.entries(), truth.entries(), strict=True))

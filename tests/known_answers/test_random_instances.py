@@ -18,25 +18,16 @@ from tests.support.instances import config, instance, largest_violation, truth
 QUICK = 2
 COUNT = int(os.environ.get("SPARSEROB_INSTANCES", "300"))
 FIRST = int(os.environ.get("SPARSEROB_FIRST_INSTANCE", "300000"))
-FOUND = (301955, 420593, 420815)  # problems whose honest runs `check` once refused: taken whatever the numbers are
+# problems whose honest runs `check` once refused, or did not check: taken whatever the numbers are
+FOUND = (300270, 301955, 420593, 420815, 610056, 610151)
 SETS_THAT_ARE_NOT_CHECKED = "the checker has no bound of the support function of this"
-
-
-OPEN = {
-    300270: [
-        pytest.mark.xfail(
-            strict=True,
-            reason="the checker's cells of directions do not close on this ball of a p-norm, an honest `not checked`",
-        )
-    ]
-}
 
 
 def numbers():
     return [
         *range(FIRST, FIRST + QUICK),
         *(
-            pytest.param(seed, marks=[pytest.mark.slow, *OPEN.get(seed, ())])
+            pytest.param(seed, marks=pytest.mark.slow)
             for seed in sorted({*FOUND, *range(FIRST + QUICK, FIRST + COUNT)})
         ),
     ]

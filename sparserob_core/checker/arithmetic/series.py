@@ -11,8 +11,7 @@ if TYPE_CHECKING:
     from flint import arb, arb_mat
 
 SMALL = 0.25  # norm below which the exponential series is summed
-TERMS = 16  # of it: what is left out is below 1e-24 then
-TINY = 1e-6  # norm below which as many terms as the stride leave out less than 1e-31
+SPARE = 16  # bits of the working precision that what is left out of the series may take
 STRIDE = 4  # of the powers by which it is summed; divides the number of terms
 
 
@@ -86,7 +85,7 @@ class Series:
     def exp(self) -> Series:
         """The exponential: its series where the norm is small, and squaring back (Moler and Van Loan 2003, method 3),
         with the tail bounded."""
-        from flint import arb, arb_mat
+        from flint import arb, arb_mat, ctx
 
         if self.monomials.size == 1:
             return Series(self.monomials, [self.parts[0].exp()])
@@ -101,14 +100,16 @@ class Series:
         powers = [Series.constant(self.monomials, unit), small]
         while len(powers) <= STRIDE:
             powers.append(powers[-1] * small)
-        terms = STRIDE if size < TINY else TERMS
+        terms, left_out = STRIDE, arb(2) ** (SPARE - ctx.prec)
+        while not _tail(size, terms) < left_out:
+            terms += STRIDE
         factors = [1 / arb(order).fac() for order in range(terms + 1)]
         result = powers[0].scaled(factors[terms])
         for first in range(terms - STRIDE, -1, -STRIDE):  # Paterson and Stockmeyer 1973
             result = powers[STRIDE] * result
             for order in range(STRIDE):
                 result = result + powers[order].scaled(factors[first + order])
-        tail = arb_mat([[arb(0, (size ** (terms + 1) * 2 / arb(terms + 1).fac()).upper())] * n] * n)
+        tail = arb_mat([[arb(0, _tail(size, terms).upper())] * n] * n)
         parts = [part + tail if mine else part for part, mine in zip(result.parts, self._generated, strict=True)]
         result = Series(self.monomials, parts)
         for _ in range(halvings):
@@ -130,6 +131,14 @@ class Series:
             Series(self.monomials, [arb_mat([row[:n] for row in part[:n]]) for part in whole]),
             Series(self.monomials, [arb_mat([row[n:] for row in part[:n]]) for part in whole]),
         )
+
+
+def _tail(size: arb, terms: int) -> arb:
+    """A bound of what the exponential series adds after so many terms, of an argument of at most that ``size``, below
+    1."""
+    from flint import arb
+
+    return size ** (terms + 1) * 2 / arb(terms + 1).fac()
 
 
 def norm(matrix: arb_mat) -> arb:

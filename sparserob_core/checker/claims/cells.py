@@ -112,7 +112,7 @@ def _examine(place: Place, sides: Sides, todo: Sequence[Interval], left: _Left, 
     """Bound every cell of time; notes the bounds that will do, and sorts what will not."""
     for interval, found, tops in _batch(place, sides.rows, todo):
         tops = [
-            top if top <= 0.0 else _cut(place, row, poly)
+            top if top <= 0.0 else min(top, _cut(place, row, poly))
             for top, row, poly in zip(tops, sides.rows, found, strict=True)
         ]
         for top, row in zip(tops, sides.rows, strict=True):
@@ -121,7 +121,7 @@ def _examine(place: Place, sides: Sides, todo: Sequence[Interval], left: _Left, 
         failed = [(row, poly) for row, poly, top in zip(sides.rows, found, tops, strict=True) if not top <= 0.0]
         if not failed:
             continue
-        if _turn(place, sides, interval, failed):
+        if _turn(place, sides, interval, failed, max(tops)):
             left.turned.append(interval)
         elif place.box[0] and any(_to_blame(poly, interval) for _, poly in failed):
             left.wide.append(interval)
@@ -130,9 +130,12 @@ def _examine(place: Place, sides: Sides, todo: Sequence[Interval], left: _Left, 
             left.halves += _halves(interval)
 
 
-def _turn(place: Place, sides: Sides, interval: Interval, failed: Sequence[tuple[Bounded, Polynomial]]) -> bool:
-    """Whether a cell fails because its directions differ too much. Stops at a violation that is certain: at the cell's
-    start."""
+def _turn(
+    place: Place, sides: Sides, interval: Interval, failed: Sequence[tuple[Bounded, Polynomial]], worst: float
+) -> bool:
+    """Whether a cell fails, by at most ``worst``, because its directions differ too much: the one in its middle does
+    not fail, and the others lose more than half of what smaller cells of time and parameters would gain. Stops at a
+    violation that is certain: at the cell's start."""
     middle = sides.centre
     if middle is None:
         if sides.curved is None:
@@ -140,7 +143,8 @@ def _turn(place: Place, sides: Sides, interval: Interval, failed: Sequence[tuple
         return False
     ((_, (poly,), (top,)),) = _batch(place, [middle], [interval])
     _refute(place, interval, [(middle, poly)])
-    return top <= 0.0 or _cut(place, middle, poly) <= 0.0
+    top = top if top <= 0.0 else min(top, _cut(place, middle, poly))
+    return top <= 0.0 and worst - top > 0.5 * (poly.expansion + poly.kinks)
 
 
 def _refute(place: Place, interval: Interval, rows: Sequence[tuple[Bounded, Polynomial]]) -> None:

@@ -86,8 +86,13 @@ class Flow:
 @final
 @dataclass(frozen=True, eq=False)
 class Remainder:
-    """``n_j``, the summed norms of all coefficients of degree ``j`` anywhere in the box, obey
+    """``n_j``, the summed norms of the coefficients of degree ``j <= D`` of the state, and ``n_{D+1}``, the norm of
+    what the polynomial of degree ``D`` differs from the state by, anywhere in the box, obey
     ``n' <= growth n + source |u|``.
+
+    The difference ``e`` starts at 0, and ``e' = A e`` plus what the polynomial leaves of the equation: the products of
+    coefficients of ``A`` and of the state whose degrees add up to more than ``D``. So it is small where the last
+    coefficients of the state are, whatever bounds of their growth would say.
 
     ``growth (D+2, D+2)``; ``control (D+2, m)``, ``disturbance``: per degree, the norms of every column of ``B``, and of
     ``E``. ``transform`` ``T``: norms are those of ``T^-1 x``.
@@ -121,7 +126,8 @@ class Remainder:
 
         A = per_degree([inverse * a * exact for a in parts["A"]])
         A[0] = upper(logarithmic_norm(inverse * parts["A"][0] * exact))
-        growth = stacked([[A[i - j] if j <= i else arb(0) for j in range(degree + 1)] for i in range(degree + 1)])
+        table = [[A[i - j] if j <= i else arb(0) for j in range(degree + 1)] for i in range(degree)]
+        growth = stacked([*table, [*beyond(A), A[0]]])
         driven, columns = (
             [per_degree([inverse * column(e, c) for e in parts[name]]) for c in range(parts[name][0].ncols())]
             for name in ("B", "E")
@@ -133,6 +139,25 @@ class Remainder:
         from flint import arb
 
         return stacked([[size if j == 0 else arb(0)] for j in range(self.growth.nrows())])
+
+    def closer(self, norms: arb_mat, parts: Sequence[arb_mat], exponents: Sequence[Sequence[int]]) -> arb_mat:
+        """Bounds of ``norms``, replaced by the norms of the coefficients ``parts``, in the coordinates ``T``, where
+        these are smaller."""
+        from flint import arb
+
+        actual = [arb(0)] * (norms.nrows() - 1)
+        for e, part in zip(exponents, parts, strict=True):
+            actual[sum(e)] = actual[sum(e)] + norm(part)
+        kept = [upper(bound).min(upper(size)) for bound, size in zip(norms.entries(), actual, strict=False)]
+        return stacked([[size] for size in (*kept, upper(norms[norms.nrows() - 1, 0]))])
+
+
+def beyond(sizes: Sequence[arb]) -> list[arb]:
+    """For every degree ``j`` from 0 to ``D`` the sum of the ``sizes`` of degrees ``D + 1 - j`` to ``D + 1``: what a
+    coefficient of degree ``j`` is multiplied by in a product's terms beyond the degree ``D``."""
+    from flint import arb
+
+    return [sum(sizes[len(sizes) - 1 - j :], arb(0)) for j in range(len(sizes) - 1)]
 
 
 def stacked(table: Sequence[Sequence[arb]]) -> arb_mat:

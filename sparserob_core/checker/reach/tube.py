@@ -11,7 +11,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.series import Series, norm, upper
 from sparserob_core.checker.reach.disturbance_support import DisturbanceSupports, Scene
-from sparserob_core.checker.reach.flow import Flow, Remainder, held, in_time, stacked, up_to
+from sparserob_core.checker.reach.flow import Flow, Remainder, beyond, held, in_time, stacked, up_to
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.checker.sets.shapes import radius
 from sparserob_core.sip.convex_set import Array
@@ -19,6 +19,7 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
+STEPS = 16  # of the horizon, after which the norms of the transition's coefficients are looked at anew
 STATES_KEPT = 20_000  # enclosures of the state, per box of parameters
 
 
@@ -86,12 +87,10 @@ class Tube:
         found = [n]
         for k, u in enumerate(self.scene.control):
             growth, driven = self._growth(self._span(self.scene.grid[k], self.scene.grid[k + 1]))
-            n = self._up(growth * n + driven * _absolute(u))
+            seen = [rest.inverse * part for part in self.nodes[k + 1].parts]
+            n = rest.closer(growth * n + driven * _absolute(u), seen, self.flow.monomials.exponents)
             found.append(n)
         return found
-
-    def _up(self, balls: arb_mat) -> arb_mat:
-        return stacked([[upper(x)] for x in balls.entries()])
 
     def _span(self, start: float, stop: float) -> int:
         """The key of a duration; equal keys share one ball."""
@@ -198,14 +197,30 @@ class Tube:
 
     @cached_property
     def _support_per_size(self) -> arb:
-        from flint import arb
+        """By the norms of the transition's coefficients, which are looked at anew after every step."""
+        from flint import arb, arb_mat
 
         rest = self.remainder
         assert rest is not None and self.scene.disturbance is not None
-        total = held(rest.growth, rest.start(arb(1)), arb(self.scene.grid[-1]))[1]
-        last = rest.growth.nrows() - 1
-        columns = zip(radius(self.scene.disturbance), rest.disturbance, strict=True)
-        return sum((arb(w) * total[last - i, 0] * e for w, per in columns for i, e in enumerate(per)), arb(0))
+        length, n = arb(self.scene.grid[-1]) / STEPS, rest.growth.nrows()
+        T = arb_mat(rest.transform.tolist())
+        step = Series(
+            self.flow.monomials, [rest.inverse * part * T for part in self.flow.states.scaled(length).exp().parts]
+        )
+        growth, driven = held(rest.growth, arb_mat([[int(i == j) for j in range(n)] for i in range(n)]), length)
+        norms, transition, total = rest.start(arb(1)), step, rest.start(arb(0))
+        for _ in range(STEPS):
+            total = total + driven * norms
+            norms = rest.closer(growth * norms, transition.parts, self.flow.monomials.exponents)
+            transition = step * transition
+        return sum(
+            (
+                arb(w) * e * total[j, 0]
+                for w, per in zip(radius(self.scene.disturbance), rest.disturbance, strict=True)
+                for j, e in enumerate([*beyond(per), per[0]])
+            ),
+            arb(0),
+        )
 
 
 def _absolute(inputs: arb_mat) -> arb_mat:
