@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
+from sparserob_core.arguments import share, whole
 from sparserob_core.control.problem.dictionary import Dictionary, DictionaryFactory
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.errors import InputError, named
@@ -76,9 +77,9 @@ def solve(
         maximiser=component(registry, "maximiser", maximiser, Maximiser),
         regulariser=None if regulariser is None else component(registry, "regulariser", regulariser, Regulariser),
         continuation=steps,
-        budget=_whole("budget", budget, 1),
-        polish=_share(polish),
-        rng=np.random.default_rng(_whole("seed", seed, 0)),
+        budget=whole("budget", budget, 1),
+        polish=share("polish", polish),
+        rng=np.random.default_rng(whole("seed", seed, 0)),
         notify=_heard(notify),
         deadline=deadline,
     )
@@ -133,8 +134,8 @@ def maximise(
     return search(
         Target(f if callback is None else _told(f, _careful("callback", callback)), box, gradient),
         chosen,
-        _whole("budget", budget, 1),
-        np.random.default_rng(_whole("seed", seed, 0)),
+        whole("budget", budget, 1),
+        np.random.default_rng(whole("seed", seed, 0)),
         Rules(polish=share, seconds=np.inf if limit is None else limit),
         notify if notify is ignore else _careful("notify", notify),
         _placed(start, box),
@@ -164,7 +165,7 @@ def ask_tell(
 
     chosen, share = _chosen(box, name, options, polish)
     first, rules = _placed(start, box), Rules(polish=share)
-    number, calls = _whole("seed", seed, 0), _whole("budget", budget, 1)
+    number, calls = whole("seed", seed, 0), whole("budget", budget, 1)
     entry: object = {"name": name, **options} if isinstance(name, str) else name
     about = {
         "maximiser": dict(entry) if isinstance(entry, Mapping) else type(entry).__name__,
@@ -193,7 +194,7 @@ def _chosen(
         raise InputError(f"{', '.join(options)}: options as keywords need the maximiser's name, got {name!r}")
     entry = {"name": name, **options} if isinstance(name, str) else name
     chosen: Maximiser = component(load_registry(), "maximiser", entry, Maximiser)
-    return chosen, chosen.polished if polish is None else _share(polish)
+    return chosen, chosen.polished if polish is None else share("polish", polish)
 
 
 def _placed(start: object, box: Box) -> Array | None:
@@ -314,19 +315,3 @@ def _heard(notify: Notify) -> Callable[[Any], None]:
             heard(event)
 
     return pass_on
-
-
-def _share(polish: object) -> float:
-    if (
-        isinstance(polish, bool)
-        or not isinstance(polish, int | float | np.integer | np.floating)
-        or not 0.0 <= polish < 1.0
-    ):
-        raise InputError(f"polish: expected a share of the budget, at least 0 and below 1, got {polish!r}")
-    return float(polish)
-
-
-def _whole(name: str, value: object, least: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise InputError(f"{name}: expected a whole number of at least {least}, got {value!r}")
-    return int(value)

@@ -8,6 +8,7 @@ from typing import final
 
 import numpy as np
 
+from sparserob_core.arguments import whole
 from sparserob_core.errors import InputError
 
 SURE = 1e-6  # the probability beta of drawing scenarios for which a bound fails
@@ -115,9 +116,8 @@ def _log_terms(scenarios: int, support: int, epsilon: float, m: np.ndarray) -> n
     )
 
 
-def _check(scenarios: object, name: str, count: object, least: int, beta: float) -> None:
-    for what, value, smallest in (("scenarios", scenarios, 1), (name, count, least)):
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < smallest:
-            raise InputError(f"{what}: expected a whole number of at least {smallest}, got {value!r}")
+def _check(scenarios: int, name: str, count: int, least: int, beta: float) -> None:
+    whole("scenarios", scenarios, 1)
+    whole(name, count, least)
     if not 0.0 < beta < 1.0:
         raise InputError(f"beta: expected a probability between 0 and 1, got {beta!r}")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sparserob_core.arguments import share, whole
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.benchmark.files import prepared, shipped, write
 from sparserob_core.experiment.benchmark.landscapes import SUITES, Landscape, landscapes
@@ -48,11 +49,11 @@ def benchmark(
     """
     if not maximisers:
         raise InputError("maximisers: expected at least one, got none")
-    calls, repeats = _whole("budget", budget), _whole("seeds", seeds)
+    calls, repeats = whole("budget", budget, 1), whole("seeds", seeds, 1)
     if not 0.0 < accuracy < 1.0:
         raise InputError(f"accuracy: expected a number above 0 and below 1, got {accuracy!r}")
     place = None if out is None else prepared(Path(out))
-    registry, rules = load_registry(), Rules(polish=polish)
+    registry, rules = load_registry(), Rules(polish=share("polish", polish))
     names = _labels(maximisers)
     chosen = [component(registry, "maximiser", choice, Maximiser) for choice in maximisers]
     every = list(landscapes(suites, _configs(configs) if "g" in suites else ()))
@@ -120,12 +121,6 @@ def _search(landscape: Landscape, name: str, maximiser: Maximiser, budget: int, 
             f"{landscape.name}: the value {report.best_value:.12g} exceeds its maximum {landscape.maximum:.12g}"
         )
     return Search(landscape, name, seed, report.trace.best, own, report.best_point)
-
-
-def _whole(name: str, value: object) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-        raise InputError(f"{name}: expected a whole number of at least 1, got {value!r}")
-    return int(value)
 
 
 def _configs(configs: Sequence[str | Path] | None) -> list[Path]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from sparserob_core.arguments import whole
 from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.sets.sets import Equality
@@ -55,8 +56,8 @@ def initial_states(
     ``limits.seconds`` of the config, end the search with what it has proven by then. Raises
     `InputError` when an argument or the config is at fault, and when the set is unbounded.
     """
-    _whole("directions", directions, 4)
-    _whole("values", values, 0)
+    whole("directions", directions, 4)
+    whole("values", values, 0)
     limit = _limit(within)
     loaded = load_config(config, overrides)
     experiment = assemble(loaded)
@@ -156,11 +157,6 @@ def _path(problem: OptimalControlProblem, found: InitialStates) -> tuple[Array, 
     sets = [entry.set for entry in problem.path if isinstance(entry, PathConstraint) and entry.start == 0.0]
     view = 10.0 * float(np.abs(found.outer - middle).max())
     return tuple(section(one, found.origin, found.states, middle, view) for one in sets)
-
-
-def _whole(name: str, value: object, least: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise InputError(f"{name}: expected a whole number of at least {least}, got {value!r}")
 
 
 def _written(directory: RunDirectory, found: InitialStates) -> InitialStates:

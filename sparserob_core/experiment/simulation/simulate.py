@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
+from sparserob_core.arguments import whole
 from sparserob_core.control.constraints.flat import INSIDE
 from sparserob_core.control.response.response import Response
 from sparserob_core.control.studies.laws import LawName, Uncertainty
@@ -264,13 +265,8 @@ def _checked(law: str, trajectories: int | None, seed: int) -> int:
             "trajectories: the law adversary replays one trajectory per constraint; expected no number, got"
             f" {trajectories!r}"
         )
-    for name, value, least in (
-        ("trajectories", TRAJECTORIES if trajectories is None else trajectories, 1),
-        ("seed", seed, 0),
-    ):
-        if isinstance(value, bool) or not hasattr(value, "__index__") or value < least:
-            raise InputError(f"{name}: expected a whole number, at least {least}, got {value!r}")
-    return int(TRAJECTORIES if trajectories is None else trajectories)
+    whole("seed", seed, 0)
+    return TRAJECTORIES if trajectories is None else whole("trajectories", trajectories, 1)
 
 
 def _directory(run: object) -> Path:

@@ -12,6 +12,7 @@ from typing import Any, Literal, final
 
 import numpy as np
 
+from sparserob_core.arguments import is_whole
 from sparserob_core.errors import ConfigError, InputError
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.overrides import parse_overrides
@@ -241,14 +242,10 @@ def _arrangement(source: Source) -> tuple[Arrangement, int | None, int | None]:
         value = source.data.get(key)
         if value is not None and not drawn:
             raise _fault(source, key, f"is for points that are drawn (random, sobol), not for {points}")
-        if (value is not None or (drawn and key == "number")) and not _is_whole(value, least):
+        if (value is not None or (drawn and key == "number")) and not is_whole(value, least):
             raise _fault(source, key, f"must be a whole number of at least {least} (got {shown(value)})")
         numbers.append(value)
     return points, numbers[0], numbers[1]
-
-
-def _is_whole(value: object, least: int) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= least
 
 
 def _fault(source: Source, key: str, said: str) -> ConfigError:
@@ -277,7 +274,7 @@ def _seed(plan: Plan) -> int:
     """The seed of the base config, with which points are drawn."""
     fixed = (axis.values[0] for axis in plan.changes if axis.single and axis.path == ("seed",))
     changed = next(fixed, plan.base.data.get("seed", 0))
-    return changed if _is_whole(changed, 0) else 0
+    return changed if is_whole(changed, 0) else 0
 
 
 def _sobol(dimension: int, count: int, rng: np.random.Generator) -> np.ndarray:

@@ -15,6 +15,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, final
 
+from sparserob_core.arguments import is_whole
 from sparserob_core.errors import InputError, SparseRobError, named
 from sparserob_core.experiment.assemble import build
 from sparserob_core.experiment.config.load import load_config
@@ -109,7 +110,7 @@ def _number(points: Arrangement | None, number: int | None) -> int | None:
         raise InputError(path="points", expected="grid, zip, random or sobol", got=repr(points))
     if number is None and not drawn:
         return None
-    if not drawn or isinstance(number, bool) or not isinstance(number, int) or number < 1:
+    if not drawn or number is None or not is_whole(number, 1):
         raise InputError(
             path="number", expected="how many points to draw, with points random or sobol alone", got=repr(number)
         )

@@ -16,6 +16,7 @@ from typing import Any, Self, TypeAlias, final
 
 import numpy as np
 
+from sparserob_core.arguments import is_whole
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.maximiser import EvaluationError, Report, Trace
@@ -128,8 +129,7 @@ class AskTell:
         There are fewer than ``k`` where the maximiser must know values before it goes on; most want one point at a
         time. Raises `InputError` for a ``k`` below 1, and what the maximiser has raised.
         """
-        count: object = k
-        if k is not None and (isinstance(count, bool) or not isinstance(count, int | np.integer) or k < 1):
+        if k is not None and not is_whole(k, 1):
             raise InputError(f"ask: expected a number of points of at least 1, got {k!r}")
         waiting = self._waiting()
         if waiting is None:

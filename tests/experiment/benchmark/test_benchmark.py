@@ -99,6 +99,8 @@ def test_nobody_exceeds_the_certified_maximum_of_a_landscape_of_g_and_the_gradie
         ({"suites": ["standart"]}, "suite: expected one of"),
         ({"budget": 0}, "budget: expected a whole number"),
         ({"seeds": 1.5}, "seeds: expected a whole number"),
+        ({"polish": 1.0}, "polish: expected a share of the budget, at least 0 and below 1, got 1.0"),
+        ({"polish": True}, "polish: expected a share"),
         ({"accuracy": 0.0}, "accuracy: expected a number above 0"),
         ({"maximisers": []}, "maximisers: expected at least one"),
         ({"maximisers": ["sobol", "sobol"]}, "expected each one once"),
