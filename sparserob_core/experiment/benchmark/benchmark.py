@@ -10,10 +10,11 @@ import numpy as np
 
 from sparserob_core.arguments import share, whole
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.benchmark.files import prepared, shipped, write
+from sparserob_core.experiment.benchmark.files import shipped, write
 from sparserob_core.experiment.benchmark.landscapes import SUITES, Landscape, landscapes
 from sparserob_core.experiment.benchmark.searches import Benchmark, Search
 from sparserob_core.experiment.comparison.profiles import Instance, Profiles
+from sparserob_core.experiment.directory.artefacts import create_directory
 from sparserob_core.experiment.plugins.registry import load_registry
 from sparserob_core.experiment.run.events import StudyProgress
 from sparserob_core.experiment.solve import Choice, component
@@ -52,23 +53,28 @@ def benchmark(
     calls, repeats = whole("budget", budget, 1), whole("seeds", seeds, 1)
     if not 0.0 < accuracy < 1.0:
         raise InputError(f"accuracy: expected a number above 0 and below 1, got {accuracy!r}")
-    place = None if out is None else prepared(Path(out))
     registry, rules = load_registry(), Rules(polish=share("polish", polish))
     names = _labels(maximisers)
     chosen = [component(registry, "maximiser", choice, Maximiser) for choice in maximisers]
-    every = list(landscapes(suites, _configs(configs) if "g" in suites else ()))
-    searches: list[Search] = []
-    total, began = len(every) * len(names) * repeats, time.monotonic()
-    for landscape in every:
-        for name, maximiser in zip(names, chosen, strict=True):
-            for seed in range(repeats):
-                searches.append(_search(landscape, name, maximiser, calls, seed, rules))
-                gone = time.monotonic() - began
-                left = gone / len(searches) * (total - len(searches))
-                text = f"{landscape.name}: {len(searches)} of {total} searches, {left:.0f} s left"
-                notify(StudyProgress(text=text, done=len(searches), total=total))
-    found = _told(every, names, searches, calls, repeats, accuracy, suites)
-    return found if place is None else write(found, place)
+
+    def find() -> Benchmark:
+        every = list(landscapes(suites, _configs(configs) if "g" in suites else ()))
+        searches: list[Search] = []
+        total, began = len(every) * len(names) * repeats, time.monotonic()
+        for landscape in every:
+            for name, maximiser in zip(names, chosen, strict=True):
+                for seed in range(repeats):
+                    searches.append(_search(landscape, name, maximiser, calls, seed, rules))
+                    gone = time.monotonic() - began
+                    left = gone / len(searches) * (total - len(searches))
+                    text = f"{landscape.name}: {len(searches)} of {total} searches, {left:.0f} s left"
+                    notify(StudyProgress(text=text, done=len(searches), total=total))
+        return _told(every, names, searches, calls, repeats, accuracy, suites)
+
+    if out is None:
+        return find()
+    with create_directory(out, "benchmark", "") as directory:
+        return write(find(), directory)
 
 
 def _told(

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sparserob_core.errors import InputError
 from sparserob_core.experiment.comparison.profiles_figure import write_profiles
 from sparserob_core.experiment.directory.artefacts import RunDirectory, finite
 from sparserob_core.experiment.figures.style import missing_matplotlib
@@ -44,26 +43,14 @@ def shipped(name: str) -> Path:
     return next((place for place in places if place.exists()), places[-1])
 
 
-def prepared(place: Path) -> Path:
-    """The directory, made where it is missing; raises `InputError` for one that holds something."""
-    if place.exists() and (not place.is_dir() or any(place.iterdir())):
-        raise InputError(f"out: expected a new or empty directory, got {place}")
-    try:
-        place.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"out: {place} cannot be made: {error.strerror}") from error
-    return place
-
-
-def write(found: Benchmark, place: Path) -> Benchmark:
+def write(found: Benchmark, directory: RunDirectory) -> Benchmark:
     """Write everything; where matplotlib is missing the remarks say so."""
-    directory = RunDirectory(place)
     directory.write_json("benchmark.json", found.summary())
     for name, text in ioh_files(found):
         directory.write_text(name, text)
     if missing := missing_matplotlib():
         return replace(found, profiles=replace(found.profiles, undrawn=missing))
-    write_profiles(place / "profiles.png", found.profiles)
+    write_profiles(directory.path / "profiles.png", found.profiles)
     return found
 
 

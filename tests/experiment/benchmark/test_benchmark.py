@@ -63,8 +63,14 @@ def test_a_benchmark_is_the_same_twice_and_leaves_its_files(tmp_path):
     assert table.count("evaluations raw_y") == 2
     last = float(table[-1].split()[1])
     assert last == pytest.approx(facts["scenarios"][0]["runs"][-1]["best"]["y"], rel=1e-11)
-    with pytest.raises(sr.InputError, match="new or empty directory"):
+    with pytest.raises(sr.InputError, match=r"one: expected a new or an empty directory, got one that holds files$"):
         sr.benchmark(names, budget=60, seeds=2, out=tmp_path / "one")
+    (tmp_path / "file").touch()
+    with pytest.raises(sr.InputError, match=r"file: expected a directory, got a file$"):
+        sr.benchmark(names, budget=60, seeds=2, out=tmp_path / "file")
+    with pytest.raises(sr.InputError, match="nobody"):
+        sr.benchmark(["nobody"], out=tmp_path / "none")
+    assert not (tmp_path / "none").exists() and not list(tmp_path.rglob(".lock"))
 
 
 @pytest.mark.skipif(find_spec("ioh") is None, reason="ioh, of the extra bench, is not installed")
