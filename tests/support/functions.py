@@ -14,6 +14,18 @@ from dataclasses import dataclass
 import numpy as np
 
 import sparserob_core as sr
+from sparserob_core.experiment.benchmark.functions import (
+    GARLAND,
+    GARLAND_MAXIMUM,
+    HOLDER,
+    HOLDER_MAXIMUM,
+    ackley,
+    garland,
+    himmelblau,
+    holder,
+    rastrigin,
+    rosenbrock,
+)
 
 GARLAND_FLOOR = 2e-8  # what rounding of the argument leaves of the square root at the top of `garland1`
 TOP_OF_RASTRIGIN = np.array([0.7123, -1.3391, 1.0417])
@@ -35,10 +47,6 @@ class Landscape:
         return self.maximum - value
 
 
-def garland(x):
-    return (x * (1 - x) * (4 - np.sqrt(np.abs(np.sin(60 * x))))).sum(axis=1)
-
-
 def distance_to_inverse_e(x):
     return -np.abs(x[:, 0] - math.exp(-1))
 
@@ -53,10 +61,6 @@ def double_sine(x, centre=1 / math.e, rho=(0.3, 0.8)):
     return np.where(u > 0, wave * (safe**wide - safe**narrow) - safe**wide, 0.0)
 
 
-def holder(x):
-    return np.abs(np.sin(x[:, 0]) * np.cos(x[:, 1]) * np.exp(np.abs(1 - np.hypot(x[:, 0], x[:, 1]) / math.pi)))
-
-
 def complex_holder(x):
     """dlib's discontinuous relative of `holder`: bands of the first coordinate are shifted to and fro, and a fast wave
     is added."""
@@ -66,24 +70,6 @@ def complex_holder(x):
         moved = np.where((start < moved) & (moved < start + 0.5), moved + 0.25 * sign, moved)
         sign = -sign
     return holder(np.column_stack([moved, other])) - (moved + other) / 10 - np.sin(10 * moved) * np.cos(10 * other)
-
-
-def himmelblau(x):
-    return -((x[:, 0] ** 2 + x[:, 1] - 11) ** 2) - (x[:, 0] + x[:, 1] ** 2 - 7) ** 2
-
-
-def ackley(x, top=TOP_OF_ACKLEY):
-    far = np.sqrt(((x - top) ** 2).mean(axis=1))
-    return 20 * np.exp(-0.2 * far) + np.exp(np.cos(2 * math.pi * (x - top)).mean(axis=1)) - 20 - math.e
-
-
-def rastrigin(x, top=0.0):
-    z = x - top
-    return -(z**2 - 10 * np.cos(2 * math.pi * z) + 10).sum(axis=1)
-
-
-def rosenbrock(x):
-    return -(100 * (x[:, 1:] - x[:, :-1] ** 2) ** 2 + (x[:, :-1] - 1) ** 2).sum(axis=1)
 
 
 def sphere(x):
@@ -110,14 +96,11 @@ def _listed(*landscapes):
     return {landscape.name: landscape for landscape in landscapes}
 
 
-_TOP = math.pi / 6
 LANDSCAPES = _listed(
-    Landscape("garland1", garland, _cube(0, 1, 1), 4 * _TOP * (1 - _TOP), np.array([_TOP])),
+    Landscape("garland1", garland, _cube(0, 1, 1), GARLAND_MAXIMUM, np.array([GARLAND])),
     Landscape("inverse_e", distance_to_inverse_e, _cube(0, 1, 1), 0.0, np.array([math.exp(-1)])),
     Landscape("double_sine", double_sine, _cube(0, 1, 1), 0.0, np.array([math.exp(-1)])),
-    Landscape(
-        "holder2", holder, _cube(-10, 10, 2), 19.208502567886747, np.array([8.055023486477124, 9.664590040782658])
-    ),
+    Landscape("holder2", holder, _cube(-10, 10, 2), HOLDER_MAXIMUM, np.array(HOLDER)),
     Landscape(
         "complex_holder",
         complex_holder,
@@ -126,8 +109,8 @@ LANDSCAPES = _listed(
         np.array([-8.019008764680642, -9.727163884685025]),
     ),
     Landscape("himmelblau2", himmelblau, _cube(-5, 5, 2), 0.0, np.array([3.0, 2.0])),
-    Landscape("ackley2s", ackley, _cube(-32.768, 32.768, 2), 0.0, TOP_OF_ACKLEY),
-    Landscape("rastrigin3", rastrigin, _cube(-5.12, 5.12, 3), 0.0, np.zeros(3)),
+    Landscape("ackley2s", lambda x: ackley(x, TOP_OF_ACKLEY), _cube(-32.768, 32.768, 2), 0.0, TOP_OF_ACKLEY),
+    Landscape("rastrigin3", lambda x: rastrigin(x, np.zeros(3)), _cube(-5.12, 5.12, 3), 0.0, np.zeros(3)),
     Landscape("rastrigin3s", lambda x: rastrigin(x, TOP_OF_RASTRIGIN), _cube(-5.12, 5.12, 3), 0.0, TOP_OF_RASTRIGIN),
     Landscape("rosenbrock2", rosenbrock, _cube(-2.048, 2.048, 2), 0.0, np.ones(2)),
     Landscape("rosenbrock3", rosenbrock, _cube(-2.048, 2.048, 3), 0.0, np.ones(3)),

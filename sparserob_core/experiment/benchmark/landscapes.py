@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -12,6 +11,7 @@ from typing import Any, final
 import numpy as np
 
 from sparserob_core.errors import InputError
+from sparserob_core.experiment.benchmark import functions
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.maximiser import LinearBlocks
 
@@ -71,37 +71,15 @@ def landscapes(suites: Sequence[str], configs: Sequence[Path], instance: int = 1
 def standard() -> Iterator[Landscape]:
     """Six functions with their maxima off the centre of the box, where a method that begins there would meet them by
     luck."""
-    shift = np.array([0.7123, -1.3391, 1.0417, 0.2718, -0.5772])
-
-    def garland(x: Array) -> Array:
-        return np.asarray((x * (1 - x) * (4 - np.sqrt(np.abs(np.sin(60 * x))))).sum(axis=1))
-
-    def holder(x: Array) -> Array:
-        wave = np.sin(x[:, 0]) * np.cos(x[:, 1])
-        return np.asarray(np.abs(wave * np.exp(np.abs(1 - np.hypot(x[:, 0], x[:, 1]) / math.pi))))
-
-    def himmelblau(x: Array) -> Array:
-        return -((x[:, 0] ** 2 + x[:, 1] - 11) ** 2) - (x[:, 0] + x[:, 1] ** 2 - 7) ** 2
-
-    def ackley(x: Array) -> Array:
-        z = x - shift[: x.shape[1]]
-        flat = 20 * np.exp(-0.2 * np.sqrt((z**2).mean(axis=1)))
-        return np.asarray(flat + np.exp(np.cos(2 * math.pi * z).mean(axis=1)) - 20 - math.e)
-
-    def rastrigin(x: Array) -> Array:
-        z = x - shift[: x.shape[1]]
-        return np.asarray(-(z**2 - 10 * np.cos(2 * math.pi * z) + 10).sum(axis=1))
-
-    def rosenbrock(x: Array) -> Array:
-        return np.asarray(-(100 * (x[:, 1:] - x[:, :-1] ** 2) ** 2 + (1 - x[:, :-1]) ** 2).sum(axis=1))
-
-    # the maxima of the first two are known to these digits only: a value above them by that much is no fault
-    yield Landscape("garland", garland, Box(np.zeros(1), np.ones(1)), 0.9977723, 101, "standard")
-    yield Landscape("holder table", holder, _cube(10.0, 2), 19.2085026, 102, "standard")
-    yield Landscape("himmelblau", himmelblau, _cube(5.0, 2), 0.0, 103, "standard")
-    yield Landscape("ackley", ackley, _cube(32.0, 2), 0.0, 104, "standard")
-    yield Landscape("rastrigin", rastrigin, _cube(5.12, 3), 0.0, 105, "standard")
-    yield Landscape("rosenbrock", rosenbrock, _cube(2.048, 5), 0.0, 106, "standard")
+    shift = np.array([0.7123, -1.3391, 1.0417])
+    yield Landscape(
+        "garland", functions.garland, Box(np.zeros(1), np.ones(1)), functions.GARLAND_MAXIMUM, 101, "standard"
+    )
+    yield Landscape("holder table", functions.holder, _cube(10.0, 2), functions.HOLDER_MAXIMUM, 102, "standard")
+    yield Landscape("himmelblau", functions.himmelblau, _cube(5.0, 2), 0.0, 103, "standard")
+    yield Landscape("ackley", lambda x: functions.ackley(x, shift[:2]), _cube(32.0, 2), 0.0, 104, "standard")
+    yield Landscape("rastrigin", lambda x: functions.rastrigin(x, shift), _cube(5.12, 3), 0.0, 105, "standard")
+    yield Landscape("rosenbrock", functions.rosenbrock, _cube(2.048, 5), 0.0, 106, "standard")
 
 
 def bbob(instance: int = 1) -> Iterator[Landscape]:
