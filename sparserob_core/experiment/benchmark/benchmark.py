@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from sparserob_core.experiment.solve import Choice, component
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.maximiser import Maximiser, Report
-from sparserob_core.sip.search.search import Rules, Target, maximise
+from sparserob_core.sip.search.search import Rules, maximise
 
 CONFIGS = ("coupled_masses", "experiment1_repaired", "experiment2_repaired")
 DIGITS = 1e-6  # of the maximum: to so many digits the maxima of the standard functions are known
@@ -91,7 +92,7 @@ def _told(
         begin = landscape.begin(0)
         slack = max(accuracy * (landscape.maximum - begin), DIGITS * abs(landscape.maximum))
         targets.append(landscape.maximum - slack)
-    problems = [Instance(one.name, one.maximum, True, one.box.dimension + 1.0) for one in every]
+    problems = [Instance(one.name, one.maximum, True, one.target.domain.dimension + 1.0) for one in every]
     times = [
         [
             np.array([one.needed(target) for one in searches if one.landscape is landscape and one.contender == name])
@@ -108,19 +109,18 @@ def _told(
 
 
 def _search(landscape: Landscape, name: str, maximiser: Maximiser, budget: int, seed: int, rules: Rules) -> Search:
-    fresh = landscape if landscape.fresh is None else landscape.fresh()
+    fresh = (landscape if landscape.fresh is None else landscape.fresh()).target
     inside = 0.0
 
     def clocked(points: Array) -> Array:
         nonlocal inside
         began = time.process_time()
-        values = fresh.function(points)
+        values = np.asarray(fresh.function(points))
         inside += time.process_time() - began
         return values
 
-    target = Target(clocked, fresh.box, fresh.gradient, fresh.block, fresh.linear)
     began = time.process_time()
-    report: Report = maximise(target, maximiser, budget, np.random.default_rng(seed), rules)
+    report: Report = maximise(replace(fresh, function=clocked), maximiser, budget, np.random.default_rng(seed), rules)
     own = max(0.0, time.process_time() - began - inside)
     if report.best_value > landscape.maximum + 10 * DIGITS * max(1.0, abs(landscape.maximum)):
         raise InputError(

@@ -62,9 +62,7 @@ def ioh_files(found: Benchmark) -> Iterator[tuple[str, str]]:
         mine = sorted((one for one in found.searches if one.contender == name), key=_function)
         for (number, title), group in groupby(mine, key=_function):
             searches, scenarios = list(group), []
-            for size, runs in groupby(
-                sorted(searches, key=lambda one: one.landscape.box.dimension), lambda one: one.landscape.box.dimension
-            ):
+            for size, runs in groupby(sorted(searches, key=_dimension), _dimension):
                 table = f"data_f{number}_{title}/IOHprofiler_f{number}_DIM{size}.dat"
                 kept = list(runs)
                 yield f"{folder}/{table}", "".join(_table(one) for one in kept)
@@ -82,6 +80,10 @@ def ioh_files(found: Benchmark) -> Iterator[tuple[str, str]]:
 
 def _function(one: Search) -> tuple[int, str]:
     return one.landscape.number, _plain(re.sub(r" \d+D$", "", one.landscape.name))
+
+
+def _dimension(one: Search) -> int:
+    return one.landscape.target.domain.dimension
 
 
 def _plain(name: str) -> str:

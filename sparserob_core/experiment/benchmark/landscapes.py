@@ -13,7 +13,7 @@ import numpy as np
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.benchmark import functions
 from sparserob_core.sip.convex_set import Array, Box
-from sparserob_core.sip.maximiser import LinearBlocks
+from sparserob_core.sip.search.search import Target
 
 SUITES = ("standard", "bbob", "g")
 BBOB_DIMENSIONS = (2, 5)
@@ -25,31 +25,26 @@ SAMPLE = 1000  # uniform points whose median is where a search is said to begin
 @final
 @dataclass(frozen=True, eq=False)
 class Landscape:
-    """A function to be maximised over a box ``(d,)``: points ``(k, d)`` to values ``(k,)``, its ``maximum``, and the
-    number and the instance under which IOHprofiler knows it.
+    """What is to be maximised, its ``maximum``, and the number and the instance under which IOHprofiler knows it.
 
-    ``gradient``, ``block`` and ``linear`` as in a search (`Objective`). ``fresh`` makes the same function anew, where
-    it remembers what it was asked before.
+    ``fresh`` makes the same anew, where it remembers what it was asked before.
     """
 
     name: str
-    function: Callable[[Array], Array]
-    box: Box
+    target: Target
     maximum: float
     number: int
     suite: str
     instance: int = 1
-    gradient: Callable[[Array], Array] | None = None
-    block: int = 1
-    linear: LinearBlocks | None = None
     fresh: Callable[[], Landscape] | None = None
 
     def begin(self, seed: int) -> float:
         """The median of the function at uniform points: what a search begins with."""
+        box = self.target.domain
         points = np.random.default_rng([seed, self.number]).uniform(
-            self.box.lower, self.box.upper, (SAMPLE if self.fresh is None else 50, self.box.dimension)
+            box.lower, box.upper, (SAMPLE if self.fresh is None else 50, box.dimension)
         )
-        values = np.asarray(self.function(points), dtype=float)
+        values = np.asarray(self.target.function(points), dtype=float)
         return float(np.median(values[np.isfinite(values)], axis=0)) if np.isfinite(values).any() else -np.inf
 
 
@@ -72,14 +67,16 @@ def standard() -> Iterator[Landscape]:
     """Six functions with their maxima off the centre of the box, where a method that begins there would meet them by
     luck."""
     shift = np.array([0.7123, -1.3391, 1.0417])
-    yield Landscape(
-        "garland", functions.garland, Box(np.zeros(1), np.ones(1)), functions.GARLAND_MAXIMUM, 101, "standard"
-    )
-    yield Landscape("holder table", functions.holder, _cube(10.0, 2), functions.HOLDER_MAXIMUM, 102, "standard")
-    yield Landscape("himmelblau", functions.himmelblau, _cube(5.0, 2), 0.0, 103, "standard")
-    yield Landscape("ackley", lambda x: functions.ackley(x, shift[:2]), _cube(32.0, 2), 0.0, 104, "standard")
-    yield Landscape("rastrigin", lambda x: functions.rastrigin(x, shift), _cube(5.12, 3), 0.0, 105, "standard")
-    yield Landscape("rosenbrock", functions.rosenbrock, _cube(2.048, 5), 0.0, 106, "standard")
+    yield _standard("garland", functions.garland, Box(np.zeros(1), np.ones(1)), 101, functions.GARLAND_MAXIMUM)
+    yield _standard("holder table", functions.holder, _cube(10.0, 2), 102, functions.HOLDER_MAXIMUM)
+    yield _standard("himmelblau", functions.himmelblau, _cube(5.0, 2), 103)
+    yield _standard("ackley", lambda x: functions.ackley(x, shift[:2]), _cube(32.0, 2), 104)
+    yield _standard("rastrigin", lambda x: functions.rastrigin(x, shift), _cube(5.12, 3), 105)
+    yield _standard("rosenbrock", functions.rosenbrock, _cube(2.048, 5), 106)
+
+
+def _standard(name: str, function: Callable[[Array], Array], box: Box, number: int, maximum: float = 0.0) -> Landscape:
+    return Landscape(name, Target(function, box), maximum, number, "standard")
 
 
 def bbob(instance: int = 1) -> Iterator[Landscape]:
@@ -98,7 +95,8 @@ def bbob(instance: int = 1) -> Iterator[Landscape]:
                 return -np.array([problem(point) for point in x], dtype=float)
 
             name = f"{problem.meta_data.name} {dimension}D"
-            yield Landscape(name, negated, _cube(5.0, dimension), -float(problem.optimum.y), number, "bbob", instance)
+            target = Target(negated, _cube(5.0, dimension))
+            yield Landscape(name, target, -float(problem.optimum.y), number, "bbob", instance)
 
 
 def landscape_of(config: Path, number: int) -> Landscape:
@@ -107,7 +105,7 @@ def landscape_of(config: Path, number: int) -> Landscape:
 
     Raises `InputError` where the exchange certifies none, for then the maximum is not known.
     """
-    from sparserob_core.experiment.assemble import assemble, tools_of
+    from sparserob_core.experiment.assemble import assemble, build, tools_of
     from sparserob_core.experiment.config.load import load_config
     from sparserob_core.sip.methods.own_units import solve_in_own_units
     from sparserob_core.sip.relaxed.relaxed import RelaxedProgram
@@ -116,8 +114,7 @@ def landscape_of(config: Path, number: int) -> Landscape:
     fixed = {"start": EPSILON, "stop": EPSILON}
     loaded = load_config(str(config), {"method": {"name": "exchange", "exact": False}, "continuation": fixed})
     experiment, tools = assemble(loaded), tools_of(loaded)
-    method = loaded.registry.build("method", "exchange", {"exact": False})
-    result = solve_in_own_units(method, experiment.program, tools)
+    result = solve_in_own_units(build(loaded, "method", loaded.config.method), experiment.program, tools)
     if result.status not in ("certified", "verified") or not experiment.program.families:
         raise InputError(f"{config}: expected a config whose value is certified, got {result.status}: {result.message}")
 
@@ -125,10 +122,8 @@ def landscape_of(config: Path, number: int) -> Landscape:
         relaxed = RelaxedProgram(experiment.program, tools.solver, tools.regulariser)
         g = TupleValue(experiment.program, relaxed, INDICES)
         g.epsilon = EPSILON
-        name = f"g of {config.stem}"
-        return Landscape(
-            name, g, g.domain, float(result.value), number, "g", 1, g.gradient, g.block, g.linear, fresh=made
-        )
+        target = Target(g, g.domain, g.gradient, g.block, g.linear)
+        return Landscape(f"g of {config.stem}", target, float(result.value), number, "g", fresh=made)
 
     return made()
 

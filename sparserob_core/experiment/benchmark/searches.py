@@ -9,6 +9,7 @@ from typing import Any, final
 import numpy as np
 
 from sparserob_core.experiment.benchmark.landscapes import Landscape
+from sparserob_core.experiment.comparison.curve import spent_until
 from sparserob_core.experiment.comparison.profiles import Profiles
 from sparserob_core.sip.convex_set import Array
 
@@ -28,8 +29,7 @@ class Search:
 
     def needed(self, target: float) -> float:
         """Evaluations until a value; infinite where it was not reached."""
-        reached = np.flatnonzero(self.best >= target)
-        return float(reached[0] + 1) if reached.size else float("inf")
+        return spent_until(target, self.best, np.arange(1.0, self.best.size + 1.0))
 
 
 @final

@@ -37,4 +37,5 @@ class Comparison:
 
     def within(self, curve: Curve, share: float) -> float:
         """The evaluations after which the curve came within that share of the exact value; nan when it never did."""
-        return curve.reached(self.exact - share * abs(self.exact))
+        needed = curve.reached(self.exact - share * abs(self.exact))
+        return needed if np.isfinite(needed) else np.nan

@@ -54,14 +54,18 @@ class Curve:
     """Coordinates of what is searched, or variables of a decision; 0: it is not known."""
 
     def reached_after(self, target: float) -> float:
-        """The seconds after which the bound was at least ``target``; nan when it never was."""
-        there = np.flatnonzero(self.bound >= target)
-        return float(self.seconds[there[0]]) if there.size else np.nan
+        """The seconds after which the bound was at least ``target``; infinite when it never was."""
+        return spent_until(target, self.bound, self.seconds)
 
     def reached(self, target: float) -> float:
-        """The evaluations after which the bound was at least ``target``; nan when it never was."""
-        there = np.flatnonzero(self.bound >= target)
-        return float(self.evaluations[there[0]]) if there.size else np.nan
+        """The evaluations after which the bound was at least ``target``; infinite when it never was."""
+        return spent_until(target, self.bound, self.evaluations)
+
+
+def spent_until(target: float, best: Array, spent: Array) -> float:
+    """What was spent when the best value so far ``(n,)`` came to a target; infinite when it never did."""
+    there = np.flatnonzero(best >= target)
+    return float(spent[there[0]]) if there.size else np.inf
 
 
 def read_curve(directory: Path) -> Curve:

@@ -103,7 +103,7 @@ def _times(curves: Sequence[Curve], seeds: Mapping[Any, None], target: float, me
     found = dict.fromkeys(seeds, np.inf)
     for one in curves:
         needed = one.reached(target) if measure == "evaluations" else one.reached_after(target)
-        found[one.config.get("seed")] = min(found[one.config.get("seed")], needed if np.isfinite(needed) else np.inf)
+        found[one.config.get("seed")] = float(np.fmin(found[one.config.get("seed")], needed))  # nan: it is not known
     return np.array(list(found.values()))
 
 

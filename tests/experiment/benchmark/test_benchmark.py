@@ -13,12 +13,13 @@ import sparserob_core as sr
 from sparserob_core.experiment.benchmark.landscapes import Landscape, bbob, landscape_of, landscapes, standard
 from sparserob_core.experiment.benchmark.searches import Benchmark, Search
 from sparserob_core.experiment.comparison.profiles import Instance, Profiles
+from sparserob_core.sip.search.search import Target
 from tests.support.places import CONFIGS
 
 
 @pytest.mark.parametrize("landscape", list(standard()), ids=lambda one: one.name)
 def test_no_point_of_a_standard_function_exceeds_its_maximum_and_a_search_comes_near(landscape):
-    report = sr.maximise(landscape.function, landscape.box, "simulated_annealing", 3000, 0, 0.3)
+    report = sr.maximise(landscape.target.function, landscape.target.domain, "simulated_annealing", 3000, 0, 0.3)
     slack = 1e-6 * max(1.0, abs(landscape.maximum))
     assert report.best_value <= landscape.maximum + slack
     assert report.best_value >= landscape.maximum - 0.01 * (landscape.maximum - landscape.begin(0))
@@ -29,13 +30,15 @@ def test_bbob_functions_have_their_maximum_where_ioh_says():
     found = list(bbob())
     assert len(found) == 48
     for landscape in found[:8]:
-        values = landscape.function(np.random.default_rng(0).uniform(-5.0, 5.0, (50, landscape.box.dimension)))
+        values = landscape.target.function(
+            np.random.default_rng(0).uniform(-5.0, 5.0, (50, landscape.target.domain.dimension))
+        )
         assert (values <= landscape.maximum).all()
 
 
 def searched(bests, budget=10, target=1.0):
     """A benchmark of one contender on one landscape, with these running best values."""
-    landscape = Landscape("hill", lambda x: x[:, 0], sr.Box([0.0], [1.0]), 1.0, 1, "standard")
+    landscape = Landscape("hill", Target(lambda x: x[:, 0], sr.Box([0.0], [1.0])), 1.0, 1, "standard")
     searches = [Search(landscape, "a", seed, np.array(best), 0.001, np.zeros(1)) for seed, best in enumerate(bests)]
     times = [[np.array([one.needed(target) for one in searches])]]
     profiles = Profiles("", "evaluations", 1e-3, ["a"], [Instance("hill", 1.0, True, 2.0)], [[0, 1]], times, [0])
