@@ -8,7 +8,7 @@ from __future__ import annotations
 import random
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -65,21 +65,22 @@ class ScheduleContract(Contract[Schedule], kind="schedule"):
         )
         return float(answer)
 
-    def test_every_weight_is_positive_and_below_the_one_before(self) -> None:
+    def descent(self) -> Iterator[tuple[float, float]]:
+        """First weights, each with the one at which its iterations end; every weight between is looked at."""
         schedule = self.create()
         for first in FIRST:
             epsilon, j = first, 0
             while epsilon > STOP * first and j < MOST:
                 j += 1
                 epsilon = self.weight(schedule, epsilon, j)
+            yield first, epsilon
+
+    def test_every_weight_is_positive_and_below_the_one_before(self) -> None:
+        for _first, _last in self.descent():
+            pass
 
     def test_weights_come_down_to_a_millionth_of_the_first_one(self) -> None:
-        schedule = self.create()
-        for first in FIRST:
-            epsilon, j = first, 0
-            while epsilon > STOP * first and j < MOST:
-                j += 1
-                epsilon = self.weight(schedule, epsilon, j)
+        for first, epsilon in self.descent():
             demand(
                 epsilon <= STOP * first,
                 f"from {first:g} the weight has come down to {epsilon:.3g} only after {MOST} iterations",
