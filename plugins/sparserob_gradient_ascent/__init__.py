@@ -42,9 +42,7 @@ class GradientAscent(sr.Maximiser, sr.Options):
         climb = _Climb(objective)
         start = objective.best_point if objective.evaluations else climb.uniform(rng)
         if objective.linear is not None:
-            if not objective.evaluations:
-                objective.evaluate(start[np.newaxis])
-            sr.block_ascent(objective)
+            sr.block_ascent(objective, start)
             start = objective.best_point
         while objective.remaining:
             climb.run(start, self.steps)

@@ -14,9 +14,9 @@ OCTAVES = 40.0  # halvings of a side from the farthest to the nearest neighbour 
 GOLDEN = (5.0**0.5 - 1.0) / 2.0
 
 
-def block_ascent(objective: Objective) -> None:
-    """Climb from the best point of an objective that is linear in blocks (`Objective.linear`) until nothing near the
-    blocks that act is a gain; where it is not, do nothing.
+def block_ascent(objective: Objective, start: Array | None = None) -> None:
+    """Climb from ``start (d,)``, or from the best point, of an objective that is linear in blocks (`Objective.linear`)
+    until nothing near the blocks that act is a gain; where it is not, or the value there is not finite, do nothing.
 
     One step is one evaluation. The linear coordinates of every block go to the vertex at which the block weighs most
     (Frank and Wolfe 1956; for the maximum of a convex function, which is at a vertex: Mangasarian 1996). Blocks that do
@@ -26,11 +26,13 @@ def block_ascent(objective: Objective) -> None:
     Notes ``acting``, how many blocks act. Ends by `SearchEnded` when the budget is spent.
     """
     linear = objective.linear
-    if linear is None or not np.isfinite(objective.best_value):
+    if linear is None or (start is None and not np.isfinite(objective.best_value)):
         return
     climb = _Climb(objective, linear)
-    best, still, tried = objective.best_point, 0, 0.0
+    best, still, tried = objective.best_point if start is None else start, 0, 0.0
     value = float(objective.evaluate(best[np.newaxis])[0])
+    if not np.isfinite(value):
+        return
     while still < PATIENCE or tried < 2.0 * OCTAVES:
         acts = linear.acting()
         objective.note(acting=float(acts.sum()))

@@ -6,7 +6,6 @@ import numpy as np
 
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.maximiser import Objective
-from sparserob_core.sip.search.block_ascent import block_ascent
 from sparserob_core.sip.search.trust_region import TrustRegion
 
 MODELLED = 30
@@ -24,7 +23,7 @@ def polish(objective: Objective, points: Array, values: Array) -> None:
     """Climb from the best of the evaluated ``points (k, d)`` with ``values (k,)`` until the budget is spent or nothing
     is left to gain.
 
-    Where blocks are linear, the `block_ascent` first. With gradients: L-BFGS-B (Byrd, Lu, Nocedal and Zhu 1995). Then,
+    With gradients: L-BFGS-B (Byrd, Lu, Nocedal and Zhu 1995). Then,
     up to 30 coordinates, the derivative-free `TrustRegion`; beyond, a compass search that moves one coordinate, hence
     one block, at a time. Starts are the best points, then the next best that lie apart; one that its recent progress
     cannot bring to the top is given up. Nothing is done without a finite value.
@@ -32,10 +31,8 @@ def polish(objective: Objective, points: Array, values: Array) -> None:
     finite = np.isfinite(values)
     if not finite.any():
         return
-    block_ascent(objective)
     order = np.flatnonzero(finite)[np.argsort(-values[finite], kind="stable")][:CONSIDERED]
     seen = _Seen(objective, points[order], values[order])
-    seen.include_best()
     if objective.differentiable:
         _ascend(seen)
     if seen.dimension <= MODELLED:
@@ -54,13 +51,6 @@ class _Seen:
         self.blocks = np.arange(self.dimension) // objective.block
         self.points = np.clip((points - self.lower) / self.width, 0.0, 1.0)
         self.values = values.copy()
-
-    def include_best(self) -> None:
-        """Add the best point of the objective, where it is better than all that is seen."""
-        if self.objective.best_value > self.values.max():
-            self._add(
-                np.clip((self.objective.best_point - self.lower) / self.width, 0.0, 1.0), self.objective.best_value
-            )
 
     def starts(self) -> Array:
         """The best points that lie apart from one another, best first."""

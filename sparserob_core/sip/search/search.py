@@ -15,6 +15,7 @@ from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.maximiser import EvaluationError, LinearBlocks, Maximiser, Objective, Report, SearchEnded, Trace
 from sparserob_core.sip.rules import Metropolis, Progress
+from sparserob_core.sip.search.block_ascent import block_ascent
 from sparserob_core.sip.search.moving import Moving
 from sparserob_core.sip.search.notifier import Notifier, Standing
 
@@ -329,6 +330,7 @@ def maximise(
             stopped = f"{stopped}; then polished"
             from sparserob_core.sip.search.local_search import polish
 
+            block_ascent(shown)
             points, values = objective.seen()
             polish(shown, points[:, moves], values)
     except SearchEnded:

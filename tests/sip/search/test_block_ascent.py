@@ -71,6 +71,19 @@ def test_the_ascent_meets_the_maximum_of_a_known_function_and_never_descends():
     assert objective.evaluations < 400
 
 
+def test_an_ascent_that_is_given_its_start_evaluates_it_once():
+    peaks = Peaks()
+    target = Target(peaks, peaks.domain, block=peaks.m + 2, linear=peaks.linear)
+    objective, start = CountedObjective(target, 400), np.random.default_rng(0).uniform(size=peaks.domain.dimension)
+    sr.block_ascent(objective, start)
+    assert objective.best_value == pytest.approx(peaks.maximum, abs=1e-8)
+    points = maximise(
+        target, sr.load_registry().build("maximiser", "gradient_ascent"), 50, np.random.default_rng(0)
+    ).trace.points
+    for seen, first in ((objective.seen()[0], start), (points, points[0])):
+        assert (seen[0] == first).all() and not (seen[1] == first).all()
+
+
 @pytest.mark.parametrize("polish", [0.0, 0.5])
 def test_a_polish_takes_the_ascent_for_every_maximiser_and_sees_only_what_can_move(polish):
     class Once(sr.Maximiser):
