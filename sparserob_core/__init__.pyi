@@ -83,6 +83,9 @@ from sparserob_core.sip.method import Continuation as Continuation
 from sparserob_core.sip.method import ExecutorFactory as ExecutorFactory
 from sparserob_core.sip.method import Method as Method
 from sparserob_core.sip.method import Tools as Tools
+from sparserob_core.workers import one_thread as one_thread
+from sparserob_core.workers import processors as processors
+from sparserob_core.workers import without_script as without_script
 from sparserob_core.sip.solver import Claim as Claim
 from sparserob_core.sip.solver import QuadraticProgram as QuadraticProgram
 from sparserob_core.sip.solver import Solver as Solver

@@ -61,11 +61,7 @@ class Dask(sr.ExecutorFactory, sr.Options):
             raise sr.UnknownPluginError(
                 f"executor 'dask' needs the package {error.name}: pip install 'sparserob[dask]'"
             ) from error
-        import scipy.linalg  # its library of linear algebra is to be there when threads are limited
-        from threadpoolctl import threadpool_limits
-
-        assert scipy.linalg
-        with threadpool_limits(limits=1):  # here, too: what this process adds up, it adds up as the workers do
+        with sr.one_thread():  # here, too: what this process adds up, it adds up as the workers do
             if self.address is not None:
                 with connected(self.address, self.timeout) as executor:
                     yield executor

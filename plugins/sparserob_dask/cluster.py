@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import signal
 import sys
 import threading
@@ -14,7 +13,6 @@ from concurrent.futures import BrokenExecutor, Executor, Future
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pickle import PicklingError
-from types import ModuleType
 from typing import Any, ParamSpec, TypeVar, final
 
 import cloudpickle
@@ -29,24 +27,20 @@ Arguments = ParamSpec("Arguments")
 Answer = TypeVar("Answer")
 
 LOUD = 50  # logging.CRITICAL: what dask has to say about workers that are ended on purpose is not for users
-ONE_THREAD = dict.fromkeys(
-    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS", "RAYON_NUM_THREADS"), 1
-)
 SETTINGS = {
     "distributed.scheduler.allowed-failures": 0,  # whoever submits decides whether to try again
     "distributed.worker.multiprocessing-method": "spawn",
-    "distributed.nanny.pre-spawn-environ": ONE_THREAD,
+    "distributed.nanny.pre-spawn-environ": {},  # threads of linear algebra: `sparserob_core.one_thread`
 }
 
 
 @contextmanager
 def started(workers: int | None, host: str, timeout: float) -> Iterator[Executor]:
     """A cluster of this machine, which ends with the context."""
-    count = workers or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
     with _event_loop(timeout) as loop:
-        with dask.config.set(SETTINGS), _without_script():
+        with dask.config.set(SETTINGS), sr.without_script():
             cluster = LocalCluster(
-                n_workers=count,
+                n_workers=workers or sr.processors(),
                 threads_per_worker=1,
                 host=host,
                 dashboard_address=f"{host}:0",
@@ -293,14 +287,3 @@ class _Mortal(Nanny):  # type: ignore[misc]
             return Status.closed
         self.begun = True
         return await super().instantiate()
-
-
-@contextmanager
-def _without_script() -> Iterator[None]:
-    """A process that is started meanwhile does not import the script that is run here."""
-    script = sys.modules["__main__"]
-    sys.modules["__main__"] = ModuleType("__main__")
-    try:
-        yield
-    finally:
-        sys.modules["__main__"] = script

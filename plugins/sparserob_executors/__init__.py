@@ -10,7 +10,6 @@ from typing import ParamSpec, TypeVar
 from pydantic import Field
 
 import sparserob_core as sr
-from sparserob_executors.threads import one_thread
 
 Arguments = ParamSpec("Arguments")
 Answer = TypeVar("Answer")
@@ -29,7 +28,7 @@ class Serial(sr.ExecutorFactory, sr.Options):
     @contextmanager
     def open(self) -> Iterator[Executor]:
         """See `sparserob_core.ExecutorFactory`."""
-        with one_thread(), _Now() as executor:
+        with sr.one_thread(), _Now() as executor:
             yield executor
 
 
@@ -49,9 +48,9 @@ class Processes(sr.ExecutorFactory, sr.Options):
     @contextmanager
     def open(self) -> Iterator[Executor]:
         """See `sparserob_core.ExecutorFactory`."""
-        from sparserob_executors.processes import Pool, processors
+        from sparserob_executors.processes import Pool
 
-        with one_thread(), Pool(self.workers or processors()) as executor:
+        with sr.one_thread(), Pool(self.workers or sr.processors()) as executor:
             yield executor
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import pickle
 import signal
-import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterator
@@ -14,20 +13,15 @@ from contextlib import contextmanager
 from multiprocessing import connection, parent_process
 from multiprocessing.context import SpawnContext, SpawnProcess
 from multiprocessing.reduction import ForkingPickler
-from types import ModuleType, TracebackType
+from types import TracebackType
 from typing import Any, ParamSpec, TypeVar, cast, final
 
-from sparserob_executors.threads import environment
+import sparserob_core as sr
 
 Arguments = ParamSpec("Arguments")
 Answer = TypeVar("Answer")
 
 _starting = threading.Lock()
-
-
-def processors() -> int:
-    """How many processors this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @final
@@ -116,7 +110,7 @@ class _Worker(SpawnProcess):
     """A process that starts with one thread of linear algebra, without Ctrl-C, and without the parent's script."""
 
     def start(self) -> None:
-        with _starting, environment(), _without_script(), _without_interrupt():
+        with _starting, sr.one_thread(), sr.without_script(), _without_interrupt():
             super().start()
 
     def __reduce__(self) -> Any:
@@ -138,18 +132,6 @@ class _Context(SpawnContext):
         worker = _Worker(*args, **kwargs)
         self.workers.append(worker)
         return worker
-
-
-@contextmanager
-def _without_script() -> Iterator[None]:
-    """A process that is started meanwhile does not import the script that is run here: one without
-    ``if __name__ == "__main__"`` would start everything again in each worker."""
-    script = sys.modules["__main__"]
-    sys.modules["__main__"] = ModuleType("__main__")
-    try:
-        yield
-    finally:
-        sys.modules["__main__"] = script
 
 
 @contextmanager

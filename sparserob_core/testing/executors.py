@@ -239,8 +239,8 @@ class ExecutorContract(Contract[ExecutorFactory], kind="executor"):
         demand(
             pools and set(pools) == {1},
             f"libraries of linear algebra have so many threads: {pools}",
-            "set OMP_NUM_THREADS=1 and OPENBLAS_NUM_THREADS=1 before a worker imports numpy; in this process, use "
-            "threadpoolctl.threadpool_limits(1)",
+            "start the workers within `sparserob_core.one_thread()`, and leave it when they have ended; elsewhere, set "
+            "OMP_NUM_THREADS=1 and OPENBLAS_NUM_THREADS=1 before they import numpy",
         )
 
     def test_a_worker_that_dies_breaks_the_executor_and_hangs_nobody(self) -> None:

@@ -74,7 +74,8 @@ def test_the_ascent_meets_the_maximum_of_a_known_function_and_never_descends():
 def test_an_ascent_that_is_given_its_start_evaluates_it_once():
     peaks = Peaks()
     target = Target(peaks, peaks.domain, block=peaks.m + 2, linear=peaks.linear)
-    objective, start = CountedObjective(target, 400), np.random.default_rng(0).uniform(size=peaks.domain.dimension)
+    objective, rng = CountedObjective(target, 400), np.random.default_rng(0)
+    start = rng.uniform(peaks.domain.lower, peaks.domain.upper)
     sr.block_ascent(objective, start)
     assert objective.best_value == pytest.approx(peaks.maximum, abs=1e-8)
     points = maximise(
