@@ -53,6 +53,7 @@ class MinimumAttention(sr.LinearKeys):
             disturbance_class=self.disturbance_class,
             path=[*path, *self._bounds(d, m)],
             terminal=[*ends, sr.Equality(np.append(np.full(d, np.nan), np.zeros(m)))],
+            names=_names(self.names.build().fitting(d, m, plain.disturbances), d, m),
         )
 
     def _augmented(self, d: int, m: int) -> sr.LinearSystem:
@@ -87,6 +88,23 @@ class MinimumAttention(sr.LinearKeys):
         return [
             sr.PathConstraint(sr.Polytope(np.hstack([np.zeros((len(flat[0]), d)), flat[0]]), flat[1]), name="control")
         ]
+
+
+def _names(given: sr.Names, d: int, m: int) -> sr.Names:
+    """The control is a state of the augmented system, and its rate the control."""
+    called = [given.control(channel) for channel in range(m)]
+    per = f"/{given.time}" if given.time else ""
+    rates = [f"{unit}{per}" if unit and per else "" for unit in given.control_units]
+    units = [*(given.state_units or [""] * d), *(given.control_units or [""] * m)]
+    return sr.Names(
+        states=[*(given.state(state) for state in range(d)), *called],
+        controls=[f"{name}'" for name in called],
+        disturbances=given.disturbances,
+        state_units=units,
+        control_units=rates,
+        disturbance_units=given.disturbance_units,
+        time=given.time,
+    )
 
 
 def _extended(end: sr.ConvexSet | sr.Equality, m: int) -> sr.ConvexSet | sr.Equality:

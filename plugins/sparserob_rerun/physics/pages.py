@@ -24,11 +24,10 @@ class Page:
     path: str
     plots: tuple[tuple[Kind, int], ...]
 
-    @property
-    def name(self) -> str:
+    def name(self, names: sr.Names) -> str:
         """What is on it, such as ``u3, x5, x6``."""
-        letters = {"control": "u", "state": "x"}
-        return ", ".join(f"{letters[kind]}{place + 1}" for kind, place in self.plots if kind != "push")
+        called = {"control": names.control, "state": names.state}
+        return ", ".join(called[kind](place) for kind, place in self.plots if kind != "push")
 
 
 def pages(problem: sr.OptimalControlProblem) -> list[Page]:
@@ -47,7 +46,7 @@ def pages(problem: sr.OptimalControlProblem) -> list[Page]:
 def heading(problem: sr.OptimalControlProblem) -> str:
     """What the first screen shows, and where the rest is."""
     more = pages(problem)[1:]
-    rest = ", ".join(page.name for page in more)
+    rest = ", ".join(page.name(problem.names) for page in more)
     return "Control and states against the time of the system" + (
         f"; {rest} in the tab Further signals" if more else ""
     )

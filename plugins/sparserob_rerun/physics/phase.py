@@ -39,7 +39,9 @@ def _slices(data: sr.FigureData) -> Floats:
 def _plane(data: sr.FigureData, worst: Mapping[str, Any]) -> Drawing:
     axes = Axes(60.0, 0.0, SIDE, SIDE, _limits(data, 0), _limits(data, 1))
     drawing = Drawing()
-    drawing.frame(axes, "x2 over x1: worst-case boxes along the way", "x1")
+    drawing.frame(
+        axes, f"{data.names.state(1)} over {data.names.state(0)}: worst-case boxes along the way", data.names.state(0)
+    )
     for box in _slices(data):
         (a, b), (c, d) = box
         drawing.line("slices", axes.at(np.array([a, b, b, a, a]), np.array([c, c, d, d, c])), ink.TUBE, 1.0)
@@ -108,7 +110,10 @@ def _space(rr: Any, stream: Any, data: sr.FigureData, worst: Mapping[str, Any]) 
     ends = [(float(data.tube_lower[k].min()), float(data.tube_upper[k].max())) for k in range(3)]
     stream.log("physics/phase/axes", rr.LineStrips3D(_cage(ends), colors=[ink.FAINT], radii=rr.Radius.ui_points(0.5)))
     start = data.state[:3, 0]
-    corners = [(tuple(ends[j][1 if j == k else 0] for j in range(3)), f"x{k + 1} = {ends[k][1]:.3g}") for k in range(3)]
+    corners = [
+        (tuple(ends[j][1 if j == k else 0] for j in range(3)), f"{data.names.state(k)} = {ends[k][1]:.3g}")
+        for k in range(3)
+    ]
     stream.log(
         "physics/phase/labels",
         rr.Points3D(

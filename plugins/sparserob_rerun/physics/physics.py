@@ -67,7 +67,7 @@ class Physics:
         rr, data = self.rr, self.view.picture(decision, np.empty(0))
         at = [rr.TimeColumn("t", duration=data.breakpoints[:-1])]
         channels, states = len(data.control), len(data.state)
-        names = [_name("u", channel, channels) for channel in range(channels)]
+        names = [data.names.control(channel) for channel in range(channels)]
         colours = [SHADES[channel % len(SHADES)] for channel in range(channels)]
         self.stream.log(
             "signals/control",
@@ -78,10 +78,10 @@ class Physics:
         self.stream.send_columns("signals/control", at, rows)
         at = [rr.TimeColumn("t", duration=data.times)]
         for state in range(states):
-            name, colour = _name("x", state, states), SHADES[state % len(SHADES)]
+            name, colour = data.names.state(state), SHADES[state % len(SHADES)]
             pale = (*colour[:3], 110)
             self.stream.log(
-                f"signals/states/{name}",
+                f"signals/states/x{state + 1}",
                 rr.SeriesLines(
                     names=[f"{name} nominal", f"{name} at least", f"{name} at most"],
                     colors=[colour, pale, pale],
@@ -91,11 +91,16 @@ class Physics:
             )
             values = np.stack([data.state[state], data.tube_lower[state], data.tube_upper[state]], axis=1)
             rows = rr.Scalars.columns(scalars=values.ravel()).partition([3] * len(values))
-            self.stream.send_columns(f"signals/states/{name}", at, rows)
+            self.stream.send_columns(f"signals/states/x{state + 1}", at, rows)
 
     def _control(self, drawing: Drawing, axes: Axes, data: sr.FigureData, channel: int, last: bool) -> None:
-        name = _name("u", channel, len(data.control))
-        drawing.frame(axes, f"control {name}(t): dashed, its bounds", "t", ticks_below=last)
+        name = data.names.control(channel)
+        drawing.frame(
+            axes,
+            f"control {name}(t){_unit(data.names.control_units, channel)}: dashed, its bounds",
+            _time(data),
+            ticks_below=last,
+        )
         for bound in (data.control_lower[channel], data.control_upper[channel]):
             drawing.dashed("marks", axes.at(np.array(axes.x), np.full(2, bound)), ink.VERMILLION)
         steps, edges = data.control[channel], data.breakpoints
@@ -105,10 +110,13 @@ class Physics:
     def _push(
         self, drawing: Drawing, axes: Axes, data: sr.FigureData, push: Floats | None, channel: int, last: bool
     ) -> None:
-        name = _name("u", channel, len(data.control))
+        name = data.names.control(channel)
         if push is None or not push.any():
             drawing.frame(
-                axes, f"why {name} switches: no constraint pushes, or its push is not known", "t", ticks_below=last
+                axes,
+                f"why {name} switches: no constraint pushes, or its push is not known",
+                _time(data),
+                ticks_below=last,
             )
             return
         values = push[channel]
@@ -117,7 +125,7 @@ class Physics:
         drawing.frame(
             axes,
             f"why {name} switches: it acts where the push of the constraints leaves the band",
-            "t",
+            _time(data),
             ticks_below=last,
         )
         for price in (-1.0, 1.0):
@@ -132,8 +140,13 @@ class Physics:
     def _state(
         self, drawing: Drawing, axes: Axes, data: sr.FigureData, worst: Mapping[str, Any], state: int, last: bool
     ) -> None:
-        name = _name("x", state, len(data.state))
-        drawing.frame(axes, f"state {name}(t): nominal, worst-case tube, walls", "t", ticks_below=last)
+        name = data.names.state(state)
+        drawing.frame(
+            axes,
+            f"state {name}(t){_unit(data.names.state_units, state)}: nominal, worst-case tube, walls",
+            _time(data),
+            ticks_below=last,
+        )
         drawing.band("tube", axes, data.times, data.tube_lower[state], data.tube_upper[state], ink.TUBE)
         for wall in data.walls:
             if wall.state == state:
@@ -205,5 +218,9 @@ def _padded(values: list[float]) -> tuple[float, float]:
     return low - margin, high + margin
 
 
-def _name(letter: str, index: int, count: int) -> str:
-    return f"{letter}{index + 1}" if count > 1 else letter
+def _unit(units: Sequence[str], index: int) -> str:
+    return f" in {units[index]}" if units and units[index] else ""
+
+
+def _time(data: sr.FigureData) -> str:
+    return f"t{_unit([data.names.time], 0)}"

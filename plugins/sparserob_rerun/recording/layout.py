@@ -99,13 +99,19 @@ def _phase(rrb: Any, problem: sr.OptimalControlProblem) -> Any:
     if problem.system.states == 2:
         return view("/physics/phase", "Phase plane", (-10.0, 520.0, -40.0, 470.0))
     states = problem.system.states
-    name = "State space" if states == 3 else f"State space: x1, x2, x3 of {states} states"
+    name = (
+        "State space"
+        if states == 3
+        else f"State space: {', '.join(problem.names.state(k) for k in range(3))} of {states} states"
+    )
     return rrb.Spatial3DView(origin="/physics/phase", name=name, background=list(ink.GROUND[:3]))
 
 
 def _further(rrb: Any, problem: sr.OptimalControlProblem) -> Any:
     """The controls and states that the first screen has no room for."""
-    more = [view(f"/{page.path}", page.name, physics.extent(len(page.plots))) for page in pages(problem)[1:]]
+    more = [
+        view(f"/{page.path}", page.name(problem.names), physics.extent(len(page.plots))) for page in pages(problem)[1:]
+    ]
     return rrb.Horizontal(*more, name="Further signals") if len(more) < 4 else rrb.Grid(*more, name="Further signals")
 
 

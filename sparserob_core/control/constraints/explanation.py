@@ -7,6 +7,7 @@ from typing import ClassVar, final
 
 import numpy as np
 
+from sparserob_core.control.problem.names import UNNAMED, Names
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.program import Explanation, WorstConstraint, told_apart
@@ -35,7 +36,7 @@ class TimedExplanation(Explanation):
     such as ``x1(5)`` with a ``limit``: ``bound`` is what the quantity may be (``|x1| <= 0.3``), ``free`` its value
     without control and disturbance, ``sign`` -1 for a lower limit, ``sigma`` how far the disturbance alone moves it
     towards the limit, ``where`` the parameter in words. ``constraint``: the name of the constraint. Words say all of
-    these, and the ``direction``, divided by ``scale``.
+    these, and the ``direction``, divided by ``scale``; ``names``: what the states are called.
     """
 
     decides: ClassVar[str] = "control"
@@ -54,6 +55,7 @@ class TimedExplanation(Explanation):
     sign: float = 1.0
     where: str = ""
     scale: float = 1.0
+    names: Names = UNNAMED
 
     def witness(self, worst: WorstConstraint) -> WorstConstraint:
         return Witness(
@@ -106,7 +108,7 @@ class TimedExplanation(Explanation):
         most = "at least" if side < 0 else "at most"
         taken = f" less {moved:.4g} for the worst disturbances" if moved > 0 and side > 0 else ""
         taken = f" and {moved:.4g} more for the worst disturbances" if moved > 0 and side < 0 else taken
-        quantity = combination(side * rest, f"({self.time:.6g})")
+        quantity = combination(side * rest, self.names, f"({self.time:.6g})")
         return (
             f"the control cannot move {quantity}, which is {side * free:.6g}, "
             f"but {self.statement} and {other.statement} ask for {most} {side * allowed:.6g}{taken}"
@@ -152,7 +154,7 @@ def explanation(
     free, sigma, worst = functionals.parts(time, direction, parameter)
     free, limit = sign * free + 0.0, sign * float(h[row])
     quantity, where = (
-        combination(sign * direction / scale, f"({time:.6g})"),
+        combination(sign * direction / scale, functionals.names, f"({time:.6g})"),
         system.describe(parameter) if parameter.size else "",
     )
     remarks = [f"the initial state gives {free / scale:.6g}"] if time <= 0 else []
@@ -169,23 +171,31 @@ def explanation(
         parameter,
         worst,
         quantity=quantity,
-        bound=_bound(sign * direction / scale, limit / scale, None if opposite is None else opposite / scale, sign),
+        bound=_bound(
+            combination(sign * direction / scale, functionals.names),
+            limit / scale,
+            None if opposite is None else opposite / scale,
+            sign,
+        ),
         limit=limit,
         free=free,
         sigma=sigma,
         sign=sign,
         where=where,
         scale=scale,
+        names=functionals.names,
     )
 
 
-def combination(direction: Array, suffix: str = "") -> str:
-    """``c'x`` in words, such as ``x1(5)`` or ``x1(5) - 0.5 x2(5)``; the suffix stands behind every state."""
+def combination(direction: Array, names: Names, suffix: str = "") -> str:
+    """``c'x`` in words, such as ``x1(5)`` or ``x1(5) - 0.5 x2(5)``; the suffix stands behind every state's name."""
     parts: list[str] = []
     for state in np.flatnonzero(direction):
         size = abs(direction[state])
         sign = "-" if direction[state] < 0 else "+" if parts else ""
-        parts.append(f"{sign}{' ' if parts else ''}{'' if size == 1 else f'{size:.4g} '}x{state + 1}{suffix}")
+        parts.append(
+            f"{sign}{' ' if parts else ''}{'' if size == 1 else f'{size:.4g} '}{names.state(int(state))}{suffix}"
+        )
     return " ".join(parts) or "0"
 
 
@@ -195,9 +205,8 @@ def _opposite(H: Array, h: Array, row: int) -> float | None:
     return float(found.min()) if found.size else None
 
 
-def _bound(direction: Array, limit: float, opposite: float | None, sign: float) -> str:
-    """``|x1| <= 0.7``, ``-0.2 <= x1 <= 0.3`` or ``x1 >= -0.7``."""
-    words = combination(direction)
+def _bound(words: str, limit: float, opposite: float | None, sign: float) -> str:
+    """``|x1| <= 0.7``, ``-0.2 <= x1 <= 0.3`` or ``x1 >= -0.7``, of a quantity in words."""
     if opposite is None:
         return f"{words} {'>=' if sign < 0 else '<='} {limit:.6g}"
     low, high = sorted([limit, -sign * opposite])

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.control.problem.names import UNNAMED, Names
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Equality
 from sparserob_core.errors import InputError
@@ -45,8 +46,8 @@ class OptimalControlProblem:
     function into the set), or ``l1_ball`` (the coefficients of channel ``i`` in the dictionary have absolute sum at
     most ``upper_i`` of a symmetric box: a far smaller set). ``initial_control``: the control ``(m,)`` before time 0, or
     ``None`` where it does not matter. ``control_step``: the set of every change ``u_{k+1} - u_k`` from one piece of the
-    control's dictionary to the next, of ``u_0 - initial_control`` too where that is told; ``None``: any. After
-    construction ``weights`` is ``(m,)``, ``path`` and
+    control's dictionary to the next, of ``u_0 - initial_control`` too where that is told; ``None``: any.
+    ``names`` are for messages, tables and figures. After construction ``weights`` is ``(m,)``, ``path`` and
     ``terminal`` are tuples, every window has its ``stop``, and constraints that restrict nothing are gone. An initial
     state outside a path set is legal: that problem is infeasible. Raises `InputError`.
     """
@@ -63,6 +64,7 @@ class OptimalControlProblem:
     title: str = ""
     initial_control: npt.ArrayLike | None = None
     control_step: ConvexSet | None = None
+    names: Names = UNNAMED
 
     def __post_init__(self) -> None:
         if not isinstance(self.system, LinearSystem):
@@ -85,6 +87,7 @@ class OptimalControlProblem:
             step = _checked_set("control_step", self.control_step, self.system.controls, "controls")
             self._set("control_step", None if _restricts_nothing(step) else step)
         self._check_disturbance()
+        self._check_names()
         windows = [self._windowed(f"path.{i}", entry) for i, entry in enumerate(_listed("path", self.path))]
         self._set("path", tuple(window for window in windows if not _restricts_nothing(window.set)))
         self._set("terminal", tuple(self._terminal()))
@@ -137,6 +140,11 @@ class OptimalControlProblem:
             raise InputError(
                 "the class l1_ball needs a box that is symmetric about the origin, such as box: 0.1", path="disturbance"
             )
+
+    def _check_names(self) -> None:
+        if not isinstance(self.names, Names):
+            raise InputError(path="names", expected="Names(states=[...], ...)", got=f"{type(self.names).__name__}")
+        self.names.fitting(self.system.states, self.system.controls, self.system.disturbances)
 
     def _windowed(self, where: str, entry: object) -> PathConstraint:
         item = (

@@ -58,6 +58,22 @@ class LinearSystem:
             self._check_drift(d)
         self.matrices(self._probes())
 
+    @staticmethod
+    def from_statespace(
+        plant: object,
+        E: Matrix | None = None,
+        parameters: ConvexSet | None = None,
+        names: Sequence[str] = (),
+        c: Matrix | None = None,
+        delay: float = 0.0,
+    ) -> LinearSystem:
+        """The system of a state-space model of another package (python-control, scipy.signal, harold, or whatever has
+        ``A`` and ``B``); its outputs play no part. The other arguments are those of the class. Raises `InputError` for
+        a plant without these matrices and for one in discrete time."""
+        from sparserob_core.control.problem.statespace import matrices_of
+
+        return LinearSystem(*matrices_of(plant), E, parameters, names, c, delay)
+
     @property
     def states(self) -> int:
         """Number ``d`` of states."""

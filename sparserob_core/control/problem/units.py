@@ -58,6 +58,7 @@ class Units:
                 None if problem.initial_control is None else np.asarray(problem.initial_control) / self.controls
             ),
             control_step=None if problem.control_step is None else problem.control_step.in_units(self.controls),
+            names=problem.names,
         )
 
     def _window(self, entry: PathConstraint) -> PathConstraint:

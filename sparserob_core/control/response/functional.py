@@ -4,13 +4,14 @@ cannot help."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
 from sparserob_core.control.enclosures.combination import Combination
 from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.names import UNNAMED, Names
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.disturbance_support import DisturbanceSupport
@@ -31,20 +32,21 @@ class WorstCase:
     """The functionals ``c'x(t)`` of one system under its worst disturbance.
 
     Indices are given as ``times (k,)``, ``directions (k, d)``, ``parameters (k, nu)``; the decision is ``theta``
-    raveled, ``(m N,)``.
+    raveled, ``(m N,)``. ``names``: what the states are called where a functional is explained.
     """
 
     response: Response
     dictionary: Dictionary
     disturbance: DisturbanceModel | None
     shared: MeasurableSupport | None = field(default=None, repr=False)
+    names: Names = UNNAMED
 
     @shaped
     def from_state(self, initial_state: Float[Array, " d"]) -> WorstCase:
         """The functionals from another initial state ``(d,)``; what does not depend on it is shared."""
         measurable = self.disturbance is not None and self.disturbance.kind == "measurable"
         support = self.measurable if measurable else None
-        return WorstCase(self.response.from_state(initial_state), self.dictionary, self.disturbance, support)
+        return replace(self, response=self.response.from_state(initial_state), shared=support)
 
     @property
     def channels(self) -> int:
@@ -76,7 +78,8 @@ class WorstCase:
                 "piecewise_constant", single, single, model.grid, starts=np.arange(model.grid.pieces)
             )
             model = fixed if point.any() else None
-        return WorstCase(Response(known, self.response.grid, self.response.initial_state), self.dictionary, model)
+        response = Response(known, self.response.grid, self.response.initial_state)
+        return WorstCase(response, self.dictionary, model, names=self.names)
 
     @shaped
     def rows(

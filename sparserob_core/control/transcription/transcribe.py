@@ -100,7 +100,7 @@ def _functionals(
     if problem.disturbance is not None:
         model = disturbance_model(problem.disturbance_class, problem.disturbance, disturbance, grid)
     response = Response(system, grid, np.asarray(problem.initial_state, dtype=float))
-    return WorstCase(response, control, model), ParameterIndex(problem.system.parameters)
+    return WorstCase(response, control, model, names=problem.names), ParameterIndex(problem.system.parameters)
 
 
 def _assembled(

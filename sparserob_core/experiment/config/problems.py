@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import BeforeValidator, Discriminator, Field, Tag
 
 from sparserob_core.control.problem.expression import CONSTANTS, FUNCTIONS, parse_column, parse_matrix
+from sparserob_core.control.problem.names import Names
 from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint, ProblemFactory
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, ConvexSet, Equality
@@ -137,6 +138,53 @@ class SystemOptions(Options):
         return Box(*np.array(list(self.parameters.values())).T)
 
 
+@final
+class UnitsOptions(Options):
+    """What everything is measured in, one text each; an empty one where no unit is known."""
+
+    states: list[str] = Field(default_factory=list)
+    """Units of the states."""
+
+    controls: list[str] = Field(default_factory=list)
+    """Units of the controls."""
+
+    disturbances: list[str] = Field(default_factory=list)
+    """Units of the disturbance's components."""
+
+    time: str = ""
+    """Unit of time."""
+
+
+@final
+class NamesOptions(Options):
+    """What everything is called in messages, tables, figures and recordings; no number changes."""
+
+    states: list[str] = Field(default_factory=list)
+    """Names of the states; x1, x2, ... unless given."""
+
+    controls: list[str] = Field(default_factory=list)
+    """Names of the controls; u1, u2, ... unless given."""
+
+    disturbances: list[str] = Field(default_factory=list)
+    """Names of the disturbance's components; w1, w2, ... unless given."""
+
+    units: UnitsOptions = UnitsOptions()
+    """What they are measured in."""
+
+    def build(self) -> Names:
+        """The names; raises `InputError` that begins with the key."""
+        units = self.units
+        return Names(
+            states=self.states,
+            controls=self.controls,
+            disturbances=self.disturbances,
+            state_units=units.states,
+            control_units=units.controls,
+            disturbance_units=units.disturbances,
+            time=units.time,
+        )
+
+
 class LinearKeys(ProblemFactory, Options):
     """The keys that problems about a linear system share; what the control is, they say themselves."""
 
@@ -164,6 +212,9 @@ class LinearKeys(ProblemFactory, Options):
 
     terminal: list[TerminalOptions] = Field(default_factory=list)
     """Sets that the state ends in, and values that it ends at."""
+
+    names: NamesOptions = NamesOptions()
+    """Names and units for messages, tables, figures and recordings."""
 
     def initial(self, states: int) -> list[float]:
         """Initial state, one number per state; raises `InputError`."""
@@ -227,6 +278,7 @@ class LinearProblem(LinearKeys):
             control_step=(
                 None if self.control_step is None else self.control_step.build("control_step", system.controls)
             ),
+            names=self.names.build(),
         )
 
     def _control_before(self, controls: int) -> list[float] | None:

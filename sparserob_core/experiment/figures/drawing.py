@@ -93,6 +93,7 @@ def _data(
         cost_scale=experiment.program.cost_scale,
         active_fraction=sparsity(control, dictionary.breakpoints).active_fraction,
         cost=cost,
+        names=problem.names,
         tolerance=tolerance if isinstance(tolerance, float) else None,
     )
 

@@ -7,7 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sparserob_core.control.problem.names import UNNAMED, Names
 from sparserob_core.errors import InputError
+from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import RoundFinished
 from sparserob_core.sip.result import UNKNOWN_SCALE
@@ -33,7 +35,7 @@ class FigureData:
     ``times (T,)`` with the nominal ``state (d, T)`` and the worst case ``tube_lower``, ``tube_upper`` ``(d, T)`` over
     every disturbance and parameter; ``walls`` the path and terminal constraints on single components; ``active_times``
     the times of the imposed constraints that carry a multiplier; ``history`` the rounds of the method. ``tolerance`` is
-    the relative gap that was asked for, ``cost_scale`` the largest possible cost.
+    the relative gap that was asked for, ``cost_scale`` the largest possible cost, ``names`` what everything is called.
     """
 
     title: str
@@ -52,9 +54,7 @@ class FigureData:
     cost: float | None = None
     tolerance: float | None = None
     cost_scale: float = UNKNOWN_SCALE
-    control_names: Sequence[str] = ()
-    state_names: Sequence[str] = ()
-    time_unit: str = ""
+    names: Names = UNNAMED
 
     def __post_init__(self) -> None:
         pieces, instants = self.breakpoints.size - 1, self.times.size
@@ -67,16 +67,25 @@ class FigureData:
 
     def control_label(self, channel: int) -> str:
         """The axis label of one control channel."""
-        return self.control_names[channel] if self.control_names else _symbol("u", channel, self.control.shape[0])
+        return label(self.names.controls, self.names.control_units, "u", channel, self.control.shape[0])
 
     def state_label(self, component: int) -> str:
         """The axis label of one state component."""
-        return self.state_names[component] if self.state_names else _symbol("x", component, self.state.shape[0])
+        return label(self.names.states, self.names.state_units, "x", component, self.state.shape[0])
 
     def time_label(self) -> str:
         """The label of the time axis."""
-        return f"time $t$ [{self.time_unit}]" if self.time_unit else "time $t$"
+        return f"time $t$ [{plain(self.names.time)}]" if self.names.time else "time $t$"
 
 
-def _symbol(letter: str, index: int, count: int) -> str:
-    return f"${letter}_{{{index + 1}}}(t)$" if count > 1 else f"${letter}(t)$"
+def label(names: Sequence[str], units: Sequence[str], letter: str, index: int, count: int, at: str = "t") -> str:
+    """The label of an axis: the name that was given, or else the letter with its number, and the unit where one is
+    known."""
+    symbol = f"${letter}_{{{index + 1}}}({at})$" if count > 1 else f"${letter}({at})$"
+    shown = plain(names[index]) + ("" if at == "t" else f"$({at})$") if names else symbol
+    return f"{shown} [{plain(units[index])}]" if units and units[index] else shown
+
+
+def plain(text: str) -> str:
+    """A text of the user's in a figure: no formula, no control character."""
+    return printable(text).replace("$", r"\$")

@@ -9,6 +9,7 @@ from typing import Any, Literal, final
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.control.problem.names import UNNAMED, Names
 from sparserob_core.control.studies.polygon_approximation import inside, polygon_area
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
@@ -30,7 +31,8 @@ class InitialStates:
     ``d'x <= bound`` that contain the set, and ``reached (n,)``: what proven points reach. ``points (v, 2)`` with
     ``costs (v,)``: initial states and the cost of a proven control from each, and ``lower_bounds (v,)`` of its optimum.
     ``origin (d,)``: the config's initial state; the coordinates that are not in the plane are as there. ``path``:
-    sections of the path sets that hold at time 0. ``limit``: the bound on the coordinates where one was asked for, and
+    sections of the path sets that hold at time 0. ``called``: the names of the
+    states. ``limit``: the bound on the coordinates where one was asked for, and
     ``cut`` whether it cuts the set. ``status``: ``certified`` (the polygons differ by at most a thousandth of the
     area), ``verified`` (by more), ``infeasible`` (the set is empty, proven) or ``undecided`` (no point is proven).
     """
@@ -50,6 +52,7 @@ class InitialStates:
     lower_bounds: Array = field(default_factory=lambda: np.zeros(0), repr=False)
     origin: Array = field(default_factory=lambda: np.zeros(0))
     path: Sequence[Array] = field(default=(), repr=False)
+    called: Names = UNNAMED
     limit: float | None = None
     cut: bool = False
     remarks: Sequence[str] = ()
@@ -59,7 +62,7 @@ class InitialStates:
     @property
     def names(self) -> tuple[str, str]:
         """The two coordinates, such as ``x1(0)``."""
-        return f"x{self.states[0] + 1}(0)", f"x{self.states[1] + 1}(0)"
+        return f"{self.called.state(self.states[0])}(0)", f"{self.called.state(self.states[1])}(0)"
 
     @property
     def start(self) -> Array:

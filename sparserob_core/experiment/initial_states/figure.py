@@ -10,6 +10,7 @@ import numpy as np
 
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.figures import style as look
+from sparserob_core.experiment.figures.figure_data import label
 from sparserob_core.experiment.figures.style import require_matplotlib, style, write_figure
 
 if TYPE_CHECKING:
@@ -74,8 +75,11 @@ def draw_initial_states(found: InitialStates) -> Figure:
             label="the config's initial state",
         )
     ax.set_title(found.title)
-    ax.set_xlabel(f"$x_{{{found.states[0] + 1}}}(0)$")
-    ax.set_ylabel(f"$x_{{{found.states[1] + 1}}}(0)$")
+    labels = [
+        label(found.called.states, found.called.state_units, "x", k, found.origin.size, "0") for k in found.states
+    ]
+    ax.set_xlabel(labels[0])
+    ax.set_ylabel(labels[1])
     figure.legend(
         *ax.get_legend_handles_labels(),
         loc="outside lower left",

@@ -67,7 +67,10 @@ class InitialStatesSearch:
     def states(self, title: str, directions: int, values: int) -> InitialStates:
         self.directions = directions
         origin = np.asarray(self.plane.model.problem.initial_state, dtype=float)
-        bare = InitialStates(title=title, states=self.plane.states, status="undecided", message="", origin=origin)
+        called = self.plane.model.problem.names
+        bare = InitialStates(
+            title=title, states=self.plane.states, status="undecided", message="", origin=origin, called=called
+        )
         limit = self._size(self.plane.radius)
         try:
             framed = self._framed()
@@ -175,7 +178,8 @@ class InitialStatesSearch:
     def _require_bounded(self, bounds: Array) -> None:
         free = np.flatnonzero(bounds > 0.999)
         if free.size:
-            names = [f"x{self.plane.states[k % 2] + 1}(0) {'above' if k < 2 else 'below'}" for k in free]
+            called = self.plane.model.problem.names
+            names = [f"{called.state(self.plane.states[k % 2])}(0) {'above' if k < 2 else 'below'}" for k in free]
             limit = self._size(self.plane.radius)
             raise InputError(
                 f"within: the set of feasible initial states has no bound on {', '.join(names)} up to {limit}; expected"

@@ -1,0 +1,79 @@
+"""What the states, controls and disturbances of a problem are called, and what they are measured in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import final
+
+from sparserob_core.errors import InputError
+
+KINDS = {"states": "x", "controls": "u", "disturbances": "w"}
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class Names:
+    """Names and units for messages, tables, figures and recordings; they change no number.
+
+    ``states``, ``controls``, ``disturbances``: one name each, or nothing: then they are ``x1``, ``u1``, ``w1`` and
+    so on; ``state_units``, ``control_units``, ``disturbance_units``: one unit each, such as ``m/s`` (empty:
+    none is known), and ``time`` the unit of time. Raises `InputError` for a name that is empty or occurs twice.
+    """
+
+    states: Sequence[str] = ()
+    controls: Sequence[str] = ()
+    disturbances: Sequence[str] = ()
+    state_units: Sequence[str] = ()
+    control_units: Sequence[str] = ()
+    disturbance_units: Sequence[str] = ()
+    time: str = ""
+
+    def __post_init__(self) -> None:
+        seen: dict[str, str] = {}
+        for kind in KINDS:
+            names = self._texts(kind)
+            for name in names:
+                if not name.strip():
+                    raise InputError(path=f"names.{kind}", expected="names that are not empty", got=f"{list(names)}")
+                if name in seen:
+                    also = f" and in {seen[name]}" if seen[name] != kind else ""
+                    raise InputError(f"the name {name!r} occurs twice, in {kind}{also}", path="names")
+                seen[name] = kind
+            self._texts(f"{kind[:-1]}_units")
+        if not isinstance(self.time, str):
+            raise InputError(path="names.units.time", expected="a text such as s", got=f"{self.time!r}")
+
+    def fitting(self, states: int, controls: int, disturbances: int) -> Names:
+        """The same names, checked against how many there are; raises `InputError`."""
+        for kind, count in (("states", states), ("controls", controls), ("disturbances", disturbances)):
+            for key, given in ((kind, getattr(self, kind)), (f"units.{kind}", getattr(self, f"{kind[:-1]}_units"))):
+                if given and len(given) != count:
+                    raise InputError(
+                        path=f"names.{key}",
+                        expected=f"{count}, one for each of the {kind}",
+                        got=f"{len(given)}: {', '.join(given)}",
+                    )
+        return self
+
+    def state(self, index: int) -> str:
+        """The name of a state, such as ``x1``."""
+        return self.states[index] if self.states else f"x{index + 1}"
+
+    def control(self, index: int) -> str:
+        """The name of a control, such as ``u1``."""
+        return self.controls[index] if self.controls else f"u{index + 1}"
+
+    def disturbance(self, index: int) -> str:
+        """The name of a component of the disturbance, such as ``w1``."""
+        return self.disturbances[index] if self.disturbances else f"w{index + 1}"
+
+    def _texts(self, field: str) -> tuple[str, ...]:
+        given = getattr(self, field)
+        if isinstance(given, str) or not all(isinstance(text, str) for text in given):
+            raise InputError(path=f"names.{field}", expected="a list of texts", got=f"{given!r}")
+        object.__setattr__(self, field, tuple(given))
+        return tuple(given)
+
+
+UNNAMED = Names()

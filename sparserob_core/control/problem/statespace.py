@@ -1,0 +1,45 @@
+"""Plants of other packages as systems of this one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sparserob_core.errors import InputError
+
+SAMPLED = ("dt", "sampling_time", "SamplingPeriod")  # where python-control and scipy.signal, others, harold keep it
+
+
+def matrices_of(plant: object) -> tuple[Any, Any]:
+    """``A (d, d)`` and ``B (d, m)`` of whatever has them, under these names or as ``a`` and ``b``.
+
+    Raises `InputError` for what has none, or is in discrete time."""
+    given = {name: getattr(plant, name, getattr(plant, name.lower(), None)) for name in ("A", "B")}
+    missing = [name for name, matrix in given.items() if matrix is None]
+    if missing:
+        raise InputError(
+            path="plant",
+            expected="a state-space model with matrices A and B (of a transfer function: its realisation, by ss or"
+            " to_ss)",
+            got=f"a {type(plant).__name__} without {' and '.join(missing)}",
+        )
+    step = _step(plant)
+    if step is not None:
+        raise InputError(
+            path="plant",
+            expected="a system in continuous time: what is proven holds between the samples, which a discrete-time"
+            " model knows nothing of",
+            got=f"a sampled one, its step {step}",
+        )
+    return given["A"], given["B"]
+
+
+def _step(plant: object) -> str | None:
+    """The sampling step of a plant in words; ``None`` in continuous time, which python-control writes as 0 and
+    scipy.signal as ``None``."""
+    for name in SAMPLED:
+        step = getattr(plant, name, None)
+        if step is True:
+            return "not given"
+        if isinstance(step, int | float) and step > 0:
+            return f"{step:g}"
+    return None
