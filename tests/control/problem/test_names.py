@@ -86,7 +86,7 @@ def test_a_discrete_plant_is_refused_with_a_sentence():
 def test_what_is_no_state_space_model_is_refused_in_words():
     signal = pytest.importorskip("scipy.signal")
     transfer = signal.TransferFunction([1.0], [1.0, 0.5, 2.0])
-    with pytest.raises(sr.InputError, match="plant: expected a state-space model .* got a TransferFunctionContinuous"):
+    with pytest.raises(sr.InputError, match=r"plant: expected a state-space model .* got a TransferFunctionContinuous"):
         sr.LinearSystem.from_statespace(transfer)
     with pytest.raises(sr.InputError, match="C and D of a plant have no place here"):
         sr.LinearSystem(*signal.tf2ss([1.0], [1.0, 0.5, 2.0]))
