@@ -103,7 +103,7 @@ def test_every_control_and_state_is_on_one_page_and_those_with_walls_on_the_firs
     )
     assert {("state", 4), ("state", 5)} <= set(found[0].plots)
     for page in found[1:]:
-        assert page.name in heading(six.problem)
+        assert page.name(six.problem.names) in heading(six.problem)
     assert all(len(page.plots) <= 8 for page in found)
 
 
