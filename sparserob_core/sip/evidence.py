@@ -107,3 +107,17 @@ class Proof:
     unit: float = 1.0
     units: Array | None = None
     share: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Activity:
+    """What is proven of the least count of a program (`SemiInfiniteProgram.activity`) over all feasible decisions, as
+    shares of the largest: at least ``lower``, by multipliers ``dual`` of a program of its own or, where that is
+    ``None``, by those of the cost; at most ``upper``, the count of the decision that is returned, or of another one,
+    ``decision``, with the ``proofs`` of it; ``None`` where neither is proven."""
+
+    lower: float
+    upper: float | None
+    dual: Dual | None = None
+    decision: Array | None = None
+    proofs: Sequence[Proof] = ()

@@ -200,8 +200,10 @@ class SemiInfiniteProgram:
 
     ``n`` is the number of decision variables; ``S (k, n)`` is the identity when ``None``; ``lower``, ``upper`` and
     ``weights`` are numbers or ``(k,)``. ``lengths``: how much each entry of ``S x`` counts in a weighted regulariser
-    (piece lengths), ``(k,)``. ``twin`` makes the same program in its own units (`own_units`);
-    ``cost_unit`` is what a cost of 1 is in the user's units, for a program in its own.
+    (piece lengths), ``(k,)``. ``activity``: what it counts, always in the user's units, that an entry of ``S x`` is not
+    0, of the first entries or all, where that means something (`methods.counting`).
+    ``twin`` makes the same program in its own units (`own_units`); ``cost_unit`` is what a cost of 1 is in the user's
+    units, for a program in its own, and ``image_units (k,)`` what 1 of each entry of ``S x`` is.
     """
 
     n: int
@@ -218,7 +220,9 @@ class SemiInfiniteProgram:
     b: Array | None = None
     channels: int = 1
     lengths: Array | None = None
+    activity: Array | None = None
     cost_unit: float = 1.0
+    image_units: Array | None = None
     twin: Callable[[], OwnUnits] | None = field(default=None, repr=False)
     finite: FiniteProgram = field(init=False, repr=False)
 

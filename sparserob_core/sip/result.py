@@ -10,7 +10,7 @@ import numpy as np
 
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import RoundFinished
-from sparserob_core.sip.evidence import NO_BOUND, Cut, Dual, InfeasibleSubsystem, Proof
+from sparserob_core.sip.evidence import NO_BOUND, Activity, Cut, Dual, InfeasibleSubsystem, Proof
 from sparserob_core.sip.program import WorstConstraint
 
 if TYPE_CHECKING:
@@ -115,7 +115,8 @@ class Result:
     approach, what its theory promises. ``stopped``: the limit or the interrupt that ended the method early, in words.
     ``ray (n,)``: a direction along which the cost falls for ever, where one was found. ``missed``: the most by which
     the decision misses an equality, relative to the numbers that are added up in it, where there are any; computed, not
-    proven, and at most `EQUALITY` where something is claimed.
+    proven, and at most `EQUALITY` where something is claimed. ``activity``: between what the least count of the
+    program lies, where it has one.
     """
 
     status: Status
@@ -140,6 +141,7 @@ class Result:
     stopped: str = ""
     ray: Array | None = None
     missed: float | None = None
+    activity: Activity | None = None
 
     @property
     def gap(self) -> float:

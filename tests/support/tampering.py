@@ -677,6 +677,33 @@ FILES: dict[str, tuple[str, Change]] = {
             active_fraction=files.result["sparsity"]["active_fraction"] - 0.01
         ),
     ),
+    "the result says that more is needed": (
+        "known",
+        lambda files: files.result["sparsity"]["fewest_active"].update(
+            lower=files.result["sparsity"]["fewest_active"]["lower"] + 0.02
+        ),
+    ),
+    "result and certificate say that more is needed": (
+        "known",
+        lambda files: [
+            said.update(lower=files.certificate["fewest_active"]["upper"])
+            for said in (files.result["sparsity"]["fewest_active"], files.certificate["fewest_active"])
+        ],
+    ),
+    "result and certificate say that less suffices": (
+        "known",
+        lambda files: [
+            said.update(upper=said["upper"] - 0.02)
+            for said in (files.result["sparsity"]["fewest_active"], files.certificate["fewest_active"])
+        ],
+    ),
+    "a refuted control is said to suffice": (
+        "refuted",
+        lambda files: [
+            said.update(upper=1.0)
+            for said in (files.result["sparsity"]["fewest_active"], files.certificate["fewest_active"])
+        ],
+    ),
     "the result switches less often": (
         "known",
         lambda files: files.result["sparsity"].update(switches=files.result["sparsity"]["switches"] - 1),

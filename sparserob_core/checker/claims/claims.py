@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.claims import activity
 from sparserob_core.checker.claims.case import Case, listed, number, numbers
 from sparserob_core.checker.claims.constraints import bounded
 from sparserob_core.checker.claims.duality import Row
@@ -43,6 +45,8 @@ def check(case: Case, gap_tolerance: float | None) -> list[Finding]:
             return [Finding("status", "fails", f"it is {status!r}, which claims nothing")]
         claims = [judged("control", lambda: _control(case)), judged("cost", lambda: _cost(case))]
         claims += [judged("lower bound", lambda: _lower(case))]
+        if "fewest_active" in case.certificate:
+            claims.append(judged("fewest active", lambda: _fewest(case, str(status))))
         if status == "refuted":
             return [*claims, judged("violation", lambda: _witness(case))]
         if case.problem.control_step is not None:
@@ -150,9 +154,14 @@ def _agrees(name: str, written: float, derived: arb, scale: float) -> None:
 
 def _multiplied(case: Case, priced: bool) -> arb:
     """The bound that the certificate's multipliers give."""
+    rows, pieces = _weighted(case, case.certificate.get("multipliers"))
+    return case.duality.bound(rows, pieces, priced)
+
+
+def _weighted(case: Case, data: object) -> tuple[list[tuple[float, Row]], Any]:
+    """Multipliers with their constraints, and those of the control's pieces."""
     from flint import arb
 
-    data = case.certificate.get("multipliers")
     if data is None:
         raise Unchecked("the certificate holds no multipliers, which this method does not offer")
     if not isinstance(data, Mapping):
@@ -176,7 +185,40 @@ def _multiplied(case: Case, priced: bool) -> arb:
         pieces, expected = numbers(pieces, "pieces"), (case.problem.system.controls, case.control.pieces)
         if pieces.shape != expected:
             raise Broken(f"multipliers of the control's pieces have shape {pieces.shape}, expected {expected}")
-    return case.duality.bound(rows, pieces, priced)
+    return rows, pieces
+
+
+def _fewest(case: Case, status: str) -> str:
+    """Between what the least share of time lies that an admissible control must act."""
+    data = case.certificate["fewest_active"]
+    if not isinstance(data, Mapping):
+        raise Broken("fewest_active: expected lower, upper and multipliers")
+    written, upper = number(data, "lower"), data.get("upper")
+    proven = status in ("certified", "verified")
+    if (upper is not None) is not proven:
+        raise Broken(f"upper is {upper!r} where the status is {status}")
+    other = case
+    if data.get("decision") is not None:  # of a control that is admissible too, and acts less
+        other = replace(
+            case, certificate={**case.certificate, "decision": data["decision"], "proof": data.get("proof")}
+        )
+        _control(other)
+        if case.equalities:
+            equalities(other)
+        for window in other.windows:
+            bounded(other, window)
+    acted = activity.acted(other)
+    if proven and abs(number(data, "upper") - acted) > FIGURES:
+        raise Broken(f"upper is {upper!r}, the control acts for a share of {acted!r}")
+    own = data.get("multipliers")
+    rows, pieces = _weighted(case, case.certificate.get("multipliers") if own is None else own)
+    if own is None:
+        rows, pieces = activity.shared(case, rows, pieces)
+    derived = activity.least(case, rows, pieces)
+    if not 0.0 <= written <= derived + FIGURES or (proven and written > acted + FIGURES):
+        raise Broken(f"lower is {written!r}, the multipliers prove {derived!r}")
+    below = f"no admissible control acts for a share of time below {written:.6g}"
+    return f"{below}, {'this' if other is case else 'another'} one for {acted:.6g}" if proven else below
 
 
 def _row(case: Case, entry: object) -> tuple[float, Row]:
@@ -239,11 +281,12 @@ def _status(case: Case, status: str, tolerance: float | None, claims: list[Findi
     """The status must follow from the claims before it."""
     if status == "undecided":
         return "nothing is claimed beyond the figures above"
-    kept = [claim for claim in claims if claim.name not in ("cost", "lower bound")]
+    kept = [claim for claim in claims if claim.name not in ("cost", "lower bound", "fewest active")]
     wrong = [claim.name for claim in kept if claim.verdict == "fails"]
     if wrong:
         raise Broken(f"it is {status}, but {', '.join(wrong)} does not hold")
-    if any(claim.verdict == "not checked" for claim in (kept if status == "verified" else claims)):
+    needed = kept if status == "verified" else [claim for claim in claims if claim.name != "fewest active"]
+    if any(claim.verdict == "not checked" for claim in needed):
         raise Unchecked(f"{status} rests on claims that were not checked")
     cost, lower = number(case.certificate, "cost"), number(case.certificate, "lower_bound")
     gap = relative_gap(case, cost, lower)

@@ -116,18 +116,8 @@ class Duality:
     def bound(self, rows: Sequence[tuple[float, Row]], pieces: Sequence[Sequence[float]] | None, priced: bool) -> arb:
         """The bound that multipliers ``y`` of ``rows`` give; ``priced``: with the cost, otherwise as a proof of
         infeasibility."""
-        constant = sum((_exact(y) * row.constant for y, row in rows), _exact(0.0))
-        m, K = self.problem.system.controls, self.control.pieces
-        slopes = [
-            [
-                sum((_exact(y) * row.slope[k][c] for y, row in rows if not row.slope[k][c].is_zero()), _exact(0.0))
-                for c in range(m)
-            ]
-            for k in range(K)
-        ]
-        if pieces is not None and self.control.functions < K:
-            slopes, slip = self._moved(slopes, pieces)
-            constant = constant - slip
+        constant, slopes = self.summed(rows, pieces)
+        m = self.problem.system.controls
         weights = np.asarray(self.problem.weights, dtype=float) if priced else np.zeros(m)
         lengths = [
             _exact(b) - _exact(a)
@@ -140,6 +130,25 @@ class Duality:
             ),
             constant,
         )
+
+    def summed(
+        self, rows: Sequence[tuple[float, Row]], pieces: Sequence[Sequence[float]] | None
+    ) -> tuple[arb, list[list[arb]]]:
+        """The sum of ``rows`` times their multipliers ``y``: its constant, and its slopes on every piece; with fewer
+        functions than ``pieces``, in the slopes of these."""
+        constant = sum((_exact(y) * row.constant for y, row in rows), _exact(0.0))
+        m, K = self.problem.system.controls, self.control.pieces
+        slopes = [
+            [
+                sum((_exact(y) * row.slope[k][c] for y, row in rows if not row.slope[k][c].is_zero()), _exact(0.0))
+                for c in range(m)
+            ]
+            for k in range(K)
+        ]
+        if pieces is not None and self.control.functions < K:
+            slopes, slip = self._moved(slopes, pieces)
+            constant = constant - slip
+        return constant, slopes
 
     def _moved(self, slopes: list[list[arb]], pieces: Sequence[Sequence[float]]) -> tuple[list[list[arb]], arb]:
         """With fewer functions than pieces, slopes that act alike on every control of the dictionary are as good: those

@@ -147,6 +147,7 @@ def _assembled(
         b=b if b.size else None,
         channels=problem.system.controls,
         lengths=np.tile(control.lengths, problem.system.controls),
+        activity=np.kron(np.asarray(problem.weights, dtype=float), control.lengths),
     )
     return Transcription(
         problem, control, disturbance, functionals, parameters, constraints, program, formulation, rows
@@ -191,10 +192,11 @@ def _in_own_units(model: Transcription) -> OwnUnits:
     sides = _ratio(theirs, ours / rows.sides[:, None], units.controls)
     steps, mine = Steps.of(model.problem, model.control), Steps.of(own.problem, own.control).divided(rows.steps)
     pieces = np.repeat(np.concatenate([units.controls, sides]), own.control.pieces)
+    image = np.concatenate([pieces, np.repeat(_ratio(steps.H, mine.H, units.controls), steps.times.size)])
     return OwnUnits(
-        program=own.program,
+        program=replace(own.program, activity=model.program.activity, image_units=image),
         decision=np.repeat(units.controls, own.control.functions),
-        image=np.concatenate([pieces, np.repeat(_ratio(steps.H, mine.H, units.controls), steps.times.size)]),
+        image=image,
         equalities=_fixed(model.problem) @ units.states * rows.fixed,
         cost=units.cost,
     )

@@ -56,7 +56,7 @@ def compared(stored: StoredRun, loaded: Loaded, case: Case, summary: Mapping[str
 
 
 ALWAYS = {"format", "config", "status", "multipliers"}
-FIGURED = ALWAYS | {"cost", "lower_bound", "decision"}
+FIGURED = ALWAYS | {"cost", "lower_bound", "decision", "fewest_active"}
 CERTIFICATE = {
     "certified": FIGURED | {"gap_tolerance", "proof"},
     "verified": FIGURED | {"proof"},
@@ -77,8 +77,12 @@ def _unread(case: Case) -> set[str]:
     data = case.certificate
     read = CERTIFICATE.get(str(data.get("status")), FIGURED)
     left = {name for name, value in data.items() if name not in read and not (name in SOMETIMES and value in NOTHING)}
-    multipliers, proof, witness = (data.get(name) for name in ("multipliers", "proof", "witness"))
-    if isinstance(multipliers, Mapping):
+    proof, witness, fewest = (data.get(name) for name in ("proof", "witness", "fewest_active"))
+    of_activity = fewest.get("multipliers") if isinstance(fewest, Mapping) else None
+    left |= _besides("fewest_active", fewest, {"lower", "upper", "multipliers", "decision", "proof"})
+    for multipliers in (data.get("multipliers"), of_activity):
+        if not isinstance(multipliers, Mapping):
+            continue
         unused = case.control.functions >= case.control.pieces and multipliers.get("pieces") is not None
         left |= _besides("multipliers", multipliers, {"constraints", "equalities", *(() if unused else ("pieces",))})
         entries = multipliers.get("constraints")
@@ -188,6 +192,11 @@ def _sparsity(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     if not isinstance(said, Mapping):
         return ["sparsity is no mapping"]
     derived: dict[str, Any] = {"active_fraction": None, "switches": None}
+    fewest, claimed = said.get("fewest_active"), case.certificate.get("fewest_active")
+    if isinstance(claimed, Mapping):
+        claimed = {name: claimed.get(name) for name in ("lower", "upper")}
+    if fewest != claimed:
+        return [f"sparsity: fewest_active is {fewest!r}, the certificate says {claimed!r}"]
     if case.certificate.get("decision") is not None and case.certificate.get("status") != "infeasible":
         try:
             derived = asdict(sparsity(case.theta @ case.control.values, case.control.breakpoints))
@@ -249,7 +258,7 @@ def _near(said: object, point: object) -> bool:
 
 
 WORST = {"violation", "constraint", "time", "parameter"}
-SPARSITY = {"active_fraction", "switches"}
+SPARSITY = {"active_fraction", "switches", "fewest_active"}
 COMPARED: dict[str, Callable[[Case, Mapping[str, Any]], list[str] | None]] = {
     "gap": _gap,
     "cost_scale": _largest_cost,

@@ -15,7 +15,7 @@ from sparserob_core.control.transcription.steps import Steps
 from sparserob_core.control.transcription.transcribe import slanted
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.evidence import Proof
+from sparserob_core.sip.evidence import Activity, Dual, Proof
 from sparserob_core.sip.program import TOLERANCE, Formulation, SemiInfiniteProgram
 from sparserob_core.sip.result import Result
 
@@ -32,7 +32,10 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
     the dictionary is not that of their indicators.
     ``proof``: per constraint the cells ``[lower, upper]`` of (time, parameters, directions) on which it was shown, to
     ``tolerance`` in each row's own unit (decision 0016); a direction ``z`` of a curved set stands for ``z normals``.
-    ``witness``: what refutes the decision.
+    ``fewest_active``: between what the least share of time lies that any admissible control must act, with the
+    multipliers of a program of its own, or those of the cost where there are none, and with the decision that acts
+    least and its proof where that is another one. ``witness``: what refutes the
+    decision.
     """
     if not isinstance(experiment, ControlExperiment) or result.status == "failed":
         return None
@@ -52,22 +55,39 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
         "lower_bound": result.lower_bound,
         "gap_tolerance": experiment.gap_tolerance,
         "decision": theta,
-        "multipliers": _multipliers(experiment, result),
-        "proof": {proof.family: _cells(experiment, proof) for proof in result.proofs if proof.verdict == "proven"},
+        "multipliers": _multipliers(experiment, result.dual),
+        **_fewest(experiment, result.activity),
+        "proof": _proofs(experiment, result.proofs),
         "witness": _witness(problem, program, result) if result.status == "refuted" else None,
     }
 
 
-def _multipliers(experiment: ControlExperiment, result: Result) -> dict[str, Any] | None:
+def _fewest(experiment: ControlExperiment, activity: Activity | None) -> dict[str, dict[str, Any]]:
+    if activity is None:
+        return {}
+    program = experiment.program
+    own = None if activity.dual is None else _multipliers(experiment, activity.dual)
+    other: dict[str, Any] = {}
+    if activity.decision is not None:
+        theta = np.asarray(activity.decision).reshape(program.channels, experiment.control.functions)
+        other = {"decision": theta, "proof": _proofs(experiment, activity.proofs)}
+    return {"fewest_active": {"lower": activity.lower, "upper": activity.upper, "multipliers": own, **other}}
+
+
+def _proofs(experiment: ControlExperiment, proofs: Sequence[Proof]) -> dict[str, Any]:
+    return {proof.family: _cells(experiment, proof) for proof in proofs if proof.verdict == "proven"}
+
+
+def _multipliers(experiment: ControlExperiment, dual: Dual) -> dict[str, Any] | None:
     """``None`` unless every constraint can be stated in numbers: a sampled one, of the scenario approach, cannot."""
-    problem, program, z = experiment.problem, experiment.program, result.dual.z
+    problem, program, z = experiment.problem, experiment.program, dual.z
     steps = Steps.of(problem, experiment.control)
     explained = [
         (cut, said)
-        for cut in result.dual.cuts
+        for cut in dual.cuts
         if (said := _explained(program, cut.family, cut.formulation, cut.index, cut.row)) is not None
     ]
-    if len(explained) < len(result.dual.cuts) or result.dual.mu.size != program.finite.b.size:
+    if len(explained) < len(dual.cuts) or dual.mu.size != program.finite.b.size:
         return None
     return {
         "constraints": [
@@ -84,7 +104,7 @@ def _multipliers(experiment: ControlExperiment, result: Result) -> dict[str, Any
             {"constraint": "control_step", "time": t, "parameter": [], "direction": c + 0.0, "multiplier": y}
             for t, c, y in ([] if z is None or not steps.count else steps.priced(z[-steps.count :]))
         ],
-        "equalities": result.dual.mu,
+        "equalities": dual.mu,
         "pieces": _on_pieces(problem, z, experiment.control.pieces),
     }
 

@@ -42,7 +42,12 @@ def summary_of(result: Result, control: Array | None, dictionary: Dictionary | N
         "worst": _witness(result.worst),
         "tolerances": {proof.family: _tolerance(proof) for proof in result.proofs if proof.verdict == "proven"},
         **({} if result.missed is None else {"equalities": {"allowed": EQUALITY, "missed": result.missed}}),
-        "sparsity": acting or {"active_fraction": None, "switches": None},
+        "sparsity": {
+            **(acting or {"active_fraction": None, "switches": None}),
+            "fewest_active": None
+            if result.activity is None
+            else {"lower": result.activity.lower, "upper": result.activity.upper},
+        },
         "counts": {
             "relaxed_programs": 0,
             "rounds": len(result.history),

@@ -19,6 +19,7 @@ from sparserob_core.experiment.directory.finished import UNFINISHED
 from sparserob_core.experiment.directory.provenance import git_revision, provenance
 from sparserob_core.experiment.run.bound import bounded
 from sparserob_core.experiment.run.events import Broadcast, Event, Observer, RunFinished, RunStarted
+from sparserob_core.experiment.run.fewest import with_activity
 from sparserob_core.experiment.run.inspection import Inspection
 from sparserob_core.experiment.run.journal import Journal
 from sparserob_core.experiment.terminal.printing import printable
@@ -165,7 +166,7 @@ def _run(
                 if result is None:
                     raise
             if isinstance(experiment, ControlExperiment):
-                result = bounded(experiment, result)
+                result = with_activity(experiment, bounded(experiment, result), tools)
             ending = RunFinished(
                 status=result.status,
                 message=result.message,

@@ -60,10 +60,24 @@ def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("active indices", str(counts["active_indices"])),
         ("rounds", str(counts["rounds"])),
         ("share of time active", _number(sparsity["active_fraction"], ".1%")),
+        ("fewest active", _fewest(sparsity.get("fewest_active"))),
         ("switches", _number(sparsity["switches"], "d")),
         ("seconds", f"{_number(summary['seconds'], '.3f')} of the method, which solves and proves"),
     ]
     return [(name, value) for name, value in rows if value != "unknown" or name in KNOWN]
+
+
+def _fewest(known: Mapping[str, Any] | None) -> str:
+    """How little any admissible control must act."""
+    if not known:
+        return "unknown"
+    lower, upper = _number(known["lower"], ".1%"), known["upper"]
+    above = (
+        ""
+        if upper is None
+        else f", and {_number(upper, '.1%')} suffice" + (": none acts less" if upper == known["lower"] else "")
+    )
+    return f"every admissible control acts at least {lower} of the time{above}"
 
 
 def _number(value: Any, form: str) -> str:

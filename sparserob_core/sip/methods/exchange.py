@@ -20,10 +20,12 @@ from sparserob_core.options import Options
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Proof
 from sparserob_core.sip.finite import FiniteSolution
+from sparserob_core.sip.inner.vertex import vertex
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
+from sparserob_core.sip.methods.counting import count, tidied
 from sparserob_core.sip.methods.ledger import Answer, Found, Ledger, Prover
 from sparserob_core.sip.methods.unbounded import bounding_rows, falls_for_ever
-from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram, Separation
+from sparserob_core.sip.program import EQUALITY, TOLERANCE, ConstraintFamily, SemiInfiniteProgram, Separation
 from sparserob_core.sip.proof.branch_and_bound import prove
 from sparserob_core.sip.proof.verdict import worst_of
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows, rows_at
@@ -36,6 +38,7 @@ ALLOWANCES = 4  # times that a proof is helped over rounding
 THINNER = 1e-3  # share of a margin that leaves nothing feasible, which is tried next
 SMALLEST_MARGIN, LARGEST_MARGIN = 1e-15, 1e-6  # in units of the decision's bounds, where those are below 1
 CRUDE = 1e-4  # residual and relative gap of a relaxed solution that a round can do with
+SPARSIFYING = 60  # rounds after which no vertex is looked for any more
 ALLOWED = TOLERANCE / 2  # a violation that the search may leave to the proof
 
 Violated: TypeAlias = Sequence[tuple[Array, np.ndarray, str]]  # indices (k, d), rows (k,) and the name of a family
@@ -59,21 +62,23 @@ class Exchange(Method, Options):
         with the reason."""
         return self.close(program, tools, lambda x: prove(program, x, tools.notify, deadline=tools.deadline))
 
-    def close(self, program: SemiInfiniteProgram, tools: Tools, prover: Prover) -> Result:
-        """Close the gap of ``program``; what is claimed of the decision is what ``prover`` proves of it."""
+    def close(self, program: SemiInfiniteProgram, tools: Tools, prover: Prover, start: Violated = ()) -> Result:
+        """Close the gap of ``program``; what is claimed of the decision is what ``prover`` proves of it. ``start``:
+        constraints to impose from the beginning."""
         if not self.exact and tools.regulariser is None:
             raise InputError(path="exact", expected="true, for there is no regulariser", got="false")
         relaxed = RelaxedProgram(program, tools.solver, tools.regulariser, deadline=tools.deadline)
         ledger = Ledger(program, relaxed, tools, self.tolerance)
         try:
             with tools.deadline.enforced():
-                return self._exchange(ledger, prover)
+                return self._exchange(ledger, prover, start)
         except KeyboardInterrupt as error:
             return ledger.stopped(error, prover)
 
-    def _exchange(self, ledger: Ledger, prover: Prover) -> Result:
+    def _exchange(self, ledger: Ledger, prover: Prover, start: Violated) -> Result:
         program, tools = ledger.program, ledger.tools
         working = Working.start(program, tools)
+        working.add(start)
         kept: tuple[Answer, Found] | None = None
         for number in range(1, self.rounds + 1):
             tools.deadline.check()
@@ -95,9 +100,9 @@ class Exchange(Method, Options):
             # Separate: the constraints of the continuum that this decision violates most.
             x = answer.solution.x
             ledger.best = ledger.best or answer
-            found = separate(program, x, tools, ALLOWED, number)
-            violated = [_above(family, separation) for family, separation in found]
-            suggested = np.inf if any(rows.size for _, rows, _ in violated) else program.cost(x)
+            found: Found = separate(program, x, tools, ALLOWED, number)
+            violated: Violated = [_above(family, separation) for family, separation in found]
+            suggested = _suggested(program, x, violated)
             ledger.tell(number, answer, found, suggested, kept=working.rows.h.size)
 
             kept = (answer, found) if np.isfinite(suggested) else kept
@@ -106,8 +111,11 @@ class Exchange(Method, Options):
             if not last and (working.exchange(answer, violated, number) or working.tighten(violated)):
                 continue
 
+            # Sparsify: where solvers leave dust, or any optimum will do, one with zeros; it may ask for more rows.
             # Sharpen: nothing is violated but the bounds have not met, so do without the regulariser.
-            if not last and self.exact and ledger.wide(x) and working.sharpen(ledger, x):
+            answer, found, asked = _sparser(working, ledger, answer, found, number)
+            x, sharper = answer.solution.x, self.exact and ledger.wide(answer.solution.x)
+            if not last and (working.exchange(answer, asked, number) or (sharper and working.sharpen(ledger, x))):
                 continue
 
             # Prove: over the whole continuum; a witness that the proof meets is one more index to impose.
@@ -296,6 +304,45 @@ def _relaxed(method: Exchange, working: Working, ledger: Ledger) -> Answer:
         if settled and method.exact and ledger.open(solution.x):
             working.plain_bound(ledger)
     return Answer(solution, working.rows, working.epsilon, solution.value)
+
+
+def _sparser(
+    working: Working, ledger: Ledger, answer: Answer, found: Found, number: int
+) -> tuple[Answer, Found, Violated]:
+    """The answer with a decision of which fewer entries count, where there is one that violates nothing either; or the
+    same answer and what a vertex of the relaxed program, where no regulariser chooses another optimum, violates."""
+    program, x = ledger.program, answer.solution.x
+    if program.activity is None or ledger.open(x) or (number > SPARSIFYING and answer.epsilon == 0.0):
+        return answer, found, ()
+    candidates = [tidied(program, x)]
+    if answer.epsilon == 0.0 and program.finite.P is None:
+        rows = working.rows
+        norms = np.linalg.norm(rows.G, axis=1)
+        corner = vertex(ledger.relaxed.finite(rows.G, rows.h - working.margin * norms, 0.0))
+        candidates += [] if corner is None else [tidied(program, corner)]
+    kept, violated, least = (answer, found), list[tuple[Array, np.ndarray, str]](), count(program, x)
+    for other in candidates:
+        if other is x or count(program, other) >= least or not _fits(ledger, other):
+            continue
+        looked = separate(program, other, ledger.tools, ALLOWED, number)
+        above = [one for family, separation in looked if (one := _above(family, separation))[1].size]
+        if not above:
+            kept = replace(answer, solution=replace(answer.solution, x=other)), looked
+            violated, least = [], count(program, other)
+        elif answer.epsilon == 0.0:
+            violated = above
+    return *kept, violated
+
+
+def _fits(ledger: Ledger, x: Array) -> bool:
+    """Whether a decision closes the gap and keeps everything that is no family."""
+    base = ledger.program.finite
+    return not ledger.open(x) and base.missed(x) <= EQUALITY and base.residual(x) <= ALLOWED
+
+
+def _suggested(program: SemiInfiniteProgram, x: Array, violated: Violated) -> float:
+    """The upper bound that a decision suggests."""
+    return np.inf if any(rows.size for _, rows, _ in violated) else program.cost(x)
 
 
 def _above(family: ConstraintFamily, found: Separation) -> tuple[Array, np.ndarray, str]:

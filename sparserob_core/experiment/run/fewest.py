@@ -1,0 +1,69 @@
+"""How little any admissible control must act: the interval that a run reports beside its own control."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sparserob_core.control.transcription.rounding import rounded_down
+from sparserob_core.experiment.assemble import ControlExperiment
+from sparserob_core.sip.evidence import Activity
+from sparserob_core.sip.method import Tools
+from sparserob_core.sip.methods.counting import count, share_of, whole
+from sparserob_core.sip.methods.fewest import LeastCount, is_vertex, multiple
+from sparserob_core.sip.methods.own_units import solve_in_own_units
+from sparserob_core.sip.program import SemiInfiniteProgram
+from sparserob_core.sip.result import Result
+
+INWARDS = 1e-9  # of a bound, so that whoever derives it with another rounding does not find less
+ENDED, PROVEN = ("infeasible", "failed"), ("certified", "verified")
+
+
+def with_activity(experiment: ControlExperiment, result: Result, tools: Tools) -> Result:
+    """The result with what is proven of the least share of time that any admissible control of the dictionary must act.
+
+    Below by the lower bound of the cost where the convex cost below the count is a multiple of it, above by the control
+    that is returned, where that is proven. Where it is no multiple, or that control no vertex, by a program of its own,
+    which begins with the constraints that the result rests on, and by a vertex of it. A run that was stopped solves
+    nothing more.
+    """
+    program, proven = experiment.program, result.status in PROVEN
+    if result.status in ENDED or program.activity is None or result.decision is None:
+        return result
+    told = all(cut.formulation != "sampled" for cut in result.dual.cuts)  # the number of a sample tells nobody else
+    factor = multiple(program) if told else None
+    least = -np.inf if factor is None else _safe(program, factor * result.lower_bound)
+    most, other = count(program, np.asarray(result.decision)) if proven else np.inf, None
+    if factor is None or (proven and not is_vertex(program, result)):
+        other = _other(experiment, result, tools, most)
+    activity = Activity(_share(program, least) or 0.0, _share(program, most))
+    if other is not None and _safe(program, other.lower_bound) > least:
+        least = _safe(program, other.lower_bound)
+        activity = replace(activity, lower=_share(program, least) or 0.0, dual=other.dual)
+    if other is not None and other.decision is not None and other.status in PROVEN and other.proofs:
+        most = count(program, other.decision)
+        activity = replace(activity, upper=_share(program, most), decision=other.decision, proofs=other.proofs)
+    lower = activity.lower if activity.upper is None else min(activity.lower, activity.upper)
+    return replace(result, activity=replace(activity, lower=lower))
+
+
+def _safe(program: SemiInfiniteProgram, least: float) -> float:
+    return whole(program, least - INWARDS * abs(least)) if np.isfinite(least) else -np.inf
+
+
+def _share(program: SemiInfiniteProgram, counted: float) -> float | None:
+    return share_of(program, counted) if np.isfinite(counted) else None
+
+
+def _other(experiment: ControlExperiment, result: Result, tools: Tools, most: float) -> Result | None:
+    """The program whose cost is below the count, solved; ``None`` where it gives nothing."""
+    if result.stopped or tools.deadline.passed:
+        return None
+    try:
+        method = LeastCount([*result.dual.cuts, *result.indices], most if np.isfinite(most) else 0.0)
+        found = solve_in_own_units(method, experiment.program, tools)
+    except KeyboardInterrupt as error:
+        tools.deadline.interrupt(error)
+        return None
+    return None if found.status in ENDED else rounded_down(experiment.transcription, found, None)

@@ -1,0 +1,129 @@
+"""How often entries of ``S x`` are not 0: the counted program, and what a convex one proves of it.
+
+The count ``sum_k activity_k [s_k != 0]``, ``s = S x``, is not convex. The largest convex function below ``[s != 0]`` on
+``[lower, upper]`` with 0 inside is ``max(s, 0) / upper + max(-s, 0) / |lower|``; an entry whose bounds exclude 0 always
+counts. So a semi-infinite program with that cost, and every constraint as it was, bounds the count of every feasible
+decision from below: with one symmetric range and the L1 norm as the cost it is the same program.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import final
+
+import numpy as np
+
+from sparserob_core.shapes import Float, shaped
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.program import SemiInfiniteProgram
+
+DUST = 1e-5  # of an entry's range: so much is what solvers leave where 0 is meant; nothing is claimed without a proof
+MISSED = 1e-6  # of one count, by which a whole number of them may be missed
+ROUNDED = 1e-12  # of the terms of which an entry is a sum: that much counts as 0, since it is rounding
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Counted:
+    """``program``: the same constraints with the convex cost below the count, in the cost's own unit; ``certain``: what
+    is counted whatever the decision, in the user's units; ``tilt (k,)``: the part of the cost that is linear in
+    ``S x``."""
+
+    program: SemiInfiniteProgram
+    certain: float
+    tilt: Array
+
+
+def counted_below(program: SemiInfiniteProgram) -> Counted:
+    """The program whose cost, and ``certain``, are below the count at every feasible decision."""
+    base, prices = program.finite, prices_of(program)
+    always = (base.lower > 0.0) | (base.upper < 0.0)
+    up, down = slopes(base.lower, base.upper)
+    share = np.where(always, 0.0, prices / program.cost_unit)
+    tilt = share * (up - down) / 2.0
+    q = tilt if base.S is None else np.asarray(base.S.T @ tilt)
+    weights = share * (up + down) / 2.0
+    return Counted(replace(program, weights=weights, q=q, P=None, twin=None), float(prices[always].sum()), tilt)
+
+
+@shaped
+def slopes(lower: Float[Array, " k"], upper: Float[Array, " k"]) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
+    """``(up, down)``: what the convex function below ``[s != 0]`` costs per unit above and below 0. Where one side is
+    forbidden its slope is that of the other; where there is no bound it is 0."""
+    with np.errstate(divide="ignore"):
+        up, down = np.where(upper > 0.0, 1.0 / upper, 0.0), np.where(lower < 0.0, -1.0 / lower, 0.0)
+    return np.where(upper > 0.0, up, down), np.where(lower < 0.0, down, up)
+
+
+def prices_of(program: SemiInfiniteProgram) -> Array:
+    """What every entry of ``S x`` counts when it is not 0, ``(k,)``, in the user's units; zeros where none counts."""
+    prices = np.zeros(program.finite.weights.size)
+    if program.activity is not None:
+        prices[: program.activity.size] = program.activity
+    return prices
+
+
+@shaped
+def acting(coefficients: Float[Array, "m n"], values: Float[Array, "n k"]) -> np.ndarray:
+    """Where ``coefficients @ values`` is not 0, ``(m, k)``, but for the rounding of that sum itself."""
+    return np.asarray(np.abs(coefficients @ values) > ROUNDED * (np.abs(coefficients) @ np.abs(values)))
+
+
+def count(program: SemiInfiniteProgram, x: Array) -> float:
+    """The count of a decision ``x (n,)``, in the user's units."""
+    base = program.finite
+    terms = np.abs(x) if base.S is None else abs(base.S) @ np.abs(x)
+    return math.fsum(prices_of(program)[np.abs(base.image(x)) > ROUNDED * terms])
+
+
+def share_of(program: SemiInfiniteProgram, counted: float) -> float:
+    """What a count is of the largest."""
+    prices = prices_of(program)
+    prices = prices[prices > 0.0]
+    one = _one(prices)
+    return float(np.rint(counted / one) / prices.size if one else counted / math.fsum(prices))
+
+
+def whole(program: SemiInfiniteProgram, least: float) -> float:
+    """The least count that is at least ``least`` but for rounding, where all that count, count the same: a whole number
+    of them. ``least`` itself otherwise."""
+    prices = prices_of(program)
+    one = _one(prices[prices > 0.0])
+    return (
+        float(min(np.count_nonzero(prices), max(0.0, np.ceil(least / one - MISSED)))) * one if one else max(0.0, least)
+    )
+
+
+def _one(prices: Array) -> float:
+    """What all count, where that is the same; else 0."""
+    return float(prices.mean()) if prices.size and np.ptp(prices) <= ROUNDED * prices.max() else 0.0
+
+
+def tidied(program: SemiInfiniteProgram, x: Array) -> Array:
+    """The decision ``x (n,)`` with entries of ``S x`` that are nearly 0, or nearly a bound, moved there, where they
+    count; ``x`` itself where nothing is to be moved. It is as good as the constraints say: look at them again."""
+    base, prices = program.finite, prices_of(program)
+    reach = np.maximum(np.abs(base.lower), np.abs(base.upper))
+    image = base.image(x)
+    near = np.isfinite(reach) & (prices > 0.0) & (np.abs(image) <= DUST * reach)
+    near &= (base.lower <= 0.0) & (base.upper >= 0.0)
+    if not (near & (image != 0.0)).any():
+        return x
+    if base.S is None:
+        return np.where(near, 0.0, x)
+    if x.size > LARGE:
+        return x
+    with np.errstate(invalid="ignore"):
+        targets = np.where(near, 0.0, np.where(image > 0.0, base.upper, base.lower))
+        still = near | (np.isfinite(targets) & (np.abs(image - targets) <= DUST * np.abs(targets)))
+    rows = base.S[np.flatnonzero(still)].toarray()
+    alone = np.count_nonzero(rows, axis=1) == 1  # images of one entry, which are 0 exactly where it is
+    moved, free = x.copy(), np.ones(x.size, dtype=bool)
+    free[np.abs(rows[alone & near[still]]).argmax(axis=1)] = False
+    moved[~free] = 0.0
+    moved[free] += np.linalg.lstsq(rows[:, free], targets[still] - rows @ moved, rcond=None)[0]
+    return moved if count(program, moved) < count(program, x) else x
+
+
+LARGE = 2000  # variables that images are solved for
