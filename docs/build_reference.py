@@ -31,8 +31,10 @@ FILES = {
     "result.json": (
         "status, message, cost, value, epsilon, bounds, gap, worst constraint, equalities (what is missed of them, of"
         " the numbers that are added up), tolerances (what was proven of each"
-        " constraint, and what counts as no violation of its rows, in the user's units), sparsity (with `fewest_active`: `lower` and `upper` of the least share of time that any admissible control must act), counts, seconds (of"
-        " the method: solving and proving, neither reading nor drawing), seed, versions; for the scenario approach"
+        " constraint, and what counts as no violation of its rows, in the user's units), sparsity (with"
+        " `fewest_active`: `lower` and `upper` of the least share of time that any admissible control"
+        " must act), counts, seconds (of the method: solving and proving, neither reading nor drawing),"
+        " seed, versions; for the scenario approach"
         " `scenario_bound`; `upper_bound` and `gap` are null unless the status is certified or verified; `provenance`:"
         " the hash of what decides the result, when the run started, the git revision of the config's folder, host,"
         " contents of the plugin files"
