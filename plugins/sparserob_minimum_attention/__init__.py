@@ -47,6 +47,7 @@ class MinimumAttention(sr.LinearKeys):
             system=self._augmented(d, m),
             horizon=self.horizon,
             initial_state=self.initial(d) + self._initial_control(m),
+            initial_set=self._deviations(d, m),
             control=self.rate.build("rate", m),
             weights=self.weights,
             disturbance=self.noise(plain),
@@ -75,6 +76,16 @@ class MinimumAttention(sr.LinearKeys):
         if len(given) != m:
             raise sr.InputError(f"initial_control: expected {m} numbers, one per control, got {len(given)}")
         return given
+
+    def _deviations(self, d: int, m: int) -> sr.Box | None:
+        """Those of the augmented state: the control at time 0 is known."""
+        bound = self.deviations(d)
+        if bound is None:
+            return None
+        if not bound.is_box:
+            raise sr.InputError("initial_state: minimum_attention takes a box of initial states, got another set")
+        box, known = bound.bounding_box(), np.zeros(m)
+        return sr.Box(np.append(box.lower, known), np.append(box.upper, known))
 
     def _bounds(self, d: int, m: int) -> list[sr.PathConstraint]:
         """The bounds of ``u`` as path constraints; flat ones only, since they act on the last coordinates of the

@@ -108,6 +108,7 @@ def oscillator(kind: str, f: Factors) -> sr.OptimalControlProblem:
         system=sr.LinearSystem(A if parameters is not None else A([0.0]), B, E, parameters=parameters),
         horizon=3.0 / f.time,
         initial_state=np.array([1.0, 0.3]) / x,
+        initial_set=sr.Ellipsoid(np.zeros(2), np.diag((np.array([0.03, 0.05]) / x) ** 2)) if kind == "begun" else None,
         control=sr.Box([-1.0 / f.control], [1.0 / f.control]),
         weights=[f.weight],
         disturbance=None if kind == "fixed" else noise,
@@ -124,7 +125,7 @@ def active(result: sr.Result) -> set[tuple[str, int]]:
     return {(cut.family, cut.row) for cut in result.indices}
 
 
-KINDS = ("known", "uncertain", "curved", "fixed")
+KINDS = ("known", "uncertain", "curved", "fixed", "begun")
 
 
 @pytest.fixture(scope="module", params=KINDS)

@@ -34,6 +34,7 @@ EXPECTED: dict[str, tuple[str, float | None, float]] = {
     "experiment3_reduced": ("certified", None, 0.0),
     "experiment3_repaired": ("certified", 1.11230, 2e-5),
     "haar": ("certified", 0.537592, 5e-6),
+    "initial_set": ("certified", 0.502958, 1e-6),
     "parameters_and_disturbance": ("certified", None, 0.0),
     "walsh": ("certified", 0.537065, 5e-6),
 }

@@ -143,7 +143,7 @@ def tangents(d: int, p: float) -> tuple[np.ndarray, float]:
 @dataclass(frozen=True)
 class Instance:
     """``x' = (A + sum_k p_k slopes_k) x + B u + E w`` with ``|p_k| <= 1``, all sets about 0, the control and the
-    disturbance constant between ``edges``."""
+    disturbance constant between ``edges``; ``x(0)`` anywhere in ``initial_state`` plus ``initial_set``."""
 
     A: np.ndarray
     B: np.ndarray
@@ -158,6 +158,7 @@ class Instance:
     path: list[tuple[Shape, float, float]] = field(default_factory=list)
     slopes: list[np.ndarray] = field(default_factory=list)
     dictionary: str = "piecewise_constant"
+    initial_set: Shape | None = None
 
     @property
     def price(self) -> np.ndarray:
@@ -179,12 +180,14 @@ class Instance:
 @dataclass(frozen=True)
 class Sampled:
     """At the fine times ``(J,)``, for one parameter: the state without control ``(J, d)``, its response to the pieces
-    ``(J, d, m K)`` and to the disturbance ``(J, d, q, K)``, and how far a state may leave its chords ``(d,)``."""
+    ``(J, d, m K)`` and to the disturbance ``(J, d, q, K)``, what becomes of an initial state ``(J, d, d)``, and how far
+    a state may leave its chords ``(d,)``."""
 
     times: np.ndarray
     free: np.ndarray
     response: np.ndarray
     noise: np.ndarray
+    flow: np.ndarray
     sag: np.ndarray
 
 
@@ -197,20 +200,20 @@ def sample(problem: Instance, per_piece: int, parameter: np.ndarray) -> Sampled:
     steps = np.repeat(np.diff(problem.edges) / per_piece, per_piece)
     count = K * per_piece + 1
     free, response, noise = np.zeros((count, d)), np.zeros((count, d, m, K)), np.zeros((count, d, q, K))
-    free[0] = problem.initial_state
+    free[0], flow = problem.initial_state, np.broadcast_to(np.eye(d), (count, d, d)).copy()
     for j in range(count - 1):
         if j % per_piece == 0:
             size = d + m + q
             big = expm(steps[j] * np.vstack([np.hstack([A, problem.B, problem.E]), np.zeros((m + q, size))]))
             Ad, Bd, Ed = big[:d, :d], big[:d, d : d + m], big[:d, d + m :]
-        free[j + 1] = Ad @ free[j]
+        free[j + 1], flow[j + 1] = Ad @ free[j], Ad @ flow[j]
         response[j + 1] = np.einsum("ij,jmk->imk", Ad, response[j])
         response[j + 1, :, :, j // per_piece] += Bd
         noise[j + 1] = np.einsum("ij,jqk->iqk", Ad, noise[j])
         noise[j + 1, :, :, j // per_piece] += Ed
     times = np.concatenate([[0.0], np.cumsum(steps)])
     times[per_piece::per_piece] = problem.edges[1:]
-    sampled = Sampled(times, free, response.reshape(count, d, m * K), noise, np.zeros(d))
+    sampled = Sampled(times, free, response.reshape(count, d, m * K), noise, flow, np.zeros(d))
     w = np.zeros(q)
     if problem.disturbance is not None:
         w = np.maximum(problem.disturbance.support(np.eye(q)), problem.disturbance.support(-np.eye(q)))
@@ -223,10 +226,13 @@ def sample(problem: Instance, per_piece: int, parameter: np.ndarray) -> Sampled:
 
 
 def deviations(problem: Instance, sampled: Sampled, normals: np.ndarray) -> np.ndarray:
-    """The worst ``c'x`` ``(J, r)`` of the disturbance alone, for every row ``c``."""
+    """The worst ``c'x`` ``(J, r)`` of the disturbance and the initial deviation alone, for every row ``c``."""
+    begun = np.zeros((len(sampled.times), len(normals)))
+    if problem.initial_set is not None:
+        begun = problem.initial_set.support(np.einsum("rd,jde->jre", normals, sampled.flow))
     if problem.disturbance is None:
-        return np.zeros((len(sampled.times), len(normals)))
-    return problem.disturbance.support(np.einsum("rd,jdqk->jrkq", normals, sampled.noise)).sum(axis=-1)
+        return begun
+    return begun + problem.disturbance.support(np.einsum("rd,jdqk->jrkq", normals, sampled.noise)).sum(axis=-1)
 
 
 Rows = tuple[np.ndarray, np.ndarray]
@@ -390,11 +396,14 @@ def config(problem: Instance, units: Units) -> dict[str, Any]:
     ends: list[dict[str, Any]] = [shape.config(units.states, units.rows) for shape in problem.terminal]
     if problem.ends_at is not None:
         ends.append({"equals": [float(v) if np.isfinite(v) else None for v in problem.ends_at * units.states]})
+    begin: Any = (units.states * problem.initial_state).tolist()
+    if problem.initial_set is not None:
+        begin = {"centre": begin, **problem.initial_set.config(units.states, units.rows)}
     stated = {
         "name": "linear",
         "system": system,
         "horizon": horizon,
-        "initial_state": (units.states * problem.initial_state).tolist(),
+        "initial_state": begin,
         "weights": (problem.weights * units.cost / units.controls).tolist(),
         "control": problem.control.config(units.controls, units.rows),
         "path": windows,
@@ -416,7 +425,7 @@ def drawn_units(rng: np.random.Generator, problem: Instance) -> Units:
         return 10.0 ** rng.uniform(-decades, decades, size)
 
     far = rng.choice([0.0, 1.0, 1.0, 1.0])
-    states: list[Shape | None] = [*problem.terminal, *(shape for shape, _, _ in problem.path)]
+    states: list[Shape | None] = [*problem.terminal, *(one for one, _, _ in problem.path), problem.initial_set]
     return Units(
         time=float(10.0 ** rng.uniform(-4 * far, 4 * far)),
         states=some(problem.B.shape[0], 6 * far, states),
@@ -522,8 +531,13 @@ def on_the_boundary(rng: np.random.Generator, share: float) -> Instance | None:
 
 
 def instance(seed: int) -> tuple[Instance, Units]:
-    """Number ``seed``: every tenth one on the boundary, feasible or infeasible by 1e-6."""
+    """Number ``seed``: every tenth one on the boundary, feasible or infeasible by 1e-6; every third of the others from
+    a set of initial states."""
     rng = np.random.default_rng(seed)
     problem = on_the_boundary(rng, 1e-6 if seed % 20 else -1e-6) if seed % 10 == 0 else None
     problem = problem if problem is not None else drawn(rng)
+    if seed % 3 == 1 and seed % 10 and problem.ends_at is None:
+        own = np.random.default_rng([seed, 1])  # the numbers of what was drawn before stay as they are
+        widths = own.uniform(0.002, 0.05, len(problem.A))
+        problem = replace(problem, initial_set=shape(own, widths, bounded=True))
     return problem, drawn_units(rng, problem)

@@ -155,6 +155,7 @@ class Case:
             [float(v) for v in np.asarray(self.problem.initial_state)],
             None if changes is None else self.problem.disturbance,
             changes or [],
+            self.problem.initial_set,
         )
 
     def units(self, window: Window) -> RowUnits:

@@ -328,7 +328,10 @@ def _witness(case: Case) -> str:
         raise Broken(f"t = {time!r} is not within {window.start:g} to {window.stop:g}")
     if case.problem.system.parameters is not None and not member(case.problem.system.parameters, parameter):
         raise Broken(f"the parameter {parameter.tolist()} is not shown to be in its set")
-    state, height = reached(case, time, parameter, data.get("disturbance")), limit(window.shape, direction)
+    state, height = (
+        reached(case, time, parameter, data.get("disturbance"), data.get("deviation")),
+        limit(window.shape, direction),
+    )
     over = sum((balls([c])[0] * x for c, x in zip(direction, state, strict=True)), -height)
     slack = case.units(window).slack(direction, height)
     if not over > slack:

@@ -85,7 +85,8 @@ class Duality:
         return Row(constant, slope)
 
     def row(self, direction: Array, time: float, parameter: Sequence[float], limit: arb, disturbed: bool = True) -> Row:
-        """``c'x(t) <= limit`` at one parameter, for the worst disturbance, or where none reaches the state."""
+        """``c'x(t) <= limit`` at one parameter, for the worst disturbance and initial state, or where none reaches
+        it."""
         flow = Flow(self.problem.system, tuple(map(float, parameter)), (0.0,) * len(parameter), 0)
         d, m, columns = flow.parts["A"][0].nrows(), self.problem.system.controls, flow.parts["B"][0].ncols()
         matrix, delay = _joined(flow), self.problem.system.delay
@@ -101,6 +102,8 @@ class Duality:
             early = _differences([lags[s][d : d + m] if s < time else None for s in (0.0, breaks[0])], m)[0]
             constant = sum((w * _exact(u) for w, u in zip(early, before(self.problem), strict=True)), constant)
         slope = _differences([lags[s][d : d + m] if s < time else None for s in breaks], m)
+        if disturbed and self.problem.initial_set is not None:
+            constant = constant + support(self.problem.initial_set, lags[0.0][:d])
         if disturbed and self.changes is not None and self.problem.disturbance is not None:
             mw = flow.parts["E"][0].ncols()
             for weights in _differences([lags[s][d + columns :] if s < time else None for s in jumps], mw):

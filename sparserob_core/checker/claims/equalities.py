@@ -1,5 +1,5 @@
-"""States that are fixed at the end: no parameter and no disturbance may reach them, and the control must bring them
-there."""
+"""States that are fixed at the end: no parameter, no disturbance and no choice of initial state may reach them, and the
+control must bring them there."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 def equalities(case: Case) -> str:
     """Show that the fixed states are met at every parameter and disturbance; a sentence with the figures."""
     middle = [] if case.problem.system.parameters is None else case.problem.system.parameters.interior_point().tolist()
-    scene, d = replace(case.scene, disturbance=None), case.problem.system.states
+    scene, d = replace(case.scene, disturbance=None, initial_set=None), case.problem.system.states
     tube = Tube(Flow(case.problem.system, tuple(middle), (0.0,) * len(middle), 0), scene, np.eye(d))
     horizon, everything = case.problem.horizon, Box(np.full(d, -np.inf), np.full(d, np.inf))
     sums = RowUnits(case.problem, scene, everything, horizon, horizon).sums
@@ -45,7 +45,8 @@ def equalities(case: Case) -> str:
 
 
 def _reached(case: Case, state: int) -> bool:
-    """Whether an uncertain entry may reach a state: follow the entries of ``A`` that are not 0 at every parameter."""
+    """Whether an uncertain entry, a disturbance or the choice of an initial state may reach a state: follow the entries
+    of ``A`` that are not 0 at every parameter."""
     system = case.problem.system
     wide = _hull(case)
     parts = expanded(system, Monomials(len(wide), 1), wide, [1.0] * len(wide))
@@ -62,7 +63,9 @@ def _reached(case: Case, state: int) -> bool:
     bound = case.problem.disturbance
     free = [] if bound is None else [w for w, size in enumerate(radius(bound)) if size > math.ulp(0.0)]
     pushed = any(not part[i, w].is_zero() for part in parts["E"] for i in reaching for w in free)
-    return uncertain or pushed
+    begun = case.problem.initial_set
+    moved = begun is not None and any(radius(begun)[j] > math.ulp(0.0) for j in reaching)
+    return uncertain or pushed or moved
 
 
 def _hull(case: Case) -> Sequence[arb]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,9 +22,9 @@ if TYPE_CHECKING:
     from flint import arb
 
 
-def reached(case: Case, time: float, parameter: Array, signal: object) -> list[arb]:
+def reached(case: Case, time: float, parameter: Array, signal: object, deviation: object = None) -> list[arb]:
     """The state at ``time`` under the case's control, and ``signal (mw, pieces)`` on the pieces of the common grid
-    (``None``: no disturbance)."""
+    (``None``: no disturbance), from the centre of the initial states and a ``deviation (d,)`` in their set."""
     from flint import arb, arb_mat
 
     flow = Flow(case.problem.system, tuple(map(float, parameter)), (0.0,) * parameter.size, 0)
@@ -32,7 +33,10 @@ def reached(case: Case, time: float, parameter: Array, signal: object) -> list[a
     both = stacked(
         [left + right for left, right in zip(flow.parts["B"][0].tolist(), flow.parts["E"][0].tolist(), strict=True)]
     )
-    x = stacked([[v] for v in balls(np.asarray(case.problem.initial_state))])
+    begin = balls(np.asarray(case.problem.initial_state))
+    if case.problem.initial_set is not None:
+        begin = [v + off for v, off in zip(begin, balls(_begun(case, deviation)), strict=True)]
+    x = stacked([[v] for v in begin])
     for k, start in enumerate(case.grid[:-1]):
         if start >= time:
             break
@@ -43,10 +47,10 @@ def reached(case: Case, time: float, parameter: Array, signal: object) -> list[a
     return state
 
 
-def exceeded(case: Case, said: Mapping[str, object]) -> tuple[list[float], float]:
+def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None) -> tuple[list[float], float]:
     """By how much the worst disturbance exceeds each row of a constraint at one time and parameter, and how closely
-    that is known: `said` holds the names ``constraint``, ``time``, ``parameter`` and ``violation``. Raises `Broken`
-    where these are none, `Unchecked` for a curved set."""
+    that is known; from the worst initial state, or from ``begun (d,)``. `said` holds the names ``constraint``,
+    ``time``, ``parameter`` and ``violation``. Raises `Broken` where these are none, `Unchecked` for a curved set."""
     name = str(said.get("constraint"))
     of_control = {"control": case.problem.control, "control_step": case.problem.control_step}.get(name)
     if of_control is not None and facets(of_control) is None:
@@ -63,12 +67,25 @@ def exceeded(case: Case, said: Mapping[str, object]) -> tuple[list[float], float
         raise Unchecked("the worst direction of a curved set is not told")
     basis, z = found
     centre = tuple(map(float, parameter))
-    tube = Tube(Flow(case.problem.system, centre, (0.0,) * len(centre), 0), case.scene, basis)
+    scene = case.scene if begun is None else replace(case.scene, initial_state=begun.tolist(), initial_set=None)
+    tube = Tube(Flow(case.problem.system, centre, (0.0,) * len(centre), 0), scene, basis)
     piece = min(bisect_right(case.grid, time) - 1, len(case.grid) - 2 if time < case.grid[-1] else len(case.grid) - 1)
     polynomials = tube.cells(piece, time, time, z)
     over = [float(poly.coefficients[0, 0]) - float(b.mid()) for poly, (_, b) in zip(polynomials, flat, strict=True)]
     slack = max(float(poly.error) for poly in polynomials) + TOLERANCE * float(case.units(window).rows.max(initial=0.0))
     return over, slack
+
+
+def _begun(case: Case, data: object) -> Array:
+    """The deviation of the initial state, shown to be one of the problem's."""
+    bound = case.problem.initial_set
+    assert bound is not None
+    deviation = numbers(data, "deviation")
+    if deviation.shape != (bound.dimension,):
+        raise Broken(f"deviation: expected {bound.dimension} numbers, got shape {deviation.shape}")
+    if not member(bound, deviation):
+        raise Broken(f"the deviation {deviation.tolist()} of the initial state is not shown to be in its set")
+    return deviation
 
 
 def _admissible(case: Case, signal: object) -> Array:

@@ -124,6 +124,11 @@ class RowUnits:
                 v[first:] = v[first:] @ Phi
         start = np.asarray(self.problem.initial_state, dtype=float)
         high, low, sums = v @ start, -(v @ start), np.abs(v) @ np.abs(start)
+        deviations = self.problem.initial_set
+        if deviations is not None:
+            axes = np.eye(d)
+            high, low = high + deviations.support(v), low + deviations.support(-v)
+            sums = sums + np.abs(v) @ np.maximum(np.abs(deviations.support(axes)), np.abs(deviations.support(-axes)))
         waiting, given = int(np.searchsorted(nodes[:-1], system.delay)), np.ones(columns)
         given[:m] = before(self.problem)
         known = np.concatenate([driven[:waiting] * given, driven[waiting:] * np.append(np.zeros(m), given[m:])])

@@ -27,14 +27,16 @@ SAME = 1e-14  # of the horizon: durations closer than this are treated as one ba
 @final
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What is simulated: the ``grid`` (all breakpoints), the control ``(m, 1)`` on each of its pieces, ``x(0)``, and
-    the disturbance: its set and the breakpoints between which it is constant."""
+    """What is simulated: the ``grid`` (all breakpoints), the control ``(m, 1)`` on each of its pieces, the centre of
+    ``x(0)`` and the set of deviations from it, and the disturbance: its set and the breakpoints between which it is
+    constant."""
 
     grid: list[float]
     control: list[arb_mat]
     initial_state: list[float]
     disturbance: ConvexSet | None
     changes: list[float]
+    initial_set: ConvexSet | None = None
 
     @property
     def tick(self) -> float:
@@ -114,6 +116,7 @@ class DisturbanceSupports:
     basis: Array
     _tables: dict[tuple[int, int], Table] = field(default_factory=dict)
     _operators: dict[int, Operator] = field(default_factory=dict)
+    _selves: dict[int, Operator] = field(default_factory=dict)
     _onward: dict[int, Operator] = field(default_factory=dict)
     _steps: dict[int, Series] = field(default_factory=dict)
     _rows: tuple[list[int], list[Series]] | None = None
@@ -127,16 +130,22 @@ class DisturbanceSupports:
         assert self.scene.disturbance is not None
         if self._latest is None or self._latest[0] != (start, ticks):
             self._latest = ((start, ticks), *self._weights(start, ticks))
-        _, every, errors = self._latest
-        mid = np.einsum("ljkwb,ib->iljkw", every, z)
-        rad = np.einsum("ljkwb,ib->iljkw", errors + rounding(z.shape[1]) * np.abs(every), np.abs(z)) * OUTWARD
-        k, pieces, mw = mid.shape[0], mid.shape[1], mid.shape[-1]
-        value, spread = _ranges(mid, rad)
-        w, excess = linear_bound(self.scene.disturbance, value.reshape(-1, mw), spread.reshape(-1, mw))
-        w, excess = w.reshape(k, pieces, mw), excess.reshape(k, pieces)
-        moved = np.einsum("ilw,iljkw->ijk", w, mid)
-        lost = rad.sum(axis=(2, 3)) + rounding(pieces * mw) * np.abs(mid).sum(axis=(2, 3))
-        return moved, np.einsum("ilw,ilw->i", np.abs(w), lost) * OUTWARD, excess.sum(axis=1) * OUTWARD
+        return _bounded(self.scene.disturbance, *self._latest[1:], z)
+
+    def begun(self, start: float, ticks: int, z: Array) -> tuple[Array, Array, Array]:
+        """`bounds` of what the worst initial state adds to that of the centre: the support function of the set of
+        deviations at the rows themselves."""
+        assert self.scene.initial_set is not None
+        node = self.scene.grid[bisect_right(self.scene.grid, start) - 1]
+        row = self._row(round(node / self.scene.tick))
+        M, size, b = row.mid.shape
+        rows = Enclosed(row.mid.reshape(M * size, b), row.rad.reshape(M * size, b))
+        offset = round((start - node) / self.scene.tick)
+        if offset:
+            rows = self._later(offset).applied(rows)
+        found, d = self._onwards(ticks).applied(rows), len(self.scene.initial_state)
+        mid, rad = (part.reshape(1, -1, M, size, b)[:, :, :, :d] for part in (found.mid, found.rad))
+        return _bounded(self.scene.initial_set, mid, rad, z)
 
     def _weights(self, start: float, ticks: int) -> tuple[Array, Array]:
         """What every piece of the disturbance before the cell adds per unit, ``(pieces, J + 1, M, mw, b)``, with errors
@@ -184,20 +193,28 @@ class DisturbanceSupports:
         return self._onward[ticks]
 
     def _operator(self, ticks: int) -> Operator:
-        """From a row to the coefficients of its integral within that many ticks; whatever a row does in two ticks to
+        """From a row to the coefficients of its integral within that many ticks."""
+        if ticks not in self._operators:
+            self._operators[ticks] = Operator.of(self._factors(ticks), len(self.scene.initial_state))
+        return self._operators[ticks]
+
+    def _onwards(self, ticks: int) -> Operator:
+        """From a row to its own coefficients within that many ticks, with those of its integral below."""
+        if ticks not in self._selves:
+            self._selves[ticks] = Operator.of(self._factors(ticks), 0)
+        return self._selves[ticks]
+
+    def _factors(self, ticks: int) -> list[Series]:
+        """What makes the coefficients in time of a row within that many ticks; whatever a row does in two ticks to
         either side is included, since lags are rounded to ticks twice."""
         from flint import arb
 
-        if ticks not in self._operators:
-            A, length = self.flow.rows, self.scene.duration(ticks)
-            size = A.parts[0].nrows()
-            unit = Series.constant(A.monomials, stacked([[arb(int(i == j)) for j in range(size)] for i in range(size)]))
-            factors = [unit] + (in_time(A, A, length, A.scaled(up_to(length)).exp()) if ticks else [])
-            widened = A.scaled(arb(0, 2 * self.scene.tick)).exp()
-            self._operators[ticks] = Operator.of(
-                [factor * widened for factor in factors], len(self.scene.initial_state)
-            )
-        return self._operators[ticks]
+        A, length = self.flow.rows, self.scene.duration(ticks)
+        size = A.parts[0].nrows()
+        unit = Series.constant(A.monomials, stacked([[arb(int(i == j)) for j in range(size)] for i in range(size)]))
+        factors = [unit] + (in_time(A, A, length, A.scaled(up_to(length)).exp()) if ticks else [])
+        widened = A.scaled(arb(0, 2 * self.scene.tick)).exp()
+        return [factor * widened for factor in factors]
 
     def _row(self, ticks: int) -> Enclosed:
         """The rows after that many ticks, as columns: ``(M, n, b)``."""
@@ -229,6 +246,20 @@ class DisturbanceSupports:
         size, d = self.flow.rows.parts[0].nrows(), self.basis.shape[1]
         columns = [[arb(float(c[i])) if i < d else arb(0) for c in self.basis] for i in range(size)]
         return Series.constant(self.flow.monomials, stacked(columns))
+
+
+def _bounded(shape: ConvexSet, every: Array, errors: Array, z: Array) -> tuple[Array, Array, Array]:
+    """Bounds of the sum of a set's support functions at weights ``(pieces, J + 1, M, mw, b)`` that are off by at most
+    ``errors``, for combinations ``z (k, b)`` of them: as in `DisturbanceSupports.bounds`."""
+    mid = np.einsum("ljkwb,ib->iljkw", every, z)
+    rad = np.einsum("ljkwb,ib->iljkw", errors + rounding(z.shape[1]) * np.abs(every), np.abs(z)) * OUTWARD
+    k, pieces, mw = mid.shape[0], mid.shape[1], mid.shape[-1]
+    value, spread = _ranges(mid, rad)
+    w, excess = linear_bound(shape, value.reshape(-1, mw), spread.reshape(-1, mw))
+    w, excess = w.reshape(k, pieces, mw), excess.reshape(k, pieces)
+    moved = np.einsum("ilw,iljkw->ijk", w, mid)
+    lost = rad.sum(axis=(2, 3)) + rounding(pieces * mw) * np.abs(mid).sum(axis=(2, 3))
+    return moved, np.einsum("ilw,ilw->i", np.abs(w), lost) * OUTWARD, excess.sum(axis=1) * OUTWARD
 
 
 def _ranges(mid: Array, rad: Array) -> tuple[Array, Array]:

@@ -1,5 +1,5 @@
-"""The worst case of ``c'x(t)`` over every disturbance, on cells of time and over one box of parameters, as polynomials
-with an error."""
+"""The worst case of ``c'x(t)`` over every disturbance and initial state, on cells of time and over one box of
+parameters, as polynomials with an error."""
 
 from __future__ import annotations
 
@@ -71,19 +71,26 @@ class Tube:
             return None
         horizon, scene, parts = self.scene.grid[-1], self.scene, self.flow.parts
         control = np.max([_sizes(u) for u in scene.control], axis=0) if scene.control else np.zeros((0, 1))
-        speed = np.abs(scene.initial_state) / horizon + (_sizes(parts["B"][0]) @ control)[:, 0]
+        begun = np.zeros(len(scene.initial_state))
+        if scene.initial_set is not None:
+            begun = np.array(radius(scene.initial_set))
+        speed = (np.abs(scene.initial_state) + begun) / horizon + (_sizes(parts["B"][0]) @ control)[:, 0]
         if scene.disturbance is not None:
             speed += _sizes(parts["E"][0]) @ np.array(radius(scene.disturbance))
         return Remainder.of(self.flow, horizon, speed)
 
     @cached_property
     def norms(self) -> list[arb_mat]:
-        """The norms of the coefficients left out, at the breakpoints (see `Remainder`)."""
+        """The norms of the coefficients left out, at the breakpoints, from any initial state (see `Remainder`)."""
         from flint import arb
 
         rest = self.remainder
         assert rest is not None
-        n = rest.start(upper(norm(rest.inverse * stacked([[arb(v)] for v in self.scene.initial_state]))))
+        size = upper(norm(rest.inverse * stacked([[arb(v)] for v in self.scene.initial_state])))
+        if self.scene.initial_set is not None:  # of any deviation from the centre, whatever its signs
+            inverse = stacked([[abs(x) for x in row] for row in rest.inverse.tolist()])
+            size = upper(size + norm(inverse * stacked([[arb(v)] for v in radius(self.scene.initial_set)])))
+        n = rest.start(size)
         found = [n]
         for k, u in enumerate(self.scene.control):
             growth, driven = self._growth(self._span(self.scene.grid[k], self.scene.grid[k + 1]))
@@ -136,6 +143,10 @@ class Tube:
             moved, off, kinks = self.sigmas.bounds(start, ticks, z)
             rad += off + rounding(1) * (np.abs(mid) + np.abs(moved)).sum(axis=(1, 2))
             mid = mid + moved
+        if self.scene.initial_set is not None:
+            moved, off, switching = self.sigmas.begun(start, ticks, z)
+            rad += off + rounding(1) * (np.abs(mid) + np.abs(moved)).sum(axis=(1, 2))
+            mid, kinks = mid + moved, kinks + switching
         rest = self._left_out(piece, offset, length, z)
         return [
             Polynomial(mid[i], float(rad[i] + rest[i] + kinks[i]) * OUTWARD, float(rest[i]), float(kinks[i]))

@@ -188,7 +188,7 @@ class CurvedConstraint(StateConstraint):
             H = np.vstack([centre, np.diag(radius)[free]]) @ self.set.frame / self.unit
             lifted = self._flat.lifted(low[:nu], high[:nu])
             joined = self._combination(lifted, free.size)
-            sigma = self.functionals.disturbance_support(lifted, H, joined)
+            sigma = self.functionals.support_over(lifted, H, joined)
             rhs, looseness = self._minorant(H, joined, nu)
             control = self.functionals.dictionary.control(x)
             cuts = self.parameters.cuts(low[:nu], high[:nu])
@@ -239,6 +239,7 @@ class CurvedConstraint(StateConstraint):
             and mine.response.propagator is other.response.propagator
             and mine.dictionary is other.dictionary
             and mine.disturbance is other.disturbance
+            and mine.initial is other.initial
         )
         return given if same else None
 

@@ -18,25 +18,28 @@ SAME = 1e-12  # of the largest coefficient of a combination, one that is roundin
 @final
 @dataclass(frozen=True, eq=False)
 class Witness(WorstConstraint):
-    """The worst constraint of a control problem, with its ``time``, parameter ``(nu,)`` and worst disturbance
-    ``(mw, pieces)`` where it has them."""
+    """The worst constraint of a control problem, with its ``time``, parameter ``(nu,)``, worst disturbance
+    ``(mw, pieces)`` and worst ``initial_state (d,)`` where it has them."""
 
     time: float | None = None
     parameter: Array | None = None
     disturbance: Array | None = field(default=None, repr=False)
+    initial_state: Array | None = None
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class TimedExplanation(Explanation):
-    """One constraint at a ``time`` and a parameter ``(nu,)``, with the worst disturbance ``(mw, pieces)`` there and the
-    normal ``direction`` (of the state, or of the control).
+    """One constraint at a ``time`` and a parameter ``(nu,)``, with the worst disturbance ``(mw, pieces)`` there, the
+    worst initial state ``begun (d,)`` where there is more than one, and the normal ``direction`` (of the state, or of
+    the control).
 
     ``statement`` is what it asks for, ``text`` the same with remarks. A constraint on the state compares a ``quantity``
     such as ``x1(5)`` with a ``limit``: ``bound`` is what the quantity may be (``|x1| <= 0.3``), ``free`` its value
-    without control and disturbance, ``sign`` -1 for a lower limit, ``sigma`` how far the disturbance alone moves it
-    towards the limit, ``where`` the parameter in words. ``constraint``: the name of the constraint. Words say all of
-    these, and the ``direction``, divided by ``scale``; ``names``: what the states are called.
+    without control and uncertainty, ``sign`` -1 for a lower limit, ``sigma`` how far what is uncertain of disturbance
+    and initial state (the ``cause``) moves it towards the limit, ``where`` the parameter in words. ``constraint``: the
+    name of the constraint. Words say all of these, and the ``direction``, divided by ``scale``; ``names``: what the
+    states are called. ``deviation (d,)`` is that of ``begun`` from the centre of the initial states.
     """
 
     decides: ClassVar[str] = "control"
@@ -47,6 +50,9 @@ class TimedExplanation(Explanation):
     direction: Array
     parameter: Array | None = None
     disturbance: Array | None = None
+    begun: Array | None = None
+    deviation: Array | None = None
+    cause: str = "disturbance"
     quantity: str = ""
     bound: str = ""
     limit: float = np.nan
@@ -67,6 +73,7 @@ class TimedExplanation(Explanation):
             self.time,
             self.parameter,
             self.disturbance,
+            self.begun,
         )
 
     def short(self) -> str:
@@ -80,7 +87,8 @@ class TimedExplanation(Explanation):
         if not self.quantity:
             return super().beyond(amount)
         reached, pushed = (self.free + self.sign * self.sigma) / self.scale, self.sigma / self.scale
-        moved = f" under the worst disturbance, which moves it by {pushed:.4g}," if self.sigma > 0 else ""
+        also = "" if " and " in self.cause else "s"
+        moved = f" under the worst {self.cause}, which move{also} it by {pushed:.4g}," if self.sigma > 0 else ""
         return (
             f"{self.quantity} = {reached:.6g}{moved} is outside {self.bound} ({self.constraint}), "
             f"whatever the decision{self._at}"
@@ -97,7 +105,8 @@ class TimedExplanation(Explanation):
             return self._uncontrollable(other, rest, share, allowed, moved) + self._at
         if moved > 0:
             more, less = told_apart(moved / 2 / self.scale, allowed / 2 / self.scale)
-            return f"the disturbance alone moves {self.quantity} by {more}, {self._set} allows {less}{self._at}"
+            verb = "move" if " and " in self.cause else "moves"
+            return f"the {self.cause} alone {verb} {self.quantity} by {more}, {self._set} allows {less}{self._at}"
         return f"{self.text} and {other.text} leave nothing between them{self._at}"
 
     def _uncontrollable(self, other: TimedExplanation, rest: Array, share: float, allowed: float, moved: float) -> str:
@@ -106,8 +115,8 @@ class TimedExplanation(Explanation):
         free = (self.sign * self.free + share * other.sign * other.free) / self.scale
         rest, allowed, moved = rest / self.scale, allowed / self.scale, moved / self.scale
         most = "at least" if side < 0 else "at most"
-        taken = f" less {moved:.4g} for the worst disturbances" if moved > 0 and side > 0 else ""
-        taken = f" and {moved:.4g} more for the worst disturbances" if moved > 0 and side < 0 else taken
+        taken = f" less {moved:.4g} for the worst {self.cause}s" if moved > 0 and side > 0 else ""
+        taken = f" and {moved:.4g} more for the worst {self.cause}s" if moved > 0 and side < 0 else taken
         quantity = combination(side * rest, self.names, f"({self.time:.6g})")
         return (
             f"the control cannot move {quantity}, which is {side * free:.6g}, "
@@ -121,7 +130,7 @@ class TimedExplanation(Explanation):
         if needed - amount < 0:
             return f"{self.text} is violated by at least {amount:.4g}, whatever the control{self._at}"
         verb = "raise" if self.sign < 0 else "lower"
-        pushed = f", {self.sigma / self.scale:.4g} of it for the worst disturbance" if self.sigma > 0 else ""
+        pushed = f", {self.sigma / self.scale:.4g} of it for the worst {self.cause}" if self.sigma > 0 else ""
         can, must = told_apart(needed - amount, needed)
         return (
             f"the control can {verb} {self.quantity} by at most {can}, and {must} is needed{pushed}: "
@@ -151,14 +160,23 @@ def explanation(
     uncertainty does to it; in words divided by ``scale``."""
     direction, system = H[row], functionals.response.system
     sign = -1.0 if np.count_nonzero(direction) == 1 and direction.sum() < 0 else 1.0
-    free, sigma, worst = functionals.parts(time, direction, parameter)
-    free, limit = sign * free + 0.0, sign * float(h[row])
+    parts = functionals.parts(time, direction, parameter)
+    sigma = parts.sigma
+    free, limit = sign * parts.free + 0.0, sign * float(h[row])
+    names = [
+        name
+        for name, moved in (("disturbance", sigma - parts.begun), ("initial state", parts.begun))
+        if moved > SAME * sigma
+    ]
+    cause = " and ".join(names) or "disturbance"
     quantity, where = (
         combination(sign * direction / scale, functionals.names, f"({time:.6g})"),
         system.describe(parameter) if parameter.size else "",
     )
     remarks = [f"the initial state gives {free / scale:.6g}"] if time <= 0 else []
-    remarks += [f"the disturbance alone moves it by {sigma / scale:.4g}"] if sigma > 0 else []
+    remarks += (
+        [f"the {cause} alone {'move' if len(names) > 1 else 'moves'} it by {sigma / scale:.4g}"] if sigma > 0 else []
+    )
     remarks += [f"at {where}"] if where else []
     statement = f"{name}: {quantity} {'>=' if sign < 0 else '<='} {limit / scale:.6g}"
     opposite = _opposite(H, h, row)
@@ -169,7 +187,10 @@ def explanation(
         time,
         direction,
         parameter,
-        worst,
+        parts.disturbance,
+        None if parts.deviation is None else functionals.response.initial_state + parts.deviation,
+        parts.deviation,
+        cause,
         quantity=quantity,
         bound=_bound(
             combination(sign * direction / scale, functionals.names),

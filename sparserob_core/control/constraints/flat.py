@@ -14,11 +14,10 @@ from sparserob_core.control.constraints.local_maxima import TINY, climb, local_m
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.matrix_exponential import transitions
-from sparserob_core.control.response.disturbance_support import DisturbanceSupport
 from sparserob_core.control.response.enclosure import CELLS_KEPT, CellEnclosure, enclose
 from sparserob_core.control.response.functional import WorstCase
+from sparserob_core.control.response.initial_support import Supports
 from sparserob_core.control.response.lifted import LiftedSystem, lift
-from sparserob_core.control.response.measurable import MeasurableCellSupport
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.response import Response, distinct_times
 from sparserob_core.shapes import Float, Int, shaped
@@ -45,7 +44,7 @@ class Samples:
     h: Array
     window: tuple[float, float]
     parameters: ParameterIndex
-    _supports: dict[bytes, DisturbanceSupport | MeasurableCellSupport | None] = field(default_factory=dict, repr=False)
+    _supports: dict[bytes, Supports | None] = field(default_factory=dict, repr=False)
 
     def serve(self, constraint: FlatConstraint) -> bool:
         """Whether they are of this constraint, from whatever initial state."""
@@ -54,6 +53,7 @@ class Samples:
             mine.response.propagator is other.response.propagator
             and mine.dictionary is other.dictionary
             and mine.disturbance is other.disturbance
+            and mine.initial is other.initial
             and self.H is constraint.H
             and self.h is constraint.h
             and self.window == (constraint.start, constraint.stop)
@@ -80,7 +80,7 @@ class Samples:
     def margins(self) -> Array:
         """``h - sigma`` on the lattice, ``(v, r, times)``: what the worst disturbance leaves of every side."""
         points, _ = self.lattice
-        if self.functionals.disturbance is None:
+        if not self.functionals.disturbed:
             return np.broadcast_to(self.h[None, :, None], (points.shape[0], self.h.size, self.times.size))
         return self.h[None, :, None] - np.stack([self.functionals.profile(self.times, self.H, p).T for p in points])
 
@@ -97,11 +97,11 @@ class Samples:
     @shaped
     def support_over(
         self, lifted: LiftedSystem, low: Float[Array, " nu"], high: Float[Array, " nu"]
-    ) -> DisturbanceSupport | MeasurableCellSupport | None:
-        """The support of the disturbance over a cell of parameters, remembered."""
+    ) -> Supports | None:
+        """What the uncertainty adds over a cell of parameters, remembered."""
         key = low.tobytes() + high.tobytes()
         if key not in self._supports:
-            remember(self._supports, key, self.functionals.disturbance_support(lifted, self.H), CELLS_KEPT)
+            remember(self._supports, key, self.functionals.support_over(lifted, self.H), CELLS_KEPT)
         return self._supports[key]
 
     @property

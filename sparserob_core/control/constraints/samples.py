@@ -1,4 +1,4 @@
-"""Random disturbances and parameters for the scenario approach; a sample proves nothing."""
+"""Random disturbances, parameters and initial states for the scenario approach; a sample proves nothing."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ class ScenarioConstraint:
     """``H x(t) <= h`` for all times of a window and for ``S`` samples only; the index is ``(t, sample number)``.
 
     ``H (r, d)``, ``h (r,)`` are the sides of the constraint ``base``; ``disturbances (S, mw, L)`` on the pieces of the
-    merged grid or ``None``; ``parameters (S, nu)``.
+    merged grid or ``None``; ``parameters (S, nu)``; ``deviations (S, d)`` of the initial state or ``None``.
     """
 
     base: StateConstraint
@@ -31,6 +31,7 @@ class ScenarioConstraint:
     h: Array
     disturbances: Array | None
     parameters: Array
+    deviations: Array | None = None
 
     def family(self) -> ConstraintFamily:
         """The constraint as a family."""
@@ -51,7 +52,8 @@ class ScenarioConstraint:
         which = np.repeat(np.rint(indices[:, 1]).astype(int), r)
         times, directions = np.repeat(indices[:, 0], r), np.tile(self.H, (k, 1))
         signals = None if self.disturbances is None else self.disturbances[which]
-        G, offset = self.base.functionals.rows_under(times, directions, self.parameters[which], signals)
+        begun = np.zeros(directions.shape) if self.deviations is None else self.deviations[which]
+        G, offset = self.base.functionals.rows_under(times, directions, self.parameters[which], signals, begun)
         return G.reshape(k, r, -1), self.h - offset.reshape(k, r)
 
     def worst(self, x: Array) -> Separation:
@@ -70,21 +72,21 @@ class ScenarioConstraint:
         """Largest violation over the samples, ``(r, times)``, and the sample that has it."""
         if self.parameters.shape[1] == 0:
             margins, sample = self._known
-            undisturbed = self._states(x, slice(0, 1), None)[0]
+            undisturbed = self._states(x, slice(0, 1), None, None)[0]
             return self.H @ undisturbed.T - margins, sample
-        return self._maximum(lambda part: self._states(x, part, self.disturbances))
+        return self._maximum(lambda part: self._states(x, part, self.disturbances, self.deviations))
 
     @cached_property
     def _known(self) -> tuple[Array, np.ndarray]:
         """For a known system: ``h - max_s H d_s(t)``, and the maximising samples; it does not depend on the
         decision."""
-        if self.disturbances is None:
+        if self.disturbances is None and self.deviations is None:
             return np.repeat(self.h[:, None], self._times.size, axis=1), np.zeros(
                 (self.h.size, self._times.size), dtype=int
             )
         still = np.zeros(self.base.functionals.variables)
-        rest = self._states(still, slice(0, 1), None)
-        worst, sample = self._maximum(lambda part: self._states(still, part, self.disturbances) - rest)
+        rest = self._states(still, slice(0, 1), None, None)
+        worst, sample = self._maximum(lambda part: self._states(still, part, self.disturbances, self.deviations) - rest)
         return -worst, sample
 
     def _maximum(self, states: Callable[[slice], Array]) -> tuple[Array, np.ndarray]:
@@ -100,10 +102,10 @@ class ScenarioConstraint:
             best = np.maximum(best, height)
         return best, where
 
-    def _states(self, x: Array, part: slice, disturbances: Array | None) -> Array:
+    def _states(self, x: Array, part: slice, disturbances: Array | None, deviations: Array | None) -> Array:
         """States ``(s, times, d)`` of some samples."""
-        signal = None if disturbances is None else disturbances[part]
-        path = self._fine.states(self.base.functionals.on_grid(x), self.parameters[part], signal)
+        signal, begun = (None if drawn is None else drawn[part] for drawn in (disturbances, deviations))
+        path = self._fine.states(self.base.functionals.on_grid(x), self.parameters[part], signal, begun)
         return path[:, self._kept]
 
     @cached_property

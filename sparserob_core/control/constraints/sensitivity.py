@@ -25,7 +25,7 @@ ENTERED = 1e-9  # of a piece: what has passed of one that is just entered, to kn
 @dataclass(frozen=True, eq=False)
 class Functional:
     """``c'x(t)`` of every index and its derivatives in the ``nu`` parameters, as weights on the initial state and on
-    what drives every piece.
+    what drives every piece. ``start (k, d)``: the initial state of every index.
 
     ``c = sum_b shares_b directions_b`` with ``directions (k, b, d)`` and ``shares (k, b)``; ``along (k, b, 1 + nu, d)``
     and ``gains (k, b, L, 1 + nu, d)`` are those of every direction. ``A (k, d, d)``, and ``B (k, 1 + nu, d, m)``,
@@ -65,9 +65,9 @@ class Functional:
 
     def in_time(self, force: Array) -> Array:
         """``c'(A x(t) + B u(t) + E w(t))``, as ``(k, 1)``; ``e^{As}`` and ``A`` commute."""
-        drift = (self.free[:, :1] @ self.A)[:, 0] @ self.start + ((self.driven[:, :, 0] @ self.A) * force[:, :, 0]).sum(
-            axis=(1, 2)
-        )
+        drift = ((self.free[:, :1] @ self.A)[:, 0] * self.start).sum(axis=1) + (
+            (self.driven[:, :, 0] @ self.A) * force[:, :, 0]
+        ).sum(axis=(1, 2))
         sigma = (self.direction * force[np.arange(self.now.size), self.now, 0]).sum(axis=1)
         return np.asarray(drift + sigma)[:, None]
 
@@ -75,13 +75,16 @@ class Functional:
         """The derivatives ``(k, nu)`` of ``c'x(t)`` in the parameters, the inputs fixed."""
         through_A = np.einsum("klad,kld->ka", self.driven[:, :, 1:], force[:, :, 0])
         return np.asarray(
-            self.free[:, 1:] @ self.start + through_A + np.einsum("kld,klad->ka", self.driven[:, :, 0], force[:, :, 1:])
+            np.einsum("kad,kd->ka", self.free[:, 1:], self.start)
+            + through_A
+            + np.einsum("kld,klad->ka", self.driven[:, :, 0], force[:, :, 1:])
         )
 
     def states(self, force: Array) -> Array:
         """``directions_b'x(t)``, ``(k, b)``."""
         return np.asarray(
-            self.along[:, :, 0] @ self.start + np.einsum("kbld,kld->kb", self.gains[:, :, :, 0], force[:, :, 0])
+            np.einsum("kbd,kd->kb", self.along[:, :, 0], self.start)
+            + np.einsum("kbld,kld->kb", self.gains[:, :, :, 0], force[:, :, 0])
         )
 
     def _joined(self, parts: Array) -> Array:
@@ -151,11 +154,15 @@ class Sensitivity:
         larger = np.concatenate([directions, np.zeros((k, b, (blocks - 1) * d))], axis=2).reshape(k * b, -1)
         free, gains, B, W = response.adjoint(np.repeat(times, b), larger, np.repeat(parameters, b, axis=0))
         A = self._response.system.matrices(parameters)[0]
+        along, initial = free.reshape(k, b, blocks, d), self.constraint.functionals.initial
+        start = np.broadcast_to(self._response.initial_state, (k, d))
+        if initial is not None:
+            start = start + initial.support_point(np.einsum("kb,kbd->kd", shares, along[:, :, 0]))
         return Functional(
-            self._response.initial_state,
+            start,
             directions,
             shares,
-            free.reshape(k, b, blocks, d),
+            along,
             gains.reshape(k, b, -1, blocks, d),
             A,
             B[::b].reshape(k, blocks, d, -1),

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from sparserob_core.sip.program import SemiInfiniteProgram
 
 SHORTEST = 1e-12  # of the horizon: a delay that is not rounding
+SAME = 1e-12  # of the size of a set, what is rounding
 DisturbanceClass: TypeAlias = Literal["piecewise_constant", "measurable", "l1_ball"]
 
 
@@ -47,15 +48,21 @@ class OptimalControlProblem:
     most ``upper_i`` of a symmetric box: a far smaller set). ``initial_control``: the control ``(m,)`` before time 0, or
     ``None`` where it does not matter. ``control_step``: the set of every change ``u_{k+1} - u_k`` from one piece of the
     control's dictionary to the next, of ``u_0 - initial_control`` too where that is told; ``None``: any.
-    ``names`` are for messages, tables and figures. After construction ``weights`` is ``(m,)``, ``path`` and
-    ``terminal`` are tuples, every window has its ``stop``, and constraints that restrict nothing are gone. An initial
-    state outside a path set is legal: that problem is infeasible. Raises `InputError`.
+    ``names`` are for messages, tables and figures.
+
+    ``initial_set``: the bounded set of deviations from ``initial_state``, or ``None``; it holds 0. The state begins
+    anywhere in ``initial_state + initial_set``, and every constraint holds from there.
+
+    After construction ``weights`` is ``(m,)``, ``path`` and ``terminal`` are tuples, every window has its ``stop``, and
+    constraints that restrict nothing are gone. An initial state outside a path set is legal: that problem is
+    infeasible. Raises `InputError`.
     """
 
     system: LinearSystem
     horizon: float
     initial_state: npt.ArrayLike
     control: ConvexSet
+    initial_set: ConvexSet | None = None
     weights: npt.ArrayLike | None = None
     disturbance: ConvexSet | None = None
     disturbance_class: DisturbanceClass = "piecewise_constant"
@@ -80,6 +87,7 @@ class OptimalControlProblem:
                 got=f"{self.system.delay:g}",
             )
         self._set("initial_state", self._state())
+        self._set("initial_set", self._deviations())
         self._set("weights", self._weights())
         self._set("initial_control", self._control_before())
         _checked_set("control", self.control, self.system.controls, "controls", bounded=True)
@@ -103,6 +111,20 @@ class OptimalControlProblem:
                 path="initial_state", expected=f"{d} finite numbers, one per state", got=f"{state.tolist()}"
             )
         return state
+
+    def _deviations(self) -> ConvexSet | None:
+        if self.initial_set is None:
+            return None
+        bound = _checked_set("initial_set", self.initial_set, self.system.states, "states", bounded=True)
+        axes = np.eye(bound.dimension)
+        size = float(bound.reach(axes).max())
+        if float(bound.violation(np.zeros(bound.dimension))) > SAME * size:
+            raise InputError(
+                path="initial_set",
+                expected="a set of deviations that holds 0, so that the centre is one of the initial states",
+                got=f"{bound.kind} without it",
+            )
+        return bound if size > 0.0 else None
 
     def _weights(self) -> Array:
         m = self.system.controls

@@ -47,6 +47,7 @@ class Units:
             system=self.of_system(problem.system),
             horizon=problem.horizon / self.time,
             initial_state=np.asarray(problem.initial_state) / self.states,
+            initial_set=None if problem.initial_set is None else problem.initial_set.in_units(self.states),
             control=problem.control.in_units(self.controls),
             weights=np.asarray(problem.weights) * self.controls * self.time / self.cost,
             disturbance=None if problem.disturbance is None else problem.disturbance.in_units(self.disturbances),

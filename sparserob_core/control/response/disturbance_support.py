@@ -14,7 +14,7 @@ from sparserob_core.control.enclosures.polynomial import distinct_patterns, face
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.lifted import LiftedSystem
-from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.convex_set import Array, ConvexSet
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,16 +43,11 @@ class DisturbanceSupport:
         ``ends (k, r, nu)``: parameters that are known to be at an end of the cell (-1 or 1); the centre is that of the
         face they leave.
         """
-        k, r, _ = ends.shape
-        patterns, which = distinct_patterns(ends)
-        coefficients, excess = np.empty((k, r, self._space.size)), np.empty((k, r))
-        for position, pattern in enumerate(patterns):
-            face = face_matrix(self._space, pattern) if pattern.any() else None
-            here = (which == position).any(axis=1)
-            parts = self._gathered(times[here], partial(self._summed, face=face))
-            mine = which[here] == position
-            coefficients[which == position], excess[which == position] = parts[mine][:, :-1], parts[mine][:, -1]
-        return coefficients, excess
+        return over_faces(
+            self._space,
+            ends,
+            lambda here, face: self._gathered(times[here], partial(summed, self.disturbance.set, face=face)),
+        )
 
     def deviation(self, start: Array, widths: Array) -> Array:
         """Bounds ``(k, r)``, for times in ``[start, start + width]`` inside one piece, of how far what the blocks
@@ -147,18 +142,6 @@ class DisturbanceSupport:
         """How much any one disturbance can make of every Taylor coefficient of every block, ``(k, r, nb, M)``."""
         return self.disturbance.set.reach(blocks).swapaxes(2, 3)
 
-    def _summed(self, blocks: Array, face: Array | None) -> Array:
-        """Per block: the polynomial under the centre's worst disturbance, and the excess as one more entry; from
-        ``(k, r, M, nb, q)``."""
-        bound = self.disturbance.set
-        blocks = blocks if face is None else np.einsum("ab,krbnq->kranq", face, blocks, optimize=True)
-        point = bound.support_point(blocks[:, :, 0])
-        coefficients = np.einsum("krbq,krabq->krba", point, blocks, optimize=True)
-        excess = np.zeros(coefficients.shape[:3])
-        if blocks.shape[2] > 1:
-            excess = bound.linearisation_excess(blocks[:, :, 0], np.moveaxis(blocks[:, :, 1:], 2, 3))
-        return np.concatenate([coefficients, excess[..., None]], axis=3)
-
     def _blocks(self, times: Array, rows: Array) -> Array:
         """Taylor coefficients ``(k, r, M, nb, q)`` of what functionals that start as lifted ``rows (r, M d)`` give to
         every block."""
@@ -201,6 +184,35 @@ class DisturbanceSupport:
         for piece in range(grid.pieces):
             gains[piece + 1] += product(reach.flow[piece], gains[piece][:, None])[:, 0]
         return gains
+
+
+def over_faces(
+    space: TaylorSpace, ends: Array, parts: Callable[[np.ndarray, Array | None], Array]
+) -> tuple[Array, Array]:
+    """Coefficients ``(k, r, M)`` and excess ``(k, r)`` where every functional has its own pattern of ``ends (k, r,
+    nu)``; ``parts(here, face)`` gives both as ``(k', r, M + 1)`` for the times ``here`` on one face of the cell."""
+    k, r, _ = ends.shape
+    patterns, which = distinct_patterns(ends)
+    coefficients, excess = np.empty((k, r, space.size)), np.empty((k, r))
+    for position, pattern in enumerate(patterns):
+        face = face_matrix(space, pattern) if pattern.any() else None
+        here = (which == position).any(axis=1)
+        found = parts(here, face)
+        mine = which[here] == position
+        coefficients[which == position], excess[which == position] = found[mine][:, :-1], found[mine][:, -1]
+    return coefficients, excess
+
+
+def summed(bound: ConvexSet, blocks: Array, face: Array | None) -> Array:
+    """Per block in ``bound``: the polynomial under the centre's worst point, and the excess as one more entry; from
+    Taylor coefficients ``(k, r, M, nb, q)``."""
+    blocks = blocks if face is None else np.einsum("ab,krbnq->kranq", face, blocks, optimize=True)
+    point = bound.support_point(blocks[:, :, 0])
+    coefficients = np.einsum("krbq,krabq->krba", point, blocks, optimize=True)
+    excess = np.zeros(coefficients.shape[:3])
+    if blocks.shape[2] > 1:
+        excess = bound.linearisation_excess(blocks[:, :, 0], np.moveaxis(blocks[:, :, 1:], 2, 3))
+    return np.concatenate([coefficients, excess[..., None]], axis=3)
 
 
 def _row_norms(coefficients: Array, starts: np.ndarray) -> Array:

@@ -21,9 +21,8 @@ from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.polynomial import distinct_patterns, face_matrix, monotone_ends, polynomial_bound
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.enclosures.valid_inequalities import Cuts
-from sparserob_core.control.response.disturbance_support import DisturbanceSupport
+from sparserob_core.control.response.initial_support import Supports
 from sparserob_core.control.response.lifted import LiftedSystem
-from sparserob_core.control.response.measurable import MeasurableCellSupport
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.program import Enclosure
@@ -51,7 +50,7 @@ class CellEnclosure:
     """
 
     lifted: LiftedSystem
-    sigma: DisturbanceSupport | MeasurableCellSupport | None
+    sigma: Supports | None
     H: Array
     rhs: Array
     control: Array

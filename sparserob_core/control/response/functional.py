@@ -1,5 +1,5 @@
-"""Worst-case functionals of the state: ``max_w c'x(t; theta, w, p)`` split into what the control does and what it
-cannot help."""
+"""Worst-case functionals of the state: the largest ``c'x(t; theta, w, p)`` over disturbances ``w`` and initial states,
+split into what the control does and what it cannot help."""
 
 from __future__ import annotations
 
@@ -10,17 +10,19 @@ from functools import cached_property
 import numpy as np
 
 from sparserob_core.control.enclosures.combination import Combination
+from sparserob_core.control.enclosures.matrix_exponential import transitions
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.names import UNNAMED, Names
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.disturbance_support import DisturbanceSupport
+from sparserob_core.control.response.initial_support import InitialSupport, Support, Supports
 from sparserob_core.control.response.lifted import LiftedSystem, frozen
 from sparserob_core.control.response.measurable import MeasurableCellSupport, MeasurableSupport
 from sparserob_core.control.response.response import Response
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.shapes import Float, shaped
-from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
 # said where it is met, and before anything is solved
 WITHOUT_PROOF = "measurable disturbances are proven only for known systems and sets with flat sides"
@@ -28,8 +30,25 @@ CHUNK = 4_000_000  # entries of a gain array that are built at once (32 MB)
 
 
 @dataclass(frozen=True, eq=False)
+class Parts:
+    """What the largest ``c'x(t)`` at one index is made of, beside the control: what the centre of the initial states
+    gives (``free``), what the worst disturbance and the worst initial state add together (``sigma``, of which ``begun``
+    is the initial state's), and these: ``disturbance (mw, L)`` on the pieces of the merged grid, and ``deviation (d,)``
+    from the centre; ``None`` where there is none."""
+
+    free: float
+    sigma: float
+    begun: float
+    disturbance: Array | None
+    deviation: Array | None
+
+
+@dataclass(frozen=True, eq=False)
 class WorstCase:
-    """The functionals ``c'x(t)`` of one system under its worst disturbance.
+    """The functionals ``c'x(t)`` of one system under its worst disturbance, from the worst initial state.
+
+    The initial states are that of the response plus ``initial``, a set of deviations; what the worst of them adds is
+    the set's support function of ``e^{A't} c``.
 
     Indices are given as ``times (k,)``, ``directions (k, d)``, ``parameters (k, nu)``; the decision is ``theta``
     raveled, ``(m N,)``. ``names``: what the states are called where a functional is explained.
@@ -40,6 +59,7 @@ class WorstCase:
     disturbance: DisturbanceModel | None
     shared: MeasurableSupport | None = field(default=None, repr=False)
     names: Names = UNNAMED
+    initial: ConvexSet | None = None
 
     @shaped
     def from_state(self, initial_state: Float[Array, " d"]) -> WorstCase:
@@ -54,6 +74,11 @@ class WorstCase:
         return self.response.system.controls - self.response.grid.constants
 
     @property
+    def disturbed(self) -> bool:
+        """Whether there is a disturbance, or more than one initial state."""
+        return self.disturbance is not None or self.initial is not None
+
+    @property
     def variables(self) -> int:
         return self.channels * self.dictionary.functions
 
@@ -64,8 +89,8 @@ class WorstCase:
         return self.response.grid.inputs(np.zeros((self.channels, self.dictionary.pieces)))
 
     def nominal(self) -> WorstCase:
-        """The functionals of the system at an interior point of its parameters, under one admissible disturbance: none,
-        where it may be."""
+        """The functionals of the system at an interior point of its parameters, from the centre of the initial states,
+        under one admissible disturbance: none, where it may be."""
         system, model = self.response.system, self.disturbance
         middle = np.zeros((1, 0)) if system.parameters is None else system.parameters.interior_point()[None]
         A, B, E = system.matrices(middle)
@@ -90,7 +115,7 @@ class WorstCase:
             times,
             directions,
             parameters,
-            lambda part, gains, W: self._support(gains, W, times[part], directions[part], parameters[part]),
+            lambda part, free, gains, W: self._support(free, gains, W, times[part], directions[part], parameters[part]),
         )
 
     @shaped
@@ -100,17 +125,17 @@ class WorstCase:
         directions: Float[Array, "k d"],
         parameters: Float[Array, "k nu"],
         disturbances: Float[Array, "k mw L"] | None,
+        deviations: Float[Array, "k d"] | None = None,
     ) -> tuple[Float[Array, "k n"], Float[Array, " k"]]:
         """``G (k, n)`` and ``offset (k,)`` with ``c'x(t) = G theta + offset`` under given disturbances ``(k, mw, L)``
-        on the grid's pieces."""
-        return self._rows(
-            times,
-            directions,
-            parameters,
-            lambda part, gains, W: (
-                0.0 if disturbances is None else np.einsum("kli,kil->k", gains @ W, disturbances[part])
-            ),
-        )
+        on the grid's pieces, from given ``deviations (k, d)`` of the initial state; the worst one of every index where
+        none are given."""
+
+        def pushed(part: slice, free: Array, gains: Array, W: Array) -> Array:
+            begun = self._begun(free) if deviations is None else (free * deviations[part]).sum(axis=1)
+            return begun if disturbances is None else begun + np.einsum("kli,kil->k", gains @ W, disturbances[part])
+
+        return self._rows(times, directions, parameters, pushed)
 
     @shaped
     def _rows(
@@ -118,16 +143,16 @@ class WorstCase:
         times: Float[Array, " k"],
         directions: Float[Array, "k d"],
         parameters: Float[Array, "k nu"],
-        pushed: Callable[[slice, Array, Array], Array | float],
+        pushed: Callable[[slice, Array, Array, Array], Array | float],
     ) -> tuple[Float[Array, "k n"], Float[Array, " k"]]:
-        """Rows and offsets; ``pushed(part, gains, W)`` is what the disturbance adds to the offsets of a part of the
-        indices."""
+        """Rows and offsets; ``pushed(part, free, gains, W)`` is what the uncertainty adds to the offsets of a part of
+        the indices."""
         G, offset = np.empty((times.size, self.variables)), np.empty(times.size)
         for part in self._chunks(times.size):
             free, gains, B, W = self.response.adjoint(times[part], directions[part], parameters[part])
             weights = gains @ B
             G[part] = self.on_decision(weights)
-            offset[part] = free @ self.response.initial_state + self.given(weights) + pushed(part, gains, W)
+            offset[part] = free @ self.response.initial_state + self.given(weights) + pushed(part, free, gains, W)
         return G, offset
 
     @shaped
@@ -153,7 +178,7 @@ class WorstCase:
         for part in self._chunks(times.size):
             free, gains, B, W = self.response.adjoint(times[part], directions[part], parameters[part])
             driven = np.einsum("klm,ml->k", gains @ B, control)
-            support = self._support(gains, W, times[part], directions[part], parameters[part])
+            support = self._support(free, gains, W, times[part], directions[part], parameters[part])
             result[part] = free @ self.response.initial_state + driven + support
         return result
 
@@ -163,42 +188,49 @@ class WorstCase:
     ) -> Float[Array, "k r"]:
         """``sigma (k, r)`` at one parameter, for all ``times (k,)`` and ``directions (r, d)``; by the age of the pieces
         where the grid allows."""
-        model = self.disturbance
-        if model is None or model.kind == "measurable" or not (self.response.uniform and model.by_piece):
-            k, r = times.size, directions.shape[0]
+        model, (k, r) = self.disturbance, (times.size, directions.shape[0])
+        if model is not None and (model.kind == "measurable" or not (self.response.uniform and model.by_piece)):
             every = np.broadcast_to(parameter, (k * r, parameter.size))
             return self.offsets(np.repeat(times, r), np.tile(directions, (k, 1)), every).reshape(k, r)
-        known = frozen(self.response.system, self.response.grid, self.response.initial_state, parameter)
-        return DisturbanceSupport(known, model, directions).at(times, np.zeros((times.size, directions.shape[0], 0)))[
-            0
-        ][:, :, 0]
+        sigma = np.zeros((k, r))
+        if model is not None:
+            known = frozen(self.response.system, self.response.grid, self.response.initial_state, parameter)
+            sigma = DisturbanceSupport(known, model, directions).at(times, np.zeros((k, r, 0)))[0][:, :, 0]
+        if self.initial is not None:
+            flows = transitions(self.response.system.matrices(parameter[None])[0][0], times)[0]
+            sigma = sigma + self.initial.support(np.einsum("rd,kde->kre", directions, flows))
+        return sigma
 
     @shaped
-    def disturbance_support(
+    def support_over(
         self, lifted: LiftedSystem, H: Float[Array, "r d"], joined: Combination | None = None
-    ) -> DisturbanceSupport | MeasurableCellSupport | None:
-        """The support function of the disturbance on functionals ``H (r, d)`` over a cell; raises `NotEnclosable` where
-        no bound of it is proven."""
+    ) -> Supports | None:
+        """What the worst disturbance and the worst initial state add to functionals ``H (r, d)`` over a cell, ``None``
+        where there is neither; raises `NotEnclosable` where no bound of it is proven."""
+        rows = H @ lifted.transform
+        found: list[Support] = []
         model = self.disturbance
-        if model is None:
-            return None
-        if model.kind != "measurable":
-            return DisturbanceSupport(lifted, model, H @ lifted.transform, joined)
-        if lifted.space.nu or joined is not None:
-            raise NotEnclosable(f"{WITHOUT_PROOF}; with disturbance_class piecewise_constant there is one")
-        return MeasurableCellSupport(self.measurable, H, lifted)
+        if model is not None and model.kind != "measurable":
+            found.append(DisturbanceSupport(lifted, model, rows, joined))
+        elif model is not None:
+            if lifted.space.nu or joined is not None:
+                raise NotEnclosable(f"{WITHOUT_PROOF}; with disturbance_class piecewise_constant there is one")
+            found.append(MeasurableCellSupport(self.measurable, H, lifted))
+        if self.initial is not None:
+            found.append(InitialSupport(lifted, self.initial, rows, joined))
+        return Supports(tuple(found)) if found else None
 
     @shaped
     def offsets(
         self, times: Float[Array, " k"], directions: Float[Array, "k d"], parameters: Float[Array, "k nu"]
     ) -> Float[Array, " k"]:
-        """``sigma (k,)``: how far the worst disturbance alone pushes ``c'x(t)``."""
-        if self.disturbance is None:
+        """``sigma (k,)``: how far the worst disturbance and the worst initial state alone push ``c'x(t)``."""
+        if not self.disturbed:
             return np.zeros(times.size)
         result = np.empty(times.size)
         for part in self._chunks(times.size):
-            _, gains, _, W = self.response.adjoint(times[part], directions[part], parameters[part])
-            result[part] = self._support(gains, W, times[part], directions[part], parameters[part])
+            free, gains, _, W = self.response.adjoint(times[part], directions[part], parameters[part])
+            result[part] = self._support(free, gains, W, times[part], directions[part], parameters[part])
         return result
 
     @shaped
@@ -206,19 +238,29 @@ class WorstCase:
         self, time: float, direction: Float[Array, " d"], parameter: Float[Array, " nu"]
     ) -> Float[Array, "mw L"] | None:
         """A disturbance ``(mw, L)`` on the pieces of the merged grid that attains the worst case at one index."""
-        return self.parts(time, direction, parameter)[2]
+        return self.parts(time, direction, parameter).disturbance
 
     @shaped
-    def parts(
-        self, time: float, direction: Float[Array, " d"], parameter: Float[Array, " nu"]
-    ) -> tuple[float, float, Float[Array, "mw L"] | None]:
-        """What ``max_w c'x(t)`` is made of at one index, beside the control: what the initial state and all that is not
-        decided give, what the worst disturbance adds, and such a disturbance (`worst_disturbance`)."""
+    def parts(self, time: float, direction: Float[Array, " d"], parameter: Float[Array, " nu"]) -> Parts:
+        """What the largest ``c'x(t)`` is made of at one index, beside the control."""
         at = (np.array([time]), direction[None], parameter[None])
         free, gains, B, W = self.response.adjoint(*at)
-        rest = float(free[0] @ self.response.initial_state + self.given(gains @ B)[0])
-        worst: Array | None = None if self.disturbance is None else self.disturbance.worst(gains @ W)[0]
-        return rest, float(self._support(gains, W, *at)[0]), worst
+        return Parts(
+            float(free[0] @ self.response.initial_state + self.given(gains @ B)[0]),
+            float(self._support(free, gains, W, *at)[0]),
+            float(self._begun(free)[0]),
+            None if self.disturbance is None else self.disturbance.worst(gains @ W)[0],
+            None if self.initial is None else self.initial.support_point(free)[0],
+        )
+
+    @shaped
+    def worst_deviations(
+        self, times: Float[Array, " k"], directions: Float[Array, "k d"], parameters: Float[Array, "k nu"]
+    ) -> Float[Array, "k d"]:
+        """The deviation ``(k, d)`` of a worst initial state at every index; 0 where there is one initial state."""
+        if self.initial is None:
+            return np.zeros(directions.shape)
+        return self.initial.support_point(self.response.adjoint(times, directions, parameters)[0])
 
     @cached_property
     def measurable(self) -> MeasurableSupport:
@@ -263,17 +305,24 @@ class WorstCase:
     @shaped
     def _support(
         self,
+        free: Float[Array, "k d"],
         gains: Float[Array, "k L d"],
         W: Float[Array, "k d mw"],
         times: Float[Array, " k"],
         directions: Float[Array, "k d"],
         parameters: Float[Array, "k nu"],
     ) -> Float[Array, " k"]:
+        begun = self._begun(free)
         if self.disturbance is None:
-            return np.zeros(times.size)
+            return begun
         if self.disturbance.kind == "measurable":
-            return self.measurable(times, directions, parameters)
-        return self.disturbance.support(gains @ W)
+            return begun + self.measurable(times, directions, parameters)
+        return begun + self.disturbance.support(gains @ W)
+
+    @shaped
+    def _begun(self, free: Float[Array, "k d"]) -> Float[Array, " k"]:
+        """What the worst initial state adds to functionals with the weights ``free (k, d)`` on it."""
+        return np.zeros(free.shape[0]) if self.initial is None else self.initial.support(free)
 
     @cached_property
     def _gives(self) -> bool:

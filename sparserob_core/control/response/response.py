@@ -338,14 +338,16 @@ class Response:
         control: Float[Array, "m K"],
         parameters: Float[Array, "v nu"],
         disturbance: Float[Array, "vw mw M"] | None = None,
+        deviations: Float[Array, "vd d"] | None = None,
     ) -> Float[Array, "vx points d"]:
         """States ``(v, L+1, d)`` at the breakpoints of the grid.
 
         ``control (m, K)`` on the control's pieces (`TimeGrid.inputs`), ``parameters (v, nu)`` (one row serves all
-        disturbances), ``disturbance (v, mw, M)`` on the disturbance's pieces or ``None``.
+        disturbances), ``disturbance (v, mw, M)`` on the disturbance's pieces or ``None``, ``deviations (v, d)`` of the
+        initial state.
         """
         steps = self.steps(parameters)
-        count = parameters.shape[0] if disturbance is None else max(parameters.shape[0], disturbance.shape[0])
+        count = max(part.shape[0] for part in (parameters, disturbance, deviations) if part is not None)
         drive = np.einsum("vdm,ml->vld", steps.B, self.grid.inputs(control))
         if disturbance is not None:
             drive = drive + np.einsum(
@@ -354,7 +356,7 @@ class Response:
                 disturbance[:, :, self.grid.disturbance_piece],
             )
         path = np.empty((count, self.grid.pieces + 1, self.initial_state.size))
-        path[:, 0] = self.initial_state
+        path[:, 0] = self.initial_state if deviations is None else self.initial_state + deviations
         shared, lengths = steps.Phi.shape[0] == 1, self.which.tolist()
 
         def moved(matrices: Array, vectors: Array) -> Array:

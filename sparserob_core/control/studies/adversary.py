@@ -22,7 +22,7 @@ LOST = 1e-14  # of the largest integrand times the horizon: what a constant on a
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Adversary:
     """The worst case of one family: ``direction'x(time) - bound = violation`` (negative: a margin) under
-    ``parameter (nu,)`` and the disturbance.
+    ``parameter (nu,)`` and the disturbance, from ``initial_state (d,)``.
 
     ``direction (d,)`` is row ``row`` of a set with flat sides, or a unit normal of a curved one. The disturbance
     ``(mw, L)`` is constant between ``breakpoints (L + 1,)``; ``None`` where there is none.
@@ -37,6 +37,7 @@ class Adversary:
     violation: float
     breakpoints: Array
     disturbance: Array | None
+    initial_state: Array
 
 
 def find_adversary(constraint: StateConstraint, decision: Array) -> Adversary | None:
@@ -59,6 +60,8 @@ def find_adversary(constraint: StateConstraint, decision: Array) -> Adversary | 
         violation=float(found.violations[0]),
         breakpoints=breakpoints,
         disturbance=disturbance,
+        initial_state=constraint.functionals.response.initial_state
+        + constraint.functionals.worst_deviations(np.array([time]), directions[None], parameters[None])[0],
     )
 
 

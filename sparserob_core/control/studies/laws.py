@@ -1,5 +1,5 @@
-"""Laws of random disturbances and parameters for simulation: each draws admissible signals only, and none of them
-proves anything."""
+"""Laws of random disturbances, parameters and initial states for simulation: each draws admissible ones only, and none
+of them proves anything."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ NEAR = 0.1  # how far the parameter of a neighbour is drawn towards a random one
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """What is uncertain in a system: the disturbance (``None``: nothing) and the parameters, and the worst cases found
-    of them.
+    """What is uncertain in a system: the disturbance (``None``: nothing), the parameters and the initial state, and the
+    worst cases found of them.
 
     ``worst``: times ``(k,)``, directions ``(k, d)`` and parameters ``(k, nu)`` of functionals whose worst disturbances
     are known to matter.
@@ -38,11 +38,21 @@ class Uncertainty:
     constraints: Sequence[StateConstraint]
     worst: tuple[Array, Array, Array]
 
-    def draw(self, law: LawName, count: int, rng: np.random.Generator) -> tuple[Array | None, Array]:
-        """``count`` disturbances ``(count, mw, L)`` on the pieces of the merged grid (or ``None``) and parameters
-        ``(count, nu)``."""
+    def draw(self, law: LawName, count: int, rng: np.random.Generator) -> tuple[Array | None, Array, Array | None]:
+        """``count`` disturbances ``(count, mw, L)`` on the pieces of the merged grid (or ``None``), parameters
+        ``(count, nu)``, and initial states ``(count, d)`` (``None``: there is one only)."""
         if law == "neighbours":
             return self._neighbours(count, rng)
+        disturbances, parameters = self._drawn(law, count, rng)
+        bound = self.functionals.initial
+        if bound is None:
+            return disturbances, parameters, None
+        # slow is a law of signals; a state that is there at once is drawn as those of `iid`
+        points = _extreme if law == "vertices" else _uniform
+        return disturbances, parameters, self.functionals.response.initial_state + points(bound, count, rng)
+
+    def _drawn(self, law: LawName, count: int, rng: np.random.Generator) -> tuple[Array | None, Array]:
+        """Disturbances and parameters of `draw`."""
         points = _extreme if law == "vertices" else _uniform
         parameters = np.zeros((count, 0)) if self.parameters.set is None else points(self.parameters.set, count, rng)
         model = self.functionals.disturbance
@@ -73,10 +83,22 @@ class Uncertainty:
             return _drawn_in(model.set, coefficients.reshape(count, 1, -1))
         return _drawn_in(model.set, coefficients / np.where(model.scale > 0, model.scale, 1.0)[:, None])
 
-    def _neighbours(self, count: int, rng: np.random.Generator) -> tuple[Array | None, Array]:
-        """The worst disturbance of a random time and constraint with a few blocks replaced by extreme points, and a
-        parameter near its own."""
-        bases, base = self._bases, rng.integers(0, self._bases[2].shape[0], size=count)
+    def _neighbours(self, count: int, rng: np.random.Generator) -> tuple[Array | None, Array, Array | None]:
+        """The worst disturbance of a random time and constraint with a few blocks replaced by extreme points, a
+        parameter near its own, and the worst initial state, for some drawn towards an extreme one."""
+        base = rng.integers(0, self._bases[2].shape[0], size=count)
+        disturbances, parameters = self._near(base, rng)
+        bound = self.functionals.initial
+        if bound is None:
+            return disturbances, parameters, None
+        worst = self._worst_deviations[base]
+        share = rng.uniform(0.0, MIXED, size=(count, 1)) * (rng.integers(0, 2, size=(count, 1)) > 0)
+        deviations = worst + share * (bound.sample_extreme(count, rng) - worst)
+        return disturbances, parameters, self.functionals.response.initial_state + deviations
+
+    def _near(self, base: np.ndarray, rng: np.random.Generator) -> tuple[Array | None, Array]:
+        """Disturbances and parameters of `_neighbours`."""
+        bases, count = self._bases, base.size
         parameters = bases[2][base]
         if self.parameters.set is not None:
             near = rng.uniform(0.0, NEAR, size=(count, 1))
@@ -113,6 +135,10 @@ class Uncertainty:
             found.append((times[pick], directions[pick], parameters[pick]))
         times, directions, parameters = (np.concatenate(parts) for parts in zip(*found, strict=True))
         return times, directions, parameters
+
+    @cached_property
+    def _worst_deviations(self) -> Array:
+        return self.functionals.worst_deviations(*self._bases)
 
     @cached_property
     def _worst_blocks(self) -> Array:

@@ -38,9 +38,15 @@ def finer(grid: TimeGrid, times: Array) -> TimeGrid:
     return TimeGrid(times, origin, origin)
 
 
-def walk(response: Response, control: Array, parameters: Array, disturbances: Array | None) -> Iterator[Array]:
+def walk(
+    response: Response,
+    control: Array,
+    parameters: Array,
+    disturbances: Array | None,
+    initial_states: Array | None = None,
+) -> Iterator[Array]:
     """The states ``(d, n)`` of ``n`` trajectories at every breakpoint of the response's grid, one time after another,
-    from the initial state.
+    from ``initial_states (n, d)``, or from that of the response.
 
     ``control (m, K)`` and ``disturbances (n, mw, M)`` (or ``None``) on the pieces that the grid refers to,
     ``parameters (n, nu)``: the variation of constants over each piece, in which both inputs are constant.
@@ -54,6 +60,8 @@ def walk(response: Response, control: Array, parameters: Array, disturbances: Ar
     lengths, which = grid.distinct(grid.lengths)
     flows, integrals = _transitions(A, lengths)
     state = np.repeat(response.initial_state[:, None], parameters.shape[0], axis=1)
+    if initial_states is not None:
+        state = np.ascontiguousarray(initial_states.T)
     yield state
     before, sigma = (-1, -1, -1), np.zeros(0)
     for piece in range(grid.pieces):

@@ -39,7 +39,10 @@ def rough_units(problem: OptimalControlProblem) -> Units:
     lasting = float(power_of_two(np.array(min(time, 1.0 / fastest if fastest > 0.0 else np.inf))))
     inputs = controls if problem.initial_control is None else np.maximum(controls, np.abs(problem.initial_control))
     inputs = np.concatenate([inputs, np.ones(B.shape[1] - inputs.size)])  # that of a drift is 1
-    reach = np.maximum(np.abs(np.asarray(problem.initial_state)), time * (B * inputs).max(axis=1, initial=0.0))
+    begun = np.abs(np.asarray(problem.initial_state))
+    if problem.initial_set is not None:
+        begun = np.maximum(begun, extent(problem.initial_set))
+    reach = np.maximum(begun, time * (B * inputs).max(axis=1, initial=0.0))
     if bound is not None:
         reach = np.maximum(reach, time * (E * disturbances).max(axis=1, initial=0.0))
     for _ in range(system.states - 1):
@@ -96,8 +99,8 @@ def units_of_sides(H: Array, h: Array, reach: Array, added: Array) -> Array:
 def reaches(
     functionals: WorstCase, parameters: ParameterIndex, control: ConvexSet, H: Array, times: Array
 ) -> tuple[Array, Array]:
-    """How far the quantities ``H x(t)`` come from 0 at some times, over the control's set and the worst disturbance,
-    ``(r,)``, and the largest sum of absolute values from which they are computed, ``(r,)``."""
+    """How far the quantities ``H x(t)`` come from 0 at some times, over the control's set, the worst disturbance and
+    the worst initial state, ``(r,)``, and the largest sum of absolute values from which they are computed, ``(r,)``."""
     points, r = looked_at(parameters), H.shape[0]
     shape = (points.shape[0], times.size, r)
     at = np.tile(np.repeat(times, r), shape[0])
@@ -117,7 +120,11 @@ def reaches(
         added[part] = np.abs(free) @ np.abs(functionals.response.initial_state)
         added[part] += np.einsum("klm,ml->k", np.abs(every), np.abs(functionals.known))
         added[part] += np.abs(on_control @ np.diag(extent(control))).sum(axis=(1, 2))
-        model = functionals.disturbance
+        model, initial = functionals.disturbance, functionals.initial
+        if initial is not None:
+            up[part] += initial.support(free)
+            down[part] += initial.support(-free)
+            added[part] += np.abs(free) @ extent(initial)
         if model is not None:
             on_noise = gains @ W
             up[part] += model.support(on_noise)

@@ -64,6 +64,8 @@ def _added(model: Transcription, result: Result) -> float:
     multipliers, times, directions, parameters = (np.array(column, dtype=float) for column in zip(*rows, strict=True))
     free, gains, B, E = model.response.adjoint(times, directions, parameters.reshape(len(rows), -1))
     sizes = np.abs(free) @ np.abs(model.response.initial_state)
+    if model.problem.initial_set is not None:
+        sizes += np.abs(free) @ _far(model.problem.initial_set)
     weights, functionals = gains @ B, model.functionals
     sizes += np.einsum("klm,ml->k", np.abs(weights), np.abs(functionals.known))
     sizes += (np.abs(functionals.decided(weights)) @ _far(model.problem.control)).sum(axis=1)

@@ -99,8 +99,9 @@ def _functionals(
     model: DisturbanceModel | None = None
     if problem.disturbance is not None:
         model = disturbance_model(problem.disturbance_class, problem.disturbance, disturbance, grid)
-    response = Response(system, grid, np.asarray(problem.initial_state, dtype=float))
-    return WorstCase(response, control, model, names=problem.names), ParameterIndex(problem.system.parameters)
+    response, begun = Response(system, grid, np.asarray(problem.initial_state, dtype=float)), problem.initial_set
+    functionals = WorstCase(response, control, model, names=problem.names, initial=begun)
+    return functionals, ParameterIndex(problem.system.parameters)
 
 
 def _assembled(
@@ -474,7 +475,9 @@ def family_of(constraint: StateConstraint) -> ConstraintFamily:
             )
         disturbances = None if model is None else sample_disturbances(model, count, rng)
         drawn = sample_parameters(constraint.parameters.set, count, rng)
-        return ScenarioConstraint(constraint, *sides, disturbances, drawn).family()
+        bound = constraint.functionals.initial
+        begun = None if bound is None else bound.sample(count, rng)
+        return ScenarioConstraint(constraint, *sides, disturbances, drawn, begun).family()
 
     model, reduced = constraint.functionals.disturbance, _reduced(constraint)
     literal = reduced if model is None else LiteralConstraint(constraint, model).family(reduced)

@@ -70,6 +70,8 @@ NOTHING: tuple[object, ...] = (None, {}, [])
 MULTIPLIER = {"constraint", "time", "parameter", "direction", "multiplier"}
 CELLS = {"tolerance", "lower", "upper"}
 WITNESS = {"constraint", "time", "parameter", "direction", "disturbance", "violation"}
+BEGUN = {"deviation"}
+"""Of a witness, where the initial states are a set."""
 
 
 def _unread(case: Case) -> set[str]:
@@ -94,7 +96,8 @@ def _unread(case: Case) -> set[str]:
         left |= _besides("proof", proof, set(shapes))
         for name, shape in shapes.items():
             left |= _besides(f"proof.{name}", proof.get(name), CELLS if _flat(shape) else CELLS | {"normals"})
-    return left | (_besides("witness", witness, WITNESS) if "witness" in read else set())
+    known = WITNESS if case.problem.initial_set is None else WITNESS | BEGUN
+    return left | (_besides("witness", witness, known) if "witness" in read else set())
 
 
 def _besides(name: str, data: object, read: set[str]) -> set[str]:
@@ -221,8 +224,6 @@ def _value(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
 
 def _worst(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     """The worst constraint: that of the witness, or computed anew at its time and parameter where its set is flat."""
-    from sparserob_core.checker.claims.replay import exceeded
-
     said, status = summary.get("worst"), case.certificate.get("status")
     if not isinstance(said, Mapping):
         return ["worst is no mapping"]
@@ -233,21 +234,54 @@ def _worst(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
         names = [name for name in ("violation", "constraint", "time") if not _same(said.get(name), witness.get(name))]
         if said.get("parameter") and not _near(said["parameter"], witness.get("parameter")):
             names.append("parameter")
+        names += [] if _begins(case, said, witness) else ["initial_state"]
         return [f"worst: {name} is {said.get(name)!r}, that of the witness {witness.get(name)!r}" for name in names]
     if status not in ("certified", "verified"):
         return None
     if said.get("constraint") in (None, ""):  # a problem without constraints that can be violated
         return [] if said.get("violation") is None and not case.windows else ["worst: no constraint is named"]
     try:
-        most, slack = exceeded(case, said)
+        return _attained(case, said)
     except Unchecked:
         return None
     except Broken as error:
         return [f"worst: {error}"]
+
+
+def _attained(case: Case, said: Mapping[str, Any]) -> list[str]:
+    """Whether the worst violation is what the worst uncertainty causes, and is reached from the initial state that is
+    named where there are several."""
+    from sparserob_core.checker.arithmetic.balls import balls
+    from sparserob_core.checker.claims.case import numbers
+    from sparserob_core.checker.claims.replay import exceeded
+    from sparserob_core.checker.sets.shapes import excess
+
+    found = [("", *exceeded(case, said))]
+    if case.problem.initial_set is not None:
+        begun = numbers(said.get("initial_state"), "initial_state")
+        centre = np.asarray(case.problem.initial_state)
+        if begun.shape != centre.shape or excess(case.problem.initial_set, balls(begun - centre))[0] > CLOSE:
+            return [f"worst: {begun.tolist()} is no initial state"]
+        found.append((f" from {begun.tolist()}", *exceeded(case, said, begun)))
+    elif "initial_state" in said:
+        return ["worst: an initial state is named where there is one only"]
     violation = said["violation"]
-    if not any(abs(violation - value) <= 1e-6 * abs(value) + slack for value in most):
-        return [f"worst: the violation is {violation!r}, derived are {', '.join(f'{value:.3g}' for value in most)}"]
-    return []
+    return [
+        f"worst: the violation is {violation!r}, derived are {', '.join(f'{value:.3g}' for value in most)}{where}"
+        for where, most, slack in found
+        if not any(abs(violation - value) <= 1e-6 * abs(value) + slack for value in most)
+    ]
+
+
+def _begins(case: Case, said: Mapping[str, Any], witness: Mapping[str, Any]) -> bool:
+    """Whether the worst initial state that is told is the one that the witness begins at."""
+    if case.problem.initial_set is None:
+        return "initial_state" not in said
+    deviation = witness.get("deviation")
+    if not isinstance(deviation, list) or not all(isinstance(one, int | float) for one in deviation):
+        return False
+    centre = np.asarray(case.problem.initial_state, dtype=float)
+    return len(deviation) == centre.size and _near(said.get("initial_state"), (centre + deviation).tolist())
 
 
 def _near(said: object, point: object) -> bool:
@@ -257,7 +291,7 @@ def _near(said: object, point: object) -> bool:
     return all(_same(a, b, CLOSE) for a, b in zip(said, point, strict=True))
 
 
-WORST = {"violation", "constraint", "time", "parameter"}
+WORST = {"violation", "constraint", "time", "parameter", "initial_state"}
 SPARSITY = {"active_fraction", "switches", "fewest_active"}
 COMPARED: dict[str, Callable[[Case, Mapping[str, Any]], list[str] | None]] = {
     "gap": _gap,

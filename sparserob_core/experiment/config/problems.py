@@ -15,8 +15,8 @@ from sparserob_core.control.problem.problem import OptimalControlProblem, PathCo
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, ConvexSet, Equality
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.config.option_kinds import OneOrMore
-from sparserob_core.experiment.config.set_options import PathOptions, SetOptions, TerminalOptions
+from sparserob_core.experiment.config.option_kinds import LIST, NUMBER, Number, Numbers, OneOrMore, one_of
+from sparserob_core.experiment.config.set_options import InitialStateOptions, PathOptions, SetOptions, TerminalOptions
 from sparserob_core.options import Options
 
 
@@ -194,8 +194,17 @@ class LinearKeys(ProblemFactory, Options):
     horizon: float = Field(gt=0.0)
     """Final time."""
 
-    initial_state: OneOrMore
-    """State at time 0, one number per state; a number serves every state."""
+    initial_state: Annotated[
+        Number | Numbers | Annotated[InitialStateOptions, Tag("set")],
+        one_of(
+            "a number, a list of numbers, or {centre: ..., box: ...} for all initial states of a set",
+            number=NUMBER,
+            list=LIST,
+            set=(Mapping, InitialStateOptions),
+        ),
+    ]
+    """State at time 0, one number per state; a number serves every state. Or a set of states: a ``centre`` and any set
+    of deviations from it, such as ``{centre: [-1, 1], box: 0.05}``."""
 
     weights: OneOrMore | None = None
     """Weight of every control in the cost, positive; 1 unless given."""
@@ -217,11 +226,19 @@ class LinearKeys(ProblemFactory, Options):
     """Names and units for messages, tables, figures and recordings."""
 
     def initial(self, states: int) -> list[float]:
-        """Initial state, one number per state; raises `InputError`."""
+        """The initial state, or the centre of the initial states, one number per state; raises `InputError`."""
+        if isinstance(self.initial_state, InitialStateOptions):
+            return [float(value) for value in self.initial_state.around("initial_state", states)[0]]
         given = self.initial_state if isinstance(self.initial_state, list) else [self.initial_state] * states
         if len(given) != states:
             raise InputError(path="initial_state", expected=f"{states} numbers, one per state", got=f"{len(given)}")
         return given
+
+    def deviations(self, states: int) -> ConvexSet | None:
+        """The set of deviations from `initial`, ``None`` for a single initial state; raises `InputError`."""
+        if not isinstance(self.initial_state, InitialStateOptions):
+            return None
+        return self.initial_state.around("initial_state", states)[1]
 
     def noise(self, system: LinearSystem) -> ConvexSet | None:
         """The set of disturbances; raises `InputError`."""
@@ -268,6 +285,7 @@ class LinearProblem(LinearKeys):
             system=system,
             horizon=self.horizon,
             initial_state=self.initial(system.states),
+            initial_set=self.deviations(system.states),
             control=self.control.build("control", system.controls),
             weights=self.weights,
             disturbance=self.noise(system),

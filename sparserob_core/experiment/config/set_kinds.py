@@ -87,11 +87,11 @@ class PolytopeFactory(SetFactory, Options):
 
 
 @final
-class EllipsoidFactory(SetFactory, Options):
+class EllipsoidFactory(SetFactory, Sparse):
     """``(x - centre)' shape^-1 (x - centre) <= 1``."""
 
-    centre: OneOrMore = 0.0
-    """Centre."""
+    centre: OneOrMore | None = None
+    """Centre; the origin unless given."""
 
     shape: Annotated[
         Number | Annotated[list[list[float]], Tag("matrix")],
@@ -107,17 +107,17 @@ class EllipsoidFactory(SetFactory, Options):
     def build(self, dimension: int) -> Ellipsoid:
         """The ellipsoid."""
         if not isinstance(self.shape, list):
-            return Ellipsoid(broadcast("centre", self.centre, dimension), self.shape * np.eye(dimension))
+            return Ellipsoid(broadcast("centre", self.centre or 0.0, dimension), self.shape * np.eye(dimension))
         if len(self.shape) != dimension or {len(row) for row in self.shape} != {dimension}:
             raise InputError(
                 f"shape must have {dimension} rows of {dimension} numbers, got rows of"
                 f" {[len(row) for row in self.shape]}"
             )
-        return Ellipsoid(broadcast("centre", self.centre, dimension), np.array(self.shape))
+        return Ellipsoid(broadcast("centre", self.centre or 0.0, dimension), np.array(self.shape))
 
 
 @final
-class NormFactory(SetFactory, Options):
+class NormFactory(SetFactory, Sparse):
     """``|x - centre|_p <= radius``."""
 
     p: Annotated[float, Field(ge=1.0)] | Literal["inf"]
@@ -126,9 +126,9 @@ class NormFactory(SetFactory, Options):
     radius: float = Field(ge=0.0)
     """Radius."""
 
-    centre: OneOrMore = 0.0
-    """Centre."""
+    centre: OneOrMore | None = None
+    """Centre; the origin unless given."""
 
     def build(self, dimension: int) -> NormBall:
         """The ball."""
-        return NormBall(float(self.p), self.radius, broadcast("centre", self.centre, dimension))
+        return NormBall(float(self.p), self.radius, broadcast("centre", self.centre or 0.0, dimension))

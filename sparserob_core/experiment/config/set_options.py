@@ -6,8 +6,8 @@ Which kinds there are, the registry knows: every plugin of the kind ``set`` is a
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
-from typing import Annotated, Any, final
+from dataclasses import is_dataclass, replace
+from typing import Annotated, Any, cast, final
 
 import numpy as np
 from pydantic import (
@@ -21,15 +21,16 @@ from pydantic import (
 )
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from sparserob_core.control.sets.sets import ConvexSet, Equality, SetFactory, intersection
+from sparserob_core.control.sets.sets import Box, ConvexSet, Equality, NormBall, Polytope, SetFactory, intersection
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.config.option_kinds import FreeNumbers, Sparse, count
+from sparserob_core.experiment.config.option_kinds import FreeNumbers, OneOrMore, Sparse, broadcast, count
 from sparserob_core.experiment.plugins.components import Registry
 from sparserob_core.experiment.plugins.hookspecs import SetPlugin
 from sparserob_core.experiment.plugins.messages import COMPLAINT, Complaint, nearest, shown
 from sparserob_core.experiment.plugins.records import Plugin
 from sparserob_core.experiment.plugins.registry import load_registry
 from sparserob_core.options import Options
+from sparserob_core.sip.convex_set import Array
 
 KIND = SetPlugin.kind
 
@@ -138,6 +139,64 @@ class PathOptions(SetOptions, populate_by_name=True):
 
     stop: float | None = Field(default=None, alias="to", ge=0.0)
     """End of the window; the horizon unless given."""
+
+
+@final
+class InitialStateOptions(SetOptions):
+    """All initial states of a set: a centre, and the set of deviations from it; without a centre, the set itself."""
+
+    centre: OneOrMore | None = None
+    """Centre of the initial states, one number per state; a number serves every state. Without one the set is where it
+    says, and its middle is the centre."""
+
+    def around(self, where: str, dimension: int) -> tuple[Array, ConvexSet]:
+        """The centre ``(d,)`` and the set of deviations from it; raises `InputError` that begins with the key below
+        ``where``."""
+        convex = self.build(where, dimension)
+        if not convex.is_bounded:
+            raise InputError("the set must be bounded", path=where)
+        if self.centre is None:
+            centre = convex.middle()
+            return centre, _moved(convex, centre, where)
+        inside = [kind for kind, typed in (self.__pydantic_extra__ or {}).items() if _has_centre(typed)]
+        if inside:
+            raise InputError(
+                path=f"{where}.{inside[0]}.centre",
+                expected=f"one centre, beside the set or inside it, not both ({where}.centre is given)",
+                got="a second one",
+            )
+        try:
+            centre = broadcast("centre", self.centre, dimension)
+        except InputError as error:
+            raise error.under(where) from None
+        if not convex.contains(np.zeros(dimension)):
+            raise InputError(
+                path=where, expected="deviations among which 0 is: the set holds 0, which is the centre", got="none"
+            )
+        return centre, convex
+
+
+def _has_centre(typed: object) -> bool:
+    """Whether a set was given a centre of its own: more than what a complete config says where it was given none."""
+    if not isinstance(typed, Options) or "centre" not in typed.model_fields_set:
+        return False
+    return bool(getattr(typed, "centre", None) != type(typed).model_fields["centre"].default)
+
+
+def _moved(convex: ConvexSet, centre: Array, where: str) -> ConvexSet:
+    """The set of all ``x - centre``."""
+    if isinstance(convex, Box):
+        return Box(convex.lower - centre, convex.upper - centre)
+    if isinstance(convex, Polytope):
+        return Polytope(convex.H, convex.h - convex.H @ centre)
+    if isinstance(convex, NormBall):
+        return NormBall(convex.p, convex.radius, convex.centre - centre)
+    if not centre.any():
+        return convex
+    other, record = cast("Any", convex), is_dataclass(convex)
+    if record and hasattr(other, "centre"):
+        return cast("ConvexSet", replace(other, centre=np.asarray(other.centre) - centre))
+    raise InputError(path=where, expected=f"the key centre beside {convex.kind}, and 0 within it", got="none")
 
 
 @final

@@ -27,18 +27,19 @@ SHAPES = {
     "violations": "f",
     "breakpoints": "b",
     "disturbances": "fwl",
+    "initial_states": "fd",
 }
 
 
 def adversaries(experiment: Experiment, decision: Array) -> dict[str, Array]:
-    """``adversary.npz``: the worst parameter and disturbance of every path and terminal constraint at a decision
-    ``(m N,)`` or ``(m, N)``.
+    """``adversary.npz``: the worst parameter, disturbance and initial state of every path and terminal constraint at a
+    decision ``(m N,)`` or ``(m, N)``.
 
     One row per family ``f``: ``names``, ``rows`` (which side; 0 for a curved set), ``times``, ``directions (f, d)`` and
     ``bounds`` with ``direction'x(time) - bound = violation`` in ``violations`` (negative: a margin),
-    ``parameters (f, nu)``, and ``disturbances (f, mw, L)``, constant between the common ``breakpoints (L + 1,)``;
-    ``states (f, d, T)`` at ``state_times (T,)`` is what they do to the state. Nothing, ``{}``, for a program that is no
-    control problem, or has no state constraint.
+    ``parameters (f, nu)``, ``initial_states (f, d)``, and ``disturbances (f, mw, L)``, constant between the common
+    ``breakpoints (L + 1,)``; ``states (f, d, T)`` at ``state_times (T,)`` is what they do to the state. Nothing,
+    ``{}``, for a program that is no control problem, or has no state constraint.
     """
     if not isinstance(experiment, ControlExperiment):
         return {}
@@ -62,7 +63,7 @@ def propagated(model: Transcription, theta: Array, arrays: Mapping[str, Array]) 
     times = fine_times(Response(response.system, grid, response.initial_state), model.parameters, arrays["times"])
     fine = Response(response.system, finer(grid, times), response.initial_state)
     disturbances = arrays["disturbances"] if arrays["disturbances"].shape[1] else None
-    states = np.stack(list(walk(fine, control[:, which], arrays["parameters"], disturbances)))
+    states = np.stack(list(walk(fine, control[:, which], arrays["parameters"], disturbances, arrays["initial_states"])))
     return times, np.ascontiguousarray(states.transpose(2, 1, 0))
 
 
@@ -80,6 +81,9 @@ def read_adversaries(directory: Path, model: Transcription) -> dict[str, Array]:
     arrays = read_arrays(file)
     if not arrays:
         return {}
+    if "names" in arrays and "initial_states" not in arrays and model.problem.initial_set is None:
+        # a file of a version that knew one initial state only
+        arrays = {**arrays, "initial_states": np.tile(model.response.initial_state, (arrays["names"].size, 1))}
     _require_shapes(file, arrays, model)
     known = [constraint.name for constraint in model.constraints if constraint.name in arrays["names"]]
     if arrays["names"].tolist() != known:
@@ -142,4 +146,5 @@ def _stacked(found: Sequence[Adversary], model: Transcription) -> dict[str, Arra
         "parameters": np.array([one.parameter for one in found]),
         "breakpoints": points,
         "disturbances": disturbances,
+        "initial_states": np.array([one.initial_state for one in found]),
     }

@@ -171,11 +171,15 @@ def _witness(problem: OptimalControlProblem, program: SemiInfiniteProgram, resul
     if signal is not None and problem.disturbance is not None:
         middle = problem.disturbance.interior_point()
         signal = np.array([_inside(problem.disturbance, column, middle) for column in np.asarray(signal).T]).T
+    begun: dict[str, Any] = {}
+    if problem.initial_set is not None and said.deviation is not None:
+        begun["deviation"] = _inside(problem.initial_set, said.deviation, problem.initial_set.interior_point())
     return {
         "constraint": worst.constraint,
         "time": said.time,
         "parameter": _parameter(problem, said),
         "direction": _direction(said),
         "disturbance": signal,
+        **begun,
         "violation": worst.violation,
     }

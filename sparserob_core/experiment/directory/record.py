@@ -75,6 +75,11 @@ def _witness(worst: WorstConstraint | None) -> dict[str, Any]:
         "constraint": None if worst is None else worst.constraint,
         "time": worst.time if isinstance(worst, Witness) else None,
         "parameter": worst.parameter if isinstance(worst, Witness) else None,
+        **(
+            {"initial_state": worst.initial_state}
+            if isinstance(worst, Witness) and worst.initial_state is not None
+            else {}
+        ),
     }
 
 

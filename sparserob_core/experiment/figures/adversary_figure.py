@@ -78,7 +78,7 @@ def draw_adversary(arrays: Mapping[str, Array], data: FigureData) -> Figure:
         ax.axhline(0.0, color=look.GREY, linewidth=0.6, zorder=1)
         ax.set_ylabel(f"$w_{{{channel + 1}}}(t)$" if channels > 1 else "$w(t)$")
         ax.margins(y=0.15)
-    caption(figure, axes, data, "the worst disturbance and parameter of every constraint")
+    caption(figure, axes, data, "the worst case of every constraint: disturbance, parameter and initial state")
     return figure
 
 

@@ -120,6 +120,19 @@ def _parameters(problem: OptimalControlProblem) -> Scaling:
 
 
 def _initial_state(problem: OptimalControlProblem) -> Scaling:
+    """The set of deviations about the centre, where there is one; else the initial state itself."""
+    bound = problem.initial_set
+    if bound is not None:
+        one, far = np.ones(bound.dimension), float(bound.reach(np.eye(bound.dimension)).max())
+        return Scaling(
+            "initial_state",
+            "factor on the set of initial states",
+            "largest",
+            # about the centre, which is no deviation, not about the middle of the deviations
+            lambda f: replace(problem, initial_set=bound.in_units(one / f) if f > 0.0 else None),
+            "largest deviation of x_i(0)",
+            _times(far),
+        )
     state = np.asarray(problem.initial_state, dtype=float)
     if not state.any():
         raise InputError("of: initial_state is the origin, which no factor moves; expected a state that is not 0")

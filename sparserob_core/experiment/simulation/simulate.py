@@ -117,10 +117,10 @@ def _sampled(
     rng, block, done, out = np.random.default_rng(seed), trajectories_at_once(fine, parameters.count > 0), 0, 0
     while done < count:
         size = min(block, count - done)
-        disturbances, drawn = uncertainty.draw(law, size, rng)
+        disturbances, drawn, begun = uncertainty.draw(law, size, rng)
         for one in counts:
             one.begin(size)
-        for position, state in enumerate(walk(fine, control, drawn, disturbances)):
+        for position, state in enumerate(walk(fine, control, drawn, disturbances, begun)):
             envelope.add(position, state)
             for one in counts:
                 one.add(position, state)

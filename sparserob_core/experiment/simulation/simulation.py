@@ -152,7 +152,8 @@ class Simulation:
         """What is to be said beside the table: what a sample is worth, and what is proven."""
         if self.law == ADVERSARY:
             yield (
-                "each row is one trajectory: the worst disturbance and parameter of that constraint, propagated exactly"
+                "each row is one trajectory: the worst disturbance, parameter and initial state of that constraint,"
+                " propagated exactly"
             )
         else:
             yield (
@@ -171,8 +172,8 @@ class Simulation:
             )
         elif self.status in PROVEN:
             yield (
-                f"the run proves what no sample can (status {self.status}): no admissible disturbance and parameter"
-                " violates a constraint"
+                f"the run proves what no sample can (status {self.status}): no admissible disturbance, parameter and"
+                " initial state violates a constraint"
             )
         else:
             yield (

@@ -3,6 +3,8 @@ small cells."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -135,6 +137,27 @@ def test_every_class_of_disturbances_is_enclosed(seed, kind, nu):
         *constraint.cells,
         count=5 if kind == "measurable" else 300,
     )
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    seed=st.integers(0, 10**6),
+    nu=st.sampled_from([0, 1, 2]),
+    bound=st.sampled_from(["none", "box"]),
+    initial=st.sampled_from(["box", "ellipsoid", "1-norm", "triangle"]),
+    grid=st.sampled_from(sorted(GRIDS)),
+)
+def test_the_worst_initial_state_of_a_set_is_enclosed(seed, nu, bound, initial, grid):
+    rng = np.random.default_rng(seed)
+    plain = constraint_of(rng, system_of(rng, nu), GRIDS[grid], BOUNDS[bound])
+    constraint = replace(plain, functionals=replace(plain.functionals, initial=BOUNDS[initial]))
+    x, (lower, upper) = rng.normal(size=plain.functionals.variables), plain.cells
+    if nu:
+        lower[::2, 1:], upper[::2, 1:] = np.sort(rng.uniform(-1, 1, (2, nu)), axis=0)
+    check(constraint, x, rng, lower, upper)
+    middles = (lower + upper) / 2
+    exact = [(G @ x - rhs).max() for G, rhs in zip(*constraint.rows(middles), strict=True)]
+    np.testing.assert_allclose(constraint.enclosure(x, middles, middles).bounds, exact, rtol=1e-7, atol=1e-7)
 
 
 def test_an_l1_ball_of_functions_larger_than_one_is_enclosed():

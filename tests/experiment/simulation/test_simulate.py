@@ -115,7 +115,7 @@ CLASSES = {
 @pytest.mark.parametrize("name", CLASSES)
 def test_every_law_draws_admissible_signals_that_differ(name, law):
     model = model_of(*CLASSES[name])
-    disturbances, _ = uncertainty_of(model).draw(law, 60, np.random.default_rng(1))
+    disturbances, _, _ = uncertainty_of(model).draw(law, 60, np.random.default_rng(1))
     assert disturbances.shape == (60, 2, model.response.grid.pieces)
     assert np.ptp(disturbances, axis=0).max() > 1e-3
     assert admissibility(model.functionals.disturbance, disturbances).max() <= 1e-12
@@ -137,7 +137,7 @@ def test_every_law_draws_admissible_signals_that_differ(name, law):
 def test_a_signal_that_is_not_admissible_is_told_from_one_that_is():
     for parts in CLASSES.values():
         model = model_of(*parts)
-        drawn, _ = uncertainty_of(model).draw("vertices", 20, np.random.default_rng(2))
+        drawn, _, _ = uncertainty_of(model).draw("vertices", 20, np.random.default_rng(2))
         assert admissibility(model.functionals.disturbance, 1.3 * drawn).max() > 1e-3
 
 
@@ -154,7 +154,7 @@ def test_a_signal_that_is_not_admissible_is_told_from_one_that_is():
 )
 def test_parameters_of_any_set_are_drawn_from_it(parameters, law):
     model = model_of(BOX, uniform(6, 2.0), parameters=parameters)
-    _, drawn = uncertainty_of(model).draw(law, 80, np.random.default_rng(3))
+    _, drawn, _ = uncertainty_of(model).draw(law, 80, np.random.default_rng(3))
     assert drawn.shape == (80, parameters.dimension)
     assert np.ptp(drawn, axis=0).min() > 1e-3
     assert parameters.contains(drawn, 1e-12).all()
@@ -228,7 +228,7 @@ def test_trajectories_agree_with_an_integrator_and_with_augmented_exponentials()
 def test_every_trajectory_has_its_own_parameter():
     model = model_of(BOX, uniform(6, 2.0), parameters=sr.Box([-0.5, -0.3], [0.5, 0.3]))
     rng = np.random.default_rng(8)
-    disturbances, parameters = uncertainty_of(model).draw("iid", 4, rng)
+    disturbances, parameters, _ = uncertainty_of(model).draw("iid", 4, rng)
     u = rng.normal(size=(1, 8))
     grid = model.response.grid
     paths = np.stack(
