@@ -5,6 +5,7 @@ A name that users or authors of components need is added here, as ``Name as Name
 """
 
 # To state a problem.
+from sparserob_core.control.problem.cost import Cost as Cost
 from sparserob_core.control.problem.dictionary import Dictionary as Dictionary
 from sparserob_core.control.problem.dictionary import DictionaryFactory as DictionaryFactory
 from sparserob_core.control.problem.names import Names as Names

@@ -55,7 +55,31 @@ class MinimumAttention(sr.LinearKeys):
             path=[*path, *self._bounds(d, m)],
             terminal=[*ends, sr.Equality(np.append(np.full(d, np.nan), np.zeros(m)))],
             names=_names(self.names.build().fitting(d, m, plain.disturbances), d, m),
+            cost=self._cost(d, m),
         )
+
+    def _cost(self, d: int, m: int) -> sr.Cost:
+        """The cost of the augmented problem: absolute values and norms are those of the rate, quadratic terms those of
+        the state and of the control, which is a part of it."""
+        weights = np.broadcast_to(1.0 if self.weights is None else self.weights, m)
+        try:
+            plain = self.cost.build(d).checked(d, m, weights)
+        except sr.InputError as error:
+            raise error if error.path[:1] == ("cost",) else error.under("cost") from None
+        (state, control, final), both = plain.terms, None
+        if state is not None or control is not None:
+            Q, r = np.zeros((d + m, d + m)), np.zeros(d + m)
+            if state is not None:
+                Q[:d, :d], r[:d] = state.Q, state.reference
+            if control is not None:
+                Q[d:, d:] = control.Q
+            both = {"Q": Q, "reference": r}
+        last = None
+        if final is not None:
+            Q = np.zeros((d + m, d + m))
+            Q[:d, :d] = final.Q
+            last = {"Q": Q, "reference": np.append(final.reference, np.zeros(m))}
+        return sr.Cost(l1=plain.l1, group=plain.group, state=both, final=last)
 
     def _augmented(self, d: int, m: int) -> sr.LinearSystem:
         """``A = [[A, B], [0, 0]]``, ``B = [0; I]``, ``E = [E; 0]``, still in expressions of the parameters."""

@@ -29,7 +29,8 @@ class Cut:
 class Dual:
     """Multipliers that prove a lower ``bound`` of the semi-infinite program's value, or of its infeasibility: those of
     the imposed constraints (in ``cuts``), ``mu (e,)`` of the equalities, and ``z (k,)`` of the image ``S x`` unless
-    ``S`` is the identity; ``fixed (r,)`` are those of the program's fixed rows ``G x <= h``.
+    ``S`` is the identity; ``fixed (r,)`` are those of the program's fixed rows ``G x <= h``. ``at (n,)``: the decision
+    at which quadratic terms, and norms, of the cost are replaced by their tangents, where there are any.
     """
 
     bound: float
@@ -37,6 +38,7 @@ class Dual:
     mu: Array
     z: Array | None = None
     fixed: Array = field(default_factory=lambda: np.zeros(0))
+    at: Array | None = None
 
 
 NO_BOUND = Dual(-np.inf, (), np.zeros(0))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -16,9 +17,65 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
+class Blocks:
+    """Entries of an image that count with their Euclidean norm: ``number (k,)`` is the block of each, -1 for one that
+    counts alone. Entries of one block have one weight."""
+
+    number: np.ndarray
+
+    @cached_property
+    def entries(self) -> np.ndarray:
+        """The entries ``(e,)`` that are in a block."""
+        return np.flatnonzero(self.number >= 0)
+
+    @cached_property
+    def of(self) -> np.ndarray:
+        """The block ``(e,)`` of each of those."""
+        return np.asarray(self.number[self.entries])
+
+    @cached_property
+    def first(self) -> np.ndarray:
+        """The first entry ``(b,)`` of every block."""
+        return np.asarray(self.entries[np.unique(self.of, return_index=True)[1]])
+
+    @cached_property
+    def table(self) -> np.ndarray:
+        """The entries ``(b, g)`` of every block, -1 where it has fewer than the largest."""
+        order = np.argsort(self.of, kind="stable")
+        sizes = np.bincount(self.of, minlength=self.first.size)
+        table = np.full((sizes.size, int(sizes.max(initial=0))), -1)
+        table[np.arange(table.shape[1]) < sizes[:, None]] = self.entries[order]
+        return table
+
+    @shaped
+    def norms(self, image: Float[Array, " k"]) -> Float[Array, " b"]:
+        """The norm of every block."""
+        squares = np.bincount(self.of, image[self.entries] ** 2, self.first.size)
+        return np.asarray(np.sqrt(squares), dtype=float)
+
+    @shaped
+    def directions(self, image: Float[Array, " k"]) -> Float[Array, " k"]:
+        """Every block divided by its norm; 0 where that is 0, and outside of blocks."""
+        answer = np.zeros(image.size)
+        norms = self.norms(image)
+        answer[self.entries] = image[self.entries] / np.where(norms > 0.0, norms, np.inf)[self.of]
+        return answer
+
+    @shaped
+    def lengths(self, image: Float[Array, " k"]) -> Float[Array, " k"]:
+        """What every entry counts with: the norm of its block in the first entry of it and 0 in the others, its
+        absolute value outside of blocks."""
+        answer = np.abs(image)
+        answer[self.entries] = 0.0
+        answer[self.first] = self.norms(image)
+        return answer
+
+
+@dataclass(frozen=True, eq=False)
 class FiniteProgram:
-    """minimise ``sum_k weights_k |(S x)_k| + 1/2 x'P x + q'x``
-    subject to ``lower <= S x <= upper``, ``G x <= h``, ``A x = b``.
+    """minimise ``sum_k weights_k |(S x)_k| + 1/2 x'P x + q'x + constant``
+    subject to ``lower <= S x <= upper``, ``G x <= h``, ``A x = b``; where there are ``blocks`` of images, each counts
+    with its weight times its Euclidean norm instead.
 
     Shapes: ``q (n,)``, ``P (n, n)`` symmetric positive semidefinite or ``None``, ``S (k, n)`` or ``None`` for the
     identity, ``weights, lower, upper (k,)`` with ``weights >= 0``, ``G (r, n)``, ``h (r,)``, ``A (e, n)``, ``b (e,)``.
@@ -36,6 +93,8 @@ class FiniteProgram:
     b: Array
     P: csc_array | None = None
     S: csc_array | None = None
+    constant: float = 0.0
+    blocks: Blocks | None = None
 
     @property
     def n(self) -> int:
@@ -51,14 +110,27 @@ class FiniteProgram:
     def objective(self, x: Float[Array, " n"]) -> float:
         """The cost at ``x``."""
         quadratic = 0.0 if self.P is None else 0.5 * float(x @ (self.P @ x))
-        return float(self.weights @ np.abs(self.image(x)) + self.q @ x) + quadratic
+        return float(self.weights @ self._lengths(x) + self.q @ x) + quadratic + self.constant
+
+    @shaped
+    def _lengths(self, x: Float[Array, " n"]) -> Float[Array, " k"]:
+        image = self.image(x)
+        return np.abs(image) if self.blocks is None else self.blocks.lengths(image)
+
+    @shaped
+    def tangent(self, at: Float[Array, " n"]) -> FiniteProgram:
+        """The same program with ``1/2 x'P x`` replaced by its tangent at ``at``, which lies below it."""
+        if self.P is None:
+            return self
+        bent = np.asarray(self.P @ at, dtype=float)
+        return replace(self, P=None, q=self.q + bent, constant=self.constant - 0.5 * float(at @ bent))
 
     @shaped
     def magnitude(self, x: Float[Array, " n"]) -> float:
         """The sum of the absolute values of the terms of the cost at ``x``: what its rounding is relative to."""
         size = np.abs(x)
         quadratic = 0.0 if self.P is None else 0.5 * float(size @ (abs(self.P) @ size))
-        return float(self.weights @ np.abs(self.image(x)) + np.abs(self.q) @ size) + quadratic
+        return float(self.weights @ self._lengths(x) + np.abs(self.q) @ size) + quadratic + abs(self.constant)
 
     @shaped
     def residual(self, x: Float[Array, " n"]) -> float:
@@ -98,6 +170,8 @@ class FiniteProgram:
             raise InputError("finite program: a bound or right-hand side is NaN")
         if np.isneginf(self.h).any() or (self.weights < 0).any():
             raise InputError("finite program: expected weights >= 0 and right-hand sides above -inf")
+        if not np.isfinite(self.constant):
+            raise InputError(f"finite program: constant is {self.constant}, expected a finite number")
 
 
 def diagonal(P: csc_array | None, n: int) -> Array | None:
@@ -126,6 +200,22 @@ def scaled_violation(
 
 
 @dataclass(frozen=True, eq=False)
+class Directions:
+    """Unit vectors ``vectors (r, g)``, each for the block ``block (r,)`` in the order of its entries: the largest of
+    ``d's`` over those of a block is at most its norm."""
+
+    block: np.ndarray
+    vectors: Array
+
+    def joined(self, other: Directions) -> Directions:
+        """These and those of the others that are not among them."""
+        block, vectors = np.concatenate([self.block, other.block]), np.vstack([self.vectors, other.vectors])
+        _, first = np.unique(np.column_stack([block, np.round(vectors, 12) + 0.0]), axis=0, return_index=True)
+        kept = np.sort(first)
+        return Directions(block[kept], vectors[kept])
+
+
+@dataclass(frozen=True, eq=False)
 class FiniteSolution:
     """What was *checked* about a finite program; no number here was taken from a solver unread.
 
@@ -133,7 +223,8 @@ class FiniteSolution:
     proven) or ``failed``. ``value`` is the cost at ``x (n,)``; ``lower_bound`` is proven by weak duality from
     ``y (r,) >= 0`` (of ``G x <= h``), ``mu (e,)`` (of ``A x = b``) and ``z (k,)`` (of ``s = S x``), with
     ``P x + q + G'y + A'mu + S'z = 0`` at an optimum. ``residual``: see `FiniteProgram.residual`;
-    ``gap = value - lower_bound``. ``infeasibility``: a proven lower bound of the smallest ``t`` for which
+    ``gap = value - lower_bound``. ``directions``: those that norms of blocks were replaced by, the last time.
+    ``infeasibility``: a proven lower bound of the smallest ``t`` for which
     ``G_i x <= h_i + t |G_i|`` and ``|A_i x - b_i| <= t |A_i|`` can be met within the bounds. ``attempts``: what was
     tried and why it was not believed.
     """
@@ -150,3 +241,4 @@ class FiniteSolution:
     message: str = ""
     attempts: tuple[str, ...] = ()
     infeasibility: float = 0.0
+    directions: Directions | None = None

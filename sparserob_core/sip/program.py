@@ -9,11 +9,12 @@ from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias, final
 
 import numpy as np
+import numpy.typing as npt
 
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, Box, as_bound
-from sparserob_core.sip.finite import FiniteProgram
+from sparserob_core.sip.finite import Blocks, FiniteProgram
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
@@ -195,8 +196,8 @@ class ConstraintFamily:
 
 @dataclass(frozen=True, eq=False)
 class SemiInfiniteProgram:
-    """minimise ``sum_k weights_k |(S x)_k| + 1/2 x'P x + q'x`` subject to ``lower <= S x <= upper``, ``G x <= h``,
-    ``A x = b`` and every constraint family at every index.
+    """minimise ``sum_k weights_k |(S x)_k| + 1/2 x'P x + q'x + constant`` subject to ``lower <= S x <= upper``,
+    ``G x <= h``, ``A x = b`` and every constraint family at every index.
 
     ``n`` is the number of decision variables; ``S (k, n)`` is the identity when ``None``; ``lower``, ``upper`` and
     ``weights`` are numbers or ``(k,)``. ``lengths``: how much each entry of ``S x`` counts in a weighted regulariser
@@ -204,6 +205,9 @@ class SemiInfiniteProgram:
     0, of the first entries or all, where that means something (`methods.counting`).
     ``twin`` makes the same program in its own units (`own_units`); ``cost_unit`` is what a cost of 1 is in the user's
     units, for a program in its own, and ``image_units (k,)`` what 1 of each entry of ``S x`` is.
+    ``blocks (k,)``: images with the same number of at least 0 count together, with their weight times their Euclidean
+    norm; -1 is one that counts alone. ``largest``: the largest possible cost, where it is known, of which a gap is a
+    share (`cost_scale`).
     """
 
     n: int
@@ -223,6 +227,9 @@ class SemiInfiniteProgram:
     activity: Array | None = None
     cost_unit: float = 1.0
     image_units: Array | None = None
+    constant: float = 0.0
+    blocks: npt.ArrayLike | None = None
+    largest: float | None = None
     twin: Callable[[], OwnUnits] | None = field(default=None, repr=False)
     finite: FiniteProgram = field(init=False, repr=False)
 
@@ -246,9 +253,23 @@ class SemiInfiniteProgram:
         if len(set(names)) < len(names):
             raise InputError(f"families: names must differ, got {names}")
         object.__setattr__(self, "families", tuple(self.families))
-        object.__setattr__(
-            self, "finite", FiniteProgram(q=q, weights=weights, lower=lower, upper=upper, G=G, h=h, A=A, b=b, P=P, S=S)
+        constant = _vector("constant", self.constant, 1)
+        finite = FiniteProgram(
+            q=q, weights=weights, lower=lower, upper=upper, G=G, h=h, A=A, b=b, P=P, S=S, constant=float(constant[0])
         )
+        object.__setattr__(self, "finite", replace(finite, blocks=self._blocks(weights)))
+
+    def _blocks(self, weights: Array) -> Blocks | None:
+        if self.blocks is None:
+            return None
+        given = np.asarray(self.blocks)
+        if given.shape != weights.shape or given.dtype.kind not in "iu":
+            raise InputError(f"blocks: expected {weights.size} whole numbers, got shape {given.shape}")
+        _, number = np.unique(np.where(given < 0, -1, given), return_inverse=True)
+        blocks = Blocks(number.reshape(-1) - int((given < 0).any()))
+        if (weights[blocks.entries] != weights[blocks.first][blocks.of]).any():
+            raise InputError("weights: expected one weight for all images of a block")
+        return blocks if blocks.entries.size else None
 
     def _rows(self, left: str, matrix: object, right: str, bounds: object) -> tuple[Array, Array]:
         if (matrix is None) != (bounds is None):
@@ -269,7 +290,8 @@ class SemiInfiniteProgram:
     @property
     def _parts(self) -> tuple[int, ...]:
         """What the program is made of, by identity."""
-        numbers = (self.q, self.P, self.weights, self.S, self.lower, self.upper, self.G, self.h, self.A, self.b)
+        cost = (self.q, self.P, self.weights, self.constant, self.blocks)
+        numbers = (*cost, self.S, self.lower, self.upper, self.G, self.h, self.A, self.b)
         return tuple(id(part) for part in (*numbers, *self.families))
 
     def mirrored(self, twin: Callable[[SemiInfiniteProgram], OwnUnits]) -> SemiInfiniteProgram:
@@ -300,6 +322,8 @@ class SemiInfiniteProgram:
     def cost_scale(self) -> float:
         """The largest possible cost: that of the bounds, what a gap is relative to (`sip.result.relative_gap`). Where
         an entry that costs something has no bound, a million of the largest coefficient, but at most a million."""
+        if self.largest is not None:
+            return self.largest
         program = self.finite
         reach = np.maximum(np.abs(program.lower), np.abs(program.upper))
         size = np.full(self.n, np.inf) if program.S is not None else reach
@@ -309,7 +333,7 @@ class SemiInfiniteProgram:
                 np.where(cost > 0.0, cost * far, 0.0)
                 for cost, far in ((program.weights, reach), (np.abs(program.q), size), (curvature / 2, size**2))
             ]
-        largest = float(sum(term.sum() for term in terms))
+        largest = float(sum(term.sum() for term in terms)) + abs(program.constant)
         if np.isfinite(largest):
             return largest
         coefficients = (program.weights, np.abs(program.q), curvature)

@@ -38,9 +38,10 @@ def acted(case: Case) -> float:
 
 
 def shared(case: Case, rows: Rows, pieces: Any) -> tuple[Rows, Any]:
-    """Multipliers of the cost, as multipliers of the count: divided by the largest value of a channel, which is best
-    where all have the same. Any factor that is not negative proves something."""
-    most = max((max(float(abs(low).mid()), float(abs(high).mid())) for low, high in _ranges(case)), default=1.0) or 1.0
+    """Multipliers of the cost, as multipliers of the count: divided by what the largest value of a channel costs, which
+    is best where all have the same. Any factor that is not negative proves something."""
+    most = max((max(float(abs(low).mid()), float(abs(high).mid())) for low, high in _ranges(case)), default=1.0)
+    most = most * case.problem.cost.l1 or 1.0
     rest = pieces if pieces is None else (np.asarray(pieces, dtype=float) / most).tolist()
     return [(y / most, row) for y, row in rows], rest
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.claims.cost import Price
 from sparserob_core.checker.claims.duality import Duality, before
 from sparserob_core.checker.claims.units import RowUnits
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
@@ -130,12 +131,16 @@ class Case:
     @cached_property
     def pieces(self) -> list[arb_mat]:
         """The control ``(m, 1)`` on every piece of its dictionary."""
+        return self.on_pieces(self.theta)
+
+    def on_pieces(self, coefficients: Array) -> list[arb_mat]:
+        """A control ``(m, 1)`` on every piece of its dictionary, from coefficients ``(m, N)``."""
         from flint import arb
 
         values = self.control.values
         if np.array_equal(values, np.eye(values.shape[0])):
-            return [stacked([[arb(float(v))] for v in column]) for column in self.theta.T]
-        theta = stacked([[arb(float(v)) for v in row] for row in self.theta])
+            return [stacked([[arb(float(v))] for v in column]) for column in coefficients.T]
+        theta = stacked([[arb(float(v)) for v in row] for row in coefficients])
         table = (theta * stacked([[arb(float(v)) for v in row] for row in values])).transpose().tolist()
         return [stacked([[x] for x in row]) for row in table]
 
@@ -167,6 +172,10 @@ class Case:
     @cached_property
     def _units(self) -> dict[Window, RowUnits]:
         return {}
+
+    @cached_property
+    def price(self) -> Price:
+        return Price(self.problem, self.control)
 
     @cached_property
     def duality(self) -> Duality:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -16,12 +16,12 @@ from sparserob_core.checker.claims.duality import Row
 from sparserob_core.checker.claims.equalities import equalities
 from sparserob_core.checker.claims.replay import reached
 from sparserob_core.checker.outcome import TOLERANCE, Broken, Finding, Unchecked
-from sparserob_core.checker.sets.shapes import excess, limit, member, support
+from sparserob_core.checker.sets.shapes import excess, limit, member
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
-    from flint import arb
+    from flint import arb, arb_mat
 
 PRECISION = 96  # bits, where the numbers of a system are of one size
 MOST_PRECISION = 1024
@@ -124,23 +124,9 @@ def _steps(case: Case) -> str:
     return f"{len(steps)} steps in their set" + (f", to {worst:.1e} of its own units" if worst > 0 else "")
 
 
-def cost_of(case: Case) -> arb:
-    """``J`` of the decision."""
-    from flint import arb
-
-    total = arb(0)
-    for k, piece in enumerate(case.pieces):
-        length = arb(float(case.control.breakpoints[k + 1])) - arb(float(case.control.breakpoints[k]))
-        total = total + length * sum(
-            (arb(float(w)) * abs(u) for w, u in zip(np.asarray(case.problem.weights), piece.entries(), strict=True)),
-            arb(0),
-        )
-    return total
-
-
 def _cost(case: Case) -> str:
-    derived = cost_of(case)
-    _agrees("cost", number(case.certificate, "cost"), derived, SMALL_COST * largest_cost(case))
+    derived = case.price.of(case.pieces)
+    _agrees("cost", number(case.certificate, "cost"), derived, SMALL_COST * case.price.largest)
     return f"J = {float(derived.mid()):.12g}"
 
 
@@ -154,8 +140,11 @@ def _agrees(name: str, written: float, derived: arb, scale: float) -> None:
 
 def _multiplied(case: Case, priced: bool) -> arb:
     """The bound that the certificate's multipliers give."""
-    rows, pieces = _weighted(case, case.certificate.get("multipliers"))
-    return case.duality.bound(rows, pieces, priced)
+    data = case.certificate.get("multipliers")
+    rows, pieces = _weighted(case, data)
+    if not priced:
+        return case.duality.bound(rows, pieces, None)
+    return case.duality.bound(rows, pieces, case.price, _touched(case, data))
 
 
 def _weighted(case: Case, data: object) -> tuple[list[tuple[float, Row]], Any]:
@@ -219,6 +208,18 @@ def _fewest(case: Case, status: str) -> str:
         raise Broken(f"lower is {written!r}, the multipliers prove {derived!r}")
     below = f"no admissible control acts for a share of time below {written:.6g}"
     return f"{below}, {'this' if other is case else 'another'} one for {acted:.6g}" if proven else below
+
+
+def _touched(case: Case, data: object) -> Sequence[arb_mat] | None:
+    """The control at which the certificate replaces the cost by its tangent, on every piece."""
+    if not (case.price.is_quadratic or any(len(block) > 1 for block in case.price.blocks)):
+        return None
+    said = data.get("tangent") if isinstance(data, Mapping) else None
+    at, expected = numbers(said, "tangent"), (case.problem.system.controls, case.control.functions)
+    if at.shape != expected:
+        raise Broken(f"the tangent's control has shape {at.shape}, expected {expected}")
+    case.price.convex()
+    return case.on_pieces(at)
 
 
 def _row(case: Case, entry: object) -> tuple[float, Row]:
@@ -300,19 +301,10 @@ def _status(case: Case, status: str, tolerance: float | None, claims: list[Findi
     return f"every constraint is kept, and the bounds meet within {gap:.2e}"
 
 
-def largest_cost(case: Case) -> float:
-    """The largest cost that a control may have."""
-    axes = np.eye(case.problem.system.controls)
-    reach = [
-        max(abs(float(support(case.problem.control, balls(s * axis)).mid())) for s in (1.0, -1.0)) for axis in axes
-    ]
-    return float(np.dot(np.asarray(case.problem.weights), reach)) * case.problem.horizon
-
-
 def relative_gap(case: Case, cost: float, lower: float) -> float:
     """The gap relative to the cost, or to a millionth of the largest cost where that is more; 0 where the bounds
     meet."""
-    return 0.0 if cost <= lower else (cost - lower) / (max(abs(cost), SMALL_COST * largest_cost(case)) or 1.0)
+    return 0.0 if cost <= lower else (cost - lower) / (max(abs(cost), SMALL_COST * case.price.largest) or 1.0)
 
 
 def _witness(case: Case) -> str:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import rational
+from sparserob_core.checker.claims.cost import Price, Tangent
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.reach.flow import Flow, stacked
 from sparserob_core.checker.sets.shapes import arrangement, boxed, facets, limit, support
@@ -116,29 +117,69 @@ class Duality:
         column: list[arb] = ((matrix * (_exact(time) - _exact(since))).exp() * start).entries()
         return column
 
-    def bound(self, rows: Sequence[tuple[float, Row]], pieces: Sequence[Sequence[float]] | None, priced: bool) -> arb:
-        """The bound that multipliers ``y`` of ``rows`` give; ``priced``: with the cost, otherwise as a proof of
-        infeasibility."""
-        constant, slopes = self.summed(rows, pieces)
+    def bound(
+        self,
+        rows: Sequence[tuple[float, Row]],
+        pieces: Sequence[Sequence[float]] | None,
+        price: Price | None,
+        touched: Sequence[arb_mat] | None = None,
+    ) -> arb:
+        """The bound that multipliers ``y`` of ``rows`` give; with the ``price``, or without as a proof of
+        infeasibility. Quadratic terms, and norms, are replaced by their tangents at the control ``touched (m, 1)`` on
+        every piece."""
+        tangent = None if price is None or touched is None or not price.is_quadratic else price.tangent(touched)
+        constant, slopes = self.summed(rows, pieces, tangent)
         m = self.problem.system.controls
-        weights = np.asarray(self.problem.weights, dtype=float) if priced else np.zeros(m)
+        weights = [_exact(0.0)] * m if price is None else price.weights
+        groups = [] if price is None else [block for block in price.blocks if len(block) > 1]
         lengths = [
             _exact(b) - _exact(a)
             for a, b in zip(self.control.breakpoints[:-1], self.control.breakpoints[1:], strict=True)
         ]
-        return sum(
-            (
-                self._least([_exact(w) * length for w in weights], slope)
-                for length, slope in zip(lengths, slopes, strict=True)
-            ),
-            constant,
-        )
+        for k, (length, slope) in enumerate(zip(lengths, slopes, strict=True)):
+            costs = [w * length for w in weights]
+            if groups and touched is not None:
+                constant = constant + self._least_of_groups(costs, slope, groups, touched[k].entries())
+            else:
+                constant = constant + self._least(costs, slope)
+        return constant
+
+    def _least_of_groups(
+        self, weights: list[arb], slope: list[arb], groups: Sequence[Sequence[int]], at: Sequence[arb]
+    ) -> arb:
+        """At most the least cost with norms of groups: ``weight |s| >= d's`` for any ``|d| <= weight``, that which the
+        slope asks for or that of the tangent; each group the better one, for a set that is a box, else all the same."""
+        offers = []
+        for chosen in (_against, _along):
+            tilted, left = list(slope), list(weights)
+            for block in groups:
+                d = chosen([slope[c] for c in block], [at[c] for c in block], weights[block[0]])
+                for c, push in zip(block, d, strict=True):
+                    tilted[c], left[c] = slope[c] + push, _exact(0.0)
+            offers.append((left, tilted))
+        bound = boxed(self.problem.control)
+        if not isinstance(bound, Box):
+            values = [self._least(*offer) for offer in offers]
+            return values[0].max(values[1])
+        sides = list(zip(bound.lower, bound.upper, strict=True))
+        found = _exact(0.0)
+        alone = [c for c in range(len(slope)) if not any(c in block for block in groups)]
+        for block in (*groups, *([c] for c in alone)):
+            values = [
+                sum((_least_between(left[c], tilted[c], *map(float, sides[c])) for c in block), _exact(0.0))
+                for left, tilted in offers
+            ]
+            found = found + values[0].max(values[1])
+        return found
 
     def summed(
-        self, rows: Sequence[tuple[float, Row]], pieces: Sequence[Sequence[float]] | None
+        self,
+        rows: Sequence[tuple[float, Row]],
+        pieces: Sequence[Sequence[float]] | None,
+        tangent: Tangent | None = None,
     ) -> tuple[arb, list[list[arb]]]:
-        """The sum of ``rows`` times their multipliers ``y``: its constant, and its slopes on every piece; with fewer
-        functions than ``pieces``, in the slopes of these."""
+        """The sum of ``rows`` times their multipliers ``y``, and of a ``tangent``: its constant, and its slopes on
+        every piece; with fewer functions than ``pieces``, in the slopes of these."""
         constant = sum((_exact(y) * row.constant for y, row in rows), _exact(0.0))
         m, K = self.problem.system.controls, self.control.pieces
         slopes = [
@@ -148,6 +189,11 @@ class Duality:
             ]
             for k in range(K)
         ]
+        if tangent is not None:
+            constant = constant + tangent.constant
+            slopes = [
+                [a + b for a, b in zip(one, two, strict=True)] for one, two in zip(slopes, tangent.slope, strict=True)
+            ]
         if pieces is not None and self.control.functions < K:
             slopes, slip = self._moved(slopes, pieces)
             constant = constant - slip
@@ -233,6 +279,26 @@ def _differences(integrals: Sequence[list[arb] | None], width: int) -> list[list
         zero if now is None else [a - b for a, b in zip(now, later or zero, strict=True)]
         for now, later in zip(integrals, nexts, strict=True)
     ]
+
+
+def _against(slope: Sequence[arb], at: Sequence[arb], weight: arb) -> list[arb]:
+    """The vector no longer than the weight that is nearest to ``-slope``; of its middle, which is exact."""
+    wanted = [_exact(-float(s.mid())) for s in slope]
+    return wanted if _squares(wanted) <= weight * weight else _lengthened(wanted, weight)
+
+
+def _along(slope: Sequence[arb], at: Sequence[arb], weight: arb) -> list[arb]:
+    """The vector as long as the weight in the direction of a control; 0 where that is 0."""
+    return _lengthened([_exact(float(u.mid())) for u in at], weight)
+
+
+def _lengthened(vector: Sequence[arb], length: arb) -> list[arb]:
+    size = _squares(vector)
+    return [length * v / size.sqrt() for v in vector] if size > 0 else [_exact(0.0) for _ in vector]
+
+
+def _squares(vector: Sequence[arb]) -> arb:
+    return sum((v * v for v in vector), _exact(0.0))
 
 
 def _least_between(w: arb, s: arb, low: float, high: float) -> arb:

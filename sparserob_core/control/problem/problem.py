@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.control.problem.cost import Cost
 from sparserob_core.control.problem.names import UNNAMED, Names
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Equality
@@ -36,7 +37,8 @@ class PathConstraint:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class OptimalControlProblem:
-    """Minimise ``sum_i weights_i int_0^T |u_i(t)| dt`` such that for every disturbance and every parameter
+    """Minimise a `Cost`, ``sum_i weights_i int_0^T |u_i(t)| dt`` unless told otherwise, such that for every disturbance
+    and every parameter
 
     ``x' = A(p) x + B(p) u + E(p) w + c(p)``, ``x(0) = initial_state (d,)``, ``u(t)`` in ``control``, ``x(t)`` in every
     ``path`` set during its window, and ``x(T)`` in every ``terminal`` set, where ``T = horizon`` (in the time unit of
@@ -72,6 +74,7 @@ class OptimalControlProblem:
     initial_control: npt.ArrayLike | None = None
     control_step: ConvexSet | None = None
     names: Names = UNNAMED
+    cost: Cost = Cost()  # noqa: RUF009  immutable
 
     def __post_init__(self) -> None:
         if not isinstance(self.system, LinearSystem):
@@ -90,6 +93,7 @@ class OptimalControlProblem:
         self._set("initial_set", self._deviations())
         self._set("weights", self._weights())
         self._set("initial_control", self._control_before())
+        self._set("cost", self._costs())
         _checked_set("control", self.control, self.system.controls, "controls", bounded=True)
         if self.control_step is not None:
             step = _checked_set("control_step", self.control_step, self.system.controls, "controls")
@@ -134,6 +138,14 @@ class OptimalControlProblem:
                 path="weights", expected=f"{m} positive numbers, one per control", got=f"{weights.tolist()}"
             )
         return weights
+
+    def _costs(self) -> Cost:
+        if not isinstance(self.cost, Cost):
+            raise InputError(path="cost", expected="a Cost", got=f"{type(self.cost).__name__}")
+        try:
+            return self.cost.checked(self.system.states, self.system.controls, np.asarray(self.weights))
+        except InputError as error:
+            raise error.under("cost") from None
 
     def _control_before(self) -> Array | None:
         if self.initial_control is None:

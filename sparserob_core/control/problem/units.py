@@ -55,6 +55,7 @@ class Units:
             path=[self._window(entry) for entry in problem.path if isinstance(entry, PathConstraint)],
             terminal=[end.in_units(self.states) for end in problem.terminal],
             title=problem.title,
+            cost=problem.cost.in_units(self.states, self.controls, self.time, self.cost),
             initial_control=(
                 None if problem.initial_control is None else np.asarray(problem.initial_control) / self.controls
             ),

@@ -27,7 +27,7 @@ def rough_units(problem: OptimalControlProblem) -> Units:
     """
     system, bound = problem.system, problem.disturbance
     time = float(power_of_two(np.array(problem.horizon)))
-    controls, disturbances = power_of_two(extent(problem.control)), np.ones(system.disturbances)
+    controls, disturbances = _control_units(problem), np.ones(system.disturbances)
     if bound is not None:
         disturbances = power_of_two(extent(bound))
     index = ParameterIndex(system.parameters)
@@ -62,9 +62,28 @@ def own_units(problem: OptimalControlProblem, rough: Units, functionals: WorstCa
     usable = np.isfinite(reach) & (reach > 0.0)
     states = rough.states * power_of_two(np.where(usable, reach, 1.0))
     states = np.where(usable, states, power_of_two(walls(problem)))
-    weights = np.asarray(problem.weights) * extent(problem.control)
-    cost = COST * float(power_of_two(np.array(weights.sum()))) * rough.time
+    cost = COST * float(power_of_two(np.array(_cost_per_time(problem, states, rough.time)))) * rough.time
     return Units(rough.time, states, rough.controls, rough.disturbances, rough.parameters, cost)
+
+
+def _control_units(problem: OptimalControlProblem) -> Array:
+    """A unit for every control, ``(m,)``; one for all of a group, whose norm is that of one vector."""
+    size = extent(problem.control)
+    for block in problem.cost.blocks:
+        size[list(block)] = size[list(block)].max()
+    return power_of_two(size)
+
+
+def _cost_per_time(problem: OptimalControlProblem, states: Array, time: float) -> float:
+    """The largest cost per time, where states are as large as their units or their references."""
+    size = extent(problem.control)
+    total = problem.cost.l1 * float((np.asarray(problem.weights) * size).sum())
+    state, control, final = problem.cost.terms
+    for term, reach, over in ((state, states, 1.0), (control, size, 1.0), (final, states, time)):
+        if term is not None:
+            far = reach + np.abs(term.reference)
+            total += float(far @ np.abs(term.Q) @ far) / over
+    return total
 
 
 def row_units(constraint: StateConstraint, control: ConvexSet) -> Array:

@@ -31,7 +31,8 @@ def rounded_down(model: Transcription, result: Result, tolerance: float | None) 
     """
     if not np.isfinite(result.lower_bound) or result.lower_bound <= 0.0:  # without multipliers 0 is exact
         return result
-    lost = SHARE * (_added(model, result) + result.lower_bound) + _neglected(model, result)
+    lost = SHARE * (_added(model, result) + _quadratic(model, result) + result.lower_bound)
+    lost += _neglected(model, result)
     lowered = max(0.0, result.lower_bound - lost)
     dual = replace(result.dual, bound=min(result.dual.bound, lowered))
     answer = replace(result, lower_bound=lowered, dual=dual)
@@ -72,6 +73,19 @@ def _added(model: Transcription, result: Result) -> float:
     if model.problem.disturbance is not None:
         sizes += (np.abs(gains @ E) @ _far(model.problem.disturbance)).sum(axis=1)
     return float(multipliers @ sizes)
+
+
+def _quadratic(model: Transcription, result: Result) -> float:
+    """The numbers that are added up to the tangent of the quadratic terms, at its largest."""
+    finite, at = model.program.finite, result.dual.at
+    if finite.P is None or at is None:
+        return 0.0
+    reach = model.problem.control.reach(np.eye(model.problem.system.controls))
+    pieces = np.repeat(reach, model.control.pieces)
+    far = pieces if finite.S is None else np.abs(np.linalg.pinv(model.control.values.T)).sum(axis=1)
+    far = far if finite.S is None else np.kron(reach, far)
+    bent = np.abs(np.asarray(finite.P @ at))
+    return float(abs(finite.constant) + 0.5 * np.abs(at) @ bent + (np.abs(finite.q) + bent) @ far)
 
 
 def _neglected(model: Transcription, result: Result) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, TypedDict
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.response.disturbance import DisturbanceModel, disturbance_model
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
+from sparserob_core.control.response.quadratic import quadratic_cost
 from sparserob_core.control.response.response import SAME_TIME, Response, merge_grids
 from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.transcription.own_units import (
@@ -141,6 +142,8 @@ def _assembled(
         n=functionals.variables,
         families=families,
         weights=weights,
+        blocks=_blocks(problem, control, weights.size),
+        **_quadratic(problem, control),
         S=S,
         lower=lower,
         upper=upper,
@@ -316,6 +319,7 @@ def from_state(model: Transcription, initial_state: Array) -> Transcription:
     A, b = (A, b) if model.rows is None else model.rows.equalities(A, b)
     program = replace(
         model.program,
+        **_quadratic(problem, model.control),
         families=[moved.get(family.name, family) for family in model.program.families],
         A=A if b.size else None,
         b=b if b.size else None,
@@ -363,7 +367,8 @@ def _image(
         np.repeat(-bound.support(-axes), dictionary.pieces),
         np.repeat(bound.support(axes), dictionary.pieces),
     )
-    weights: Array = np.kron(np.asarray(problem.weights, dtype=float), dictionary.lengths)
+    priced = np.asarray(problem.cost.l1 * np.asarray(problem.weights), dtype=float)
+    weights: Array = np.kron(priced, dictionary.lengths)
     values = csc_array(dictionary.values.T)
     H, h = slanted(bound)
     H, h = (H, h) if rows is None else (H / rows.sides[:, None], h / rows.sides)
@@ -387,6 +392,38 @@ def _image(
         np.concatenate([upper, extra, most]),
         np.concatenate([weights, np.zeros(extra.size + steps.count)]),
     )
+
+
+def _blocks(problem: OptimalControlProblem, dictionary: Dictionary, images: int) -> Array | None:
+    """The number of the group and piece of every image; ``None`` where every channel counts alone."""
+    if not problem.cost.blocks:
+        return None
+    number = np.full((problem.system.controls, dictionary.pieces), -1)
+    for group, block in enumerate(problem.cost.blocks):
+        number[list(block)] = group * dictionary.pieces + np.arange(dictionary.pieces)
+    answer: Array = np.append(number.ravel(), np.full(images - number.size, -1))
+    return answer
+
+
+class Quadratics(TypedDict, total=False):
+    """What the quadratic terms of a cost are in a program."""
+
+    P: csc_array
+    q: Array
+    constant: float
+    largest: float
+
+
+def _quadratic(problem: OptimalControlProblem, dictionary: Dictionary) -> Quadratics:
+    """The quadratic terms of the cost, and what a gap is relative to: the largest cost of the absolute values, and the
+    largest of the quadratic terms at a control that stays 0, or stays at one end of one channel."""
+    if not problem.cost.is_quadratic:
+        return {}
+    on_pieces = quadratic_cost(problem, dictionary.breakpoints)
+    terms, axes = on_pieces.on(dictionary), np.eye(problem.system.controls)
+    reach = problem.control.reach(axes)
+    largest = problem.cost.l1 * float(np.asarray(problem.weights) @ reach) * problem.horizon + on_pieces.largest(reach)
+    return {"P": terms.P, "q": terms.q, "constant": terms.constant, "largest": largest}
 
 
 def slanted(bound: ConvexSet) -> tuple[Array, Array]:

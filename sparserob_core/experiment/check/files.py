@@ -85,8 +85,11 @@ def _unread(case: Case) -> set[str]:
     for multipliers in (data.get("multipliers"), of_activity):
         if not isinstance(multipliers, Mapping):
             continue
+        touched = multipliers is not of_activity and not case.problem.cost.is_linear
+        touched = touched or multipliers.get("tangent") is None
         unused = case.control.functions >= case.control.pieces and multipliers.get("pieces") is not None
-        left |= _besides("multipliers", multipliers, {"constraints", "equalities", *(() if unused else ("pieces",))})
+        told = {"constraints", "equalities", *(() if unused else ("pieces",)), *(("tangent",) if touched else ())}
+        left |= _besides("multipliers", multipliers, told)
         entries = multipliers.get("constraints")
         for entry in entries if isinstance(entries, list) else []:
             left |= _besides("multipliers.constraints", entry, MULTIPLIER)
@@ -181,11 +184,9 @@ def _gap(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
 
 def _largest_cost(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     """The largest possible cost; earlier versions did not write it."""
-    from sparserob_core.checker.claims.claims import largest_cost
-
     if "cost_scale" not in summary:
         return None
-    said, derived = summary["cost_scale"], largest_cost(case)
+    said, derived = summary["cost_scale"], case.price.largest
     return [] if _same(said, derived, CLOSE) else [f"cost_scale is {said!r}, not {derived!r}"]
 
 

@@ -7,15 +7,26 @@ from collections.abc import Mapping
 from typing import Annotated, Literal, TypeAlias, final
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import BeforeValidator, Discriminator, Field, Tag
 
+from sparserob_core.control.problem.cost import Cost
 from sparserob_core.control.problem.expression import CONSTANTS, FUNCTIONS, parse_column, parse_matrix
 from sparserob_core.control.problem.names import Names
 from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint, ProblemFactory
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, ConvexSet, Equality
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.config.option_kinds import LIST, NUMBER, Number, Numbers, OneOrMore, one_of
+from sparserob_core.experiment.config.option_kinds import (
+    LIST,
+    NUMBER,
+    Number,
+    Numbers,
+    OneOrMore,
+    Sparse,
+    broadcast,
+    one_of,
+)
 from sparserob_core.experiment.config.set_options import InitialStateOptions, PathOptions, SetOptions, TerminalOptions
 from sparserob_core.options import Options
 
@@ -37,6 +48,7 @@ def _interval(value: object) -> object:
 
 Interval: TypeAlias = Annotated[tuple[float, float], BeforeValidator(_interval)]
 Rows: TypeAlias = Annotated[list[Annotated[list[Entry], Field(min_length=1)]], Field(min_length=1)]
+Matrix: TypeAlias = Annotated[list[Annotated[list[float], Field(min_length=1)]], Field(min_length=1)]
 
 
 @final
@@ -185,6 +197,69 @@ class NamesOptions(Options):
         )
 
 
+@final
+class StateCostOptions(Options):
+    """``(x - reference)' Q (x - reference)``."""
+
+    Q: Matrix
+    """Symmetric positive semidefinite matrix, row by row."""
+
+    reference: OneOrMore = 0.0
+    """Where it is 0, one number per state; a number serves every state."""
+
+    def term(self, key: str, states: int) -> Mapping[str, npt.ArrayLike]:
+        """The term of that key, as `Cost` takes it; raises `InputError`."""
+        try:
+            return {"Q": self.Q, "reference": broadcast("reference", self.reference, states)}
+        except InputError as error:
+            raise error.under("cost", key) from None
+
+
+@final
+class ControlCostOptions(Options):
+    """``u'R u``."""
+
+    R: Matrix
+    """Symmetric positive semidefinite matrix, row by row."""
+
+
+@final
+class CostOptions(Sparse):
+    """What a control costs; quadratic terms are those of the nominal trajectory, integrated exactly."""
+
+    l1: float = Field(default=1.0, ge=0.0)
+    """Factor of the integral of the weighted absolute values; 0 for a purely quadratic cost."""
+
+    group: (
+        Annotated[
+            Annotated[Literal["all"], Tag("all")]
+            | Annotated[list[Annotated[list[int], Field(min_length=1)]], Tag("lists")],
+            one_of("lists of channels counted from 1, as [[1, 2], [3]], or all", all=str, lists=LIST),
+        ]
+        | None
+    ) = None
+    """Channels that count with their Euclidean norm, as one vector, instead of their absolute values."""
+
+    state: StateCostOptions | None = None
+    """Integrated over time; none unless given."""
+
+    control: ControlCostOptions | None = None
+    """Integrated over time; none unless given."""
+
+    final: StateCostOptions | None = None
+    """Of the state at the horizon; none unless given."""
+
+    def build(self, states: int) -> Cost:
+        """The cost; raises `InputError` that begins with the key."""
+        return Cost(
+            l1=self.l1,
+            group=self.group,
+            state=None if self.state is None else self.state.term("state", states),
+            control=None if self.control is None else {"R": self.control.R},
+            final=None if self.final is None else self.final.term("final", states),
+        )
+
+
 class LinearKeys(ProblemFactory, Options):
     """The keys that problems about a linear system share; what the control is, they say themselves."""
 
@@ -208,6 +283,9 @@ class LinearKeys(ProblemFactory, Options):
 
     weights: OneOrMore | None = None
     """Weight of every control in the cost, positive; 1 unless given."""
+
+    cost: CostOptions = Field(default_factory=CostOptions)
+    """What is minimised; the integral of the weighted absolute values of the control unless given."""
 
     disturbance: SetOptions | None = None
     """Set that the disturbance takes its values in; none unless given."""
@@ -292,6 +370,7 @@ class LinearProblem(LinearKeys):
             disturbance_class=self.disturbance_class,
             path=self.windows(system.states),
             terminal=self.ends(system.states),
+            cost=self.cost.build(system.states),
             initial_control=self._control_before(system.controls),
             control_step=(
                 None if self.control_step is None else self.control_step.build("control_step", system.controls)

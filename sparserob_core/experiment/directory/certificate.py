@@ -29,7 +29,8 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
 
     ``cost`` and ``lower_bound`` are as in ``result.json``. ``multipliers``: of constraints at a time, a parameter and a
     normal direction (of the state, or of the control and its steps), of equalities, and of the control's pieces where
-    the dictionary is not that of their indicators.
+    the dictionary is not that of their indicators;
+    ``tangent``: the control at which the bound replaces quadratic terms and norms of the cost by their tangents.
     ``proof``: per constraint the cells ``[lower, upper]`` of (time, parameters, directions) on which it was shown, to
     ``tolerance`` in each row's own unit (decision 0016); a direction ``z`` of a curved set stands for ``z normals``.
     ``fewest_active``: between what the least share of time lies that any admissible control must act, with the
@@ -106,6 +107,7 @@ def _multipliers(experiment: ControlExperiment, dual: Dual) -> dict[str, Any] | 
         ],
         "equalities": dual.mu,
         "pieces": _on_pieces(problem, z, experiment.control.pieces),
+        **({} if dual.at is None else {"tangent": dual.at.reshape(problem.system.controls, -1)}),
     }
 
 

@@ -58,6 +58,8 @@ def _of_the_image(program: FiniteProgram) -> NewVariables | None:
 def _of_size_one(program: FiniteProgram) -> NewVariables | None:
     """The variables ``x_k / unit_k``, with powers of two for units, which change no number but its exponent; ``None``
     where the bounds of all variables are of ordinary size."""
+    if program.blocks is not None:  # a norm has one unit for all its entries
+        return None
     sources = (program.lower, program.upper, program.weights)
     found = _units.recall(sources, None, lambda: _scaled(*sources))
     if found is None:
@@ -69,7 +71,9 @@ def _of_size_one(program: FiniteProgram) -> NewVariables | None:
 
         P = (diags_array(unit) @ program.P @ diags_array(unit)).tocsc()
     G, A = program.G * unit, program.A * unit
-    easier = FiniteProgram(program.q * unit, weights, lower, upper, G, program.h, A, program.b, P=P)
+    easier = FiniteProgram(
+        program.q * unit, weights, lower, upper, G, program.h, A, program.b, P=P, constant=program.constant
+    )
     return NewVariables(easier, lambda x: x / unit, lambda v: v * unit, lambda z: z / unit)
 
 

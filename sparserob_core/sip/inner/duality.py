@@ -7,12 +7,12 @@ slopes that they ask for, and `vertex_multipliers` are those of the plain progra
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
 
-from sparserob_core.shapes import Bool, Float, shaped
+from sparserob_core.shapes import Bool, Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution, diagonal
 from sparserob_core.sip.inner.equalities import onto_equalities
@@ -25,6 +25,7 @@ ROUND_OFF = 1e-14
 
 NOTABLE = 1e-11  # of a bound: where its evaluation may be off by more, it is evaluated with more digits
 NEAR = 1e-6  # a slope this close to its limit, or beyond it, is moved onto the limit
+LEAST = 1e300  # what a bound of one block that is infinite is compared as
 REPAIRS = 4
 FREE = 1e-7  # an entry further than this from 0 and from both bounds, relative to their distance, is free
 TIGHT = 1e-9  # a row with a slack below this may carry a multiplier
@@ -36,7 +37,7 @@ Multipliers: TypeAlias = tuple[Array, Array, Array | None, Array | None]
 @dataclass(frozen=True)
 class _Terms:
     """``bound = constant + sum_k min weights_k |s| + 1/2 curvature_k s^2 + slope_k s`` over the bounds; ``noise (k,)``
-    of the slope."""
+    of the slope. ``at (k,)``: an image where norms of blocks may be replaced by their tangents."""
 
     constant: float
     slope: Array
@@ -44,6 +45,7 @@ class _Terms:
     weights: Array
     curvature: Array | None
     magnitude: float
+    at: Array | None = None
 
 
 @shaped
@@ -84,7 +86,7 @@ def proving(
     better = repaired(program, y, mu, z, at)
     if better is not None:
         bound = _bound(_terms(program, *better), program)
-    if bound == -np.inf and not program.q.any():
+    if bound == -np.inf and not program.q.any() and program.blocks is None:
         return _shrunk_bound(program, y, mu, z, at)
     return (bound, y, mu, z) if better is None else (bound, *better[:3])
 
@@ -192,8 +194,9 @@ def _terms(
     at: Float[Array, " n"] | None,
 ) -> _Terms:
     finite = np.where(y > 0, program.h, 0.0)
-    constant = -float(y @ finite + mu @ program.b)
-    magnitude = float(y @ np.abs(finite) + np.abs(mu) @ np.abs(program.b))
+    constant = program.constant - float(y @ finite + mu @ program.b)
+    magnitude = float(y @ np.abs(finite) + np.abs(mu) @ np.abs(program.b)) + abs(program.constant)
+    image = None if at is None or program.blocks is None else program.image(at)
     noise = np.abs(program.q) + y @ np.abs(program.G) + np.abs(mu) @ np.abs(program.A)
     curvature = diagonal(program.P, program.n) if program.S is None else None
     slope = program.q + y @ program.G + mu @ program.A
@@ -206,13 +209,50 @@ def _terms(
     if program.P is None:
         curvature = None
     if program.S is None:
-        return _Terms(constant, slope, noise, program.weights, curvature, magnitude)
+        return _Terms(constant, slope, noise, program.weights, curvature, magnitude, image)
     start = np.zeros(program.weights.size) if z is None else z
     z = onto_stationary(program, start, slope)
-    return _Terms(constant, -z, np.abs(z) + np.abs(noise).max(initial=0.0), program.weights, None, magnitude)
+    return _Terms(constant, -z, np.abs(z) + np.abs(noise).max(initial=0.0), program.weights, None, magnitude, image)
+
+
+def _without_norms(terms: _Terms, program: FiniteProgram) -> _Terms:
+    """Every block's ``weight |s|`` replaced by ``d's`` for the ``|d| <= weight`` that bounds more: that nearest to what
+    the slope asks for, or that of the tangent at an image."""
+    blocks = program.blocks
+    if blocks is None or not np.isfinite(terms.slope).all():
+        return terms
+    entries, of = blocks.entries, blocks.of
+    weights = terms.weights[blocks.first] * (1.0 - ROUND_OFF)
+    offers = [-terms.slope * _shrinking(weights, blocks.norms(terms.slope))[_numbered(blocks.number)]]
+    if terms.at is not None:
+        offers.append(blocks.directions(terms.at) * weights[_numbered(blocks.number)])
+    bounds, slopes = [], []
+    low, high = program.lower[entries], program.upper[entries]
+    for offer in offers:
+        slope = (terms.slope + offer)[entries]
+        with np.errstate(invalid="ignore"):
+            least = np.where(slope > 0.0, slope * low, np.where(slope < 0.0, slope * high, 0.0))
+        bounds.append(np.bincount(of, np.maximum(least, -LEAST), blocks.first.size))
+        slopes.append(slope)
+    best = np.argmax(bounds, axis=0)[of]
+    slope, weights, noise = terms.slope.copy(), terms.weights.copy(), terms.noise.copy()
+    slope[entries] = np.choose(best, slopes)
+    weights[entries] = 0.0
+    noise[entries] += terms.weights[entries]
+    return replace(terms, slope=slope, weights=weights, noise=noise)
+
+
+def _numbered(number: Int[np.ndarray, " k"]) -> Int[np.ndarray, " k"]:
+    answer: np.ndarray = np.maximum(number, 0)
+    return answer
+
+
+def _shrinking(weights: Array, norms: Array) -> Array:
+    return np.minimum(1.0, weights / np.where(norms > 0.0, norms, 1.0))
 
 
 def _bound(terms: _Terms, program: FiniteProgram) -> float:
+    terms = _without_norms(terms, program)
     slope = terms.slope
     if not (np.isfinite(terms.constant) and np.isfinite(slope).all()):
         return -np.inf
@@ -342,11 +382,16 @@ def vertex_multipliers(
     if program.S is not None or program.P is not None or not active.size + mu.size:
         return y, mu
     width = np.where(np.isfinite(program.upper - program.lower), program.upper - program.lower, 1.0)
-    kink = np.where(program.weights > 0.0, np.abs(x), np.inf)
+    size, sign = np.abs(x), np.sign(x)
+    if program.blocks is not None:
+        entries = program.blocks.entries
+        size[entries] = program.blocks.norms(x)[program.blocks.of]
+        sign[entries] = program.blocks.directions(x)[entries]
+    kink = np.where(program.weights > 0.0, size, np.inf)
     away = np.minimum(kink, np.minimum(x - program.lower, program.upper - x))
     free = away > FREE * width
     rows = np.vstack([program.G[active], program.A, -program.A])[:, free]
-    slope = -program.q[free] - program.weights[free] * np.sign(x[free])
+    slope = -program.q[free] - program.weights[free] * sign[free]
     try:
         found, _ = nnls(rows.T, slope)
     except RuntimeError:  # its iteration limit: these multipliers were an offer only

@@ -19,7 +19,7 @@ UNIT = float(np.finfo(WIDE).eps)  # at least twice the unit roundoff, whatever t
 
 @shaped
 def extended_bound(program: FiniteProgram, y: Float[Array, " r"], mu: Float[Array, " e"]) -> float:
-    """``-y'h - mu'b + sum_k min_s weights_k |s| + 1/2 p_k s^2 + slope_k s`` over the bounds, with
+    """``constant - y'h - mu'b + sum_k min_s weights_k |s| + 1/2 p_k s^2 + slope_k s`` over the bounds, with
     ``slope = q + G'y + A'mu``, rounded downwards: a lower bound of the value for any ``y >= 0``, ``mu``.
 
     ``-inf`` for a program of another structure than an identity image, finite bounds and a diagonal ``P``.
@@ -33,7 +33,8 @@ def extended_bound(program: FiniteProgram, y: Float[Array, " r"], mu: Float[Arra
     ``p/2`` times the square of that.
     """
     curvature = diagonal(program.P, program.n) if program.S is None else None
-    if curvature is None or not (np.isfinite(program.lower).all() and np.isfinite(program.upper).all()):
+    bounded = np.isfinite(program.lower).all() and np.isfinite(program.upper).all()
+    if curvature is None or program.blocks is not None or not bounded:
         return -np.inf
     used = y > 0.0
     v = np.concatenate([y[used], mu]).astype(WIDE)
@@ -43,13 +44,13 @@ def extended_bound(program: FiniteProgram, y: Float[Array, " r"], mu: Float[Arra
     off = _gamma(v.size + 2) * terms
     least = np.minimum(*(_least(program, curvature, slope + side * off) for side in (-1.0, 1.0)))
     far = np.maximum(np.abs(program.lower), np.abs(program.upper)).astype(WIDE)
-    size = np.abs(v) @ np.abs(rhs) + np.abs(least).sum()
+    size = np.abs(v) @ np.abs(rhs) + np.abs(least).sum() + abs(program.constant)
     # the terms of each minimum are rounded too, and no larger than at the bound further away; where the slope is well
     # within the weight, the minimum is 0 without rounding
     near = (least != 0.0) | ((1.0 + NEAR) * np.abs(slope) + off >= program.weights)
     moving = np.where(near, (program.weights + terms + curvature * far) * far, 0.0)
     size = size + 8.0 * moving.sum() / (program.n + v.size + 8)
-    total = least.sum() - v @ rhs - _gamma(program.n + v.size + 8) * size
+    total = least.sum() - v @ rhs + program.constant - _gamma(program.n + v.size + 8) * size
     return float(np.nextafter(float(total), -np.inf))
 
 

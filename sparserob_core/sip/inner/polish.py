@@ -33,7 +33,7 @@ def polish(
 ) -> FiniteSolution | None:
     """The optimum to round-off from a nearby claim, by `newton_solve` or, where the curvature is too small for it,
     `proximal_polish`."""
-    curvature = diagonal(program.P, program.n) if program.S is None else None
+    curvature = diagonal(program.P, program.n) if program.S is None and program.blocks is None else None
     if curvature is None or x.shape != program.q.shape or y.shape != program.h.shape or mu.shape != program.b.shape:
         return None
     bent = float(curvature.min(initial=np.inf)) >= FLAT * _cost(program)

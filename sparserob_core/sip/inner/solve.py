@@ -20,16 +20,22 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sparserob_core.errors import PluginError
-from sparserob_core.sip.finite import FiniteProgram, FiniteSolution, diagonal
+from sparserob_core.sip.finite import Blocks, Directions, FiniteProgram, FiniteSolution, diagonal
 from sparserob_core.sip.inner.change_of_variables import NewVariables, in_new_variables
 from sparserob_core.sip.inner.duality import farkas_margin, measure, minimisers, vertex_multipliers
 from sparserob_core.sip.inner.more_digits import refined
+from sparserob_core.sip.inner.norms import around, towards
 from sparserob_core.sip.inner.polish import polish
 from sparserob_core.sip.inner.standard_form import Form, Recovered, standard_form
 from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
 
 # The accuracy that a solver is asked for, in multiples of the tolerance, in each form, until it is believed.
 ATTEMPTS: tuple[tuple[Form, float], ...] = (("split", 0.1), ("epigraph", 0.1), ("split", 1e-3), ("split", 10.0))
+
+# The same for norms of blocks, whose form is the epigraph; at most so many programs with more and more directions each,
+# and so many answers in a row that bring the bounds no nearer.
+ACCURACIES = (0.1, 1e-3, 10.0)
+DIRECTIONS, PATIENCE = 60, 12
 
 ADVICE = "try another solver, or state the problem in units in which its numbers are of one size"
 
@@ -98,9 +104,55 @@ def solve_finite(
         if believed is not None:
             return believed
     case.attempts.clear()
+    if program.blocks is not None and program.S is None:
+        return _by_directions(case, program.blocks, guess)
     easier = in_new_variables(program)
     answer = None if easier is None else _through(case, easier, guess)
+    if answer is None and program.blocks is not None:
+        return _by_directions(case, program.blocks, guess)
     return _tried(case) if answer is None else answer
+
+
+def _by_directions(case: _Case, blocks: Blocks, guess: FiniteSolution | None) -> FiniteSolution:
+    """Norms of blocks as the largest of ``d's`` over finitely many directions (Kelley 1960), those of the answers and
+    those that their multipliers ask for, until the cost with the norms themselves meets the bound."""
+    program, directions = case.program, around(blocks)
+    if guess is not None and np.isfinite(guess.x).all():
+        directions = directions.joined(towards(program, blocks, guess.x, guess.y, guess.mu, guess.z))
+        directions = directions if guess.directions is None else guess.directions.joined(directions)
+    for accuracy in ACCURACIES:
+        believed, proof, directions = _kelley(case, blocks, accuracy * case.tolerance, directions)
+        if believed is None:
+            believed = case.blunt or _elastic_proof(case, proof)
+        if believed is not None:
+            return replace(believed, directions=directions)
+    return replace(_failed(case), directions=directions)
+
+
+def _kelley(
+    case: _Case, blocks: Blocks, accuracy: float, directions: Directions
+) -> tuple[FiniteSolution | None, FiniteSolution | None, Directions]:
+    """A believed answer, or a proof that there is none, or neither; and the directions used."""
+    program, closest, idle = case.program, np.inf, 0
+    for _ in range(DIRECTIONS):
+        claim, answer = _ask(case, program, "epigraph", accuracy, directions)
+        if claim is not None and claim.status == "infeasible":
+            return None, _proof(case, answer, "the solver's ray"), directions
+        if answer is None or not np.isfinite(answer[0]).all():
+            break
+        x, y, mu, z = answer
+        for offer in ((y, mu), vertex_multipliers(program.tangent(x), x, y, mu)):
+            solution = measure(program, x, *offer, z, message="claimed")
+            believed = case.judge(solution, "by directions")
+            if believed is not None:
+                return believed, None, directions
+            idle = 0 if solution.gap < 0.9 * closest else idle + 1
+            closest = min(closest, solution.gap)
+        more = directions.joined(towards(program, blocks, x, y, mu, z))
+        if idle > PATIENCE or more.block.size == directions.block.size:
+            break
+        directions = more
+    return None, None, directions
 
 
 def _tried(case: _Case) -> FiniteSolution:
@@ -170,7 +222,7 @@ def cost_scale(program: FiniteProgram, value: float) -> float:
 def _cheap(case: _Case, guess: FiniteSolution | None) -> Iterator[FiniteSolution]:
     """What needs no solver: the optimum without rows, and Newton's method from a guess."""
     program = case.program
-    curvature = diagonal(program.P, program.n) if program.S is None else None
+    curvature = diagonal(program.P, program.n) if program.S is None and program.blocks is None else None
     if curvature is not None:
         x = minimisers(program.weights, curvature, program.q, program.lower, program.upper)
         if np.isfinite(x).all() and program.residual(x) <= case.tolerance:
@@ -181,9 +233,11 @@ def _cheap(case: _Case, guess: FiniteSolution | None) -> Iterator[FiniteSolution
             yield found
 
 
-def _ask(case: _Case, program: FiniteProgram, form: Form, accuracy: float) -> tuple[Claim | None, Recovered | None]:
+def _ask(
+    case: _Case, program: FiniteProgram, form: Form, accuracy: float, directions: Directions | None = None
+) -> tuple[Claim | None, Recovered | None]:
     """The solver's claim, and its numbers in terms of the program if they have the right shapes and are finite."""
-    qp, recover = standard_form(program, form)
+    qp, recover = standard_form(program, form, directions)
     try:
         claim = case.solver.solve(qp, accuracy)
     except Exception as error:  # noqa: BLE001  a foreign solver may raise anything; its failure must not be ours

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.finite import FiniteProgram, diagonal
+from sparserob_core.sip.finite import Blocks, Directions, FiniteProgram, diagonal
 from sparserob_core.sip.inner.image import Memory
 from sparserob_core.sip.solver import Claim, QuadraticProgram
 
@@ -25,7 +25,7 @@ Recovered: TypeAlias = tuple[Array, Array, Array, Array | None]
 @dataclass(frozen=True, eq=False)
 class ImageModel:
     """The image as ``s = T v + offset`` of variables ``lower <= v <= upper`` with cost ``cost'v`` and rows
-    ``R v <= 0``.
+    ``R v <= right``.
 
     Column ``j`` of ``T`` has the single entry ``sign[j]`` (0 for an epigraph variable) in row ``entry[j]``.
     """
@@ -37,13 +37,14 @@ class ImageModel:
     lower: Array
     upper: Array
     R: csc_array | None
+    right: Array
 
 
 _models = Memory(16)
 
 
 def standard_form(
-    program: FiniteProgram, form: Form = "split"
+    program: FiniteProgram, form: Form = "split", directions: Directions | None = None
 ) -> tuple[QuadraticProgram, Callable[[Claim], Recovered]]:
     """The program as a `QuadraticProgram`, and the way back from a claim to ``(x, y, mu, z)`` of the program (``z`` or
     ``None``).
@@ -52,8 +53,11 @@ def standard_form(
     With ``S`` the identity ``x`` is substituted (a diagonal ``P`` is put on both parts, which are complementary at an
     optimum, so that the split program stays strictly convex); otherwise ``S x = s`` are equality rows. The cost is
     divided by its largest linear coefficient, rows by their norm; rows that hold nothing (zero, or with an infinite
-    right-hand side) are left out.
+    right-hand side) are left out. Norms of blocks get ``t >= d's`` for the ``directions`` given, in the epigraph form.
     """
+    if program.blocks is not None and directions is not None:
+        model = _with_norms(_epigraph_model(program, program.blocks.number < 0), program, program.blocks, directions)
+        return _substituted(program, model) if program.S is None else _lifted(program, model)
     sources = (program.weights, program.lower, program.upper)
     model = _models.recall(sources, (form, program.S is None), lambda: _model(program, form))
     return _substituted(program, model) if program.S is None else _lifted(program, model)
@@ -61,42 +65,76 @@ def standard_form(
 
 def _model(program: FiniteProgram, form: Form) -> ImageModel:
     lower, upper, weights = program.lower, program.upper, program.weights
+    if form == "epigraph":
+        return _epigraph_model(program, np.full(weights.size, True))
     fixed = lower == upper
     offset = np.where(fixed, lower, 0.0)
     bent = ~fixed & (weights > 0)
-    if form == "epigraph":
-        return _epigraph(program, fixed, bent & (lower < 0) & (upper > 0), offset)
     above, below = np.flatnonzero(bent & (upper > 0)), np.flatnonzero(bent & (lower < 0))
     plain = np.flatnonzero(~fixed & (weights == 0))
     entry = np.concatenate([above, below, plain])
     sign = np.concatenate([np.ones(above.size), -np.ones(below.size), np.ones(plain.size)])
     floor = np.concatenate([np.maximum(lower[above], 0.0), np.maximum(-upper[below], 0.0), lower[plain]])
     ceiling = np.concatenate([upper[above], -lower[below], upper[plain]])
-    return ImageModel(entry, sign, offset, weights[entry], floor, ceiling, None)
+    return ImageModel(entry, sign, offset, weights[entry], floor, ceiling, None, np.zeros(0))
 
 
-def _epigraph(
-    program: FiniteProgram, fixed: npt.NDArray[np.bool_], bent: npt.NDArray[np.bool_], offset: Array
-) -> ImageModel:
+def _epigraph_model(program: FiniteProgram, alone: npt.NDArray[np.bool_]) -> ImageModel:
+    """``alone (k,)``: the entries that count with their absolute values."""
     from scipy.sparse import csc_array
 
+    lower, upper, weights = program.lower, program.upper, np.where(alone, program.weights, 0.0)
+    fixed = lower == upper
+    offset = np.where(fixed, lower, 0.0)
+    bent = ~fixed & (weights > 0) & (lower < 0) & (upper > 0)
     plain, kinks = np.flatnonzero(~fixed), np.flatnonzero(bent)
     entry = np.concatenate([plain, kinks])
     sign = np.concatenate([np.ones(plain.size), np.zeros(kinks.size)])
-    one_signed = np.where(bent, 0.0, np.where(program.lower >= 0, program.weights, -program.weights))
-    cost = np.concatenate([one_signed[plain], program.weights[kinks]])
+    one_signed = np.where(bent, 0.0, np.where(program.lower >= 0, weights, -weights))
+    cost = np.concatenate([one_signed[plain], weights[kinks]])
     floor = np.concatenate([program.lower[plain], np.zeros(kinks.size)])
     ceiling = np.concatenate([program.upper[plain], np.full(kinks.size, np.inf)])
     if not kinks.size:
-        return ImageModel(entry, sign, offset, cost, floor, ceiling, None)
+        return ImageModel(entry, sign, offset, cost, floor, ceiling, None, np.zeros(0))
     rows, inside, tops = np.arange(kinks.size), np.searchsorted(plain, kinks), plain.size + np.arange(kinks.size)
     data = np.repeat([1.0, -1.0, -1.0, -1.0], kinks.size) / np.sqrt(2.0)
     places = (
         np.concatenate([rows, rows, rows + kinks.size, rows + kinks.size]),
         np.concatenate([inside, tops, inside, tops]),
     )
+    R = csc_array((data, places), shape=(2 * kinks.size, entry.size))
+    return ImageModel(entry, sign, offset, cost, floor, ceiling, R, np.zeros(2 * kinks.size))
+
+
+def _with_norms(model: ImageModel, program: FiniteProgram, blocks: Blocks, directions: Directions) -> ImageModel:
+    """The model with one variable ``t`` for every block, which costs the block's weight, and rows ``d's <= t``."""
+    from scipy.sparse import csc_array, hstack, vstack
+
+    size, count, tops = directions.block.size, blocks.first.size, model.entry.size
+    of = np.full(program.weights.size, -1)  # where an entry is among the variables; a fixed one is not
+    of[model.entry[model.sign > 0]] = np.flatnonzero(model.sign > 0)
+    entries = blocks.table[directions.block]
+    inside = (entries >= 0) & (directions.vectors != 0.0)
+    moving = inside & (of[entries] >= 0)
+    row = np.broadcast_to(np.arange(size)[:, None], entries.shape)
+    places = (
+        np.concatenate([row[moving], np.arange(size)]),
+        np.concatenate([of[entries[moving]], tops + directions.block]),
+    )
+    data = np.concatenate([directions.vectors[moving], -np.ones(size)]) / np.sqrt(2.0)
+    rows = csc_array((data, places), shape=(size, tops + count))
+    fixed = np.where(inside, directions.vectors * model.offset[entries], 0.0).sum(axis=1)
+    if model.R is not None:
+        rows = vstack([hstack([model.R, csc_array((model.R.shape[0], count))]), rows], format="csc")
     return ImageModel(
-        entry, sign, offset, cost, floor, ceiling, csc_array((data, places), shape=(2 * kinks.size, entry.size))
+        np.concatenate([model.entry, blocks.first]),
+        np.concatenate([model.sign, np.zeros(count)]),
+        model.offset,
+        np.concatenate([model.cost, program.weights[blocks.first]]),
+        np.concatenate([model.lower, np.zeros(count)]),
+        np.concatenate([model.upper, np.full(count, np.inf)]),
+        rows,
+        np.concatenate([model.right, -fixed / np.sqrt(2.0)]),
     )
 
 
@@ -118,7 +156,7 @@ def _substituted(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticPr
     rows, h, keep, norms = _unit_rows(program.G, program.h, model)
     equal, b, keep_equal, norms_equal = _unit_rows(program.A, program.b, model)
     G = _stack(rows, model.R)
-    right = h if model.R is None else np.concatenate([h, np.zeros(model.R.shape[0])])
+    right = np.concatenate([h, model.right])
     qp = QuadraticProgram(P, cost / kappa, G, right, _stack(equal, None), b, model.lower, model.upper)
 
     def recover(claim: Claim) -> Recovered:
@@ -139,7 +177,8 @@ def _lifted(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticProgram
     held = np.flatnonzero((program.weights > 0) | np.isfinite(program.lower) | np.isfinite(program.upper))
     T = csc_array((model.sign, (model.entry, np.arange(size))), shape=(k, size))
     link = hstack([program.S, -T], format="csr")[held]
-    whole = ImageModel(np.arange(n), np.ones(n), np.zeros(n), program.q, np.full(n, -np.inf), np.full(n, np.inf), None)
+    free = np.full(n, np.inf)
+    whole = ImageModel(np.arange(n), np.ones(n), np.zeros(n), program.q, -free, free, None, np.zeros(0))
     rows, h, keep, norms = _unit_rows(program.G, program.h, whole)
     equal, b, keep_equal, norms_equal = _unit_rows(program.A, program.b, whole)
     cost = np.concatenate([program.q, model.cost])
@@ -151,8 +190,7 @@ def _lifted(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticProgram
     if model.R is not None:
         G = vstack([G, hstack([csc_array((model.R.shape[0], n)), model.R])], format="csc")
     A = vstack([hstack([csc_array(equal), csc_array((equal.shape[0], size))]), link], format="csc")
-    free = np.full(n, np.inf)
-    right = np.concatenate([h, np.zeros(G.shape[0] - h.size)])
+    right = np.concatenate([h, model.right])
     qp = QuadraticProgram(
         P,
         cost / kappa,

@@ -44,7 +44,8 @@ def counted_below(program: SemiInfiniteProgram) -> Counted:
     tilt = share * (up - down) / 2.0
     q = tilt if base.S is None else np.asarray(base.S.T @ tilt)
     weights = share * (up + down) / 2.0
-    return Counted(replace(program, weights=weights, q=q, P=None, twin=None), float(prices[always].sum()), tilt)
+    below = replace(program, weights=weights, q=q, P=None, constant=0.0, blocks=None, largest=None, twin=None)
+    return Counted(below, float(prices[always].sum()), tilt)
 
 
 @shaped

@@ -315,7 +315,7 @@ def _sparser(
     if program.activity is None or ledger.open(x) or (number > SPARSIFYING and answer.epsilon == 0.0):
         return answer, found, ()
     candidates = [tidied(program, x)]
-    if answer.epsilon == 0.0 and program.finite.P is None:
+    if answer.epsilon == 0.0 and program.finite.P is None and program.blocks is None:
         rows = working.rows
         norms = np.linalg.norm(rows.G, axis=1)
         corner = vertex(ledger.relaxed.finite(rows.G, rows.h - working.margin * norms, 0.0))

@@ -27,7 +27,7 @@ def multiple(program: SemiInfiniteProgram) -> float | None:
     own, up to rounding; ``None`` where it is not."""
     below = counted_below(program)
     own, other = program.finite, below.program.finite
-    if own.P is not None or own.q.any() or other.q.any() or below.certain:
+    if own.P is not None or own.blocks is not None or own.q.any() or other.q.any() or below.certain:
         return None
     if not np.array_equal(own.weights > 0.0, other.weights > 0.0) or not other.weights.any():
         return None

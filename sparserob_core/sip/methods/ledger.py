@@ -194,7 +194,7 @@ class Ledger:
         rows, solution = irreducible(self.relaxed, answer.rows, solution)
         answer = replace(answer, rows=rows, solution=solution)
         found, worst = infeasible_subsystem(self.relaxed.program, rows, solution.y, solution.infeasibility)
-        self.dual = self.relaxed.dual(rows, solution.y, solution.mu, solution.z, solution.infeasibility)
+        self.dual = self.relaxed.dual(rows, solution.y, solution.mu, solution.z, solution.infeasibility, priced=False)
         return replace(self.result("infeasible", found.sentence(), answer, worst), infeasible=found)
 
     def result(self, status: Status, message: str, answer: Answer, worst: WorstConstraint | None = None) -> Result:

@@ -183,6 +183,7 @@ class UsersUnits:
             mu=own.mu * self.cost / self.equalities if own.mu.size == self.equalities.size else own.mu,
             z=None if own.z is None else own.z * self.cost / self.image,
             fixed=own.fixed * self.cost,
+            at=None if own.at is None else own.at * self.decision,
         )
 
     def _cuts(self, own: Sequence[Cut]) -> tuple[Cut, ...]:

@@ -40,6 +40,7 @@ def recession_program(program: SemiInfiniteProgram) -> SemiInfiniteProgram:
         q=base.q,
         weights=base.weights,
         S=base.S,
+        blocks=program.blocks,
         lower=np.where(np.isfinite(base.lower), np.zeros(images), -1.0),
         upper=np.where(np.isfinite(base.upper), np.zeros(images), 1.0),
         G=G if h.size else None,
@@ -83,7 +84,7 @@ def falls_for_ever(ledger: Ledger, close: Close, prover: Prover, ray: Array) -> 
     """The result for a program whose cost falls along a ray: a decision that meets its constraints, where there is one,
     judged like any other; without a lower bound."""
     program, tools = ledger.program, ledger.tools
-    feasible = replace(program, q=None, P=None, weights=None, families=program.families)
+    feasible = replace(program, q=None, P=None, weights=None, blocks=None, constant=0.0, families=program.families)
     result = close(feasible, replace(tools, regulariser=None), prover)
     if result.decision is None:
         return result

@@ -11,8 +11,8 @@ import numpy as np
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Cut, Dual
-from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
-from sparserob_core.sip.inner.duality import proving, vertex_multipliers
+from sparserob_core.sip.finite import FiniteProgram, FiniteSolution, diagonal
+from sparserob_core.sip.inner.duality import homogeneous, minimisers, proving, vertex_multipliers
 from sparserob_core.sip.inner.image import onto_stationary
 from sparserob_core.sip.inner.solve import solve_finite
 from sparserob_core.sip.method import Deadline
@@ -130,6 +130,18 @@ class CountedSolver(Solver):
         return self.solver.solve(program, accuracy)
 
 
+def _touched(plain: FiniteProgram, y: Array, mu: Array, x: Array) -> Array:
+    """Where the cost is replaced by its tangent, for a bound from these multipliers: at their own minimiser where that
+    is explicit, which gives the bound of the cost itself; else at ``x``."""
+    curvature = diagonal(plain.P, plain.n) if plain.S is None and plain.blocks is None else None
+    if plain.P is not None and curvature is not None:
+        slope = plain.q + np.maximum(y, 0.0) @ plain.G + mu @ plain.A
+        own = minimisers(plain.weights, curvature, slope, plain.lower, plain.upper)
+        if np.isfinite(own).all():
+            return own
+    return np.where(np.isfinite(x), x, 0.0)
+
+
 @dataclass(eq=False)
 class RelaxedProgram:
     """``g(epsilon; indices)``: minimise ``J + epsilon rho`` over the finite constraints and the imposed indices.
@@ -178,13 +190,17 @@ class RelaxedProgram:
             (np.zeros_like(solution.y), np.zeros_like(solution.mu), np.zeros_like(solution.z)),
             (solution.y, solution.mu, solution.z),
         ]
-        if plain.P is None and np.isfinite(solution.x).all():
-            offers.append((*vertex_multipliers(plain, solution.x, solution.y, solution.mu), solution.z))
-        proven = [proving(plain, y, mu, z, at=solution.x) for y, mu, z in offers]
+        known = bool(np.isfinite(solution.x).all())
+        if known:
+            linear = plain.tangent(solution.x)
+            offers.append((*vertex_multipliers(linear, solution.x, solution.y, solution.mu), solution.z))
+        points = [_touched(plain, y, mu, solution.x) for y, mu, _ in offers]
+        proven = [proving(plain.tangent(at), y, mu, z, at=at) for at, (y, mu, z) in zip(points, offers, strict=True)]
         bounds = [bound - self._rounding(plain, y, mu, solution.x) for bound, y, mu, _ in proven]
         best = int(np.argmax(bounds))
         _, y, mu, z = proven[best]
-        return self.dual(rows, y, mu, solution.z if z is None else z, bounds[best])
+        found = self.dual(rows, y, mu, solution.z if z is None else z, bounds[best], points[best])
+        return found if plain.P is not None or plain.blocks is not None else replace(found, at=None)
 
     @shaped
     def _rounding(
@@ -199,16 +215,26 @@ class RelaxedProgram:
 
     @shaped
     def dual(
-        self, rows: Rows, y: Float[Array, " r"], mu: Float[Array, " e"], z: Float[Array, " k"], bound: float
+        self,
+        rows: Rows,
+        y: Float[Array, " r"],
+        mu: Float[Array, " e"],
+        z: Float[Array, " k"],
+        bound: float,
+        at: Float[Array, " n"] | None = None,
+        priced: bool = True,
     ) -> Dual:
-        """Multipliers of a program with these rows (and of its fixed rows, which come first in ``y``), as a record."""
+        """Multipliers of a program with these rows (and of its fixed rows, which come first in ``y``), as a record;
+        ``at``: where a bound's quadratic terms are replaced by their tangent; ``priced``: with the cost, not as a proof
+        of infeasibility."""
         own = y[y.size - rows.h.size :]
         if self.program.finite.S is not None:
             plain = self.finite(rows.G, rows.h, 0.0)
+            plain = homogeneous(plain) if not priced else plain if at is None else plain.tangent(at)
             z = onto_stationary(plain, z, plain.q + y @ plain.G + mu @ plain.A)
         cuts = tuple(replace(cut, multiplier=float(m)) for cut, m in zip(rows.cuts, own, strict=True) if m > 0.0)
         fixed = y[: y.size - rows.h.size]
-        return Dual(bound, cuts, mu, None if self.program.finite.S is None else z, fixed)
+        return Dual(bound, cuts, mu, None if self.program.finite.S is None else z, fixed, at)
 
     @shaped
     def evaluate(self, indices: Mapping[str, Float[Array, "_ _"]], epsilon: float) -> RelaxedSolution:

@@ -1,0 +1,306 @@
+"""What a control costs, in balls: norms of groups, and quadratic terms of the nominal trajectory by integrals of the
+flow (Van Loan 1978), none of it shared with what solves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from functools import cached_property
+from itertools import pairwise
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.arithmetic.series import norm
+from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.reach.flow import Flow, stacked
+from sparserob_core.checker.sets.shapes import support
+from sparserob_core.control.problem.cost import Quadratic, nominal_point
+from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.problem import OptimalControlProblem
+
+if TYPE_CHECKING:
+    from flint import arb, arb_mat
+
+ENOUGH = 1e-20  # of the sizes that are added up: how closely the quadratic terms are wanted
+MOST_BITS = 8192
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Tangent:
+    """``constant + sum_k slope_k u_k`` lies below the quadratic terms of the cost and touches them at one control;
+    ``slope`` has ``m`` balls per piece of the control."""
+
+    constant: arb
+    slope: list[list[arb]]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Price:
+    """The cost of a problem whose control is constant on the pieces of a dictionary."""
+
+    problem: OptimalControlProblem
+    control: Dictionary
+    _lengths: list[Fraction] = field(init=False, default_factory=list)
+
+    def __post_init__(self) -> None:
+        ends = [Fraction(float(t)) for t in self.control.breakpoints]
+        self._lengths.extend(b - a for a, b in pairwise(ends))
+
+    @property
+    def is_quadratic(self) -> bool:
+        return any(term is not None for term in self._terms)
+
+    @property
+    def weights(self) -> list[arb]:
+        """What a channel's absolute value costs per time ``(m,)``."""
+        from flint import arb
+
+        return [arb(self.problem.cost.l1) * w for w in balls(np.asarray(self.problem.weights))]
+
+    @property
+    def blocks(self) -> list[list[int]]:
+        """The channels that count together, those alone as groups of one."""
+        groups: list[list[int]] = []
+        if isinstance(self.problem.cost.group, tuple):
+            groups = [[int(channel) - 1 for channel in group] for group in self.problem.cost.group]
+        taken = {channel for group in groups for channel in group}
+        return groups + [[c] for c in range(self.problem.system.controls) if c not in taken]
+
+    def of(self, pieces: Sequence[arb_mat]) -> arb:
+        """``J`` of a control ``(m, 1)`` on every piece."""
+        from flint import arb
+
+        total = arb(0)
+        for length, piece in zip(self._lengths, pieces, strict=True):
+            total = total + _ball(length) * self._norms(piece.entries())
+        return total + (self._quadratic(pieces).value if self.is_quadratic else arb(0))
+
+    def _norms(self, u: Sequence[arb]) -> arb:
+        from flint import arb
+
+        found = arb(0)
+        for block in self.blocks:
+            size = abs(u[block[0]]) if len(block) == 1 else norm(stacked([[u[c]] for c in block]))
+            found = found + self.weights[block[0]] * size
+        return found
+
+    def tangent(self, pieces: Sequence[arb_mat]) -> Tangent:
+        """The tangent of the quadratic terms at a control ``(m, 1)`` on every piece."""
+        found = self._quadratic(pieces)
+        constant = found.value
+        for piece, slope in zip(pieces, found.slope, strict=True):
+            constant = constant - sum((g * u for g, u in zip(slope, piece.entries(), strict=True)), constant * 0)
+        return Tangent(constant, found.slope)
+
+    @cached_property
+    def largest(self) -> float:
+        """What a gap is relative to: the largest cost of the absolute values, and the largest of the quadratic terms
+        at a control that stays 0, or stays at one end of one channel."""
+        m, horizon = self.problem.system.controls, self.problem.horizon
+        axes = np.eye(m)
+        ends = [[float(support(self.problem.control, balls(s * axis)).mid()) for s in (1.0, -1.0)] for axis in axes]
+        reach = [max(abs(high), abs(low)) for high, low in ends]
+        total = self.problem.cost.l1 * float(np.dot(np.asarray(self.problem.weights), reach)) * horizon
+        if not self.is_quadratic:
+            return total
+        still = [np.zeros(m)] + [s * r * axis for axis, r in zip(axes, reach, strict=True) for s in (1.0, -1.0)]
+        held = [[stacked([[u] for u in balls(control)])] * len(self._lengths) for control in still]
+        return total + max(float(self._quadratic(pieces).value.mid()) for pieces in held)
+
+    @property
+    def _terms(self) -> tuple[Quadratic | None, ...]:
+        return self.problem.cost.terms
+
+    def convex(self) -> None:
+        """Show that every matrix is positive semidefinite; raises `Broken`."""
+        for name, term in zip(("state", "control", "final"), self._terms, strict=True):
+            if term is not None and not _semidefinite(term):
+                raise Broken(f"the matrix of the cost's {name} term is not positive semidefinite")
+
+    def _quadratic(self, pieces: Sequence[arb_mat]) -> _Walk:
+        """The quadratic terms and their slopes, with as many bits as it takes."""
+        from flint import ctx
+
+        bits = int(ctx.prec)
+        while True:
+            with ctx.workprec(bits):
+                found = _walked(self.problem, self.control, pieces)
+            if found.blurred <= ENOUGH:
+                return found
+            bits *= 2
+            if bits > MOST_BITS:
+                raise Unchecked("the quadratic cost cannot be resolved: the state grows too far over the horizon")
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Walk:
+    """The quadratic terms at a control, their derivatives on every piece, and the largest radius of them, relative to
+    the sizes that are added up."""
+
+    value: arb
+    slope: list[list[arb]]
+    blurred: float
+
+
+def _walked(problem: OptimalControlProblem, control: Dictionary, pieces: Sequence[arb_mat]) -> _Walk:
+    """``z = (x, 1, u)`` along the nominal trajectory, and back with the costates of what it costs; a control acts on
+    the state as late as the system says, and costs when it is given."""
+    from flint import arb, arb_mat
+
+    nominal, d, m = _Nominal.of(problem), problem.system.states, problem.system.controls
+    still = stacked([[arb(0)] for _ in range(m)])
+    x, walked = nominal.start, []
+    for start, stop, k in _acting(problem, control):
+        flow, weight = nominal.over(stop - start, acting=k >= 0)
+        z = arb_mat(x.tolist() + (still if k < 0 else pieces[k]).tolist())
+        walked.append((k, flow, weight, z))
+        x = arb_mat((flow * z).tolist()[: d + 1])
+    costate = nominal.final * x
+    value = (x.transpose() * costate)[0, 0]
+    slope: list[list[arb]] = [[arb(0)] * m for _ in pieces]
+    for k, flow, weight, z in reversed(walked):
+        own = weight * z
+        value = value + (z.transpose() * own)[0, 0]
+        both = (own + flow.transpose() * arb_mat([*costate.tolist(), *([arb(0)] for _ in range(m))])).tolist()
+        costate = arb_mat(both[: d + 1])
+        if k >= 0:
+            slope[k] = [g + 2 * entry[0] for g, entry in zip(slope[k], both[d + 1 :], strict=True)]
+    R = problem.cost.terms[1]
+    if R is not None:
+        matrix, ends = stacked([balls(row) for row in R.Q]), [Fraction(float(t)) for t in control.breakpoints]
+        for k, (start, stop) in enumerate(pairwise(ends)):
+            push = matrix * pieces[k] * _ball(stop - start)
+            value = value + (pieces[k].transpose() * push)[0, 0]
+            slope[k] = [g + 2 * entry for g, entry in zip(slope[k], push.entries(), strict=True)]
+    sizes = [abs(float(value.mid())), *(abs(float(g.mid())) for entry in slope for g in entry)]
+    radii = [float(value.rad()), *(float(g.rad()) for entry in slope for g in entry)]
+    exact = max(radii) == 0.0
+    blurred = 0.0 if exact else float("inf") if not np.isfinite(sum(radii)) else max(radii) / (max(sizes) or 1.0)
+    return _Walk(value, slope, blurred)
+
+
+def _acting(problem: OptimalControlProblem, control: Dictionary) -> list[tuple[Fraction, Fraction, int]]:
+    """The intervals of time on which one piece of the control acts, with its number; -1 before the first does."""
+    delay, horizon = problem.system.delay, float(control.breakpoints[-1])
+    begins = [(float(t) + delay, k) for k, t in enumerate(control.breakpoints[:-1]) if float(t) + delay < horizon]
+    begins = begins if delay == 0.0 else [(0.0, -1), *begins]
+    ends = [*(t for t, _ in begins[1:]), horizon]
+    return [(Fraction(start), Fraction(stop), k) for (start, k), stop in zip(begins, ends, strict=True)]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Nominal:
+    """``z' = F z`` for ``z = (x, 1, u)``, with every uncertainty at its nominal point; ``waiting``: the same while the
+    control before time 0 still acts. The cost ``z'M z`` per time, ``start = (x(0), 1)``, and the final cost of
+    ``(x, 1)``."""
+
+    F: arb_mat
+    waiting: arb_mat
+    M: arb_mat
+    start: arb_mat
+    final: arb_mat
+    _known: dict[tuple[Fraction, bool], tuple[arb_mat, arb_mat]] = field(default_factory=dict)
+
+    @staticmethod
+    def of(problem: OptimalControlProblem) -> _Nominal:
+        from flint import arb
+
+        d, m, zero = problem.system.states, problem.system.controls, arb(0)
+        parameters = problem.system.parameters
+        point = () if parameters is None else tuple(map(float, nominal_point(parameters)))
+        parts = Flow(problem.system, point, (0.0,) * len(point), 0).parts
+        A, B, E = (parts[name][0].tolist() for name in ("A", "B", "E"))
+        w = [] if problem.disturbance is None else balls(nominal_point(problem.disturbance))
+        pushed = [sum((e * v for e, v in zip(row, w, strict=True)), zero) if w else zero for row in E]
+        drift = [sum(row[m:], push) for row, push in zip(B, pushed, strict=True)]  # further inputs are 1
+        early = [0.0] * m if problem.initial_control is None else np.asarray(problem.initial_control).tolist()
+        waiting = [
+            sum((b * u for b, u in zip(row[:m], balls(early), strict=True)), c) for row, c in zip(B, drift, strict=True)
+        ]
+        below = [[zero] * (d + 1 + m) for _ in range(1 + m)]
+        M = [[zero] * (d + 1 + m) for _ in range(d + 1 + m)]
+        for i, row in enumerate(_deviation(problem.cost.terms[0], d)):
+            M[i][: d + 1] = row
+        begin = balls(np.asarray(problem.initial_state))
+        if problem.initial_set is not None:
+            begin = [x + e for x, e in zip(begin, balls(nominal_point(problem.initial_set)), strict=True)]
+        start = [[x] for x in (*begin, arb(1))]
+        return _Nominal(
+            stacked([[*A[i], drift[i], *B[i][:m]] for i in range(d)] + below),
+            stacked([[*A[i], waiting[i], *[zero] * m] for i in range(d)] + below),
+            stacked(M),
+            stacked(start),
+            stacked(_deviation(problem.cost.terms[2], d)),
+        )
+
+    def over(self, length: Fraction, acting: bool) -> tuple[arb_mat, arb_mat]:
+        """What a time does to ``z``, and what it costs."""
+        if (length, acting) not in self._known:
+            self._known[length, acting] = _integrated(self.F if acting else self.waiting, self.M, length)
+        return self._known[length, acting]
+
+
+def _deviation(term: Quadratic | None, size: int) -> list[list[arb]]:
+    """``(x - r)'Q (x - r)`` as a matrix on ``(x, 1)``."""
+    from flint import arb
+
+    if term is None:
+        return [[arb(0)] * (size + 1) for _ in range(size + 1)]
+    Q, r = stacked([balls(row) for row in term.Q]), stacked([[x] for x in balls(term.reference)])
+    beside = -(Q * r)
+    corner = (r.transpose() * Q * r)[0, 0]
+    rows = [[*row, side] for row, (side,) in zip(Q.tolist(), beside.tolist(), strict=True)]
+    return [*rows, [*(side for (side,) in beside.tolist()), corner]]
+
+
+def _integrated(F: arb_mat, M: arb_mat, length: Fraction) -> tuple[arb_mat, arb_mat]:
+    """``e^{F h}`` and ``int_0^h e^{F't} M e^{Ft} dt``: one exponential for a short time, then doubled."""
+    from flint import arb, arb_mat
+
+    n, zero = F.nrows(), arb(0)
+    doublings, size = 0, norm(F) * _ball(length)
+    while not size <= 1:
+        doublings, size = doublings + 1, size / 2
+        if doublings > 200:
+            raise Unchecked("the system is too fast for its horizon")
+    turned = (-F.transpose()).tolist()
+    rows = [[*a, *b] for a, b in zip(turned, M.tolist(), strict=True)]
+    rows += [[zero] * n + row for row in F.tolist()]
+    whole = (stacked(rows) * _ball(length / 2**doublings)).exp().tolist()
+    flow = arb_mat([row[n:] for row in whole[n:]])
+    weight = flow.transpose() * arb_mat([row[n:] for row in whole[:n]])
+    for _ in range(doublings):
+        weight = weight + flow.transpose() * weight * flow
+        flow = flow * flow
+    return flow, weight
+
+
+def _ball(value: Fraction) -> arb:
+    from flint import arb, fmpq
+
+    return arb(fmpq(value.numerator, value.denominator))
+
+
+def _semidefinite(term: Quadratic) -> bool:
+    """Symmetric elimination in rational numbers: no pivot is negative, and none is 0 beside an entry that is not."""
+    from flint import fmpq
+
+    exact = [[Fraction(float(entry)) for entry in row] for row in term.Q]
+    rows = [[fmpq(entry.numerator, entry.denominator) for entry in row] for row in exact]
+    if any(rows[i][j] != rows[j][i] for i in range(len(rows)) for j in range(i)):
+        return False
+    for k, row in enumerate(rows):
+        if row[k] < 0 or (row[k] == 0 and any(entry != 0 for entry in row[k + 1 :])):
+            return False
+        for i in range(k + 1, len(rows)):
+            if row[k] != 0 and rows[i][k] != 0:
+                factor = rows[i][k] / row[k]
+                rows[i] = [entry - factor * other for entry, other in zip(rows[i], row, strict=True)]
+    return True

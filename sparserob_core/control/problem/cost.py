@@ -1,0 +1,234 @@
+"""What a control costs: its integral of absolute values or of norms, and quadratic terms of the nominal trajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from typing import Literal, TypeAlias, final
+
+import numpy as np
+import numpy.typing as npt
+
+from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import Array, ConvexSet
+
+EXACT = 16  # states up to which a matrix is shown to be positive semidefinite in fractions
+ROUNDED = 1e-13  # of the diagonal, per row: a negative eigenvalue of at most that is rounding of the numbers given
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Quadratic:
+    """``(v - reference)' Q (v - reference)``: ``Q (d, d)`` symmetric and positive semidefinite, ``reference (d,)``."""
+
+    Q: Array
+    reference: Array
+
+
+Term: TypeAlias = Quadratic | Mapping[str, npt.ArrayLike]
+
+
+@final
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Cost:
+    """``J = l1 int sum_i weights_i |u_i| dt + int (x - r)' Q (x - r) dt + int u' R u dt + (x(T) - r)' Q (x(T) - r)``,
+    ``x`` the nominal trajectory.
+
+    ``l1``: factor of the first integral, 0 for a purely quadratic cost. ``group``: channels, counted from 1, that count
+    with their Euclidean norm instead of their absolute values, as ``[[1, 2], [3]]``, or ``all`` for one group; a
+    channel in no group counts alone. ``state``, ``final``: ``{Q: (d, d), reference: (d,)}``, the reference 0 unless
+    given; ``control``: ``{R: (m, m)}``. All matrices symmetric and positive semidefinite. Units: ``l1`` has none,
+    ``Q`` and ``R`` make the integrals cost per time, ``final`` is a cost.
+
+    The nominal trajectory is that of the `nominal_point` of every uncertainty set.
+    """
+
+    l1: float = 1.0
+    group: Sequence[Sequence[int]] | Literal["all"] | None = None
+    state: Term | None = None
+    control: Term | None = None
+    final: Term | None = None
+
+    def checked(self, states: int, controls: int, weights: Array) -> Cost:
+        """The same cost for that many states and controls, with `Quadratic` terms and tuples for groups; raises
+        `InputError` that begins with the key below ``cost``."""
+        try:
+            l1 = float(self.l1)
+        except (TypeError, ValueError):
+            l1 = np.nan
+        if not 0.0 <= l1 < np.inf or isinstance(self.l1, bool):
+            raise InputError(path="l1", expected="a number, at least 0", got=f"{self.l1!r}")
+        group = _groups(self.group, controls, weights)
+        if group and l1 == 0.0:
+            raise InputError("nothing is left to group where l1 is 0", path="group")
+        state, final = (_term(key, term, "Q", states) for key, term in (("state", self.state), ("final", self.final)))
+        control = _term("control", self.control, "R", controls)
+        if l1 == 0.0 and not any(term is not None and term.Q.any() for term in (state, control, final)):
+            raise InputError(path="l1", expected="a number above 0, or one of state, control and final", got="0")
+        return replace(self, l1=l1, group=group, state=state, control=control, final=final)
+
+    @property
+    def blocks(self) -> tuple[tuple[int, ...], ...]:
+        """The groups of two channels or more, counted from 0."""
+        assert self.group != "all"
+        return tuple(tuple(int(c) - 1 for c in group) for group in self.group or () if len(group) > 1)
+
+    @property
+    def terms(self) -> tuple[Quadratic | None, Quadratic | None, Quadratic | None]:
+        """The quadratic terms of state, control and final state, of a `checked` cost."""
+        found = (self.state, self.control, self.final)
+        assert all(term is None or isinstance(term, Quadratic) for term in found)
+        return found  # type: ignore[return-value]
+
+    @property
+    def is_quadratic(self) -> bool:
+        """Whether there are quadratic terms."""
+        return any(term is not None for term in self.terms)
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether it is a weighted sum of absolute values."""
+        return not self.is_quadratic and not self.blocks
+
+    def in_units(self, states: Array, controls: Array, time: float, cost: float) -> Cost:
+        """The same cost of states, controls, times and costs in these units."""
+        state, control, final = self.terms
+        return replace(
+            self,
+            state=_scaled(state, states, time / cost),
+            control=_scaled(control, controls, time / cost),
+            final=_scaled(final, states, 1.0 / cost),
+        )
+
+    def words(self) -> str:
+        """What the cost is, in a few words."""
+        state, control, final = self.terms
+        parts = []
+        if self.l1 > 0.0:
+            factor = "" if self.l1 == 1.0 else f"{self.l1:g} "
+            parts.append(f"{factor}{'norm of groups' if self.blocks else 'L1 norm'}")
+        names = (("quadratic state", state), ("quadratic control", control), ("quadratic final state", final))
+        return " + ".join(parts + [name for name, term in names if term is not None])
+
+
+def nominal_point(convex: ConvexSet) -> Array:
+    """The centre of an uncertainty set ``(d,)``, which the nominal trajectory is that of: the middle of its bounding
+    box if that is inside, else the mean of its vertices, or an interior point where there are none."""
+    box = convex.bounding_box()
+    middle = (box.lower + box.upper) / 2
+    if bool(convex.contains(middle)):
+        return np.asarray(middle, dtype=float)
+    vertices = getattr(convex, "vertices", None)
+    return convex.interior_point() if vertices is None else np.asarray(vertices, dtype=float).mean(axis=0)
+
+
+def _scaled(term: Quadratic | None, units: Array, factor: float) -> Quadratic | None:
+    return None if term is None else Quadratic(factor * units[:, None] * term.Q * units, term.reference / units)
+
+
+def _groups(given: object, controls: int, weights: Array) -> tuple[tuple[int, ...], ...] | None:
+    if given is None:
+        return None
+    if isinstance(given, str):
+        if given != "all":
+            raise InputError(path="group", expected="lists of channels, as [[1, 2], [3]], or all", got=f"{given!r}")
+        given = [range(1, controls + 1)]
+    try:
+        groups = tuple(tuple(group) for group in given)  # type: ignore[attr-defined]
+    except TypeError:
+        raise InputError(
+            path="group", expected="lists of channels, as [[1, 2], [3]], or all", got=f"{given!r}"
+        ) from None
+    channels = [channel for group in groups for channel in group]
+    for channel in channels:
+        whole = isinstance(channel, int | np.integer) and not isinstance(channel, bool)
+        if not whole or not 1 <= channel <= controls:
+            raise InputError(path="group", expected=f"channels from 1 to {controls}", got=f"{channel!r}")
+    if len(set(channels)) < len(channels) or not all(groups):
+        raise InputError(
+            path="group",
+            expected="every channel in one group at most, and no group empty",
+            got=f"{[list(map(int, group)) for group in groups]}",
+        )
+    found = tuple(tuple(int(channel) for channel in group) for group in groups)
+    for group in found:
+        own = np.asarray(weights)[np.array(group) - 1]
+        if (own != own[0]).any():
+            raise InputError(
+                path="group", expected="equal weights within a group", got=f"{own.tolist()} for {list(group)}"
+            )
+    return found
+
+
+def _term(key: str, given: object, letter: str, size: int) -> Quadratic | None:
+    """One quadratic term from ``{letter: matrix, reference: vector}``."""
+    if given is None:
+        return None
+    reference: object
+    if isinstance(given, Quadratic):
+        matrix, reference = given.Q, given.reference
+    elif isinstance(given, Mapping):
+        known = {letter} if key == "control" else {letter, "reference"}
+        if letter not in given or not set(given) <= known:
+            raise InputError(path=key, expected=f"{{{', '.join(sorted(known))}}}", got=f"{sorted(map(str, given))}")
+        matrix, reference = given[letter], given.get("reference")
+    else:
+        raise InputError(path=key, expected=f"a mapping with {letter}", got=f"{type(given).__name__}")
+    of = "control" if key == "control" else "state"
+    Q = _numbers(
+        f"{key}.{letter}", matrix, (size, size), f"a {size} by {size} matrix of finite numbers, a row per {of}"
+    )
+    r = np.zeros(size)
+    if reference is not None:
+        r = _numbers(f"{key}.reference", reference, (size,), f"{size} finite numbers, one per {of}")
+    return Quadratic(_semidefinite(f"{key}.{letter}", Q), r)
+
+
+def _numbers(path: str, given: object, shape: tuple[int, ...], expected: str) -> Array:
+    try:
+        array = np.asarray(given, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(path=path, expected=expected, got=f"{given!r}") from None
+    if array.shape != shape or not np.isfinite(array).all():
+        raise InputError(path=path, expected=expected, got=f"{array.tolist()}")
+    return array + 0.0
+
+
+def _semidefinite(path: str, Q: Array) -> Array:
+    """A symmetric positive semidefinite matrix, or one that is but for rounding, which is then made so.
+
+    Every test is one of the matrix with a diagonal of about 1, by powers of two: it does not depend on units.
+    """
+    if not np.array_equal(Q, Q.T):
+        raise InputError(path=path, expected="a symmetric matrix", got=f"{Q.tolist()}")
+    diagonal = np.diag(Q)
+    if np.array_equal(Q, np.diag(diagonal)) and (diagonal >= 0.0).all():
+        return Q
+    size = np.exp2(np.round(np.log2(np.where(diagonal > 0.0, diagonal, 1.0)) / 2))
+    least = float(np.linalg.eigvalsh(Q / size[:, None] / size)[0])
+    small = ROUNDED * Q.shape[0]
+    bare = ~(diagonal > 0.0)
+    if least < -small or Q[bare].any():
+        raise InputError(
+            path=path,
+            expected="a positive semidefinite matrix",
+            got=f"the eigenvalue {float(np.linalg.eigvalsh(Q)[0]):.6g}",
+        )
+    if least > small or (Q.shape[0] <= EXACT and _exactly_semidefinite(Q)):
+        return Q
+    return Q + np.diag(4.0 * small * diagonal)
+
+
+def _exactly_semidefinite(Q: Array) -> bool:
+    """Symmetric elimination in fractions: no pivot is negative, and none is 0 beside an entry that is not."""
+    rows = [[Fraction(float(entry)) for entry in row] for row in Q]
+    for k in range(len(rows)):
+        pivot = rows[k][k]
+        if pivot < 0 or (pivot == 0 and any(rows[k][k + 1 :])):
+            return False
+        for i in range(k + 1, len(rows)):
+            if pivot and rows[i][k]:
+                factor = rows[i][k] / pivot
+                rows[i] = [entry - factor * other for entry, other in zip(rows[i], rows[k], strict=True)]
+    return True

@@ -1,0 +1,185 @@
+"""Quadratic costs of the nominal trajectory, exactly: integrals of the flow in closed form (Van Loan 1978, Theorem 1).
+
+On a piece of length ``h`` the control is constant, so ``z = (x - r, 1, u)`` obeys ``z' = F z`` and
+``int_0^h z'M z dt = z(0)' W(h) z(0)`` with ``W(h) = int_0^h e^{F't} M e^{Ft} dt``. For a short piece ``W`` is
+read off one exponential; ``W(2h) = W(h) + e^{F'h} W(h) e^{Fh}`` doubles it, a sum of matrices without a sign that could
+cancel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sparserob_core.control.problem.cost import nominal_point
+from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.response.response import merge_grids
+from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_array
+
+MOST = 5000  # values of a control that may be coupled: a matrix of their square
+SHORT = 0.5  # the norm of F h up to which W is read off one exponential
+
+
+@dataclass(frozen=True, eq=False)
+class QuadraticCost:
+    """``u'P u / 2 + q'u + constant`` in the control's values on its pieces, channel-major ``(m K,)``."""
+
+    P: csc_array
+    q: Array
+    constant: float
+
+    def on(self, dictionary: Dictionary) -> QuadraticCost:
+        """The same cost in the coefficients of a dictionary, ``(m N,)``."""
+        if dictionary.is_indicators:
+            return self
+        from scipy.sparse import csc_array, eye_array, kron
+
+        V = csc_array(kron(eye_array(self.q.size // dictionary.pieces), csc_array(dictionary.values)))
+        P = V @ self.P @ V.T
+        return QuadraticCost(csc_array((P + P.T) / 2), np.asarray(V @ self.q), self.constant)
+
+    def largest(self, reach: Array) -> float:
+        """Its largest value at a control that stays 0, or stays at ``+-reach_i`` in one of the ``m`` channels."""
+        held = np.kron(np.diag(reach), np.ones(self.q.size // reach.size))
+        bent, slope = np.einsum("ik,ik->i", held, held @ self.P) / 2, np.abs(held @ self.q)
+        return float(max(self.constant, self.constant + (bent + slope).max()))
+
+
+@dataclass(frozen=True, eq=False)
+class NominalPieces:
+    """What every piece of time does to the nominal ``z = (x - r, 1, u)``, one of ``q`` different pieces each:
+    ``which (L,)``, ``acts (L,)`` the piece of the control that acts on it, -1 where none does yet,
+    ``flow (q, d + 1 + m, d + 1 + m)`` and ``weight`` of the same shape, the matrix ``W``. ``start (d + 1,)``;
+    ``end (d + 1, d + 1)``: the cost of the final state."""
+
+    which: np.ndarray
+    acts: np.ndarray
+    flow: Array
+    weight: Array
+    start: Array
+    end: Array
+
+
+def nominal_pieces(problem: OptimalControlProblem, breakpoints: Array) -> NominalPieces:
+    """The nominal trajectory of a problem whose control changes at ``breakpoints (K + 1,)``, and what it costs."""
+    system, (state, _, final) = problem.system, problem.cost.terms
+    d, m, horizon = system.states, system.controls, float(breakpoints[-1])
+    given = np.zeros(m) if problem.initial_control is None else np.asarray(problem.initial_control, dtype=float)
+    grid = merge_grids(breakpoints, np.array([0.0, horizon]), system.delay, given, int(system.c is not None))
+    parameter = np.zeros(0) if system.parameters is None else nominal_point(system.parameters)
+    A, B, E = (matrix[0] for matrix in system.forced.matrices(parameter[None]))
+    reference = np.zeros(d) if state is None else state.reference
+    drift = A @ reference + B[:, m:].sum(axis=1)
+    if problem.disturbance is not None:
+        drift = drift + E @ nominal_point(problem.disturbance)
+    M = np.zeros((d + 1 + m, d + 1 + m))
+    if state is not None:
+        M[:d, :d] = state.Q
+    decided = grid.control_piece >= 0
+    kinds, which = np.unique(
+        np.column_stack([np.round(grid.lengths / horizon, 13), decided]), axis=0, return_inverse=True
+    )
+    which = which.reshape(-1)
+    means = np.bincount(which, grid.lengths) / np.bincount(which)  # the rounding of equal pieces must not add up
+    flows, weights = [], []
+    for length, acting in zip(means, kinds[:, 1], strict=True):
+        F = np.zeros_like(M)
+        F[:d, :d], F[:d, d] = A, drift if acting else drift + B[:, :m] @ given
+        F[:d, d + 1 :] = B[:, :m] if acting else 0.0
+        flow, weight = _integrated(F, M, float(length))
+        flows.append(flow)
+        weights.append(weight)
+    end = np.zeros((d + 1, d + 1))
+    if final is not None:
+        away = np.hstack([np.eye(d), (reference - final.reference)[:, None]])
+        end = away.T @ final.Q @ away
+    begin = np.asarray(problem.initial_state, dtype=float)
+    if problem.initial_set is not None:
+        begin = begin + nominal_point(problem.initial_set)
+    start = np.append(begin - reference, 1.0)
+    return NominalPieces(which, grid.control_piece, np.stack(flows), np.stack(weights), start, end)
+
+
+def quadratic_cost(problem: OptimalControlProblem, breakpoints: Array) -> QuadraticCost:
+    """The quadratic terms of a problem's cost as one quadratic in the control's values on its pieces."""
+    from scipy.sparse import csc_array, diags_array, kron
+
+    (state, control, final), m = problem.cost.terms, problem.system.controls
+    size = m * (breakpoints.size - 1)
+    P, q, constant = csc_array((size, size)), np.zeros(size), 0.0
+    if control is not None:
+        P = csc_array(2.0 * kron(csc_array(control.Q), diags_array(np.diff(breakpoints))))
+    if state is not None or final is not None:
+        if size > MOST:
+            raise InputError(
+                f"a quadratic cost of the state couples all {size} values of the control, at most {MOST} can be;"
+                " expected fewer pieces",
+                path="cost",
+            )
+        coupled, q, constant = _of_the_state(nominal_pieces(problem, breakpoints), m, size)
+        P = csc_array(P + csc_array(coupled))
+    return QuadraticCost(P, q, constant)
+
+
+def _of_the_state(pieces: NominalPieces, m: int, size: int) -> tuple[Array, Array, float]:
+    """``P (m K, m K)``, ``q (m K,)`` and the constant of the cost of the state.
+
+    ``V`` is what the free motion from the start of a piece ``l`` of time costs. Then the whole is
+    ``x_0'V_0 x_0 + sum_l 2 x_l'H_l u_l + u_l'U_l u_l`` with the state ``x_l`` there, by telescoping, and
+    ``x_l = f_l + X_l u`` for the free motion ``f`` and the response ``X`` to the controls before.
+    """
+    L, e, K = pieces.which.size, pieces.start.size, size // m
+    free, forced = pieces.flow[:, :e, :e], pieces.flow[:, :e, e:]
+    H, U = np.empty((L, e, m)), np.empty((L, m, m))
+    V = pieces.end
+    for piece in range(L - 1, -1, -1):
+        i = pieces.which[piece]
+        W, Phi, Gamma = pieces.weight[i], free[i], forced[i]
+        after = V @ Gamma
+        H[piece] = W[:e, e:] + Phi.T @ after
+        U[piece] = W[e:, e:] + Gamma.T @ after
+        V = W[:e, :e] + Phi.T @ V @ Phi
+        V = (V + V.T) / 2
+    P, q = np.zeros((K, m, K, m)), np.zeros((K, m))
+    x, X, last = pieces.start, np.zeros((e, K * m)), 0
+    for piece in range(L):
+        i, k = pieces.which[piece], int(pieces.acts[piece])
+        if k >= 0:
+            q[k] += 2.0 * (x @ H[piece])
+            before = 2.0 * (X[:, : last * m].T @ H[piece])
+            P[:last, :, k, :] += before.reshape(last, m, m)
+            P[k, :, :last, :] += before.T.reshape(m, last, m)
+            P[k, :, k, :] += U[piece] + U[piece].T
+            last = max(last, k + 1)
+        X[:, : last * m] = free[i] @ X[:, : last * m]
+        if k >= 0:
+            X[:, k * m : (k + 1) * m] += forced[i]
+        x = free[i] @ x
+    constant = float(pieces.start @ V @ pieces.start)
+    return P.transpose(1, 0, 3, 2).reshape(size, size), q.T.ravel(), constant
+
+
+def _integrated(F: Array, M: Array, length: float) -> tuple[Array, Array]:
+    """``e^{F h}`` and ``int_0^h e^{F't} M e^{Ft} dt``."""
+    from scipy.linalg import expm
+
+    size = F.shape[0]
+    doublings = max(0, int(np.ceil(np.log2(max(np.abs(F).sum(axis=0).max() * length / SHORT, 1e-300)))))
+    short = length / 2.0**doublings
+    block = np.zeros((2 * size, 2 * size))
+    block[:size, :size], block[:size, size:], block[size:, size:] = -F.T, M, F
+    found = expm(block * short)
+    flow = found[size:, size:]
+    weight = flow.T @ found[:size, size:]
+    weight = (weight + weight.T) / 2
+    for _ in range(doublings):
+        weight = weight + flow.T @ weight @ flow
+        flow = flow @ flow
+    return flow, weight
