@@ -52,6 +52,10 @@ from sparserob_core.experiment.comparison.profiles import Instance as Instance
 from sparserob_core.experiment.comparison.profiles import Profiles as Profiles
 from sparserob_core.experiment.benchmark.searches import Benchmark as Benchmark
 from sparserob_core.experiment.benchmark.benchmark import benchmark as benchmark
+from sparserob_core.control.studies.answer import ControlResult as ControlResult
+from sparserob_core.control.studies.answer import Signal as Signal
+from sparserob_core.control.studies.answer import Tube as Tube
+from sparserob_core.control.studies.adversary import Adversary as Adversary
 from sparserob_core.sip.result import Result as Result
 from sparserob_core.sip.result import SearchTrace as SearchTrace
 from sparserob_core.sip.evidence import Cut as Cut

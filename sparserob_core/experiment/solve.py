@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict, overload
 
 import numpy as np
 
@@ -27,12 +27,52 @@ from sparserob_core.sip.result import Result
 from sparserob_core.sip.solver import Solver
 
 if TYPE_CHECKING:
+    from typing import Unpack
+
+    from sparserob_core.control.studies.answer import ControlResult
+    from sparserob_core.control.transcription.record import Transcription
     from sparserob_core.sip.events import Notify
     from sparserob_core.sip.search.ask_tell import AskTell
 
 Choice: TypeAlias = str | Mapping[str, Any]
 logger = logging.getLogger("sparserob")
 PIECES = {"name": "piecewise_constant", "pieces": 100}
+
+
+class Keywords(TypedDict, total=False):
+    """The keywords of `solve` that are no components."""
+
+    tolerance: float | None
+    seed: int
+    control: Choice | DictionaryFactory | Dictionary | None
+    disturbance: Choice | DictionaryFactory | Dictionary | None
+    continuation: Continuation | Mapping[str, float] | None
+    budget: int
+    polish: float
+    seconds: float | None
+    notify: Notify
+
+
+@overload
+def solve(
+    problem: OptimalControlProblem,
+    method: Choice | Method = ...,
+    solver: Choice | Solver = ...,
+    maximiser: Choice | Maximiser = ...,
+    regulariser: Choice | Regulariser | None = ...,
+    **keywords: Unpack[Keywords],
+) -> ControlResult: ...
+
+
+@overload
+def solve(
+    problem: SemiInfiniteProgram,
+    method: Choice | Method = ...,
+    solver: Choice | Solver = ...,
+    maximiser: Choice | Maximiser = ...,
+    regulariser: Choice | Regulariser | None = ...,
+    **keywords: Unpack[Keywords],
+) -> Result: ...
 
 
 def solve(
@@ -62,13 +102,14 @@ def solve(
     programs, so that ``value`` is the cost. ``budget``: evaluations per search of the maximiser, of which the share
     ``polish`` goes to a local method at its end. ``seconds``: the time after which it returns what it knows, as it does
     at an interrupt from the keyboard; ``Result.stopped`` then says so; where no control can ever be certified it is 30
-    unless given. Raises `InputError` when an argument is at
-    fault.
+    unless given. The result of a control problem knows its control, tube and worst cases as functions of time
+    (`ControlResult`). Raises `InputError` when an argument is at fault.
     """
     deadline, registry = Deadline(as_seconds(seconds)), load_registry()
     if isinstance(problem, OptimalControlProblem):
         deadline = _announced(problem, deadline)
-    program = _program(registry, problem, control, disturbance)
+    model = _stated(registry, problem, control, disturbance)
+    program = model if isinstance(model, SemiInfiniteProgram) else model.program
     if regulariser == "default":
         regulariser = None if program.lengths is None else "ridge"
     steps = continuation if isinstance(continuation, Continuation) else _continuation(continuation or {})
@@ -84,7 +125,12 @@ def solve(
         deadline=deadline,
     )
     chosen: Method = component(registry, "method", _with_tolerance(registry, method, tolerance), Method)
-    return solve_in_own_units(chosen, program, tools)
+    result = solve_in_own_units(chosen, program, tools)
+    if isinstance(model, SemiInfiniteProgram):
+        return result
+    from sparserob_core.control.studies.answer import ControlResult
+
+    return ControlResult.of(result, model)
 
 
 def _announced(problem: OptimalControlProblem, deadline: Deadline) -> Deadline:
@@ -266,7 +312,9 @@ def indicators(on: Dictionary) -> Dictionary:
     return Dictionary(on.breakpoints, np.eye(on.pieces))
 
 
-def _program(registry: Registry, problem: object, control: object, disturbance: object) -> SemiInfiniteProgram:
+def _stated(
+    registry: Registry, problem: object, control: object, disturbance: object
+) -> SemiInfiniteProgram | Transcription:
     if isinstance(problem, SemiInfiniteProgram):
         if control is not None or disturbance is not None:
             raise InputError(
@@ -277,11 +325,11 @@ def _program(registry: Registry, problem: object, control: object, disturbance: 
         raise InputError(
             f"problem: expected an OptimalControlProblem or a SemiInfiniteProgram, got {type(problem).__name__}"
         )
-    from sparserob_core.control.transcription.transcribe import transcribe
+    from sparserob_core.control.transcription.transcribe import prepare
 
     controls = dictionary(registry, PIECES if control is None else control, problem.horizon)
     disturbances = indicators(controls) if disturbance is None else dictionary(registry, disturbance, problem.horizon)
-    return transcribe(problem, control=controls, disturbance=disturbances)
+    return prepare(problem, controls, disturbances)
 
 
 def _continuation(given: Mapping[str, float]) -> Continuation:

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -397,6 +397,10 @@ class Box(ConvexSet):
 
     lower: Array
     upper: Array
+
+    if TYPE_CHECKING:  # what is given may be a list; what is kept is an array
+
+        def __init__(self, lower: npt.ArrayLike, upper: npt.ArrayLike) -> None: ...
 
     def __post_init__(self) -> None:
         lower, upper = as_bound("lower", self.lower), as_bound("upper", self.upper)

@@ -212,16 +212,16 @@ class SemiInfiniteProgram:
 
     n: int
     families: Sequence[ConstraintFamily] = ()
-    q: Array | None = None
+    q: npt.ArrayLike | None = None
     P: object | None = None
-    weights: Array | float | None = None
+    weights: npt.ArrayLike | None = None
     S: object | None = None
-    lower: Array | float = -np.inf
-    upper: Array | float = np.inf
-    G: Array | None = None
-    h: Array | None = None
-    A: Array | None = None
-    b: Array | None = None
+    lower: npt.ArrayLike = -np.inf
+    upper: npt.ArrayLike = np.inf
+    G: npt.ArrayLike | None = None
+    h: npt.ArrayLike | None = None
+    A: npt.ArrayLike | None = None
+    b: npt.ArrayLike | None = None
     channels: int = 1
     lengths: Array | None = None
     activity: Array | None = None

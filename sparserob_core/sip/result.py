@@ -143,6 +143,16 @@ class Result:
     missed: float | None = None
     activity: Activity | None = None
 
+    def __repr__(self) -> str:
+        lines = [
+            f"{type(self).__name__}: {self.status}: {self.message}",
+            f"  cost: {self.cost:.9g}",
+            f"  bounds: {self.lower_bound:.9g} to {self.upper_bound:.9g}",
+            f"  gap: {self.gap:.2e}",
+            f"  seconds: {self.seconds:.3f}",
+        ]
+        return "\n".join(lines)
+
     @property
     def gap(self) -> float:
         """The relative gap of the two bounds."""

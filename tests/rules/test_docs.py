@@ -128,3 +128,24 @@ def test_fences_carry_known_attributes_only() -> None:
     assert not [
         relative(page) for page in PAGES for block in fences(page) if set(block.attributes) - {"title", "status"}
     ]
+
+
+@pytest.mark.slow
+def test_the_python_of_the_readme_is_typed_as_the_package_is(tmp_path: Path) -> None:
+    snippets = [fence.text for fence in fences(ROOT / "README.md") if fence.language == "python"]
+    assert snippets
+    for number, text in enumerate(snippets):
+        (tmp_path / f"snippet{number}.py").write_text(text)
+    check = [
+        sys.executable,
+        "-m",
+        "mypy",
+        "--strict",
+        "--follow-imports=silent",
+        "--cache-dir",
+        str(tmp_path / "cache"),
+    ]
+    done = subprocess.run(
+        [*check, *map(str, sorted(tmp_path.glob("*.py")))], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout

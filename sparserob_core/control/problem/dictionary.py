@@ -5,8 +5,10 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, shaped
@@ -24,6 +26,10 @@ class Dictionary:
 
     breakpoints: Array
     values: Array
+
+    if TYPE_CHECKING:  # what is given may be a list; what is kept is an array
+
+        def __init__(self, breakpoints: npt.ArrayLike, values: npt.ArrayLike) -> None: ...
 
     def __post_init__(self) -> None:
         breakpoints, values = _real("breakpoints", self.breakpoints), _real("values", self.values)

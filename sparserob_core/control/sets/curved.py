@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +27,10 @@ class Ellipsoid(ConvexSet):
 
     centre: Array
     shape: Array
+
+    if TYPE_CHECKING:  # what is given may be a list; what is kept is an array
+
+        def __init__(self, centre: npt.ArrayLike, shape: npt.ArrayLike) -> None: ...
 
     def __post_init__(self) -> None:
         try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +31,10 @@ class Polytope(ConvexSet):
 
     H: Array
     h: Array
+
+    if TYPE_CHECKING:  # what is given may be a list; what is kept is an array
+
+        def __init__(self, H: npt.ArrayLike, h: npt.ArrayLike) -> None: ...
 
     def __post_init__(self) -> None:
         try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -53,6 +53,10 @@ class Equality:
     """
 
     values: Array
+
+    if TYPE_CHECKING:  # what is given may be a list; what is kept is an array
+
+        def __init__(self, values: npt.ArrayLike) -> None: ...
 
     def __post_init__(self) -> None:
         try:

@@ -78,9 +78,9 @@ class InitialPlane:
         base = self._base
         if base.A is None or base.b is None:
             return None, None
-        b = base.b - self._columns @ z
-        needed = base.A.any(axis=1) | (np.abs(b) > TOLERANCE)
-        return (base.A[needed], b[needed]) if needed.any() else (None, None)
+        A, b = np.asarray(base.A, dtype=float), np.asarray(base.b, dtype=float) - self._columns @ z
+        needed = A.any(axis=1) | (np.abs(b) > TOLERANCE)
+        return (A[needed], b[needed]) if needed.any() else (None, None)
 
     def support(self, direction: Array, known: Sequence[Cut] = ()) -> SemiInfiniteProgram:
         """Minimise ``-direction'z`` over all ``(theta, z)``: its value is minus the support function of the feasible

@@ -11,7 +11,7 @@ import numpy as np
 
 from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
 from sparserob_core.control.sets.sets import Equality
-from sparserob_core.control.transcription.record import Transcription
+from sparserob_core.control.studies.answer import tube
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment
 from sparserob_core.experiment.directory.sparsity import sparsity
@@ -21,7 +21,6 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.events import RoundFinished
 
 TIMES = 400
-PARAMETERS = 27
 
 
 def draw_experiment(
@@ -76,17 +75,17 @@ def _data(
     axes = np.eye(problem.system.controls)
     shown = _shown(model.response.grid.breakpoints.size)
     tolerance = experiment.loaded.config.method.options.get("tolerance")
-    state, lower, upper = _tube(model, control, shown)
+    around = tube(model, np.ravel(theta), model.response.grid.breakpoints[shown])
     return FigureData(
         title=printable(experiment.title),
         breakpoints=dictionary.breakpoints,
         control=control,
         control_lower=-problem.control.support(-axes),
         control_upper=problem.control.support(axes),
-        times=model.response.grid.breakpoints[shown],
-        state=state,
-        tube_lower=lower,
-        tube_upper=upper,
+        times=around.times,
+        state=around.nominal,
+        tube_lower=around.lower,
+        tube_upper=around.upper,
         walls=list(_walls(problem)),
         active_times=active_times,
         history=history,
@@ -100,28 +99,6 @@ def _data(
 
 def _shown(count: int) -> np.ndarray[Any, np.dtype[np.intp]]:
     return np.unique(np.linspace(0, count - 1, min(count, TIMES + 1)).round().astype(int))
-
-
-def _tube(
-    model: Transcription, control: Array, shown: np.ndarray[Any, np.dtype[np.intp]]
-) -> tuple[Array, Array, Array]:
-    """Nominal state and worst case from both sides, ``(d, T)`` each, over a lattice of parameters."""
-    lattice, _ = model.parameters.lattice()
-    if model.functionals.disturbance is not None and len(lattice) > PARAMETERS:
-        lattice = lattice[np.unique(np.linspace(0, len(lattice) - 1, PARAMETERS).round().astype(int))]
-    paths = model.response.states(control, lattice)[:, shown]
-    count, instants, states = paths.shape
-    times = np.tile(model.response.grid.breakpoints[shown], count)
-    at = np.repeat(lattice, instants, axis=0)
-    lower, upper = np.empty((states, instants)), np.empty((states, instants))
-    for state in range(states):
-        direction = np.tile(np.eye(states)[state], (times.size, 1))
-        above, below = (
-            model.functionals.offsets(times, side * direction, at).reshape(count, instants) for side in (1.0, -1.0)
-        )
-        upper[state] = (paths[:, :, state] + above).max(axis=0)
-        lower[state] = (paths[:, :, state] - below).min(axis=0)
-    return paths[len(lattice) // 2].T, lower, upper
 
 
 def _walls(problem: OptimalControlProblem) -> Iterator[Wall]:

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, final
 
+import numpy.typing as npt
+
 from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.studies.adversary import Adversary
+from sparserob_core.control.studies.answer import ControlResult, Tube
 from sparserob_core.control.transcription.provable import SECONDS, announced, unprovable
-from sparserob_core.errors import named
+from sparserob_core.errors import InputError, named
 from sparserob_core.experiment.assemble import Anew, ControlExperiment, Experiment, assemble, build, name_of, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
-from sparserob_core.experiment.config.reader import write_yaml
+from sparserob_core.experiment.config.reader import Source, write_yaml
 from sparserob_core.experiment.directory.artefacts import create_directory
 from sparserob_core.experiment.directory.finished import UNFINISHED
 from sparserob_core.experiment.directory.provenance import git_revision, provenance
@@ -23,12 +27,14 @@ from sparserob_core.experiment.run.fewest import with_activity
 from sparserob_core.experiment.run.inspection import Inspection
 from sparserob_core.experiment.run.journal import Journal
 from sparserob_core.experiment.terminal.printing import printable
+from sparserob_core.experiment.terminal.table import result_rows
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.method import Deadline, ExecutorFactory, Method, Tools
 from sparserob_core.sip.methods.own_units import solve_in_own_units
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.result import Result
 
+ROWS = 4  # of a table, in a line each of what `repr` says
 HEADING = "Complete and resolved. To repeat the run: sparserob run config.yaml"
 
 
@@ -36,8 +42,10 @@ HEADING = "Complete and resolved. To repeat the run: sparserob run config.yaml"
 @dataclass(frozen=True, eq=False)
 class Outcome:
     """A finished run. ``control (m, K)`` is ``None`` without a decision or for a program that is no control problem;
-    ``summary`` is what ``result.json`` holds; ``remarks`` say what could not be done beside the result;
-    ``interrupted``: a key or a signal ended it, or came while it ended."""
+    the ``result`` of a control problem is a `ControlResult`; ``summary`` is what ``result.json`` holds; ``remarks`` say
+    what could not be done beside the result; ``interrupted``: a key or a signal ended it, or came while it ended.
+
+    It can be pickled: the experiment is built anew from its config where it is read."""
 
     result: Result
     directory: Path
@@ -46,6 +54,10 @@ class Outcome:
     summary: Mapping[str, Any]
     remarks: Sequence[str] = ()
     interrupted: bool = False
+
+    def __post_init__(self) -> None:
+        if isinstance(self.experiment, ControlExperiment) and not isinstance(self.result, ControlResult):
+            object.__setattr__(self, "result", ControlResult.of(self.result, self.experiment.transcription))
 
     @property
     def status(self) -> str:
@@ -62,6 +74,36 @@ class Outcome:
         """The semi-infinite program that was solved."""
         return self.experiment.program
 
+    def tube(self, times: npt.ArrayLike) -> Tube:
+        """The states at times ``(T,)`` and how far the disturbance may bring them: `ControlResult.tube`."""
+        return self._of_control().tube(times)
+
+    def worst(self, constraint: str) -> Adversary:
+        """The worst case of the constraint of that name: `ControlResult.adversary`."""
+        return self._of_control().adversary(constraint)
+
+    def _of_control(self) -> ControlResult:
+        if not isinstance(self.result, ControlResult):
+            raise InputError("this is a semi-infinite program that is no control problem: it has no states")
+        return self.result
+
+    def __repr__(self) -> str:
+        said = [f"  {name}: {value}" for name, value in result_rows(self.summary)[:ROWS]]
+        return "\n".join([f"Outcome of {self.experiment.title!r} in {self.directory}", *said])
+
+    def _repr_html_(self) -> str:
+        """The table of the run and the figure of its control, for notebooks."""
+        from sparserob_core.experiment.terminal.notebook import page
+
+        return page(self.experiment.title, result_rows(self.summary), self.directory / "figures" / "control.png")
+
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        result = self.result
+        plain = Result(**{one.name: getattr(result, one.name) for one in fields(Result)})
+        loaded = self.experiment.loaded
+        stated = Source(loaded.source.name, loaded.source.folder, loaded.config.plain())
+        return _read, (stated, plain, self.directory, self.control, self.summary, self.remarks, self.interrupted)
+
     def show(self, save: str | Path | None = None, *, serve: bool = False, connect: str | None = None) -> None:
         """Show the run in the viewer of Rerun: a new one, one that listens at ``connect``, a browser (``serve``), or
         later (``save``, a file).
@@ -76,6 +118,19 @@ class Outcome:
             serve=serve,
             connect=connect,
         )
+
+
+def _read(
+    stated: Source,
+    result: Result,
+    directory: Path,
+    control: Array | None,
+    summary: Mapping[str, Any],
+    remarks: Sequence[str],
+    interrupted: bool,
+) -> Outcome:
+    """A pickled outcome; its experiment is built anew from its config."""
+    return Outcome(result, directory, assemble(load_config(stated)), control, summary, remarks, interrupted)
 
 
 def run(
@@ -166,7 +221,8 @@ def _run(
                 if result is None:
                     raise
             if isinstance(experiment, ControlExperiment):
-                result = with_activity(experiment, bounded(experiment, result), tools)
+                known = with_activity(experiment, bounded(experiment, result), tools)
+                result = ControlResult.of(known, experiment.transcription)
             ending = RunFinished(
                 status=result.status,
                 message=result.message,

@@ -107,6 +107,6 @@ def _worst(worst: Mapping[str, Any]) -> str:
     if worst["violation"] is None:
         return "unknown"
     at = "" if worst["time"] is None else f" at t = {worst['time']:.6g}"
-    if worst["parameter"]:
+    if worst["parameter"] is not None and len(worst["parameter"]):
         at += ", p = (" + ", ".join(f"{value:.6g}" for value in worst["parameter"]) + ")"
     return f"{worst['violation']:.2e} in {worst['constraint']}{at}"

@@ -1,0 +1,148 @@
+"""The answer to a control problem as functions of time: the control, the tube of states around it, the worst cases."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, final
+
+import numpy as np
+import numpy.typing as npt
+
+from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.studies.adversary import Adversary, find_adversary
+from sparserob_core.control.transcription.record import Transcription
+from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.result import Result
+
+PARAMETERS = 27  # at most, at which the tube of an uncertain system is computed
+INSTANTS = 20_000  # functionals that are asked for at once
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Signal:
+    """A piecewise constant function of time: ``values (m, K)`` between ``breakpoints (K + 1,)``.
+
+    Called with a time, it gives ``(m,)``, and with times ``(k,)``, ``(m, k)``; at a breakpoint the piece that begins
+    there counts, at the last one the piece that ends there. Raises `InputError` for times outside.
+    """
+
+    breakpoints: Array
+    values: Array
+
+    def __call__(self, time: npt.ArrayLike) -> Array:
+        times = _times(time, float(self.breakpoints[-1]))
+        pieces = np.clip(np.searchsorted(self.breakpoints, times, side="right") - 1, 0, self.values.shape[1] - 1)
+        return np.asarray(self.values[:, pieces])
+
+    def __repr__(self) -> str:
+        m, pieces = self.values.shape
+        return f"Signal of {m} channel{'s' * (m > 1)}, {pieces} pieces on [0, {self.breakpoints[-1]:g}]"
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Tube:
+    """Where the states are at ``times (T,)``: the ``nominal`` ones, and the least and largest values that any
+    disturbance brings them to, ``lower`` and ``upper``, ``(d, T)`` each, at the parameters of a lattice."""
+
+    times: Array
+    nominal: Array
+    lower: Array
+    upper: Array
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class ControlResult(Result):
+    """The `Result` of a control problem; ``model`` is what the problem became.
+
+    ``control``, ``tube`` and ``adversary`` raise `InputError` where there is no decision. It can be pickled if the
+    problem can: the program is then built anew where it is read.
+    """
+
+    model: Transcription = field(repr=False)
+
+    @staticmethod
+    def of(result: Result, model: Transcription) -> ControlResult:
+        """The result with its problem."""
+        return ControlResult(**{one.name: getattr(result, one.name) for one in fields(Result)}, model=model)
+
+    @property
+    def problem(self) -> OptimalControlProblem:
+        """The control problem."""
+        return self.model.problem
+
+    @property
+    def control(self) -> Signal:
+        """The control as a function of time, and as breakpoints with values ``(m, K)``."""
+        return Signal(self.model.control.breakpoints, self.model.pieces(self._decided()))
+
+    def tube(self, times: npt.ArrayLike) -> Tube:
+        """The states at times ``(T,)``, and how far the disturbance may bring them: exact for known systems, at
+        sampled parameters for uncertain ones."""
+        return tube(self.model, self._decided(), np.atleast_1d(_times(times, self.problem.horizon)))
+
+    def adversary(self, constraint: str) -> Adversary:
+        """The worst case of the constraint of that name: time, parameter and disturbance, as arrays. Raises
+        `InputError` for a name that no constraint on the state has."""
+        named = {one.name: one for one in self.model.constraints}
+        if constraint not in named:
+            known = ", ".join(named) or "none on the state"
+            raise InputError(path="constraint", expected=f"one of {known}", got=f"{constraint!r}")
+        found = find_adversary(named[constraint], self._decided())
+        if found is None:
+            raise InputError(f"the constraint {constraint} has no worst case at this decision")
+        return found
+
+    def _decided(self) -> Array:
+        if self.decision is None:
+            raise InputError(f"there is no control: the result is {self.status}: {self.message}")
+        return np.asarray(self.decision, dtype=float).ravel()
+
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        model = self.model
+        plain = Result(**{one.name: getattr(self, one.name) for one in fields(Result)})
+        return _read, (plain, model.problem, model.control, model.disturbance, model.formulation)
+
+
+def _read(
+    result: Result, problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary, form: Any
+) -> ControlResult:
+    from sparserob_core.control.transcription.transcribe import prepare
+
+    return ControlResult.of(result, prepare(problem, control, disturbance, form))
+
+
+def tube(model: Transcription, theta: Array, times: Array) -> Tube:
+    """The tube at a decision ``theta (m N,)`` and at ``times (T,)``."""
+    functionals, known = model.functionals, replace(model.functionals, disturbance=None)
+    lattice, _ = model.parameters.lattice()
+    if len(lattice) > PARAMETERS:
+        lattice = lattice[np.unique(np.linspace(0, len(lattice) - 1, PARAMETERS).round().astype(int))]
+    d, count = model.problem.system.states, len(lattice)
+    nominal, lower, upper = np.empty((d, times.size)), np.empty((d, times.size)), np.empty((d, times.size))
+    size = max(1, INSTANTS // count)
+    for start in range(0, times.size, size):
+        part = slice(start, start + size)
+        at, p = np.tile(times[part], count), np.repeat(lattice, times[part].size, axis=0)
+        middle = lattice[count // 2][None].repeat(times[part].size, axis=0)
+        for state in range(d):
+            direction = np.tile(np.eye(d)[state], (at.size, 1))
+            above, below = (functionals.values(theta, at, side * direction, p) for side in (1.0, -1.0))
+            upper[state, part] = above.reshape(count, -1).max(axis=0)
+            lower[state, part] = -below.reshape(count, -1).max(axis=0)
+            nominal[state, part] = known.values(theta, times[part], direction[: times[part].size], middle)
+    return Tube(times, nominal, lower, upper)
+
+
+def _times(time: npt.ArrayLike, horizon: float) -> Array:
+    try:
+        times = np.array(time, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(path="times", expected="numbers", got=f"{time!r}") from None
+    if times.ndim > 1 or not ((times >= 0.0) & (times <= horizon)).all():
+        raise InputError(path="times", expected=f"a time, or times (k,), from 0 to {horizon:g}", got=f"{time!r}")
+    return times
