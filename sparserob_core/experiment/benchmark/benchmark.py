@@ -11,10 +11,11 @@ import numpy as np
 
 from sparserob_core.arguments import share, whole
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.benchmark.files import shipped, write
+from sparserob_core.experiment.benchmark.files import write
 from sparserob_core.experiment.benchmark.landscapes import SUITES, Landscape, landscapes
 from sparserob_core.experiment.benchmark.searches import Benchmark, Search
 from sparserob_core.experiment.comparison.profiles import Instance, Profiles
+from sparserob_core.experiment.config.examples import shipped
 from sparserob_core.experiment.directory.artefacts import create_directory
 from sparserob_core.experiment.plugins.registry import load_registry
 from sparserob_core.experiment.run.events import StudyProgress

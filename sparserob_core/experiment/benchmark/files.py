@@ -7,7 +7,6 @@ import re
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from itertools import groupby
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,13 +33,6 @@ class Facts:
     algorithm: dict[str, str]
     attributes: tuple[str, ...] = ("evaluations", "raw_y")
     scenarios: list[dict[str, Any]]
-
-
-def shipped(name: str) -> Path:
-    """The file of a config of this distribution: beside the package where it is installed, in the repository else."""
-    package = Path(__file__).resolve().parents[2]
-    places = [folder / "configs" / f"{name}.yaml" for folder in (package, package.parent)]
-    return next((place for place in places if place.exists()), places[-1])
 
 
 def write(found: Benchmark, directory: RunDirectory) -> Benchmark:

@@ -11,15 +11,16 @@ from typing import Any
 import click
 
 from sparserob_core.errors import SparseRobError, named
+from sparserob_core.experiment.cli.catalogue.examples import examples
+from sparserob_core.experiment.cli.catalogue.plugins import new_plugin, plugins
+from sparserob_core.experiment.cli.catalogue.schema import schema
 from sparserob_core.experiment.cli.commands.check import check
 from sparserob_core.experiment.cli.commands.compare import benchmark, compare
 from sparserob_core.experiment.cli.commands.figures import figures
 from sparserob_core.experiment.cli.commands.initial_states import initial_states
 from sparserob_core.experiment.cli.commands.margin import margin
-from sparserob_core.experiment.cli.commands.plugins import new_plugin, plugins
 from sparserob_core.experiment.cli.commands.replay import replay
 from sparserob_core.experiment.cli.commands.run import run
-from sparserob_core.experiment.cli.commands.schema import schema
 from sparserob_core.experiment.cli.commands.simulate import simulate
 from sparserob_core.experiment.cli.commands.sweep import sweep
 from sparserob_core.experiment.cli.commands.watch import watch
@@ -104,6 +105,7 @@ for command in (
     figures,
     plugins,
     new_plugin,
+    examples,
     schema,
 ):
     commands.add_command(command)

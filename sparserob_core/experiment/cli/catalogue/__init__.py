@@ -1,0 +1,1 @@
+"""Commands about what there is: components, examples, the schema of a config."""

@@ -1,0 +1,67 @@
+"""The configs that come with this distribution: complete experiments, each a story."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import final
+
+from sparserob_core.errors import InputError
+
+SCHEMA = "# yaml-language-server:"  # a line for editors, beside the schema's file only
+
+
+@final
+@dataclass(frozen=True)
+class Example:
+    """A config that comes with the distribution: its ``name``, the ``title`` of its runs, its ``story`` (the comment at
+    its beginning), and its ``text``."""
+
+    name: str
+    title: str
+    story: str
+    text: str
+
+
+def shipped(name: str) -> Path:
+    """The file of a config of this distribution; it need not exist."""
+    return _folder() / f"{name}.yaml"
+
+
+def examples() -> list[Example]:
+    """All of them, by name."""
+    return [_read(file) for file in sorted(_folder().glob("*.yaml"))]
+
+
+def example(name: str) -> Example:
+    """The one of that name; raises `InputError` when there is none."""
+    from sparserob_core.experiment.plugins.messages import nearest
+
+    known = [file.stem for file in _folder().glob("*.yaml")]
+    if name not in known:
+        raise InputError(f"examples: there is none called {name!r}{nearest(name, set(known))}")
+    return _read(shipped(name))
+
+
+def _folder() -> Path:
+    """Beside the package where it is installed, in the repository else."""
+    package = Path(__file__).resolve().parents[2]
+    places = [folder / "configs" for folder in (package, package.parent)]
+    return next((place for place in places if place.is_dir()), places[-1])
+
+
+def _read(file: Path) -> Example:
+    text = file.read_text("utf-8")
+    lines = [line for line in text.splitlines() if not line.startswith(SCHEMA)]
+    story = " ".join(line.lstrip("# ") for line in _leading(lines))
+    title = re.search(r"^title: *(.*?) *$", text, re.MULTILINE)
+    return Example(file.stem, file.stem if title is None else title[1].strip("'\""), story, "\n".join(lines) + "\n")
+
+
+def _leading(lines: list[str]) -> Iterator[str]:
+    for line in lines:
+        if not line.startswith("#"):
+            return
+        yield line

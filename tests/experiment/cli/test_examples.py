@@ -1,0 +1,32 @@
+"""Guards `sparserob examples`: every config is listed with its story, copied whole, and nothing is overwritten."""
+
+from pathlib import Path
+
+from sparserob_core.experiment.config.load import load_config
+from tests.support.stub import Command
+
+
+def test_every_config_is_listed_with_its_story(repository: Path, command: Command):
+    printed = command("examples").stdout
+    for file in sorted((repository / "configs").glob("*.yaml")):
+        line = next(line for line in printed.splitlines() if line.split()[:1] == [file.stem])
+        assert len(line.split()) > 8, f"{file.name} begins with no comment that says what it is about"
+
+
+def test_an_example_is_copied_and_means_the_same(repository: Path, command: Command, tmp_path: Path):
+    done = command("examples", "double_integrator", "--out", str(tmp_path / "new"))
+    file = tmp_path / "new" / "double_integrator.yaml"
+    assert done.stdout == f"written to {file}; next: sparserob run {file}\n"
+    assert load_config(file).config == load_config(repository / "configs" / "double_integrator.yaml").config
+    assert "yaml-language-server" not in file.read_text()
+
+
+def test_nothing_is_overwritten_and_a_wrong_name_is_one_error(command: Command, tmp_path: Path):
+    (tmp_path / "haar.yaml").write_text("mine")
+    done = command("examples", "haar", "--out", str(tmp_path))
+    assert "expected no file of that name, which would be overwritten" in done.stderr
+    assert (tmp_path / "haar.yaml").read_text() == "mine"
+    done = command("examples", "harr", "--out", str(tmp_path))
+    assert "there is none called 'harr'; did you mean 'haar'?" in done.stderr
+    done = command("examples", "walsh", "--out", str(tmp_path / "haar.yaml"))
+    assert (done.returncode, done.stderr.lower().count("error:")) == (2, 1)
