@@ -11,6 +11,7 @@ from sparserob_core.control.problem.dictionary import DictionaryFactory as Dicti
 from sparserob_core.control.problem.names import Names as Names
 from sparserob_core.control.problem.system import LinearSystem as LinearSystem
 from sparserob_core.control.problem.problem import OptimalControlProblem as OptimalControlProblem
+from sparserob_core.control.problem.problem import MixedConstraint as MixedConstraint
 from sparserob_core.control.problem.problem import PathConstraint as PathConstraint
 from sparserob_core.control.problem.problem import ProblemFactory as ProblemFactory
 from sparserob_core.control.sets.sets import Ellipsoid as Ellipsoid

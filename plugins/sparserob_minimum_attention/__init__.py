@@ -38,10 +38,7 @@ class MinimumAttention(sr.LinearKeys):
             )
         plain = self.system.build()
         d, m = plain.states, plain.controls
-        path = [
-            sr.PathConstraint(sr.cylinder(item.set, d + m), item.start, item.stop, item.name)
-            for item in self.windows(d)
-        ]
+        path = [_extended_window(item, m) for item in self.windows(d)]
         ends = [_extended(end, m) for end in self.ends(d)]
         return sr.OptimalControlProblem(
             system=self._augmented(d, m),
@@ -140,6 +137,20 @@ def _names(given: sr.Names, d: int, m: int) -> sr.Names:
         disturbance_units=given.disturbance_units,
         time=given.time,
     )
+
+
+def _extended_window(item: sr.PathConstraint | sr.MixedConstraint, m: int) -> sr.PathConstraint:
+    """A window of ``x``, or of ``x`` and ``u`` together, as one of the augmented state ``(x, u)``."""
+    if isinstance(item, sr.MixedConstraint):
+        H, G = (np.atleast_2d(np.asarray(rows, dtype=float)) for rows in (item.H, item.G))
+        if len(H) != len(G) or G.shape[1] != m:
+            raise sr.InputError(f"path: mixed: expected as many rows in G as in H, {m} numbers in each")
+        return sr.PathConstraint(sr.Polytope(np.hstack([H, G]), np.asarray(item.h)), item.start, item.stop, item.name)
+    moved = item.relative_to
+    if moved is not None:
+        rows = np.asarray(moved, dtype=float)
+        moved = np.hstack([rows, np.zeros((len(rows), m))])
+    return sr.PathConstraint(sr.cylinder(item.set, item.set.dimension + m), item.start, item.stop, item.name, moved)
 
 
 def _extended(end: sr.ConvexSet | sr.Equality, m: int) -> sr.ConvexSet | sr.Equality:

@@ -61,7 +61,7 @@ def _walled(problem: sr.OptimalControlProblem) -> set[int]:
     axes, found = np.eye(problem.system.states), set[int]()
     for entry in problem.path:
         bounds = getattr(entry, "set", None)
-        if bounds is not None:
+        if bounds is not None and bounds.dimension == problem.system.states:
             reach = np.minimum(bounds.support(axes), bounds.support(-axes))
             found |= {int(state) for state in np.flatnonzero(np.isfinite(reach))}
     return found

@@ -67,7 +67,7 @@ def _walls(drawing: Drawing, axes: Axes, data: sr.FigureData) -> None:
             float(axes.at((a + b) / 2, d)[0, 0]), float(axes.at(a, d)[0, 1]) - 12.0, "terminal set", ink.VERMILLION
         )
     for wall in data.walls:
-        if wall.start == wall.end:
+        if wall.start == wall.end or wall.moves:
             continue
         low, high = axes.x if wall.state == 0 else axes.y
         for edge, outside in ((wall.lower, low), (wall.upper, high)):
@@ -78,9 +78,7 @@ def _walls(drawing: Drawing, axes: Axes, data: sr.FigureData) -> None:
 
 
 def _limits(data: sr.FigureData, state: int) -> tuple[float, float]:
-    edges = [
-        edge for wall in data.walls if wall.state == state for edge in (wall.lower, wall.upper) if np.isfinite(edge)
-    ]
+    edges = [edge for wall in data.walls if wall.state == state for edge in wall.edges]
     low, high = min([*edges, float(data.tube_lower[state].min())]), max([*edges, float(data.tube_upper[state].max())])
     margin = 0.1 * max(high - low, 1e-9)
     return low - margin, high + margin

@@ -150,7 +150,7 @@ class Physics:
         drawing.band("tube", axes, data.times, data.tube_lower[state], data.tube_upper[state], ink.TUBE)
         for wall in data.walls:
             if wall.state == state:
-                _wall(drawing, axes, wall.lower, wall.upper, wall.start, wall.end)
+                _wall(drawing, axes, wall)
         for path in worst.get("states", ()):
             drawing.line("worst", axes.at(worst["state_times"], path[state]), ink.ORANGE, 1.2)
         drawing.line("curve", axes.at(data.times, data.state[state]), ink.SKY, 2.0)
@@ -176,7 +176,8 @@ def _axes(position: int, data: sr.FigureData, limits: tuple[float, float]) -> Ax
     )
 
 
-def _wall(drawing: Drawing, axes: Axes, lower: float, upper: float, start: float, end: float) -> None:
+def _wall(drawing: Drawing, axes: Axes, wall: sr.Wall) -> None:
+    lower, upper, start, end = wall.lower, wall.upper, wall.start, wall.end
     if start == end:
         right = axes.at(end, axes.y[0])[0, 0]
         top, bottom = axes.at(end, min(upper, axes.y[1]))[0, 1], axes.at(end, max(lower, axes.y[0]))[0, 1]
@@ -187,10 +188,11 @@ def _wall(drawing: Drawing, axes: Axes, lower: float, upper: float, start: float
             3.0,
         )
         return
-    for edge, outside in ((lower, axes.y[0]), (upper, axes.y[1])):
-        if np.isfinite(edge):
+    for side, outside, nearest in zip(wall.sides, axes.y, (min, max), strict=True):
+        if np.isfinite(side).all():
+            edge = nearest(side)  # what is beyond is forbidden all the time
             drawing.hatched("hatch", axes, (start, end), (min(edge, outside), max(edge, outside)), ink.HATCH)
-            drawing.line("wall", axes.at(np.array([start, end]), np.full(2, edge)), ink.VERMILLION, 1.5)
+            drawing.line("wall", axes.at(np.array([start, end]), np.array(side)), ink.VERMILLION, 1.5)
 
 
 def _fill(edges: Floats, steps: Floats) -> tuple[Floats, Floats, Floats]:
@@ -206,9 +208,7 @@ def _control_limits(data: sr.FigureData, channel: int) -> tuple[float, float]:
 
 
 def _state_limits(data: sr.FigureData, state: int) -> tuple[float, float]:
-    edges = [
-        edge for wall in data.walls if wall.state == state for edge in (wall.lower, wall.upper) if np.isfinite(edge)
-    ]
+    edges = [edge for wall in data.walls if wall.state == state for edge in wall.edges]
     return _padded([*edges, float(data.tube_lower[state].min()), float(data.tube_upper[state].max())])
 
 

@@ -13,27 +13,17 @@ from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.claims.cost import Price
 from sparserob_core.checker.claims.duality import Duality, before
 from sparserob_core.checker.claims.units import RowUnits
+from sparserob_core.checker.claims.window import Beside, Window
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.control.problem.dictionary import Dictionary
-from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem
 from sparserob_core.control.sets.sets import ConvexSet, Equality
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
     from flint import arb_mat
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Window:
-    """``x(t)`` in ``shape`` for all ``t`` from ``start`` to ``stop``."""
-
-    name: str
-    shape: ConvexSet
-    start: float
-    stop: float
 
 
 @final
@@ -50,7 +40,8 @@ class Case:
     @cached_property
     def windows(self) -> list[Window]:
         """The state constraints, under the names that the certificate uses."""
-        path = [entry for entry in self.problem.path if isinstance(entry, PathConstraint)]
+        path = [entry for entry in self.problem.path if not isinstance(entry, ConvexSet)]
+        d = self.problem.system.states
         ends = [end for end in self.problem.terminal if not isinstance(end, Equality)]
         found = [
             Window(
@@ -58,11 +49,17 @@ class Case:
                 entry.set,
                 entry.start,
                 self.problem.horizon if entry.stop is None else entry.stop,
+                d,
+                None
+                if isinstance(entry, MixedConstraint) or entry.relative_to is None
+                else np.asarray(entry.relative_to),
             )
             for i, entry in enumerate(path)
         ]
         return found + [
-            Window(f"terminal[{i}]" if len(ends) > 1 else "terminal", end, self.problem.horizon, self.problem.horizon)
+            Window(
+                f"terminal[{i}]" if len(ends) > 1 else "terminal", end, self.problem.horizon, self.problem.horizon, d
+            )
             for i, end in enumerate(ends)
         ]
 
@@ -163,10 +160,18 @@ class Case:
             self.problem.initial_set,
         )
 
+    def beside(self, window: Window, basis: Array, gains: Array) -> Beside | None:
+        """What stands beside the state in the rows of a constraint; ``None``: nothing."""
+        if window.reference is None and not window.is_mixed:
+            return None
+        return Beside(window, basis, gains, self.scene, self.control.breakpoints.tolist(), self.pieces)
+
     def units(self, window: Window) -> RowUnits:
         """What violations of a constraint are judged by."""
         if window not in self._units:
-            self._units[window] = RowUnits(self.problem, self.scene, window.shape, window.start, window.stop)
+            self._units[window] = RowUnits(
+                self.problem, self.scene, window.shape, window.start, window.stop, window.reference
+            )
         return self._units[window]
 
     @cached_property

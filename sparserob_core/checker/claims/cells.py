@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.bernstein import highest
+from sparserob_core.checker.claims.window import Beside
 from sparserob_core.checker.outcome import TOLERANCE, Broken, Clock, Unchecked
 from sparserob_core.checker.reach.tube import Polynomial, Tube
 from sparserob_core.checker.sets.parameters import Corners, Parameters
@@ -44,8 +45,15 @@ Work: TypeAlias = tuple[Corners, Sides, list[Interval]]
 """A box of parameters, what is to be bounded, and when."""
 
 
-def prove(tubes: Callable[[Corners], Tube], parameters: Parameters, work: Sequence[Work], clock: Clock) -> Proven:
-    """Show that no row is exceeded by more than its slack on the cells ``work``; raises `Broken` where one is, and
+def prove(
+    tubes: Callable[[Corners], Tube],
+    parameters: Parameters,
+    work: Sequence[Work],
+    clock: Clock,
+    beside: Beside | None = None,
+) -> Proven:
+    """Show that no row, with what stands ``beside`` the state in it, is exceeded by more than its slack on the cells
+    ``work``; raises `Broken` where one is, and
     `Unchecked` where neither could be shown."""
     stack = list(reversed(work))
     found, cells, items = _Found(), 0, 0
@@ -62,7 +70,7 @@ def prove(tubes: Callable[[Corners], Tube], parameters: Parameters, work: Sequen
                     f"neither shown nor refuted: after {cells} cells a violation of more than {TOLERANCE:.0e} of its"
                     " unit is not excluded"
                 )
-            _examine(Place(tubes(box), parameters, box, clock), sides, todo, left, found)
+            _examine(Place(tubes(box), parameters, box, clock, beside), sides, todo, left, found)
             todo, left.halves = left.halves, []
         if left.turned:
             stack += [(box, half, left.turned) for half in reversed(sides.halves())]
@@ -80,6 +88,12 @@ class Place:
     parameters: Parameters
     box: Corners
     clock: Clock
+    beside: Beside | None = None
+
+    def cells(self, interval: Interval, z: Array) -> list[Polynomial]:
+        """The polynomials of all rows on an interval."""
+        found = self.tube.cells(*interval, z)
+        return found if self.beside is None else self.beside.added(found, *interval[1:], z)
 
 
 @final
@@ -162,7 +176,7 @@ def _batch(
     z, every = np.array([row.z for row in rows]), []
     for interval in todo:
         place.clock.check()
-        every.append(place.tube.cells(*interval, z))
+        every.append(place.cells(interval, z))
     tops = _tops(place.tube, [(poly, row.allowed) for found in every for poly, row in zip(found, rows, strict=True)])
     for number, (interval, found) in enumerate(zip(todo, every, strict=True)):
         yield interval, found, tops[number * len(rows) : (number + 1) * len(rows)].tolist()

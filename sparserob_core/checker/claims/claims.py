@@ -15,8 +15,9 @@ from sparserob_core.checker.claims.constraints import bounded
 from sparserob_core.checker.claims.duality import Row
 from sparserob_core.checker.claims.equalities import equalities
 from sparserob_core.checker.claims.replay import reached
+from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import TOLERANCE, Broken, Finding, Unchecked
-from sparserob_core.checker.sets.shapes import excess, limit, member
+from sparserob_core.checker.sets.shapes import excess, member
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
@@ -242,13 +243,27 @@ def _row(case: Case, entry: object) -> tuple[float, Row]:
         _sized(direction, case.problem.system.controls, name)
         return y, case.duality.step_row(direction, time)
     window, parameter = case.window(name), numbers(entry.get("parameter"), f"{name}: parameter")
-    _sized(direction, case.problem.system.states, name)
+    _sized(direction, window.shape.dimension, name)
     if not window.start <= time <= window.stop:
         raise Broken(f"{name}: t = {time!r} is not within {window.start:g} to {window.stop:g}")
     _sized(parameter, case.problem.system.parameter_count, name)
     if case.problem.system.parameters is not None and not member(case.problem.system.parameters, parameter):
         raise Broken(f"{name}: the parameter {parameter.tolist()} is not shown to be in its set")
-    return y, case.duality.row(direction, time, parameter.tolist(), limit(window.shape, direction))
+    c, gain = window.split(direction)
+    row = case.duality.row(c, time, parameter.tolist(), window.limit(direction, time))
+    if window.is_mixed:
+        piece = _piece(case, window, entry, time)
+        row.slope[piece] = [a + balls([g])[0] for a, g in zip(row.slope[piece], gain, strict=True)]
+    return y, row
+
+
+def _piece(case: Case, window: Window, entry: Mapping[str, Any], time: float) -> int:
+    """The piece of the control that a mixed constraint speaks of."""
+    piece = entry.get("piece")
+    if not isinstance(piece, int) or isinstance(piece, bool):
+        raise Broken(f"{window.name}: piece is {piece!r}, expected the number of a piece of the control")
+    window.meets(case.control.breakpoints.tolist(), piece, time)
+    return piece
 
 
 def _sized(vector: Array, size: int, name: str) -> None:
@@ -314,16 +329,16 @@ def _witness(case: Case) -> str:
         raise Unchecked("the certificate holds no witness")
     window, time = case.window(str(data.get("constraint"))), number(data, "time")
     direction, parameter = (numbers(data.get(key), key) for key in ("direction", "parameter"))
-    _sized(direction, case.problem.system.states, window.name)
+    _sized(direction, window.shape.dimension, window.name)
     _sized(parameter, case.problem.system.parameter_count, window.name)
     if not window.start <= time <= window.stop:
         raise Broken(f"t = {time!r} is not within {window.start:g} to {window.stop:g}")
     if case.problem.system.parameters is not None and not member(case.problem.system.parameters, parameter):
         raise Broken(f"the parameter {parameter.tolist()} is not shown to be in its set")
-    state, height = (
-        reached(case, time, parameter, data.get("disturbance"), data.get("deviation")),
-        limit(window.shape, direction),
-    )
+    state = reached(case, time, parameter, data.get("disturbance"), data.get("deviation"))
+    height = window.limit(direction, time)
+    if window.is_mixed:
+        state = state + case.pieces[_piece(case, window, data, time)].entries()
     over = sum((balls([c])[0] * x for c, x in zip(direction, state, strict=True)), -height)
     slack = case.units(window).slack(direction, height)
     if not over > slack:

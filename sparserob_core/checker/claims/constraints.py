@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls, below
-from sparserob_core.checker.claims.case import Case, Window, number, numbers
+from sparserob_core.checker.claims.case import Case, number, numbers
 from sparserob_core.checker.claims.cells import Interval, Work, prove
 from sparserob_core.checker.claims.subdivision import fill
 from sparserob_core.checker.claims.units import RowUnits
+from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.reach.flow import Flow
 from sparserob_core.checker.reach.tube import Tube
@@ -24,7 +25,7 @@ from sparserob_core.control.sets.sets import Cylinder
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
 DEGREES = {0: 0, 1: 8, 2: 6, 3: 4, 4: 3}  # of the expansion in the parameters, by their number; 2 beyond
 TUBES_KEPT = 8
@@ -47,8 +48,14 @@ def bounded(case: Case, window: Window) -> str:
         raise Unchecked("the certificate holds no cells for a constraint that was not proven on cells")
     normals = _normals(window, entry.get("normals"))
     _covered(case, window, lower, upper)
-    basis, work = _work(case, window, normals, lower, upper)
-    found = prove(_tubes(case, basis, lower, upper), Parameters(case.problem.system.parameters), work, case.clock)
+    basis, gains, work = _work(case, window, normals, lower, upper)
+    found = prove(
+        _tubes(case, basis, lower, upper),
+        Parameters(case.problem.system.parameters),
+        work,
+        case.clock,
+        case.beside(window, basis, gains),
+    )
     size = f"{found.cells} cells" + (f" in {found.boxes} boxes" if found.boxes > 1 else "")
     if found.bound < 0:
         return f"kept, with a margin of at least {-found.bound:.1e} ({size})"
@@ -111,11 +118,12 @@ def _extent(case: Case, window: Window, lower: Array, upper: Array) -> tuple[Arr
     return np.append(window.start, low), np.append(window.stop, high)
 
 
-def _work(case: Case, window: Window, normals: Array, lower: Array, upper: Array) -> tuple[Array, list[Work]]:
-    """What directions are combinations of ``(b, d)``, and the cells, those with the same parameters and directions
-    together, their times cut at the breakpoints of the grid."""
+def _work(case: Case, window: Window, normals: Array, lower: Array, upper: Array) -> tuple[Array, Array, list[Work]]:
+    """What directions are combinations of, ``(b, d)``, with their parts on the control, ``(b, m)``, and the cells,
+    those with the same parameters and directions together, their times cut wherever anything turns or jumps."""
     nu, units = case.problem.system.parameter_count, case.units(window)
-    basis, flat = _facets(window, units)
+    basis, gains, flat = _facets(window, units)
+    cuts = sorted({*case.grid, *window.cuts(case.control.breakpoints.tolist())})
     curved = None if flat is not None else Curved(window.shape, normals, units.sums)
     keys = [(tuple(a[1:].tolist()), tuple(b[1:].tolist())) for a, b in zip(lower, upper, strict=True)]
     order = sorted(range(len(keys)), key=lambda i: (keys[i], lower[i, 0]))
@@ -124,31 +132,31 @@ def _work(case: Case, window: Window, normals: Array, lower: Array, upper: Array
         case.clock.check()
         sides = Sides.cell(curved, np.array(a[nu:]), np.array(b[nu:])) if curved is not None else flat
         assert sides is not None
-        intervals = [part for i in members for part in _cut(case, float(lower[i, 0]), float(upper[i, 0]))]
+        intervals = [part for i in members for part in _cut(case, cuts, float(lower[i, 0]), float(upper[i, 0]))]
         work.append(((a[:nu], b[:nu]), sides, intervals))
-    return normals if curved is not None else basis, work
+    return normals if curved is not None else basis, gains, work
 
 
-def _facets(window: Window, units: RowUnits) -> tuple[Array, Sides | None]:
-    """The normals of a flat set's facets up to the sign, and its rows; no rows for a curved one."""
+def _facets(window: Window, units: RowUnits) -> tuple[Array, Array, Sides | None]:
+    """The normals of a flat set's facets up to the sign, on the state and on the control, and its rows; no rows for a
+    curved one."""
     found, flat = flat_basis(window.shape), facets(window.shape)
     if found is None or flat is None:
-        return np.zeros((0, 0)), None
+        return np.zeros((0, 0)), np.zeros((0, 0)), None
     basis, z = found
     rows = [
         Bounded(direction, below(b), unit) for direction, (_, b), unit in zip(z, flat, units.rows.tolist(), strict=True)
     ]
-    return basis, Sides(rows)
+    return basis[:, : window.states], basis[:, window.states :], Sides(rows)
 
 
-def _cut(case: Case, start: float, stop: float) -> list[Interval]:
-    grid = np.array(case.grid)
-    first = int(np.clip(np.searchsorted(grid, start, side="right") - 1, 0, grid.size - 2))
-    if start == stop:
-        return [(first if start < grid[-1] else grid.size - 2, start, stop)]
-    last = int(np.clip(np.searchsorted(grid, stop, side="left") - 1, 0, grid.size - 2))
-    points = [start, *grid[first + 1 : last + 1].tolist(), stop]
-    return [(first + i, a, b) for i, (a, b) in enumerate(pairwise(points))]
+def _cut(case: Case, cuts: Sequence[float], start: float, stop: float) -> list[Interval]:
+    """The parts between the ``cuts``, each with the piece of the grid that it lies in."""
+    grid, every = np.array(case.grid), np.array(cuts)
+    inside = every[(every > start) & (every < stop)].tolist()
+    parts = list(pairwise([start, *inside, stop]))
+    pieces = np.searchsorted(grid, [a for a, _ in parts], side="right") - 1
+    return [(int(k), a, b) for k, (a, b) in zip(np.clip(pieces, 0, grid.size - 2), parts, strict=True)]
 
 
 def _tubes(case: Case, basis: Array, lower: Array, upper: Array) -> Callable[[Corners], Tube]:

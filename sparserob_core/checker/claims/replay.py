@@ -65,13 +65,21 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
     flat, found = facets(window.shape), flat_basis(window.shape)
     if flat is None or found is None:
         raise Unchecked("the worst direction of a curved set is not told")
-    basis, z = found
+    (basis, gains), z = np.split(found[0], [window.states], axis=1), found[1]
     centre = tuple(map(float, parameter))
     scene = case.scene if begun is None else replace(case.scene, initial_state=begun.tolist(), initial_set=None)
     tube = Tube(Flow(case.problem.system, centre, (0.0,) * len(centre), 0), scene, basis)
     piece = min(bisect_right(case.grid, time) - 1, len(case.grid) - 2 if time < case.grid[-1] else len(case.grid) - 1)
-    polynomials = tube.cells(piece, time, time, z)
-    over = [float(poly.coefficients[0, 0]) - float(b.mid()) for poly, (_, b) in zip(polynomials, flat, strict=True)]
+    polynomials, beside = tube.cells(piece, time, time, z), case.beside(window, basis, gains)
+    breaks: list[int | None] = [None]
+    if window.is_mixed:  # where the control jumps, either of its values
+        ends = case.control.breakpoints
+        pieces = [int(np.searchsorted(ends, time, side=side)) - 1 for side in ("left", "right")]
+        breaks = [*{max(0, min(piece, case.control.pieces - 1)) for piece in pieces}]
+    if beside is not None:
+        polynomials = [p for k in breaks for p in beside.added(polynomials, time, time, z, k)]
+    limits = [float(b.mid()) for _, b in flat] * len(breaks)
+    over = [float(poly.coefficients[0, 0]) - b for poly, b in zip(polynomials, limits, strict=True)]
     slack = max(float(poly.error) for poly in polynomials) + TOLERANCE * float(case.units(window).rows.max(initial=0.0))
     return over, slack
 

@@ -28,7 +28,8 @@ MOST_AXES = 4  # of the parameters, at whose ends a window is looked at
 @final
 @dataclass(frozen=True, eq=False)
 class RowUnits:
-    """The units of the constraint ``x(t)`` in ``shape`` from ``start`` to ``stop``.
+    """The units of the constraint ``x(t) - r(t)`` in ``shape`` from ``start`` to ``stop``, or ``(x(t), u(t))`` in one
+    of more coordinates; ``reference (q, 1 + d)``: times and points of ``r``.
 
     That of a row ``c'x <= b`` is the smallest that is not zero of: how far ``c'x`` can reach over the window (any
     admissible control, the worst disturbance, any parameter), ``|b|``, and the width of the slab where the opposite row
@@ -42,6 +43,7 @@ class RowUnits:
     shape: ConvexSet
     start: float
     stop: float
+    reference: Array | None = None
 
     @cached_property
     def rows(self) -> Array:
@@ -110,7 +112,9 @@ class RowUnits:
     def _walked(self, parameter: tuple[float, ...]) -> tuple[Array, Array]:
         system, bound = self.problem.system, self.problem.disturbance
         d, m, columns = system.states, system.controls, system.controls + (system.c is not None)
-        normals = np.array([c for c, _ in facets(self.shape) or []]).reshape(-1, d)
+        normals, gains = np.split(
+            np.array([c for c, _ in facets(self.shape) or []]).reshape(-1, self.shape.dimension), [d], 1
+        )
         (nodes, places), step = self._nodes(), _Steps(self.problem, parameter, columns, self.scene.tick)
         v = np.tile(np.vstack([normals, np.eye(d)]), (len(places), 1, 1))
         count = len(nodes) - 1
@@ -143,6 +147,16 @@ class RowUnits:
                 axes = np.eye(convex.dimension)
                 far = np.maximum(np.abs(convex.support(axes)), np.abs(convex.support(-axes)))
                 sums = sums + (np.abs(weights) @ far).sum(axis=0)
+        if self.reference is not None:
+            at, (times, *points) = np.array(nodes)[places], self.reference.T
+            moved = np.stack([np.interp(at, times, column) for column in points], axis=1)
+            off = moved @ np.vstack([normals, np.eye(d)]).T
+            high, low, sums = high - off, low + off, sums + np.abs(off)
+        if gains.shape[1]:
+            own, count = self.problem.control, len(normals)
+            up, down = own.support(gains), own.support(-gains)
+            high[:, :count], low[:, :count] = high[:, :count] + up, low[:, :count] + down
+            sums[:, :count] += np.maximum(np.abs(up), np.abs(down))
         return np.maximum(np.abs(high), np.abs(low)).max(axis=0), sums.max(axis=0)
 
     def _joined(self, nodes: list[float], pushed: Array) -> Array:

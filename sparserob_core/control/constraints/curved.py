@@ -19,6 +19,7 @@ from sparserob_core.control.response.enclosure import CELLS_KEPT, CellEnclosure,
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.parameters import ParameterIndex
+from sparserob_core.control.response.reference import Moving, Reference
 from sparserob_core.control.sets.directions import across, faces, on_surface, sampled, shares, unit
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
@@ -33,7 +34,7 @@ KEPT = 8  # separated constraints per round
 class CurvedConstraint(StateConstraint):
     """``x(t)`` in a curved set for all ``t`` in ``[start, stop]``, ``p`` and ``w``: ``c'x(t) <= h(c)`` for every
     direction ``c``, normalised such that ``h(c) - c'm = unit`` for the middle ``m`` of the set: what is exceeded is the
-    gauge of ``x(t)`` less 1, in multiples of ``unit``.
+    gauge of ``x(t)`` less 1, in multiples of ``unit``. A set with a ``reference`` moves: it holds ``x(t) - r(t)``.
 
     The index is ``(t, p, z)`` with ``z`` in ``[-1, 1]^b`` a direction, not normalised, in the coordinates of the set's
     `ConvexSet.frame`.
@@ -46,6 +47,7 @@ class CurvedConstraint(StateConstraint):
     stop: float
     parameters: ParameterIndex
     unit: float = 1.0
+    reference: Reference | None = None
     shared: CurvedConstraint | None = field(default=None, repr=False)
 
     @property
@@ -71,7 +73,10 @@ class CurvedConstraint(StateConstraint):
     ) -> tuple[Float[Array, " n"], Float[Array, "n d"], Float[Array, "n nu"], Float[Array, " n"]]:
         nu = self.parameters.count
         directions = unit(self.set, indices[:, 1 + nu :]) / self.unit
-        return indices[:, 0], directions, self.parameters.clamp(indices[:, 1 : 1 + nu]), self.set.support(directions)
+        rhs = self.set.support(directions)
+        if self.reference is not None:
+            rhs = rhs + (directions * self.reference.at(indices[:, 0])).sum(axis=1)
+        return indices[:, 0], directions, self.parameters.clamp(indices[:, 1 : 1 + nu]), rhs
 
     @shaped
     def violations(
@@ -174,7 +179,13 @@ class CurvedConstraint(StateConstraint):
         return across(self.set, z, states - self.set.support_point(directions) @ self.set.frame.T / self.unit)
 
     @shaped
-    def outwardness(self, states: Float[Array, "d n"]) -> Float[Array, " n"]:
+    def beside(self, x: Float[Array, " n"], times: Float[Array, " k"]) -> Float[Array, "k d"]:
+        still = np.zeros((times.size, self.set.dimension))
+        return still if self.reference is None else -self.reference.at(times)
+
+    @shaped
+    def outwardness(self, states: Float[Array, "d n"], beside: Float[Array, " d"] | None = None) -> Float[Array, " n"]:
+        states = states if beside is None else states + beside[:, None]
         sizes = self.set.gauge(states.T) - 1.0
         return sizes if np.isfinite(sizes).all() else self.set.violation(states.T)
 
@@ -192,8 +203,12 @@ class CurvedConstraint(StateConstraint):
             rhs, looseness = self._minorant(H, joined, nu)
             control = self.functionals.dictionary.control(x)
             cuts = self.parameters.cuts(low[:nu], high[:nu])
+            moving = None if self.reference is None else Moving(self.reference, H)
             remember(
-                self._cells, key, CellEnclosure(lifted, sigma, H, rhs, control, joined, looseness, cuts), CELLS_KEPT
+                self._cells,
+                key,
+                CellEnclosure(lifted, sigma, H, rhs, control, joined, looseness, cuts, moving),
+                CELLS_KEPT,
             )
         return self._cells[key]
 
@@ -235,6 +250,7 @@ class CurvedConstraint(StateConstraint):
         mine, other = self.functionals, given.functionals
         same = (
             given.set is self.set
+            and given.reference is self.reference
             and given.parameters is self.parameters
             and mine.response.propagator is other.response.propagator
             and mine.dictionary is other.dictionary
@@ -258,7 +274,14 @@ class CurvedConstraint(StateConstraint):
             return self._sharing._flat.from_state(self.functionals.response.initial_state)
         H = unit(self.set, sampled(self._b)) / self.unit
         return FlatConstraint(
-            self.name, self.functionals, H, self.set.support(H), self.start, self.stop, self.parameters
+            self.name,
+            self.functionals,
+            H,
+            self.set.support(H),
+            self.start,
+            self.stop,
+            self.parameters,
+            reference=self.reference,
         )
 
 

@@ -39,7 +39,8 @@ class TimedExplanation(Explanation):
     without control and uncertainty, ``sign`` -1 for a lower limit, ``sigma`` how far what is uncertain of disturbance
     and initial state (the ``cause``) moves it towards the limit, ``where`` the parameter in words. ``constraint``: the
     name of the constraint. Words say all of these, and the ``direction``, divided by ``scale``; ``names``: what the
-    states are called. ``deviation (d,)`` is that of ``begun`` from the centre of the initial states.
+    states are called. ``deviation (d,)`` is that of ``begun`` from the centre of the initial states. ``gain (m,)``: the
+    part of the normal on the control, of a mixed constraint, and ``piece`` the piece of the control that it looks at.
     """
 
     decides: ClassVar[str] = "control"
@@ -62,6 +63,8 @@ class TimedExplanation(Explanation):
     where: str = ""
     scale: float = 1.0
     names: Names = UNNAMED
+    gain: Array | None = None
+    piece: int | None = None
 
     def witness(self, worst: WorstConstraint) -> WorstConstraint:
         return Witness(
@@ -95,7 +98,8 @@ class TimedExplanation(Explanation):
         )
 
     def apart(self, other: Explanation, share: float, amount: float) -> str:
-        if not isinstance(other, TimedExplanation) or not (self.quantity and other.quantity):
+        known = isinstance(other, TimedExplanation) and self.quantity and other.quantity
+        if not isinstance(other, TimedExplanation) or not known or self.gain is not None or other.gain is not None:
             return super().apart(other, share, amount)
         rest = self.direction + share * other.direction
         rest = np.where(np.abs(rest) <= SAME * np.abs(self.direction).max(), 0.0, rest)
@@ -155,11 +159,15 @@ def explanation(
     time: float,
     parameter: Array,
     scale: float = 1.0,
+    mixed: tuple[Array, int] | None = None,
 ) -> TimedExplanation:
     """Row ``row`` of ``H x(t) <= h`` at a time and a parameter ``(nu,)``: what is bounded, when, and what the
-    uncertainty does to it; in words divided by ``scale``."""
+    uncertainty does to it; in words divided by ``scale``. ``mixed``: ``G (r, m)`` of ``H x + G u <= h``, and the piece
+    of the control."""
     direction, system = H[row], functionals.response.system
-    sign = -1.0 if np.count_nonzero(direction) == 1 and direction.sum() < 0 else 1.0
+    gain = None if mixed is None else mixed[0][row]
+    normal = direction if gain is None else np.concatenate([direction, gain])
+    sign = -1.0 if np.count_nonzero(normal) == 1 and normal.sum() < 0 else 1.0
     parts = functionals.parts(time, direction, parameter)
     sigma = parts.sigma
     free, limit = sign * parts.free + 0.0, sign * float(h[row])
@@ -170,7 +178,7 @@ def explanation(
     ]
     cause = " and ".join(names) or "disturbance"
     quantity, where = (
-        combination(sign * direction / scale, functionals.names, f"({time:.6g})"),
+        combination(sign * normal / scale, functionals.names, f"({time:.6g})", direction.size),
         system.describe(parameter) if parameter.size else "",
     )
     remarks = [f"the initial state gives {free / scale:.6g}"] if time <= 0 else []
@@ -179,7 +187,7 @@ def explanation(
     )
     remarks += [f"at {where}"] if where else []
     statement = f"{name}: {quantity} {'>=' if sign < 0 else '<='} {limit / scale:.6g}"
-    opposite = _opposite(H, h, row)
+    opposite = _opposite(H if mixed is None else np.hstack([H, mixed[0]]), h, row)
     return TimedExplanation(
         f"{statement} ({', '.join(remarks)})" if remarks else statement,
         name,
@@ -193,7 +201,7 @@ def explanation(
         cause,
         quantity=quantity,
         bound=_bound(
-            combination(sign * direction / scale, functionals.names),
+            combination(sign * normal / scale, functionals.names, states=direction.size),
             limit / scale,
             None if opposite is None else opposite / scale,
             sign,
@@ -205,18 +213,21 @@ def explanation(
         where=where,
         scale=scale,
         names=functionals.names,
+        gain=gain,
+        piece=None if mixed is None else mixed[1],
     )
 
 
-def combination(direction: Array, names: Names, suffix: str = "") -> str:
-    """``c'x`` in words, such as ``x1(5)`` or ``x1(5) - 0.5 x2(5)``; the suffix stands behind every state's name."""
+def combination(direction: Array, names: Names, suffix: str = "", states: int | None = None) -> str:
+    """``c'x`` in words, such as ``x1(5)`` or ``x1(5) - 0.5 x2(5)``; the suffix stands behind every state's name. What
+    is beyond the number of ``states`` is the control's, such as ``u1(5)``."""
+    last = direction.size if states is None else states
     parts: list[str] = []
     for state in np.flatnonzero(direction):
         size = abs(direction[state])
         sign = "-" if direction[state] < 0 else "+" if parts else ""
-        parts.append(
-            f"{sign}{' ' if parts else ''}{'' if size == 1 else f'{size:.4g} '}{names.state(int(state))}{suffix}"
-        )
+        name = names.state(int(state)) if state < last else names.control(int(state) - last)
+        parts.append(f"{sign}{' ' if parts else ''}{'' if size == 1 else f'{size:.4g} '}{name}{suffix}")
     return " ".join(parts) or "0"
 
 

@@ -14,11 +14,13 @@ from sparserob_core.control.constraints.local_maxima import TINY, climb, local_m
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.matrix_exponential import transitions
+from sparserob_core.control.problem.problem import MixedConstraint
 from sparserob_core.control.response.enclosure import CELLS_KEPT, CellEnclosure, enclose
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.initial_support import Supports
 from sparserob_core.control.response.lifted import LiftedSystem, lift
 from sparserob_core.control.response.parameters import ParameterIndex
+from sparserob_core.control.response.reference import Direct, Moving, Reference
 from sparserob_core.control.response.response import Response, distinct_times
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box
@@ -44,6 +46,8 @@ class Samples:
     h: Array
     window: tuple[float, float]
     parameters: ParameterIndex
+    reference: Reference | None = None
+    gains: Array | None = None
     _supports: dict[bytes, Supports | None] = field(default_factory=dict, repr=False)
 
     def serve(self, constraint: FlatConstraint) -> bool:
@@ -58,7 +62,26 @@ class Samples:
             and self.h is constraint.h
             and self.window == (constraint.start, constraint.stop)
             and self.parameters is constraint.parameters
+            and self.reference is constraint.reference
+            and self.gains is constraint.gains
         )
+
+    @cached_property
+    def proven(self) -> int:
+        """How many of the rows there are to be proven: those of a mixed constraint are there twice, for both values of
+        a control that jumps."""
+        return self.h.size if self.gains is None else self.h.size // 2
+
+    @cached_property
+    def cuts(self) -> Array:
+        """Times inside the window at which anything turns or jumps: breakpoints of the grid, kinks of a reference, and
+        where the commanded control of a mixed constraint changes."""
+        start, stop = self.window
+        found = [self._response.grid.breakpoints]
+        found += [] if self.reference is None else [self.reference.times]
+        found += [] if self.gains is None else [self.functionals.dictionary.breakpoints]
+        every = np.concatenate(found)
+        return np.unique(every[(every > start) & (every < stop)])
 
     @cached_property
     def times(self) -> Array:
@@ -68,8 +91,13 @@ class Samples:
         counts = np.clip(np.ceil(pace * grid.lengths / SMOOTH), INSIDE + 1, MOST_INSIDE).astype(int)
         which = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
         inside = np.repeat(grid.breakpoints[:-1], counts) + which * np.repeat(grid.lengths / counts, counts)
-        inside = inside[(inside > start) & (inside < stop)]
-        return distinct_times(np.concatenate([[start], inside, [stop]]), float(grid.breakpoints[-1]))
+        inside = np.concatenate([inside[(inside > start) & (inside < stop)], self.cuts])
+        return self.apart(np.concatenate([[start], inside, [stop]]))
+
+    def apart(self, times: Array) -> Array:
+        """The times in increasing order, those closer than rounding as one; not where a control may jump between."""
+        horizon = float(self._response.grid.breakpoints[-1])
+        return np.unique(times) if self.gains is not None else distinct_times(times, horizon)
 
     @cached_property
     def lattice(self) -> tuple[Array, tuple[int, ...]]:
@@ -82,7 +110,9 @@ class Samples:
         points, _ = self.lattice
         if not self.functionals.disturbed:
             return np.broadcast_to(self.h[None, :, None], (points.shape[0], self.h.size, self.times.size))
-        return self.h[None, :, None] - np.stack([self.functionals.profile(self.times, self.H, p).T for p in points])
+        H, copies = self.H[: self.proven], self.h.size // max(1, self.proven)
+        sigma = np.stack([self.functionals.profile(self.times, H, p).T for p in points])
+        return self.h[None, :, None] - np.tile(sigma, (1, copies, 1))
 
     @cached_property
     def steps(self) -> tuple[np.ndarray, Array, Array]:
@@ -101,7 +131,8 @@ class Samples:
         """What the uncertainty adds over a cell of parameters, remembered."""
         key = low.tobytes() + high.tobytes()
         if key not in self._supports:
-            remember(self._supports, key, self.functionals.support_over(lifted, self.H), CELLS_KEPT)
+            support = self.functionals.support_over(lifted, self.H[: self.proven])
+            remember(self._supports, key, support, CELLS_KEPT)
         return self._supports[key]
 
     @property
@@ -112,9 +143,11 @@ class Samples:
 @final
 @dataclass(frozen=True, eq=False)
 class FlatConstraint(StateConstraint):
-    """``H x(t) <= h`` for all ``t`` in ``[start, stop]``, ``p`` and ``w``; the index is ``(t, p)``.
+    """``H (x(t) - r(t)) + G u(t) <= h`` for all ``t`` in ``[start, stop]``, ``p`` and ``w``; the index is ``(t, p)``.
 
-    ``H (r, d)``, ``h (r,)``. A terminal constraint is the window ``[T, T]``.
+    ``H (r, d)``, ``h (r,)``; ``reference``: ``r``, of a set that moves; ``gains (r, m)``: ``G``, of a mixed constraint,
+    whose rows are there twice (`twofold`): the second half looks at the control that follows a jump. A terminal
+    constraint is the window ``[T, T]``.
     """
 
     name: str
@@ -125,13 +158,27 @@ class FlatConstraint(StateConstraint):
     stop: float
     parameters: ParameterIndex
     shared: Samples | None = field(default=None, repr=False)
+    reference: Reference | None = None
+    gains: Array | None = None
+
+    @staticmethod
+    def twofold(
+        name: str, functionals: WorstCase, entry: MixedConstraint, stop: float, parameters: ParameterIndex
+    ) -> FlatConstraint:
+        """A mixed constraint, with its rows for the control before and after a jump."""
+        H, h = entry.set.halfspaces()
+        rows, d = np.vstack([H, H]), np.asarray(entry.H).shape[1]
+        return FlatConstraint(
+            name, functionals, rows[:, :d], np.tile(h, 2), entry.start, stop, parameters, gains=rows[:, d:]
+        )
 
     @cached_property
     def samples(self) -> Samples:
         """What does not depend on the initial state; the ``shared`` ones where they are of this constraint."""
         if self.shared is not None and self.shared.serve(self):
             return self.shared
-        return Samples(self.functionals, self.H, self.h, (self.start, self.stop), self.parameters)
+        window = (self.start, self.stop)
+        return Samples(self.functionals, self.H, self.h, window, self.parameters, self.reference, self.gains)
 
     @property
     @shaped
@@ -148,15 +195,16 @@ class FlatConstraint(StateConstraint):
 
     @shaped
     def divided(self, units: Float[Array, " r"]) -> FlatConstraint:
-        return replace(self, H=self.H / units[:, None], h=self.h / units, shared=None)
+        gains = None if self.gains is None else self.gains / units[:, None]
+        return replace(self, H=self.H / units[:, None], h=self.h / units, gains=gains, shared=None)
 
     @shaped
     def functionals_at(
         self, indices: Float[Array, "k j"]
     ) -> tuple[Float[Array, " n"], Float[Array, "n d"], Float[Array, "n nu"], Float[Array, " n"]]:
         parameters = np.repeat(self.parameters.clamp(indices[:, 1:]), self.h.size, axis=0)
-        count = indices.shape[0]
-        return np.repeat(indices[:, 0], self.h.size), np.tile(self.H, (count, 1)), parameters, np.tile(self.h, count)
+        count, rhs = indices.shape[0], self.h[None] - self._moved(indices[:, 0])
+        return np.repeat(indices[:, 0], self.h.size), np.tile(self.H, (count, 1)), parameters, rhs.ravel()
 
     @shaped
     def violations(
@@ -164,7 +212,41 @@ class FlatConstraint(StateConstraint):
     ) -> Float[Array, " k"]:
         parameters = self.parameters.clamp(indices[:, 1:])
         answer: Array = self.functionals.values(x, indices[:, 0], self.H[rows], parameters) - self.h[rows]
+        if self.reference is None and self.gains is None:
+            return answer
+        answer += self.beside(x, indices[:, 0])[np.arange(rows.size), rows]
         return answer
+
+    @shaped
+    def beside(self, x: Float[Array, " n"], times: Float[Array, " k"]) -> Float[Array, "k r"]:
+        added = self._moved(times)
+        if self.gains is not None:
+            control = self.functionals.dictionary.control(x)[:, self._commanded(times)]
+            added = added + np.einsum("rm,mkr->kr", self.gains, control)
+        return added
+
+    @shaped
+    def direct(self, times: Float[Array, " k"]) -> Float[Array, "q n"] | None:
+        if self.gains is None:
+            return None
+        values = self.functionals.dictionary.values[:, self._commanded(times)]
+        return np.asarray(np.einsum("rm,nkr->krmn", self.gains, values).reshape(times.size * self.h.size, -1))
+
+    @shaped
+    def _moved(self, times: Float[Array, " k"]) -> Float[Array, "k r"]:
+        """``-H r(t)``."""
+        if self.reference is None:
+            return np.zeros((times.size, self.h.size))
+        return Moving(self.reference, self.H).at(times)
+
+    @shaped
+    def _commanded(self, times: Float[Array, " k"]) -> Int[np.ndarray, "k r"]:
+        """The piece of the control's dictionary that every row looks at: the first half the one that a time ends or is
+        in, the second half the one that it begins or is in; among those that meet the window in positive length."""
+        ends = self.functionals.dictionary.breakpoints
+        first, last = np.searchsorted(ends, self.start, side="right") - 1, np.searchsorted(ends, self.stop) - 1
+        pieces = np.stack([np.searchsorted(ends, times, side=side) - 1 for side in ("left", "right")], axis=1)
+        return np.repeat(np.clip(pieces, first, last), self.h.size // 2, axis=1)
 
     @shaped
     def worst(self, x: Float[Array, " n"]) -> Separation:
@@ -193,21 +275,26 @@ class FlatConstraint(StateConstraint):
             if unsure.size:
                 indices[unsure], found[unsure] = self._refined(x, indices[unsure], rows[unsure])
         order = np.argsort(-found, kind="stable")
+        if self.gains is not None:  # where nothing jumps, both halves of the rows say the same
+            pieces = self._commanded(indices[order, 0])
+            order = order[(rows[order] < self.samples.proven) | (pieces[:, 0] != pieces[:, -1])]
         return Separation(indices[order], rows[order], found[order])
 
     @shaped
     def explain(self, index: Float[Array, " j"], row: int) -> Explanation:
         time, parameter = float(index[0]), self.parameters.clamp(index[None, 1:])[0]
-        return explanation(self.name, self.functionals, self.H, self.h, row, time, parameter)
+        allowed = self.h - self._moved(index[:1])[0]
+        if self.gains is None:
+            return explanation(self.name, self.functionals, self.H, allowed, row, time, parameter)
+        mixed = (self.gains, int(self._commanded(index[:1])[0, row]))
+        return explanation(self.name, self.functionals, self.H, allowed, row, time, parameter, mixed=mixed)
 
     def nominal(self) -> FlatConstraint:
-        known = self.functionals.nominal()
-        return FlatConstraint(self.name, known, self.H, self.h, self.start, self.stop, ParameterIndex(None))
+        return replace(self, functionals=self.functionals.nominal(), parameters=ParameterIndex(None), shared=None)
 
     @shaped
     def from_state(self, initial_state: Float[Array, " d"]) -> FlatConstraint:
-        moved = self.functionals.from_state(initial_state)
-        return FlatConstraint(self.name, moved, self.H, self.h, self.start, self.stop, self.parameters, self.samples)
+        return replace(self, functionals=self.functionals.from_state(initial_state), shared=self.samples)
 
     @shaped
     def directions(
@@ -216,19 +303,16 @@ class FlatConstraint(StateConstraint):
         return self.H[rows][:, None], np.ones((rows.size, 1))
 
     @shaped
-    def outwardness(self, states: Float[Array, "d n"]) -> Float[Array, " n"]:
-        return np.asarray((self.H @ states - self.h[:, None]).max(axis=0))
+    def outwardness(self, states: Float[Array, "d n"], beside: Float[Array, " r"] | None = None) -> Float[Array, " n"]:
+        allowed = self.h if beside is None else self.h - beside
+        return np.asarray((self.H @ states - allowed[:, None]).max(axis=0))
 
     @property
     @shaped
     def cells(self) -> tuple[Float[Array, "k j"], Float[Array, "k j"]]:
-        """The window cut at the breakpoints, times the whole box of parameters: ``(lower, upper)``, ``(k, 1 + nu)``
-        each."""
-        breaks = self.functionals.response.grid.breakpoints
-        points = distinct_times(
-            np.concatenate([[self.start], breaks[(breaks > self.start) & (breaks < self.stop)], [self.stop]]),
-            breaks[-1],
-        )
+        """The window cut wherever anything turns or jumps, times the whole box of parameters: ``(lower, upper)``,
+        ``(k, 1 + nu)`` each."""
+        points = self.samples.apart(np.concatenate([[self.start], self.samples.cuts, [self.stop]]))
         starts, stops = (points[:-1], points[1:]) if points.size > 1 else (points, points)
         box = self.index_set
         return (
@@ -263,18 +347,23 @@ class FlatConstraint(StateConstraint):
         if key not in self._cells:
             lifted = self.lifted(low, high)
             control = self.functionals.dictionary.control(x)
-            rhs = np.zeros((self.h.size, lifted.space.size))
-            rhs[:, 0] = self.h
+            rows = self.samples.proven
+            rhs, H = np.zeros((rows, lifted.space.size)), self.H[:rows]
+            rhs[:, 0] = self.h[:rows]
+            moving = None if self.reference is None else Moving(self.reference, H)
+            direct = None if self.gains is None else Direct(self.gains[:rows], self.functionals.dictionary, control)
             remember(
                 self._cells,
                 key,
                 CellEnclosure(
                     lifted,
                     self.samples.support_over(lifted, low, high),
-                    self.H,
+                    H,
                     rhs,
                     control,
                     cuts=self.parameters.cuts(low, high),
+                    moving=moving,
+                    direct=direct,
                 ),
                 CELLS_KEPT,
             )
@@ -311,7 +400,8 @@ class FlatConstraint(StateConstraint):
             "vtij,vtj->vti", driven, drive[:, pieces]
         )
         answer: Array = np.einsum("ri,vti->vrt", self.H, states) - self.samples.margins
-        return answer
+        beside = self.reference is not None or self.gains is not None
+        return answer + self.beside(x, self.times).T if beside else answer
 
     @shaped
     def _refined(

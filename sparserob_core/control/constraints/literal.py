@@ -60,6 +60,8 @@ class LiteralConstraint:
         per_index = times.size // indices.shape[0]
         signals = np.repeat(self._signals(beta), per_index, axis=0)
         G, offset = self.base.functionals.rows_under(times, directions, parameters, signals)
+        direct = self.base.direct(reduced[:, 0])
+        G = G if direct is None else G + direct
         shape = (indices.shape[0], per_index)
         return G.reshape(*shape, -1), (rhs - offset).reshape(shape)
 
@@ -89,8 +91,10 @@ class LiteralConstraint:
     def steepest(self, x: Array, indices: Array, rows: np.ndarray) -> Separation:
         """The worst disturbance of every index for one row, ``rows (k,)``; for -1 of the row that is violated most."""
         reduced, beta = self._split(np.asarray(indices, dtype=float))
-        times, directions, parameters, rhs = self.base.functionals_at(reduced)
-        values = (self.base.functionals.values(x, times, directions, parameters) - rhs).reshape(len(reduced), -1)
+        times, directions, parameters, _ = self.base.functionals_at(reduced)
+        r = times.size // len(reduced)
+        values = self.base.violations(x, np.repeat(reduced, r, axis=0), np.tile(np.arange(r), len(reduced)))
+        values = values.reshape(len(reduced), r)
         chosen = np.where(rows >= 0, rows, values.argmax(axis=1))
         pick = np.arange(chosen.size) * values.shape[1] + chosen
         blocks = self.base.functionals.worst_blocks(times[pick], directions[pick], parameters[pick])

@@ -20,7 +20,8 @@ BLOCK = 2_000_000  # sampled violations that are held at once
 
 @dataclass(frozen=True, eq=False)
 class ScenarioConstraint:
-    """``H x(t) <= h`` for all times of a window and for ``S`` samples only; the index is ``(t, sample number)``.
+    """``H x(t) <= h`` for all times of a window and for ``S`` samples only, with what the ``base`` has beside the
+    state; the index is ``(t, sample number)``.
 
     ``H (r, d)``, ``h (r,)`` are the sides of the constraint ``base``; ``disturbances (S, mw, L)`` on the pieces of the
     merged grid or ``None``; ``parameters (S, nu)``; ``deviations (S, d)`` of the initial state or ``None``.
@@ -54,7 +55,9 @@ class ScenarioConstraint:
         signals = None if self.disturbances is None else self.disturbances[which]
         begun = np.zeros(directions.shape) if self.deviations is None else self.deviations[which]
         G, offset = self.base.functionals.rows_under(times, directions, self.parameters[which], signals, begun)
-        return G.reshape(k, r, -1), self.h - offset.reshape(k, r)
+        direct, still = self.base.direct(indices[:, 0]), np.zeros(self.base.functionals.variables)
+        G = G if direct is None else G + direct
+        return G.reshape(k, r, -1), self.h - self.base.beside(still, indices[:, 0]) - offset.reshape(k, r)
 
     def worst(self, x: Array) -> Separation:
         """Local maxima in time of the worst sample's violation, at the breakpoints and between them."""
@@ -70,11 +73,13 @@ class ScenarioConstraint:
 
     def _worst_samples(self, x: Array) -> tuple[Array, np.ndarray]:
         """Largest violation over the samples, ``(r, times)``, and the sample that has it."""
+        beside = self.base.beside(x, self._times).T
         if self.parameters.shape[1] == 0:
             margins, sample = self._known
             undisturbed = self._states(x, slice(0, 1), None, None)[0]
-            return self.H @ undisturbed.T - margins, sample
-        return self._maximum(lambda part: self._states(x, part, self.disturbances, self.deviations))
+            return self.H @ undisturbed.T - margins + beside, sample
+        values, sample = self._maximum(lambda part: self._states(x, part, self.disturbances, self.deviations))
+        return values + beside, sample
 
     @cached_property
     def _known(self) -> tuple[Array, np.ndarray]:

@@ -95,12 +95,12 @@ class Functional:
 class Sensitivity:
     """The derivatives of ``max_w c'x(t) - h(c)`` in the index, at a decision.
 
-    Time: ``c'(A x + B u + E w)``. Inputs jump at breakpoints, so the constraint, and with it the value of a relaxed
-    program, has kinks there: the derivative is the one from the left, except at the start of the window, where it is
-    the one from the right. Parameters: the functional is propagated together with its derivatives (`tangent`), and
-    through the map of a box onto a set that is not one (`ParameterIndex.pulled_back`). Direction ``z``: the state less
-    the support point of ``c``, across ``z``; 0 at ``z = 0``. Where the worst disturbance (or the support point) is not
-    unique there is a kink too, and the derivative is that of one of them.
+    Time: ``c'(A x + B u + E w - r')``. Inputs jump at breakpoints, so the constraint, and with it the value of a
+    relaxed program, has kinks there: the derivative is the one from the left, except at the start of the window, where
+    it is the one from the right. Parameters: the functional is propagated together with its derivatives (`tangent`),
+    and through the map of a box onto a set that is not one (`ParameterIndex.pulled_back`). Direction ``z``: the state
+    less the support point of ``c``, across ``z``; 0 at ``z = 0``. Where the worst disturbance (or the support point) is
+    not unique there is a kink too, and the derivative is that of one of them.
 
     Measurable disturbances: the derivative in time is in closed form, ``h_W(E'e^{A't} c)`` for the support function;
     those in parameters and directions are differences of the support function, two tables of integrals for each.
@@ -143,6 +143,12 @@ class Sensitivity:
         if closed:
             sigma = self._sigma_slopes(times[:, 0], parameters, at)
             in_time, in_parameters, states = in_time + sigma[0], in_parameters + sigma[1], states + sigma[2]
+        reference = self.constraint.reference
+        if reference is not None:
+            in_time = (
+                in_time - (at.direction * reference.slope(times[:, 0], self.constraint.start)).sum(axis=1)[:, None]
+            )
+            states = states - np.einsum("kbd,kd->kb", at.directions, reference.at(times[:, 0]))
         in_parameters = self.constraint.parameters.pulled_back(points, in_parameters)
         in_direction = self.constraint.turned(z, at.direction, states)
         return np.hstack([in_time, in_parameters, in_direction]), weights

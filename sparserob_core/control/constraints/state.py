@@ -8,14 +8,16 @@ import numpy as np
 
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
+from sparserob_core.control.response.reference import Reference
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.program import Enclosure, Explanation, Separation
 
 
 class StateConstraint(ABC):
-    """``c'x(t) <= h(c)`` for all ``t`` in ``[start, stop]``, parameters and disturbances, and for the normals ``c`` of
-    a convex set. A terminal constraint is the window ``[T, T]``.
+    """``c'(x(t) - r(t)) + g'u(t) <= h(c)`` for all ``t`` in ``[start, stop]``, parameters and disturbances, and for the
+    normals ``c`` of a convex set, ``r`` its ``reference`` where it moves; ``g = 0`` but for mixed constraints. A
+    terminal constraint is the window ``[T, T]``.
 
     An index is ``(t, p)``, followed by a direction ``z (b,)`` where the set is curved; at each there are ``r`` rows.
     The disturbance is maximised in closed form (`WorstCase`), so the formulation is the reduced one.
@@ -26,6 +28,9 @@ class StateConstraint(ABC):
     start: float
     stop: float
     parameters: ParameterIndex
+    reference: Reference | None = None
+    gains: Array | None = None
+    """``G (r, m)`` of a mixed constraint."""
 
     @property
     @abstractmethod
@@ -101,20 +106,40 @@ class StateConstraint(ABC):
         return z
 
     @abstractmethod
-    def outwardness(self, states: Float[Array, "d n"]) -> Float[Array, " n"]:
-        """A cheap measure ``(n,)`` of states ``(d, n)``: positive outside the set, not positive inside, growing
-        outwards."""
+    def beside(self, x: Float[Array, " n"], times: Float[Array, " k"]) -> Float[Array, "k j"]:
+        """What is added at times ``(k,)``, for a decision ``x (n,)``: to the rows of a set with flat sides, ``(k, r)``,
+        ``G u(t) - H r(t)``; to the state for a curved one, ``(k, d)``, ``-r(t)``."""
+
+    @abstractmethod
+    def outwardness(self, states: Float[Array, "d n"], beside: Float[Array, " j"] | None = None) -> Float[Array, " n"]:
+        """A cheap measure ``(n,)`` of states ``(d, n)`` at one time, with what is `beside` them: positive outside the
+        set, not positive inside, growing outwards."""
 
     @shaped
-    def excess(self, states: Float[Array, "d n"]) -> Float[Array, " n"]:
+    def excess(self, states: Float[Array, "d n"], beside: Float[Array, " j"] | None = None) -> Float[Array, " n"]:
         """By how much states ``(d, n)`` violate the constraint, ``(n,)``; negative: a margin. With flat sides the
         `outwardness` itself."""
-        return self.outwardness(states)
+        return self.outwardness(states, beside)
+
+    @shaped
+    def direct(self, times: Float[Array, " k"]) -> Float[Array, "q n"] | None:
+        """What the control adds by itself to all rows at times ``(k,)``, as rows ``(k r, n)`` of the decision, time by
+        time; ``None`` where it adds nothing."""
+        return None
+
+    @shaped
+    def normals_at(self, index: Float[Array, " j"]) -> Float[Array, "r q"]:
+        """The normals of all rows at one index, those of a mixed constraint with their part on the control,
+        ``(r, d + m)``."""
+        directions, gains = self.functionals_at(index[None])[1], self.gains
+        return directions if gains is None else np.hstack([directions, gains])
 
     @shaped
     def rows(self, indices: Float[Array, "k j"]) -> tuple[Float[Array, "k r n"], Float[Array, "k r"]]:
         """``G (k, r, n)``, ``rhs (k, r)`` at indices ``(k, ...)``."""
         times, directions, parameters, rhs = self.functionals_at(indices)
         G, offset = self.functionals.rows(times, directions, parameters)
+        direct = self.direct(indices[:, 0])
+        G = G if direct is None else G + direct
         shape = (indices.shape[0], times.size // max(1, indices.shape[0]))
         return G.reshape(*shape, G.shape[1]), (rhs - offset).reshape(shape)

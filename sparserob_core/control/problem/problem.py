@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy.typing as npt
 from sparserob_core.control.problem.cost import Cost
 from sparserob_core.control.problem.names import UNNAMED, Names
 from sparserob_core.control.problem.system import LinearSystem
-from sparserob_core.control.sets.sets import Equality
+from sparserob_core.control.sets.sets import Equality, Polytope
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound
 
@@ -27,12 +28,39 @@ DisturbanceClass: TypeAlias = Literal["piecewise_constant", "measurable", "l1_ba
 
 @dataclass(frozen=True, eq=False)
 class PathConstraint:
-    """The state stays in ``set`` for all times in ``[start, stop]``; ``stop`` is the horizon when ``None``."""
+    """The state stays in ``set`` for all times in ``[start, stop]``; ``stop`` is the horizon when ``None``.
+
+    ``relative_to (q, 1 + d)``: rows of a time and a point, times increasing: then ``x(t) - r(t)`` stays in the set,
+    where ``r`` runs from point to point along straight lines. The times cover the window.
+    """
 
     set: ConvexSet
     start: float = 0.0
     stop: float | None = None
     name: str | None = None
+    relative_to: npt.ArrayLike | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class MixedConstraint:
+    """``H x(t) + G u(t) <= h`` for all times in ``[start, stop]``; ``H (r, d)``, ``G (r, m)``, ``h (r,)``, a number for
+    all rows alike; ``stop`` is the horizon when ``None``.
+
+    It holds on every piece of the control that meets the window in positive length, its ends included, with the control
+    of that piece: where the control jumps, with both of its values. ``u(t)`` is the commanded control, delay or not.
+    """
+
+    H: npt.ArrayLike
+    G: npt.ArrayLike
+    h: npt.ArrayLike
+    start: float = 0.0
+    stop: float | None = None
+    name: str | None = None
+
+    @cached_property
+    def set(self) -> Polytope:
+        """The set of all ``(x, u)`` that are allowed, ``d + m`` coordinates."""
+        return Polytope(np.hstack([np.asarray(self.H), np.asarray(self.G)]), np.asarray(self.h))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -41,8 +69,8 @@ class OptimalControlProblem:
     and every parameter
 
     ``x' = A(p) x + B(p) u + E(p) w + c(p)``, ``x(0) = initial_state (d,)``, ``u(t)`` in ``control``, ``x(t)`` in every
-    ``path`` set during its window, and ``x(T)`` in every ``terminal`` set, where ``T = horizon`` (in the time unit of
-    the system).
+    ``path`` set during its window (or ``(x(t), u(t))``: `MixedConstraint`), and ``x(T)`` in every ``terminal`` set,
+    where ``T = horizon`` (in the time unit of the system).
 
     ``disturbance``: the bounded set of ``w``, or ``None``; ``disturbance_class`` says which functions it makes:
     ``piecewise_constant`` (every piece of the disturbance's dictionary in the set), ``measurable`` (any measurable
@@ -68,7 +96,7 @@ class OptimalControlProblem:
     weights: npt.ArrayLike | None = None
     disturbance: ConvexSet | None = None
     disturbance_class: DisturbanceClass = "piecewise_constant"
-    path: Sequence[PathConstraint | ConvexSet] = ()
+    path: Sequence[PathConstraint | MixedConstraint | ConvexSet] = ()
     terminal: Sequence[ConvexSet | Equality] = ()
     title: str = ""
     initial_control: npt.ArrayLike | None = None
@@ -180,13 +208,13 @@ class OptimalControlProblem:
             raise InputError(path="names", expected="Names(states=[...], ...)", got=f"{type(self.names).__name__}")
         self.names.fitting(self.system.states, self.system.controls, self.system.disturbances)
 
-    def _windowed(self, where: str, entry: object) -> PathConstraint:
-        item = (
-            entry
-            if isinstance(entry, PathConstraint)
-            else PathConstraint(_checked_set(where, entry, self.system.states, "states"))
-        )
-        _checked_set(where, item.set, self.system.states, "states")
+    def _windowed(self, where: str, entry: object) -> PathConstraint | MixedConstraint:
+        item: PathConstraint | MixedConstraint
+        if isinstance(entry, MixedConstraint):
+            item = _checked_mixed(f"{where}.mixed", entry, self.system)
+        else:
+            item = entry if isinstance(entry, PathConstraint) else PathConstraint(entry)  # type: ignore[arg-type]
+            _checked_set(where, item.set, self.system.states, "states")
         start, stop = float(item.start), self.horizon if item.stop is None else float(item.stop)
         if not 0.0 <= start <= stop <= self.horizon:
             raise InputError(
@@ -194,7 +222,19 @@ class OptimalControlProblem:
                 expected=f"0 <= from <= to <= {self.horizon:g} (the horizon)",
                 got=f"from {start:g} to {stop:g}",
             )
-        return replace(item, start=start, stop=stop)
+        if isinstance(item, MixedConstraint):
+            if stop - start <= SHORTEST * self.horizon:
+                expected = "a window of positive length, since a control lasts"
+                raise InputError(path=where, expected=expected, got=f"from {start:g} to {stop:g}")
+            return replace(item, start=start, stop=stop)
+        if item.relative_to is None:
+            return replace(item, start=start, stop=stop)
+        where, slack = f"{where}.relative_to", SHORTEST * self.horizon
+        moved = _reference(where, item.relative_to, self.system.states)
+        if moved[0, 0] > start + slack or moved[-1, 0] < stop - slack:
+            expected = f"rows whose times cover the window, {start:g} to {stop:g}"
+            raise InputError(path=where, expected=expected, got=f"{moved[0, 0]:g} to {moved[-1, 0]:g}")
+        return replace(item, start=start, stop=stop, relative_to=moved)
 
     def _terminal(self) -> list[ConvexSet | Equality]:
         kept: list[ConvexSet | Equality] = []
@@ -222,7 +262,7 @@ class ProblemFactory(ABC):
 
 
 def _listed(name: str, value: object) -> list[object]:
-    if isinstance(value, ConvexSet | PathConstraint | Equality):
+    if isinstance(value, ConvexSet | PathConstraint | MixedConstraint | Equality):
         return [value]
     if not isinstance(value, Sequence):
         raise InputError(path=name, expected="a list of sets", got=f"{type(value).__name__}")
@@ -245,6 +285,46 @@ def _checked_set(name: str, value: object, dimension: int, of: str, bounded: boo
     if bounded and not value.is_bounded:
         raise InputError("the set must be bounded", path=name)
     return value
+
+
+def _checked_mixed(where: str, entry: MixedConstraint, system: LinearSystem) -> MixedConstraint:
+    """With arrays of the right shapes, and a set of ``(x, u)`` that is not empty."""
+    H, G = (
+        _matrix(f"{where}.{name}", rows, f"rows of {columns} finite numbers, one per {of}", columns)
+        for name, rows, columns, of in (
+            ("H", entry.H, system.states, "state"),
+            ("G", entry.G, system.controls, "control"),
+        )
+    )
+    if len(G) != len(H):
+        raise InputError(path=f"{where}.G", expected=f"{len(H)} rows, as H has", got=f"{len(G)}")
+    h = as_bound(f"{where}.h", entry.h, len(H))
+    if np.isneginf(h).any():
+        raise InputError(path=f"{where}.h", expected="numbers above -inf", got=f"{h.tolist()}")
+    found = replace(entry, H=H, G=G, h=h)
+    try:
+        _ = found.set
+    except InputError as error:
+        raise InputError(error.sentence, path=where) from None
+    return found
+
+
+def _matrix(where: str, rows: object, expected: str, columns: int) -> Array:
+    try:
+        matrix = np.array(rows, dtype=float)
+    except (TypeError, ValueError):
+        matrix = np.zeros(0)
+    if matrix.ndim != 2 or matrix.shape[1] != columns or not matrix.size or not np.isfinite(matrix).all():
+        raise InputError(path=where, expected=expected, got=f"{rows!r}")
+    return matrix
+
+
+def _reference(where: str, rows: object, states: int) -> Array:
+    """Rows of a time and a point, ``(q, 1 + d)``."""
+    moved = _matrix(where, rows, f"rows of {1 + states} finite numbers, a time and a point each", 1 + states)
+    if (np.diff(moved[:, 0]) <= 0.0).any():
+        raise InputError(path=where, expected="rows whose times increase", got=f"times {moved[:, 0].tolist()}")
+    return moved
 
 
 def _restricts_nothing(value: ConvexSet) -> bool:

@@ -8,9 +8,9 @@ from typing import final
 import numpy as np
 
 from sparserob_core.control.problem.dictionary import Dictionary
-from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
 from sparserob_core.control.problem.system import LinearSystem
-from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.convex_set import Array, ConvexSet
 
 OFFSET = 0.26535897932384626  # irrational: numbers that people choose are not at the edge between two powers of two
 
@@ -52,7 +52,7 @@ class Units:
             weights=np.asarray(problem.weights) * self.controls * self.time / self.cost,
             disturbance=None if problem.disturbance is None else problem.disturbance.in_units(self.disturbances),
             disturbance_class=problem.disturbance_class,
-            path=[self._window(entry) for entry in problem.path if isinstance(entry, PathConstraint)],
+            path=[self._window(entry) for entry in problem.path if not isinstance(entry, ConvexSet)],
             terminal=[end.in_units(self.states) for end in problem.terminal],
             title=problem.title,
             cost=problem.cost.in_units(self.states, self.controls, self.time, self.cost),
@@ -63,9 +63,14 @@ class Units:
             names=problem.names,
         )
 
-    def _window(self, entry: PathConstraint) -> PathConstraint:
-        stop = None if entry.stop is None else entry.stop / self.time
-        return replace(entry, set=entry.set.in_units(self.states), start=entry.start / self.time, stop=stop)
+    def _window(self, entry: PathConstraint | MixedConstraint) -> PathConstraint | MixedConstraint:
+        start, stop = entry.start / self.time, None if entry.stop is None else entry.stop / self.time
+        if isinstance(entry, MixedConstraint):
+            H, G = np.asarray(entry.H) * self.states, np.asarray(entry.G) * self.controls
+            return replace(entry, H=H, G=G, start=start, stop=stop)
+        moved = entry.relative_to
+        moved = None if moved is None else np.asarray(moved) / np.concatenate([[self.time], self.states])
+        return replace(entry, set=entry.set.in_units(self.states), start=start, stop=stop, relative_to=moved)
 
     def of_system(self, system: LinearSystem) -> LinearSystem:
         """``x' = A x + B u + E w + c`` with all of it in these units."""

@@ -23,6 +23,7 @@ from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.enclosures.valid_inequalities import Cuts
 from sparserob_core.control.response.initial_support import Supports
 from sparserob_core.control.response.lifted import LiftedSystem
+from sparserob_core.control.response.reference import Direct, Moving
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.program import Enclosure
@@ -46,7 +47,8 @@ class CellEnclosure:
     ``H (r, d)``; ``rhs (r', M')``, polynomials over the cell; ``control (m, K)`` on the pieces of the control's
     dictionary. Without a combination every row of ``H`` is a constraint (``r' = r``, ``M' = M``); with one they are the
     parts of a single constraint. ``looseness (nu',)``: how far ``rhs`` may be below the truth at the ends of every
-    coordinate; it only guides the halving. ``cuts``: beyond them the cell holds no parameters.
+    coordinate; it only guides the halving. ``cuts``: beyond them the cell holds no parameters. ``moving``,
+    ``direct``: what is added to the rows, linear in time or constant on every cell of times.
     """
 
     lifted: LiftedSystem
@@ -57,6 +59,8 @@ class CellEnclosure:
     combination: Combination | None = None
     looseness: Array | float = 0.0
     cuts: Cuts | None = None
+    moving: Moving | None = None
+    direct: Direct | None = None
 
     def bounds(self, start: Array, stop: Array) -> tuple[Array, Array, Array]:
         """For time cells ``[start, stop]`` (``(k,)``, each inside one piece): upper bounds ``(k,)``, the part of them
@@ -73,6 +77,9 @@ class CellEnclosure:
         neglected = self._neglected[:, pieces].T
         if self.combination is not None:  # the parts of one constraint, each with a factor of at most 1
             bend, neglected = bend.sum(axis=1, keepdims=True), neglected.sum(axis=1, keepdims=True)
+        if self.direct is not None:
+            added = self.direct.on(start, stop)
+            left, right = left + added, right + added
         total = np.maximum(left, right) + bend + neglected
         worst = total.argmax(axis=1)
         pick = (np.arange(worst.size), worst)
@@ -90,6 +97,8 @@ class CellEnclosure:
         """Bounds ``(k, r)`` at single times, and how much of them each parameter accounts for, ``(k, r, nu)``."""
         states = self._states(times, pieces)
         coefficients = np.einsum("ri,kai->kra", self._rows, states)
+        if self.moving is not None:
+            coefficients[:, :, 0] += self.moving.at(times)
         space = self.lifted.space
         if self.combination is not None:
             coefficients, space = self.combination.apply(coefficients), self.combination.space
@@ -227,6 +236,8 @@ class CellEnclosure:
             sizes = sizes + self.sigma.reached
         terms = rounding(2 * lifted.states + self.rhs.shape[1])
         sides = np.abs(self.rhs).sum(axis=1, keepdims=True)  # of every row, or of the one that a combination makes
+        for part in (self.moving, self.direct):
+            sides = sides if part is None else sides + part.size[:, None]
         return np.asarray(total + terms * (product(widest, sizes.T) + sides))
 
 

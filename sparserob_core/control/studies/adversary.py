@@ -22,7 +22,8 @@ LOST = 1e-14  # of the largest integrand times the horizon: what a constant on a
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Adversary:
     """The worst case of one family: ``direction'x(time) - bound = violation`` (negative: a margin) under
-    ``parameter (nu,)`` and the disturbance, from ``initial_state (d,)``.
+    ``parameter (nu,)`` and the disturbance, from ``initial_state (d,)``; what the control itself uses of the bound of a
+    mixed constraint is taken off.
 
     ``direction (d,)`` is row ``row`` of a set with flat sides, or a unit normal of a curved one. The disturbance
     ``(mw, L)`` is constant between ``breakpoints (L + 1,)``; ``None`` where there is none.
@@ -48,7 +49,8 @@ def find_adversary(constraint: StateConstraint, decision: Array) -> Adversary | 
         return None
     row = int(found.rows[0])
     times, directions, parameters, bounds = (part[row] for part in constraint.functionals_at(found.indices[:1]))
-    time = float(times)
+    time, direct = float(times), constraint.direct(found.indices[:1, 0])
+    bounds = bounds if direct is None else bounds - direct[row] @ decision
     breakpoints, disturbance = worst_signal(constraint.functionals, time, directions, parameters)
     return Adversary(
         name=constraint.name,

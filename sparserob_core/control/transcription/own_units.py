@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sparserob_core.control.constraints.state import StateConstraint
-from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
 from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
@@ -91,17 +91,29 @@ def row_units(constraint: StateConstraint, control: ConvexSet) -> Array:
     of its gauge, 1, or what double precision resolves of that."""
     functionals, sides = constraint.functionals, constraint.sides
     times = window_times(functionals, constraint.start, constraint.stop)
+    moved = constraint.reference
     if sides is not None:
-        return units_of_sides(*sides, *reaches(functionals, constraint.parameters, control, sides[0], times))
+        beside = None if moved is None else -(moved.at(times) @ sides[0].T)
+        found = reaches(functionals, constraint.parameters, control, sides[0], times, beside, constraint.gains)
+        return units_of_sides(*constraint_sides(constraint), *found)
     box = constraint.index_set
     z = sampled(box.dimension - 1 - constraint.parameters.count)
     indices = np.hstack([np.tile(box.lower[: box.dimension - z.shape[1]], (z.shape[0], 1)), z])
     directions = constraint.functionals_at(indices)[1]
     _, added = reaches(functionals, constraint.parameters, control, np.eye(directions.shape[1]), times)
+    added = added if moved is None else added + moved.size
     if (np.abs(directions) @ added).max() <= 1.0 / RESOLVED:  # a sum along c is at most |c| times those along the axes
         return np.ones(1)
     _, added = reaches(functionals, constraint.parameters, control, directions, times)
+    added = added if moved is None else added + np.abs(directions) @ moved.size
     return np.maximum(1.0, power_of_two(np.array([RESOLVED * added.max()])))
+
+
+def constraint_sides(constraint: StateConstraint) -> tuple[Array, Array]:
+    """The rows of a constraint with flat sides, those of a mixed one with their part on the control."""
+    assert constraint.sides is not None
+    H, h = constraint.sides
+    return (H if constraint.gains is None else np.hstack([H, constraint.gains])), h
 
 
 def units_of_sides(H: Array, h: Array, reach: Array, added: Array) -> Array:
@@ -116,10 +128,17 @@ def units_of_sides(H: Array, h: Array, reach: Array, added: Array) -> Array:
 
 
 def reaches(
-    functionals: WorstCase, parameters: ParameterIndex, control: ConvexSet, H: Array, times: Array
+    functionals: WorstCase,
+    parameters: ParameterIndex,
+    control: ConvexSet,
+    H: Array,
+    times: Array,
+    beside: Array | None = None,
+    G: Array | None = None,
 ) -> tuple[Array, Array]:
     """How far the quantities ``H x(t)`` come from 0 at some times, over the control's set, the worst disturbance and
-    the worst initial state, ``(r,)``, and the largest sum of absolute values from which they are computed, ``(r,)``."""
+    the worst initial state, ``(r,)``, and the largest sum of absolute values from which they are computed, ``(r,)``.
+    ``beside (times, r)`` is added to them, and ``G u`` of any control where there is ``G (r, m)``."""
     points, r = looked_at(parameters), H.shape[0]
     shape = (points.shape[0], times.size, r)
     at = np.tile(np.repeat(times, r), shape[0])
@@ -149,8 +168,14 @@ def reaches(
             up[part] += model.support(on_noise)
             down[part] += model.support(-on_noise)
             added[part] += np.abs(on_noise @ np.diag(extent(model.bound))).sum(axis=(1, 2))
-    reach = np.maximum(np.maximum(up, down), 0.0).reshape(-1, r).max(axis=0)
-    return reach, added.reshape(-1, r).max(axis=0)
+    high, low, sums = (one.reshape(shape) for one in (up, down, added))
+    if beside is not None:
+        high, low, sums = high + beside, low - beside, sums + np.abs(beside)
+    if G is not None:
+        high, low = high + control.support(G), low + control.support(-G)
+        sums = sums + np.abs(G) @ extent(control)
+    reach = np.maximum(np.maximum(high, low), 0.0).max(axis=(0, 1))
+    return reach, sums.max(axis=(0, 1))
 
 
 def looked_at(parameters: ParameterIndex) -> Array:
@@ -201,6 +226,8 @@ def walls(problem: OptimalControlProblem) -> Array:
     """The least bound other than 0 that a row or an equality on it alone gives each state; 1 without one."""
     least = np.full(problem.system.states, np.inf)
     for item in (*problem.path, *problem.terminal):
+        if isinstance(item, MixedConstraint):
+            continue
         convex = item.set if isinstance(item, PathConstraint) else item
         if isinstance(convex, Equality):
             sizes = np.abs(np.where(np.isnan(convex.values), 0.0, convex.values))

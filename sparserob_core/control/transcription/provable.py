@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from sparserob_core.control.enclosures.taylor import TaylorSpace
-from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.functional import WITHOUT_PROOF
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.sets.sets import Equality
 from sparserob_core.errors import NotEnclosable
+from sparserob_core.sip.convex_set import ConvexSet
 
 SECONDS = 30.0  # that the search takes for a problem that cannot be proven, unless a limit is given: for a witness
 TINY = 1e-6  # of the parameters: a cell on which a system that can be enclosed at all will be
@@ -24,7 +25,7 @@ def unprovable(problem: OptimalControlProblem) -> str | None:
     Nothing is solved: this takes milliseconds.
     """
     if problem.disturbance is not None and problem.disturbance_class == "measurable":
-        paths = [entry.set if isinstance(entry, PathConstraint) else entry for entry in problem.path]
+        paths = [entry if isinstance(entry, ConvexSet) else entry.set for entry in problem.path]
         ends = [terminal for terminal in problem.terminal if not isinstance(terminal, Equality)]
         curved = [one for one in (*paths, *ends) if one.halfspaces() is None]
         if problem.system.parameter_count or curved:

@@ -45,17 +45,18 @@ def rounded_down(model: Transcription, result: Result, tolerance: float | None) 
 def _added(model: Transcription, result: Result) -> float:
     """The sum over all rows with a multiplier of multiplier times the numbers that are added up to the row."""
     middle = np.zeros(0) if model.parameters.set is None else model.parameters.set.interior_point()
-    rows = []
+    rows, besides = [], 0.0
     for cut in result.dual.cuts:
         family = model.program.formulated(cut.family, cut.formulation)
-        said = (
-            None
-            if family is None or model.constraint(model.program.family(cut.family)) is None
-            else (family.explanation(cut.index, cut.row))
-        )
+        constraint = model.constraint(model.program.family(cut.family))
+        said = None if family is None or constraint is None else family.explanation(cut.index, cut.row)
         if isinstance(said, TimedExplanation) and cut.multiplier > 0.0:
             known = said.parameter is not None and said.parameter.size > 0
             rows.append((cut.multiplier, said.time, said.direction, said.parameter if known else middle))
+            if said.gain is not None:
+                besides += cut.multiplier * float(np.abs(said.gain) @ _far(model.problem.control))
+            if constraint is not None and constraint.reference is not None:
+                besides += cut.multiplier * float(np.abs(said.direction) @ constraint.reference.size)
     fixed = [i for end in model.problem.terminal if isinstance(end, Equality) for i in end.fixed]
     axes = np.eye(model.problem.system.states)
     for i, price in zip(fixed, result.dual.mu, strict=False):
@@ -72,7 +73,7 @@ def _added(model: Transcription, result: Result) -> float:
     sizes += (np.abs(functionals.decided(weights)) @ _far(model.problem.control)).sum(axis=1)
     if model.problem.disturbance is not None:
         sizes += (np.abs(gains @ E) @ _far(model.problem.disturbance)).sum(axis=1)
-    return float(multipliers @ sizes)
+    return float(multipliers @ sizes) + besides
 
 
 def _quadratic(model: Transcription, result: Result) -> float:

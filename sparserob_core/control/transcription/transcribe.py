@@ -17,12 +17,13 @@ from sparserob_core.control.constraints.sensitivity import Sensitivity
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.dictionary import Dictionary
-from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
 from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.response.disturbance import DisturbanceModel, disturbance_model
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.quadratic import quadratic_cost
+from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.response.response import SAME_TIME, Response, merge_grids
 from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.transcription.own_units import (
@@ -230,7 +231,7 @@ def _step_units(problem: OptimalControlProblem) -> Array:
 
 def _shares(one: StateConstraint, other: StateConstraint) -> Array:
     """What the rows ``(r,)`` of a constraint are of those of another one, whose directions are the same."""
-    theirs, ours = (each.functionals_at(each.index_set.lower[None])[1] for each in (one, other))
+    theirs, ours = (each.normals_at(each.index_set.lower) for each in (one, other))
     largest = np.abs(ours).argmax(axis=1)[:, None]
     shares = np.take_along_axis(theirs, largest, axis=1) / np.take_along_axis(ours, largest, axis=1)
     return np.asarray(shares[:, 0] if one.sides is not None else shares[:1, 0])
@@ -241,8 +242,9 @@ def _rows_in_users(model: Transcription, own: Transcription, units: Units) -> li
     whose directions are the same, gives the same rows but for their factors."""
     found = []
     for theirs, ours in zip(model.constraints, own.constraints, strict=True):
-        rows = [one.functionals_at(one.index_set.lower[None])[1] for one in (theirs, ours)]
-        found.append(_ratio(rows[0], rows[1], units.states))
+        rows = [one.normals_at(one.index_set.lower) for one in (theirs, ours)]
+        mine = units.states if theirs.gains is None else np.concatenate([units.states, units.controls])
+        found.append(_ratio(rows[0], rows[1], mine))
     return found + [np.ones(1)] * (len(own.program.families) - len(found))
 
 
@@ -334,19 +336,26 @@ def _state_constraints(
 ) -> tuple[StateConstraint, ...]:
     """The path and terminal constraints, named as the families of the program; equalities are not among them."""
     end = problem.horizon
-    path = [entry for entry in problem.path if isinstance(entry, PathConstraint)]
+    path = [entry for entry in problem.path if not isinstance(entry, ConvexSet)]
     ends = [terminal for terminal in problem.terminal if not isinstance(terminal, Equality)]
-    windows = [(entry.name or _name("path", i, len(path)), entry) for i, entry in enumerate(path)]
+    windows: list[tuple[str, PathConstraint | MixedConstraint]] = [
+        (entry.name or _name("path", i, len(path)), entry) for i, entry in enumerate(path)
+    ]
     windows += [
         (_name("terminal", i, len(ends)), PathConstraint(terminal, end, end)) for i, terminal in enumerate(ends)
     ]
     found: list[StateConstraint] = []
     for name, entry in windows:
         stop, sides = end if entry.stop is None else entry.stop, entry.set.halfspaces()
+        if isinstance(entry, MixedConstraint):
+            found.append(FlatConstraint.twofold(name, functionals, entry, stop, parameters))
+            continue
+        moved = Reference.of(entry.relative_to)
         if sides is None:
-            found.append(CurvedConstraint(name, functionals, entry.set, entry.start, stop, parameters))
+            window = (entry.start, stop)
+            found.append(CurvedConstraint(name, functionals, entry.set, *window, parameters, reference=moved))
         elif sides[1].size:
-            found.append(FlatConstraint(name, functionals, *sides, entry.start, stop, parameters))
+            found.append(FlatConstraint(name, functionals, *sides, entry.start, stop, parameters, reference=moved))
     return tuple(found)
 
 

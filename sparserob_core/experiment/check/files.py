@@ -79,6 +79,7 @@ def _unread(case: Case) -> set[str]:
     data = case.certificate
     read = CERTIFICATE.get(str(data.get("status")), FIGURED)
     left = {name for name, value in data.items() if name not in read and not (name in SOMETIMES and value in NOTHING)}
+    pieced = {window.name for window in case.windows if window.is_mixed}
     proof, witness, fewest = (data.get(name) for name in ("proof", "witness", "fewest_active"))
     of_activity = fewest.get("multipliers") if isinstance(fewest, Mapping) else None
     left |= _besides("fewest_active", fewest, {"lower", "upper", "multipliers", "decision", "proof"})
@@ -92,7 +93,8 @@ def _unread(case: Case) -> set[str]:
         left |= _besides("multipliers", multipliers, told)
         entries = multipliers.get("constraints")
         for entry in entries if isinstance(entries, list) else []:
-            left |= _besides("multipliers.constraints", entry, MULTIPLIER)
+            mixed = isinstance(entry, Mapping) and str(entry.get("constraint")) in pieced
+            left |= _besides("multipliers.constraints", entry, MULTIPLIER | {"piece"} if mixed else MULTIPLIER)
             left |= {"multipliers.constraints.parameter"} if _of_a_curved_set_of_controls(case, entry) else set()
     if "proof" in read and isinstance(proof, Mapping):
         shapes = {window.name: window.shape for window in case.windows}
@@ -100,6 +102,8 @@ def _unread(case: Case) -> set[str]:
         for name, shape in shapes.items():
             left |= _besides(f"proof.{name}", proof.get(name), CELLS if _flat(shape) else CELLS | {"normals"})
     known = WITNESS if case.problem.initial_set is None else WITNESS | BEGUN
+    mixed = isinstance(witness, Mapping) and str(witness.get("constraint")) in pieced
+    known = known | {"piece"} if mixed else known
     return left | (_besides("witness", witness, known) if "witness" in read else set())
 
 

@@ -13,7 +13,12 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag
 from sparserob_core.control.problem.cost import Cost
 from sparserob_core.control.problem.expression import CONSTANTS, FUNCTIONS, parse_column, parse_matrix
 from sparserob_core.control.problem.names import Names
-from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint, ProblemFactory
+from sparserob_core.control.problem.problem import (
+    MixedConstraint,
+    OptimalControlProblem,
+    PathConstraint,
+    ProblemFactory,
+)
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, ConvexSet, Equality
 from sparserob_core.errors import InputError
@@ -322,19 +327,10 @@ class LinearKeys(ProblemFactory, Options):
         """The set of disturbances; raises `InputError`."""
         return None if self.disturbance is None else self.disturbance.build("disturbance", system.disturbances)
 
-    def windows(self, states: int) -> list[PathConstraint]:
-        """The path constraints, one per set; raises `InputError`."""
-        found = []
-        for i, item in enumerate(self.path):
-            stop = self.horizon if item.stop is None else item.stop
-            if not item.start <= stop <= self.horizon:
-                raise InputError(
-                    path=f"path.{i}",
-                    expected=f"from <= to <= {self.horizon:g} (the horizon)",
-                    got=f"from {item.start:g} to {stop:g}",
-                )
-            found += [PathConstraint(member, item.start, stop) for member in item.members(f"path.{i}", states)]
-        return found
+    def windows(self, states: int) -> list[PathConstraint | MixedConstraint]:
+        """The path constraints, one per set or bounds of state and control together; raises `InputError`."""
+        listed = enumerate(self.path)
+        return [one for i, item in listed for one in item.entries(f"path.{i}", states, self.horizon)]
 
     def ends(self, states: int) -> list[ConvexSet | Equality]:
         """The terminal sets and equalities; raises `InputError`."""

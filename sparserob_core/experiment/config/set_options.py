@@ -21,6 +21,7 @@ from pydantic import (
 )
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
+from sparserob_core.control.problem.problem import MixedConstraint, PathConstraint
 from sparserob_core.control.sets.sets import Box, ConvexSet, Equality, NormBall, Polytope, SetFactory, intersection
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.config.option_kinds import FreeNumbers, OneOrMore, Sparse, broadcast, count
@@ -131,14 +132,59 @@ def shorthand(record: Plugin) -> str | None:
 
 
 @final
+class MixedOptions(Options):
+    """``H x(t) + G u(t) <= h``, row by row."""
+
+    H: list[list[float]] = Field(min_length=1)
+    """One column per state."""
+
+    G: list[list[float]] = Field(min_length=1)
+    """As many rows as ``H``, one column per control."""
+
+    h: OneOrMore
+    """One number per row; a number serves every row."""
+
+
+@final
 class PathOptions(SetOptions, populate_by_name=True):
-    """A set that the state stays in during a window of time."""
+    """A set that the state stays in during a window of time, or a bound of state and control together."""
 
     start: float = Field(default=0.0, alias="from", ge=0.0)
     """Beginning of the window."""
 
     stop: float | None = Field(default=None, alias="to", ge=0.0)
     """End of the window; the horizon unless given."""
+
+    relative_to: list[list[float]] | None = None
+    """The set moves: rows of a time and a point, between which it goes along straight lines; at rest unless given."""
+
+    mixed: MixedOptions | None = None
+    """Bounds of state and control together, with the control of every piece that meets the window."""
+
+    def _given(self) -> list[str]:
+        return super()._given() + ["mixed"] * (self.mixed is not None)
+
+    def entries(self, where: str, states: int, horizon: float) -> list[PathConstraint | MixedConstraint]:
+        """One constraint per key; raises `InputError` that begins with the key below ``where``."""
+        stop = horizon if self.stop is None else self.stop
+        if not self.start <= stop <= horizon:
+            raise InputError(
+                path=where,
+                expected=f"from <= to <= {horizon:g} (the horizon)",
+                got=f"from {self.start:g} to {stop:g}",
+            )
+        members = self.members(where, states)
+        found: list[PathConstraint | MixedConstraint] = [
+            PathConstraint(member, self.start, stop, relative_to=self.relative_to) for member in members
+        ]
+        if self.mixed is None:
+            return found
+        if self.relative_to is not None:
+            raise InputError(
+                "moves a set of states; a mixed constraint beside it has none: write it as an entry of its own",
+                path=f"{where}.relative_to",
+            )
+        return [*found, MixedConstraint(self.mixed.H, self.mixed.G, self.mixed.h, self.start, stop)]
 
 
 @final

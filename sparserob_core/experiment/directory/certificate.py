@@ -96,7 +96,7 @@ def _multipliers(experiment: ControlExperiment, dual: Dual) -> dict[str, Any] | 
                 "constraint": cut.family,
                 "time": said.time,
                 "parameter": [] if cut.family == "control_step" else _parameter(problem, said),
-                "direction": _direction(said),
+                **_direction(said),
                 "multiplier": cut.multiplier,
             }
             for cut, said in explained
@@ -143,8 +143,11 @@ def _parameter(problem: OptimalControlProblem, said: TimedExplanation) -> Array:
     )
 
 
-def _direction(said: TimedExplanation) -> Array:
-    return said.direction + 0.0  # no negative zeros
+def _direction(said: TimedExplanation) -> dict[str, Any]:
+    """The normal; of a mixed constraint with its part on the control, and the piece of that."""
+    if said.gain is None:
+        return {"direction": said.direction + 0.0}  # no negative zeros
+    return {"direction": np.concatenate([said.direction, said.gain]) + 0.0, "piece": said.piece}
 
 
 def _inside(bound: ConvexSet, point: Array, middle: Array) -> Array:
@@ -180,7 +183,7 @@ def _witness(problem: OptimalControlProblem, program: SemiInfiniteProgram, resul
         "constraint": worst.constraint,
         "time": said.time,
         "parameter": _parameter(problem, said),
-        "direction": _direction(said),
+        **_direction(said),
         "disturbance": signal,
         **begun,
         "violation": worst.violation,

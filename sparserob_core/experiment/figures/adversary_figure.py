@@ -93,7 +93,7 @@ def draw_tube(ax: Axes, data: FigureData, component: int) -> None:
 def finish_panel(ax: Axes, data: FigureData, component: int, curves: tuple[Array, ...]) -> None:
     """Limits around everything that is drawn, then the walls within them."""
     walls = [wall for wall in data.walls if wall.state == component]
-    edges = [edge for wall in walls for edge in (wall.lower, wall.upper) if np.isfinite(edge)]
+    edges = [edge for wall in walls for edge in wall.edges]
     low = min([*edges, float(data.tube_lower[component].min()), *(float(curve.min()) for curve in curves)])
     high = max([*edges, float(data.tube_upper[component].max()), *(float(curve.max()) for curve in curves)])
     margin = 0.12 * max(high - low, 1e-9)

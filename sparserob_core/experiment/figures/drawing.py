@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.studies.answer import tube
 from sparserob_core.errors import InputError
@@ -104,8 +105,27 @@ def _shown(count: int) -> np.ndarray[Any, np.dtype[np.intp]]:
 def _walls(problem: OptimalControlProblem) -> Iterator[Wall]:
     end = problem.horizon
     for entry in problem.path:
-        if isinstance(entry, PathConstraint):
-            yield from _sides(entry.set, entry.start, end if entry.stop is None else entry.stop)
+        if not isinstance(entry, PathConstraint):  # it bounds no state alone
+            continue
+        stop = end if entry.stop is None else entry.stop
+        moved = Reference.of(entry.relative_to)
+        if moved is None:
+            yield from _sides(entry.set, entry.start, stop)
+            continue
+        times = np.concatenate([[entry.start], moved.kinks(entry.start, stop), [stop]])
+        points = moved.at(times)
+        for wall in _sides(entry.set, entry.start, stop):
+            for k in range(times.size - 1):
+                begin, last = points[k : k + 2, wall.state].tolist()
+                yield Wall(
+                    state=wall.state,
+                    lower=wall.lower + begin,
+                    upper=wall.upper + begin,
+                    start=float(times[k]),
+                    end=float(times[k + 1]),
+                    lower_end=wall.lower + last,
+                    upper_end=wall.upper + last,
+                )
     for terminal in problem.terminal:
         if isinstance(terminal, Equality):
             yield from (

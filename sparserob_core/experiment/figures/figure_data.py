@@ -18,13 +18,33 @@ from sparserob_core.sip.result import UNKNOWN_SCALE
 @dataclass(frozen=True, kw_only=True)
 class Wall:
     """One state component must stay in ``[lower, upper]`` for ``start <= t <= end``; ``start == end`` is a terminal
-    constraint."""
+    constraint. Where the set moves, the bounds go in straight lines to ``lower_end`` and ``upper_end``."""
 
     state: int
     lower: float = -np.inf
     upper: float = np.inf
     start: float
     end: float
+    lower_end: float | None = None
+    upper_end: float | None = None
+
+    @property
+    def sides(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """The lower and the upper bound, each at the start and at the end."""
+        return (
+            (self.lower, self.lower if self.lower_end is None else self.lower_end),
+            (self.upper, self.upper if self.upper_end is None else self.upper_end),
+        )
+
+    @property
+    def edges(self) -> list[float]:
+        """Every bound that there is, at the start and at the end."""
+        return [edge for side in self.sides for edge in side if np.isfinite(edge)]
+
+    @property
+    def moves(self) -> bool:
+        """Whether a bound is another at the end."""
+        return any(first != last for first, last in self.sides)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

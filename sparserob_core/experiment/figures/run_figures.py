@@ -167,7 +167,7 @@ def draw_time_axis(ax: Axes, data: FigureData) -> None:
 
 
 def _limits(data: FigureData, component: int, walls: list[Wall]) -> tuple[float, float]:
-    edges = [edge for wall in walls for edge in (wall.lower, wall.upper) if np.isfinite(edge)]
+    edges = [edge for wall in walls for edge in wall.edges]
     low = min([*edges, float(data.tube_lower[component].min())])
     high = max([*edges, float(data.tube_upper[component].max())])
     margin = 0.12 * max(high - low, 1e-9)
@@ -182,11 +182,11 @@ def draw_walls(ax: Axes, walls: Sequence[Wall]) -> None:
 
 def _forbidden(ax: Axes, wall: Wall) -> None:
     low, high = ax.get_ylim()
-    for edge, outside in ((wall.lower, low), (wall.upper, high)):
-        if np.isfinite(edge):
+    for side, outside in zip(wall.sides, (low, high), strict=True):
+        if np.isfinite(side).all():
             ax.fill_between(
                 [wall.start, wall.end],
-                edge,
+                side,
                 outside,
                 facecolor=look.MIST,
                 edgecolor="#C4C4C4",
@@ -195,7 +195,7 @@ def _forbidden(ax: Axes, wall: Wall) -> None:
                 zorder=0,
                 label="forbidden",
             )
-            ax.plot([wall.start, wall.end], [edge, edge], color=look.GREY, linewidth=1.0, zorder=1)
+            ax.plot([wall.start, wall.end], side, color=look.GREY, linewidth=1.0, zorder=1)
 
 
 def _terminal(ax: Axes, wall: Wall) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from sparserob_core.arguments import whole
 from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
 from sparserob_core.control.problem.units import Units
+from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.studies.initial_states import InitialPlane, check_states
 from sparserob_core.control.transcription.own_units import walls
@@ -130,6 +131,8 @@ def _far(problem: OptimalControlProblem) -> float:
         for H, h in (sides for sides in flat if sides is not None)
         if h.size
     ]
+    moved = [entry.relative_to for entry in problem.path if isinstance(entry, PathConstraint)]
+    sizes += [float(np.abs(np.asarray(rows)[:, 1:]).max()) for rows in moved if rows is not None]
     sizes += [float(np.abs(end.values[end.fixed]).max()) for end in problem.terminal if isinstance(end, Equality)]
     return FAR * max([1.0, float(np.abs(np.asarray(problem.initial_state)).max()), *sizes])
 
@@ -154,9 +157,14 @@ def _path(problem: OptimalControlProblem, found: InitialStates) -> tuple[Array, 
     if not found.outer.shape[0]:
         return ()
     middle = (found.inner if found.inner.shape[0] else found.outer).mean(axis=0)
-    sets = [entry.set for entry in problem.path if isinstance(entry, PathConstraint) and entry.start == 0.0]
-    view = 10.0 * float(np.abs(found.outer - middle).max())
-    return tuple(section(one, found.origin, found.states, middle, view) for one in sets)
+    held = [entry for entry in problem.path if isinstance(entry, PathConstraint) and entry.start == 0.0]
+    view, states, polygons = 10.0 * float(np.abs(found.outer - middle).max()), list(found.states), []
+    for entry in held:
+        moved = Reference.of(entry.relative_to)
+        off = np.zeros(found.origin.size) if moved is None else moved.at(np.zeros(1))[0]
+        polygon = section(entry.set, found.origin - off, found.states, middle - off[states], view)
+        polygons.append(polygon + off[states])
+    return tuple(polygons)
 
 
 def _written(directory: RunDirectory, found: InitialStates) -> InitialStates:

@@ -113,7 +113,8 @@ def _positions(loaded: Loaded, problem: OptimalControlProblem) -> tuple[list[lis
     if not isinstance(factory, LinearKeys):
         return [[i] for i in range(len(problem.path))], [[i] for i in range(len(problem.terminal))]
     states = factory.system.build().states
-    members = [[_restricts(one) for one in item.members(f"path.{i}", states)] for i, item in enumerate(factory.path)]
+    entries = [item.entries(f"path.{i}", states, factory.horizon) for i, item in enumerate(factory.path)]
+    members = [[_restricts(one.set) for one in entry] for entry in entries]
     ends = [[_restricts(one) for one in item.ends(f"terminal.{i}", states)] for i, item in enumerate(factory.terminal)]
     return _counted(members), _counted(ends)
 

@@ -8,7 +8,7 @@ from typing import Literal, TypeAlias, final
 
 import numpy as np
 
-from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
 from sparserob_core.control.sets.sets import ConvexSet, Equality
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.plugins.messages import nearest
@@ -165,18 +165,26 @@ def _control(problem: OptimalControlProblem) -> Scaling:
 
 def _path(problem: OptimalControlProblem, of: str, positions: Sequence[int]) -> Scaling:
     paths = _entries(problem)
-    resized = {i: _resizing(of, paths[i].set) for i in positions}
+    resized = {i: _resized(of, paths[i]) for i in positions}
     return Scaling(
         of,
         f"factor on the set {of}",
         "smallest",
-        lambda f: replace(
-            problem,
-            path=[replace(entry, set=resized[i](f)) if i in resized else entry for i, entry in enumerate(paths)],
-        ),
+        lambda f: replace(problem, path=[resized[i](f) if i in resized else entry for i, entry in enumerate(paths)]),
         "largest half-width",
         _times(max(_half_width(paths[i].set) for i in positions)),
     )
+
+
+def _resized(of: str, entry: PathConstraint | MixedConstraint) -> Callable[[float], PathConstraint | MixedConstraint]:
+    """A window with its set scaled; bounds of state and control together about 0, which must be within them."""
+    if isinstance(entry, PathConstraint):
+        scaled = _resizing(of, entry.set)
+        return lambda f: replace(entry, set=scaled(f))
+    h = np.asarray(entry.h, dtype=float)
+    if not (h > 0.0).all():
+        raise InputError(f"of: {of} bounds state and control together, and h is not positive: 0 is no middle of it")
+    return lambda f: replace(entry, h=f * h)
 
 
 def _terminal(problem: OptimalControlProblem, of: str, positions: Sequence[int]) -> Scaling:
@@ -213,8 +221,8 @@ def _window(problem: OptimalControlProblem, path: str, positions: Sequence[int])
     )
 
 
-def _entries(problem: OptimalControlProblem) -> list[PathConstraint]:
-    return [entry for entry in problem.path if isinstance(entry, PathConstraint)]
+def _entries(problem: OptimalControlProblem) -> list[PathConstraint | MixedConstraint]:
+    return [entry for entry in problem.path if not isinstance(entry, ConvexSet)]
 
 
 def _resizing(of: str, bound: ConvexSet) -> Callable[[float], ConvexSet]:

@@ -111,7 +111,10 @@ def _sampled(
     known = tuple(worst[name] for name in ("times", "directions", "parameters"))
     uncertainty = Uncertainty(model.functionals, parameters, model.constraints, (known[0], known[1], known[2]))
     counts, envelope = (
-        [ViolationCount(one, times, row_units(one, model.problem.control)) for one in model.constraints],
+        [
+            ViolationCount(one, times, row_units(one, model.problem.control), finished.theta.ravel())
+            for one in model.constraints
+        ],
         _Envelope(shown, response.initial_state.size),
     )
     rng, block, done, out = np.random.default_rng(seed), trajectories_at_once(fine, parameters.count > 0), 0, 0

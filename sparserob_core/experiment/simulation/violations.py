@@ -17,16 +17,17 @@ class ViolationCount:
     """The largest violation of one constraint along every trajectory of a block, and over all blocks.
 
     With flat sides: the largest ``H x(t) - h`` over the sides and the times, which counts as a violation where one is
-    above `TOLERANCE` of its own unit (``units (r,)``). A curved set: the gauge less 1, at the time at which the
-    trajectory is furthest out; its unit is 1.
+    above `TOLERANCE` of its own unit (``units (r,)``), for a decision ``x (n,)``. A curved set: the gauge less 1, at
+    the time at which the trajectory is furthest out; its unit is 1.
     """
 
-    def __init__(self, constraint: StateConstraint, times: Array, units: Array) -> None:
+    def __init__(self, constraint: StateConstraint, times: Array, units: Array, x: Array) -> None:
         slack = SAME_TIME * times[-1]
         self.constraint, self.times = constraint, times
         self._is_curved = constraint.sides is None
         self.units, self._in_own_units = units, constraint.divided(units)
         self._inside = (times >= constraint.start - slack) & (times <= constraint.stop + slack)
+        self._beside, self._beside_own = constraint.beside(x, times), self._in_own_units.beside(x, times)
         self.violated, self.largest, self.time = 0, -np.inf, np.nan
 
     @property
@@ -44,15 +45,16 @@ class ViolationCount:
         """The states ``(d, n)`` at one of the times."""
         if not self._inside[position]:
             return
-        value = self.constraint.outwardness(state)
+        value = self.constraint.outwardness(state, self._beside[position])
         if not self._is_curved:
-            np.maximum(self._own, self._in_own_units.outwardness(state), out=self._own)
+            own = self._in_own_units.outwardness(state, self._beside_own[position])
+            np.maximum(self._own, own, out=self._own)
         better = value > self._best
         if better.any():
             np.copyto(self._best, value, where=better)
             self._when[better] = position
             if self._is_curved:
-                np.copyto(self._states, state, where=better)
+                np.copyto(self._states, state + self._beside[position][:, None], where=better)
 
     def close(self) -> np.ndarray:
         """Which trajectories of the block violate the constraint, ``(n,)``."""

@@ -1,0 +1,131 @@
+"""A constraint on the state, which may move with time and speak of the control too, and what that adds to its rows."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+
+from sparserob_core.checker.outcome import Broken
+from sparserob_core.checker.reach.disturbance_support import Scene
+from sparserob_core.checker.reach.flow import stacked
+from sparserob_core.checker.reach.tube import Polynomial
+from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, Enclosed, rounding
+from sparserob_core.checker.sets.shapes import limit
+from sparserob_core.control.sets.sets import ConvexSet
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from flint import arb, arb_mat
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Window:
+    """``x(t) - r(t)`` in ``shape`` for all ``t`` from ``start`` to ``stop``; of more coordinates than the ``states``:
+    ``(x(t), u(t))``, with ``u`` of every piece of the control that meets the window in positive length.
+
+    ``reference (q, 1 + d)``: times and points between which ``r`` is linear; ``None``: ``r = 0``.
+    """
+
+    name: str
+    shape: ConvexSet
+    start: float
+    stop: float
+    states: int
+    reference: Array | None = None
+
+    @property
+    def is_mixed(self) -> bool:
+        """Whether the control is in it."""
+        return self.shape.dimension > self.states
+
+    def split(self, direction: Array) -> tuple[Array, Array]:
+        """The parts of a normal on the state and on the control."""
+        return direction[: self.states], direction[self.states :]
+
+    def limit(self, direction: Array, time: float) -> arb:
+        """The largest ``c'x + g'u`` that is allowed at a time."""
+        c, _ = self.split(direction)
+        offset, _ = self.moved(time, time)
+        moved = [_exact(a) * r for a, r in zip(c, offset, strict=True) if a]
+        return sum(moved, limit(self.shape, direction))
+
+    def moved(self, start: float, stop: float) -> tuple[list[arb], list[arb]]:
+        """``r(start)`` and ``r'`` on ``[start, stop]``, which no time of the reference cuts, ``(d,)`` each."""
+        zero = [_exact(0.0)] * self.states
+        if self.reference is None:
+            return zero, zero
+        times = self.reference[:, 0].tolist()
+        place = bisect_right(times, start) - 1
+        if place < 0 or place >= len(times) - 1:
+            return [_exact(v) for v in self.reference[max(place, 0), 1:]], zero
+        (t, *p), (s, *q) = self.reference[place].tolist(), self.reference[place + 1].tolist()
+        slope = [(_exact(b) - _exact(a)) / (_exact(s) - _exact(t)) for a, b in zip(p, q, strict=True)]
+        return [_exact(a) + v * (_exact(start) - _exact(t)) for a, v in zip(p, slope, strict=True)], slope
+
+    def cuts(self, breakpoints: Sequence[float]) -> list[float]:
+        """Times at which its rows turn or jump, beside what the state does; ``breakpoints`` are the control's."""
+        kinks = [] if self.reference is None else self.reference[:, 0].tolist()
+        return kinks + (list(breakpoints) if self.is_mixed else [])
+
+    def meets(self, breakpoints: Sequence[float], piece: int, time: float) -> None:
+        """Raise `Broken` unless a piece of the control holds a time and meets the window in positive length."""
+        if not 0 <= piece < len(breakpoints) - 1:
+            raise Broken(f"{self.name}: the control has no piece {piece}")
+        begin, end = float(breakpoints[piece]), float(breakpoints[piece + 1])
+        if not (begin <= time <= end and max(begin, self.start) < min(end, self.stop)):
+            raise Broken(f"{self.name}: piece {piece} of the control is not one of t = {time!r} within the window")
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """What stands beside ``c'x(t)`` in the rows of a window: ``g'u - c'r(t)``, for ``c = z'basis``, ``g = z'gains``,
+    ``basis (b, d)``, ``gains (b, m)``. ``breakpoints`` and ``pieces`` are the commanded control's."""
+
+    window: Window
+    basis: Array
+    gains: Array
+    scene: Scene
+    breakpoints: Sequence[float]
+    pieces: Sequence[arb_mat]
+
+    def added(
+        self, found: Sequence[Polynomial], start: float, stop: float, z: Array, piece: int | None = None
+    ) -> list[Polynomial]:
+        """The polynomials of ``c'x``, one for every ``z (k, b)``, with what stands beside it on ``[start, stop]``; with
+        the control of a ``piece``, that of the interval unless given."""
+        offset, slope = self.window.moved(start, stop)
+        basis = stacked([[_exact(v) for v in row] for row in self.basis])
+        level = -basis * stacked([[r] for r in offset])
+        if self.window.is_mixed:
+            place = bisect_right(self.breakpoints, start) - 1 if piece is None else piece
+            control = self.pieces[min(place, len(self.pieces) - 1)]
+            level = level + stacked([[_exact(v) for v in row] for row in self.gains]) * control
+        terms = [level]
+        if stop > start and self.window.reference is not None:
+            length = self.scene.duration(self.scene.ticks(start, stop))
+            terms.append(-basis * stacked([[v * length] for v in slope]))
+        enclosed = Enclosed.all(terms, (len(terms), self.basis.shape[0]))
+        mid = enclosed.mid @ z.T
+        lost = (enclosed.rad + rounding(z.shape[1]) * np.abs(enclosed.mid)) @ np.abs(z).T
+        return [_plus(poly, mid[:, i], float(lost[:, i].sum())) for i, poly in enumerate(found)]
+
+
+def _plus(poly: Polynomial, terms: Array, lost: float) -> Polynomial:
+    """A polynomial plus one in the time alone, with coefficients ``terms`` that are off by ``lost`` together."""
+    missing = max(0, terms.size - poly.coefficients.shape[0])
+    coefficients = np.pad(poly.coefficients, ((0, missing), (0, 0)))
+    coefficients[: terms.size, 0] += terms
+    lost += 2.0 * HALF_ULP * float(np.abs(coefficients[: terms.size, 0]).sum())
+    return replace(poly, coefficients=coefficients, error=(poly.error + lost) * OUTWARD)
+
+
+def _exact(value: float) -> arb:
+    from flint import arb
+
+    return arb(float(value))

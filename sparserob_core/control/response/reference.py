@@ -1,0 +1,91 @@
+"""What a moving set is about: points that follow one another along straight lines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.shapes import Float, shaped
+from sparserob_core.sip.convex_set import Array
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """``r(t)``, linear between ``points (q, d)`` at increasing ``times (q,)``; constant beyond them."""
+
+    times: Array
+    points: Array
+
+    @staticmethod
+    def of(rows: object) -> Reference | None:
+        """That of rows of a time and a point, ``(q, 1 + d)``; ``None`` for none."""
+        table = None if rows is None else np.asarray(rows, dtype=float)
+        return None if table is None else Reference(table[:, 0], table[:, 1:])
+
+    @shaped
+    def at(self, times: Float[Array, " k"]) -> Float[Array, "k d"]:
+        """``r (k, d)``."""
+        return np.stack([np.interp(times, self.times, column) for column in self.points.T], axis=1)
+
+    @shaped
+    def slope(self, times: Float[Array, " k"], start: float) -> Float[Array, "k d"]:
+        """``r' (k, d)``, from the left at a kink, but from the right at and before ``start``."""
+        if self.times.size < 2:
+            return np.zeros((times.size, self.points.shape[1]))
+        slopes = np.diff(self.points, axis=0) / np.diff(self.times)[:, None]
+        left, right = (np.searchsorted(self.times, times, side=side) - 1 for side in ("left", "right"))
+        piece = np.where(times <= start, right, left)
+        inside = (piece >= 0) & (piece < len(slopes))
+        return np.where(inside[:, None], slopes[np.clip(piece, 0, len(slopes) - 1)], 0.0)
+
+    def kinks(self, start: float, stop: float) -> Array:
+        """The times inside a window at which it may turn."""
+        return self.times[(self.times > start) & (self.times < stop)]
+
+    @property
+    def size(self) -> Array:
+        """The largest ``|r_i|``, ``(d,)``."""
+        return np.asarray(np.abs(self.points).max(axis=0))
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Moving:
+    """What a moving set takes off functionals ``H x(t)``, ``H (r, d)``, on cells of time between its kinks."""
+
+    reference: Reference
+    H: Array
+
+    def at(self, times: Array) -> Array:
+        """``-H r(t)``, ``(k, r)``."""
+        return -(self.reference.at(times) @ self.H.T)
+
+    @property
+    def size(self) -> Array:
+        """The largest sum of absolute numbers in that, ``(r,)``."""
+        return np.abs(self.H) @ self.reference.size
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Direct:
+    """What the commanded ``control (m, K)`` adds to functionals by itself, ``G u``, ``G (r, m)``, on cells of time
+    within its pieces."""
+
+    G: Array
+    dictionary: Dictionary
+    control: Array
+
+    def on(self, start: Array, stop: Array) -> Array:
+        """``G u`` on cells ``[start, stop]`` (``(k,)``), ``(k, r)``."""
+        piece = np.searchsorted(self.dictionary.breakpoints, stop) - 1
+        return (self.G @ self.control[:, np.clip(piece, 0, self.dictionary.pieces - 1)]).T
+
+    @property
+    def size(self) -> Array:
+        """The largest sum of absolute numbers in that, ``(r,)``."""
+        return np.asarray((np.abs(self.G) @ np.abs(self.control)).max(axis=1))
