@@ -375,8 +375,6 @@ def vertex_multipliers(
     2). Any answer is safe: weak duality decides what it is worth. ``S`` must be the identity and ``P`` absent,
     otherwise the multipliers come back unchanged.
     """
-    from scipy.optimize import nnls
-
     tight = program.h - program.G @ x <= TIGHT * np.maximum(1.0, np.abs(program.h))
     active = np.flatnonzero((y > ACTIVE * y.max(initial=0.0)) | tight)
     if program.S is not None or program.P is not None or not active.size + mu.size:
@@ -390,12 +388,18 @@ def vertex_multipliers(
     kink = np.where(program.weights > 0.0, size, np.inf)
     away = np.minimum(kink, np.minimum(x - program.lower, program.upper - x))
     free = away > FREE * width
-    rows = np.vstack([program.G[active], program.A, -program.A])[:, free]
+    rows, equalities = program.G[active][:, free].T, program.A[:, free].T
     slope = -program.q[free] - program.weights[free] * sign[free]
-    try:
-        found, _ = nnls(rows.T, slope)
-    except RuntimeError:  # its iteration limit: these multipliers were an offer only
-        return y, mu
-    plain, count = np.zeros_like(y), active.size
-    plain[active] = found[:count]
-    return plain, found[count : count + mu.size] - found[count + mu.size :]
+    found = _least_norm([rows, equalities], slope)
+    if found is None or found[0].min(initial=0.0) < -ACTIVE * found[0].max(initial=0.0):
+        from scipy.optimize import nnls  # only here: its import takes as long as a small run
+
+        try:
+            positive, _ = nnls(np.hstack([rows, equalities, -equalities]), slope)
+        except RuntimeError:  # its iteration limit: these multipliers were an offer only
+            return y, mu
+        first, second, third = np.split(positive, [active.size, active.size + mu.size])
+        found = [first, second - third]
+    plain = np.zeros_like(y)
+    plain[active] = np.maximum(found[0], 0.0)
+    return plain, found[1]
