@@ -135,12 +135,18 @@ def _own_entry_points(disabled: Sequence[str]) -> list[metadata.EntryPoint]:
 
 
 def _distribution(entry: metadata.EntryPoint) -> str:
-    return entry.dist.name if entry.dist else "?"
+    return _name_and_version(entry.dist)[0] if entry.dist else "?"
 
 
 def _source(entry: metadata.EntryPoint) -> str:
-    version = f" {entry.dist.version}" if entry.dist else ""
+    version = f" {_name_and_version(entry.dist)[1]}" if entry.dist else ""
     return f"{_distribution(entry)}{version}, {entry.value}"
+
+
+@cache
+def _name_and_version(distribution: metadata.Distribution) -> tuple[str, str]:
+    """They are parsed anew whenever they are asked for, and the entry points of a distribution share it."""
+    return distribution.name, distribution.version
 
 
 def _identity(entry: metadata.EntryPoint) -> str:

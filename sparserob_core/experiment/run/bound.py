@@ -6,9 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from sparserob_core.checker.claims.case import Case
-from sparserob_core.checker.claims.claims import derived_bound
-from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.control.transcription.provable import remark
 from sparserob_core.control.transcription.rounding import SMALL_GAP, rounded_down
 from sparserob_core.experiment.assemble import ControlExperiment
@@ -52,6 +49,10 @@ def _bounded(experiment: ControlExperiment, result: Result) -> Result:
     data = certificate(experiment, safe)
     if data is None:
         return safe
+    from sparserob_core.checker.claims.case import Case
+    from sparserob_core.checker.claims.claims import derived_bound
+    from sparserob_core.checker.outcome import Broken, Clock, Unchecked
+
     case = Case(experiment.problem, experiment.control, experiment.disturbance, finite(data), Clock(SECONDS))
     try:
         derived = derived_bound(case)
