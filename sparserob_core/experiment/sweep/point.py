@@ -5,18 +5,27 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
 
+import numpy as np
+
 from sparserob_core.errors import SparseRobError, named
-from sparserob_core.experiment.config.load import load_config
+from sparserob_core.experiment.assemble import build
+from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.directory.artefacts import finite
 from sparserob_core.experiment.run.events import EvaluationsFinished, Event, Observer, RoundFinished
 from sparserob_core.experiment.run.run import run_loaded
 from sparserob_core.sip.method import OutOfTime
+from sparserob_core.sip.solver import QuadraticProgram
 
+ACCURACY = 1e-6  # of a program that is solved for nothing but its imports
 TRIES = 5  # to give a directory a name that somebody else gives another one at the same moment
+
+
+_solved_with = set[tuple[str, str]]()  # in this process
 
 
 @final
@@ -80,6 +89,7 @@ def run_point(task: Task, observers: Iterable[Observer] = ()) -> Answer:
     try:
         partial.parent.mkdir(parents=True, exist_ok=True)
         loaded = load_config(task.config)
+        _import_what_runs(loaded)
         outcome = run_loaded(loaded, task.git, partial, quiet=True, figures=task.figures, observers=observers)
         if outcome.interrupted and outcome.result.stopped:
             raise KeyboardInterrupt(outcome.result.stopped)
@@ -92,6 +102,23 @@ def run_point(task: Task, observers: Iterable[Observer] = ()) -> Answer:
         raise
     except (Exception, SystemExit) as error:  # noqa: BLE001  one point must not end the study
         return _failed(partial, ends, str(error) if isinstance(error, SparseRobError) else named(error))
+
+
+def _import_what_runs(loaded: Loaded) -> None:
+    """Import now what a run imports where it needs it, the solver's package too: or the column ``seconds`` would say of
+    the first run of every process that it took half a second more."""
+    import scipy.optimize
+    from scipy.sparse import csc_array
+
+    assert scipy.optimize
+    entry = loaded.config.solver
+    if (entry.name, repr(entry.options)) in _solved_with:
+        return
+    _solved_with.add((entry.name, repr(entry.options)))
+    one, none = csc_array(np.ones((1, 1))), csc_array((0, 1))
+    smallest = QuadraticProgram(one, -np.ones(1), one, np.ones(1), none, np.zeros(0), np.zeros(1), np.ones(1))
+    with suppress(SparseRobError):  # the run will say so
+        build(loaded, "solver", entry).solve(smallest, ACCURACY)
 
 
 def keep(partial: Path, ends: Path) -> None:

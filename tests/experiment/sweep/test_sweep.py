@@ -9,6 +9,7 @@ import json
 import multiprocessing
 import shutil
 import signal
+import subprocess
 import sys
 import time
 from collections import Counter
@@ -24,6 +25,7 @@ from sparserob_core.experiment.directory.lock import NAME, Lock
 from sparserob_core.experiment.sweep.study import read_study
 from sparserob_core.experiment.sweep.table import read_table
 from tests.experiment.cli.test_process import started, wait_for
+from tests.support.places import ROOT
 from tests.support.stub import CONFIG, Command
 
 LEFT = {"sweep.yaml", "runs", "table.csv", "columns.csv", "sweep.pdf", "sweep.png"}
@@ -196,6 +198,30 @@ def test_a_change_that_decides_no_result_runs_nothing(counting: Path, tmp_path: 
     other = {"title": "Another title", "limits.seconds": 50.0, "observers": []}
     sr.sweep(counting, {"method.number": [1, 2]}, other, out=tmp_path / "out")
     assert calls(counting) == {1: 1, 2: 1}
+
+
+def test_the_first_run_of_a_process_has_imported_everything_when_its_clock_starts(tmp_path: Path) -> None:
+    script = tmp_path / "study.py"
+    script.write_text(
+        "import sys\n"
+        "import sparserob_core as sr\n"
+        "from sparserob_core.experiment.run import run\n"
+        "solve = run.solve_in_own_units\n"
+        "def clocked(*given):\n"
+        "    before = set(sys.modules)\n"
+        "    found = solve(*given)\n"
+        "    late = {name.partition('.')[0] for name in set(sys.modules) - before}\n"
+        "    print(sorted(late & {'scipy', 'piqp', 'clarabel'}))\n"
+        "    return found\n"
+        "run.solve_in_own_units = clocked\n"
+        f"config = {str(ROOT / 'configs' / 'double_integrator.yaml')!r}\n"
+        f"sr.sweep(config, {{'solver': ['piqp', 'clarabel']}}, out={str(tmp_path / 'study')!r}, figures=False)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, text=True, timeout=120, cwd=ROOT, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == ["[]", "[]"]
 
 
 def test_points_with_one_config_are_run_once(counting: Path, tmp_path: Path) -> None:
