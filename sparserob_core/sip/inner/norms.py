@@ -1,18 +1,21 @@
-"""Directions that stand for the norms of blocks: ``|s|`` is the largest of ``d's`` over the unit vectors ``d``."""
+"""What stands for the norms of blocks: directions, for ``|s|`` is the largest of ``d's`` over the unit vectors ``d``,
+and second-order expansions where a block is not 0."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 
-from sparserob_core.shapes import Float, shaped
+from sparserob_core.shapes import Bool, Float, shaped
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import Blocks, Directions, FiniteProgram
 from sparserob_core.sip.inner.image import onto_stationary
 
-FAN = 16  # directions of a block of two entries, to begin with
+FAN = 8  # directions of a block of two entries, to begin with
 CORNERS = 4  # entries of a block up to which the corners of a cube are looked at too
+KEPT = 6  # directions of a block, those nearest to what an answer asks for, that are worth keeping
 NOTHING = 1e-14  # of the largest norm: a block that has no direction
 
 
@@ -56,6 +59,60 @@ def towards(
         asked = onto_stationary(program, np.zeros(program.weights.size) if z is None else z, slope)
     found = [_unit(blocks, vector) for vector in (program.image(x), asked) if np.isfinite(vector).all()]
     return Directions(np.concatenate([one.block for one in found]), np.vstack([one.vectors for one in found]))
+
+
+def near(directions: Directions, wanted: Directions) -> Directions:
+    """Of some directions, the few of every block that are nearest to one of its ``wanted``."""
+    kept = []
+    for block in np.unique(wanted.block):
+        mine = np.flatnonzero(directions.block == block)
+        others = wanted.vectors[wanted.block == block]
+        cosines = (directions.vectors[mine] @ others.T).max(axis=1, initial=-1.0)
+        kept.append(mine[np.argsort(-cosines, kind="stable")[:KEPT]])
+    chosen = np.concatenate([np.zeros(0, dtype=int), *kept])
+    return Directions(directions.block[chosen], directions.vectors[chosen])
+
+
+@shaped
+def bent(
+    program: FiniteProgram, blocks: Blocks, x: Float[Array, " n"], moving: Bool[np.ndarray, " b"]
+) -> FiniteProgram:
+    """The program with the norm of every ``moving (b,)`` block replaced by its second-order expansion at ``x (n,)``:
+    ``weight d's + weight/(2 |s_0|) |s - (d's) d|^2`` with ``d = s_0 / |s_0|``. ``S`` must be the identity."""
+    from scipy.sparse import csc_array
+
+    of = blocks.of
+    entries = blocks.entries[moving[of]]
+    d, norms = blocks.directions(x), np.where(moving, blocks.norms(x), 1.0)
+    weights, number = program.weights.copy(), blocks.number.copy()
+    weights[entries], number[entries] = 0.0, -1
+    q = program.q.copy()
+    q[entries] += program.weights[entries] * d[entries]
+    table = blocks.table[moving]
+    curved = (program.weights[blocks.first] / norms)[moving]
+    row = np.repeat(table[:, :, None], table.shape[1], axis=2)
+    column = row.swapaxes(1, 2)
+    across = np.where(row == column, 1.0, 0.0) - d[row] * d[column]
+    inside = (row >= 0) & (column >= 0)
+    data = (curved[:, None, None] * across)[inside]
+    H = csc_array((data, (row[inside], column[inside])), shape=(program.n, program.n))
+    P = csc_array(H if program.P is None else program.P + H)
+    still = None if moving.all() else Blocks(_renumbered(number))
+    return replace(program, P=P, q=q, weights=weights, blocks=still)
+
+
+def _renumbered(number: np.ndarray) -> np.ndarray:
+    """The same blocks, numbered from 0 without a gap."""
+    _, found = np.unique(number, return_inverse=True)
+    answer: np.ndarray = found.reshape(-1) - int((number < 0).any())
+    return answer
+
+
+def of_the_rest(directions: Directions, moving: Bool[np.ndarray, " b"]) -> Directions:
+    """The directions of the blocks that are not ``moving (b,)``, by their numbers among those."""
+    kept = ~moving[directions.block]
+    numbers = np.cumsum(~moving) - 1
+    return Directions(numbers[directions.block[kept]], directions.vectors[kept])
 
 
 def _unit(blocks: Blocks, image: Array) -> Directions:

@@ -24,7 +24,7 @@ from sparserob_core.sip.finite import Blocks, Directions, FiniteProgram, FiniteS
 from sparserob_core.sip.inner.change_of_variables import NewVariables, in_new_variables
 from sparserob_core.sip.inner.duality import farkas_margin, measure, minimisers, vertex_multipliers
 from sparserob_core.sip.inner.more_digits import refined
-from sparserob_core.sip.inner.norms import around, towards
+from sparserob_core.sip.inner.norms import around, bent, near, of_the_rest, towards
 from sparserob_core.sip.inner.polish import polish
 from sparserob_core.sip.inner.standard_form import Form, Recovered, standard_form
 from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
@@ -36,6 +36,10 @@ ATTEMPTS: tuple[tuple[Form, float], ...] = (("split", 0.1), ("epigraph", 0.1), (
 # and so many answers in a row that bring the bounds no nearer.
 ACCURACIES = (0.1, 1e-3, 10.0)
 DIRECTIONS, PATIENCE = 60, 12
+# From a gap of this share of the value, and again from such a share of that gap, Newton's method is tried for so many
+# steps, on blocks whose norm is more than this share of the largest.
+NEARLY, NEWTON, SMALLEST = 0.03, 6, 1e-7
+CRUDE = 1e-6  # a residual of an answer whose gap says something
 
 ADVICE = "try another solver, or state the problem in units in which its numbers are of one size"
 
@@ -118,8 +122,15 @@ def _by_directions(case: _Case, blocks: Blocks, guess: FiniteSolution | None) ->
     those that their multipliers ask for, until the cost with the norms themselves meets the bound."""
     program, directions = case.program, around(blocks)
     if guess is not None and np.isfinite(guess.x).all():
-        directions = directions.joined(towards(program, blocks, guess.x, guess.y, guess.mu, guess.z))
-        directions = directions if guess.directions is None else guess.directions.joined(directions)
+        wanted = towards(program, blocks, guess.x, guess.y, guess.mu, guess.z)
+        known = () if guess.directions is None else (near(guess.directions, wanted),)
+        for more in (wanted, *known):
+            directions = directions.joined(more)
+        if program.S is None:
+            start = (guess.x, guess.y, guess.mu, guess.z)
+            believed, _, _ = _newton(case, blocks, ACCURACIES[0] * case.tolerance, directions, start, np.inf)
+            if believed is not None:
+                return replace(believed, directions=directions)
     for accuracy in ACCURACIES:
         believed, proof, directions = _kelley(case, blocks, accuracy * case.tolerance, directions)
         if believed is None:
@@ -132,27 +143,73 @@ def _by_directions(case: _Case, blocks: Blocks, guess: FiniteSolution | None) ->
 def _kelley(
     case: _Case, blocks: Blocks, accuracy: float, directions: Directions
 ) -> tuple[FiniteSolution | None, FiniteSolution | None, Directions]:
-    """A believed answer, or a proof that there is none, or neither; and the directions used."""
-    program, closest, idle = case.program, np.inf, 0
+    """A believed answer, or a proof that there is none, or neither; and the directions used. Where an answer is near,
+    Newton's method is tried from it: it knows the curvature of the norms, but not which blocks are 0."""
+    program, closest, tried, idle = case.program, np.inf, np.inf, 0
     for _ in range(DIRECTIONS):
         claim, answer = _ask(case, program, "epigraph", accuracy, directions)
         if claim is not None and claim.status == "infeasible":
             return None, _proof(case, answer, "the solver's ray"), directions
         if answer is None or not np.isfinite(answer[0]).all():
             break
+        believed, gap = _looked_at(case, answer)
+        if (
+            believed is None
+            and program.S is None
+            and gap <= NEARLY * min(tried, cost_scale(program, program.objective(answer[0])))
+        ):
+            tried = gap
+            believed, answer, gap = _newton(case, blocks, accuracy, directions, answer, gap)
+        if believed is not None:
+            return believed, None, directions
+        idle = 0 if gap < 0.9 * closest else idle + 1
+        closest = min(closest, gap)
         x, y, mu, z = answer
-        for offer in ((y, mu), vertex_multipliers(program.tangent(x), x, y, mu)):
-            solution = measure(program, x, *offer, z, message="claimed")
-            believed = case.judge(solution, "by directions")
-            if believed is not None:
-                return believed, None, directions
-            idle = 0 if solution.gap < 0.9 * closest else idle + 1
-            closest = min(closest, solution.gap)
         more = directions.joined(towards(program, blocks, x, y, mu, z))
         if idle > PATIENCE or more.block.size == directions.block.size:
             break
         directions = more
     return None, None, directions
+
+
+def _looked_at(case: _Case, answer: Recovered) -> tuple[FiniteSolution | None, float]:
+    """A believed solution, if the answer is one, and its gap: with its own multipliers or those of the tangent there,
+    whichever prove more."""
+    x, y, mu, z = answer
+    gap = np.inf
+    for offer in ((y, mu), vertex_multipliers(case.program.tangent(x), x, y, mu)):
+        solution = measure(case.program, x, *offer, z, message="claimed")
+        believed = case.judge(solution, "by directions")
+        gap = min(gap, solution.gap if solution.residual <= CRUDE else np.inf)
+        if believed is not None:
+            return believed, gap
+    return None, gap
+
+
+def _newton(
+    case: _Case, blocks: Blocks, accuracy: float, directions: Directions, answer: Recovered, gap: float
+) -> tuple[FiniteSolution | None, Recovered, float]:
+    """A believed solution, the best answer and its gap, by second-order expansions of the norms that are not 0; the
+    others keep their directions."""
+    program = case.program
+    norms = blocks.norms(answer[0])
+    moving = norms > SMALLEST * norms.max(initial=0.0)
+    here = answer[0]
+    for _ in range(NEWTON):
+        if not moving.any():
+            break
+        step = bent(program, blocks, here, moving)
+        rest = None if step.blocks is None else of_the_rest(directions, moving)
+        _, found = _ask(case, step, "epigraph", accuracy, rest)
+        if found is None or not np.isfinite(found[0]).all():
+            break
+        believed, after = _looked_at(case, found)
+        if believed is not None or not after < 0.5 * gap:
+            return believed, answer, gap
+        answer, gap = found, after
+        moving = moving & (blocks.norms(found[0]) > SMALLEST * norms.max())
+        here = found[0]
+    return None, answer, gap
 
 
 def _tried(case: _Case) -> FiniteSolution:
