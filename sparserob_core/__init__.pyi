@@ -19,6 +19,7 @@ from sparserob_core.control.sets.sets import Equality as Equality
 from sparserob_core.control.sets.sets import NormBall as NormBall
 from sparserob_core.control.sets.sets import Polytope as Polytope
 from sparserob_core.control.sets.sets import SetFactory as SetFactory
+from sparserob_core.control.sets.sets import Zonotope as Zonotope
 from sparserob_core.control.sets.sets import cylinder as cylinder
 from sparserob_core.control.sets.sets import intersection as intersection
 from sparserob_core.control.transcription.transcribe import transcribe as transcribe

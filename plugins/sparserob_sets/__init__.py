@@ -1,4 +1,4 @@
-"""The kinds of sets that a config can name: four whose mathematics is in the core, and zonotopes."""
+"""The kinds of sets that a config can name: their mathematics is in the core."""
 
 from __future__ import annotations
 

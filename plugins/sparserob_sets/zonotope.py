@@ -1,78 +1,13 @@
-"""Zonotopes: sums of segments, ``{m + sum_j s_j g_j : |s_j| <= 1}`` (Ziegler 1995, section 7.3)."""
+"""Zonotopes as a config writes them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
-from itertools import combinations
-from math import comb
 from typing import final
 
 import numpy as np
 from pydantic import Field
 
 import sparserob_core as sr
-
-MOST_SIDES = 500  # pairs of half-spaces that are listed; beyond, the set is left to its support function
-PARALLEL = 1e-10  # of its generators' size, a normal that is none
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Zonotope(sr.ConvexSet):
-    """``{centre + sum_j s_j generators_j : |s_j| <= 1}``, ``centre (d,)``, ``generators (q, d)``.
-
-    Support function ``c'centre + sum_j |c'generators_j|``. Without an interior where the generators do not span the
-    space: such a set can be a disturbance's, but not one that states must stay in.
-    """
-
-    centre: sr.Array
-    generators: sr.Array
-
-    @property
-    def dimension(self) -> int:
-        return int(self.centre.size)
-
-    def support(self, directions: sr.Array) -> sr.Array:
-        directions = np.asarray(directions, dtype=float)
-        height: sr.Array = directions @ self.centre + np.abs(directions @ self.generators.T).sum(axis=-1)
-        return height
-
-    def support_point(self, directions: sr.Array) -> sr.Array:
-        signs = np.sign(np.asarray(directions, dtype=float) @ self.generators.T)
-        point: sr.Array = self.centre + signs @ self.generators
-        return point
-
-    def interior_point(self) -> sr.Array:
-        return self.centre.copy()
-
-    def linearisation_excess(self, centre: sr.Array, spread: sr.Array) -> sr.Array:
-        """``|a + b| - sign(a) (a + b) <= 2 max(|b| - |a|, 0)`` for every generator; ``|a + b|`` itself where ``a`` is
-        0."""
-        along = np.abs(np.asarray(centre) @ self.generators.T)
-        moved = np.abs(np.asarray(spread) @ self.generators.T).sum(axis=-2)
-        excess: sr.Array = np.where(along > 0, 2.0 * np.maximum(moved - along, 0.0), moved).sum(axis=-1)
-        return excess
-
-    def halfspaces(self) -> tuple[sr.Array, sr.Array] | None:
-        return self._sides
-
-    @cached_property
-    def _sides(self) -> tuple[sr.Array, sr.Array] | None:
-        """Every facet is spanned by ``d - 1`` generators; ``None`` where these are too many, or there is no
-        interior."""
-        d, sizes = self.dimension, np.linalg.norm(self.generators, axis=1)
-        generators = self.generators[sizes > 0] / sizes[sizes > 0, None]
-        few = comb(len(generators), d - 1) <= MOST_SIDES
-        if not few or not len(generators) or np.linalg.matrix_rank(generators, tol=PARALLEL) < d:
-            return None
-        normals = []
-        for chosen in combinations(generators, d - 1):
-            _, values, rows = np.linalg.svd(np.array(chosen).reshape(d - 1, d))
-            if d == 1 or values.min() > PARALLEL:
-                normals.append(rows[-1])
-        H = np.vstack([normals, -np.array(normals)])
-        return H, self.support(H)
 
 
 @final
@@ -85,7 +20,7 @@ class ZonotopeFactory(sr.SetFactory, sr.Options):
     centre: float | list[float] = 0.0
     """Centre; a number serves every coordinate."""
 
-    def build(self, dimension: int) -> Zonotope:
+    def build(self, dimension: int) -> sr.Zonotope:
         """The zonotope; raises `InputError` when the numbers are not as many as coordinates."""
         if {len(row) for row in self.generators} != {dimension}:
             lengths = [len(row) for row in self.generators]
@@ -93,4 +28,4 @@ class ZonotopeFactory(sr.SetFactory, sr.Options):
         centre = self.centre if isinstance(self.centre, list) else [self.centre] * dimension
         if len(centre) != dimension:
             raise sr.InputError(f"centre: expected {dimension} numbers, got {len(centre)}")
-        return Zonotope(np.array(centre), np.array(self.generators))
+        return sr.Zonotope(np.array(centre), np.array(self.generators))

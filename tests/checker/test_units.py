@@ -1,4 +1,4 @@
-"""Guards checker.claims.units, checker.sets.shapes.excess: every component, row and direction is judged in its own
+"""Guards checker.claims.units, checker.sets.shape.excess: every component, row and direction is judged in its own
 unit: no certificate of an infeasible problem is accepted, and what is honest is, in anyone's units."""
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import sparserob_core as sr
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.claims.claims import check
 from sparserob_core.checker.outcome import Clock, Finding
-from sparserob_core.checker.sets.shapes import excess, units
+from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.dictionary import Dictionary
 
 INFINITY = np.inf
@@ -143,18 +143,18 @@ def test_a_control_outside_a_small_component_is_refused_with_any_multiplier() ->
 def test_a_row_of_a_polytope_of_controls_means_the_same_at_any_factor(factor: float) -> None:
     H, h = np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1], [factor, factor]]), np.array([1, 1, 1, 1, 0.5 * factor])
     shape = sr.Polytope(H, h)
-    assert units(shape)[4] == pytest.approx(0.5 * factor, rel=1e-12)
+    assert known(shape).units()[4] == pytest.approx(0.5 * factor, rel=1e-12)
     for point, over in (([0.25, 0.25 + 1e-8], 2e-8), ([0.95, 0.95], 2.8), ([0.25, 0.2], 0.0)):
-        found, where = excess(shape, [arb(x) for x in point])
+        found, where = known(shape).excess([arb(x) for x in point])
         assert found == pytest.approx(over, rel=1e-6)
         assert where == ("row 5" if over else "")
 
 
 def test_every_component_of_a_control_is_judged_in_its_own_range() -> None:
     shape = box([-1e-9, 0.0, 5.0], [1e-9, 1e6, 5.0])
-    assert excess(shape, [arb(1.5e-9), arb(3.0), arb(5.0)])[0] == pytest.approx(0.5, rel=1e-6)
-    assert excess(shape, [arb(0.0), arb(1e6 + 1e-3), arb(5.0)]) == (pytest.approx(1e-9, rel=1e-3), "u2")
-    assert excess(shape, [arb(0.0), arb(0.0), arb(5.0 + 1e-12)])[0] > 1e-13
+    assert known(shape).excess([arb(1.5e-9), arb(3.0), arb(5.0)])[0] == pytest.approx(0.5, rel=1e-6)
+    assert known(shape).excess([arb(0.0), arb(1e6 + 1e-3), arb(5.0)]) == (pytest.approx(1e-9, rel=1e-3), "u2")
+    assert known(shape).excess([arb(0.0), arb(0.0), arb(5.0 + 1e-12)])[0] > 1e-13
 
 
 def test_states_in_units_of_a_millionth_are_judged_as_before() -> None:

@@ -20,7 +20,6 @@ COUNT = int(os.environ.get("SPARSEROB_INSTANCES", "300"))
 FIRST = int(os.environ.get("SPARSEROB_FIRST_INSTANCE", "300000"))
 # problems whose honest runs `check` once refused, or did not check: taken whatever the numbers are
 FOUND = (300270, 301955, 420593, 420815, 610056, 610151)
-SETS_THAT_ARE_NOT_CHECKED = "the checker has no bound of the support function of this"
 
 
 def numbers():
@@ -62,5 +61,4 @@ def test_what_is_said_of_a_random_problem_in_any_units_is_true(seed, tmp_path):
             assert largest_violation(problem, pieces.ravel()) <= 2e-9
     if checked:
         found = [claim for claim in sr.check(tmp_path / "run").claims if claim.verdict != "holds"]
-        assert not [claim for claim in found if claim.verdict == "fails"], found
-        assert not found or any(SETS_THAT_ARE_NOT_CHECKED in claim.text for claim in found), found
+        assert not found, found

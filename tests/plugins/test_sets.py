@@ -105,14 +105,47 @@ def zonotopes(tmp_path_factory) -> Path:
     return out
 
 
-def test_the_check_of_a_set_that_it_does_not_know_is_open_and_names_the_kind(zonotopes):
+def test_every_claim_about_zonotopes_is_checked(zonotopes):
     pytest.importorskip("flint")
     found = sr.check(zonotopes)
-    assert found.status == "undecided"
-    verdicts = {claim.name: claim for claim in found.claims}
-    for name in ("control", "path", "terminal", "lower bound"):
-        assert verdicts[name].verdict == "not checked"
-        assert "zonotope" in verdicts[name].text
+    assert found.status == "verified", [claim for claim in found.claims if claim.verdict != "holds"]
+
+
+# Slanted segments, more of them than dimensions, in the plane and in space, wherever a set is written.
+SLANTED = changed(
+    control={"zonotope": {"generators": [[1.5], [0.5]]}},
+    disturbance={"zonotope": {"generators": [[0.01, 0.005], [0.0, 0.004], [-0.003, 0.007]]}},
+    path=[{"zonotope": {"generators": [[0.7, 0.1], [0.2, 0.9], [0.2, -0.3]], "centre": [0.6, -0.4]}}],
+    terminal=[{"zonotope": {"generators": [[0.15, 0.1], [0.1, -0.2], [0.1, 0.0]]}}],
+)
+SOLID = changed(
+    system={
+        "A": [[0, 1, 0], [0, 0, 1], ["p", -1, -1]],
+        "B": [[0, 0], [1, 0.2], [0, 1]],
+        "parameters": {"p": [-0.1, 0.1]},
+    },
+    initial_state=[1, 0, 0],
+    control={"zonotope": {"generators": [[1.5, 0.3], [0.5, -1.0], [0.2, 0.2]]}},
+    disturbance={"zonotope": {"generators": [[0.01, 0.005, 0], [0, 0.004, 0.01], [-0.003, 0, 0.007], [0.001] * 3]}},
+    path=[{"zonotope": {"generators": [[1.1, 0.1, 0.2], [0, 1.9, 0.1], [0.1, 0.3, 2.0], [0.5, 0.5, -0.5]]}}],
+    terminal=[{"zonotope": {"generators": [[0.3, 0.1, 0], [0, 0.3, 0.1], [0.1, 0, 0.3], [0.1, 0.1, 0.1]]}}],
+)
+
+
+@pytest.mark.parametrize("config", [SLANTED, SOLID], ids=["plane", "space"])
+def test_every_claim_about_slanted_zonotopes_is_checked(config, tmp_path):
+    pytest.importorskip("flint")
+    cost(config, tmp_path / "run")
+    found = sr.check(tmp_path / "run")
+    assert found.status == "verified", [claim for claim in found.claims if claim.verdict != "holds"]
+
+
+def test_a_zonotope_that_is_left_is_refuted_by_a_disturbance_that_is_checked(tmp_path):
+    pytest.importorskip("flint")
+    config = copy.deepcopy(SLANTED) | {"method": {"name": "nominal"}}
+    assert sr.run(config, out=tmp_path / "run", quiet=True, figures=False).result.status == "refuted"
+    found = sr.check(tmp_path / "run")
+    assert found.status == "verified", [claim for claim in found.claims if claim.verdict != "holds"]
 
 
 def test_no_random_trajectory_leaves_a_zonotope_that_was_proven(zonotopes):

@@ -13,11 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import rational
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.claims.duality import Row
-from sparserob_core.checker.sets.shapes import arrangement, boxed, facets, support
-from sparserob_core.control.sets.sets import Box
+from sparserob_core.checker.sets.known import known
 
 if TYPE_CHECKING:
     from flint import arb
@@ -77,51 +75,17 @@ def _least(case: Case, ranges: list[tuple[arb, arb]], count: list[arb], slope: l
         down = arb(0) if always or not low < 0 else one / -low
         ups.append(up if high > 0 else down)
         downs.append(down if low < 0 else up)
-    bound = boxed(case.problem.control)
-    if isinstance(bound, Box):
-        sides = zip(ups, downs, slope, bound.lower, bound.upper, strict=True)
-        return sum((_between(up, down, s, float(low), float(high)) for up, down, s, low, high in sides), certain)
-    if facets(bound) is not None:
-        corners = [
-            sum(
-                (_value(up, down, s, rational(v)) for up, down, s, v in zip(ups, downs, slope, point, strict=True)),
-                arb(0),
-            )
-            for point in arrangement(bound)
-        ]
-        return certain + _smallest(corners)
-    tilts = [
-        s + arb(float(np.clip(-float(s.mid()), -float(down.lower()), float(up.lower()))))
-        for up, down, s in zip(ups, downs, slope, strict=True)
-    ]
-    return certain - support(bound, [-tilt for tilt in tilts])  # any slope between -down and up is below the count
-
-
-def _between(up: arb, down: arb, s: arb, low: float, high: float) -> arb:
-    from flint import arb
-
-    return _smallest([_value(up, down, s, arb(v)) for v in (low, high, float(np.clip(0.0, low, high)))])
-
-
-def _value(up: arb, down: arb, s: arb, v: arb) -> arb:
-    return (up * v if v >= 0 else -down * v) + s * v
-
-
-def _smallest(values: Sequence[arb]) -> arb:
-    answer = values[0]
-    for value in values[1:]:
-        answer = answer.min(value)
-    return answer
+    return certain + known(case.problem.control).least(ups, downs, slope)
 
 
 def _ranges(case: Case) -> list[tuple[arb, arb]]:
     """The least and the largest value of every channel."""
     from flint import arb
 
-    found, m = [], case.problem.system.controls
+    found, m, shape = [], case.problem.system.controls, known(case.problem.control)
     for i in range(m):
         axis = [arb(float(i == j)) for j in range(m)]
-        found.append((-support(case.problem.control, [-a for a in axis]), support(case.problem.control, axis)))
+        found.append((-shape.support([-a for a in axis]), shape.support(axis)))
     return found
 
 

@@ -90,9 +90,9 @@ class Place:
     clock: Clock
     beside: Beside | None = None
 
-    def cells(self, interval: Interval, z: Array) -> list[Polynomial]:
-        """The polynomials of all rows on an interval."""
-        found = self.tube.cells(*interval, z)
+    def cells(self, interval: Interval, z: Array, sharp: bool) -> list[Polynomial]:
+        """The polynomials of all rows on an interval, `Tube.cells` of them."""
+        found = self.tube.cells(*interval, z, sharp)
         return found if self.beside is None else self.beside.added(found, *interval[1:], z)
 
 
@@ -125,10 +125,9 @@ class _Left:
 def _examine(place: Place, sides: Sides, todo: Sequence[Interval], left: _Left, shown: _Found) -> None:
     """Bound every cell of time; notes the bounds that will do, and sorts what will not."""
     for interval, found, tops in _batch(place, sides.rows, todo):
-        tops = [
-            top if top <= 0.0 else min(top, _cut(place, row, poly))
-            for top, row, poly in zip(tops, sides.rows, found, strict=True)
-        ]
+        for i, row in enumerate(sides.rows):
+            if not tops[i] <= 0.0:
+                tops[i], found[i] = _closer(place, row, interval, found[i], tops[i])
         for top, row in zip(tops, sides.rows, strict=True):
             if top <= 0.0:
                 shown.add(top, row)
@@ -144,6 +143,16 @@ def _examine(place: Place, sides: Sides, todo: Sequence[Interval], left: _Left, 
             left.halves += _halves(interval)
 
 
+def _closer(place: Place, row: Bounded, interval: Interval, poly: Polynomial, top: float) -> tuple[float, Polynomial]:
+    """A bound that is less far from the truth, with what takes longer: a sharper polynomial where switching is to
+    blame, and the set of parameters."""
+    if poly.kinks > BLAME * row.slack:
+        ((_, (sharper,), (other,)),) = _batch(place, [row], [interval], sharp=True)
+        if other < top:
+            top, poly = other, sharper
+    return (top if top <= 0.0 else min(top, _cut(place, row, poly))), poly
+
+
 def _turn(
     place: Place, sides: Sides, interval: Interval, failed: Sequence[tuple[Bounded, Polynomial]], worst: float
 ) -> bool:
@@ -156,8 +165,9 @@ def _turn(
             _refute(place, interval, failed)
         return False
     ((_, (poly,), (top,)),) = _batch(place, [middle], [interval])
+    if not top <= 0.0:
+        top, poly = _closer(place, middle, interval, poly, top)
     _refute(place, interval, [(middle, poly)])
-    top = top if top <= 0.0 else min(top, _cut(place, middle, poly))
     return top <= 0.0 and worst - top > 0.5 * (poly.expansion + poly.kinks)
 
 
@@ -169,14 +179,14 @@ def _refute(place: Place, interval: Interval, rows: Sequence[tuple[Bounded, Poly
 
 
 def _batch(
-    place: Place, rows: Sequence[Bounded], todo: Sequence[Interval]
+    place: Place, rows: Sequence[Bounded], todo: Sequence[Interval], sharp: bool = False
 ) -> Iterator[tuple[Interval, list[Polynomial], list[float]]]:
     """Every interval with its polynomials, one per row, and the proven upper bounds of what they exceed their row's
     limit and slack by."""
     z, every = np.array([row.z for row in rows]), []
     for interval in todo:
         place.clock.check()
-        every.append(place.cells(interval, z))
+        every.append(place.cells(interval, z, sharp))
     tops = _tops(place.tube, [(poly, row.allowed) for found in every for poly, row in zip(found, rows, strict=True)])
     for number, (interval, found) in enumerate(zip(todo, every, strict=True)):
         yield interval, found, tops[number * len(rows) : (number + 1) * len(rows)].tolist()

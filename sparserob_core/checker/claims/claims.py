@@ -17,7 +17,7 @@ from sparserob_core.checker.claims.equalities import equalities
 from sparserob_core.checker.claims.replay import reached
 from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import TOLERANCE, Broken, Finding, Unchecked
-from sparserob_core.checker.sets.shapes import excess, member
+from sparserob_core.checker.sets.known import known
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
@@ -100,7 +100,7 @@ def _control(case: Case) -> str:
     worst = 0.0
     for start, piece in zip(case.control.breakpoints[:-1], case.pieces, strict=True):
         case.clock.check()
-        over, where = excess(case.problem.control, piece.entries())
+        over, where = known(case.problem.control).excess(piece.entries())
         if over > TOLERANCE:
             raise Broken(f"{where} leaves its set by {over:.3g} of its own unit, from t = {float(start):.6g} on")
         worst = max(worst, over)
@@ -115,7 +115,7 @@ def _steps(case: Case) -> str:
     for k in steps:
         case.clock.check()
         before = case.duality.before if k == 0 else case.pieces[k - 1].entries()
-        over, where = excess(bound, [u - v for u, v in zip(case.pieces[k].entries(), before, strict=True)])
+        over, where = known(bound).excess([u - v for u, v in zip(case.pieces[k].entries(), before, strict=True)])
         if over > TOLERANCE:
             where = "the change of the control" if where == "it" else f"the change of {where}"
             raise Broken(
@@ -247,7 +247,7 @@ def _row(case: Case, entry: object) -> tuple[float, Row]:
     if not window.start <= time <= window.stop:
         raise Broken(f"{name}: t = {time!r} is not within {window.start:g} to {window.stop:g}")
     _sized(parameter, case.problem.system.parameter_count, name)
-    if case.problem.system.parameters is not None and not member(case.problem.system.parameters, parameter):
+    if case.problem.system.parameters is not None and not known(case.problem.system.parameters).contains(parameter):
         raise Broken(f"{name}: the parameter {parameter.tolist()} is not shown to be in its set")
     c, gain = window.split(direction)
     row = case.duality.row(c, time, parameter.tolist(), window.limit(direction, time))
@@ -333,7 +333,7 @@ def _witness(case: Case) -> str:
     _sized(parameter, case.problem.system.parameter_count, window.name)
     if not window.start <= time <= window.stop:
         raise Broken(f"t = {time!r} is not within {window.start:g} to {window.stop:g}")
-    if case.problem.system.parameters is not None and not member(case.problem.system.parameters, parameter):
+    if case.problem.system.parameters is not None and not known(case.problem.system.parameters).contains(parameter):
         raise Broken(f"the parameter {parameter.tolist()} is not shown to be in its set")
     state = reached(case, time, parameter, data.get("disturbance"), data.get("deviation"))
     height = window.limit(direction, time)

@@ -17,11 +17,9 @@ from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.reach.flow import Flow
 from sparserob_core.checker.reach.tube import Tube
+from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Corners, Parameters
-from sparserob_core.checker.sets.shapes import facets, support
-from sparserob_core.checker.sets.sides import Bounded, Curved, Sides, flat_basis
-from sparserob_core.control.sets.sets import Box as BoxSet
-from sparserob_core.control.sets.sets import Cylinder
+from sparserob_core.checker.sets.sides import Bounded, Curved, Sides
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -51,7 +49,7 @@ def bounded(case: Case, window: Window) -> str:
     basis, gains, work = _work(case, window, normals, lower, upper)
     found = prove(
         _tubes(case, basis, lower, upper),
-        Parameters(case.problem.system.parameters),
+        _parameters(case),
         work,
         case.clock,
         case.beside(window, basis, gains),
@@ -65,7 +63,7 @@ def bounded(case: Case, window: Window) -> str:
 def _normals(window: Window, data: object) -> Array:
     """The coordinates of a curved set's directions, ``(b, d)``: they must be able to name every direction in which it
     is bounded. Those of the state where the certificate has none."""
-    b, d = _spanned(window), window.shape.dimension
+    b, d = window.seen.spanned, window.shape.dimension
     if data is None:
         return np.eye(b, d)
     normals = numbers(data, "normals")
@@ -78,14 +76,15 @@ def _normals(window: Window, data: object) -> Array:
     return normals
 
 
-def _spanned(window: Window) -> int:
-    return window.shape.base.dimension if isinstance(window.shape, Cylinder) else window.shape.dimension
+def _parameters(case: Case) -> Parameters:
+    bound = case.problem.system.parameters
+    return Parameters(None if bound is None else known(bound))
 
 
 def _covered(case: Case, window: Window, lower: Array, upper: Array) -> None:
     """The cells must fill the times and parameters, and for a curved set every face of the cube of directions too."""
     nu = case.problem.system.parameter_count
-    b = 0 if facets(window.shape) is not None else _spanned(window)
+    b = 0 if window.seen.facets is not None else window.seen.spanned
     if lower.ndim != 2 or lower.shape != upper.shape or lower.shape[1] != 1 + nu + b:
         raise Broken(f"its cells are no pairs of corners with {1 + nu + b} coordinates")
     low, high = _extent(case, window, lower, upper)
@@ -105,14 +104,15 @@ def _extent(case: Case, window: Window, lower: Array, upper: Array) -> tuple[Arr
     nu, bound = case.problem.system.parameter_count, case.problem.system.parameters
     if bound is None:
         return np.array([window.start]), np.array([window.stop])
-    if isinstance(bound, BoxSet):
-        return np.append(window.start, bound.lower), np.append(window.stop, bound.upper)
+    if known(bound).is_box:
+        box = bound.bounding_box()
+        return np.append(window.start, box.lower), np.append(window.stop, box.upper)
     low, high = lower[:, 1 : 1 + nu].min(axis=0), upper[:, 1 : 1 + nu].max(axis=0)
     slack = balls(WIDER * (high - low))
     for i, axis in enumerate(np.eye(nu)):
         if not (
-            support(bound, balls(axis)) <= balls(high)[i] + slack[i]
-            and support(bound, balls(-axis)) <= -balls(low)[i] + slack[i]
+            known(bound).support(balls(axis)) <= balls(high)[i] + slack[i]
+            and known(bound).support(balls(-axis)) <= -balls(low)[i] + slack[i]
         ):
             raise Broken("the cells leave out some of the parameters")
     return np.append(window.start, low), np.append(window.stop, high)
@@ -124,7 +124,7 @@ def _work(case: Case, window: Window, normals: Array, lower: Array, upper: Array
     nu, units = case.problem.system.parameter_count, case.units(window)
     basis, gains, flat = _facets(window, units)
     cuts = sorted({*case.grid, *window.cuts(case.control.breakpoints.tolist())})
-    curved = None if flat is not None else Curved(window.shape, normals, units.sums)
+    curved = None if flat is not None else Curved(window.seen, normals, units.sums)
     keys = [(tuple(a[1:].tolist()), tuple(b[1:].tolist())) for a, b in zip(lower, upper, strict=True)]
     order = sorted(range(len(keys)), key=lambda i: (keys[i], lower[i, 0]))
     work: list[Work] = []
@@ -140,7 +140,7 @@ def _work(case: Case, window: Window, normals: Array, lower: Array, upper: Array
 def _facets(window: Window, units: RowUnits) -> tuple[Array, Array, Sides | None]:
     """The normals of a flat set's facets up to the sign, on the state and on the control, and its rows; no rows for a
     curved one."""
-    found, flat = flat_basis(window.shape), facets(window.shape)
+    found, flat = window.seen.basis, window.seen.facets
     if found is None or flat is None:
         return np.zeros((0, 0)), np.zeros((0, 0)), None
     basis, z = found
@@ -161,7 +161,7 @@ def _cut(case: Case, cuts: Sequence[float], start: float, stop: float) -> list[I
 
 def _tubes(case: Case, basis: Array, lower: Array, upper: Array) -> Callable[[Corners], Tube]:
     nu = case.problem.system.parameter_count
-    widened = nu and not isinstance(case.problem.system.parameters, BoxSet)
+    widened = nu and not _parameters(case).is_box
     extra = WIDER * (upper[:, 1 : 1 + nu].max(axis=0) - lower[:, 1 : 1 + nu].min(axis=0)) if widened else np.zeros(nu)
     made: dict[Corners, Tube] = {}
 

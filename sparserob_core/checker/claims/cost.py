@@ -16,7 +16,7 @@ from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.series import norm
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.reach.flow import Flow, stacked
-from sparserob_core.checker.sets.shapes import support
+from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.cost import Quadratic, nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -103,7 +103,9 @@ class Price:
         at a control that stays 0, or stays at one end of one channel."""
         m, horizon = self.problem.system.controls, self.problem.horizon
         axes = np.eye(m)
-        ends = [[float(support(self.problem.control, balls(s * axis)).mid()) for s in (1.0, -1.0)] for axis in axes]
+        ends = [
+            [float(known(self.problem.control).support(balls(s * axis)).mid()) for s in (1.0, -1.0)] for axis in axes
+        ]
         reach = [max(abs(high), abs(low)) for high, low in ends]
         total = self.problem.cost.l1 * float(np.dot(np.asarray(self.problem.weights), reach)) * horizon
         if not self.is_quadratic:

@@ -15,14 +15,13 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import rational
 from sparserob_core.checker.claims.cost import Price, Tangent
-from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.reach.flow import Flow, stacked
-from sparserob_core.checker.sets.shapes import arrangement, boxed, facets, limit, support
+from sparserob_core.checker.sets.flat import Boxed
+from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.sets.sets import Box
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -56,7 +55,7 @@ class Duality:
         )
         slope = [[_exact(0.0)] * direction.size for _ in range(self.control.pieces)]
         slope[piece] = [_exact(c) for c in direction]
-        return Row(-support(self.problem.control, slope[piece]), slope)
+        return Row(-known(self.problem.control).support(slope[piece]), slope)
 
     @property
     def before(self) -> list[arb]:
@@ -78,7 +77,7 @@ class Duality:
         (k,) = found
         slope = [[_exact(0.0)] * direction.size for _ in range(self.control.pieces)]
         slope[k] = [_exact(c) for c in direction]
-        constant = -limit(self.problem.control_step, direction)
+        constant = -known(self.problem.control_step).limit(direction)
         if k > 0:
             slope[k - 1] = [-_exact(c) for c in direction]
         else:
@@ -104,12 +103,12 @@ class Duality:
             constant = sum((w * _exact(u) for w, u in zip(early, before(self.problem), strict=True)), constant)
         slope = _differences([lags[s][d : d + m] if s < time else None for s in breaks], m)
         if disturbed and self.problem.initial_set is not None:
-            constant = constant + support(self.problem.initial_set, lags[0.0][:d])
+            constant = constant + known(self.problem.initial_set).support(lags[0.0][:d])
         if disturbed and self.changes is not None and self.problem.disturbance is not None:
             mw = flow.parts["E"][0].ncols()
             for weights in _differences([lags[s][d + columns :] if s < time else None for s in jumps], mw):
                 if any(not w.is_zero() for w in weights):
-                    constant = constant + support(self.problem.disturbance, weights)
+                    constant = constant + known(self.problem.disturbance).support(weights)
         return Row(constant, slope)
 
     def _lag(self, matrix: arb_mat, direction: Array, time: float, since: float) -> list[arb]:
@@ -141,7 +140,7 @@ class Duality:
             if groups and touched is not None:
                 constant = constant + self._least_of_groups(costs, slope, groups, touched[k].entries())
             else:
-                constant = constant + self._least(costs, slope)
+                constant = constant + known(self.problem.control).least(costs, costs, slope)
         return constant
 
     def _least_of_groups(
@@ -157,18 +156,15 @@ class Duality:
                 for c, push in zip(block, d, strict=True):
                     tilted[c], left[c] = slope[c] + push, _exact(0.0)
             offers.append((left, tilted))
-        bound = boxed(self.problem.control)
-        if not isinstance(bound, Box):
-            values = [self._least(*offer) for offer in offers]
+        shape = known(self.problem.control)
+        if not isinstance(shape, Boxed):
+            values = [shape.least(left, left, tilted) for left, tilted in offers]
             return values[0].max(values[1])
-        sides = list(zip(bound.lower, bound.upper, strict=True))
+        alone = [[c] for c in range(len(slope)) if not any(c in block for block in groups)]
+        parts = [shape.shares_of_least(left, left, tilted) for left, tilted in offers]
         found = _exact(0.0)
-        alone = [c for c in range(len(slope)) if not any(c in block for block in groups)]
-        for block in (*groups, *([c] for c in alone)):
-            values = [
-                sum((_least_between(left[c], tilted[c], *map(float, sides[c])) for c in block), _exact(0.0))
-                for left, tilted in offers
-            ]
+        for block in (*groups, *alone):
+            values = [sum((part[c] for c in block), _exact(0.0)) for part in parts]
             found = found + values[0].max(values[1])
         return found
 
@@ -220,7 +216,8 @@ class Duality:
 
     def _largest_coefficients(self, channel: int) -> list[arb]:
         axis = [_exact(float(i == channel)) for i in range(self.problem.system.controls)]
-        reach = support(self.problem.control, axis).max(support(self.problem.control, [-a for a in axis]))
+        shape = known(self.problem.control)
+        reach = shape.support(axis).max(shape.support([-a for a in axis]))
         return [sum((abs(x) for x in row), _exact(0.0)) * reach for row in self._pseudoinverse]
 
     @cached_property
@@ -229,33 +226,6 @@ class Duality:
         V = stacked([[_exact(v) for v in row] for row in self.control.values])
         table: list[list[arb]] = ((V * V.transpose()).inv() * V).tolist()
         return table
-
-    def _least(self, weights: list[arb], slope: list[arb]) -> arb:
-        """At most ``min sum_i weights_i |u_i| + slope_i u_i`` over the controls' set."""
-        bound = boxed(self.problem.control)
-        if isinstance(bound, Box):
-            return sum(
-                (
-                    _least_between(w, s, float(low), float(high))
-                    for w, s, low, high in zip(weights, slope, bound.lower, bound.upper, strict=True)
-                ),
-                _exact(0.0),
-            )
-        flat = facets(bound)
-        if flat is not None:
-            values = [
-                sum(
-                    (w * rational(abs(v)) + s * rational(v) for w, s, v in zip(weights, slope, point, strict=True)),
-                    _exact(0.0),
-                )
-                for point in arrangement(bound)
-            ]
-            return _smallest(values)
-        tilt = [
-            s + _exact(float(np.clip(-float(s.mid()), -float(w.lower()), float(w.lower()))))
-            for w, s in zip(weights, slope, strict=True)
-        ]
-        return -support(bound, [-t for t in tilt])  # |u_i| >= v_i u_i for any |v_i| <= 1
 
 
 def before(problem: OptimalControlProblem) -> list[float]:
@@ -299,20 +269,6 @@ def _lengthened(vector: Sequence[arb], length: arb) -> list[arb]:
 
 def _squares(vector: Sequence[arb]) -> arb:
     return sum((v * v for v in vector), _exact(0.0))
-
-
-def _least_between(w: arb, s: arb, low: float, high: float) -> arb:
-    ends = [low, high, float(np.clip(0.0, low, high))]
-    return _smallest([w * abs(_exact(v)) + s * _exact(v) for v in ends])
-
-
-def _smallest(values: Sequence[arb]) -> arb:
-    if not values:
-        raise Unchecked("the set of controls has no corners")
-    least = values[0]
-    for value in values[1:]:
-        least = least.min(value)
-    return least
 
 
 def _exact(value: float) -> arb:

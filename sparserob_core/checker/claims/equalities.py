@@ -16,7 +16,7 @@ from sparserob_core.checker.claims.units import RowUnits
 from sparserob_core.checker.outcome import EQUALITY, Broken, Unchecked
 from sparserob_core.checker.reach.flow import Flow
 from sparserob_core.checker.reach.tube import Tube
-from sparserob_core.checker.sets.shapes import radius, support
+from sparserob_core.checker.sets.known import known
 from sparserob_core.control.sets.sets import Box
 
 if TYPE_CHECKING:
@@ -61,10 +61,10 @@ def _reached(case: Case, state: int) -> bool:
         for j in range(part.ncols())
     )
     bound = case.problem.disturbance
-    free = [] if bound is None else [w for w, size in enumerate(radius(bound)) if size > math.ulp(0.0)]
+    free = [] if bound is None else [w for w, size in enumerate(known(bound).radius) if size > math.ulp(0.0)]
     pushed = any(not part[i, w].is_zero() for part in parts["E"] for i in reaching for w in free)
     begun = case.problem.initial_set
-    moved = begun is not None and any(radius(begun)[j] > math.ulp(0.0) for j in reaching)
+    moved = begun is not None and any(known(begun).radius[j] > math.ulp(0.0) for j in reaching)
     return uncertain or pushed or moved
 
 
@@ -74,4 +74,5 @@ def _hull(case: Case) -> Sequence[arb]:
     if bound is None:
         return []
     axes = [[float(i == j) for j in range(bound.dimension)] for i in range(bound.dimension)]
-    return [(-support(bound, balls([-a for a in axis]))).union(support(bound, balls(axis))) for axis in axes]
+    shape = known(bound)
+    return [(-shape.support(balls([-a for a in axis]))).union(shape.support(balls(axis))) for axis in axes]

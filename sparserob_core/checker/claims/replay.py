@@ -14,8 +14,7 @@ from sparserob_core.checker.claims.case import Case, number, numbers
 from sparserob_core.checker.outcome import TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.reach.flow import Flow, held, stacked
 from sparserob_core.checker.reach.tube import Tube
-from sparserob_core.checker.sets.shapes import facets, member
-from sparserob_core.checker.sets.sides import flat_basis
+from sparserob_core.checker.sets.known import known
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -53,7 +52,7 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
     ``time``, ``parameter`` and ``violation``. Raises `Broken` where these are none, `Unchecked` for a curved set."""
     name = str(said.get("constraint"))
     of_control = {"control": case.problem.control, "control_step": case.problem.control_step}.get(name)
-    if of_control is not None and facets(of_control) is None:
+    if of_control is not None and known(of_control).facets is None:
         raise Unchecked("the worst direction of a curved set is not told")
     window, time = case.window(name), number(said, "time")
     parameter = numbers(said.get("parameter"), "parameter")
@@ -62,7 +61,7 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
         raise Broken(f"parameter: {parameter.size} numbers where {case.problem.system.parameter_count} are expected")
     if not window.start <= time <= window.stop:
         raise Broken(f"t = {time!r} is not within {window.start:g} to {window.stop:g}")
-    flat, found = facets(window.shape), flat_basis(window.shape)
+    flat, found = window.seen.facets, window.seen.basis
     if flat is None or found is None:
         raise Unchecked("the worst direction of a curved set is not told")
     (basis, gains), z = np.split(found[0], [window.states], axis=1), found[1]
@@ -91,7 +90,7 @@ def _begun(case: Case, data: object) -> Array:
     deviation = numbers(data, "deviation")
     if deviation.shape != (bound.dimension,):
         raise Broken(f"deviation: expected {bound.dimension} numbers, got shape {deviation.shape}")
-    if not member(bound, deviation):
+    if not known(bound).contains(deviation):
         raise Broken(f"the deviation {deviation.tolist()} of the initial state is not shown to be in its set")
     return deviation
 
@@ -109,6 +108,6 @@ def _admissible(case: Case, signal: object) -> Array:
     for k in range(w.shape[1]):
         if k and case.grid[k] not in jumps and not np.array_equal(w[:, k], w[:, k - 1]):
             raise Broken(f"the disturbance jumps at t = {case.grid[k]:.6g}, within a piece")
-        if not member(bound, w[:, k]):
+        if not known(bound).contains(w[:, k]):
             raise Broken(f"the disturbance {w[:, k].tolist()} at t = {case.grid[k]:.6g} is not shown to be in its set")
     return w

@@ -13,9 +13,10 @@ from sparserob_core.checker.claims.duality import before
 from sparserob_core.checker.outcome import RESOLVED, TOLERANCE, Unchecked
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import Flow, held, stacked
-from sparserob_core.checker.sets.shapes import centre, facet, facets, smallest, widths
+from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.shape import smallest, widths
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.sets.sets import Box, ConvexSet
+from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ class RowUnits:
     @cached_property
     def rows(self) -> Array:
         """The unit ``(k,)`` of every facet of a flat set."""
-        flat = facets(self.shape)
+        flat = known(self.shape).facets
         assert flat is not None
         heights = np.array([abs(float(b.mid())) for _, b in flat])
         reach, sums = self._measured(self._middle)
@@ -67,17 +68,13 @@ class RowUnits:
         return self._measured(self._middle)[1][-self.problem.system.states :]
 
     def slack(self, direction: Array, limit: arb) -> float:
-        """What counts as none in any direction ``c (d,)`` with ``c'x <= limit`` on the set: that of its facet, of a box
-        the sum of those of its sides."""
-        flat = facets(self.shape)
-        if flat is None:
-            width = float(limit.mid()) - float(direction @ centre(self.shape))
+        """What counts as none in any direction ``c (d,)`` with ``c'x <= limit`` on the set: that of its facet, or
+        the sum of those of the facets that it is a sum of."""
+        shape = known(self.shape)
+        if shape.facets is None:
+            width = float(limit.mid()) - float(direction @ shape.centre)
             return TOLERANCE * max(width, RESOLVED * float(np.abs(direction) @ self.sums))
-        if not isinstance(self.shape, Box):
-            number, factor = facet(flat, direction)
-            return TOLERANCE * float(factor) * float(self.rows[number])
-        lengths = np.maximum(0.0, np.array([c for c, _ in flat]) @ direction)
-        return TOLERANCE * float(lengths @ self.rows)
+        return TOLERANCE * float(shape.shares(direction) @ self.rows)
 
     @property
     def _middle(self) -> tuple[float, ...]:
@@ -113,7 +110,7 @@ class RowUnits:
         system, bound = self.problem.system, self.problem.disturbance
         d, m, columns = system.states, system.controls, system.controls + (system.c is not None)
         normals, gains = np.split(
-            np.array([c for c, _ in facets(self.shape) or []]).reshape(-1, self.shape.dimension), [d], 1
+            np.array([c for c, _ in known(self.shape).facets or []]).reshape(-1, self.shape.dimension), [d], 1
         )
         (nodes, places), step = self._nodes(), _Steps(self.problem, parameter, columns, self.scene.tick)
         v = np.tile(np.vstack([normals, np.eye(d)]), (len(places), 1, 1))
@@ -135,9 +132,9 @@ class RowUnits:
             sums = sums + np.abs(v) @ np.maximum(np.abs(deviations.support(axes)), np.abs(deviations.support(-axes)))
         waiting, given = int(np.searchsorted(nodes[:-1], system.delay)), np.ones(columns)
         given[:m] = before(self.problem)
-        known = np.concatenate([driven[:waiting] * given, driven[waiting:] * np.append(np.zeros(m), given[m:])])
-        high, low = high + known.sum(axis=(0, 3)), low - known.sum(axis=(0, 3))
-        sums = sums + np.abs(known).sum(axis=(0, 3))
+        applied = np.concatenate([driven[:waiting] * given, driven[waiting:] * np.append(np.zeros(m), given[m:])])
+        high, low = high + applied.sum(axis=(0, 3)), low - applied.sum(axis=(0, 3))
+        sums = sums + np.abs(applied).sum(axis=(0, 3))
         for convex, weights in (
             (self.problem.control, driven[waiting:, ..., :m]),
             (bound, self._joined(nodes, pushed)),

@@ -13,8 +13,9 @@ from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.reach.tube import Polynomial
+from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, Enclosed, rounding
-from sparserob_core.checker.sets.shapes import limit
+from sparserob_core.checker.sets.shape import Shape
 from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.sip.convex_set import Array
 
@@ -39,6 +40,11 @@ class Window:
     reference: Array | None = None
 
     @property
+    def seen(self) -> Shape:
+        """The set in balls."""
+        return known(self.shape)
+
+    @property
     def is_mixed(self) -> bool:
         """Whether the control is in it."""
         return self.shape.dimension > self.states
@@ -52,7 +58,7 @@ class Window:
         c, _ = self.split(direction)
         offset, _ = self.moved(time, time)
         moved = [_exact(a) * r for a, r in zip(c, offset, strict=True) if a]
-        return sum(moved, limit(self.shape, direction))
+        return sum(moved, self.seen.limit(direction))
 
     def moved(self, start: float, stop: float) -> tuple[list[arb], list[arb]]:
         """``r(start)`` and ``r'`` on ``[start, stop]``, which no time of the reference cuts, ``(d,)`` each."""

@@ -14,7 +14,9 @@ import numpy as np
 from sparserob_core.checker.arithmetic.bernstein import bernstein
 from sparserob_core.checker.arithmetic.series import Series
 from sparserob_core.checker.reach.flow import Flow, in_time, stacked, up_to
-from sparserob_core.checker.sets.polynomials import OUTWARD, ROUNDING, Enclosed, linear_bound, rounding
+from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.polynomials import OUTWARD, ROUNDING, Enclosed, lengths, rounding
+from sparserob_core.checker.sets.shape import Shape
 from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.sip.convex_set import Array
 
@@ -123,16 +125,16 @@ class DisturbanceSupports:
     _floats: dict[int, Enclosed] = field(default_factory=dict)
     _latest: tuple[tuple[float, int], Array, Array] | None = None
 
-    def bounds(self, start: float, ticks: int, z: Array) -> tuple[Array, Array, Array]:
+    def bounds(self, start: float, ticks: int, z: Array, sharp: bool) -> tuple[Array, Array, Array]:
         """For every direction ``z_i'basis``, ``z (k, b)``: coefficients ``(k, J + 1, M)`` of a bound of the
-        disturbance's support from ``start`` on for that many ticks, its error ``(k,)``, and how much of that is due to
-        switching."""
+        disturbance's support from ``start`` on for that many ticks, its error ``(k,)``, and how much of that, or of the
+        coefficients, is due to switching. ``sharp``: less of it where the set is round, which takes longer."""
         assert self.scene.disturbance is not None
         if self._latest is None or self._latest[0] != (start, ticks):
             self._latest = ((start, ticks), *self._weights(start, ticks))
-        return _bounded(self.scene.disturbance, *self._latest[1:], z)
+        return self._bounded(known(self.scene.disturbance), *self._latest[1:], z, sharp)
 
-    def begun(self, start: float, ticks: int, z: Array) -> tuple[Array, Array, Array]:
+    def begun(self, start: float, ticks: int, z: Array, sharp: bool) -> tuple[Array, Array, Array]:
         """`bounds` of what the worst initial state adds to that of the centre: the support function of the set of
         deviations at the rows themselves."""
         assert self.scene.initial_set is not None
@@ -145,7 +147,34 @@ class DisturbanceSupports:
             rows = self._later(offset).applied(rows)
         found, d = self._onwards(ticks).applied(rows), len(self.scene.initial_state)
         mid, rad = (part.reshape(1, -1, M, size, b)[:, :, :, :d] for part in (found.mid, found.rad))
-        return _bounded(self.scene.initial_set, mid, rad, z)
+        return self._bounded(known(self.scene.initial_set), mid, rad, z, sharp)
+
+    def _bounded(self, shape: Shape, every: Array, errors: Array, z: Array, sharp: bool) -> tuple[Array, Array, Array]:
+        """Bounds of the sum of a set's support functions at weights ``(pieces, J + 1, M, mw, b)`` that are off by at
+        most ``errors``, for combinations ``z (k, b)`` of them: as in `bounds`."""
+        mid = np.einsum("ljkwb,ib->iljkw", every, z)
+        rad = np.einsum("ljkwb,ib->iljkw", errors + rounding(z.shape[1]) * np.abs(every), np.abs(z)) * OUTWARD
+        k, pieces, mw = mid.shape[0], mid.shape[1], mid.shape[-1]
+        value, spread = _ranges(mid, rad)
+        w, excess = shape.bound(value.reshape(-1, mw), spread.reshape(-1, mw))
+        w, kinks = w.reshape(k, pieces, mw), excess.reshape(k, pieces) * OUTWARD
+        lost = rad.sum(axis=(2, 3)) + rounding(pieces * mw) * np.abs(mid).sum(axis=(2, 3))
+        error = np.einsum("ilw,ilw->il", np.abs(w), lost) * OUTWARD + kinks
+        if not sharp or shape.round is None:
+            moved = np.einsum("ilw,iljkw->ijk", w, mid)
+            return moved, error.sum(axis=1) * OUTWARD, kinks.sum(axis=1) * OUTWARD
+        # of every piece the better of this linear bound and of a polynomial above the length of L'f
+        m, L = shape.round
+        parts = (mid @ L).reshape(-1, *mid.shape[2:4], L.shape[1])
+        above, off, over = (part.reshape(k, pieces, *part.shape[1:]) for part in lengths(self.flow.monomials, parts))
+        spare = (lost + rounding(mw) * np.abs(mid).sum(axis=(2, 3))) @ np.abs(L)
+        off = off + np.linalg.norm(spare, axis=2) + lost @ np.abs(m)
+        off = (off + rounding(pieces) * np.abs(above).sum(axis=(2, 3))) * OUTWARD
+        better = off < error
+        linear = np.einsum("ilw,iljkw->iljk", w, mid)
+        moved = np.where(better[:, :, None, None], above + mid @ m, linear).sum(axis=1)
+        error, kinks = np.where(better, off, error), np.where(better, over, kinks)
+        return moved, error.sum(axis=1) * OUTWARD, kinks.sum(axis=1) * OUTWARD
 
     def _weights(self, start: float, ticks: int) -> tuple[Array, Array]:
         """What every piece of the disturbance before the cell adds per unit, ``(pieces, J + 1, M, mw, b)``, with errors
@@ -246,20 +275,6 @@ class DisturbanceSupports:
         size, d = self.flow.rows.parts[0].nrows(), self.basis.shape[1]
         columns = [[arb(float(c[i])) if i < d else arb(0) for c in self.basis] for i in range(size)]
         return Series.constant(self.flow.monomials, stacked(columns))
-
-
-def _bounded(shape: ConvexSet, every: Array, errors: Array, z: Array) -> tuple[Array, Array, Array]:
-    """Bounds of the sum of a set's support functions at weights ``(pieces, J + 1, M, mw, b)`` that are off by at most
-    ``errors``, for combinations ``z (k, b)`` of them: as in `DisturbanceSupports.bounds`."""
-    mid = np.einsum("ljkwb,ib->iljkw", every, z)
-    rad = np.einsum("ljkwb,ib->iljkw", errors + rounding(z.shape[1]) * np.abs(every), np.abs(z)) * OUTWARD
-    k, pieces, mw = mid.shape[0], mid.shape[1], mid.shape[-1]
-    value, spread = _ranges(mid, rad)
-    w, excess = linear_bound(shape, value.reshape(-1, mw), spread.reshape(-1, mw))
-    w, excess = w.reshape(k, pieces, mw), excess.reshape(k, pieces)
-    moved = np.einsum("ilw,iljkw->ijk", w, mid)
-    lost = rad.sum(axis=(2, 3)) + rounding(pieces * mw) * np.abs(mid).sum(axis=(2, 3))
-    return moved, np.einsum("ilw,ilw->i", np.abs(w), lost) * OUTWARD, excess.sum(axis=1) * OUTWARD
 
 
 def _ranges(mid: Array, rad: Array) -> tuple[Array, Array]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 from typing import TYPE_CHECKING, final
 
 import numpy as np
@@ -12,8 +13,8 @@ import numpy as np
 from sparserob_core.checker.arithmetic.series import Series, norm, upper
 from sparserob_core.checker.reach.disturbance_support import DisturbanceSupports, Scene
 from sparserob_core.checker.reach.flow import Flow, Remainder, beyond, held, in_time, stacked, up_to
+from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
-from sparserob_core.checker.sets.shapes import radius
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -27,8 +28,9 @@ STATES_KEPT = 20_000  # enclosures of the state, per box of parameters
 @dataclass(frozen=True, eq=False)
 class Polynomial:
     """``coefficients (J + 1, M)`` in powers of the time within the cell (from 0 to 1) and monomials of the parameters;
-    the truth exceeds it by at most ``error``, of which ``expansion`` is due to the size of the box of parameters and
-    ``kinks`` to disturbances about to switch.
+    the truth exceeds it by at most ``error``, of which ``expansion`` is due to the size of the box of parameters; both
+    together exceed the truth by at most twice the ``error`` and ``kinks``, which is due to disturbances about to
+    switch.
     """
 
     coefficients: Array
@@ -73,10 +75,10 @@ class Tube:
         control = np.max([_sizes(u) for u in scene.control], axis=0) if scene.control else np.zeros((0, 1))
         begun = np.zeros(len(scene.initial_state))
         if scene.initial_set is not None:
-            begun = np.array(radius(scene.initial_set))
+            begun = np.array(known(scene.initial_set).radius)
         speed = (np.abs(scene.initial_state) + begun) / horizon + (_sizes(parts["B"][0]) @ control)[:, 0]
         if scene.disturbance is not None:
-            speed += _sizes(parts["E"][0]) @ np.array(radius(scene.disturbance))
+            speed += _sizes(parts["E"][0]) @ np.array(known(scene.disturbance).radius)
         return Remainder.of(self.flow, horizon, speed)
 
     @cached_property
@@ -86,17 +88,33 @@ class Tube:
 
         rest = self.remainder
         assert rest is not None
-        size = upper(norm(rest.inverse * stacked([[arb(v)] for v in self.scene.initial_state])))
-        if self.scene.initial_set is not None:  # of any deviation from the centre, whatever its signs
-            inverse = stacked([[abs(x) for x in row] for row in rest.inverse.tolist()])
-            size = upper(size + norm(inverse * stacked([[arb(v)] for v in radius(self.scene.initial_set)])))
-        n = rest.start(size)
+        n = rest.start(upper(norm(rest.inverse * stacked([[arb(v)] for v in self.scene.initial_state]))))
         found = [n]
         for k, u in enumerate(self.scene.control):
             growth, driven = self._growth(self._span(self.scene.grid[k], self.scene.grid[k + 1]))
             seen = [rest.inverse * part for part in self.nodes[k + 1].parts]
             n = rest.closer(growth * n + driven * _absolute(u), seen, self.flow.monomials.exponents)
             found.append(n)
+        return found if self.scene.initial_set is None else [a + b for a, b in zip(found, self._strays, strict=True)]
+
+    @property
+    def _strays(self) -> list[arb_mat]:
+        """What `norms` has for deviations from the initial state, whatever their signs: those of the transition times
+        the largest one."""
+        from flint import arb, arb_mat
+
+        rest, shape = self.remainder, self.scene.initial_set
+        assert rest is not None and shape is not None
+        inverse = stacked([[abs(x) for x in row] for row in rest.inverse.tolist()])
+        size = upper(norm(inverse * stacked([[arb(v)] for v in known(shape).radius])))
+        T, transition = arb_mat(rest.transform.tolist()), None
+        found = [rest.start(size)]
+        for start, stop in pairwise(self.scene.grid):
+            key = self._span(start, stop)
+            step = self._transition(key)[0]
+            transition = step if transition is None else step * transition
+            seen = [rest.inverse * part * T * size for part in transition.parts]
+            found.append(rest.closer(self._growth(key)[0] * found[-1], seen, self.flow.monomials.exponents))
         return found
 
     def _span(self, start: float, stop: float) -> int:
@@ -128,9 +146,9 @@ class Tube:
             self._growths[key] = held(rest.growth, rest.control, self._lengths[key])
         return self._growths[key]
 
-    def cells(self, piece: int, start: float, stop: float, z: Array) -> list[Polynomial]:
+    def cells(self, piece: int, start: float, stop: float, z: Array, sharp: bool = False) -> list[Polynomial]:
         """For every ``c = z_i'basis``, ``z (k, b)``, the polynomial above ``c'x`` on ``[start, stop]``, a part
-        of piece ``piece`` of the grid."""
+        of piece ``piece`` of the grid; ``sharp``: with less for disturbances about to switch, where that can be."""
         from flint import arb
 
         ticks = self.scene.ticks(start, stop)  # never shorter than the cell: a bound on a little more is a bound
@@ -140,16 +158,16 @@ class Tube:
         lost = state.rad + rounding(z.shape[1]) * np.abs(state.mid)
         rad, kinks = np.einsum("jkb,ib->i", lost, np.abs(z)), np.zeros(z.shape[0])
         if self.scene.disturbance is not None and stop > 0.0:
-            moved, off, kinks = self.sigmas.bounds(start, ticks, z)
+            moved, off, kinks = self.sigmas.bounds(start, ticks, z, sharp)
             rad += off + rounding(1) * (np.abs(mid) + np.abs(moved)).sum(axis=(1, 2))
             mid = mid + moved
         if self.scene.initial_set is not None:
-            moved, off, switching = self.sigmas.begun(start, ticks, z)
+            moved, off, switching = self.sigmas.begun(start, ticks, z, sharp)
             rad += off + rounding(1) * (np.abs(mid) + np.abs(moved)).sum(axis=(1, 2))
             mid, kinks = mid + moved, kinks + switching
         rest = self._left_out(piece, offset, length, z)
         return [
-            Polynomial(mid[i], float(rad[i] + rest[i] + kinks[i]) * OUTWARD, float(rest[i]), float(kinks[i]))
+            Polynomial(mid[i], float(rad[i] + rest[i]) * OUTWARD, float(rest[i]), float(kinks[i]))
             for i in range(z.shape[0])
         ]
 
@@ -227,7 +245,7 @@ class Tube:
         return sum(
             (
                 arb(w) * e * total[j, 0]
-                for w, per in zip(radius(self.scene.disturbance), rest.disturbance, strict=True)
+                for w, per in zip(known(self.scene.disturbance).radius, rest.disturbance, strict=True)
                 for j, e in enumerate([*beyond(per), per[0]])
             ),
             arb(0),

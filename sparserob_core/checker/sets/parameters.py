@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, TypeAlias, final
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import above, balls
-from sparserob_core.checker.sets.shapes import facets, member, support
-from sparserob_core.control.sets.sets import Box, ConvexSet, Ellipsoid
+from sparserob_core.checker.sets.shape import Shape
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -25,48 +24,38 @@ Corners: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
 class Parameters:
     """The set that the parameters are known to be in; ``None`` for a known system."""
 
-    shape: ConvexSet | None
+    shape: Shape | None
 
     @property
     def is_box(self) -> bool:
         """Whether boxes of the subdivision hold parameters only."""
-        return self.shape is None or isinstance(self.shape, Box)
+        return self.shape is None or self.shape.is_box
 
     def holds(self, point: Array) -> bool:
         """Whether a point is proven to be in the set."""
-        return self.shape is None or member(self.shape, point)
+        return self.shape is None or self.shape.contains(point)
 
     def meets(self, box: Corners) -> bool:
         """Whether a box may hold parameters; ``False`` only where a half-space of the set provably excludes it."""
-        if self.is_box:
+        if self.shape is None or self.is_box:
             return True
         low, high = np.array(box[0]), np.array(box[1])
-        return all(not _least(normal, low, high) > limit for normal, limit in self._halfspaces((low + high) / 2))
+        return all(not _least(normal, low, high) > limit for normal, limit in self.shape.halfspaces((low + high) / 2))
 
     def bounds(self, box: Corners, slope: Array) -> list[tuple[Array, Array, float]]:
         """Ways to use the set: normals ``a (k, nu)``, limits ``s (k,)`` with ``a p <= s`` on the set, and weights
         ``(k,) >= 0``, such that the weighted normals take up as much as they can of ``slope (nu,)``."""
         if self.is_box or self.shape is None or not slope.any():
             return []
-        found = [(slope[None], np.array([above(support(self.shape, balls(slope)))]), np.ones(1))]
+        found = [(slope[None], np.array([above(self.shape.support(balls(slope)))]), np.ones(1))]
         low, high = np.array(box[0]), np.array(box[1])
-        near = [(a, s) for a, s in self._halfspaces((low + high) / 2) if not -_least(-a, low, high) <= s]
+        near = [(a, s) for a, s in self.shape.halfspaces((low + high) / 2) if not -_least(-a, low, high) <= s]
         if near:
             from scipy.optimize import nnls
 
             normals, limits = np.array([a for a, _ in near]), np.array([above(s) for _, s in near])
             found.append((normals, limits, nnls(normals.T, slope)[0]))
         return found  # type: ignore[return-value]
-
-    def _halfspaces(self, point: Array) -> list[tuple[Array, arb]]:
-        """The facets of a flat set; the half-space of a round one that looks towards a point."""
-        assert self.shape is not None
-        flat = facets(self.shape)
-        if flat is not None:
-            return flat
-        towards = point - np.asarray(getattr(self.shape, "centre", np.zeros(point.size)))
-        normal = np.linalg.solve(self.shape.shape, towards) if isinstance(self.shape, Ellipsoid) else towards
-        return [(normal, support(self.shape, balls(normal)))] if normal.any() else []
 
 
 def _least(normal: Array, low: Array, high: Array) -> arb:

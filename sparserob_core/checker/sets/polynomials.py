@@ -1,17 +1,16 @@
-"""From ball matrices to arrays with an error bound, and the disturbance's support function as a linear bound on small
-ranges."""
+"""From ball matrices to arrays with an error bound; polynomials of such arrays, and the length of vectors of them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, final
 
 import numpy as np
 
+from sparserob_core.checker.arithmetic.jets import Monomials
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.sets.shapes import boxed, corners, known
-from sparserob_core.control.sets.sets import Box, ConvexSet, Ellipsoid, NormBall, Polytope
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -20,6 +19,7 @@ if TYPE_CHECKING:
 HALF_ULP = 1.2e-16
 OUTWARD = 1.0 + 1e-12  # factor on computed error bounds, which are sums of a few thousand rounded numbers at most
 TINY = 1e-300
+NEAR = 0.5  # how far a squared length may be from its middle, as a share of it, for a polynomial above the length
 ROUNDING = 1e-13  # of a sum of floats, relative to the sum of absolute values (up to a few hundred terms)
 
 
@@ -53,54 +53,92 @@ class Enclosed:
         return Enclosed(mid, (rad + HALF_ULP * np.abs(mid)) * OUTWARD + TINY)
 
 
-def linear_bound(shape: ConvexSet, value: Array, spread: Array) -> tuple[Array, Array]:
-    """``w (k, mw)`` and ``excess (k,)`` with ``h(f) <= w'f + excess`` for every ``f`` within ``spread (k, mw)`` of
-    ``value (k, mw)``.
+@final
+@dataclass(frozen=True, eq=False)
+class Truncated:
+    """Polynomials on ``[0, 1]`` in time and ``[-1, 1]`` in the parameters, ``coefficients (n, J + 1, M)``, each off by
+    at most ``lost (n,)``: products drop what is beyond the degrees, and bound it."""
 
-    For flat sets ``w`` is the corner that is best at ``value``, and nothing is lost where it stays the best; for round
-    ones the loss is of second order in ``spread``: in the norm of the set,
-    ``|f| - f0'f / |f0| <= |f - f0|^2 / (2 (|f0| - |f - f0|))``.
+    monomials: Monomials
+    coefficients: Array
+    lost: Array
+
+    def __mul__(self, other: Truncated) -> Truncated:
+        left, right = self.coefficients, other.coefficients
+        J, first, second, gather, degrees = left.shape[1], *_pairs(self.monomials)
+        found = np.empty_like(left)
+        for t in range(J):
+            pairs = sum(left[:, s, first] * right[:, t - s, second] for s in range(t + 1))
+            found[:, t] = pairs @ gather
+        sizes = [np.abs(part) @ degrees for part in (left, right)]  # by time and degree
+        kept = np.zeros(len(left))
+        for t in range(J):
+            for s in range(t + 1):
+                below = np.cumsum(sizes[1][:, t - s], axis=1)[:, ::-1]
+                kept += (sizes[0][:, s] * below).sum(axis=1)
+        a, b = self.size, other.size
+        dropped = np.maximum(a * b - kept, 0.0) + rounding(J * len(first) + 4) * a * b
+        return Truncated(self.monomials, found, (dropped + a * other.lost + (b + other.lost) * self.lost) * OUTWARD)
+
+    def __add__(self, other: Truncated) -> Truncated:
+        found, size = self.coefficients + other.coefficients, self.size + other.size
+        return Truncated(self.monomials, found, (self.lost + other.lost + rounding(1) * size) * OUTWARD)
+
+    def scaled(self, factors: Array) -> Truncated:
+        """Each times a number."""
+        found, sizes = self.coefficients * factors[:, None, None], np.abs(factors)
+        return Truncated(self.monomials, found, sizes * (self.lost + rounding(1) * self.size) * OUTWARD)
+
+    def plus(self, number: float) -> Truncated:
+        """Each plus a number."""
+        found = self.coefficients.copy()
+        found[:, 0, 0] += number
+        return Truncated(self.monomials, found, self.lost + rounding(1) * (self.size + abs(number)))
+
+    @cached_property
+    def size(self) -> Array:
+        """A bound ``(n,)`` of the polynomials without what was lost."""
+        answer: Array = np.abs(self.coefficients).sum(axis=(1, 2))
+        return answer
+
+
+@lru_cache(maxsize=16)
+def _pairs(monomials: Monomials) -> tuple[Array, Array, Array, Array]:
+    """Pairs of monomials whose product is kept: the first and the second of each, the matrix from pairs to products;
+    and that from monomials to degrees."""
+    products = np.array(monomials.products)
+    gather, degrees = np.zeros((len(products), monomials.size)), np.zeros((monomials.size, monomials.degree + 1))
+    gather[np.arange(len(products)), products[:, 2]] = 1.0
+    degrees[np.arange(monomials.size), [sum(e) for e in monomials.exponents]] = 1.0
+    return products[:, 0], products[:, 1], gather, degrees
+
+
+def lengths(monomials: Monomials, parts: Array) -> tuple[Array, Array, Array]:
+    """Upper bounds of ``|g|`` for vectors of polynomials ``g (n, J + 1, M, r)``: coefficients ``(n, J + 1, M)``, their
+    errors ``(n,)``, and how far above the truth they may be besides; infinite where a vector may come near 0.
+
+    With ``|g|^2 = s^2 (1 + e)`` it is ``s sqrt(1 + e) <= s (1 + e/2 - e^2/8 + e^3/16)``, since the next derivative of
+    the root is negative everywhere; what is lost is of fourth order in ``e``.
     """
-    known(shape)
-    shape = boxed(shape)
-    if isinstance(shape, Box):
-        w = np.where(value >= 0, shape.upper, shape.lower)
-        return w, (np.maximum(spread - np.abs(value), 0.0) * (shape.upper - shape.lower)).sum(axis=1) * OUTWARD
-    if isinstance(shape, Polytope) or (isinstance(shape, NormBall) and shape.p == 1.0):
-        points = (
-            np.array([[float(x) for x in corner] for corner in corners(shape)])
-            if isinstance(shape, Polytope)
-            else _octahedron(shape)
-        )
-        heights = value @ points.T
-        best = heights.argmax(axis=1)
-        w, reach = points[best], np.abs(value) + spread
-        apart = np.einsum("kvw,kw->kv", np.abs(points[None] - w[:, None]), spread)
-        ahead = heights - heights.max(axis=1, keepdims=True) + apart
-        ahead += 3.0 * rounding(shape.dimension) * (reach @ np.abs(points).max(axis=0))[:, None]
-        ahead[np.arange(best.size), best] = 0.0
-        corner = 2.0 * HALF_ULP * (reach @ np.abs(points).T).max(axis=1)  # corners are rounded to floats
-        return w, (np.maximum(ahead.max(axis=1), 0.0) + corner) * OUTWARD
-    if isinstance(shape, Ellipsoid) or (isinstance(shape, NormBall) and shape.p == 2.0):
-        S = shape.shape if isinstance(shape, Ellipsoid) else shape.radius**2 * np.eye(shape.dimension)
-        return _round_bound(shape.centre, S, value, spread)
-    raise Unchecked(f"the checker has no bound of the support function of this {type(shape).__name__}")
+    none = np.zeros(len(parts))
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _lengths(monomials, parts, none)
 
 
-def _round_bound(centre: Array, S: Array, value: Array, spread: Array) -> tuple[Array, Array]:
-    square = np.maximum(np.einsum("ki,ij,kj->k", value, S, value), 0.0)
-    lost = ROUNDING * np.einsum("ki,ij,kj->k", np.abs(value), np.abs(S), np.abs(value))  # by cancellation
-    size = np.sqrt(square)
-    safe = np.where(size > 0, size, 1.0)
-    w = centre + np.where(size[:, None] > 0, value @ S / safe[:, None], 0.0)
-    off = spread @ np.sqrt(np.diag(S)) * OUTWARD
-    with np.errstate(divide="ignore", invalid="ignore"):
-        excess = np.where(off < 0.5 * size, off**2 / (2.0 * (size - off)), 2.0 * off + np.where(size > 0, 0.0, off))
-    short = np.sqrt(square + lost) - size + lost / safe
-    return w, (excess + short) * OUTWARD + 1e-14 * (size + off + np.abs(value) @ np.abs(centre))
-
-
-def _octahedron(shape: NormBall) -> Array:
-    ends = np.vstack([np.eye(shape.dimension), -np.eye(shape.dimension)]) * shape.radius
-    points: Array = shape.centre + ends
-    return points
+def _lengths(monomials: Monomials, parts: Array, none: Array) -> tuple[Array, Array, Array]:
+    square = Truncated(monomials, np.zeros(parts.shape[:3]), none)
+    for r in range(parts.shape[3]):
+        part = Truncated(monomials, parts[..., r], none)
+        square = square + part * part
+    middle = square.coefficients[:, 0, 0] + square.coefficients[:, 1:, 0].sum(axis=1) / 2
+    there = np.isfinite(middle) & (middle > TINY)
+    middle = np.where(there, middle, 1.0)
+    e = square.scaled(1.0 / middle).plus(-1.0)
+    over = np.abs(e.coefficients).sum(axis=(1, 2)) + e.lost
+    near = there & (over < NEAR)
+    root = (e * (e * e.scaled(none + 1.0 / 16.0).plus(-1.0 / 8.0)).plus(1.0 / 2.0)).plus(1.0).scaled(np.sqrt(middle))
+    over = np.where(near, over, 0.0)
+    above = np.sqrt(middle) * over**4 * 5.0 / 128.0 / (1.0 - over) ** 3.5
+    lost = (root.lost + rounding(8) * root.size) * OUTWARD
+    found = np.where(near[:, None, None], root.coefficients, 0.0)
+    return found, np.where(near, lost, np.inf), np.where(near, above, np.inf)

@@ -9,16 +9,13 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls, below
+from sparserob_core.checker.arithmetic.balls import below
 from sparserob_core.checker.outcome import RESOLVED, TOLERANCE, Unchecked
-from sparserob_core.checker.sets.shapes import centre, dot, facets, member, support
-from sparserob_core.control.sets.sets import ConvexSet, Cylinder
+from sparserob_core.checker.sets.shape import Shape, along, dot
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
     from flint import arb
-
-INSIDE = 1.0 - 1e-14  # a point that is to be in a set is drawn inwards by rounding
 
 
 @final
@@ -48,7 +45,7 @@ class Curved:
     """A curved set with the coordinates of its directions: ``c = z'normals``, ``normals (b, d)``; ``sums (d,)``: the
     largest numbers that are added up to a state."""
 
-    shape: ConvexSet
+    shape: Shape
     normals: Array
     sums: Array
 
@@ -56,15 +53,15 @@ class Curved:
         """The constraint in one direction with a point ``inside`` the set as its limit. Its unit is the width of the
         set from its centre to there, so that an excess is judged along the gauge."""
         c = self.balls(z)
-        height, middle = _along(c, inside), _along(c, centre(self.shape))
+        height, middle = along(inside, c), along(self.shape.centre, c)
         unit = max(0.0, below(height - middle))
         return self._row(z, below(height), unit)
 
     def true(self, z: Array) -> Bounded:
         """The constraint in one direction, with its true limit."""
         c = self.balls(z)
-        height = support(self.shape, c)
-        return self._row(z, below(height), max(0.0, below(height - _along(c, centre(self.shape)))))
+        height = self.shape.support(c)
+        return self._row(z, below(height), max(0.0, below(height - along(self.shape.centre, c))))
 
     def _row(self, z: Array, limit: float, unit: float) -> Bounded:
         return Bounded(z, limit, max(unit, RESOLVED * float(np.abs(self.floats(z)) @ self.sums)) or 1.0)
@@ -94,7 +91,7 @@ class Sides:
     @staticmethod
     def cell(curved: Curved, low: Array, high: Array) -> Sides:
         """The cell of directions ``[low, high]`` of a curved set."""
-        w = _point(curved.shape, curved.floats((low + high) / 2))
+        w = curved.shape.point(curved.floats((low + high) / 2))
         free = np.flatnonzero(high > low)
         rows = []
         for ends in product((0, 1), repeat=free.size):
@@ -120,38 +117,3 @@ class Sides:
         left, right = self.high.copy(), self.low.copy()
         left[axis] = right[axis] = middle
         return [Sides.cell(self.curved, self.low, left), Sides.cell(self.curved, right, self.high)]
-
-
-def flat_basis(shape: ConvexSet) -> tuple[Array, Array] | None:
-    """``basis (b, d)`` and ``z (k, b)`` with ``z_i'basis`` the normal of the ``i``-th facet, exactly; opposite normals
-    share a row of the basis. ``None`` for a curved set."""
-    found = facets(shape)
-    if found is None:
-        return None
-    places: dict[bytes, int] = {}
-    normals, z = [c + 0.0 for c, _ in found], np.zeros((len(found), len(found)))
-    for i, c in enumerate(normals):
-        opposite = places.get((-c + 0.0).tobytes())
-        z[i, places.setdefault(c.tobytes(), len(places)) if opposite is None else opposite] = (
-            1.0 if opposite is None else -1.0
-        )
-    kept = [np.frombuffer(key) for key in places]
-    return np.array(kept).reshape(len(kept), shape.dimension), z[:, : len(kept)]
-
-
-def _along(c: Sequence[arb], point: Array) -> arb:
-    return sum((a * x for a, x in zip(c, balls(point), strict=True)), balls([0.0])[0])
-
-
-def _point(shape: ConvexSet, direction: Array) -> Array:
-    """A point of the set far out in a direction, proven to be in it; the middle when nothing better is."""
-    base = shape.base if isinstance(shape, Cylinder) else shape
-    middle = centre(base)
-    far = base.support_point(direction[None, : base.dimension])[0]
-    share, rest = INSIDE, np.zeros(shape.dimension - base.dimension)
-    while share > 0.5:
-        point: Array = middle + share * (far - middle)
-        if member(base, point):
-            return np.concatenate([point, rest])
-        share = 1.0 - 10.0 * (1.0 - share)
-    return np.concatenate([middle, rest])

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from sparserob_core.control.sets.curved import Ellipsoid, NormBall
 from sparserob_core.control.sets.polytope import Polytope
+from sparserob_core.control.sets.zonotope import Zonotope
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import Bool, Float, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
@@ -25,6 +26,7 @@ __all__ = [
     "NormBall",
     "Polytope",
     "SetFactory",
+    "Zonotope",
     "cylinder",
     "intersection",
 ]

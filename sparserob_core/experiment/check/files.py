@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 
 from sparserob_core.checker.outcome import Broken, Finding, Unchecked
-from sparserob_core.checker.sets.shapes import facets
+from sparserob_core.checker.sets.known import known
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.directory.finished import StoredRun
 from sparserob_core.experiment.directory.sparsity import sparsity
@@ -123,7 +123,7 @@ def _of_a_curved_set_of_controls(case: Case, entry: object) -> bool:
 def _flat(shape: ConvexSet) -> bool:
     """Whether the directions of a set are its own; a certificate's are not looked at then."""
     try:
-        return facets(shape) is not None
+        return known(shape).facets is not None
     except Unchecked:
         return True
 
@@ -259,13 +259,12 @@ def _attained(case: Case, said: Mapping[str, Any]) -> list[str]:
     from sparserob_core.checker.arithmetic.balls import balls
     from sparserob_core.checker.claims.case import numbers
     from sparserob_core.checker.claims.replay import exceeded
-    from sparserob_core.checker.sets.shapes import excess
 
     found = [("", *exceeded(case, said))]
     if case.problem.initial_set is not None:
         begun = numbers(said.get("initial_state"), "initial_state")
         centre = np.asarray(case.problem.initial_state)
-        if begun.shape != centre.shape or excess(case.problem.initial_set, balls(begun - centre))[0] > CLOSE:
+        if begun.shape != centre.shape or known(case.problem.initial_set).excess(balls(begun - centre))[0] > CLOSE:
             return [f"worst: {begun.tolist()} is no initial state"]
         found.append((f" from {begun.tolist()}", *exceeded(case, said, begun)))
     elif "initial_state" in said:

@@ -1,0 +1,199 @@
+"""Curved sets in ball arithmetic: ellipsoids, balls of p-norms, and cylinders over them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from itertools import product
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.balls import above, balls
+from sparserob_core.checker.outcome import Broken
+from sparserob_core.checker.sets.polynomials import OUTWARD, ROUNDING
+from sparserob_core.checker.sets.shape import Shape, along, total
+from sparserob_core.control.sets.sets import Cylinder, Ellipsoid, NormBall
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from flint import arb
+
+MOST_ENDS = 8  # dimension up to which a ball of a p-norm is looked at in all corners of a range
+
+
+@final
+class Ellipsoidal(Shape):
+    """An ellipsoid: ``h(c) = c'm + sqrt(c'S c)``."""
+
+    source: Ellipsoid
+
+    @property
+    def centre(self) -> Array:
+        return np.asarray(self.source.centre, dtype=float)
+
+    def support(self, direction: Sequence[arb]) -> arb:
+        quadratic = total(a * along(row, direction) for a, row in zip(direction, self.source.shape, strict=True))
+        return along(self.centre, direction) + quadratic.nonnegative_part().sqrt()
+
+    def contains(self, point: Sequence[float] | Array) -> bool:
+        return bool(self._square([x - m for x, m in zip(balls(point), balls(self.centre), strict=True)]) <= 1)
+
+    def gauge(self, offsets: Sequence[arb]) -> arb:
+        return self._square(offsets).nonnegative_part().sqrt()
+
+    def _square(self, offsets: Sequence[arb]) -> arb:
+        from flint import arb_mat
+
+        z = arb_mat([balls(row) for row in self.source.shape]).solve(arb_mat([[v] for v in offsets]))
+        return total(v * z[i, 0] for i, v in enumerate(offsets))
+
+    def towards(self, offset: Array) -> Array:
+        return np.asarray(np.linalg.solve(self.source.shape, offset), dtype=float)
+
+    def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:
+        return _round_bound(self.centre, self.source.shape, value, spread)
+
+    @cached_property
+    def round(self) -> tuple[Array, Array]:
+        """Cholesky's factor is rounded: what the matrix exceeds ``L L'`` by, as a share of it, is measured in balls."""
+        from flint import arb_mat
+
+        L = self.source.factor
+        inverse = arb_mat(L.tolist()).inv()
+        shares = (inverse * arb_mat(self.source.shape.tolist()) * inverse.transpose()).tolist()
+        off = total((x - int(i == j)) ** 2 for i, row in enumerate(shares) for j, x in enumerate(row))
+        return self.centre, L * np.nextafter(1.0 + above(off.nonnegative_part().sqrt()), np.inf) * OUTWARD
+
+
+@final
+class Ball(Shape):
+    """A ball of a p-norm: ``h(c) = c'm + radius |c|_q``, ``1/p + 1/q = 1``."""
+
+    source: NormBall
+
+    @property
+    def centre(self) -> Array:
+        return np.asarray(self.source.centre, dtype=float)
+
+    def support(self, direction: Sequence[arb]) -> arb:
+        from flint import arb
+
+        return along(self.centre, direction) + arb(self.source.radius) * self._dual(direction)
+
+    def _dual(self, direction: Sequence[arb]) -> arb:
+        from flint import arb
+
+        p, sizes = self.source.p, [abs(c) for c in direction]
+        if p == 1.0:
+            largest = sizes[0]
+            for size in sizes[1:]:
+                largest = largest.max(size)
+            return largest
+        if p == 2.0:
+            return total(c * c for c in direction).nonnegative_part().sqrt()
+        q = arb(p) / (arb(p) - 1)
+        summed = total(_power(size, q) for size in sizes if not size.is_zero())
+        return summed if summed.is_zero() else _power(summed, 1 / q)
+
+    def contains(self, point: Sequence[float] | Array) -> bool:
+        from flint import arb
+
+        p, radius = self.source.p, arb(self.source.radius)
+        offsets = [x - m for x, m in zip(balls(point), balls(self.centre), strict=True)]
+        if p == 2.0:
+            return bool(total(v * v for v in offsets) <= radius**2)
+        return bool(total(abs(v) ** arb(p) for v in offsets if not v.is_zero()) <= radius ** arb(p))
+
+    def gauge(self, offsets: Sequence[arb]) -> arb:
+        from flint import arb
+
+        p = arb(self.source.p)
+        summed = total(_power(v, p) for v in offsets if not v.is_zero())
+        return (summed if summed.is_zero() else _power(summed, 1 / p)) / arb(self.source.radius)
+
+    def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:
+        """``h(f) - w'f`` is convex: on a range it is largest at one of the corners."""
+        d, p = self.dimension, self.source.p
+        if p == 2.0:
+            return _round_bound(self.centre, self.source.radius**2 * np.eye(d), value, spread)
+        w = self.source.support_point(value)
+        if d <= MOST_ENDS:
+            ends = value[:, None] + spread[:, None] * np.array(list(product((-1.0, 1.0), repeat=d)))
+            over = (self._norm(ends) - np.einsum("kw,kew->ke", w - self.centre, ends)).max(axis=1)
+        else:
+            over = self._norm(value) - ((w - self.centre) * value).sum(axis=1)
+            over += self._norm(spread) + (np.abs(w - self.centre) * spread).sum(axis=1)
+        reach = np.abs(value) + spread
+        lost = ROUNDING * (self._norm(reach) + (reach * (np.abs(w) + 2.0 * np.abs(self.centre))).sum(axis=1))
+        return w, (np.maximum(over, 0.0) + lost) * OUTWARD
+
+    def _norm(self, vectors: Array) -> Array:
+        """The support function about the centre, to rounding; no component over- or underflows."""
+        size = np.abs(vectors).max(axis=-1, keepdims=True)
+        scaled = vectors / np.where(size > 0.0, size, 1.0)
+        answer: Array = self.source.radius * size[..., 0] * np.linalg.norm(scaled, ord=self.source.dual, axis=-1)
+        return answer
+
+    @cached_property
+    def round(self) -> tuple[Array, Array] | None:
+        return (self.centre, self.source.radius * np.eye(self.dimension)) if self.source.p == 2.0 else None
+
+
+@final
+class Cylindrical(Shape):
+    """A cylinder: the first coordinates are in the set ``base``, the others are free."""
+
+    source: Cylinder
+
+    def __init__(self, source: Cylinder, base: Shape) -> None:
+        super().__init__(source)
+        self.base = base
+
+    @property
+    def spanned(self) -> int:
+        return self.base.dimension
+
+    @property
+    def centre(self) -> Array:
+        return np.concatenate([self.base.centre, np.zeros(self.dimension - self.spanned)])
+
+    def support(self, direction: Sequence[arb]) -> arb:
+        if any(not c.is_zero() for c in direction[self.spanned :]):
+            raise Broken("a direction points where its set is unbounded")
+        return self.base.support(direction[: self.spanned])
+
+    def contains(self, point: Sequence[float] | Array) -> bool:
+        return self.base.contains(np.asarray(point)[: self.spanned])
+
+    def gauge(self, offsets: Sequence[arb]) -> arb:
+        return self.base.gauge(offsets[: self.spanned])
+
+    def point(self, direction: Array) -> Array:
+        return np.concatenate([self.base.point(direction[: self.spanned]), np.zeros(self.dimension - self.spanned)])
+
+    def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:
+        raise Broken("a disturbance is unbounded")
+
+
+def _power(value: arb, exponent: arb) -> arb:
+    """``|value|^exponent``, ``exponent > 0``, also of a ball that holds 0, for which Arb gives none."""
+    from flint import arb
+
+    size = abs(value)
+    return size**exponent if size > 0 else arb(0).union(arb(size.upper()) ** exponent)
+
+
+def _round_bound(centre: Array, S: Array, value: Array, spread: Array) -> tuple[Array, Array]:
+    """What is lost is of second order in ``spread``: in the norm of the set,
+    ``|f| - f0'f / |f0| <= |f - f0|^2 / (2 (|f0| - |f - f0|))``."""
+    square = np.maximum(np.einsum("ki,ij,kj->k", value, S, value), 0.0)
+    lost = ROUNDING * np.einsum("ki,ij,kj->k", np.abs(value), np.abs(S), np.abs(value))  # by cancellation
+    size = np.sqrt(square)
+    safe = np.where(size > 0, size, 1.0)
+    w = centre + np.where(size[:, None] > 0, value @ S / safe[:, None], 0.0)
+    off = spread @ np.sqrt(np.diag(S)) * OUTWARD
+    with np.errstate(divide="ignore", invalid="ignore"):
+        excess = np.where(off < 0.5 * size, off**2 / (2.0 * (size - off)), 2.0 * off + np.where(size > 0, 0.0, off))
+    short = np.sqrt(square + lost) - size + lost / safe
+    return w, (excess + short) * OUTWARD + 1e-14 * (size + off + np.abs(value) @ np.abs(centre))

@@ -1,0 +1,313 @@
+"""Flat sets in ball arithmetic: boxes, polytopes, balls of the 1-norm and the maximum norm, sums of segments."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from fractions import Fraction
+from functools import cached_property, lru_cache
+from itertools import combinations, product
+from math import comb
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.balls import above, balls, below, rational
+from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, rounding
+from sparserob_core.checker.sets.shape import Facet, Shape, along, dot, facet, total
+from sparserob_core.control.sets.sets import Box, NormBall, Polytope, Zonotope
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from flint import arb
+
+MOST_CORNERS = 20_000  # intersections of facets looked at when a polytope's corners are listed
+
+
+class Flat(Shape):
+    """A set that its facets describe."""
+
+    @property
+    def sides(self) -> list[Facet]:
+        """The facets, which there are."""
+        assert self.facets is not None
+        return self.facets
+
+    def contains(self, point: Sequence[float] | Array) -> bool:
+        return all(bool(dot(c, point) <= b) for c, b in self.sides)
+
+    @property
+    def holding(self) -> list[Facet]:
+        """Half-spaces that hold the set."""
+        return self.sides
+
+    def least(self, ups: Sequence[arb], downs: Sequence[arb], slope: Sequence[arb]) -> arb:
+        """Where the coordinate planes cut the set (or one that holds it, larger by rounding), what is asked for is
+        linear on every part: its least value is attained at a corner of one of them."""
+        rows = tuple((*map(float, c), float(b.mid()) if b.is_exact() else above(b)) for c, b in self.holding)
+        return _least(
+            [
+                total(map(_height, ups, downs, slope, map(rational, point)))
+                for point in _meets(rows, tuple(range(self.dimension)))
+            ]
+        )
+
+    def shares(self, direction: Array) -> Array:
+        from scipy.optimize import nnls
+
+        answer: Array = nnls(np.array([c for c, _ in self.sides]).T, direction)[0]
+        return answer
+
+
+@final
+class Boxed(Flat):
+    """A box, or what is one: a ball of the maximum norm, of any norm in one dimension."""
+
+    def __init__(self, source: Box | NormBall) -> None:
+        from flint import arb
+
+        super().__init__(source)
+        self.is_box = isinstance(source, Box)
+        if isinstance(source, Box):
+            self._low, self._high = ([arb(float(v)) for v in ends] for ends in (source.lower, source.upper))
+        else:
+            middles, radius = [arb(float(v)) for v in source.centre], arb(source.radius)
+            self._low, self._high = [m - radius for m in middles], [m + radius for m in middles]
+
+    @cached_property
+    def facets(self) -> list[Facet]:
+        axes = np.eye(self.dimension)
+        return [(axis, b) for axis, b in zip(axes, self._high, strict=True) if b.is_finite()] + [
+            (-axis, -b) for axis, b in zip(axes, self._low, strict=True) if b.is_finite()
+        ]
+
+    def support(self, direction: Sequence[arb]) -> arb:
+        from flint import arb
+
+        height = arb(0)
+        for c, low, high in zip(direction, self._low, self._high, strict=True):
+            if c.is_zero():
+                continue
+            if low.is_finite() and high.is_finite():
+                height = height + (high + low) / 2 * c + (high - low) / 2 * abs(c)
+            elif c > 0 and high.is_finite():
+                height = height + c * high
+            elif c < 0 and low.is_finite():
+                height = height + c * low
+            else:
+                raise Broken("a direction points where its set is unbounded")
+        return height
+
+    def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:
+        low, high = np.array([below(b) for b in self._low]), np.array([above(b) for b in self._high])
+        w = np.where(value >= 0, high, low)
+        return w, (np.maximum(spread - np.abs(value), 0.0) * (high - low)).sum(axis=1) * OUTWARD
+
+    def least(self, ups: Sequence[arb], downs: Sequence[arb], slope: Sequence[arb]) -> arb:
+        return total(self.shares_of_least(ups, downs, slope))
+
+    def shares_of_least(self, ups: Sequence[arb], downs: Sequence[arb], slope: Sequence[arb]) -> list[arb]:
+        """What every component has of the `least`."""
+        ends = zip(self._low, self._high, strict=True)
+        points = [[low, high] + ([0 * low] if low <= 0 and high >= 0 else []) for low, high in ends]
+        return [
+            _least([_height(up, down, s, v) for v in some])
+            for up, down, s, some in zip(ups, downs, slope, points, strict=True)
+        ]
+
+    def shares(self, direction: Array) -> Array:
+        return np.maximum(0.0, np.array([c for c, _ in self.sides]) @ direction)
+
+
+class Cornered(Flat):
+    """A flat set with corners that are known."""
+
+    @property
+    @abstractmethod
+    def corners(self) -> list[tuple[Fraction, ...]]:
+        """All corners of a bounded set, exactly."""
+
+    def support(self, direction: Sequence[arb]) -> arb:
+        heights = [total(rational(x) * c for x, c in zip(corner, direction, strict=True)) for corner in self.corners]
+        answer = heights[0]
+        for height in heights[1:]:
+            answer = answer.max(height)
+        return answer
+
+    def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:
+        """The corner that is best at ``value``: nothing is lost where it stays the best."""
+        points = np.array([[float(x) for x in corner] for corner in self.corners])
+        heights = value @ points.T
+        best = heights.argmax(axis=1)
+        w, reach = points[best], np.abs(value) + spread
+        apart = np.einsum("kvw,kw->kv", np.abs(points[None] - w[:, None]), spread)
+        ahead = heights - heights.max(axis=1, keepdims=True) + apart
+        ahead += 3.0 * rounding(self.dimension) * (reach @ np.abs(points).max(axis=0))[:, None]
+        ahead[np.arange(best.size), best] = 0.0
+        corner = 2.0 * HALF_ULP * (reach @ np.abs(points).T).max(axis=1)  # corners are rounded to floats
+        return w, (np.maximum(ahead.max(axis=1), 0.0) + corner) * OUTWARD
+
+
+@final
+class Polyhedral(Cornered):
+    """A polytope."""
+
+    source: Polytope
+
+    @cached_property
+    def facets(self) -> list[Facet]:
+        from flint import arb
+
+        return [(c, arb(float(b))) for c, b in zip(self.source.H, self.source.h, strict=True)]
+
+    @cached_property
+    def corners(self) -> list[tuple[Fraction, ...]]:
+        H, h = self.source.H, self.source.h
+        return list(_meets(tuple((*map(float, row), float(b)) for row, b in zip(H, h, strict=True)), ()))
+
+    def limit(self, direction: Array) -> arb:
+        """Simply what the facet says whose normal the direction is."""
+        number, factor = facet(self.sides, direction)
+        return self.sides[number][1] * rational(factor)
+
+    def shares(self, direction: Array) -> Array:
+        number, factor = facet(self.sides, direction)
+        answer: Array = float(factor) * np.eye(len(self.sides))[number]
+        return answer
+
+    def _sizes(self, limit: arb) -> list[float]:
+        return [abs(float(limit.mid()))]
+
+
+@final
+class Octahedral(Cornered):
+    """A ball of the 1-norm."""
+
+    source: NormBall
+
+    @cached_property
+    def facets(self) -> list[Facet]:
+        from flint import arb
+
+        normals = np.array(list(product((-1.0, 1.0), repeat=self.dimension)))
+        return [(c, dot(c, self.source.centre) + arb(self.source.radius)) for c in normals]
+
+    @cached_property
+    def corners(self) -> list[tuple[Fraction, ...]]:
+        middle, radius = [Fraction(float(v)) for v in self.source.centre], Fraction(self.source.radius)
+        return [
+            tuple(m + sign * radius * (i == axis) for i, m in enumerate(middle))
+            for axis in range(self.dimension)
+            for sign in (1, -1)
+        ]
+
+
+@final
+class Segments(Flat):
+    """A zonotope: ``h(c) = c'm + sum_j |c'g_j|``. It has facets where its segments span the space."""
+
+    source: Zonotope
+
+    @cached_property
+    def facets(self) -> list[Facet] | None:
+        """Every facet is spanned by ``d - 1`` segments. Its normal is one of floats, of length 1, near the exact one:
+        its limit is drawn inwards by as much as a point within it, up to twice as large as the set, could be outside of
+        the exact one."""
+        if self.source.halfspaces() is None:  # too many, or no interior: what a run sees as curved
+            return None
+        far, found = 2 * total(balls(self.radius)), []
+        for exact in self._normals:
+            size = np.linalg.norm(np.array([float(v) for v in exact]))
+            for length in (Fraction(float(size)), -Fraction(float(size))):
+                c = np.array([float(v / length) for v in exact])
+                off = total(rational(abs(Fraction(a) - v / length)) for a, v in zip(c.tolist(), exact, strict=True))
+                found.append((c, self.support(balls(c)) - 2 * off * far))
+        return found
+
+    @property
+    def holding(self) -> list[Facet]:
+        return [(c, self.support(balls(c))) for c, _ in self.sides]
+
+    @property
+    def _normals(self) -> list[tuple[Fraction, ...]]:
+        """One normal of every pair of facets, exactly."""
+        from flint import fmpq, fmpq_mat
+
+        d, found = self.dimension, dict[tuple[str, ...], list[fmpq]]()
+        rows = [[fmpq(*v.as_integer_ratio()) for v in g] for g in self.source.generators.tolist() if any(g)]
+        for chosen in combinations(rows, d - 1):
+            minors = [
+                (-1) ** i * (fmpq_mat([[*r[:i], *r[i + 1 :]] for r in chosen]).det() if d > 1 else fmpq(1))
+                for i in range(d)
+            ]
+            lead = next((v for v in minors if v != 0), None)
+            if lead is not None:
+                size = max(abs(v) for v in minors)
+                found.setdefault(tuple(str(v / lead) for v in minors), [v / size for v in minors])
+        return [tuple(Fraction(int(v.p), int(v.q)) for v in normal) for normal in found.values()]
+
+    def contains(self, point: Sequence[float] | Array) -> bool:
+        if self.facets is None:
+            raise Unchecked(
+                "the checker cannot tell who is in a zonotope without an interior, or with very many facets"
+            )
+        return super().contains(point)
+
+    def support(self, direction: Sequence[arb]) -> arb:
+        heights = total(abs(along(g, direction)) for g in self.source.generators)
+        return along(self.source.centre, direction) + heights
+
+    def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:
+        """For every segment ``|a + b| <= sign(a) (a + b) + 2 max(|b| - |a|, 0)``."""
+        G = self.source.generators
+        heights, moved = value @ G.T, spread @ np.abs(G).T
+        moved = moved + rounding(self.dimension) * (np.abs(value) @ np.abs(G).T)  # of the heights, too
+        signs = np.where(heights >= 0, 1.0, -1.0)
+        w = self.source.centre + signs @ G
+        size = np.abs(self.source.centre) + np.abs(G).sum(axis=0)
+        lost = rounding(len(G) + 1) * (np.abs(value) + spread) @ size  # w is rounded
+        excess: Array = (2.0 * np.maximum(moved - np.abs(heights), 0.0).sum(axis=1) + lost) * OUTWARD
+        return w, excess
+
+    def least(self, ups: Sequence[arb], downs: Sequence[arb], slope: Sequence[arb]) -> arb:
+        flat = self.facets is not None
+        return super().least(ups, downs, slope) if flat else Shape.least(self, ups, downs, slope)
+
+
+def _height(up: arb, down: arb, slope: arb, value: arb) -> arb:
+    return up * value.nonnegative_part() + down * (-value).nonnegative_part() + slope * value
+
+
+def _least(values: Sequence[arb]) -> arb:
+    if not values:
+        raise Unchecked("the set of controls has no corners")
+    least = values[0]
+    for value in values[1:]:
+        least = least.min(value)
+    return least
+
+
+@lru_cache(maxsize=64)
+def _meets(rows: tuple[tuple[float, ...], ...], planes: tuple[int, ...]) -> tuple[tuple[Fraction, ...], ...]:
+    """The points of ``{x : H x <= h}`` (rows ``(*H_i, h_i)``) where ``d`` of its facets and of the coordinate
+    ``planes`` meet, in rational arithmetic; raises `Unchecked` when these are too many to list."""
+    from flint import fmpq, fmpq_mat
+
+    d = len(rows[0]) - 1
+    if comb(len(rows) + len(planes), d) > MOST_CORNERS:
+        raise Unchecked(f"a polytope with {len(rows)} facets in {d} dimensions has too many corners to be listed")
+    exact = [[fmpq(*Fraction(x).as_integer_ratio()) for x in row] for row in rows]
+    walls = exact + [[fmpq(int(i == plane)) for i in range(d)] + [fmpq(0)] for plane in planes]
+    found: set[tuple[Fraction, ...]] = set()
+    for chosen in combinations(walls, d):
+        matrix = fmpq_mat([row[:d] for row in chosen])
+        if matrix.det() == 0:
+            continue
+        point = matrix.solve(fmpq_mat([[row[d]] for row in chosen]))
+        x = [point[i, 0] for i in range(d)]
+        if all(sum((a * b for a, b in zip(row[:d], x, strict=True)), fmpq(0)) <= row[d] for row in exact):
+            found.add(tuple(Fraction(int(v.p), int(v.q)) for v in x))
+    if not found:
+        raise Unchecked("a polytope has no corners")
+    return tuple(sorted(found))

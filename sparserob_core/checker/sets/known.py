@@ -1,0 +1,51 @@
+"""Which kinds of sets the checker knows, and how it sees each of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.checker.sets.curved import Ball, Cylindrical, Ellipsoidal
+from sparserob_core.checker.sets.flat import Boxed, Octahedral, Polyhedral, Segments
+from sparserob_core.checker.sets.shape import Shape
+from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Ellipsoid, NormBall, Polytope, Zonotope
+
+MOST_SIGNS = 10  # dimension up to which a 1-norm ball is listed by its facets
+
+
+def _ball(source: NormBall) -> Shape:
+    if source.dimension == 1 or source.p == np.inf:
+        return Boxed(source)
+    return Octahedral(source) if source.p == 1.0 and source.dimension <= MOST_SIGNS else Ball(source)
+
+
+KINDS: Mapping[type[ConvexSet], Callable[[Any], Shape]] = MappingProxyType(
+    {
+        Box: Boxed,
+        Polytope: Polyhedral,
+        Ellipsoid: Ellipsoidal,
+        NormBall: _ball,
+        Zonotope: Segments,
+        Cylinder: lambda source: Cylindrical(source, known(source.base)),
+    }
+)
+
+
+def known(source: ConvexSet) -> Shape:
+    """How the checker sees a set, at the working precision. Raises `Unchecked` for a kind whose data it cannot read:
+    nothing that such a set says of itself is believed, nor what a subclass of a known kind does."""
+    from flint import ctx
+
+    if type(source) not in KINDS:
+        raise Unchecked(f"the checker does not know sets of the kind {source.kind}")
+    return _seen(source, ctx.prec)
+
+
+@lru_cache(maxsize=64)
+def _seen(source: ConvexSet, precision: int) -> Shape:
+    return KINDS[type(source)](source)
