@@ -36,7 +36,10 @@ EXPECTED: dict[str, tuple[str, float | None, float]] = {
     "experiment3_repaired": ("certified", 1.11230, 2e-5),
     "haar": ("certified", 0.537592, 5e-6),
     "initial_set": ("certified", 0.502958, 1e-6),
+    "motor_voltage": ("certified", 0.799768, 1e-6),
     "parameters_and_disturbance": ("certified", None, 0.0),
+    "rate_limits": ("certified", 4.211898, 1e-6),
+    "tracking_corridor": ("certified", 1.420693, 1e-5),
     "walsh": ("certified", 0.537065, 5e-6),
 }
 UNCHECKED = {("experiment1_scenario", "lower bound")}  # its constraints are samples
