@@ -139,6 +139,15 @@ def gap_tolerance(loaded: Loaded) -> float | None:
     return None if tolerance is None else float(tolerance)
 
 
+def counting(loaded: Loaded) -> tuple[bool, tuple[float, ...] | None]:
+    """Whether the cost of the config's method is the time that a control acts, and the only values that this may take,
+    where it is restricted to some."""
+    entry = loaded.config.method
+    method = loaded.registry.build("method", entry.name, entry.options)
+    letters = getattr(method, "alphabet", None)
+    return bool(getattr(method, "counts", False)), None if letters is None else tuple(letters)
+
+
 def name_of(loaded: Loaded) -> str:
     """The name of an experiment: its file's, without the ending."""
     return Path(loaded.source.name).stem

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal, final
+from typing import Literal, TypeAlias, final
 
 import numpy as np
 
@@ -109,6 +109,44 @@ class Proof:
     unit: float = 1.0
     units: Array | None = None
     share: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Leaf:
+    """What is known of one part of a `Tree`: multipliers ``dual`` that bound the count there, or, where it is not
+    ``feasible``, prove that nothing is feasible there."""
+
+    dual: Dual
+    feasible: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Branch:
+    """Entry ``image`` of ``S x`` is 0 in the ``first`` part and counts in the ``second``; or, where ``at`` says two
+    neighbouring letters of an alphabet, it is at most the one and at least the other. The parts are numbers of nodes.
+    """
+
+    image: int
+    first: int
+    second: int
+    at: tuple[float, float] | None = None
+
+
+Tree: TypeAlias = "Sequence[Leaf | Branch]"
+"""The nodes of a branch and bound, the first of which is everything."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sparsest:
+    """What a method that counts knows beside the count: ``norm``, the cost J of its decision, and of an optimum of J,
+    where it has one, the cost ``plain`` and the count ``plain_count``, in the user's units; and the ``tree`` behind its
+    lower bound, in which the images are restricted to ``letters`` where there are any."""
+
+    norm: float
+    plain: float | None
+    plain_count: float | None
+    tree: Tree
+    letters: Sequence[float] | None = None
 
 
 @dataclass(frozen=True, eq=False)

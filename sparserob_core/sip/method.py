@@ -207,10 +207,11 @@ class Method(ABC):
     """A way to solve a semi-infinite program.
 
     ``searches``: whether it maximises ``g`` over tuples of indices, so that its `EvaluationsFinished` are about tuples;
-    observers then show the search.
+    observers then show the search. ``counts``: whether the cost of its result is the time that a control acts.
     """
 
     searches: ClassVar[bool] = False
+    counts: ClassVar[bool] = False
 
     @abstractmethod
     def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:

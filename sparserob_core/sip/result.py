@@ -10,7 +10,7 @@ import numpy as np
 
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import RoundFinished
-from sparserob_core.sip.evidence import NO_BOUND, Activity, Cut, Dual, InfeasibleSubsystem, Proof
+from sparserob_core.sip.evidence import NO_BOUND, Activity, Cut, Dual, InfeasibleSubsystem, Proof, Sparsest
 from sparserob_core.sip.program import WorstConstraint
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ class Result:
     ``ray (n,)``: a direction along which the cost falls for ever, where one was found. ``missed``: the most by which
     the decision misses an equality, relative to the numbers that are added up in it, where there are any; computed, not
     proven, and at most `EQUALITY` where something is claimed. ``activity``: between what the least count of the
-    program lies, where it has one.
+    program lies, where it has one. ``sparsest``: there where the cost is that count, not J.
     """
 
     status: Status
@@ -142,6 +142,7 @@ class Result:
     ray: Array | None = None
     missed: float | None = None
     activity: Activity | None = None
+    sparsest: Sparsest | None = None
 
     def __repr__(self) -> str:
         lines = [

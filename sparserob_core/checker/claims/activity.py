@@ -7,7 +7,8 @@ that cost over the admissible controls, bounded by weak duality, is below the we
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import reduce
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ import numpy as np
 
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.claims.duality import Row
+from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.sets.known import known
 
 if TYPE_CHECKING:
@@ -63,8 +65,11 @@ def least(case: Case, rows: Rows, pieces: Sequence[Sequence[float]] | None) -> f
     return max(0.0, bound / float(table.sum()))
 
 
-def _least(case: Case, ranges: list[tuple[arb, arb]], count: list[arb], slope: list[arb]) -> arb:
-    """At most the minimum over the controls' set of what one piece counts and the slopes add."""
+def _least(
+    case: Case, ranges: list[tuple[arb, arb]], count: list[arb], slope: list[arb], off: Sequence[bool] = ()
+) -> arb:
+    """At most the minimum of what one piece counts and the slopes add, over the controls in the set that are 0 in the
+    channels that are ``off``."""
     from flint import arb
 
     ups, downs, certain = [], [], arb(0)
@@ -75,6 +80,9 @@ def _least(case: Case, ranges: list[tuple[arb, arb]], count: list[arb], slope: l
         down = arb(0) if always or not low < 0 else one / -low
         ups.append(up if high > 0 else down)
         downs.append(down if low < 0 else up)
+    for i, zero in enumerate(off):
+        if zero:  # what a value that is not 0 there would bring is outweighed
+            ups[i] = downs[i] = abs(slope[i])
     return certain + known(case.problem.control).least(ups, downs, slope)
 
 
@@ -99,3 +107,102 @@ def _lengths(case: Case) -> list[arb]:
 def _counts(case: Case) -> np.ndarray:
     """What every piece of every channel counts, ``(m, K)``."""
     return np.asarray(np.outer(np.asarray(case.problem.weights, dtype=float), np.diff(case.control.breakpoints)))
+
+
+def largest(case: Case) -> float:
+    """The longest time that a control can act, weighted over its channels."""
+    return float(_counts(case).sum())
+
+
+Part = tuple[float, float, bool]
+"""Bounds of one piece of one channel in a part of the controls, and whether it counts there whatever its value."""
+ANY: Part = (-np.inf, np.inf, False)
+
+
+def proven(case: Case, nodes: Sequence[Any], weighted: Callable[[Mapping[str, Any]], Rows]) -> float:
+    """The time that every control acts at least, by the leaves of a tree of parts: infinite where each leaf proves that
+    nothing is feasible in its part. Raises `Broken` unless the parts are all controls."""
+    answer, waiting, seen = float("inf"), [(0, dict[tuple[int, int], Part]())], set[int]()
+    while waiting:
+        case.clock.check()
+        number, parts = waiting.pop()
+        node = nodes[number] if 0 <= number < len(nodes) else None
+        if number in seen or not isinstance(node, Mapping):
+            raise Broken("tree: its nodes are no tree")
+        seen.add(number)
+        if "multipliers" in node:
+            answer = min(answer, _leaf(case, node.get("feasible") is not False, parts, weighted(node)))
+            continue
+        place, halves = _divided(case, node, parts)
+        for key, half in zip(("first", "second"), halves, strict=True):
+            child = node.get(key)
+            if type(child) is not int:
+                raise Broken("tree: expected the numbers of two nodes")
+            waiting.append((child, {**parts, place: half}))
+    return answer
+
+
+def _divided(
+    case: Case, node: Mapping[str, Any], parts: Mapping[tuple[int, int], Part]
+) -> tuple[tuple[int, int], tuple[Part, Part]]:
+    """The piece of a channel where a part is divided, and its two halves, which hold every control of the part."""
+    channel, piece = node.get("channel"), node.get("piece")
+    m, K = case.problem.system.controls, case.control.pieces
+    if type(channel) is not int or type(piece) is not int or not (0 <= channel < m and 0 <= piece < K):
+        raise Broken(f"tree: there is no piece {piece!r} of channel {channel!r}")
+    low, high, on = parts.get((channel, piece), ANY)
+    if case.letters is None:
+        return (channel, piece), ((0.0, 0.0, False), (low, high, True))
+    at = node.get("at")
+    if not (isinstance(at, list) and len(at) == 2 and all(value in case.letters for value in at) and at[0] < at[1]):
+        raise Broken(f"tree: expected two letters, got {at!r}")
+    if any(at[0] < letter < at[1] for letter in case.letters):
+        raise Broken(f"tree: {at} are no neighbours")
+    return (channel, piece), ((low, min(high, float(at[0])), on), (max(low, float(at[1])), high, on))
+
+
+def _leaf(case: Case, feasible: bool, parts: Mapping[tuple[int, int], Part], rows: Rows) -> float:
+    """The time that a control of one part acts at least."""
+    from flint import arb
+
+    total, slopes = case.duality.summed(rows, None)
+    for k, (length, slope) in enumerate(zip(_lengths(case), slopes, strict=True)):
+        here = [parts.get((c, k), ANY) for c in range(len(slope))]
+        counts = [arb(float(c)) * length if feasible else arb(0) for c in np.asarray(case.problem.weights)]
+        total = total + _least_of_part(case, here, counts, slope)
+    if not feasible:
+        if not total > 0:
+            raise Broken(f"tree: multipliers of a part prove {float(total.lower()):.3g}, expected a positive number")
+        return float("inf")
+    table = _counts(case)
+    bound = float(np.nextafter(float(total.lower()), -np.inf))
+    if np.ptp(table) <= EQUAL * table.max():
+        return float(max(0.0, np.ceil(bound / float(table.mean()) - NEARLY))) * float(table.mean())
+    return max(0.0, bound)
+
+
+def _least_of_part(case: Case, parts: Sequence[Part], counts: list[arb], slope: list[arb]) -> arb:
+    """At most the minimum of what one piece counts and the slopes add, over the controls' set within a part."""
+    from flint import arb
+
+    if case.problem.control.is_box or case.letters is not None:
+        box, total = case.problem.control.bounding_box(), arb(0)
+        for part, count, s, low, high in zip(parts, counts, slope, box.lower, box.upper, strict=True):
+            ends = _values(case, part, float(low), float(high))
+            if not ends:
+                return arb("inf")  # nothing is in this part
+            heights = [(count if part[2] or v != 0.0 else arb(0)) + s * arb(v) for v in ends]
+            total = total + reduce(lambda one, other: one.min(other), heights)
+        return total
+    certain = sum((count for part, count in zip(parts, counts, strict=True) if part[2]), arb(0))
+    priced = [arb(0) if part[2] else count for part, count in zip(parts, counts, strict=True)]
+    return certain + _least(case, _ranges(case), priced, slope, [part[:2] == (0.0, 0.0) for part in parts])
+
+
+def _values(case: Case, part: Part, low: float, high: float) -> list[float]:
+    """The values at one of which the count of an entry and any slope are least together: the ends of its range, and
+    0 in between; with an alphabet its letters."""
+    if case.letters is not None:
+        return [letter for letter in case.letters if part[0] <= letter <= part[1]]
+    least, most = max(low, part[0]), min(high, part[1])
+    return [] if least > most else [least, most, float(np.clip(0.0, least, most))]

@@ -11,7 +11,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.claims.cost import Price
-from sparserob_core.checker.claims.duality import Duality, before
+from sparserob_core.checker.claims.duality import Duality, Row, before
 from sparserob_core.checker.claims.units import RowUnits
 from sparserob_core.checker.claims.window import Beside, Window
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
@@ -29,13 +29,16 @@ if TYPE_CHECKING:
 @final
 @dataclass(frozen=True, eq=False)
 class Case:
-    """What is checked: a certificate (plain data) against a problem on its two dictionaries."""
+    """What is checked: a certificate (plain data) against a problem on its two dictionaries. ``counts``: its cost is
+    the time that the control acts, which may take the values ``letters`` only where there are any."""
 
     problem: OptimalControlProblem
     control: Dictionary
     disturbance: Dictionary
     certificate: Mapping[str, Any]
     clock: Clock = field(default_factory=Clock)
+    counts: bool = False
+    letters: tuple[float, ...] | None = None
 
     @cached_property
     def windows(self) -> list[Window]:
@@ -181,6 +184,11 @@ class Case:
     @cached_property
     def price(self) -> Price:
         return Price(self.problem, self.control)
+
+    @cached_property
+    def rows(self) -> dict[tuple[object, ...], Row]:
+        """Constraints that were derived before."""
+        return {}
 
     @cached_property
     def duality(self) -> Duality:

@@ -126,9 +126,24 @@ def _steps(case: Case) -> str:
 
 
 def _cost(case: Case) -> str:
+    if case.counts:
+        return _counted(case)
     derived = case.price.of(case.pieces)
     _agrees("cost", number(case.certificate, "cost"), derived, SMALL_COST * case.price.largest)
     return f"J = {float(derived.mid()):.12g}"
+
+
+def _counted(case: Case) -> str:
+    """The time that the control acts, the cost J beside it, and its letters."""
+    from flint import arb
+
+    acted, total = activity.acted(case), activity.largest(case)
+    _agrees("cost", number(case.certificate, "cost"), arb(acted * total), SMALL_COST * total)
+    derived = case.price.of(case.pieces)
+    _agrees("J", number(case.certificate, "J"), derived, SMALL_COST * case.price.largest)
+    if case.letters is not None and not np.isin(case.theta @ case.control.values, case.letters).all():
+        raise Broken(f"the control takes other values than {list(case.letters)}")
+    return f"it acts for {acted * total:.9g} of {total:.9g}, J = {float(derived.mid()):.12g}"
 
 
 def _agrees(name: str, written: float, derived: arb, scale: float) -> None:
@@ -187,20 +202,16 @@ def _fewest(case: Case, status: str) -> str:
     proven = status in ("certified", "verified")
     if (upper is not None) is not proven:
         raise Broken(f"upper is {upper!r} where the status is {status}")
-    other = case
-    if data.get("decision") is not None:  # of a control that is admissible too, and acts less
-        other = replace(
-            case, certificate={**case.certificate, "decision": data["decision"], "proof": data.get("proof")}
-        )
-        _control(other)
-        if case.equalities:
-            equalities(other)
-        for window in other.windows:
-            bounded(other, window)
+    other = _other(case, data)
     acted = activity.acted(other)
     if proven and abs(number(data, "upper") - acted) > FIGURES:
         raise Broken(f"upper is {upper!r}, the control acts for a share of {acted!r}")
     own = data.get("multipliers")
+    if case.counts and case.letters is None:
+        derived = _tree(case) / activity.largest(case)
+        if not 0.0 <= written <= min(derived, acted if proven else np.inf) + FIGURES:
+            raise Broken(f"lower is {written!r}, the leaves prove {derived!r}")
+        return f"no admissible control acts for a share of time below {written:.6g}"
     rows, pieces = _weighted(case, case.certificate.get("multipliers") if own is None else own)
     if own is None:
         rows, pieces = activity.shared(case, rows, pieces)
@@ -209,6 +220,20 @@ def _fewest(case: Case, status: str) -> str:
         raise Broken(f"lower is {written!r}, the multipliers prove {derived!r}")
     below = f"no admissible control acts for a share of time below {written:.6g}"
     return f"{below}, {'this' if other is case else 'another'} one for {acted:.6g}" if proven else below
+
+
+def _other(case: Case, data: Mapping[str, Any]) -> Case:
+    """Another control that the certificate offers, which is admissible too and acts less; or the case itself."""
+    if data.get("decision") is None:
+        return case
+    said = {name: data.get(name) for name in ("decision", "proof")}
+    other = replace(case, certificate={**case.certificate, **said})
+    _control(other)
+    if case.equalities:
+        equalities(other)
+    for window in other.windows:
+        bounded(other, window)
+    return other
 
 
 def _touched(case: Case, data: object) -> Sequence[arb_mat] | None:
@@ -249,11 +274,15 @@ def _row(case: Case, entry: object) -> tuple[float, Row]:
     _sized(parameter, case.problem.system.parameter_count, name)
     if case.problem.system.parameters is not None and not known(case.problem.system.parameters).contains(parameter):
         raise Broken(f"{name}: the parameter {parameter.tolist()} is not shown to be in its set")
+    key = name, time, tuple(direction.tolist()), tuple(parameter.tolist()), repr(entry.get("piece"))
+    if key in case.rows:
+        return y, case.rows[key]
     c, gain = window.split(direction)
     row = case.duality.row(c, time, parameter.tolist(), window.limit(direction, time))
     if window.is_mixed:
         piece = _piece(case, window, entry, time)
         row.slope[piece] = [a + balls([g])[0] for a, g in zip(row.slope[piece], gain, strict=True)]
+    case.rows[key] = row
     return y, row
 
 
@@ -272,6 +301,11 @@ def _sized(vector: Array, size: int, name: str) -> None:
 
 
 def _lower(case: Case) -> str:
+    if case.counts:
+        written, least = number(case.certificate, "lower_bound"), _tree(case)
+        if not written <= least + FIGURES * max(1.0, abs(least)):
+            raise Broken(f"{written!r} is written, the leaves prove {least!r}")
+        return f"no control of these acts for less than {written:.9g}"
     written, derived = number(case.certificate, "lower_bound"), _multiplied(case, priced=True)
     if not derived >= written:
         raise Broken(f"{written!r} is written, the multipliers prove {float(derived.lower())!r}")
@@ -282,7 +316,32 @@ def _lower(case: Case) -> str:
     )
 
 
+def _tree(case: Case) -> float:
+    """What the leaves of the certificate's tree prove of the time that a control acts."""
+    data = case.certificate.get("tree")
+    if not isinstance(data, Mapping):
+        raise Unchecked("the certificate holds no tree of parts")
+    if case.control.functions < case.control.pieces:
+        raise Unchecked("the control has fewer functions than pieces, which is not followed")
+    known = listed(data, "constraints")
+
+    def weighted(leaf: Mapping[str, Any]) -> list[tuple[float, Row]]:
+        constraints = []
+        for pair in listed(leaf, "multipliers"):
+            if not (isinstance(pair, list) and len(pair) == 2 and type(pair[0]) is int and 0 <= pair[0] < len(known)):
+                raise Broken("tree: expected the number of a constraint and its multiplier")
+            said = known[pair[0]]
+            constraints.append({**said, "multiplier": pair[1]} if isinstance(said, Mapping) else said)
+        return _weighted(case, {"constraints": constraints, "equalities": leaf.get("equalities")})[0]
+
+    return activity.proven(case, listed(data, "nodes"), weighted)
+
+
 def _infeasible(case: Case) -> str:
+    if case.certificate.get("tree") is not None and case.certificate.get("multipliers") is None:
+        if not case.counts or _tree(case) < np.inf:
+            raise Broken("the leaves of the tree leave some control")
+        return "every part of the controls is excluded by multipliers of its own"
     amount = _multiplied(case, priced=False)
     if not amount > 0:
         raise Broken(f"the multipliers prove {float(amount.lower()):.3g}, expected a positive number")
@@ -319,7 +378,12 @@ def _status(case: Case, status: str, tolerance: float | None, claims: list[Findi
 def relative_gap(case: Case, cost: float, lower: float) -> float:
     """The gap relative to the cost, or to a millionth of the largest cost where that is more; 0 where the bounds
     meet."""
-    return 0.0 if cost <= lower else (cost - lower) / (max(abs(cost), SMALL_COST * case.price.largest) or 1.0)
+    return 0.0 if cost <= lower else (cost - lower) / (max(abs(cost), SMALL_COST * largest_cost(case)) or 1.0)
+
+
+def largest_cost(case: Case) -> float:
+    """The largest cost that a control may have."""
+    return activity.largest(case) if case.counts else case.price.largest
 
 
 def _witness(case: Case) -> str:

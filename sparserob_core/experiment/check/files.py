@@ -56,13 +56,13 @@ def compared(stored: StoredRun, loaded: Loaded, case: Case, summary: Mapping[str
 
 
 ALWAYS = {"format", "config", "status", "multipliers"}
-FIGURED = ALWAYS | {"cost", "lower_bound", "decision", "fewest_active"}
+FIGURED = ALWAYS | {"cost", "lower_bound", "decision", "fewest_active", "J", "tree"}
 CERTIFICATE = {
     "certified": FIGURED | {"gap_tolerance", "proof"},
     "verified": FIGURED | {"proof"},
     "undecided": FIGURED | {"proof"},
     "refuted": FIGURED | {"witness"},
-    "infeasible": ALWAYS | {"lower_bound"},
+    "infeasible": ALWAYS | {"lower_bound", "tree"},
 }
 """What is looked at of a certificate, by its status."""
 SOMETIMES = frozenset[str]().union(*CERTIFICATE.values())
@@ -147,6 +147,7 @@ def _result(loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Verdicts:
             "refuted": (None,),
             "undecided": (None, case.certificate.get("cost")),
         }.get(str(status), (case.certificate.get("cost"),)),
+        "J": (case.certificate.get("J"),),
         "seed": (loaded.config.seed,),
         "title": (loaded.config.title, loaded.config.title or summary.get("title")),
     }
@@ -190,7 +191,9 @@ def _largest_cost(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     """The largest possible cost; earlier versions did not write it."""
     if "cost_scale" not in summary:
         return None
-    said, derived = summary["cost_scale"], case.price.largest
+    from sparserob_core.checker.claims.claims import largest_cost
+
+    said, derived = summary["cost_scale"], largest_cost(case)
     return [] if _same(said, derived, CLOSE) else [f"cost_scale is {said!r}, not {derived!r}"]
 
 

@@ -15,7 +15,7 @@ from sparserob_core.control.transcription.steps import Steps
 from sparserob_core.control.transcription.transcribe import slanted
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.evidence import Activity, Dual, Proof
+from sparserob_core.sip.evidence import Activity, Branch, Dual, Proof
 from sparserob_core.sip.program import TOLERANCE, Formulation, SemiInfiniteProgram
 from sparserob_core.sip.result import Result
 
@@ -35,7 +35,8 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
     ``tolerance`` in each row's own unit (decision 0016); a direction ``z`` of a curved set stands for ``z normals``.
     ``fewest_active``: between what the least share of time lies that any admissible control must act, with the
     multipliers of a program of its own, or those of the cost where there are none, and with the decision that acts
-    least and its proof where that is another one. ``witness``: what refutes the
+    least and its proof where that is another one. Where the cost is the time that the control acts, ``J`` is beside it,
+    and ``tree`` holds the parts of the controls, each with multipliers of its own. ``witness``: what refutes the
     decision.
     """
     if not isinstance(experiment, ControlExperiment) or result.status == "failed":
@@ -56,11 +57,40 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
         "lower_bound": result.lower_bound,
         "gap_tolerance": experiment.gap_tolerance,
         "decision": theta,
-        "multipliers": _multipliers(experiment, result.dual),
+        **_counted(experiment, result),
         **_fewest(experiment, result.activity),
         "proof": _proofs(experiment, result.proofs),
         "witness": _witness(problem, program, result) if result.status == "refuted" else None,
     }
+
+
+def _counted(experiment: ControlExperiment, result: Result) -> dict[str, Any]:
+    """The multipliers of the cost; or the cost beside the count, and the tree of parts with their multipliers."""
+    if result.sparsest is None:
+        return {"multipliers": _multipliers(experiment, result.dual)}
+    constraints: dict[str, int] = {}
+    told: list[dict[str, Any]] = []
+    nodes: list[dict[str, Any]] = []
+    for node in result.sparsest.tree:
+        if isinstance(node, Branch):
+            channel, piece = divmod(node.image, experiment.control.pieces)
+            at = {} if node.at is None else {"at": list(node.at)}
+            nodes.append({"channel": channel, "piece": piece, "first": node.first, "second": node.second, **at})
+            continue
+        said = _multipliers(experiment, node.dual) if node.dual.mu.size == experiment.program.finite.b.size else None
+        if said is None:
+            return {"multipliers": None, "J": result.sparsest.norm}
+        pairs = []
+        for entry in said["constraints"]:
+            plain = {name: value for name, value in entry.items() if name != "multiplier"}
+            number = constraints.setdefault(repr(plain), len(constraints))
+            if number == len(told):
+                told.append(plain)
+            pairs.append([number, entry["multiplier"]])
+        nodes.append({"multipliers": pairs, "equalities": said["equalities"], "feasible": node.feasible})
+    tree = {"constraints": told, "nodes": nodes}
+    norm = {} if result.status == "infeasible" else {"J": result.sparsest.norm}
+    return {"multipliers": None, **norm, "tree": tree}
 
 
 def _fewest(experiment: ControlExperiment, activity: Activity | None) -> dict[str, dict[str, Any]]:

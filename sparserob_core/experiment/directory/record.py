@@ -12,7 +12,7 @@ import numpy as np
 
 from sparserob_core.control.constraints.explanation import Witness
 from sparserob_core.control.problem.dictionary import Dictionary
-from sparserob_core.experiment.directory.sparsity import sparsity
+from sparserob_core.experiment.directory.sparsity import sparsity, verdict
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Proof
 from sparserob_core.sip.program import EQUALITY, TOLERANCE, SemiInfiniteProgram, WorstConstraint
@@ -32,6 +32,7 @@ def summary_of(result: Result, control: Array | None, dictionary: Dictionary | N
         "status": result.status,
         "message": result.message,
         "cost": result.cost,
+        **({} if result.sparsest is None or result.decision is None else {"J": result.sparsest.norm}),
         "value": result.value,
         "epsilon": result.epsilon,
         "lower_bound": result.lower_bound,
@@ -47,6 +48,7 @@ def summary_of(result: Result, control: Array | None, dictionary: Dictionary | N
             "fewest_active": None
             if result.activity is None
             else {"lower": result.activity.lower, "upper": result.activity.upper},
+            "verdict": verdict(result),
         },
         "counts": {
             "relaxed_programs": 0,

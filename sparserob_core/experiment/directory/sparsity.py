@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.result import Result
 
 ZERO = 1e-6
+PROVEN, SAME = "L1 is sparsest here: proven", 1e-6
 
 
 @dataclass(frozen=True)
@@ -32,3 +34,28 @@ def sparsity(control: Array, breakpoints: Array) -> Sparsity:
         active_fraction=float(lengths[active].sum() / lengths.sum()),
         switches=int((np.abs(np.diff(control, axis=1)) > threshold).sum()),
     )
+
+
+def verdict(result: Result) -> str | None:
+    """Whether an optimum of the L1 norm is sparsest: what this result shows of that; ``None`` where it shows nothing.
+
+    It is proven where no admissible control acts less than an optimum of the usual cost; a control that acts less is
+    told with how much less, in the units of time.
+    """
+    found, known = result.sparsest, result.activity
+    if found is not None:
+        if result.status != "certified" or found.plain_count is None or found.plain is None:
+            return None
+        less = found.plain_count - result.cost
+        if less <= SAME * found.plain_count:
+            return PROVEN
+        same = found.norm - found.plain <= SAME * max(abs(found.plain), abs(found.norm))
+        rest = ", at the same cost, for the optimum is not unique" if same else ""
+        return f"the sparsest control acts {less:.6g} less than the optimum: here it is{rest}"
+    if result.status != "certified" or known is None or known.upper is None:
+        return None
+    if known.decision is not None:
+        return "not decided: another admissible control acts less; method sparsest finds the one that acts least"
+    if known.upper - known.lower <= SAME * known.upper:
+        return PROVEN
+    return "not decided: method sparsest finds the control that acts least"

@@ -31,6 +31,11 @@ def sparserob_methods() -> Iterator[MethodPlugin]:
         summary="The paper's algorithm: the value g of the relaxed program, maximised over tuples of indices.",
     )
     yield MethodPlugin(
+        name="sparsest",
+        factory="sparserob_core.sip.methods.sparsest:SparsestMethod",
+        summary="The fewest active pieces exactly, or a control that takes the values of an alphabet only.",
+    )
+    yield MethodPlugin(
         name="nominal",
         factory="sparserob_core.sip.methods.baselines:Nominal",
         summary="Baseline: the same problem as if nothing were uncertain.",

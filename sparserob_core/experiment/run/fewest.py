@@ -31,7 +31,11 @@ def with_activity(experiment: ControlExperiment, result: Result, tools: Tools) -
     program, proven = experiment.program, result.status in PROVEN
     if result.status in ENDED or program.activity is None or result.decision is None:
         return result
-    told = all(cut.formulation != "sampled" for cut in result.dual.cuts)  # the number of a sample tells nobody else
+    if result.sparsest is not None and result.sparsest.letters is None:  # its own bounds are those of the count
+        upper = _share(program, result.cost) if proven else None
+        return replace(result, activity=Activity(_share(program, result.lower_bound) or 0.0, upper))
+    # the number of a sample tells nobody else
+    told = result.sparsest is None and all(cut.formulation != "sampled" for cut in result.dual.cuts)
     factor = multiple(program) if told else None
     least = -np.inf if factor is None else _safe(program, factor * result.lower_bound)
     most, other = count(program, np.asarray(result.decision)) if proven else np.inf, None

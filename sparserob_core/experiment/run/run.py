@@ -221,8 +221,8 @@ def _run(
                 if result is None:
                     raise
             if isinstance(experiment, ControlExperiment):
-                known = with_activity(experiment, bounded(experiment, result), tools)
-                result = ControlResult.of(known, experiment.transcription)
+                known = bounded(experiment, result) if result.sparsest is None else result
+                result = ControlResult.of(with_activity(experiment, known, tools), experiment.transcription)
             ending = RunFinished(
                 status=result.status,
                 message=result.message,

@@ -60,6 +60,8 @@ def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("active indices", str(counts["active_indices"])),
         ("rounds", str(counts["rounds"])),
         ("share of time active", _number(sparsity["active_fraction"], ".1%")),
+        ("J", _number(summary.get("J"), ".9g")),
+        ("sparsest", sparsity.get("verdict") or "unknown"),
         ("fewest active", _fewest(sparsity.get("fewest_active"))),
         ("switches", _number(sparsity["switches"], "d")),
         ("seconds", f"{_number(summary['seconds'], '.3f')} of the method, which solves and proves"),

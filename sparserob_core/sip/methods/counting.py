@@ -16,6 +16,7 @@ import numpy as np
 
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.finite import FiniteProgram
 from sparserob_core.sip.program import SemiInfiniteProgram
 
 DUST = 1e-5  # of an entry's range: so much is what solvers leave where 0 is meant; nothing is claimed without a proof
@@ -37,15 +38,27 @@ class Counted:
 
 def counted_below(program: SemiInfiniteProgram) -> Counted:
     """The program whose cost, and ``certain``, are below the count at every feasible decision."""
-    base, prices = program.finite, prices_of(program)
+    prices = prices_of(program)
+    finite, tilt, certain = convex_below(program.finite, prices / program.cost_unit)
+    cost = finite.weights, finite.q
+    cheaper = replace(program, weights=cost[0], q=cost[1], P=None, constant=0.0, blocks=None, largest=None, twin=None)
+    return Counted(cheaper, certain * program.cost_unit, tilt)
+
+
+def convex_below(
+    base: FiniteProgram, prices: Array, on: np.ndarray | None = None
+) -> tuple[FiniteProgram, Array, float]:
+    """The finite program with the convex cost below the count of its images ``(k,)``, the ``tilt (k,)`` of that cost,
+    and what is counted in any case: images whose bounds exclude 0, and those that are ``on``."""
     always = (base.lower > 0.0) | (base.upper < 0.0)
+    always = always if on is None else always | on
     up, down = slopes(base.lower, base.upper)
-    share = np.where(always, 0.0, prices / program.cost_unit)
+    share = np.where(always, 0.0, prices)
     tilt = share * (up - down) / 2.0
     q = tilt if base.S is None else np.asarray(base.S.T @ tilt)
     weights = share * (up + down) / 2.0
-    below = replace(program, weights=weights, q=q, P=None, constant=0.0, blocks=None, largest=None, twin=None)
-    return Counted(below, float(prices[always].sum()), tilt)
+    cheaper = replace(base, weights=weights, q=q, P=None, constant=0.0, blocks=None)
+    return cheaper, tilt, float(prices[always].sum())
 
 
 @shaped

@@ -26,7 +26,7 @@ from sparserob_core.sip.events import (
     frozen,
     ignore,
 )
-from sparserob_core.sip.evidence import Cut, Dual, Proof
+from sparserob_core.sip.evidence import Cut, Dual, Leaf, Proof, Sparsest
 from sparserob_core.sip.method import Method, Tools
 from sparserob_core.sip.program import (
     ConstraintFamily,
@@ -66,7 +66,7 @@ class UsersUnits:
             value=own.value * self.cost,
             lower_bound=own.lower_bound * self.cost,
             upper_bound=own.upper_bound * self.cost,
-            cost_scale=self.program.cost_scale * self.cost,
+            cost_scale=(self.program.cost_scale if own.sparsest is None else own.cost_scale) * self.cost,
             ray=None if own.ray is None else own.ray * self.decision,
             worst=None if own.worst is None else self._witness(own.worst),
             indices=self._cuts(own.indices),
@@ -74,7 +74,16 @@ class UsersUnits:
             trace=None if own.trace is None else self._trace(own.trace),
             dual=self._dual(own.dual, infeasible=own.status == "infeasible"),
             proofs=tuple(self._proof(proof) for proof in own.proofs),
+            sparsest=None if own.sparsest is None else self._sparsest(own.sparsest),
         )
+
+    def _sparsest(self, own: Sparsest) -> Sparsest:
+        tree = [
+            replace(node, dual=self._dual(node.dual, infeasible=not node.feasible)) if isinstance(node, Leaf) else node
+            for node in own.tree
+        ]
+        plain = None if own.plain is None else own.plain * self.cost
+        return replace(own, norm=own.norm * self.cost, plain=plain, tree=tree)
 
     def event(self, own: Event) -> Event:
         """An event of a method that works on the program in its own units, in the user's."""

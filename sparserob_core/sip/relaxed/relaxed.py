@@ -196,16 +196,17 @@ class RelaxedProgram:
             offers.append((*vertex_multipliers(linear, solution.x, solution.y, solution.mu), solution.z))
         points = [_touched(plain, y, mu, solution.x) for y, mu, _ in offers]
         proven = [proving(plain.tangent(at), y, mu, z, at=at) for at, (y, mu, z) in zip(points, offers, strict=True)]
-        bounds = [bound - self._rounding(plain, y, mu, solution.x) for bound, y, mu, _ in proven]
+        bounds = [bound - self.rounding(plain, y, mu, solution.x) for bound, y, mu, _ in proven]
         best = int(np.argmax(bounds))
         _, y, mu, z = proven[best]
         found = self.dual(rows, y, mu, solution.z if z is None else z, bounds[best], points[best])
         return found if plain.P is not None or plain.blocks is not None else replace(found, at=None)
 
     @shaped
-    def _rounding(
+    def rounding(
         self, plain: FiniteProgram, y: Float[Array, " r"], mu: Float[Array, " e"], x: Float[Array, " n"]
     ) -> float:
+        """What the rounding of the rows themselves may do to a lower bound from these multipliers near ``x (n,)``."""
         size = np.where(np.isfinite(x), np.abs(x), 0.0)
         used = (y > 0) & np.isfinite(plain.h)
         total = y[used] @ (np.abs(plain.h[used]) + np.abs(plain.G[used]) @ size) + np.abs(mu) @ (

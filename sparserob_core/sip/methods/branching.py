@@ -1,0 +1,261 @@
+"""Branch and bound over which entries count: a tree of convex programs, every leaf with multipliers that prove it.
+
+The simplex method only says where to look. What is claimed of a leaf is weak duality with its multipliers, or Farkas'
+lemma, evaluated by `inner.duality`; whoever doubts the tree follows it with the multipliers alone (`checker`).
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.evidence import NO_BOUND, Branch, Dual, Leaf
+from sparserob_core.sip.finite import FiniteProgram
+from sparserob_core.sip.inner.duality import farkas_margin, proving
+from sparserob_core.sip.inner.solve import elastic_program, unrelaxed
+from sparserob_core.sip.inner.vertex import simplex
+from sparserob_core.sip.methods.counting import MISSED, convex_below, prices_of, whole
+from sparserob_core.sip.program import SemiInfiniteProgram
+from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
+
+SECONDS = 20.0  # that a mixed-integer program may take
+INTEGRAL = 1e-6  # of an entry's range, within which it is 0 or a letter
+IMPOSSIBLE = 1e-9  # of the numbers that cancel in it, what a proof of infeasibility must exceed
+INWARDS = 1e-9  # of a bound, so that whoever derives it with another rounding does not find less
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One part of the decisions: the change of one image's bounds (``lower``, ``upper``), or that it counts (``on``),
+    from the part ``above`` it; and what was found: the count is at least ``bound`` there, ``x (n,)`` is where to look
+    next."""
+
+    above: int
+    image: int
+    lower: float
+    upper: float
+    on: bool
+    bound: float = -np.inf
+    x: Array | None = None
+
+
+@dataclass(eq=False)
+class Branching:
+    """A tree over ``program`` with the rows ``rows``. ``letters``: for an alphabet, its values in the program's units
+    ``(k, letters)``, ascending; ``alphabet``: the same as the user writes them."""
+
+    program: SemiInfiniteProgram
+    relaxed: RelaxedProgram
+    rows: Rows
+    letters: Array | None = None
+    alphabet: Sequence[float] = ()
+    parts: list[Part] = field(default_factory=list)
+    nodes: list[Leaf | Branch] = field(default_factory=list)
+    _heap: list[tuple[float, int]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        base = self.program.finite
+        self.prices = prices_of(self.program)
+        self._add(Part(-1, 0, float(base.lower[0]), float(base.upper[0]), False))
+
+    @property
+    def lower(self) -> float:
+        """What every decision counts at least, in the user's units; infinite where nothing is feasible."""
+        return min((self._safe(bound) for bound, _ in self._heap), default=np.inf)
+
+    def _safe(self, bound: float) -> float:
+        return bound if np.isinf(bound) else whole(self.program, bound - INWARDS * abs(bound))
+
+    def grow(self, incumbent: Callable[[], float], look: Callable[[Array], bool], go_on: Callable[[int], bool]) -> None:
+        """Divide the part with the least bound until none is below the ``incumbent`` count. ``look`` is shown decisions
+        that count less, and returns whether the rows or the incumbent are others now; ``go_on`` is asked before each
+        step, with the number of nodes."""
+        while self._heap and self._heap[0][0] < np.inf:
+            bound, number = self._heap[0]
+            if self._safe(bound) >= incumbent() * (1.0 - MISSED) or not go_on(len(self.nodes)):
+                return
+            x = self.parts[number].x
+            if x is None:
+                return
+            image = self._undecided(number, x)
+            if image is None and look(x):
+                if self._safe(bound) < incumbent() * (1.0 - MISSED):
+                    heapq.heapreplace(self._heap, (self._measured(number), number))
+                continue
+            if image is None and (image := self._free(number)) is None:
+                return
+            heapq.heappop(self._heap)
+            self._divide(number, image, float(self.program.finite.image(x)[image]))
+
+    def _divide(self, number: int, image: int, value: float) -> None:
+        low, high, _ = self._bounds(number)
+        below, above = float(low[image]), float(high[image])
+        if self.letters is None:
+            at = None
+            children = [Part(number, image, 0.0, 0.0, False), Part(number, image, below, above, True)]
+        else:
+            allowed = self.letters[image]
+            inside = np.flatnonzero((allowed >= below) & (allowed <= above))
+            cut = int(np.clip(np.searchsorted(allowed[inside], value, side="right"), 1, inside.size - 1))
+            left, right = int(inside[cut - 1]), int(inside[cut])
+            at = (float(self.alphabet[left]), float(self.alphabet[right]))
+            children = [
+                Part(number, image, below, float(allowed[left]), False),
+                Part(number, image, float(allowed[right]), above, False),
+            ]
+        first = len(self.nodes)
+        for child in children:
+            self._add(child)
+        self.nodes[number] = Branch(image, first, first + 1, at)
+        self.parts[number] = replace(self.parts[number], x=None)
+
+    def _add(self, part: Part) -> None:
+        self.parts.append(part)
+        self.nodes.append(Leaf(NO_BOUND))
+        number = len(self.nodes) - 1
+        heapq.heappush(self._heap, (self._measured(number), number))
+
+    def _measured(self, number: int) -> float:
+        """Bound one part anew, with all rows; keeps what is known of it where that is better."""
+        finite, certain = self._finite(number)
+        corner = simplex(finite)
+        if corner.status == "infeasible":
+            y, mu, z = unrelaxed_of(finite)
+            amount, magnitude = farkas_margin(finite, y, mu, z)
+            if amount > IMPOSSIBLE * max(1.0, magnitude):
+                size = float(y @ np.linalg.norm(finite.G, axis=1) + np.abs(mu) @ np.linalg.norm(finite.A, axis=1))
+                self.nodes[number] = Leaf(self._told(y / size, mu / size, z, amount), feasible=False)
+                self.parts[number] = replace(self.parts[number], bound=np.inf, x=None)
+                return np.inf
+            return max(self.parts[number].bound, 0.0)
+        if corner.status == "failed":
+            return max(self.parts[number].bound, 0.0)
+        offers = [(corner.y, corner.mu, corner.z), (np.zeros_like(corner.y), np.zeros_like(corner.mu), None)]
+        proven = [proving(finite, y, mu, z) for y, mu, z in offers]
+        bound, y, mu, z = max(proven, key=lambda one: one[0])
+        bound += certain - self.relaxed.rounding(finite, y, mu, corner.x)
+        part = self.parts[number]
+        if bound > part.bound:
+            self.nodes[number] = Leaf(self._told(y, mu, z, bound))
+        self.parts[number] = replace(part, bound=max(bound, part.bound), x=corner.x)
+        return self.parts[number].bound
+
+    def _told(self, y: Array, mu: Array, z: Array | None, bound: float) -> Dual:
+        """Multipliers in the unit of the cost, as every program tells them."""
+        unit, z = self.program.cost_unit, np.zeros(self.program.finite.weights.size) if z is None else z
+        return self.relaxed.dual(self.rows, y / unit, mu / unit, z / unit, bound / unit)
+
+    def _bounds(self, number: int) -> tuple[Array, Array, np.ndarray]:
+        """The bounds of all images in one part, and which count there whatever their value."""
+        base = self.program.finite
+        lower, upper, on = base.lower.copy(), base.upper.copy(), np.zeros(base.lower.size, dtype=bool)
+        seen: set[int] = set()
+        while number > 0:
+            part = self.parts[number]
+            if part.image not in seen:
+                lower[part.image], upper[part.image], on[part.image] = part.lower, part.upper, part.on
+                seen.add(part.image)
+            number = part.above
+        return lower, upper, on
+
+    def _finite(self, number: int) -> tuple[FiniteProgram, float]:
+        lower, upper, on = self._bounds(number)
+        base = replace(self.relaxed.finite(self.rows.G, self.rows.h, 0.0), lower=lower, upper=upper)
+        finite, _, certain = convex_below(base, self.prices, on)
+        return finite, certain
+
+    def _undecided(self, number: int, x: Array) -> int | None:
+        """The image that is furthest from being decided at ``x``; ``None`` where each is 0, on, or a letter."""
+        lower, upper, on = self._bounds(number)
+        image = self.program.finite.image(x)
+        counted = self.prices > 0.0
+        if self.letters is not None:
+            apart = np.abs(image[: len(self.letters), None] - self.letters).min(axis=1)
+            reach = np.maximum(np.abs(lower), np.abs(upper))[: apart.size]
+            share = np.where(counted[: apart.size], apart / np.where(reach > 0.0, reach, 1.0), 0.0)
+        else:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                part = np.where(image > 0.0, image / upper, image / lower)
+            part = np.where(counted & ~on & (lower <= 0.0) & (upper >= 0.0) & (image != 0.0), part, 0.0)
+            share = np.minimum(part, 1.0 - part)
+        found = int(np.argmax(share))
+        return found if share[found] > INTEGRAL else None
+
+    def _free(self, number: int) -> int | None:
+        """An image that may still be 0 or not, or one of several letters."""
+        lower, upper, on = self._bounds(number)
+        free = (self.prices > 0.0) & ~on & (lower < upper)
+        if self.letters is None:
+            free &= (lower <= 0.0) & (upper >= 0.0)
+        return int(np.argmax(free)) if free.any() else None
+
+
+def unrelaxed_of(program: FiniteProgram) -> tuple[Array, Array, Array | None]:
+    """Multipliers that may prove that a finite program is infeasible: those of its elastic program."""
+    relaxed = elastic_program(program)
+    corner = simplex(relaxed)
+    if corner.status != "optimal":
+        return np.zeros(program.h.size), np.zeros(program.b.size), None
+    _, y, mu, z = unrelaxed(program, (corner.x, corner.y, corner.mu, corner.z))
+    return y, mu, z
+
+
+def proposed(program: SemiInfiniteProgram, relaxed: RelaxedProgram, rows: Rows, letters: Array | None) -> Array | None:
+    """What HiGHS takes for the decision ``(n,)`` of which the fewest entries count among those that meet the ``rows``;
+    ``None`` where it finds none in time. Nothing is believed of it."""
+    from scipy.optimize import Bounds, LinearConstraint, milp
+    from scipy.sparse import csr_array, eye_array, hstack
+
+    finite, prices = relaxed.finite(rows.G, rows.h, 0.0), prices_of(program)
+    n, unit = program.n, prices[prices > 0.0].min()
+    S = csr_array(eye_array(n)) if finite.S is None else csr_array(finite.S)
+    blocks = _off_or_on(S, finite, prices) if letters is None else _spelt(S, letters, prices)
+    cost, couplings = blocks[0] / unit, list(blocks[1])
+    count, left = cost.size, relaxed.deadline.left
+    plain = [(S, finite.lower, finite.upper), (finite.G, -np.inf, finite.h), (finite.A, finite.b, finite.b)]
+    couplings += [
+        LinearConstraint(hstack([csr_array(part), csr_array((part.shape[0], count))], format="csr"), low, high)
+        for part, low, high in plain
+        if part.shape[0]
+    ]
+    found = milp(
+        np.concatenate([np.zeros(n), cost]),
+        constraints=couplings,
+        integrality=np.concatenate([np.zeros(n), np.ones(count)]),
+        bounds=Bounds(np.repeat([-np.inf, 0.0], [n, count]), np.repeat([np.inf, 1.0], [n, count])),
+        options={"time_limit": SECONDS if left is None else min(SECONDS, left)},
+    )
+    return None if found.x is None else np.asarray(found.x[:n])
+
+
+def _off_or_on(S: Any, finite: FiniteProgram, prices: Array) -> tuple[Array, list[Any]]:
+    """``lower b <= s <= upper b`` with ``b`` 0 or 1, and what every ``b`` costs."""
+    from scipy.optimize import LinearConstraint
+    from scipy.sparse import diags_array, hstack
+
+    either = np.flatnonzero((prices > 0.0) & (finite.lower <= 0.0) & (finite.upper >= 0.0))
+    above, below = (diags_array(-side[either]) for side in (finite.upper, finite.lower))
+    return prices[either], [
+        LinearConstraint(hstack([S[either], above], format="csr"), -np.inf, 0.0),
+        LinearConstraint(hstack([S[either], below], format="csr"), 0.0, np.inf),
+    ]
+
+
+def _spelt(S: Any, letters: Array, prices: Array) -> tuple[Array, list[Any]]:
+    """``s = sum_j letters_j b_j`` with one ``b_j`` of each entry 1, and what every ``b`` costs."""
+    from scipy.optimize import LinearConstraint
+    from scipy.sparse import csr_array, eye_array, hstack, kron
+
+    size, width = letters.shape
+    place = (np.repeat(np.arange(size), width), np.arange(size * width))
+    spelt = csr_array((letters.ravel(), place), shape=(size, size * width))
+    one = csr_array(kron(eye_array(size), np.ones((1, width))))
+    return (prices[:size, None] * (letters != 0.0)).ravel(), [
+        LinearConstraint(hstack([S[:size], -spelt], format="csr"), 0.0, 0.0),
+        LinearConstraint(hstack([csr_array((size, S.shape[1])), one], format="csr"), 1.0, 1.0),
+    ]

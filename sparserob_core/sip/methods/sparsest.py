@@ -1,0 +1,366 @@
+"""The decision of which the fewest entries count, exactly: the convex bound first, then integers where it leaves a gap.
+
+The count is not convex, so two bounds are closed upon one another that are each proven. From below: the convex program
+below the count (`counting`), and where that is not enough branch and bound over which entries count, every leaf with
+multipliers of its own (`branching`). From above: decisions that act on a few entries only, each proven over the
+continuum by the exchange. A mixed-integer solver (HiGHS) proposes which entries; no claim rests on what it says.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from sparserob_core.errors import InputError
+from sparserob_core.options import Options
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.events import RoundFinished, forwarded, ignore
+from sparserob_core.sip.evidence import Cut, Leaf, Sparsest
+from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
+from sparserob_core.sip.methods.branching import Branching, proposed
+from sparserob_core.sip.methods.counting import DUST, count, counted_below, prices_of
+from sparserob_core.sip.methods.exchange import Exchange
+from sparserob_core.sip.program import TOLERANCE, SemiInfiniteProgram
+from sparserob_core.sip.proof.branch_and_bound import prove
+from sparserob_core.sip.proof.verdict import verdict, witness, worst_of
+from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows, rows_at
+from sparserob_core.sip.result import Result, relative_gap
+from sparserob_core.sip.separation.separation import separate
+
+PROVEN = ("certified", "verified")
+PROPOSALS = 40  # of the mixed-integer solver
+SECONDS = 20.0  # that one of its programs may take
+SAME = 1e-6  # relative difference of two counts that is none
+
+
+class SparsestMethod(Method, Options):
+    """Fewest active pieces: the control that acts for the shortest time, weighted over its channels.
+
+    ``cost`` is that time; ``norm`` beside it is the usual cost. With ``alphabet`` the control takes only these values.
+    """
+
+    counts: ClassVar[bool] = True
+
+    tolerance: float = Field(default=GAP_TOLERANCE, gt=0.0, le=1.0)
+    """Relative gap at which the bounds have met."""
+
+    rounds: int = Field(default=200, ge=1)
+    """Rounds of each exchange at most."""
+
+    alphabet: list[float] | None = Field(default=None, min_length=1, max_length=64)
+    """The only values that the control may take, in every channel; null: any in its set."""
+
+    nodes: int = Field(default=2000, ge=1)
+    """Parts at most into which branch and bound divides the controls, where the convex bound leaves a gap."""
+
+    @field_validator("alphabet")
+    @classmethod
+    def _distinct(cls, value: list[float] | None) -> list[float] | None:
+        if value is None:
+            return None
+        if not np.isfinite(value).all() or len(set(value)) < len(value):
+            raise InputError(expected="finite numbers that differ", got=f"{value}")
+        return sorted(value)
+
+    def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
+        started = time.perf_counter()
+        if program.activity is None or program.n != program.activity.size:
+            raise InputError(
+                "method: sparsest counts pieces, for which a control needs a function per piece; expected a dictionary"
+                " such as piecewise_constant"
+            )
+        bounded, letters = self._bounded(program)
+        plain = self._plain(program, tools)
+        if plain is not None and (plain.status == "infeasible" or plain.decision is None):
+            return plain
+        state = _Search(self, program, bounded, tools, letters, plain)
+        root = state.root()
+        if root is not None:
+            return root
+        try:
+            with tools.deadline.enforced():
+                state.propose()
+                state.branch()
+        except KeyboardInterrupt as error:
+            tools.deadline.interrupt(error)
+        return state.result(started)
+
+    def _bounded(self, program: SemiInfiniteProgram) -> tuple[SemiInfiniteProgram, Array | None]:
+        """The program with bounds as narrow as the alphabet is, and its letters in the program's units."""
+        if self.alphabet is None:
+            return program, None
+        base, size = program.finite, program.n
+        if base.S is not None and (abs(base.S[:size] - _identity(size))).max() > 0.0:
+            raise InputError(
+                "method: sparsest.alphabet needs a dictionary whose coefficients are the control's values; expected"
+                " piecewise_constant"
+            )
+        units = np.ones(size) if program.image_units is None else program.image_units[:size]
+        letters = np.array(self.alphabet)[None] / units[:, None]
+        slack = TOLERANCE * np.maximum(np.abs(base.lower), np.abs(base.upper))[:size]
+        outside = (letters < (base.lower[:size] - slack)[:, None]) | (letters > (base.upper[:size] + slack)[:, None])
+        if outside.any():
+            worst = self.alphabet[int(np.argmax(outside.any(axis=0)))]
+            raise InputError(path="method.alphabet", expected="values within the control's range", got=f"{worst:g}")
+        lower, upper = base.lower.copy(), base.upper.copy()
+        lower[:size], upper[:size] = letters[:, 0], letters[:, -1]
+        return replace(program, lower=lower, upper=upper, twin=None), letters
+
+    def _plain(self, program: SemiInfiniteProgram, tools: Tools) -> Result | None:
+        """An optimum of the program's own cost, to compare with; none with an alphabet."""
+        if self.alphabet is not None:
+            return None
+        return Exchange(tolerance=self.tolerance, rounds=self.rounds).solve(program, replace(tools, notify=ignore))
+
+
+@dataclass(eq=False)
+class _Search:
+    """What is known while the bounds close: the rows that were found, the best decision with its result, the tree."""
+
+    method: SparsestMethod
+    program: SemiInfiniteProgram
+    bounded: SemiInfiniteProgram
+    tools: Tools
+    letters: Array | None
+    plain: Result | None
+    best: Result | None = None
+    least: float = np.inf
+    ending: str = ""
+    told: RoundFinished | None = None
+    rounds: list[RoundFinished] = field(default_factory=list)
+    tree: Branching | None = None
+    tried: set[bytes] = field(default_factory=set)
+
+    def __post_init__(self) -> None:
+        self.relaxed = RelaxedProgram(self.bounded, self.tools.solver, None, deadline=self.tools.deadline)
+        self.rows = Rows.none(self.program.n)
+        if self.plain is not None and self.plain.status in PROVEN and self.plain.decision is not None:
+            self.best, self.least = self.plain, count(self.program, self.plain.decision)
+            self._keep(self.plain.indices)
+
+    @property
+    def lower(self) -> float:
+        """The proven lower bound of the count, in the user's units."""
+        return 0.0 if self.tree is None else self.tree.lower
+
+    @property
+    def closed(self) -> bool:
+        return self.lower >= self.least * (1.0 - SAME)
+
+    def root(self) -> Result | None:
+        """The convex program below the count; its result where nothing is feasible."""
+        below = counted_below(self.bounded)
+        start = [(cut.index[None], np.array([cut.row]), cut.family) for cut in self.rows.cuts]
+
+        def heard(event: RoundFinished) -> RoundFinished:
+            self.told = replace(event, upper_bound=np.inf, gap=np.inf)
+            return self.told
+
+        tools = replace(self.tools, notify=forwarded(self.tools.notify, RoundFinished, heard), regulariser=None)
+        method = Exchange(tolerance=self.method.tolerance, rounds=self.method.rounds)
+        result = method.close(below.program, tools, lambda x: (), start)
+        if result.status == "infeasible":
+            if self.letters is None:
+                return result
+            leaf, letters = Leaf(result.dual, feasible=False), tuple(self.method.alphabet or ())
+            alone = Sparsest(np.nan, None, None, (leaf,), letters)
+            said = f"no control with values in {list(letters)}: {result.message}"
+            return replace(result, message=said, sparsest=alone)
+        self._keep([*result.indices, *result.dual.cuts])
+        self.rounds = list(result.history)
+        self.tree = Branching(self.bounded, self.relaxed, self.rows, self.letters, tuple(self.method.alphabet or ()))
+        if result.decision is not None and self.letters is None:
+            self.look(result.decision)
+        return None
+
+    def _keep(self, cuts: Sequence[Cut]) -> bool:
+        """Impose constraints; ``False`` where all are known."""
+        known = {(cut.family, cut.row, cut.index.tobytes()) for cut in self.rows.cuts}
+        fresh = [cut for cut in cuts if (cut.family, cut.row, cut.index.tobytes()) not in known]
+        for cut in {(cut.family, cut.row, cut.index.tobytes()): cut for cut in fresh}.values():
+            self.rows = self.rows.joined(rows_at(self.program, cut.family, cut.index[None], np.array([cut.row])))
+        if self.tree is not None:
+            self.tree.rows = self.rows
+        return bool(fresh)
+
+    def look(self, x: Array) -> bool:
+        """Try to prove a decision that acts on no more entries than ``x (n,)``, where that is less than before; whether
+        something is known now that was not."""
+        base, prices = self.program.finite, prices_of(self.program)
+        image = base.image(x)
+        reach = np.maximum(np.abs(base.lower), np.abs(base.upper))
+        acts = np.abs(image) > DUST * np.where(np.isfinite(reach), reach, 1.0)
+        if self.letters is not None:
+            return self._exactly(self._spelt(image))
+        key = np.packbits(acts[prices > 0.0]).tobytes()
+        if float(prices[acts].sum()) >= self.least * (1.0 - SAME) or key in self.tried:
+            return False
+        self.tried.add(key)
+        off = ~acts & (prices > 0.0)
+        narrow = replace(
+            self.program, lower=np.where(off, 0.0, base.lower), upper=np.where(off, 0.0, base.upper), twin=None
+        )
+        start = [(cut.index[None], np.array([cut.row]), cut.family) for cut in self.rows.cuts]
+        method = Exchange(tolerance=self.method.tolerance, rounds=self.method.rounds)
+        tools = replace(self.tools, notify=ignore)
+        result = method.close(narrow, tools, lambda u: prove(self.program, u, deadline=tools.deadline), start)
+        fresh = self._keep([*result.indices, *result.dual.cuts])
+        if result.status in PROVEN and result.decision is not None:
+            counted = count(self.program, result.decision)
+            if counted < self.least * (1.0 - SAME):
+                self.best, self.least = result, counted
+                self.tell()
+                return True
+        return fresh
+
+    def _spelt(self, image: Array) -> Array:
+        assert self.letters is not None
+        nearest = np.abs(image[: len(self.letters), None] - self.letters).argmin(axis=1)
+        return np.asarray(self.letters[np.arange(nearest.size), nearest])
+
+    def _exactly(self, x: Array) -> bool:
+        """Prove a decision of letters, or impose what it violates."""
+        if x.tobytes() in self.tried:
+            return False
+        self.tried.add(x.tobytes())
+        program, tools = self.program, self.tools
+        if count(program, x) >= self.least * (1.0 - SAME):
+            return False
+        found = separate(program, x, replace(tools, notify=ignore), TOLERANCE)
+        fresh: list[Cut] = []
+        for family, separation in found:
+            above = separation.violations > TOLERANCE
+            pairs = zip(separation.indices[above], separation.rows[above], strict=True)
+            fresh += [Cut(family.name, index, int(row), formulation=family.formulation) for index, row in pairs]
+        if fresh:
+            return self._keep(fresh)
+        if program.finite.residual(x) > TOLERANCE or program.finite.missed(x) > TOLERANCE:
+            return False
+        proofs = prove(program, x, tools.notify, deadline=tools.deadline)
+        if any(proof.verdict != "proven" for proof in proofs):
+            cuts = [
+                Cut(proof.family, proof.index, proof.row, formulation=proof.formulation)
+                for proof in proofs
+                if proof.verdict == "refuted" and proof.index is not None
+            ]
+            return self._keep(cuts)
+        self.least = count(program, x)
+        worst = witness(program, worst_of(found), proofs)
+        self.best = Result(
+            status="verified",
+            message="",
+            decision=x,
+            cost=program.cost(x),
+            proofs=tuple(proofs),
+            worst=worst,
+            indices=self.rows.cuts,
+        )
+        self.tell()
+        return True
+
+    def tell(self) -> None:
+        """Tell of better bounds, as a round like the last."""
+        if self.told is None:
+            return
+        unit, total = self.program.cost_unit, float(prices_of(self.program).sum())
+        decision = None if self.best is None else self.best.decision
+        self.told = replace(
+            self.told,
+            round=self.told.round + 1,
+            lower_bound=self.lower / unit,
+            upper_bound=self.least / unit,
+            cost=self.least / unit,
+            decision=self.told.decision if decision is None else decision,
+            gap=relative_gap(self.lower, self.least, total),
+            relaxed_programs=self.relaxed.solves,
+        )
+        self.rounds.append(self.told)
+        self.tools.notify(self.told)
+
+    def propose(self) -> None:
+        """Ask the mixed-integer solver for decisions that count less than the best, until it has none."""
+        for _ in range(PROPOSALS):
+            self.tools.deadline.check()
+            if self.closed:
+                return
+            x = proposed(self.bounded, self.relaxed, self.rows, self.letters)
+            if x is None or not self.look(x):
+                return
+
+    def branch(self) -> None:
+        """Close what is left by branch and bound."""
+        assert self.tree is not None
+        shown = time.monotonic()
+
+        def go_on(nodes: int) -> bool:
+            nonlocal shown
+            if time.monotonic() - shown > 1.0:
+                shown = time.monotonic()
+                self.tell()
+            if nodes >= self.method.nodes:
+                self.ending = f"the {self.method.nodes} nodes of the method are used up"
+            return nodes < self.method.nodes and not self.tools.deadline.passed
+
+        self.tree.grow(lambda: self.least, self.look, go_on)
+
+    def result(self, started: float) -> Result:
+        """What is known, told as a result whose cost is the count."""
+        assert self.tree is not None
+        program, unit = self.program, self.program.cost_unit
+        total = float(prices_of(program).sum())
+        ending = self.ending or self.tools.deadline.reason
+        counts = {"relaxed_programs": self.relaxed.solves, "rounds": len(self.rounds), "nodes": len(self.tree.nodes)}
+        letters = None if self.method.alphabet is None else tuple(self.method.alphabet)
+        tree, history, seconds = tuple(self.tree.nodes), tuple(self.rounds), time.perf_counter() - started
+        if self.best is None:
+            none = self.tree.lower == np.inf
+            said = f"no control with values in {list(letters or ())} meets the constraints, by branch and bound"
+            return Result(
+                status="infeasible" if none else "failed",
+                message=said if none else "; ".join(part for part in ("no control was found", ending) if part),
+                lower_bound=np.inf if none else self.lower / unit,
+                counts=counts,
+                sparsest=Sparsest(np.nan, None, None, tree, letters),
+                history=history,
+                seconds=seconds,
+                cost_scale=total / unit,
+            )
+        lower = min(self.tree.lower, self.least)
+        status, message = verdict(self.best.proofs, relative_gap(lower, self.least, total), self.method.tolerance)
+        plain = self.plain if self.plain is not None and self.plain.status in PROVEN else None
+        beside = Sparsest(
+            norm=self.best.cost,
+            plain=None if plain is None else plain.cost,
+            plain_count=None if plain is None or plain.decision is None else count(program, plain.decision),
+            tree=tree,
+            letters=letters,
+        )
+        first = self.tree.nodes[0]
+        return replace(
+            self.best,
+            status=status,
+            message=f"{message}; {ending}" if ending and status != "certified" else message,
+            cost=self.least / unit,
+            value=self.least / unit,
+            epsilon=0.0,
+            lower_bound=lower / unit,
+            upper_bound=self.least / unit if status in PROVEN else np.inf,
+            dual=first.dual if isinstance(first, Leaf) else self.best.dual,
+            stopped=self.tools.deadline.reason,
+            counts={**counts, "active_indices": len(self.best.indices)},
+            sparsest=beside,
+            history=history,
+            seconds=seconds,
+            cost_scale=total / unit,
+        )
+
+
+def _identity(size: int) -> object:
+    from scipy.sparse import csc_array, eye_array
+
+    return csc_array(eye_array(size))
