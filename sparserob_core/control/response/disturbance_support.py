@@ -142,6 +142,10 @@ class DisturbanceSupport:
         """How much any one disturbance can make of every Taylor coefficient of every block, ``(k, r, nb, M)``."""
         return self.disturbance.set.reach(blocks).swapaxes(2, 3)
 
+    def blocks(self, times: Array) -> Array:
+        """Taylor coefficients ``(k, r, M, nb, q)`` of what the functionals give to every block."""
+        return self._blocks(times, self._lifted_rows)
+
     def _blocks(self, times: Array, rows: Array) -> Array:
         """Taylor coefficients ``(k, r, M, nb, q)`` of what functionals that start as lifted ``rows (r, M d)`` give to
         every block."""

@@ -84,7 +84,7 @@ class InitialSupport:
 
     def steepness(self, times: Array) -> Array:
         """How steep the functional of *any* one deviation can be in each parameter over the cell: ``(k, r, nu)``."""
-        return np.asarray(self._reaches(self._combined(self._blocks(times))) @ self._space.exponents)
+        return np.asarray(self._reaches(self._combined(self.blocks(times))) @ self._space.exponents)
 
     def at(self, times: Array, ends: Array) -> tuple[Array, Array]:
         """Taylor coefficients ``(k, r, M)`` under the worst deviation of a centre, and the excess ``(k, r)``, as in
@@ -92,9 +92,7 @@ class InitialSupport:
         return over_faces(
             self._space,
             ends,
-            lambda here, face: summed(self.set, self._combined(self._blocks(times[here]))[:, :, :, None], face)[
-                :, :, 0
-            ],
+            lambda here, face: summed(self.set, self._combined(self.blocks(times[here]))[:, :, :, None], face)[:, :, 0],
         )
 
     def deviation(self, start: Array, widths: Array) -> Array:
@@ -144,7 +142,7 @@ class InitialSupport:
         """How much any one deviation can make of every Taylor coefficient ``(k, r, M, d)``: ``(k, r, M)``."""
         return np.asarray(self.set.reach(blocks))
 
-    def _blocks(self, times: Array) -> Array:
+    def blocks(self, times: Array) -> Array:
         """Taylor coefficients ``(k, r, M, d)`` of the weights on the deviation, in the coordinates of its set."""
         return self._parts(self._lifted_rows(times))
 

@@ -16,6 +16,7 @@ from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.problems import LinearKeys
 from sparserob_core.experiment.config.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import RunDirectory, create_directory, finite
+from sparserob_core.experiment.margin.horizon import HORIZON, HorizonSearch, horizon_search
 from sparserob_core.experiment.margin.scaling import Scaling, scaling
 from sparserob_core.experiment.margin.search import Margin, MarginSearch, Point
 from sparserob_core.sip.events import Notify, ignore
@@ -40,12 +41,14 @@ def margin(
 
     ``of``: ``disturbance``, ``parameters`` or ``initial_state`` (the largest factor that is feasible; sets are scaled
     about their centre), ``path.0``, ``terminal.0`` or ``control`` (the smallest), ``path.0.from`` (the earliest start
-    of a window, in the unit of time). ``tolerance``: how close the two sides are to be, relative to the factor, or to 1
-    if that is larger (for a window to its end). ``curve``: the cost at so many factors on the feasible side, each by a
-    run of its own. ``out``: a new or empty directory for ``margin.json`` and ``margin.png``; with ``write`` and none
-    given it is ``runs/NAME-margin/STAMP-HASH``. ``notify`` receives `StudyProgress`. An interrupt ends the search
-    with what it has proven by then, ``undecided``. Raises `InputError` when an argument or the
-    config is at fault.
+    of a window, in the unit of time), or ``horizon`` (the shortest that is feasible, up to the config's; the number of
+    pieces is kept, and feasibility is not monotone, so that horizons are scanned and covered). ``tolerance``: how close
+    the two sides are to be, relative to the factor, or to 1 if that is larger (for a window to its end, for the horizon
+    to the config's). ``curve``: the cost at so many factors on the feasible side, each by a run of its own; at so many
+    horizons, feasible or not. ``out``: a new or empty directory for ``margin.json`` and ``margin.png``; with ``write``
+    and none given it is ``runs/NAME-margin/STAMP-HASH``. ``notify`` receives `StudyProgress`. An interrupt ends the
+    search with what it has proven by then, ``undecided``. Raises `InputError` when an argument or the config is at
+    fault.
     """
     if not hasattr(tolerance, "__float__") or not 1e-9 <= tolerance <= 0.1:
         raise InputError(f"tolerance: expected a number from 1e-9 to 0.1, got {tolerance!r}")
@@ -55,8 +58,9 @@ def margin(
     search = _search(loaded, str(of), float(tolerance), notify)
     if out is None and not write:
         return search.margin(int(curve))
-    with _directory(out, loaded, search.scaling.of) as directory:
-        return _written(directory, search.margin(int(curve)), search.scaling)
+    with _directory(out, loaded, str(of)) as directory:
+        found = search.margin(int(curve))
+        return _written(directory, found, None if isinstance(search, HorizonSearch) else search.scaling)
 
 
 def summary_of_margin(found: Margin) -> dict[str, Any]:
@@ -67,8 +71,17 @@ def summary_of_margin(found: Margin) -> dict[str, Any]:
 
 def margin_rows(found: Margin) -> list[tuple[str, str]]:
     """What a user wants to know of a margin, as rows of a table."""
-    rows = [
-        ("status", f"{found.status}: {found.message}"),
+    rows = [("status", f"{found.status}: {found.message}")]
+    if found.of == HORIZON:
+        rows += [
+            ("shortest horizon", _between(found.lower, found.upper)),
+            ("excluded", f"(0, {found.lower:.9g}] on {len(found.covered)} cells" if found.covered else "nothing"),
+        ]
+        if found.feasible is not None:
+            cost = f"{found.feasible.upper_bound:.9g}"
+            rows.append(("proven feasible", f"at {found.upper:.9g}: {found.feasible.status}, cost {cost}"))
+        return [*rows, ("seconds", f"{found.seconds:.3f}")]
+    rows += [
         (f"{found.sense} factor", _between(found.lower, found.upper)),
         (found.quantity, _between(*found.amounts)),
     ]
@@ -79,15 +92,27 @@ def margin_rows(found: Margin) -> list[tuple[str, str]]:
     return [*rows, ("seconds", f"{found.seconds:.3f}")]
 
 
+def curve_rows(found: Margin) -> list[tuple[str, str, str, str]]:
+    """The curve of a margin as rows of a table: factor or horizon, status, and both bounds of the cost."""
+
+    def number(value: float) -> str:
+        return f"{value:.9g}" if np.isfinite(value) else "-"
+
+    return [
+        (f"{point.amount:.6g}", point.status, number(point.lower_bound), number(point.upper_bound))
+        for point in found.curve
+    ]
+
+
 def _between(lower: float, upper: float) -> str:
-    if np.isnan(lower) and np.isnan(upper):
-        return "none"
+    if np.isnan(upper):
+        return "none" if np.isnan(lower) else f"more than {lower:.9g}"
     if np.isposinf(upper):
         return f"more than {lower:.9g}"
     return f"{lower:.9g} to {upper:.9g}" if lower != upper else f"{lower:.9g}"
 
 
-def _search(loaded: Loaded, of: str, tolerance: float, notify: Notify) -> MarginSearch:
+def _search(loaded: Loaded, of: str, tolerance: float, notify: Notify) -> MarginSearch | HorizonSearch:
     from sparserob_core.control.transcription.transcribe import in_own_units, like, prepare, transcribe
 
     experiment = assemble(loaded)
@@ -96,6 +121,9 @@ def _search(loaded: Loaded, of: str, tolerance: float, notify: Notify) -> Margin
             "config: expected a control problem, whose sets can be scaled, got a semi-infinite program of another kind"
         )
     problem, control, disturbance = experiment.problem, experiment.control, experiment.disturbance
+    if of == HORIZON:
+        both, method = (control, disturbance), _method(loaded)
+        return horizon_search(experiment.title, problem, both, method, tools_of(loaded), tolerance, notify)
     chosen = scaling(problem, of, *_positions(loaded, problem))
     programs = ParametricProgram(lambda factor: transcribe(chosen.at(factor), control=control, disturbance=disturbance))
     joined: ParametricProgram | None = None
@@ -148,13 +176,17 @@ def _directory(out: str | Path | None, loaded: Loaded, of: str) -> RunDirectory:
     return directory
 
 
-def _written(directory: RunDirectory, found: Margin, varied: Scaling) -> Margin:
+def _written(directory: RunDirectory, found: Margin, varied: Scaling | None) -> Margin:
     """The figure is an extra: where it cannot be drawn, the numbers are there all the same, with a remark."""
     if len(found.curve) > 1:
         from sparserob_core.experiment.margin.figure import write_margin_figure
+        from sparserob_core.experiment.margin.horizon_figure import write_horizon_figure
 
         try:
-            write_margin_figure(directory.path / "margin.png", found, varied)
+            if varied is None:
+                write_horizon_figure(directory.path / "margin.png", found)
+            else:
+                write_margin_figure(directory.path / "margin.png", found, varied)
         except SparseRobError as error:
             found = replace(found, remarks=(*found.remarks, str(error)))
     directory.write_json("margin.json", summary_of_margin(found))

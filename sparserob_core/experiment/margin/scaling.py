@@ -68,7 +68,7 @@ def scaling(
         raise InputError(
             f"of: '{of}' cannot be varied, the problem has no {part}; expected one of {', '.join(sorted(choices))}"
         )
-    raise InputError(f"of: expected what is to be varied, got '{of}'{nearest(of, choices)}")
+    raise InputError(f"of: expected what is to be varied, got '{of}'{nearest(of, {*choices, 'horizon'})}")
 
 
 def _choices(

@@ -62,6 +62,11 @@ class Margin:
     the factor ``lower``, or for the smallest down to 0); ``infeasible`` (at every factor; ``message`` says why);
     ``undecided`` (a side could not be proven). ``curve``: runs on the feasible side, by factor. ``directory``: where it
     was written to, if it was.
+
+    Of the ``horizon``, where feasibility is not monotone: nothing is feasible at any horizon in ``(0, lower]``, which
+    the cells ``covered`` fill, each proven by one set of multipliers with the horizon as a parameter; at ``upper`` a
+    control is proven, the shortest for which one was found. ``infeasible``: no horizon up to the config's is feasible.
+    ``curve``: runs at equally spaced horizons, feasible or not.
     """
 
     title: str
@@ -79,6 +84,7 @@ class Margin:
     remarks: tuple[str, ...] = ()
     seconds: float = 0.0
     directory: Path | None = None
+    covered: tuple[tuple[float, float], ...] = ()
 
 
 @final

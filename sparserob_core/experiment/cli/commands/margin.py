@@ -20,7 +20,8 @@ EXIT = {"certified": 0, "unbounded": 0, "infeasible": 3, "undecided": 4}
     default="disturbance",
     show_default=True,
     metavar="WHAT",
-    help="disturbance, parameters, initial_state, path.0, terminal.0, control, or path.0.from; entries count from 0.",
+    help="disturbance, parameters, initial_state, path.0, terminal.0, control, path.0.from, or horizon; entries count"
+    " from 0.",
 )
 @click.option(
     "--tolerance",
@@ -46,16 +47,20 @@ def margin(
     """Find how far something of the experiment that CONFIG describes can be changed before nothing is feasible any
     more.
 
-    The largest factor on the set of disturbances, of parameters, or on the initial state; the smallest factor on a
-    path, terminal or control set; the earliest start of a path's window. On one side a control is proven feasible, on
-    the other nothing is, by a checked certificate. Sets are scaled about their centre. KEY=VALUE changes the config.
+    The largest factor on the set of disturbances, of parameters, of initial states, or on the initial state; the
+    smallest factor on a path, terminal or control set; the earliest start of a path's window. On one side a control is
+    proven feasible, on the other nothing is, by a checked certificate. Sets are scaled about their centre. KEY=VALUE
+    changes the config.
+
+    Of the horizon: the shortest that is feasible, up to the config's, with the number of pieces as it is. Feasibility
+    is not monotone in it, so that every shorter horizon is proven infeasible, and the curve has both kinds.
 
     Exit status: 0 both sides are proven, or no end was found as far as was looked; 2 the input is at fault, 3 nothing
     is feasible at any factor, 4 a side could not be proven, 130 interrupted.
     """
     from sparserob_core.experiment.cli.shell.live_line import LiveLine
+    from sparserob_core.experiment.margin.margin import curve_rows, margin_rows, summary_of_margin
     from sparserob_core.experiment.margin.margin import margin as find
-    from sparserob_core.experiment.margin.margin import margin_rows, summary_of_margin
     from sparserob_core.experiment.terminal.table import print_table
 
     with LiveLine() as line:
@@ -64,6 +69,9 @@ def margin(
         print_json(summary_of_margin(found))
     else:
         print_table(found.title, (), margin_rows(found))
+        if found.of == "horizon" and found.curve:
+            columns = ("horizon", "status", "lower bound", "upper bound")
+            print_table("Cost against the horizon", columns, curve_rows(found))
         for remark in (*found.remarks, f"written to {found.directory}"):
             click.echo(printable(remark))
     return status_unless_interrupted(EXIT[found.status])

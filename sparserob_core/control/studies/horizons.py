@@ -1,0 +1,252 @@
+"""No control is feasible at any horizon of an interval: one set of multipliers, proven with the horizon as a parameter.
+
+In the time ``s = t / T`` of a dictionary whose pieces are fixed shares of the horizon ``T``, a system obeys
+``dx/ds = T (A x + B u + E w + c)``: ``T`` is a parameter of the system, and what multipliers make of its constraints is
+a Taylor model in it. Windows of the path begin at absolute times, so a row there is taken no earlier than its window
+begins at the shortest horizon of the interval.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import final
+
+import numpy as np
+
+from sparserob_core.control.enclosures.matrix_exponential import rounding
+from sparserob_core.control.enclosures.polynomial import polynomial_bound
+from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.problem.units import Units
+from sparserob_core.control.response.disturbance import DisturbanceModel, disturbance_model
+from sparserob_core.control.response.disturbance_support import DisturbanceSupport, summed
+from sparserob_core.control.response.initial_support import InitialSupport
+from sparserob_core.control.response.lifted import LiftedSystem, lift
+from sparserob_core.control.response.response import TimeGrid, merge_grids
+from sparserob_core.control.transcription.own_units import extent, rough_units
+from sparserob_core.errors import InputError, NotEnclosable
+from sparserob_core.sip.convex_set import Array, Box, ConvexSet
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Multiplier:
+    """``weight (c'x(share T) - limit)`` at a parameter ``(nu,)``, of a run at some horizon: ``c = direction (d,)``,
+    the time as a ``share`` of the horizon, and the absolute time at which its window begins, ``earliest``.
+    ``uncertain``: whether the worst uncertainty is part of it, which is so but for equalities."""
+
+    weight: float
+    share: float
+    direction: Array
+    parameter: Array
+    limit: float
+    earliest: float = 0.0
+    uncertain: bool = True
+
+
+def at_horizon(problem: OptimalControlProblem, horizon: float) -> OptimalControlProblem:
+    """The problem with another, shorter ``horizon``: windows that lasted until the end do so still, those that would
+    begin later are gone. Raises `InputError` for a window that ends before the horizon of the problem."""
+    windows = []
+    for i, entry in enumerate(problem.path):
+        assert isinstance(entry, PathConstraint)
+        if entry.stop is not None and entry.stop < problem.horizon:
+            raise InputError(
+                path=f"path.{i}",
+                expected=f"a window that lasts until the horizon, {problem.horizon:g}, since windows stay where they"
+                " are while the horizon varies",
+                got=f"one that ends at {entry.stop:g}",
+            )
+        if entry.start <= horizon:
+            windows.append(replace(entry, stop=None))
+    return replace(problem, horizon=horizon, path=windows)
+
+
+def stretched(dictionary: Dictionary, horizon: float) -> Dictionary:
+    """The dictionary with the same pieces as shares of another horizon."""
+    shares = dictionary.breakpoints / dictionary.horizon
+    breakpoints = horizon * shares
+    breakpoints[-1] = horizon
+    return Dictionary(breakpoints, dictionary.values)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Horizons:
+    """All horizons of one problem, whose dictionaries have the same pieces as shares of the horizon. Raises
+    `InputError` where the pieces of the system do not move with the horizon, or a control of the dictionary cannot take
+    any values on its pieces."""
+
+    problem: OptimalControlProblem
+    control: Dictionary
+    disturbance: Dictionary
+
+    def __post_init__(self) -> None:
+        if self.problem.system.delay > 0.0:
+            raise InputError(
+                "of: horizon: a delay is no share of the horizon, so that nothing can be proven of an interval of"
+                " horizons; expected a problem without system.delay"
+            )
+        if not self.control.is_complete:
+            raise InputError(
+                "of: horizon: the control's dictionary has fewer functions than pieces; expected one that takes any"
+                " values on its pieces"
+            )
+        at_horizon(self.problem, self.problem.horizon)
+        object.__setattr__(self, "control", self.control.merged())
+
+    def amount(self, multipliers: Sequence[Multiplier], low: float, high: float) -> float:
+        """A proven lower bound of the weighted sum of violations, over all controls and all horizons in
+        ``[low, high]``: where it is positive, none of them is feasible (Farkas). Rows whose window begins after ``low``
+        count for nothing; ``-inf`` where nothing can be enclosed."""
+        rows = [one for one in multipliers if one.earliest <= low or one.earliest == 0.0]
+        size = sum(abs(one.weight) for one in rows)
+        if not size > 0.0:
+            return -np.inf
+        lifted: dict[bytes, LiftedSystem] = {}
+        low, high = low / self._units.time, high / self._units.time
+        total = None
+        for one in rows:
+            key = one.parameter.tobytes()
+            try:
+                if key not in lifted:
+                    lifted[key] = self._lifted(one.parameter, low, high)
+                with np.errstate(over="ignore", invalid="ignore"):
+                    part = self._part(one, lifted[key], low)
+            except NotEnclosable:
+                return -np.inf
+            scaled = part.times(one.weight / size)
+            total = scaled if total is None else total.plus(scaled)
+        assert total is not None
+        answer = total.least(self._own.control)
+        return answer * size if np.isfinite(answer) else -np.inf
+
+    def _lifted(self, parameter: Array, low: float, high: float) -> LiftedSystem:
+        """The system at one parameter in the time ``s``, over the horizons of an interval."""
+        at = (parameter / self._units.parameters)[None]
+        A, B, E = (matrix[0] for matrix in self._own.system.forced.matrices(at))
+        scaled = LinearSystem(
+            lambda T: A * T[0],
+            lambda T: B * T[0],
+            lambda T: E * T[0],
+            parameters=Box(np.array([low]), np.array([high])),
+        )
+        middle, radius = np.array([(low + high) / 2]), np.array([(high - low) / 2])
+        return lift(scaled, self._grid, self._start, middle, radius * (1.0 + 4.0 * np.finfo(float).eps))
+
+    def _part(self, one: Multiplier, lifted: LiftedSystem, low: float) -> _Sum:
+        """``c'x(s) - limit`` with the worst uncertainty of the interval's middle, as a Taylor model in the horizon."""
+        own, m = self._own, self._own.system.controls
+        earliest = one.earliest / self._units.time
+        share = one.share
+        if earliest > 0.0:
+            share = min(1.0, max(share, float(np.nextafter(earliest / low, np.inf))))
+        at, rows = np.array([share]), (one.direction * self._units.states)[None] @ lifted.transform
+        piece = int(self._grid.locate(at)[0])
+        coefficients = np.zeros(lifted.space.size)
+        coefficients[0] = -one.limit
+        begun = own.initial_set
+        around = np.zeros(own.system.states) if begun is None else extent(begun)
+        initial = InitialSupport(lifted, Box(self._start - around, self._start + around), rows)
+        weights = initial.blocks(at)[0, 0]
+        start = self._start
+        if begun is not None and one.uncertain:
+            start = start + begun.support_point(weights[:1])[0]
+        coefficients += weights @ start
+        sizes = abs(one.limit) + float((np.abs(weights) @ (np.abs(self._start) + around)).sum())
+        lost = float(initial.neglected[0, piece])
+        if self._noise is not None and one.uncertain:
+            found = DisturbanceSupport(lifted, self._noise, rows)
+            blocks = found.blocks(at)[0, 0]
+            worst = self._noise.set.support_point(blocks[0])
+            coefficients += np.einsum("bq,abq->a", worst, blocks)
+            sizes += float(np.einsum("bq,abq->", np.abs(worst), np.abs(blocks)))
+            lost += float(found.neglected[0, piece])
+        if lifted.B.shape[2] > m:  # a drift, whose input is always 1
+            ones = Box(np.ones(lifted.B.shape[2] - m), np.ones(lifted.B.shape[2] - m))
+            whole = DisturbanceModel("piecewise_constant", ones, ones, self._grid, starts=np.zeros(1, dtype=int))
+            found = DisturbanceSupport(_driven(lifted, slice(m, None)), whole, rows)
+            blocks = found.blocks(at)[0, 0].sum(axis=(1, 2))
+            coefficients += blocks
+            sizes += float(np.abs(blocks).sum())
+            lost += float(found.neglected[0, piece])
+        acting = DisturbanceSupport(_driven(lifted, slice(0, m)), self._acting, rows)
+        blocks = acting.blocks(at)[0, 0]
+        sizes += float(own.control.reach(blocks).sum())
+        lost += float(acting.neglected[0, piece])
+        terms = rounding(2 * own.system.states + lifted.space.size + self._grid.pieces)
+        return _Sum(lifted, coefficients, blocks, lost + terms * sizes)
+
+    @cached_property
+    def _units(self) -> Units:
+        return rough_units(self.problem)
+
+    @cached_property
+    def _own(self) -> OptimalControlProblem:
+        return self._units.of_problem(self.problem)
+
+    @cached_property
+    def _start(self) -> Array:
+        return np.asarray(self._own.initial_state, dtype=float)
+
+    @cached_property
+    def _grid(self) -> TimeGrid:
+        """The merged grid in the time ``s``, from 0 to 1."""
+        both = [stretched(one, 1.0).breakpoints for one in (self.control, self.disturbance)]
+        forced = self._own.system.forced
+        return merge_grids(both[0], both[1], 0.0, None, forced.controls - self._own.system.controls)
+
+    @cached_property
+    def _noise(self) -> DisturbanceModel | None:
+        own = self._own
+        if own.disturbance is None:
+            return None
+        if own.disturbance_class == "measurable":  # what is constant on pieces is measurable
+            starts = np.arange(self._grid.pieces)
+            return DisturbanceModel("piecewise_constant", own.disturbance, own.disturbance, self._grid, starts=starts)
+        return disturbance_model(own.disturbance_class, own.disturbance, stretched(self.disturbance, 1.0), self._grid)
+
+    @cached_property
+    def _acting(self) -> DisturbanceModel:
+        """The control on its pieces, in the form of a disturbance."""
+        starts = np.flatnonzero(np.diff(self._grid.control_piece, prepend=-1))
+        return DisturbanceModel("piecewise_constant", self._own.control, self._own.control, self._grid, starts=starts)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Sum:
+    """Taylor coefficients ``(M,)`` in the horizon of what no control changes, and ``(M, K, m)`` of the weights on the
+    control's pieces; the truth is off by at most ``lost``."""
+
+    lifted: LiftedSystem
+    coefficients: Array
+    weights: Array
+    lost: float
+
+    def times(self, factor: float) -> _Sum:
+        """A multiple."""
+        return _Sum(self.lifted, factor * self.coefficients, factor * self.weights, abs(factor) * self.lost)
+
+    def plus(self, other: _Sum) -> _Sum:
+        """The sum of two."""
+        return _Sum(
+            self.lifted,
+            self.coefficients + other.coefficients,
+            self.weights + other.weights,
+            self.lost + other.lost,
+        )
+
+    def least(self, control: ConvexSet) -> float:
+        """A lower bound of the least value over every control and every horizon of the interval."""
+        pushed = summed(control, -self.weights[None, None], None)[0, 0].sum(axis=0)
+        above, _ = polynomial_bound(self.lifted.space, (pushed[:-1] - self.coefficients)[None])
+        return -float(above[0] + pushed[-1] + self.lost * (1.0 + 1e-12))
+
+
+def _driven(lifted: LiftedSystem, columns: slice) -> LiftedSystem:
+    """The lifted system with some columns of ``B`` in the place of the disturbance's."""
+    return replace(lifted, W=lifted.B[:, :, columns], slack_W=lifted.slack_B[:, columns])

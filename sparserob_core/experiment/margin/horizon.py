@@ -1,0 +1,244 @@
+"""The shortest horizon that is feasible: scanned and covered, since feasibility is not monotone in the horizon."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import final
+
+import numpy as np
+
+from sparserob_core.control.constraints.explanation import TimedExplanation
+from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.sets.sets import Equality
+from sparserob_core.control.studies.horizons import Horizons, Multiplier, at_horizon, stretched
+from sparserob_core.control.transcription.record import Transcription
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.margin.search import FEASIBLE, Answer, Margin, Point
+from sparserob_core.experiment.run.events import StudyProgress
+from sparserob_core.sip.events import Notify
+from sparserob_core.sip.method import Tools
+from sparserob_core.sip.methods.exchange import Exchange
+from sparserob_core.sip.methods.own_units import solve_in_own_units
+from sparserob_core.sip.result import Result
+
+HORIZON = "horizon"
+SCAN = 16  # equal parts of all horizons that the search begins with, where no curve asks for more
+MOST = 400  # runs that the search takes at most, beside those of the curve
+MET = 4.0  # widths by which the two ends of a finished search may differ
+
+
+@final
+@dataclass(eq=False)
+class HorizonSearch:
+    """One search over the horizons up to that of the ``problem``, whose dictionaries keep the number of their pieces.
+    ``width``: how close the two ends are to be, in the unit of time."""
+
+    title: str
+    problem: OptimalControlProblem
+    control: Dictionary
+    disturbance: Dictionary
+    method: Exchange
+    tools: Tools
+    width: float
+    notify: Notify
+    points: dict[float, Point] = field(default_factory=dict)
+    covered: list[tuple[float, float]] = field(default_factory=list)
+    _farkas: dict[float, list[Multiplier]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._bare = replace(self.problem, control_step=None)
+        self._cells = Horizons(self._bare, self.control, self.disturbance)
+
+    def margin(self, count: int) -> Margin:
+        """The shortest feasible horizon between what is covered and what is proven, with a curve of ``count`` runs."""
+        started, best, stuck = time.perf_counter(), None, ""
+        longest = self.problem.horizon
+        scan = longest * np.arange(1, max(count, SCAN) + 1) / max(count, SCAN)
+        try:
+            stuck = self._cover(scan.tolist())
+            if count:
+                for horizon in scan:
+                    self._run(float(horizon))
+        except KeyboardInterrupt as pressed:
+            stuck = str(pressed) or "interrupted from the keyboard"
+        proven = [point for point in self.points.values() if point.status in FEASIBLE]
+        best = min(proven, key=lambda point: point.factor, default=None)
+        low = self.covered[-1][1] if self.covered else 0.0
+        status, message = self._answer(best, low, stuck)
+        upper = best.factor if best is not None else np.nan
+        curve = tuple(self.points[key] for key in sorted(self.points) if key in scan or self.points[key] is best)
+        kept = f"{self.control.pieces} pieces at every horizon; windows begin at the times that the config says"
+        return Margin(
+            title=self.title,
+            of=HORIZON,
+            sense="smallest",
+            quantity="horizon",
+            status=status,
+            message=message,
+            lower=low,
+            upper=upper,
+            amounts=(low, upper),
+            feasible=best,
+            infeasible=self.points.get(low),
+            curve=curve if count else (),
+            remarks=(f"kept fixed: {kept}",),
+            seconds=time.perf_counter() - started,
+            covered=tuple(self.covered),
+        )
+
+    def _answer(self, best: Point | None, low: float, stuck: str) -> tuple[Answer, str]:
+        longest = self.problem.horizon
+        cells = f"{len(self.covered)} cell{'s' if len(self.covered) != 1 else ''}"
+        if best is None and low >= longest:
+            return "infeasible", f"no horizon up to {longest:g} is feasible, proven on {cells}: {self._why(longest)}"
+        if best is None:
+            return "undecided", f"no horizon up to {longest:g} was found feasible; {stuck}"
+        if low == 0.0 and best.factor <= MET * self.width:
+            return "unbounded", f"feasible at every horizon that was looked at on the way down to {best.factor:g}"
+        if best.factor - low <= MET * self.width:
+            return "certified", f"no horizon up to {low:.9g} is feasible, proven on {cells}: {self._why(low)}"
+        return "undecided", f"what is between {low:.9g} and {best.factor:.9g} could not be proven: {stuck}"
+
+    def _why(self, horizon: float) -> str:
+        point = self.points.get(horizon)
+        return point.message if point is not None else "the constraints clash"
+
+    def _cover(self, scan: list[float]) -> str:
+        """Cover horizons from 0 on by cells on each of which nothing is feasible, until one is feasible; where that did
+        not succeed, why."""
+        starts = [entry.start for entry in self.problem.path if isinstance(entry, PathConstraint)]
+        # windows that begin after 0 part cells: their rows are there beyond only
+        points = sorted({0.0, *scan, *(start for start in starts if 0.0 < start < self.problem.horizon)})
+        cells, best = list(pairwise(points))[::-1], np.inf
+        while cells:
+            low, high = cells.pop()
+            if low >= best:
+                break
+            high = min(high, best)
+            status = self._run(high).status
+            if status in FEASIBLE:
+                best = min(best, high)
+            elif status == "infeasible" and self._excluded(low, high):
+                self.covered.append((low, high))
+                self._tell(f"no horizon up to {high:.9g} is feasible")
+                continue
+            short = high - low <= self.width
+            if short and status in FEASIBLE:
+                break
+            stuck = self._stuck(low, high, short)
+            if stuck:
+                self._descend([point for point in points if low < point < best])
+                return stuck
+            cells += [((low + high) / 2, high), (low, (low + high) / 2)]
+        return ""
+
+    def _stuck(self, low: float, high: float, short: bool) -> str:
+        """Why an interval that was not excluded is not to be halved any more; empty where it is."""
+        point = self.points[high]
+        if point.status not in (*FEASIBLE, "infeasible"):
+            return f"the run at {high:.9g} is {point.status}: {point.message}"
+        if short:
+            left_out = (
+                "" if self.problem.control_step is None else "; control_step is left out of what excludes horizons"
+            )
+            return f"no multipliers exclude {low:.9g} to {high:.9g}{left_out}"
+        return f"{MOST} runs did not suffice" if len(self.points) > MOST else ""
+
+    def _descend(self, points: list[float]) -> None:
+        """The first feasible one of ``points``, and the shortest feasible horizon next to it: what is left to do where
+        horizons could not be covered any further."""
+        before = points[0] if points else 0.0
+        for point in points:
+            if self._run(point).status in FEASIBLE:
+                while point - before > self.width and point > before:
+                    middle = (before + point) / 2
+                    before, point = (before, middle) if self._run(middle).status in FEASIBLE else (middle, point)
+                return
+            before = point
+
+    def _excluded(self, low: float, high: float) -> bool:
+        """Whether multipliers of a run at one of the ends prove that nothing is feasible in between."""
+        known = [self._multipliers(end) for end in (high, low)]
+        return any(self._cells.amount(rows, low, high) > 0.0 for rows in known if rows)
+
+    def _run(self, horizon: float) -> Point:
+        """An ordinary run at a horizon, remembered."""
+        if horizon not in self.points:
+            model, result = self._solved(self.problem, horizon)
+            self.points[horizon] = Point(
+                horizon, horizon, result.status, result.message, result.lower_bound, result.upper_bound
+            )
+            self._tell(f"horizon {horizon:.9g}: {result.status}")
+            if result.status == "infeasible" and self.problem.control_step is None:
+                self._farkas[horizon] = _multipliers_of(model, result)
+            if result.stopped:
+                self.tools.deadline.check()
+        return self.points[horizon]
+
+    def _multipliers(self, horizon: float) -> list[Multiplier]:
+        """Those that prove a horizon infeasible; without limits on steps, of which a proof on cells knows nothing."""
+        if horizon not in self._farkas and horizon > 0.0:
+            model, result = self._solved(self._bare, horizon)
+            self._farkas[horizon] = _multipliers_of(model, result) if result.status == "infeasible" else []
+        return self._farkas.get(horizon, [])
+
+    def _solved(self, problem: OptimalControlProblem, horizon: float) -> tuple[Transcription, Result]:
+        from sparserob_core.control.transcription.transcribe import prepare
+
+        control, disturbance = (stretched(one, horizon) for one in (self.control, self.disturbance))
+        model = prepare(at_horizon(problem, horizon), control, disturbance)
+        return model, solve_in_own_units(self.method, model.program, self.tools)
+
+    def _tell(self, text: str) -> None:
+        self.notify(StudyProgress(text=text))
+
+
+def horizon_search(
+    title: str,
+    problem: OptimalControlProblem,
+    dictionaries: tuple[Dictionary, Dictionary],
+    method: Exchange,
+    tools: Tools,
+    tolerance: float,
+    notify: Notify,
+) -> HorizonSearch:
+    """The search of a margin of the horizon; raises `InputError` where nothing could be proven."""
+    width = tolerance * problem.horizon
+    try:
+        return HorizonSearch(title, problem, *dictionaries, method, tools, width, notify)
+    except InputError as error:
+        raise error if not error.path else error.under("of", HORIZON) from None
+
+
+def _multipliers_of(model: Transcription, result: Result) -> list[Multiplier]:
+    """What proves that a horizon is infeasible, row by row; rows of a curved set of controls are not needed, since the
+    least value over that set is taken."""
+    problem, found = model.problem, []
+    starts = {one.name: one.start for one in model.constraints[: len(problem.path)]}  # terminal sets come after them
+    middle = np.zeros(0) if model.parameters.set is None else model.parameters.set.interior_point()
+    for cut in result.dual.cuts:
+        family = model.program.formulated(cut.family, cut.formulation)
+        if family is None or model.constraint(model.program.family(cut.family)) is None:
+            continue
+        said = family.explanation(cut.index, cut.row)
+        if isinstance(said, TimedExplanation) and cut.multiplier > 0.0:
+            known = said.parameter is not None and said.parameter.size > 0
+            parameter = said.parameter if known and said.parameter is not None else middle
+            found.append(
+                Multiplier(
+                    weight=float(cut.multiplier),
+                    share=min(1.0, said.time / problem.horizon),
+                    direction=said.direction,
+                    parameter=np.asarray(parameter, dtype=float),
+                    limit=said.sign * said.limit,
+                    earliest=starts.get(cut.family, 0.0),
+                )
+            )
+    fixed = [(i, float(end.values[i])) for end in problem.terminal if isinstance(end, Equality) for i in end.fixed]
+    axes = np.eye(problem.system.states)
+    for (state, value), price in zip(fixed, result.dual.mu, strict=False):
+        found.append(Multiplier(float(price), 1.0, axes[state], middle, value, uncertain=False))
+    return found
