@@ -18,13 +18,14 @@ import numpy as np
 from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.polynomial import polynomial_bound
 from sparserob_core.control.problem.dictionary import Dictionary
-from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.problem import SHORTEST, OptimalControlProblem, PathConstraint
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.response.disturbance import DisturbanceModel, disturbance_model
 from sparserob_core.control.response.disturbance_support import DisturbanceSupport, summed
 from sparserob_core.control.response.initial_support import InitialSupport
 from sparserob_core.control.response.lifted import LiftedSystem, lift
+from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.response.response import TimeGrid, merge_grids
 from sparserob_core.control.transcription.own_units import extent, rough_units
 from sparserob_core.errors import InputError, NotEnclosable
@@ -36,7 +37,11 @@ from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 class Multiplier:
     """``weight (c'x(share T) - limit)`` at a parameter ``(nu,)``, of a run at some horizon: ``c = direction (d,)``,
     the time as a ``share`` of the horizon, and the absolute time at which its window begins, ``earliest``.
-    ``uncertain``: whether the worst uncertainty is part of it, which is so but for equalities."""
+
+    ``uncertain``: whether the worst uncertainty is part of it, which is so but for equalities. ``reference``: of a set
+    that moves, which adds ``c'r(share T)`` to the limit. ``gain (m,)``: the part on the control of a mixed constraint,
+    and ``piece`` the two shares between which the piece lies that it looks at.
+    """
 
     weight: float
     share: float
@@ -45,6 +50,29 @@ class Multiplier:
     limit: float
     earliest: float = 0.0
     uncertain: bool = True
+    reference: Reference | None = None
+    gain: Array | None = None
+    piece: tuple[float, float] = (0.0, 1.0)
+
+    def share_from(self, low: float) -> float:
+        """The share at which it is taken for horizons of ``low`` and more, so that its window has begun; ``nan`` where
+        there is none."""
+        if self.earliest == 0.0:
+            return self.share
+        if self.earliest > low:
+            return np.nan
+        begins = min(1.0, float(np.nextafter(self.earliest / low, np.inf)))
+        if self.gain is not None and begins >= self.piece[1]:  # that piece is over when the window begins
+            return np.nan
+        return max(self.share, begins)
+
+    def highest(self, share: float, low: float, high: float) -> float:
+        """The largest limit at that share of the horizons in ``[low, high]``."""
+        if self.reference is None:
+            return self.limit
+        times = np.array([share * low, share * high])
+        times = np.concatenate([times, self.reference.kinks(*times)])
+        return self.limit + float((self.reference.at(times) @ self.direction).max())
 
 
 def at_horizon(problem: OptimalControlProblem, horizon: float) -> OptimalControlProblem:
@@ -52,7 +80,7 @@ def at_horizon(problem: OptimalControlProblem, horizon: float) -> OptimalControl
     begin later are gone. Raises `InputError` for a window that ends before the horizon of the problem."""
     windows = []
     for i, entry in enumerate(problem.path):
-        assert isinstance(entry, PathConstraint)
+        assert not isinstance(entry, ConvexSet)
         if entry.stop is not None and entry.stop < problem.horizon:
             raise InputError(
                 path=f"path.{i}",
@@ -60,7 +88,8 @@ def at_horizon(problem: OptimalControlProblem, horizon: float) -> OptimalControl
                 " are while the horizon varies",
                 got=f"one that ends at {entry.stop:g}",
             )
-        if entry.start <= horizon:
+        lasts = horizon - entry.start > SHORTEST * horizon
+        if lasts or (entry.start <= horizon and isinstance(entry, PathConstraint)):
             windows.append(replace(entry, stop=None))
     return replace(problem, horizon=horizon, path=windows)
 
@@ -102,20 +131,20 @@ class Horizons:
         """A proven lower bound of the weighted sum of violations, over all controls and all horizons in
         ``[low, high]``: where it is positive, none of them is feasible (Farkas). Rows whose window begins after ``low``
         count for nothing; ``-inf`` where nothing can be enclosed."""
-        rows = [one for one in multipliers if one.earliest <= low or one.earliest == 0.0]
+        rows = [one for one in multipliers if np.isfinite(one.share_from(low))]
         size = sum(abs(one.weight) for one in rows)
         if not size > 0.0:
             return -np.inf
         lifted: dict[bytes, LiftedSystem] = {}
-        low, high = low / self._units.time, high / self._units.time
         total = None
         for one in rows:
             key = one.parameter.tobytes()
             try:
                 if key not in lifted:
-                    lifted[key] = self._lifted(one.parameter, low, high)
+                    lifted[key] = self._lifted(one.parameter, low / self._units.time, high / self._units.time)
+                share = one.share_from(low)
                 with np.errstate(over="ignore", invalid="ignore"):
-                    part = self._part(one, lifted[key], low)
+                    part = self._part(one, lifted[key], share, one.highest(share, low, high))
             except NotEnclosable:
                 return -np.inf
             scaled = part.times(one.weight / size)
@@ -137,17 +166,13 @@ class Horizons:
         middle, radius = np.array([(low + high) / 2]), np.array([(high - low) / 2])
         return lift(scaled, self._grid, self._start, middle, radius * (1.0 + 4.0 * np.finfo(float).eps))
 
-    def _part(self, one: Multiplier, lifted: LiftedSystem, low: float) -> _Sum:
+    def _part(self, one: Multiplier, lifted: LiftedSystem, share: float, limit: float) -> _Sum:
         """``c'x(s) - limit`` with the worst uncertainty of the interval's middle, as a Taylor model in the horizon."""
         own, m = self._own, self._own.system.controls
-        earliest = one.earliest / self._units.time
-        share = one.share
-        if earliest > 0.0:
-            share = min(1.0, max(share, float(np.nextafter(earliest / low, np.inf))))
         at, rows = np.array([share]), (one.direction * self._units.states)[None] @ lifted.transform
         piece = int(self._grid.locate(at)[0])
         coefficients = np.zeros(lifted.space.size)
-        coefficients[0] = -one.limit
+        coefficients[0] = -limit
         begun = own.initial_set
         around = np.zeros(own.system.states) if begun is None else extent(begun)
         initial = InitialSupport(lifted, Box(self._start - around, self._start + around), rows)
@@ -156,7 +181,7 @@ class Horizons:
         if begun is not None and one.uncertain:
             start = start + begun.support_point(weights[:1])[0]
         coefficients += weights @ start
-        sizes = abs(one.limit) + float((np.abs(weights) @ (np.abs(self._start) + around)).sum())
+        sizes = abs(limit) + abs(one.limit) + float((np.abs(weights) @ (np.abs(self._start) + around)).sum())
         lost = float(initial.neglected[0, piece])
         if self._noise is not None and one.uncertain:
             found = DisturbanceSupport(lifted, self._noise, rows)
@@ -175,6 +200,9 @@ class Horizons:
             lost += float(found.neglected[0, piece])
         acting = DisturbanceSupport(_driven(lifted, slice(0, m)), self._acting, rows)
         blocks = acting.blocks(at)[0, 0]
+        if one.gain is not None:
+            ends = stretched(self.control, 1.0).breakpoints
+            blocks[0, np.searchsorted(ends, sum(one.piece) / 2) - 1] += one.gain * self._units.controls
         sizes += float(own.control.reach(blocks).sum())
         lost += float(acting.neglected[0, piece])
         terms = rounding(2 * own.system.states + lifted.space.size + self._grid.pieces)

@@ -11,8 +11,8 @@ import numpy as np
 
 from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.control.problem.dictionary import Dictionary
-from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
-from sparserob_core.control.sets.sets import Equality
+from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.sets.sets import ConvexSet, Equality
 from sparserob_core.control.studies.horizons import Horizons, Multiplier, at_horizon, stretched
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
@@ -109,7 +109,7 @@ class HorizonSearch:
     def _cover(self, scan: list[float]) -> str:
         """Cover horizons from 0 on by cells on each of which nothing is feasible, until one is feasible; where that did
         not succeed, why."""
-        starts = [entry.start for entry in self.problem.path if isinstance(entry, PathConstraint)]
+        starts = [entry.start for entry in self.problem.path if not isinstance(entry, ConvexSet)]
         # windows that begin after 0 part cells: their rows are there beyond only
         points = sorted({0.0, *scan, *(start for start in starts if 0.0 < start < self.problem.horizon)})
         cells, best = list(pairwise(points))[::-1], np.inf
@@ -218,23 +218,32 @@ def _multipliers_of(model: Transcription, result: Result) -> list[Multiplier]:
     least value over that set is taken."""
     problem, found = model.problem, []
     starts = {one.name: one.start for one in model.constraints[: len(problem.path)]}  # terminal sets come after them
+    shares = model.control.breakpoints / model.control.horizon
     middle = np.zeros(0) if model.parameters.set is None else model.parameters.set.interior_point()
     for cut in result.dual.cuts:
         family = model.program.formulated(cut.family, cut.formulation)
-        if family is None or model.constraint(model.program.family(cut.family)) is None:
+        constraint = model.constraint(model.program.family(cut.family))
+        if family is None or constraint is None:
             continue
         said = family.explanation(cut.index, cut.row)
         if isinstance(said, TimedExplanation) and cut.multiplier > 0.0:
             known = said.parameter is not None and said.parameter.size > 0
             parameter = said.parameter if known and said.parameter is not None else middle
+            moved = 0.0
+            if constraint.reference is not None:
+                moved = float(constraint.reference.at(np.array([said.time]))[0] @ said.direction)
+            within = (0.0, 1.0) if said.piece is None else (float(shares[said.piece]), float(shares[said.piece + 1]))
             found.append(
                 Multiplier(
                     weight=float(cut.multiplier),
                     share=min(1.0, said.time / problem.horizon),
                     direction=said.direction,
                     parameter=np.asarray(parameter, dtype=float),
-                    limit=said.sign * said.limit,
+                    limit=said.sign * said.limit - moved,
                     earliest=starts.get(cut.family, 0.0),
+                    reference=constraint.reference,
+                    gain=said.gain,
+                    piece=within,
                 )
             )
     fixed = [(i, float(end.values[i])) for end in problem.terminal if isinstance(end, Equality) for i in end.fixed]
