@@ -2,6 +2,7 @@
 
 VENV      := .venv
 BIN       := $(VENV)/bin
+SLIM      := $(VENV)/slim
 INSTALLED := $(VENV)/installed
 PEERS     := $(VENV)/peers
 WRITERS   := $(VENV)/writers
@@ -9,6 +10,17 @@ CANDIDATES := $(PYTHON) python3 python3.13 python3.12 python3.11
 DEMO      := configs/experiment1_repaired.yaml
 LIVE      := configs/experiment1_literal.yaml
 LONGER    := method.sc2=null maximiser.budget=1500
+PIP       := $(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check
+
+define SET_UP
+python=; for candidate in $(CANDIDATES); do \
+  if $$candidate -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then python=$$candidate; break; fi; \
+done; \
+if [ -z "$$python" ]; then echo "SparseRob needs Python 3.11 or later with venv; set PYTHON=/path/to/python" >&2; exit 1; fi; \
+if ! $(BIN)/python -m pip --version >/dev/null 2>&1; then \
+  echo "setting up $(VENV) with $$($$python --version), which takes a minute, once"; $$python -m venv --clear $(VENV); \
+fi
+endef
 
 # Several test processes share the machine: one thread of linear algebra each.
 export OMP_NUM_THREADS ?= 1
@@ -25,31 +37,31 @@ help:
 	@echo "make bench       time the certified solve, and solvers and maximisers beside other people's"
 	@echo "make docs        write the reference and the schema anew, and build the site (minutes, the first time)"
 	@echo "make docs-pictures  the pictures of docs/live.md anew (minutes; needs a Vulkan driver, no display)"
-	@echo "make install     set up $(VENV) only"
+	@echo "make install     set up $(VENV) with everything, whatever is there of it"
 	@echo "make clean       remove $(VENV) and every cache"
 
 install: $(INSTALLED)
 
+# Nothing else is installed than what the target needs: `make demo` takes the package and what draws figures, the other targets everything.
+$(SLIM): pyproject.toml
+	@$(SET_UP)
+	@if [ ! $(INSTALLED) -nt pyproject.toml ]; then $(PIP) --editable '.[figures]'; fi
+	@touch $@
+
 $(INSTALLED): pyproject.toml
-	@python=; for candidate in $(CANDIDATES); do \
-	  if $$candidate -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then python=$$candidate; break; fi; \
-	done; \
-	if [ -z "$$python" ]; then echo "SparseRob needs Python 3.11 or later with venv; set PYTHON=/path/to/python" >&2; exit 1; fi; \
-	if ! $(BIN)/python -m pip --version >/dev/null 2>&1; then \
-	  echo "setting up $(VENV) with $$($$python --version), which takes a minute, once"; $$python -m venv --clear $(VENV); \
-	fi
-	@$(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check --editable '.[all]'
+	@$(SET_UP)
+	@$(PIP) --editable '.[all]'
 	@touch $@
 
 $(PEERS): $(INSTALLED)
-	@if $(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check --editable '.[all,bench,solvers]'; then touch $@; \
+	@if $(PIP) --editable '.[all,bench,solvers]'; then touch $@; \
 	else echo "not every peer can be installed here; the benchmark names those that it goes without" >&2; fi
 
 $(WRITERS): $(INSTALLED)
-	@$(BIN)/python -m pip install --quiet --quiet --disable-pip-version-check --editable '.[all,docs]'
+	@$(PIP) --editable '.[all,docs]'
 	@touch $@
 
-demo: $(INSTALLED)
+demo: $(SLIM)
 	@$(BIN)/sparserob run $(DEMO)
 	@echo "figures in $$(ls -dt runs/$(basename $(notdir $(DEMO)))/*/figures | head -n 1)"
 
