@@ -10,6 +10,7 @@ from sparserob_core.control.problem.dictionary import Dictionary as Dictionary
 from sparserob_core.control.problem.dictionary import DictionaryFactory as DictionaryFactory
 from sparserob_core.control.problem.names import Names as Names
 from sparserob_core.control.problem.system import LinearSystem as LinearSystem
+from sparserob_core.control.problem.system import SwitchedSystem as SwitchedSystem
 from sparserob_core.control.problem.problem import OptimalControlProblem as OptimalControlProblem
 from sparserob_core.control.problem.problem import MixedConstraint as MixedConstraint
 from sparserob_core.control.problem.problem import PathConstraint as PathConstraint

@@ -78,19 +78,24 @@ class MinimumAttention(sr.LinearKeys):
             last = {"Q": Q, "reference": np.append(final.reference, np.zeros(m))}
         return sr.Cost(l1=plain.l1, group=plain.group, state=both, final=last)
 
-    def _augmented(self, d: int, m: int) -> sr.LinearSystem:
-        """``A = [[A, B], [0, 0]]``, ``B = [0; I]``, ``E = [E; 0]``, still in expressions of the parameters."""
+    def _augmented(self, d: int, m: int) -> sr.LinearSystem | sr.SwitchedSystem:
+        """``A = [[A, B], [0, 0]]``, ``B = [0; I]``, ``E = [E; 0]``, ``c = [c; 0]``, still in expressions of the
+        parameters, piece by piece."""
         system = self.system
-        E = np.eye(d).tolist() if system.E is None else system.E
-        rows = [[*left, *right] for left, right in zip(system.A, system.B, strict=True)]
-        return system.model_copy(
-            update={
+        made = []
+        for _, until, (A, B, E, c) in system.matrices():
+            drive, rows = np.eye(d).tolist() if E is None else E, [[*a, *b] for a, b in zip(A, B, strict=True)]
+            larger = {
                 "A": rows + np.zeros((m, d + m)).tolist(),
                 "B": np.eye(d + m, m, -d).tolist(),
-                "E": E + np.zeros((m, len(E[0]))).tolist(),
-                "c": None if system.c is None else [*system.c, *np.zeros(m).tolist()],
+                "E": drive + np.zeros((m, len(drive[0]))).tolist(),
+                "c": None if c is None else [*c, *np.zeros(m).tolist()],
             }
-        ).build()
+            made.append(larger if until is None else {"until": until, **larger})
+        if system.pieces is None:
+            return system.model_copy(update=made[0]).build()
+        pieces = [piece.model_copy(update=one) for piece, one in zip(system.pieces, made, strict=True)]
+        return system.model_copy(update={"pieces": pieces}).build()
 
     def _initial_control(self, m: int) -> list[float]:
         given = self.initial_control if isinstance(self.initial_control, list) else [self.initial_control] * m

@@ -200,7 +200,7 @@ def tube_of(system, control, disturbance, bound, degree, theta, start):
     )
     return (
         Tube(
-            Flow(system, tuple(centre.tolist()), tuple(radius.tolist()), degree if nu else 0),
+            [Flow(system, tuple(centre.tolist()), tuple(radius.tolist()), degree if nu else 0)],
             scene,
             np.eye(system.states),
         ),
@@ -268,7 +268,7 @@ def test_the_remainder_is_enough_for_initial_states_in_a_set():
     with ctx.workprec(96):
         known_start, _, _ = tube_of(system, control, control, None, 2, np.zeros(2), np.array([0.0]))
         scene = replace(known_start.scene, initial_set=Box(-np.ones(1), np.ones(1)))
-        (poly,) = Tube(known_start.flow, scene, known_start.basis).cells(1, 1.0, 1.0, np.eye(1))
+        (poly,) = Tube(known_start.flows, scene, known_start.basis).cells(1, 1.0, 1.0, np.eye(1))
     assert poly.coefficients[0] == pytest.approx([1.0, 1.0, 0.5])
     assert np.e - 2.5 <= poly.expansion < 1.0
 

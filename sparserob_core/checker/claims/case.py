@@ -108,7 +108,8 @@ class Case:
         """Every breakpoint of either dictionary, those of the control as late as it acts."""
         ends = {float(self.control.breakpoints[-1]), float(self.disturbance.breakpoints[-1])}
         last = max(*ends, self.problem.horizon)
-        inner = {float(t) for t in (*self.acting, *self.disturbance.breakpoints)} - ends
+        switches = self.problem.system.switches
+        inner = {float(t) for t in (*self.acting, *self.disturbance.breakpoints, *switches)} - ends
         return sorted({t for t in inner if t < last} | {last})
 
     @cached_property
@@ -161,6 +162,7 @@ class Case:
             None if changes is None else self.problem.disturbance,
             changes or [],
             self.problem.initial_set,
+            tuple(float(t) for t in self.problem.system.switches),
         )
 
     def beside(self, window: Window, basis: Array, gains: Array) -> Beside | None:

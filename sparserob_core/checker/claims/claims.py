@@ -74,7 +74,7 @@ def _precision(case: Case) -> int:
     parameters = problem.system.parameters
     middle = np.zeros((1, 0)) if parameters is None else parameters.interior_point()[None]
     try:
-        parts = problem.system.matrices(middle)
+        parts = [part for mode in problem.system.modes for part in mode.matrices(middle)]
     except InputError:  # not finite there
         return PRECISION
     entries = np.concatenate([np.ravel(part) for part in parts]) * problem.horizon

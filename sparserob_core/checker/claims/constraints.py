@@ -15,7 +15,7 @@ from sparserob_core.checker.claims.subdivision import fill
 from sparserob_core.checker.claims.units import RowUnits
 from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import TOLERANCE, Broken, Unchecked
-from sparserob_core.checker.reach.flow import Flow
+from sparserob_core.checker.reach.flow import flows
 from sparserob_core.checker.reach.tube import Tube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Corners, Parameters
@@ -173,7 +173,7 @@ def _tubes(case: Case, basis: Array, lower: Array, upper: Array) -> Callable[[Co
             if len(made) >= TUBES_KEPT:
                 made.pop(next(iter(made)))
             made[box] = Tube(
-                Flow(case.problem.system, tuple(centre.tolist()), tuple(radius.tolist()), DEGREES.get(nu, 2)),
+                flows(case.problem.system, centre.tolist(), radius.tolist(), DEGREES.get(nu, 2)),
                 case.scene,
                 basis,
             )

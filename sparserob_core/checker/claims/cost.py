@@ -3,6 +3,7 @@ flow (Van Loan 1978), none of it shared with what solves."""
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -15,7 +16,7 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.series import norm
 from sparserob_core.checker.outcome import Broken, Unchecked
-from sparserob_core.checker.reach.flow import Flow, stacked
+from sparserob_core.checker.reach.flow import Flow, flows, stacked
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.cost import Quadratic, nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
@@ -155,15 +156,15 @@ def _walked(problem: OptimalControlProblem, control: Dictionary, pieces: Sequenc
     the state as late as the system says, and costs when it is given."""
     from flint import arb, arb_mat
 
-    nominal, d, m = _Nominal.of(problem), problem.system.states, problem.system.controls
+    modes, d, m = _Nominal.of(problem), problem.system.states, problem.system.controls
     still = stacked([[arb(0)] for _ in range(m)])
-    x, walked = nominal.start, []
-    for start, stop, k in _acting(problem, control):
-        flow, weight = nominal.over(stop - start, acting=k >= 0)
+    x, walked = modes[0].start, []
+    for start, stop, k, leg in _acting(problem, control):
+        flow, weight = modes[leg].over(stop - start, acting=k >= 0)
         z = arb_mat(x.tolist() + (still if k < 0 else pieces[k]).tolist())
         walked.append((k, flow, weight, z))
         x = arb_mat((flow * z).tolist()[: d + 1])
-    costate = nominal.final * x
+    costate = modes[0].final * x
     value = (x.transpose() * costate)[0, 0]
     slope: list[list[arb]] = [[arb(0)] * m for _ in pieces]
     for k, flow, weight, z in reversed(walked):
@@ -187,13 +188,18 @@ def _walked(problem: OptimalControlProblem, control: Dictionary, pieces: Sequenc
     return _Walk(value, slope, blurred)
 
 
-def _acting(problem: OptimalControlProblem, control: Dictionary) -> list[tuple[Fraction, Fraction, int]]:
-    """The intervals of time on which one piece of the control acts, with its number; -1 before the first does."""
+def _acting(problem: OptimalControlProblem, control: Dictionary) -> list[tuple[Fraction, Fraction, int, int]]:
+    """The intervals of time on which one piece of the control acts on one of the systems that take turns, with their
+    numbers; -1 before the first piece acts."""
     delay, horizon = problem.system.delay, float(control.breakpoints[-1])
     begins = [(float(t) + delay, k) for k, t in enumerate(control.breakpoints[:-1]) if float(t) + delay < horizon]
     begins = begins if delay == 0.0 else [(0.0, -1), *begins]
-    ends = [*(t for t, _ in begins[1:]), horizon]
-    return [(Fraction(start), Fraction(stop), k) for (start, k), stop in zip(begins, ends, strict=True)]
+    times, switches = [t for t, _ in begins], problem.system.switches
+    points = sorted({*times, *switches, horizon})
+    return [
+        (Fraction(start), Fraction(stop), begins[bisect_right(times, start) - 1][1], bisect_right(switches, start))
+        for start, stop in pairwise(points)
+    ]
 
 
 @final
@@ -211,13 +217,18 @@ class _Nominal:
     _known: dict[tuple[Fraction, bool], tuple[arb_mat, arb_mat]] = field(default_factory=dict)
 
     @staticmethod
-    def of(problem: OptimalControlProblem) -> _Nominal:
+    def of(problem: OptimalControlProblem) -> list[_Nominal]:
+        """Those of the systems that take turns."""
+        parameters = problem.system.parameters
+        point = () if parameters is None else tuple(map(float, nominal_point(parameters)))
+        return [_Nominal._of(problem, flow) for flow in flows(problem.system, point)]
+
+    @staticmethod
+    def _of(problem: OptimalControlProblem, flow: Flow) -> _Nominal:
         from flint import arb
 
         d, m, zero = problem.system.states, problem.system.controls, arb(0)
-        parameters = problem.system.parameters
-        point = () if parameters is None else tuple(map(float, nominal_point(parameters)))
-        parts = Flow(problem.system, point, (0.0,) * len(point), 0).parts
+        parts = flow.parts
         A, B, E = (parts[name][0].tolist() for name in ("A", "B", "E"))
         w = [] if problem.disturbance is None else balls(nominal_point(problem.disturbance))
         pushed = [sum((e * v for e, v in zip(row, w, strict=True)), zero) if w else zero for row in E]

@@ -8,6 +8,7 @@ the controls' set alone, piece by piece. With ``J`` left out, a positive number 
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,7 +18,7 @@ import numpy as np
 
 from sparserob_core.checker.claims.cost import Price, Tangent
 from sparserob_core.checker.outcome import Broken
-from sparserob_core.checker.reach.flow import Flow, stacked
+from sparserob_core.checker.reach.flow import Flow, flows, stacked
 from sparserob_core.checker.sets.flat import Boxed
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.dictionary import Dictionary
@@ -87,12 +88,12 @@ class Duality:
     def row(self, direction: Array, time: float, parameter: Sequence[float], limit: arb, disturbed: bool = True) -> Row:
         """``c'x(t) <= limit`` at one parameter, for the worst disturbance and initial state, or where none reaches
         it."""
-        flow = Flow(self.problem.system, tuple(map(float, parameter)), (0.0,) * len(parameter), 0)
-        d, m, columns = flow.parts["A"][0].nrows(), self.problem.system.controls, flow.parts["B"][0].ncols()
-        matrix, delay = _joined(flow), self.problem.system.delay
+        every, delay = flows(self.problem.system, parameter), self.problem.system.delay
+        parts = every[0].parts
+        d, m, columns = parts["A"][0].nrows(), self.problem.system.controls, parts["B"][0].ncols()
         breaks = [float(s) + delay for s in self.control.breakpoints[:-1]]  # when a piece begins to act
         jumps = self.changes if self.changes is not None else []
-        lags = {s: self._lag(matrix, direction, time, s) for s in {0.0, *(s for s in (*breaks, *jumps) if s < time)}}
+        lags = self._lags(every, direction, time, {0.0, *(s for s in (*breaks, *jumps) if s < time)})
         constant = (
             sum((lags[0.0][i] * _exact(x) for i, x in enumerate(np.asarray(self.problem.initial_state))), _exact(0.0))
             - limit
@@ -105,16 +106,26 @@ class Duality:
         if disturbed and self.problem.initial_set is not None:
             constant = constant + known(self.problem.initial_set).support(lags[0.0][:d])
         if disturbed and self.changes is not None and self.problem.disturbance is not None:
-            mw = flow.parts["E"][0].ncols()
+            mw = parts["E"][0].ncols()
             for weights in _differences([lags[s][d + columns :] if s < time else None for s in jumps], mw):
                 if any(not w.is_zero() for w in weights):
                     constant = constant + known(self.problem.disturbance).support(weights)
         return Row(constant, slope)
 
-    def _lag(self, matrix: arb_mat, direction: Array, time: float, since: float) -> list[arb]:
-        start = stacked([[_exact(v)] for v in (*direction, *np.zeros(matrix.nrows() - direction.size))])
-        column: list[arb] = ((matrix * (_exact(time) - _exact(since))).exp() * start).entries()
-        return column
+    def _lags(self, every: Sequence[Flow], direction: Array, time: float, since: set[float]) -> dict[float, list[arb]]:
+        """``c'e^{A (t - s)}`` and its integrals from each of the times ``since`` to ``time``, times ``B`` and ``E``;
+        back through the systems that took turns until then."""
+        switches, d = self.problem.system.switches, direction.size
+        matrices = [_joined(flow) for flow in every]
+        column, found = [_exact(v) for v in (*direction, *np.zeros(matrices[0].nrows() - d))], {}
+        for leg in range(bisect_left(switches, time), -1, -1):
+            begin, end = (0.0, *switches)[leg], min((*switches, time)[leg], time)
+            row, totals = stacked([[v] for v in column[:d]] + [[_exact(0.0)] for _ in column[d:]]), column[d:]
+            for s in {begin, *(s for s in since if begin <= s < end)}:
+                lag = ((matrices[leg] * (_exact(end) - _exact(s))).exp() * row).entries()
+                found[s] = lag[:d] + [a + b for a, b in zip(lag[d:], totals, strict=True)]
+            column = found[begin]
+        return found
 
     def bound(
         self,

@@ -14,7 +14,7 @@ from sparserob_core.checker.arithmetic.jets import Monomials, expanded
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.claims.units import RowUnits
 from sparserob_core.checker.outcome import EQUALITY, Broken, Unchecked
-from sparserob_core.checker.reach.flow import Flow
+from sparserob_core.checker.reach.flow import flows
 from sparserob_core.checker.reach.tube import Tube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.sets.sets import Box
@@ -29,7 +29,7 @@ def equalities(case: Case) -> str:
     """Show that the fixed states are met at every parameter and disturbance; a sentence with the figures."""
     middle = [] if case.problem.system.parameters is None else case.problem.system.parameters.interior_point().tolist()
     scene, d = replace(case.scene, disturbance=None, initial_set=None), case.problem.system.states
-    tube = Tube(Flow(case.problem.system, tuple(middle), (0.0,) * len(middle), 0), scene, np.eye(d))
+    tube = Tube(flows(case.problem.system, middle), scene, np.eye(d))
     horizon, everything = case.problem.horizon, Box(np.full(d, -np.inf), np.full(d, np.inf))
     sums = RowUnits(case.problem, scene, everything, horizon, horizon).sums
     worst = 0.0
@@ -49,12 +49,13 @@ def _reached(case: Case, state: int) -> bool:
     of ``A`` that are not 0 at every parameter."""
     system = case.problem.system
     wide = _hull(case)
-    parts = expanded(system, Monomials(len(wide), 1), wide, [1.0] * len(wide))
+    every = [expanded(mode, Monomials(len(wide), 1), wide, [1.0] * len(wide)) for mode in system.modes]
     d, reaching = system.states, {state}
     for _ in range(d):
-        reaching |= {j for i in reaching for j in range(d) if not parts["A"][0][i, j].is_zero()}
+        reaching |= {j for i in reaching for j in range(d) if any(not one["A"][0][i, j].is_zero() for one in every)}
     uncertain = any(
         not part[i, j].is_zero()
+        for parts in every
         for name in ("A", "B")
         for part in parts[name][1:]
         for i in reaching
@@ -62,7 +63,7 @@ def _reached(case: Case, state: int) -> bool:
     )
     bound = case.problem.disturbance
     free = [] if bound is None else [w for w, size in enumerate(known(bound).radius) if size > math.ulp(0.0)]
-    pushed = any(not part[i, w].is_zero() for part in parts["E"] for i in reaching for w in free)
+    pushed = any(not part[i, w].is_zero() for parts in every for part in parts["E"] for i in reaching for w in free)
     begun = case.problem.initial_set
     moved = begun is not None and any(known(begun).radius[j] > math.ulp(0.0) for j in reaching)
     return uncertain or pushed or moved

@@ -12,7 +12,7 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.claims.case import Case, number, numbers
 from sparserob_core.checker.outcome import TOLERANCE, Broken, Unchecked
-from sparserob_core.checker.reach.flow import Flow, held, stacked
+from sparserob_core.checker.reach.flow import flows, held, stacked
 from sparserob_core.checker.reach.tube import Tube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.sip.convex_set import Array
@@ -26,12 +26,13 @@ def reached(case: Case, time: float, parameter: Array, signal: object, deviation
     (``None``: no disturbance), from the centre of the initial states and a ``deviation (d,)`` in their set."""
     from flint import arb, arb_mat
 
-    flow = Flow(case.problem.system, tuple(map(float, parameter)), (0.0,) * parameter.size, 0)
+    every = [flow.parts for flow in flows(case.problem.system, parameter.tolist())]
     wanted = case.problem.disturbance is not None
     w = _admissible(case, signal) if wanted else None
-    both = stacked(
-        [left + right for left, right in zip(flow.parts["B"][0].tolist(), flow.parts["E"][0].tolist(), strict=True)]
-    )
+    both = [
+        stacked([left + right for left, right in zip(parts["B"][0].tolist(), parts["E"][0].tolist(), strict=True)])
+        for parts in every
+    ]
     begin = balls(np.asarray(case.problem.initial_state))
     if case.problem.initial_set is not None:
         begin = [v + off for v, off in zip(begin, balls(_begun(case, deviation)), strict=True)]
@@ -39,8 +40,9 @@ def reached(case: Case, time: float, parameter: Array, signal: object, deviation
     for k, start in enumerate(case.grid[:-1]):
         if start >= time:
             break
-        Phi, Gamma = held(flow.parts["A"][0], both, arb(min(case.grid[k + 1], time)) - arb(start))
-        pushed = [arb(0)] * flow.parts["E"][0].ncols() if w is None else balls(w[:, k])
+        leg = case.scene.leg(k)
+        Phi, Gamma = held(every[leg]["A"][0], both[leg], arb(min(case.grid[k + 1], time)) - arb(start))
+        pushed = [arb(0)] * every[leg]["E"][0].ncols() if w is None else balls(w[:, k])
         x = Phi * x + Gamma * arb_mat([[v] for v in case.scene.control[k].entries() + pushed])
     state: list[arb] = x.entries()
     return state
@@ -65,9 +67,8 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
     if flat is None or found is None:
         raise Unchecked("the worst direction of a curved set is not told")
     (basis, gains), z = np.split(found[0], [window.states], axis=1), found[1]
-    centre = tuple(map(float, parameter))
     scene = case.scene if begun is None else replace(case.scene, initial_state=begun.tolist(), initial_set=None)
-    tube = Tube(Flow(case.problem.system, centre, (0.0,) * len(centre), 0), scene, basis)
+    tube = Tube(flows(case.problem.system, parameter.tolist()), scene, basis)
     piece = min(bisect_right(case.grid, time) - 1, len(case.grid) - 2 if time < case.grid[-1] else len(case.grid) - 1)
     polynomials, beside = tube.cells(piece, time, time, z), case.beside(window, basis, gains)
     breaks: list[int | None] = [None]

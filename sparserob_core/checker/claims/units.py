@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, final
@@ -12,7 +13,7 @@ import numpy.typing as npt
 from sparserob_core.checker.claims.duality import before
 from sparserob_core.checker.outcome import RESOLVED, TOLERANCE, Unchecked
 from sparserob_core.checker.reach.disturbance_support import Scene
-from sparserob_core.checker.reach.flow import Flow, held, stacked
+from sparserob_core.checker.reach.flow import Flow, flows, held, stacked
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.shape import smallest, widths
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -120,7 +121,7 @@ class RowUnits:
         for k in range(count - 1, -1, -1):
             first = int(np.searchsorted(places, k, side="right"))
             if first < len(places):
-                Phi, Gamma, Delta = step.over(nodes[k], nodes[k + 1])
+                Phi, Gamma, Delta = step.over(nodes[k], nodes[k + 1], bisect_right(self.scene.switches, nodes[k]))
                 driven[k, first:], pushed[k, first:] = v[first:] @ Gamma, v[first:] @ Delta
                 v[first:] = v[first:] @ Phi
         start = np.asarray(self.problem.initial_state, dtype=float)
@@ -184,15 +185,16 @@ class _Steps:
     parameter: tuple[float, ...]
     controls: int
     tick: float
-    _known: dict[int, tuple[Array, Array, Array]] = field(default_factory=dict)
+    _known: dict[tuple[int, int], tuple[Array, Array, Array]] = field(default_factory=dict)
 
-    def over(self, start: float, stop: float) -> tuple[Array, Array, Array]:
-        """``e^{A s}``, and the integrals of it times ``B`` and times ``E``, ``s`` the length of the interval."""
+    def over(self, start: float, stop: float, leg: int) -> tuple[Array, Array, Array]:
+        """``e^{A s}``, and the integrals of it times ``B`` and times ``E``, ``s`` the length of the interval; of the
+        system whose turn it is."""
         from flint import arb
 
-        key = round((stop - start) / self.tick)
+        key = (leg, round((stop - start) / self.tick))
         if key not in self._known:
-            parts = self._parts
+            parts = self._flows[leg].parts
             both = stacked([b + e for b, e in zip(parts["B"][0].tolist(), parts["E"][0].tolist(), strict=True)])
             Phi, Gamma = held(parts["A"][0], both, arb(stop - start))
             table = _floats(Gamma)
@@ -200,8 +202,8 @@ class _Steps:
         return self._known[key]
 
     @cached_property
-    def _parts(self) -> dict[str, list[arb_mat]]:
-        return Flow(self.problem.system, self.parameter, (0.0,) * len(self.parameter), 0).parts
+    def _flows(self) -> list[Flow]:
+        return flows(self.problem.system, self.parameter)
 
 
 def _floats(matrix: arb_mat) -> Array:

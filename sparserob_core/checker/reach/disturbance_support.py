@@ -31,7 +31,7 @@ SAME = 1e-14  # of the horizon: durations closer than this are treated as one ba
 class Scene:
     """What is simulated: the ``grid`` (all breakpoints), the control ``(m, 1)`` on each of its pieces, the centre of
     ``x(0)`` and the set of deviations from it, and the disturbance: its set and the breakpoints between which it is
-    constant."""
+    constant. At the ``switches``, which are breakpoints, another system takes over."""
 
     grid: list[float]
     control: list[arb_mat]
@@ -39,6 +39,11 @@ class Scene:
     disturbance: ConvexSet | None
     changes: list[float]
     initial_set: ConvexSet | None = None
+    switches: tuple[float, ...] = ()
+
+    def leg(self, piece: int) -> int:
+        """Which system acts on a piece of the grid; the last one at its end."""
+        return bisect_right(self.switches, self.grid[piece]) if piece < len(self.grid) - 1 else len(self.switches)
 
     @property
     def tick(self) -> float:
@@ -111,11 +116,13 @@ class Operator:
 @dataclass(eq=False)
 class DisturbanceSupports:
     """The functionals ``c'e^{A s}`` and their integrals over one box of parameters, for the rows ``c`` of ``basis (b,
-    d)``; remembered by duration."""
+    d)``; remembered by duration. Of systems that take turns, while that of ``leg`` does, and ``before`` it."""
 
     flow: Flow
     scene: Scene
     basis: Array
+    leg: int = 0
+    before: DisturbanceSupports | None = None
     _tables: dict[tuple[int, int], Table] = field(default_factory=dict)
     _operators: dict[int, Operator] = field(default_factory=dict)
     _selves: dict[int, Operator] = field(default_factory=dict)
@@ -131,23 +138,82 @@ class DisturbanceSupports:
         coefficients, is due to switching. ``sharp``: less of it where the set is round, which takes longer."""
         assert self.scene.disturbance is not None
         if self._latest is None or self._latest[0] != (start, ticks):
-            self._latest = ((start, ticks), *self._weights(start, ticks))
+            self._latest = ((start, ticks), *self.every(start, ticks))
         return self._bounded(known(self.scene.disturbance), *self._latest[1:], z, sharp)
 
     def begun(self, start: float, ticks: int, z: Array, sharp: bool) -> tuple[Array, Array, Array]:
         """`bounds` of what the worst initial state adds to that of the centre: the support function of the set of
         deviations at the rows themselves."""
         assert self.scene.initial_set is not None
+        return self._bounded(known(self.scene.initial_set), *self.initial(start, ticks), z, sharp)
+
+    def initial(self, start: float, ticks: int) -> tuple[Array, Array]:
+        """The rows on the deviation of the initial state, ``(1, J + 1, M, d, b)``, with errors of the same shape."""
+        row = self._since_start(start, ticks)
+        if self.before is None:
+            return row.mid[None], row.rad[None]
+        return self._composed(row, self._initial_effect)
+
+    @cached_property
+    def _initial_effect(self) -> Enclosed:
+        """What a deviation made of the state when this leg begins, ``(1, M, d, d)``."""
+        assert self.before is not None
+        mid, rad = self.before.initial(self._begins, 0)
+        return Enclosed(*(np.moveaxis(part[:, 0], 3, 2) for part in (mid, rad)))
+
+    def every(self, start: float, ticks: int) -> tuple[Array, Array]:
+        """What every piece of the disturbance adds per unit, ``(pieces, J + 1, M, mw, b)``, with errors of the same
+        shape; those before this leg through the state that it begins with."""
+        mid, rad = self._weights(start, ticks)
+        if self.before is None:
+            return mid, rad
+        early, lost = self._composed(self._since_start(start, ticks), self.effect)
+        if self._jumps[0] not in self.scene.changes:  # that piece goes on
+            early, added, lost, more = early.copy(), mid[0], lost.copy(), rad[0]
+            lost[-1] += more + rounding(1) * (np.abs(early[-1]) + np.abs(added))
+            early[-1] += added
+            mid, rad = mid[1:], rad[1:]
+        return np.concatenate([early, mid]), np.concatenate([lost, rad])
+
+    @property
+    def _begins(self) -> float:
+        return (0.0, *self.scene.switches)[self.leg]
+
+    def _since_start(self, start: float, ticks: int) -> Enclosed:
+        """The rows as weights on the state with which this leg begins, ``(J + 1, M, d, b)``."""
         node = self.scene.grid[bisect_right(self.scene.grid, start) - 1]
-        row = self._row(round(node / self.scene.tick))
-        M, size, b = row.mid.shape
-        rows = Enclosed(row.mid.reshape(M * size, b), row.rad.reshape(M * size, b))
-        offset = round((start - node) / self.scene.tick)
+        lag, offset = (round(length / self.scene.tick) for length in (node - self._begins, start - node))
+        found = self._row(lag)
+        M, size, b = found.mid.shape
+        rows = Enclosed(found.mid.reshape(M * size, b), found.rad.reshape(M * size, b))
         if offset:
             rows = self._later(offset).applied(rows)
-        found, d = self._onwards(ticks).applied(rows), len(self.scene.initial_state)
-        mid, rad = (part.reshape(1, -1, M, size, b)[:, :, :, :d] for part in (found.mid, found.rad))
-        return self._bounded(known(self.scene.initial_set), mid, rad, z, sharp)
+        moved, d = self._onwards(ticks).applied(rows), len(self.scene.initial_state)
+        return Enclosed(*(part.reshape(-1, M, size, b)[:, :, :d] for part in (moved.mid, moved.rad)))
+
+    def _composed(self, row: Enclosed, effect: Enclosed) -> tuple[Array, Array]:
+        """Weights ``(P, J + 1, M, w, b)`` on what had the ``effect (P, M, d, w)`` on the state with which this leg
+        begins, with errors of the same shape."""
+        shape = (effect.mid.shape[0], *row.mid.shape[:2], effect.mid.shape[3], row.mid.shape[3])
+        mid, rad = np.zeros(shape), np.zeros(shape)
+        terms = rounding(row.mid.shape[2] * len(self.flow.monomials.products))
+
+        def product(left: Array, right: Array) -> Array:
+            return np.asarray(np.einsum("jdb,pdw->pjwb", left, right))
+
+        for i, j, k in self.flow.monomials.products:
+            here, there = np.abs(row.mid[:, i]), np.abs(effect.mid[:, j])
+            mid[:, :, k] += product(row.mid[:, i], effect.mid[:, j])
+            rad[:, :, k] += product(here, effect.rad[:, j] + terms * there)
+            rad[:, :, k] += product(row.rad[:, i], there + effect.rad[:, j])
+        return mid, rad * OUTWARD
+
+    @cached_property
+    def effect(self) -> Enclosed:
+        """What every piece of the disturbance made of the state when this leg begins, ``(pieces, M, d, mw)``."""
+        assert self.before is not None
+        mid, rad = self.before.every(self._begins, 0)
+        return Enclosed(*(np.moveaxis(part[:, 0], 3, 2) for part in (mid, rad)))
 
     def _bounded(self, shape: Shape, every: Array, errors: Array, z: Array, sharp: bool) -> tuple[Array, Array, Array]:
         """Bounds of the sum of a set's support functions at weights ``(pieces, J + 1, M, mw, b)`` that are off by at
@@ -196,7 +262,11 @@ class DisturbanceSupports:
 
     @cached_property
     def _jumps(self) -> Array:
-        return np.array(self.scene.changes)
+        switches, changes = self.scene.switches, self.scene.changes
+        if not switches:
+            return np.array(changes)
+        begin, end = (0.0, *switches)[self.leg], (*switches, np.inf)[self.leg]
+        return np.array([begin, *(s for s in changes if begin < s < end)])
 
     def _integrals(self, lags: list[int], offset: int, ticks: int) -> tuple[Array, Array]:
         """``int_0^s c'e^{A r} E dr`` for ``s`` from each of the ``lags (l,)`` plus ``offset`` on: ``(l, J + 1, M, mw,

@@ -22,7 +22,7 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
-    from sparserob_core.control.problem.system import LinearSystem
+    from sparserob_core.control.problem.system import LinearSystem, System
 
 WELL_CONDITIONED = 1e6
 SWEEPS = 12  # of balancing
@@ -158,6 +158,15 @@ def beyond(sizes: Sequence[arb]) -> list[arb]:
     from flint import arb
 
     return [sum(sizes[len(sizes) - 1 - j :], arb(0)) for j in range(len(sizes) - 1)]
+
+
+def flows(
+    system: System, centre: Sequence[float], radius: Sequence[float] | None = None, degree: int = 0
+) -> list[Flow]:
+    """The systems that take turns, each over one box of parameters; at one parameter without a ``radius``."""
+    point = tuple(map(float, centre))
+    width = (0.0,) * len(point) if radius is None else tuple(map(float, radius))
+    return [Flow(mode, point, width, degree) for mode in system.modes]
 
 
 def stacked(table: Sequence[Sequence[arb]]) -> arb_mat:

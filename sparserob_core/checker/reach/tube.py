@@ -3,9 +3,9 @@ parameters, as polynomials with an error."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import pairwise
 from typing import TYPE_CHECKING, final
 
 import numpy as np
@@ -42,16 +42,22 @@ class Polynomial:
 @final
 @dataclass(eq=False)
 class Tube:
-    """The reachable states over one box of parameters, seen along combinations of the rows of ``basis (b, d)``."""
+    """The reachable states over one box of parameters, seen along combinations of the rows of ``basis (b, d)``;
+    ``flows`` are those of the systems that take turns."""
 
-    flow: Flow
+    flows: Sequence[Flow]
     scene: Scene
     basis: Array
     _lengths: dict[int, arb] = field(default_factory=dict)
-    _transitions: dict[int, tuple[Series, Series]] = field(default_factory=dict)
-    _growths: dict[int, tuple[arb_mat, arb_mat]] = field(default_factory=dict)
-    _inside: dict[int, Series] = field(default_factory=dict)
+    _transitions: dict[tuple[int, int], tuple[Series, Series]] = field(default_factory=dict)
+    _growths: dict[tuple[int, int], tuple[arb_mat, arb_mat]] = field(default_factory=dict)
+    _inside: dict[tuple[int, int], Series] = field(default_factory=dict)
     _states: dict[tuple[int, float, int], Enclosed] = field(default_factory=dict)
+
+    @property
+    def flow(self) -> Flow:
+        """The first of the flows; their parameters are the same."""
+        return self.flows[0]
 
     @cached_property
     def nodes(self) -> list[Series]:
@@ -61,17 +67,18 @@ class Tube:
         x = Series.constant(self.flow.monomials, stacked([[arb(v)] for v in self.scene.initial_state]))
         found = [x]
         for k, u in enumerate(self.scene.control):
-            Phi, Gamma = self._transition(self._span(self.scene.grid[k], self.scene.grid[k + 1]))
+            Phi, Gamma = self._transition(k)
             x = Phi * x + Gamma.applied(u)
             found.append(x)
         return found
 
     @cached_property
-    def remainder(self) -> Remainder | None:
-        """Bounds of what the expansion leaves out; ``None`` for a known system."""
-        if not self.flow.centre:
-            return None
-        horizon, scene, parts = self.scene.grid[-1], self.scene, self.flow.parts
+    def remainders(self) -> list[Remainder]:
+        """Bounds of what the expansion leaves out, for every flow; none for a known system."""
+        return [self._remainder(flow) for flow in self.flows] if self.flow.centre else []
+
+    def _remainder(self, flow: Flow) -> Remainder:
+        horizon, scene, parts = self.scene.grid[-1], self.scene, flow.parts
         control = np.max([_sizes(u) for u in scene.control], axis=0) if scene.control else np.zeros((0, 1))
         begun = np.zeros(len(scene.initial_state))
         if scene.initial_set is not None:
@@ -79,43 +86,42 @@ class Tube:
         speed = (np.abs(scene.initial_state) + begun) / horizon + (_sizes(parts["B"][0]) @ control)[:, 0]
         if scene.disturbance is not None:
             speed += _sizes(parts["E"][0]) @ np.array(known(scene.disturbance).radius)
-        return Remainder.of(self.flow, horizon, speed)
+        return Remainder.of(flow, horizon, speed)
 
     @cached_property
     def norms(self) -> list[arb_mat]:
-        """The norms of the coefficients left out, at the breakpoints, from any initial state (see `Remainder`)."""
+        """The norms of the coefficients left out, at the breakpoints, from any initial state (see `Remainder`), in the
+        coordinates of the flow that begins there."""
         from flint import arb
 
-        rest = self.remainder
-        assert rest is not None
-        n = rest.start(upper(norm(rest.inverse * stacked([[arb(v)] for v in self.scene.initial_state]))))
-        found = [n]
-        for k, u in enumerate(self.scene.control):
-            growth, driven = self._growth(self._span(self.scene.grid[k], self.scene.grid[k + 1]))
-            seen = [rest.inverse * part for part in self.nodes[k + 1].parts]
-            n = rest.closer(growth * n + driven * _absolute(u), seen, self.flow.monomials.exponents)
-            found.append(n)
-        return found if self.scene.initial_set is None else [a + b for a, b in zip(found, self._strays, strict=True)]
-
-    @property
-    def _strays(self) -> list[arb_mat]:
-        """What `norms` has for deviations from the initial state, whatever their signs: those of the transition times
-        the largest one."""
-        from flint import arb, arb_mat
-
-        rest, shape = self.remainder, self.scene.initial_set
-        assert rest is not None and shape is not None
-        inverse = stacked([[abs(x) for x in row] for row in rest.inverse.tolist()])
-        size = upper(norm(inverse * stacked([[arb(v)] for v in known(shape).radius])))
-        T, transition = arb_mat(rest.transform.tolist()), None
-        found = [rest.start(size)]
-        for start, stop in pairwise(self.scene.grid):
-            key = self._span(start, stop)
-            step = self._transition(key)[0]
-            transition = step if transition is None else step * transition
-            seen = [rest.inverse * part * T * size for part in transition.parts]
-            found.append(rest.closer(self._growth(key)[0] * found[-1], seen, self.flow.monomials.exponents))
+        rest, exponents, scene = self.remainders[0], self.flow.monomials.exponents, self.scene
+        d, deviations = len(scene.initial_state), scene.initial_set
+        n = rest.start(upper(norm(rest.inverse * stacked([[arb(v)] for v in scene.initial_state]))))
+        # of any deviation from the centre, whatever its signs
+        far = stacked([[arb(v)] for v in (np.zeros(d) if deviations is None else known(deviations).radius)])
+        off = rest.start(upper(norm(_sizes_of(rest.inverse) * far)))
+        moved = Series.constant(self.flow.monomials, stacked([[arb(int(i == j)) for j in range(d)] for i in range(d)]))
+        found = [n + off]
+        for k, u in enumerate(scene.control):
+            growth, driven = self._growth(k)
+            n, off, leg = growth * n + driven * _absolute(u), growth * off, scene.leg(k + 1)
+            if scene.leg(k) != leg:
+                n, off = n * self._turn(leg), off * self._turn(leg)
+            rest = self.remainders[leg]
+            n = rest.closer(n, [rest.inverse * part for part in self.nodes[k + 1].parts], exponents)
+            if deviations is not None:
+                moved = self._transition(k)[0] * moved
+                off = rest.closer(off, [_sizes_of(rest.inverse * part) * far for part in moved.parts], exponents)
+            found.append(self._up(n + off))
         return found
+
+    def _turn(self, leg: int) -> arb:
+        """By how much a norm may be larger in the coordinates of a leg than in those of the leg before it."""
+        before, after = self.remainders[leg - 1], self.remainders[leg]
+        return upper(norm(after.inverse * stacked([[_exact(v) for v in row] for row in before.transform])))
+
+    def _up(self, balls: arb_mat) -> arb_mat:
+        return stacked([[upper(x)] for x in balls.entries()])
 
     def _span(self, start: float, stop: float) -> int:
         """The key of a duration; equal keys share one ball."""
@@ -134,17 +140,20 @@ class Tube:
     def __post_init__(self) -> None:
         self._prepare()
 
-    def _transition(self, key: int) -> tuple[Series, Series]:
-        if key not in self._transitions:
-            self._transitions[key] = self.flow.states.held(self.flow.inputs, self._lengths[key])
-        return self._transitions[key]
+    def _transition(self, piece: int) -> tuple[Series, Series]:
+        """What a whole piece of the grid makes of a state and of an input."""
+        span, leg = self._span(self.scene.grid[piece], self.scene.grid[piece + 1]), self.scene.leg(piece)
+        if (leg, span) not in self._transitions:
+            flow = self.flows[leg]
+            self._transitions[leg, span] = flow.states.held(flow.inputs, self._lengths[span])
+        return self._transitions[leg, span]
 
-    def _growth(self, key: int) -> tuple[arb_mat, arb_mat]:
-        if key not in self._growths:
-            rest = self.remainder
-            assert rest is not None
-            self._growths[key] = held(rest.growth, rest.control, self._lengths[key])
-        return self._growths[key]
+    def _growth(self, piece: int) -> tuple[arb_mat, arb_mat]:
+        span, leg = self._span(self.scene.grid[piece], self.scene.grid[piece + 1]), self.scene.leg(piece)
+        if (leg, span) not in self._growths:
+            rest = self.remainders[leg]
+            self._growths[leg, span] = held(rest.growth, rest.control, self._lengths[span])
+        return self._growths[leg, span]
 
     def cells(self, piece: int, start: float, stop: float, z: Array, sharp: bool = False) -> list[Polynomial]:
         """For every ``c = z_i'basis``, ``z (k, b)``, the polynomial above ``c'x`` on ``[start, stop]``, a part
@@ -158,11 +167,11 @@ class Tube:
         lost = state.rad + rounding(z.shape[1]) * np.abs(state.mid)
         rad, kinks = np.einsum("jkb,ib->i", lost, np.abs(z)), np.zeros(z.shape[0])
         if self.scene.disturbance is not None and stop > 0.0:
-            moved, off, kinks = self.sigmas.bounds(start, ticks, z, sharp)
+            moved, off, kinks = self.sigmas[self.scene.leg(piece)].bounds(start, ticks, z, sharp)
             rad += off + rounding(1) * (np.abs(mid) + np.abs(moved)).sum(axis=(1, 2))
             mid = mid + moved
         if self.scene.initial_set is not None:
-            moved, off, switching = self.sigmas.begun(start, ticks, z, sharp)
+            moved, off, switching = self.sigmas[self.scene.leg(piece)].begun(start, ticks, z, sharp)
             rad += off + rounding(1) * (np.abs(mid) + np.abs(moved)).sum(axis=(1, 2))
             mid, kinks = mid + moved, kinks + switching
         rest = self._left_out(piece, offset, length, z)
@@ -179,17 +188,17 @@ class Tube:
             return self._states[piece, start, ticks]
         offset = arb(start) - arb(self.scene.grid[piece])
         x, u = self.nodes[piece], self.scene.control[min(piece, len(self.scene.control) - 1)]
+        leg = self.scene.leg(piece)
+        states, inputs = self.flows[leg].states, self.flows[leg].inputs
         if not offset.is_zero():
-            Phi, Gamma = self.flow.states.held(self.flow.inputs, offset)
+            Phi, Gamma = states.held(inputs, offset)
             x = Phi * x + Gamma.applied(u)
         terms = [x]
         if ticks:
             length = self.scene.duration(ticks)
-            if ticks not in self._inside:
-                self._inside[ticks] = self.flow.states.scaled(up_to(length)).exp()
-            terms += in_time(
-                self.flow.states, self.flow.states * x + self.flow.inputs.applied(u), length, self._inside[ticks]
-            )
+            if (leg, ticks) not in self._inside:
+                self._inside[leg, ticks] = states.scaled(up_to(length)).exp()
+            terms += in_time(states, states * x + inputs.applied(u), length, self._inside[leg, ticks])
         rows = stacked([[arb(float(v)) for v in c] for c in self.basis])
         every = Enclosed.of(stacked([(rows * part).entries() for term in terms for part in term.parts]))
         shape = (len(terms), self.flow.monomials.size, self.basis.shape[0])
@@ -199,38 +208,82 @@ class Tube:
         return self._states[piece, start, ticks]
 
     @cached_property
-    def sigmas(self) -> DisturbanceSupports:
-        """What the disturbance may add."""
-        return DisturbanceSupports(self.flow, self.scene, self.basis)
+    def sigmas(self) -> list[DisturbanceSupports]:
+        """What the disturbance may add, while each of the flows acts."""
+        found, before = [], None
+        for leg, flow in enumerate(self.flows):
+            found.append(DisturbanceSupports(flow, self.scene, self.basis, leg, before))
+            before = DisturbanceSupports(flow, self.scene, np.eye(self.basis.shape[1]), leg, before)
+        return found
 
     def _left_out(self, piece: int, offset: arb, length: arb, z: Array) -> Array:
         """Lagrange's remainder ``(k,)`` of the state and of what the disturbance adds, for every direction."""
-        rest = self.remainder
-        if rest is None:
+        from flint import arb
+
+        if not self.remainders:
             return np.zeros(z.shape[0])
-        u = self.scene.control[min(piece, len(self.scene.control) - 1)]
+        leg = self.scene.leg(piece)
+        rest, u = self.remainders[leg], self.scene.control[min(piece, len(self.scene.control) - 1)]
         growth, driven = held(rest.growth, rest.control, up_to(offset + length))
         last = upper((growth * self.norms[piece] + driven * _absolute(u))[rest.growth.nrows() - 1, 0])
-        per_size = float((last + self._support_out).upper()) * OUTWARD
+        pushed = arb(0) if self.scene.disturbance is None else self._supports_out[leg]
+        per_size = float((last + pushed).upper()) * OUTWARD
         table = self.basis @ rest.transform  # rounded, which the second term covers
         terms = rounding(sum(self.basis.shape)) * np.abs(z) @ (np.abs(self.basis) @ np.abs(rest.transform))
         answer: Array = per_size * (np.linalg.norm(z @ table, axis=1) + np.linalg.norm(terms, axis=1)) * OUTWARD
         return answer
 
-    @property
-    def _support_out(self) -> arb:
-        """The remainder of the disturbance's part up to the horizon, for a direction of size 1."""
+    @cached_property
+    def _supports_out(self) -> list[arb]:
+        """The remainder of the disturbance's part up to the end of every leg, for a direction of size 1."""
+        return [self._support_per_size] if len(self.flows) == 1 else self._supports_by_leg()
+
+    def _supports_by_leg(self) -> list[arb]:
+        """Leg by leg, from what the leg before has left; what decays is taken to stay, so that the bound grows with the
+        time. The norms of what the polynomials say at the beginning of a leg are looked at."""
+        from flint import arb, arb_mat
+
+        assert self.scene.disturbance is not None
+        ends, found, sizes = (
+            (*self.scene.switches, self.scene.grid[-1]),
+            list[arb](),
+            known(self.scene.disturbance).radius,
+        )
+        n: arb_mat | None = None
+        for leg, rest in enumerate(self.remainders):
+            length, count = arb(ends[leg]) - (arb(ends[leg - 1]) if leg else arb(0)), rest.growth.nrows()
+            pushed = [
+                sum((arb(w) * e for w, e in zip(sizes, per, strict=True)), arb(0))
+                for per in zip(*rest.disturbance, strict=True)
+            ]
+            growth = arb_mat([[rest.growth[i, j].max(arb(0)) for j in range(count)] for i in range(count)])
+            Phi, Gamma = held(growth, stacked([[upper(e)] for e in pushed]), length)
+            if n is not None:
+                Gamma = Gamma + Phi * rest.closer(
+                    n * self._turn(leg), self._carried(leg), self.flow.monomials.exponents
+                )
+            n = self._up(Gamma)
+            found.append(n[count - 1, 0])
+        return found
+
+    def _carried(self, leg: int) -> list[arb_mat]:
+        """Columns whose norms bound what any disturbance made of the coefficients before a leg, one per monomial."""
         from flint import arb
 
-        return arb(0) if self.scene.disturbance is None else self._support_per_size
+        assert self.scene.disturbance is not None
+        inverse = np.abs(_middles(self.remainders[leg].inverse)) * OUTWARD
+        effect, far = self.sigmas[leg].effect, np.array(known(self.scene.disturbance).radius)
+        every = (np.abs(effect.mid) + effect.rad) @ far  # (P, M, d)
+        size = (inverse @ every.sum(axis=0).T).T * OUTWARD**2
+        return [stacked([[arb(float(v))] for v in column]) for column in size]
 
     @cached_property
     def _support_per_size(self) -> arb:
         """By the norms of the transition's coefficients, which are looked at anew after every step."""
         from flint import arb, arb_mat
 
-        rest = self.remainder
-        assert rest is not None and self.scene.disturbance is not None
+        rest = self.remainders[0]
+        assert self.scene.disturbance is not None
         length, n = arb(self.scene.grid[-1]) / STEPS, rest.growth.nrows()
         T = arb_mat(rest.transform.tolist())
         step = Series(
@@ -255,6 +308,21 @@ class Tube:
 def _absolute(inputs: arb_mat) -> arb_mat:
     """Upper bounds of the absolute values of inputs ``(m, 1)``."""
     return stacked([[upper(abs(u))] for u in inputs.entries()])
+
+
+def _exact(value: float) -> arb:
+    from flint import arb
+
+    return arb(float(value))
+
+
+def _sizes_of(matrix: arb_mat) -> arb_mat:
+    """The absolute values of balls."""
+    return stacked([[abs(x) for x in row] for row in matrix.tolist()])
+
+
+def _middles(matrix: arb_mat) -> Array:
+    return np.array([[float(x.mid()) for x in row] for row in matrix.tolist()])
 
 
 def _sizes(matrix: arb_mat) -> Array:

@@ -15,7 +15,7 @@ from sparserob_core.control.constraints.local_maxima import climb, local_maxima,
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.combination import Combination, combination
-from sparserob_core.control.response.enclosure import CELLS_KEPT, CellEnclosure, enclose
+from sparserob_core.control.response.enclosure import CELLS_KEPT, Bounded, CellEnclosure, enclose, over_legs
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.parameters import ParameterIndex
@@ -190,26 +190,25 @@ class CurvedConstraint(StateConstraint):
         return sizes if np.isfinite(sizes).all() else self.set.violation(states.T)
 
     @shaped
-    def _cell(self, x: Float[Array, " n"], low: Float[Array, " j"], high: Float[Array, " j"]) -> CellEnclosure:
+    def _cell(self, x: Float[Array, " n"], low: Float[Array, " j"], high: Float[Array, " j"]) -> Bounded:
         key = x.tobytes() + low.tobytes() + high.tobytes()
         if key not in self._cells:
             nu = self.parameters.count
             centre, radius = (low + high)[nu:] / 2, (high - low)[nu:] / 2
             free = np.flatnonzero(radius > 0)
             H = np.vstack([centre, np.diag(radius)[free]]) @ self.set.frame / self.unit
-            lifted = self._flat.lifted(low[:nu], high[:nu])
-            joined = self._combination(lifted, free.size)
-            sigma = self.functionals.support_over(lifted, H, joined)
+            legs = self._flat.legs(low[:nu], high[:nu])
+            joined = self._combination(legs[0], free.size)
             rhs, looseness = self._minorant(H, joined, nu)
             control = self.functionals.dictionary.control(x)
             cuts = self.parameters.cuts(low[:nu], high[:nu])
             moving = None if self.reference is None else Moving(self.reference, H)
-            remember(
-                self._cells,
-                key,
-                CellEnclosure(lifted, sigma, H, rhs, control, joined, looseness, cuts, moving),
-                CELLS_KEPT,
-            )
+
+            def cell(leg: LiftedSystem) -> CellEnclosure:
+                sigma = self.functionals.support_over(leg, H, joined)
+                return CellEnclosure(leg, sigma, H, rhs, control, joined, looseness, cuts, moving)
+
+            remember(self._cells, key, over_legs(legs, cell), CELLS_KEPT)
         return self._cells[key]
 
     @shaped
@@ -260,7 +259,7 @@ class CurvedConstraint(StateConstraint):
         return given if same else None
 
     @cached_property
-    def _cells(self) -> dict[bytes, CellEnclosure]:
+    def _cells(self) -> dict[bytes, Bounded]:
         return {}
 
     @property

@@ -3,6 +3,7 @@ and disturbances."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import final
@@ -15,10 +16,10 @@ from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.matrix_exponential import transitions
 from sparserob_core.control.problem.problem import MixedConstraint
-from sparserob_core.control.response.enclosure import CELLS_KEPT, CellEnclosure, enclose
+from sparserob_core.control.response.enclosure import CELLS_KEPT, Bounded, CellEnclosure, enclose, over_legs
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.initial_support import Supports
-from sparserob_core.control.response.lifted import LiftedSystem, lift
+from sparserob_core.control.response.lifted import LiftedSystem, lift_legs
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import Direct, Moving, Reference
 from sparserob_core.control.response.response import Response, distinct_times
@@ -48,7 +49,7 @@ class Samples:
     parameters: ParameterIndex
     reference: Reference | None = None
     gains: Array | None = None
-    _supports: dict[bytes, Supports | None] = field(default_factory=dict, repr=False)
+    _supports: dict[bytes, list[Supports | None]] = field(default_factory=dict, repr=False)
 
     def serve(self, constraint: FlatConstraint) -> bool:
         """Whether they are of this constraint, from whatever initial state."""
@@ -87,7 +88,7 @@ class Samples:
     def times(self) -> Array:
         """Sampled times: the window's ends, the breakpoints in it, and a few times in every piece, increasing."""
         grid, (start, stop) = self._response.grid, self.window
-        pace = float(np.linalg.norm(self._response.steps(self.lattice[0]).A, axis=(1, 2)).max())
+        pace = float(np.linalg.norm(self._response.steps(self.lattice[0]).A, axis=(2, 3)).max())
         counts = np.clip(np.ceil(pace * grid.lengths / SMOOTH), INSIDE + 1, MOST_INSIDE).astype(int)
         which = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
         inside = np.repeat(grid.breakpoints[:-1], counts) + which * np.repeat(grid.lengths / counts, counts)
@@ -119,20 +120,24 @@ class Samples:
         """The piece of every sampled time ``(times,)``, and the transitions from its start, ``(v, times, d, d)``
         each."""
         pieces = self._response.grid.locate(self.times)
-        distinct, which = self._response.grid.distinct(self.times - self._response.grid.breakpoints[pieces])
-        A = self._response.steps(self.lattice[0]).A
-        flow, driven = transitions(A[:, None], distinct[None])
+        grid, A = self._response.grid, self._response.steps(self.lattice[0]).A
+        distinct, which = grid.distinct(self.times - grid.breakpoints[pieces])
+        if grid.mode is None:
+            flow, driven = transitions(A, distinct[None])
+        else:
+            flow, driven = transitions(A[:, grid.mode[pieces]], distinct[which][None])
+            which = np.arange(which.size)
         return pieces, flow[:, which], driven[:, which]
 
     @shaped
     def support_over(
-        self, lifted: LiftedSystem, low: Float[Array, " nu"], high: Float[Array, " nu"]
-    ) -> Supports | None:
-        """What the uncertainty adds over a cell of parameters, remembered."""
+        self, legs: Sequence[LiftedSystem], low: Float[Array, " nu"], high: Float[Array, " nu"]
+    ) -> list[Supports | None]:
+        """What the uncertainty adds over a cell of parameters, for every leg; remembered."""
         key = low.tobytes() + high.tobytes()
         if key not in self._supports:
-            support = self.functionals.support_over(lifted, self.H[: self.proven])
-            remember(self._supports, key, support, CELLS_KEPT)
+            found = [self.functionals.support_over(leg, self.H[: self.proven]) for leg in legs]
+            remember(self._supports, key, found, CELLS_KEPT)
         return self._supports[key]
 
     @property
@@ -328,53 +333,46 @@ class FlatConstraint(StateConstraint):
         return enclose(lower, upper, touched, self.parameters.count, lambda low, high: self._cell(x, low, high))
 
     @shaped
-    def lifted(self, low: Float[Array, " nu"], high: Float[Array, " nu"]) -> LiftedSystem:
-        """The lifted system over a cell of parameters, remembered."""
+    def legs(self, low: Float[Array, " nu"], high: Float[Array, " nu"]) -> tuple[LiftedSystem, ...]:
+        """The lifted system over a cell of parameters, leg by leg; remembered."""
         key = low.tobytes() + high.tobytes()
         if key not in self._lifted:
             response = self.functionals.response
             remember(
                 self._lifted,
                 key,
-                lift(response.system, response.grid, response.initial_state, (low + high) / 2, (high - low) / 2),
+                lift_legs(response.system, response.grid, response.initial_state, (low + high) / 2, (high - low) / 2),
                 CELLS_KEPT,
             )
         return self._lifted[key]
 
     @shaped
-    def _cell(self, x: Float[Array, " n"], low: Float[Array, " j"], high: Float[Array, " j"]) -> CellEnclosure:
+    def _cell(self, x: Float[Array, " n"], low: Float[Array, " j"], high: Float[Array, " j"]) -> Bounded:
         key = x.tobytes() + low.tobytes() + high.tobytes()
         if key not in self._cells:
-            lifted = self.lifted(low, high)
-            control = self.functionals.dictionary.control(x)
+            legs = self.legs(low, high)
+            control, cuts = self.functionals.dictionary.control(x), self.parameters.cuts(low, high)
             rows = self.samples.proven
-            rhs, H = np.zeros((rows, lifted.space.size)), self.H[:rows]
+            rhs, H = np.zeros((rows, legs[0].space.size)), self.H[:rows]
             rhs[:, 0] = self.h[:rows]
             moving = None if self.reference is None else Moving(self.reference, H)
             direct = None if self.gains is None else Direct(self.gains[:rows], self.functionals.dictionary, control)
-            remember(
-                self._cells,
-                key,
-                CellEnclosure(
-                    lifted,
-                    self.samples.support_over(lifted, low, high),
-                    H,
-                    rhs,
-                    control,
-                    cuts=self.parameters.cuts(low, high),
-                    moving=moving,
-                    direct=direct,
+            supports = iter(self.samples.support_over(legs, low, high))
+            made = over_legs(
+                legs,
+                lambda leg: CellEnclosure(
+                    leg, next(supports), H, rhs, control, cuts=cuts, moving=moving, direct=direct
                 ),
-                CELLS_KEPT,
             )
+            remember(self._cells, key, made, CELLS_KEPT)
         return self._cells[key]
 
     @cached_property
-    def _cells(self) -> dict[bytes, CellEnclosure]:
+    def _cells(self) -> dict[bytes, Bounded]:
         return {}
 
     @cached_property
-    def _lifted(self) -> dict[bytes, LiftedSystem]:
+    def _lifted(self) -> dict[bytes, tuple[LiftedSystem, ...]]:
         return {}
 
     @property
@@ -395,7 +393,7 @@ class FlatConstraint(StateConstraint):
         nodes = response.states(control, points)
         pieces, flow, driven = self.samples.steps
         steps = response.steps(points)
-        drive = np.einsum("vdm,ml->vld", steps.B, self.functionals.on_grid(x))
+        drive = response.grid.driven(steps.B, self.functionals.on_grid(x))
         states = np.einsum("vtij,vtj->vti", flow, nodes[:, pieces]) + np.einsum(
             "vtij,vtj->vti", driven, drive[:, pieces]
         )

@@ -11,7 +11,7 @@ import numpy as np
 from sparserob_core.control.constraints.flat import KEPT
 from sparserob_core.control.constraints.local_maxima import local_maxima, vertices
 from sparserob_core.control.constraints.state import StateConstraint
-from sparserob_core.control.response.response import SAME_TIME, Response, TimeGrid, distinct_times
+from sparserob_core.control.response.response import SAME_TIME, Response, distinct_times
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.program import ConstraintFamily, Separation
 
@@ -121,8 +121,7 @@ class ScenarioConstraint:
             np.concatenate([response.grid.breakpoints, [base.start, base.stop]]), response.grid.breakpoints[-1]
         )
         points = np.sort(np.concatenate([points, (points[:-1] + points[1:]) / 2]))
-        origin = response.grid.locate((points[:-1] + points[1:]) / 2)
-        return Response(response.system, TimeGrid(points, origin, origin), response.initial_state)
+        return Response(response.system, response.grid.refined(points), response.initial_state)
 
     @cached_property
     def _kept(self) -> np.ndarray:

@@ -14,7 +14,7 @@ import numpy as np
 
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.response.functional import CHUNK
-from sparserob_core.control.response.response import Response
+from sparserob_core.control.response.response import Response, TimeGrid
 from sparserob_core.control.response.sensitivity_system import tangent
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.relaxed.index_gradient import differences
@@ -28,16 +28,18 @@ class Functional:
     what drives every piece. ``start (k, d)``: the initial state of every index.
 
     ``c = sum_b shares_b directions_b`` with ``directions (k, b, d)`` and ``shares (k, b)``; ``along (k, b, 1 + nu, d)``
-    and ``gains (k, b, L, 1 + nu, d)`` are those of every direction. ``A (k, d, d)``, and ``B (k, 1 + nu, d, m)``,
-    ``W (k, 1 + nu, d, mw)`` with their derivatives; ``now (k,)``: the piece whose inputs act at the time of the index.
+    and ``gains (k, b, L, 1 + nu, d)`` are those of every direction. ``moving``: the weights ``(k, d)`` and
+    ``(k, L, d)`` of ``c'A x(t)``. ``B (k, 1 + nu, d, J m)``, ``W (k, 1 + nu, d, J mw)`` with their derivatives, those
+    of several modes side by side; ``now (k,)``: the piece whose inputs act at the time of the index.
     """
 
     start: Array
+    grid: TimeGrid
     directions: Array
     shares: Array
     along: Array
     gains: Array
-    A: Array
+    moving: tuple[Array, Array]
     B: Array
     W: Array
     now: np.ndarray
@@ -60,14 +62,17 @@ class Functional:
     def force(self, control: Array, signals: Array | None) -> Array:
         """``B u + E w`` and its derivatives, ``(k, L, 1 + nu, d)``, from inputs on the pieces, ``(m, L)`` and
         ``(k, mw, L)``."""
-        force: Array = np.moveaxis(self.B @ control, -1, 1)
-        return force if signals is None else force + np.moveaxis(self.W @ signals[:, None], -1, 1)
+        force: Array = np.swapaxes(self.grid.driven(self.B, control), 1, 2)
+        return force if signals is None else force + np.swapaxes(self.grid.driven(self.W, signals[:, None]), 1, 2)
+
+    @property
+    def pushed(self) -> Array:
+        """Weights ``(k, L, mw)`` on the disturbance on every piece."""
+        return self.grid.through(self.driven[:, :, 0], self.W[:, 0])
 
     def in_time(self, force: Array) -> Array:
-        """``c'(A x(t) + B u(t) + E w(t))``, as ``(k, 1)``; ``e^{As}`` and ``A`` commute."""
-        drift = ((self.free[:, :1] @ self.A)[:, 0] * self.start).sum(axis=1) + (
-            (self.driven[:, :, 0] @ self.A) * force[:, :, 0]
-        ).sum(axis=(1, 2))
+        """``c'(A x(t) + B u(t) + E w(t))``, as ``(k, 1)``."""
+        drift = (self.moving[0] * self.start).sum(axis=1) + (self.moving[1] * force[:, :, 0]).sum(axis=(1, 2))
         sigma = (self.direction * force[np.arange(self.now.size), self.now, 0]).sum(axis=1)
         return np.asarray(drift + sigma)[:, None]
 
@@ -134,7 +139,7 @@ class Sensitivity:
         times, points, z = np.split(indices, [1, 1 + self._nu], axis=1)
         parameters, model = self.constraint.parameters.clamp(points), self.constraint.functionals.disturbance
         at = self._functional(times[:, 0], parameters, z, rows)
-        weights = at.driven[:, :, 0] @ at.W[:, 0]
+        weights = at.pushed
         closed = signals is None and model is not None and model.kind == "measurable"
         if signals is None and model is not None and not closed:
             signals = model.worst(self._entered(weights, at))
@@ -159,22 +164,38 @@ class Sensitivity:
         blocks = response.initial_state.size // d
         larger = np.concatenate([directions, np.zeros((k, b, (blocks - 1) * d))], axis=2).reshape(k * b, -1)
         free, gains, B, W = response.adjoint(np.repeat(times, b), larger, np.repeat(parameters, b, axis=0))
-        A = self._response.system.matrices(parameters)[0]
-        along, initial = free.reshape(k, b, blocks, d), self.constraint.functionals.initial
-        start = np.broadcast_to(self._response.initial_state, (k, d))
+        along, gains, pieces = free.reshape(k, b, blocks, d), gains.reshape(k, b, -1, blocks, d), self._pieces(times)
+        start, initial = np.broadcast_to(self._response.initial_state, (k, d)), self.constraint.functionals.initial
         if initial is not None:
             start = start + initial.support_point(np.einsum("kb,kbd->kd", shares, along[:, :, 0]))
         return Functional(
             start,
+            self._response.grid,
             directions,
             shares,
             along,
-            gains.reshape(k, b, -1, blocks, d),
-            A,
+            gains,
+            self._moving(
+                times, parameters, np.einsum("kb,kbd->kd", shares, directions), (along, gains, shares), pieces
+            ),
             B[::b].reshape(k, blocks, d, -1),
             W[::b].reshape(k, blocks, d, -1),
-            self._pieces(times),
+            pieces,
         )
+
+    def _moving(
+        self, times: Array, parameters: Array, c: Array, known: tuple[Array, Array, Array], pieces: np.ndarray
+    ) -> tuple[Array, Array]:
+        """The weights of ``c'A x(t)``: those of ``c'x(t)`` times ``A``, which commutes with ``e^{As}``; of a system
+        that changes those of the direction ``A'c``, with the ``A`` of the time of the index."""
+        response, mode = self._response, self._response.grid.mode
+        every = [one.matrices(parameters)[0] for one in response.system.modes]
+        if mode is None:
+            along, gains, shares = known
+            free, driven = (np.einsum("kb,kb...->k...", shares, part) for part in (along[:, :, 0], gains[:, :, :, 0]))
+            return (free[:, None] @ every[0])[:, 0], driven @ every[0]
+        A = np.stack(every, axis=1)[np.arange(times.size), mode[pieces]]
+        return response.adjoint(times, (c[:, None] @ A)[:, 0], parameters)[:2]
 
     def _pieces(self, times: Array) -> np.ndarray:
         """The pieces on which the times are approached: from the left, but from the right at the start of the
@@ -189,8 +210,12 @@ class Sensitivity:
         if not fresh.size:
             return weights
         entered = weights.copy()
-        trace = ENTERED * self._response.grid.lengths[at.now[fresh], None] * at.direction[fresh]
-        entered[fresh, at.now[fresh]] = (trace[:, None] @ at.W[fresh, 0])[:, 0]
+        grid = self._response.grid
+        trace = ENTERED * grid.lengths[at.now[fresh], None] * at.direction[fresh]
+        gains = np.zeros((fresh.size, grid.pieces, trace.shape[1]))
+        gains[np.arange(fresh.size), at.now[fresh]] = trace
+        found = grid.through(gains, at.W[fresh, 0])
+        entered[fresh, at.now[fresh]] = found[np.arange(fresh.size), at.now[fresh]]
         return entered
 
     def _sigma_slopes(self, times: Array, parameters: Array, at: Functional) -> tuple[Array, Array, Array]:

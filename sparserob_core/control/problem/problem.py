@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from sparserob_core.control.problem.cost import Cost
 from sparserob_core.control.problem.names import UNNAMED, Names
-from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
 from sparserob_core.control.sets.sets import Equality, Polytope
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound
@@ -70,7 +70,7 @@ class OptimalControlProblem:
 
     ``x' = A(p) x + B(p) u + E(p) w + c(p)``, ``x(0) = initial_state (d,)``, ``u(t)`` in ``control``, ``x(t)`` in every
     ``path`` set during its window (or ``(x(t), u(t))``: `MixedConstraint`), and ``x(T)`` in every ``terminal`` set,
-    where ``T = horizon`` (in the time unit of the system).
+    where ``T = horizon`` (in the time unit of the system), at which the last piece of a `SwitchedSystem` must end.
 
     ``disturbance``: the bounded set of ``w``, or ``None``; ``disturbance_class`` says which functions it makes:
     ``piecewise_constant`` (every piece of the disturbance's dictionary in the set), ``measurable`` (any measurable
@@ -88,7 +88,7 @@ class OptimalControlProblem:
     infeasible. Raises `InputError`.
     """
 
-    system: LinearSystem
+    system: LinearSystem | SwitchedSystem
     horizon: float
     initial_state: npt.ArrayLike
     control: ConvexSet
@@ -105,7 +105,7 @@ class OptimalControlProblem:
     cost: Cost = Cost()  # noqa: RUF009  immutable
 
     def __post_init__(self) -> None:
-        if not isinstance(self.system, LinearSystem):
+        if not isinstance(self.system, LinearSystem | SwitchedSystem):
             raise InputError(path="system", expected="a LinearSystem", got=f"{type(self.system).__name__}")
         horizon = as_bound("horizon", self.horizon)
         if horizon.shape != (1,) or not 0.0 < horizon[0] < np.inf:
@@ -117,6 +117,8 @@ class OptimalControlProblem:
                 expected=f"less than {self.horizon:g} (the horizon), or no control ever acts, and more than rounding",
                 got=f"{self.system.delay:g}",
             )
+        if isinstance(self.system, SwitchedSystem):
+            self._check_pieces(self.system)
         self._set("initial_state", self._state())
         self._set("initial_set", self._deviations())
         self._set("weights", self._weights())
@@ -134,6 +136,21 @@ class OptimalControlProblem:
 
     def _set(self, name: str, value: object) -> None:
         object.__setattr__(self, name, value)
+
+    def _check_pieces(self, system: SwitchedSystem) -> None:
+        last = len(system.pieces) - 1
+        if abs(system.pieces[last][0] - self.horizon) > SHORTEST * self.horizon:
+            raise InputError(
+                path=f"system.pieces.{last}.until",
+                expected=f"{self.horizon:g}, the horizon, since it is the last piece",
+                got=f"{system.pieces[last][0]:g}",
+            )
+        if self.disturbance is not None and self.disturbance_class == "measurable":
+            raise InputError(
+                path="disturbance_class",
+                expected="piecewise_constant where the system has pieces, of which measurable ones are not proven",
+                got="measurable",
+            )
 
     def _state(self) -> Array:
         d = self.system.states
@@ -287,7 +304,7 @@ def _checked_set(name: str, value: object, dimension: int, of: str, bounded: boo
     return value
 
 
-def _checked_mixed(where: str, entry: MixedConstraint, system: LinearSystem) -> MixedConstraint:
+def _checked_mixed(where: str, entry: MixedConstraint, system: LinearSystem | SwitchedSystem) -> MixedConstraint:
     """With arrays of the right shapes, and a set of ``(x, u)`` that is not empty."""
     H, G = (
         _matrix(f"{where}.{name}", rows, f"rows of {columns} finite numbers, one per {of}", columns)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeAlias, final
 
@@ -14,7 +14,7 @@ from sparserob_core.control.enclosures.taylor import TaylorModel, TaylorSpace
 from sparserob_core.control.problem.expression import ExpressionMatrix, beside
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.shapes import Float, shaped
-from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
 Matrix: TypeAlias = npt.ArrayLike | Callable[..., object] | ExpressionMatrix
 _Entry: TypeAlias = Array | Callable[..., object] | ExpressionMatrix
@@ -96,6 +96,20 @@ class LinearSystem:
         if self.c is None:
             return self
         return LinearSystem(self.A, beside(self._entry("B"), self._entry("c")), self.E, self.parameters, self.names)
+
+    def with_parameters(self, parameters: ConvexSet) -> LinearSystem:
+        """The same system with its parameters in another set."""
+        return replace(self, parameters=parameters)
+
+    @property
+    def modes(self) -> tuple[LinearSystem, ...]:
+        """The systems that take turns: this one alone."""
+        return (self,)
+
+    @property
+    def switches(self) -> tuple[float, ...]:
+        """When one mode follows another: never."""
+        return ()
 
     @property
     def parameter_count(self) -> int:
@@ -355,6 +369,156 @@ def _duration(value: object) -> float:
     if not usable or not 0.0 <= float(value) < np.inf:  # type: ignore[arg-type]
         raise InputError(path="system.delay", expected="a finite time, not negative", got=f"{value!r}")
     return float(value)  # type: ignore[arg-type]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class SwitchedSystem:
+    """Linear systems that take turns at known times: ``pieces`` are pairs ``(until, LinearSystem)``, each with its own
+    ``A``, ``B``, ``E`` and ``c``; the first begins at time 0, the last ``until`` is the horizon. The state goes on
+    where it is.
+
+    All of them have as many states, controls and disturbances, and share their parameters: a piece without any is a
+    known one. ``delay``, as that of a `LinearSystem`: what was commanded acts through the ``B`` of the time at which it
+    acts. Raises `InputError`.
+    """
+
+    pieces: Sequence[tuple[float, LinearSystem]]
+    delay: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "delay", _duration(self.delay))
+        given = list(self.pieces)
+        if not given:
+            raise InputError(path="system.pieces", expected="pairs of a time and a LinearSystem", got="none")
+        for i, pair in enumerate(given):
+            _check_piece(i, pair, given[i - 1][0] if i else 0.0)
+        first = next((one for _, one in given if one.parameters is not None), given[0][1])
+        for i, (_, system) in enumerate(given):
+            _check_alike(i, system, first)
+        drifts = any(one.c is not None for _, one in given)
+        known = [(float(until), _completed(one, first, drifts)) for until, one in given]
+        object.__setattr__(self, "pieces", tuple(known))
+
+    def with_parameters(self, parameters: ConvexSet) -> SwitchedSystem:
+        """As `LinearSystem.with_parameters`."""
+        return SwitchedSystem([(until, one.with_parameters(parameters)) for until, one in self.pieces], self.delay)
+
+    @property
+    def modes(self) -> tuple[LinearSystem, ...]:
+        """The systems that take turns."""
+        return tuple(system for _, system in self.pieces)
+
+    @property
+    def switches(self) -> tuple[float, ...]:
+        """When one follows another, ``(modes - 1,)``."""
+        return tuple(until for until, _ in self.pieces[:-1])
+
+    @property
+    def states(self) -> int:
+        """Number ``d`` of states."""
+        return self.modes[0].states
+
+    @property
+    def controls(self) -> int:
+        """Number ``m`` of controls."""
+        return self.modes[0].controls
+
+    @property
+    def disturbances(self) -> int:
+        """Number ``mw`` of disturbances."""
+        return self.modes[0].disturbances
+
+    @property
+    def parameters(self) -> ConvexSet | None:
+        """The set of the parameters."""
+        return self.modes[0].parameters
+
+    @property
+    def parameter_count(self) -> int:
+        """Number ``nu`` of parameters."""
+        return self.modes[0].parameter_count
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Names of the parameters."""
+        return self.modes[0].names
+
+    @property
+    def c(self) -> Matrix | None:
+        """Whether there is a drift: that of the first piece."""
+        return self.modes[0].c
+
+    @cached_property
+    def forced(self) -> SwitchedSystem:
+        """As `LinearSystem.forced`, piece by piece."""
+        if self.c is None:
+            return self
+        return SwitchedSystem([(until, one.forced) for until, one in self.pieces])
+
+    @shaped
+    def in_units(
+        self,
+        A: Float[Array, "d d"],
+        B: Float[Array, "d m"],
+        E: Float[Array, "d mw"],
+        parameters: Float[Array, " nu"],
+        c: Float[Array, "d 1"] | float = 1.0,
+        time: float = 1.0,
+    ) -> SwitchedSystem:
+        """As `LinearSystem.in_units`."""
+        moved = [(until / time, one.in_units(A, B, E, parameters, c, time)) for until, one in self.pieces]
+        return SwitchedSystem(moved, self.delay / time)
+
+    @shaped
+    def describe(self, parameter: Float[Array, " nu"]) -> str:
+        """As `LinearSystem.describe`."""
+        return self.modes[0].describe(parameter)
+
+
+System: TypeAlias = LinearSystem | SwitchedSystem
+
+
+def _check_piece(i: int, pair: object, before: float) -> None:
+    if not isinstance(pair, Sequence) or len(pair) != 2:
+        raise InputError(path=f"system.pieces.{i}", expected="a pair of a time and a LinearSystem", got=f"{pair!r}")
+    until, system = pair
+    if isinstance(until, bool) or not isinstance(until, int | float | np.integer | np.floating):
+        raise InputError(path=f"system.pieces.{i}.until", expected="a time", got=f"{until!r}")
+    if not before < until < np.inf:
+        raise InputError(path=f"system.pieces.{i}.until", expected=f"a time after {before:g}", got=f"{until:g}")
+    if not isinstance(system, LinearSystem) or system.delay:
+        said = "a delay of its own" if isinstance(system, LinearSystem) else type(system).__name__
+        raise InputError(path=f"system.pieces.{i}", expected="a LinearSystem without delay", got=said)
+
+
+def _check_alike(i: int, system: LinearSystem, first: LinearSystem) -> None:
+    for what in ("states", "controls", "disturbances"):
+        if getattr(system, what) != getattr(first, what):
+            raise InputError(
+                path=f"system.pieces.{i}",
+                expected=f"{getattr(first, what)} {what}, as the other pieces",
+                got=f"{getattr(system, what)}",
+            )
+    mine, other = system.parameters, first.parameters
+    if mine is None or (mine is other and system.names == first.names):
+        return
+    same = isinstance(mine, Box) and isinstance(other, Box) and mine.dimension == other.dimension
+    axes = np.vstack([np.eye(mine.dimension), -np.eye(mine.dimension)])
+    if same and other is not None:
+        same = np.array_equal(mine.support(axes), other.support(axes))
+    if not same or system.names != first.names:
+        raise InputError(path=f"system.pieces.{i}", expected="the parameters of the other pieces", got="others")
+
+
+def _completed(system: LinearSystem, first: LinearSystem, drifts: bool) -> LinearSystem:
+    """The same system with the parameters of ``first``, and with a drift, of 0 where it has none."""
+    c = np.zeros((system.states, 1)) if system.c is None and drifts else system.c
+    if c is system.c and system.parameters is first.parameters:
+        return system
+    if isinstance(system, SystemInUnits):
+        return replace(system, c=c) if c is not None else system
+    return LinearSystem(system.A, system.B, system.E, first.parameters, first.names, c)
 
 
 @final

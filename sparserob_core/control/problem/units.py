@@ -9,7 +9,7 @@ import numpy as np
 
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
-from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.problem.system import System
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 OFFSET = 0.26535897932384626  # irrational: numbers that people choose are not at the edge between two powers of two
@@ -72,7 +72,7 @@ class Units:
         moved = None if moved is None else np.asarray(moved) / np.concatenate([[self.time], self.states])
         return replace(entry, set=entry.set.in_units(self.states), start=start, stop=stop, relative_to=moved)
 
-    def of_system(self, system: LinearSystem) -> LinearSystem:
+    def of_system(self, system: System) -> System:
         """``x' = A x + B u + E w + c`` with all of it in these units."""
         rate = self.time / self.states[:, None]
         disturbances = self.disturbances[: system.disturbances]

@@ -10,10 +10,11 @@ import numpy as np
 
 from sparserob_core.control.enclosures.combination import Combination
 from sparserob_core.control.enclosures.comparison import block_norms, product
+from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.polynomial import distinct_patterns, face_matrix
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.response.disturbance import DisturbanceModel
-from sparserob_core.control.response.lifted import LiftedSystem
+from sparserob_core.control.response.lifted import LiftedSystem, Past
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 
@@ -88,12 +89,22 @@ class DisturbanceSupport:
 
     @cached_property
     def neglected(self) -> Array:
-        """What the Taylor models leave out, at most, on every piece: ``(r, L)``."""
+        """What the Taylor models leave out, at most, on every piece: ``(r, L)``.
+
+        Of what a disturbance had made of the state before this leg, the product with a row leaves out what the row
+        does, what is left out of the state already, and the terms of too high a degree.
+        """
         lifted, radius = self.lifted, self.disturbance.radius
         sizes, remainder = lifted.row_bounds(self.rows)
         spilt = lifted.spilt(_row_norms(lifted.W, lifted.starts)) + np.linalg.norm(lifted.slack_W, axis=1)
         pushed = remainder @ self._drive + radius * np.einsum("rlaj,aj->rl", sizes, spilt)
-        return np.asarray(np.cumsum(pushed * lifted.fine.lengths, axis=1)[:, lifted.ends[1:] - 1])
+        within = np.cumsum(pushed * lifted.fine.lengths, axis=1)[:, lifted.ends[1:] - 1]
+        before = self._carried
+        if before is None:
+            return np.asarray(within)
+        missed = remainder @ (before.reached + before.left_out) + sizes.sum(axis=2) @ before.left_out
+        missed = missed + np.einsum("rlaj,aj->rl", sizes, lifted.spilt(before.sizes))
+        return np.asarray(within + np.maximum.reduceat(missed, lifted.ends[:-1], axis=1))
 
     @property
     def reached(self) -> Array:
@@ -109,7 +120,8 @@ class DisturbanceSupport:
     def _repeats(self) -> bool:
         """Whether the blocks are the pieces of a uniform grid: what they receive then depends on their age ``t - s``
         only."""
-        return self.lifted.backward.uniform and self.disturbance.by_piece
+        alone = self.lifted.grid.pieces == self.disturbance.grid.pieces  # not one leg of several
+        return alone and self.lifted.backward.uniform and self.disturbance.by_piece
 
     def _gathered(
         self, times: Array, of_blocks: Callable[[Array], Array], rows: Array | None = None, plain: bool = False
@@ -149,10 +161,37 @@ class DisturbanceSupport:
     def _blocks(self, times: Array, rows: Array) -> Array:
         """Taylor coefficients ``(k, r, M, nb, q)`` of what functionals that start as lifted ``rows (r, M d)`` give to
         every block."""
+        return self.disturbance.blocks(np.moveaxis(self.on_pieces(times, rows), 3, 2))
+
+    def on_pieces(self, times: Array, rows: Array) -> Array:
+        """Taylor coefficients ``(k, r, L, M, mw)`` of what functionals that start as lifted ``rows (r, M d)`` give to
+        the disturbance on every piece of the whole grid."""
         k, r = times.size, rows.shape[0]
-        _, gains, _, _ = self.lifted.backward.adjoint(np.repeat(times, r), np.tile(rows, (k, 1)), np.zeros((k * r, 0)))
+        free, gains, _, _ = self.lifted.backward.adjoint(
+            np.repeat(times, r), np.tile(rows, (k, 1)), np.zeros((k * r, 0))
+        )
         weights = self._weights(gains.reshape(k, r, gains.shape[1], -1))
-        return self.disturbance.blocks(np.moveaxis(weights, 3, 2))
+        first, whole = self.lifted.first, self.disturbance.grid.pieces
+        if whole == weights.shape[2]:
+            return weights
+        every = np.zeros((k, r, whole, *weights.shape[3:]))
+        every[:, :, first : first + weights.shape[2]] = weights
+        if self._carried is not None:
+            space, effect = self.lifted.space, self._carried.effect
+            along = free.reshape(k, r, space.size, -1)
+            for left, right, target in zip(*space.products, strict=True):
+                every[:, :, :first, target] += np.einsum("krd,dlw->krlw", along[:, :, right], effect[left])
+        return every
+
+    @property
+    def _carried(self) -> Carried | None:
+        past = self.lifted.past
+        if past is None:
+            return None
+        known = past.carried.get(id(self.disturbance))
+        if not isinstance(known, Carried):
+            known = past.carried[id(self.disturbance)] = _carry(past, self.disturbance)
+        return known
 
     def _weights(self, gains: Array) -> Array:
         """Gains ``(..., M d)`` on the state's drive, as Taylor coefficients ``(..., M, mw)`` of the weights on the
@@ -165,6 +204,11 @@ class DisturbanceSupport:
             if used[left]:
                 weights[..., target, :] += parts[..., right, :] @ self.lifted.W[left]
         return weights
+
+    @cached_property
+    def before(self) -> Array:
+        """What any disturbance can have made of every block of the coordinates before time 0, ``(q,)``."""
+        return np.zeros(self.lifted.starts.size) if self._carried is None else self._carried.reached
 
     @cached_property
     def _lifted_rows(self) -> Array:
@@ -184,10 +228,47 @@ class DisturbanceSupport:
         until then can have made of every block."""
         grid, gains = self.lifted.grid, np.zeros((self.lifted.grid.pieces + 1, self.lifted.starts.size))
         reach = self.lifted.comparison.over(grid.lengths)
-        gains[1:] = product(reach.integral, self._drive[:, None])[..., 0]
+        gains[0], gains[1:] = self.before, product(reach.integral, self._drive[:, None])[..., 0]
         for piece in range(grid.pieces):
             gains[piece + 1] += product(reach.flow[piece], gains[piece][:, None])[:, 0]
         return gains
+
+
+@dataclass(frozen=True, eq=False)
+class Carried:
+    """What a part of the uncertainty made of the state before a leg begins: its ``effect (M, d, ...)`` per unit, Taylor
+    coefficients in the leg's coordinates.
+
+    Whatever is admissible, block by block: the norms of the coefficients ``sizes (M, q)``, all that it can be,
+    ``reached (q,)``, and what the coefficients leave out, ``left_out (q,)``. ``of``: whose it is.
+    """
+
+    of: object
+    effect: Array
+    sizes: Array
+    reached: Array
+    left_out: Array
+
+
+def carried(past: Past, of: object, old: Array, entries: Array, reached: Array, neglected: Array) -> Carried:
+    """`Carried` from what is known at the end of the leg before: the effect ``old (d, M, ...)`` in its coordinates, how
+    large its coefficients can be, ``entries (d, M)``, block norms ``reached (q',)``, and ``neglected (d,)`` of every
+    coordinate."""
+    effect = np.moveaxis(np.tensordot(past.turn, old, axes=1), 1, 0)
+    terms = rounding(2 * past.turn.shape[0] + old[0].size)
+    sizes = (1.0 + terms) * block_norms((np.abs(past.turn) @ entries).T, past.starts)
+    moved = product(past.blocks, reached[:, None])[:, 0]
+    missed = block_norms(np.abs(past.turn) @ neglected, past.starts) * (1.0 + terms)
+    return Carried(of, effect, sizes, moved, missed + past.rounded(entries.sum(axis=1)) + terms * moved)
+
+
+def _carry(past: Past, disturbance: DisturbanceModel) -> Carried:
+    lifted, d = past.lifted, past.turn.shape[0]
+    ended, rows = DisturbanceSupport(lifted, disturbance, np.eye(d)), np.eye(d, lifted.row_matrix.shape[0])
+    first = lifted.first + lifted.grid.pieces
+    old = ended.on_pieces(lifted.grid.breakpoints[-1:], rows)[0, :, :first]  # (d, L, M, mw)
+    entries = disturbance.radius * np.linalg.norm(old, axis=3).sum(axis=1)
+    return carried(past, disturbance, old.swapaxes(1, 2), entries, ended.reached[-1], ended.neglected[:, -1])
 
 
 def over_faces(

@@ -9,9 +9,10 @@ cell counts, not that of the piece.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 
@@ -78,7 +79,8 @@ class CellEnclosure:
         if self.combination is not None:  # the parts of one constraint, each with a factor of at most 1
             bend, neglected = bend.sum(axis=1, keepdims=True), neglected.sum(axis=1, keepdims=True)
         if self.direct is not None:
-            added = self.direct.on(start, stop)
+            elapsed = self.lifted.grid.elapsed
+            added = self.direct.on(start + elapsed, stop + elapsed)
             left, right = left + added, right + added
         total = np.maximum(left, right) + bend + neglected
         worst = total.argmax(axis=1)
@@ -98,7 +100,7 @@ class CellEnclosure:
         states = self._states(times, pieces)
         coefficients = np.einsum("ri,kai->kra", self._rows, states)
         if self.moving is not None:
-            coefficients[:, :, 0] += self.moving.at(times)
+            coefficients[:, :, 0] += self.moving.at(times + self.lifted.grid.elapsed)
         space = self.lifted.space
         if self.combination is not None:
             coefficients, space = self.combination.apply(coefficients), self.combination.space
@@ -241,6 +243,36 @@ class CellEnclosure:
         return np.asarray(total + terms * (product(widest, sizes.T) + sides))
 
 
+@dataclass(frozen=True, eq=False)
+class LegsEnclosure:
+    """`CellEnclosure` of a system that changes: one for every leg, in times from where it begins, ``begin (J,)``."""
+
+    legs: Sequence[CellEnclosure]
+    begin: Array
+
+    def bounds(self, start: Array, stop: Array) -> tuple[Array, Array, Array]:
+        """As `CellEnclosure.bounds`, of cells that lie within one leg each."""
+        which = np.maximum(np.searchsorted(self.begin, stop, side="left") - 1, 0)
+        found: list[tuple[np.ndarray, tuple[Array, Array, Array]]] = []
+        for number in np.unique(which):
+            mine, begin = np.flatnonzero(which == number), self.begin[number]
+            times = np.maximum(start[mine] - begin, 0.0), np.maximum(stop[mine] - begin, 0.0)
+            found.append((mine, self.legs[number].bounds(*times)))
+        order = np.argsort(np.concatenate([mine for mine, _ in found]))
+        bounds, bend, spread = (np.concatenate([parts[i] for _, parts in found])[order] for i in range(3))
+        return bounds, bend, spread
+
+
+Bounded: TypeAlias = CellEnclosure | LegsEnclosure
+
+
+def over_legs(legs: Sequence[LiftedSystem], cell: Callable[[LiftedSystem], CellEnclosure]) -> Bounded:
+    """The enclosure that ``cell`` makes of a lifted system, for every leg of it."""
+    if len(legs) == 1:
+        return cell(legs[0])
+    return LegsEnclosure([cell(leg) for leg in legs], np.array([leg.grid.elapsed for leg in legs]))
+
+
 def _on_faces(space: TaylorSpace, coefficients: Array, ends: Array) -> Array:
     """Polynomials ``(k, r, M)`` with the variables that have an end in ``ends (k, r, nu)`` set to it."""
     if not ends.any():
@@ -259,7 +291,7 @@ def _ends(start: Array, stop: Array, pieces: np.ndarray) -> tuple[tuple[Array, n
 
 
 def enclose(
-    lower: Array, upper: Array, touched: np.ndarray, nu: int, cell_over: Callable[[Array, Array], CellEnclosure]
+    lower: Array, upper: Array, touched: np.ndarray, nu: int, cell_over: Callable[[Array, Array], Bounded]
 ) -> Enclosure:
     """Bounds on cells ``(k, 1 + nu + b)`` of times, ``nu`` parameters and directions; those of one box ``(low, high)``
     share its ``cell_over``.

@@ -13,7 +13,7 @@ from sparserob_core.control.enclosures.combination import Combination
 from sparserob_core.control.enclosures.matrix_exponential import transitions
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.names import UNNAMED, Names
-from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.disturbance_support import DisturbanceSupport
 from sparserob_core.control.response.initial_support import InitialSupport, Support, Supports
@@ -93,8 +93,9 @@ class WorstCase:
         under one admissible disturbance: none, where it may be."""
         system, model = self.response.system, self.disturbance
         middle = np.zeros((1, 0)) if system.parameters is None else system.parameters.interior_point()[None]
-        A, B, E = system.matrices(middle)
-        known = LinearSystem(A[0], B[0], E[0])
+        modes = [LinearSystem(*(part[0] for part in mode.matrices(middle))) for mode in system.modes]
+        ends = (*system.switches, float(self.response.grid.breakpoints[-1]))
+        known = modes[0] if len(modes) == 1 else SwitchedSystem(list(zip(ends, modes, strict=True)))
         if model is not None:
             zero = np.zeros(model.channels)
             point = zero if model.bound.contains(zero) else model.bound.interior_point()
@@ -133,7 +134,11 @@ class WorstCase:
 
         def pushed(part: slice, free: Array, gains: Array, W: Array) -> Array:
             begun = self._begun(free) if deviations is None else (free * deviations[part]).sum(axis=1)
-            return begun if disturbances is None else begun + np.einsum("kli,kil->k", gains @ W, disturbances[part])
+            return (
+                begun
+                if disturbances is None
+                else begun + np.einsum("kli,kil->k", self._through(gains, W), disturbances[part])
+            )
 
         return self._rows(times, directions, parameters, pushed)
 
@@ -150,7 +155,7 @@ class WorstCase:
         G, offset = np.empty((times.size, self.variables)), np.empty(times.size)
         for part in self._chunks(times.size):
             free, gains, B, W = self.response.adjoint(times[part], directions[part], parameters[part])
-            weights = gains @ B
+            weights = self._through(gains, B)
             G[part] = self.on_decision(weights)
             offset[part] = free @ self.response.initial_state + self.given(weights) + pushed(part, free, gains, W)
         return G, offset
@@ -162,7 +167,7 @@ class WorstCase:
         """The coefficients ``(k, nb, q)`` of a worst disturbance at every index."""
         assert self.disturbance is not None
         _, gains, _, W = self.response.adjoint(times, directions, parameters)
-        return self.disturbance.set.support_point(self.disturbance.blocks(gains @ W))
+        return self.disturbance.set.support_point(self.disturbance.blocks(self._through(gains, W)))
 
     @shaped
     def values(
@@ -177,7 +182,7 @@ class WorstCase:
         result = np.empty(times.size)
         for part in self._chunks(times.size):
             free, gains, B, W = self.response.adjoint(times[part], directions[part], parameters[part])
-            driven = np.einsum("klm,ml->k", gains @ B, control)
+            driven = np.einsum("klm,ml->k", self._through(gains, B), control)
             support = self._support(free, gains, W, times[part], directions[part], parameters[part])
             result[part] = free @ self.response.initial_state + driven + support
         return result
@@ -189,15 +194,17 @@ class WorstCase:
         """``sigma (k, r)`` at one parameter, for all ``times (k,)`` and ``directions (r, d)``; by the age of the pieces
         where the grid allows."""
         model, (k, r) = self.disturbance, (times.size, directions.shape[0])
-        if model is not None and (model.kind == "measurable" or not (self.response.uniform and model.by_piece)):
+        changes = self.response.grid.mode is not None
+        aged = model is None or (model.kind != "measurable" and self.response.uniform and model.by_piece)
+        if changes or not aged:
             every = np.broadcast_to(parameter, (k * r, parameter.size))
             return self.offsets(np.repeat(times, r), np.tile(directions, (k, 1)), every).reshape(k, r)
         sigma = np.zeros((k, r))
         if model is not None:
-            known = frozen(self.response.system, self.response.grid, self.response.initial_state, parameter)
+            known = frozen(self.response.system.modes[0], self.response.grid, self.response.initial_state, parameter)
             sigma = DisturbanceSupport(known, model, directions).at(times, np.zeros((k, r, 0)))[0][:, :, 0]
         if self.initial is not None:
-            flows = transitions(self.response.system.matrices(parameter[None])[0][0], times)[0]
+            flows = transitions(self.response.system.modes[0].matrices(parameter[None])[0][0], times)[0]
             sigma = sigma + self.initial.support(np.einsum("rd,kde->kre", directions, flows))
         return sigma
 
@@ -246,10 +253,10 @@ class WorstCase:
         at = (np.array([time]), direction[None], parameter[None])
         free, gains, B, W = self.response.adjoint(*at)
         return Parts(
-            float(free[0] @ self.response.initial_state + self.given(gains @ B)[0]),
+            float(free[0] @ self.response.initial_state + self.given(self._through(gains, B))[0]),
             float(self._support(free, gains, W, *at)[0]),
             float(self._begun(free)[0]),
-            None if self.disturbance is None else self.disturbance.worst(gains @ W)[0],
+            None if self.disturbance is None else self.disturbance.worst(self._through(gains, W))[0],
             None if self.initial is None else self.initial.support_point(free)[0],
         )
 
@@ -307,7 +314,7 @@ class WorstCase:
         self,
         free: Float[Array, "k d"],
         gains: Float[Array, "k L d"],
-        W: Float[Array, "k d mw"],
+        W: Float[Array, "k d wj"],
         times: Float[Array, " k"],
         directions: Float[Array, "k d"],
         parameters: Float[Array, "k nu"],
@@ -317,12 +324,15 @@ class WorstCase:
             return begun
         if self.disturbance.kind == "measurable":
             return begun + self.measurable(times, directions, parameters)
-        return begun + self.disturbance.support(gains @ W)
+        return begun + self.disturbance.support(self._through(gains, W))
 
     @shaped
     def _begun(self, free: Float[Array, "k d"]) -> Float[Array, " k"]:
         """What the worst initial state adds to functionals with the weights ``free (k, d)`` on it."""
         return np.zeros(free.shape[0]) if self.initial is None else self.initial.support(free)
+
+    def _through(self, gains: Array, matrices: Array) -> Array:
+        return self.response.grid.through(gains, matrices)
 
     @cached_property
     def _gives(self) -> bool:

@@ -12,7 +12,7 @@ import numpy as np
 from sparserob_core.control.enclosures.combination import Combination
 from sparserob_core.control.enclosures.comparison import block_norms, product
 from sparserob_core.control.enclosures.taylor import TaylorSpace
-from sparserob_core.control.response.disturbance_support import over_faces, summed
+from sparserob_core.control.response.disturbance_support import Carried, carried, over_faces, summed
 from sparserob_core.control.response.lifted import KNOWN, LiftedSystem
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -123,6 +123,8 @@ class InitialSupport:
         lifted = self.lifted
         sizes, remainder = lifted.row_bounds(self.rows)
         pushed = remainder @ self._sizes + sizes.sum(axis=2) @ self._slack
+        if self._carried is not None:
+            pushed = pushed + np.einsum("rlaj,aj->rl", sizes, lifted.spilt(self._carried.sizes))
         return np.asarray(np.maximum.reduceat(pushed, lifted.ends[:-1], axis=1))
 
     @cached_property
@@ -148,8 +150,31 @@ class InitialSupport:
 
     def _parts(self, rows: Array) -> Array:
         """Lifted rows ``(k, r, M d)`` as Taylor coefficients of weights on the deviation ``(k, r, M, d)``."""
-        parts = rows.reshape(*rows.shape[:2], self.lifted.space.size, self.lifted.states)
-        return np.asarray(parts @ self.lifted.decoupling.inverse.astype(float))
+        space = self.lifted.space
+        parts = rows.reshape(*rows.shape[:2], space.size, self.lifted.states)
+        if self._carried is None:
+            return np.asarray(parts @ self.lifted.decoupling.inverse.astype(float))
+        found, effect = np.zeros((*parts.shape[:-1], self.set.dimension)), self._carried.effect
+        for left, right, target in zip(*space.products, strict=True):
+            found[..., target, :] += parts[..., right, :] @ effect[left]
+        return found
+
+    @property
+    def _carried(self) -> Carried | None:
+        """What a deviation made of the state before a later leg begins, ``effect (M, d, d)``."""
+        past = self.lifted.past
+        if past is None:
+            return None
+        known = past.carried.get(id(self.set))
+        if not isinstance(known, Carried):
+            d = past.turn.shape[0]
+            ended = InitialSupport(past.lifted, self.set, np.eye(d))
+            far = self.set.reach(np.eye(self.set.dimension))
+            old = ended.blocks(past.lifted.grid.breakpoints[-1:])[0]  # (d, M, d)
+            known = past.carried[id(self.set)] = carried(
+                past, self.set, old, np.abs(old) @ far, ended._gains[-1], ended.neglected[:, -1]
+            )
+        return known
 
     def _lifted_rows(self, times: Array) -> Array:
         """The lifted functionals that ``c'x(t)`` are of the state at time 0, ``(k, r, M d)``."""
@@ -173,12 +198,17 @@ class InitialSupport:
     @cached_property
     def _sizes(self) -> Array:
         """Norms of every block of the coordinates of any deviation, at most, ``(q,)``."""
+        if self._carried is not None:
+            return self._carried.reached
         far = self.set.reach(np.eye(self.set.dimension))
         return block_norms(np.abs(self.lifted.decoupling.inverse).astype(float) @ far, self.lifted.starts) + self._slack
 
     @cached_property
     def _slack(self) -> Array:
-        """What the rounding of the coordinates may change of every block of a deviation, at most, ``(q,)``."""
+        """What the rounding of the coordinates may change of every block of a deviation, at most, ``(q,)``; at the
+        beginning of a later leg what the Taylor models leave out."""
+        if self._carried is not None:
+            return self._carried.left_out
         inverse = self.lifted.decoupling
         far = self.set.reach(np.eye(self.set.dimension))
         if inverse.is_identity:

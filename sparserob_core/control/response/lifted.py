@@ -9,7 +9,7 @@ system is the case ``M = 1`` without truncation.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -28,6 +28,7 @@ from sparserob_core.control.enclosures.comparison import (
     block_sizes,
     comparison_matrix,
     finite,
+    product,
 )
 from sparserob_core.control.enclosures.decoupling import (
     Decoupling,
@@ -38,7 +39,7 @@ from sparserob_core.control.enclosures.decoupling import (
 )
 from sparserob_core.control.enclosures.matrix_exponential import Transitions, rounding
 from sparserob_core.control.enclosures.taylor import TaylorSpace
-from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.problem.system import LinearSystem, System
 from sparserob_core.control.response.response import Response, TimeGrid
 from sparserob_core.sip.convex_set import Array
 
@@ -51,12 +52,39 @@ PATHS_KEPT = 4
 
 
 @dataclass(frozen=True, eq=False)
+class Past:
+    """What went before a leg of a system that changes: the ``lifted`` leg before it, and ``turn (d, d)``, which takes
+    its coordinates to the new ones, within ``slip (d, d)`` entry by entry. ``starts (q,)``: where the blocks of the new
+    ones begin. ``carried`` remembers what the disturbance made of the state."""
+
+    lifted: LiftedSystem
+    turn: Array
+    slip: Array
+    starts: np.ndarray
+    carried: dict[int, object] = field(default_factory=dict, repr=False)
+
+    @cached_property
+    def blocks(self) -> Array:
+        """Norm bounds ``(q, q')`` of the blocks of ``turn``: from norms of the old blocks to those of the new ones."""
+        squares = np.add.reduceat((np.abs(self.turn) + self.slip) ** 2, self.starts, axis=0)
+        return np.asarray(
+            np.sqrt(np.add.reduceat(squares, self.lifted.starts, axis=1)) * (1.0 + rounding(squares.size))
+        )
+
+    def rounded(self, sizes: Array) -> Array:
+        """What the turn may be off by, ``(q,)``, for vectors whose entries are at most ``sizes (d,)``."""
+        lost = (self.slip + rounding(self.turn.shape[0]) * np.abs(self.turn)) @ sizes
+        return np.asarray(block_norms(lost, self.starts))
+
+
+@dataclass(frozen=True, eq=False)
 class LiftedSystem:
     """The Taylor models of a system over the cell ``centre +- radius`` (``(nu,)`` each) on a time grid, in the
     coordinates ``x = T z`` of a `Decoupling` with ``q`` blocks.
 
     ``A (M, d, d)``, ``B (M, d, m)``, ``W (M, d, mw)`` are coefficients; ``slack_A (q, q)``, ``slack_B (q, m)``,
     ``slack_W (q, mw)``, ``slack_x (q,)`` bound, block by block, what they and ``initial_state`` leave out.
+    ``past``: of a later leg of a system that changes, where it begins instead, which is then time 0.
     """
 
     space: TaylorSpace
@@ -70,6 +98,12 @@ class LiftedSystem:
     slack_B: Array
     slack_W: Array
     slack_x: Array
+    past: Past | None = None
+
+    @property
+    def first(self) -> int:
+        """How many pieces went before this leg."""
+        return 0 if self.past is None else self.past.lifted.first + self.past.lifted.grid.pieces
 
     @property
     def transform(self) -> Array:
@@ -132,6 +166,7 @@ class LiftedSystem:
             np.repeat(self.grid.disturbance_piece, counts),
             self.grid.before,
             self.grid.constants,
+            elapsed=self.grid.elapsed,
         )
 
     @cached_property
@@ -181,23 +216,50 @@ class LiftedSystem:
     def state_remainder(self, control: Array) -> tuple[Array, Array]:
         """Norm bounds ``(L, q)``, per piece and block, of the part of the state that the Taylor models leave out,
         rounding included; and of the Taylor models themselves, summed over their coefficients."""
+        return self._left_out(control)[:2]
+
+    def _left_out(self, control: Array) -> tuple[Array, Array, Array]:
+        """`state_remainder`, and the first of them at the end, ``(q,)``; remembered."""
+        key = control.tobytes()
+        if key not in self._remainders:
+            remember(self._remainders, key, self._remainder(control), PATHS_KEPT)
+        return self._remainders[key]
+
+    @cached_property
+    def _remainders(self) -> dict[bytes, tuple[Array, Array, Array]]:
+        return {}
+
+    def _remainder(self, control: Array) -> tuple[Array, Array, Array]:
         inputs = self.fine.inputs(control)
-        driven = inputs.T @ self.forward.system.matrices(KNOWN)[1][0].T
+        driven = inputs.T @ self.forward.steps(KNOWN).B[0].T
         nodes = self._path(control)[None]
         sizes = self._sizes(nodes, driven, rows=False)
         drive = (self.slack_B @ np.abs(inputs)).T[None]
         pushed = block_norms((np.abs(self.B).sum(axis=0) @ np.abs(inputs)).T, self.starts)
-        neglected = self._neglected(nodes, sizes, pushed, drive, self.slack_x[None], rows=False)[0]
+        neglected, end = self._neglected(nodes, sizes, pushed, drive, self._slack(control)[None], rows=False)
         first = self.ends[:-1]
-        left_out: Array = np.maximum.reduceat(neglected, first, axis=0)
-        return left_out, np.maximum.reduceat(sizes[0].sum(axis=1), first, axis=0)
+        left_out: Array = np.maximum.reduceat(neglected[0], first, axis=0)
+        return left_out, np.maximum.reduceat(sizes[0].sum(axis=1), first, axis=0), end[0]
+
+    def _slack(self, control: Array) -> Array:
+        """What the Taylor models leave out at time 0, ``(q,)``."""
+        if self.past is None:
+            return self.slack_x
+        before, ended = self.past.lifted, np.abs(self.past.lifted.nodes(control)[-1]).sum(axis=0)
+        return np.asarray(
+            product(self.past.blocks, before._left_out(control)[2][:, None])[:, 0] + self.past.rounded(ended)
+        )
 
     def _path(self, control: Array) -> Array:
         """Taylor coefficients of the state at the breakpoints of the fine grid, remembered: all directions of a cell
         share them."""
         key = control.tobytes()
         if key not in self._paths:
-            states = self.forward.states(control, KNOWN)[0]
+            forward = self.forward
+            if self.past is not None:
+                ended = self.past.lifted.nodes(control)[-1]
+                forward = forward.from_state((ended @ self.past.turn.T).ravel())
+            states = forward.states(control, KNOWN)[0]
             remember(self._paths, key, states.reshape(-1, self.space.size, self.states), PATHS_KEPT)
         return self._paths[key]
 
@@ -212,7 +274,7 @@ class LiftedSystem:
         nodes = self.row_nodes(directions)
         sizes = self._sizes(nodes, np.zeros(1), rows=True)
         still = np.zeros((1, 1, self.starts.size))
-        return sizes, self._neglected(nodes, sizes, still[0], still, np.zeros((1, self.starts.size)), rows=True)
+        return sizes, self._neglected(nodes, sizes, still[0], still, np.zeros((1, self.starts.size)), rows=True)[0]
 
     def row_nodes(self, directions: Array) -> Array:
         """Taylor coefficients ``(r, L'+1, M, d)`` of ``c'e^{A(p) s}`` at the breakpoints ``s`` of the fine grid."""
@@ -268,8 +330,11 @@ class LiftedSystem:
     def _majorised(self) -> dict[bool, tuple[Array, Array]]:
         return {}
 
-    def _neglected(self, nodes: Array, sizes: Array, driven: Array, extra: Array, start: Array, rows: bool) -> Array:
-        """Gronwall: ``|e|' <= M |e| + residual`` block by block, ``(r, L', q)``, from ``|e(0)| <= start (r, q)``.
+    def _neglected(
+        self, nodes: Array, sizes: Array, driven: Array, extra: Array, start: Array, rows: bool
+    ) -> tuple[Array, Array]:
+        """Gronwall: ``|e|' <= M |e| + residual`` block by block, ``(r, L', q)``, from ``|e(0)| <= start (r, q)``; and
+        at the end, ``(r, q)``.
 
         The residual of the truncation is bounded on every fine piece by the ``sizes (r, L', M, q)`` of the
         coefficients, and by ``extra (r, L', q)``. Every piece adds what the slack of ``A`` and rounding make of what
@@ -303,7 +368,7 @@ class LiftedSystem:
         for piece in range(lengths.size):
             bounds[:, piece] = bound
             bound = bound @ flow[piece].T + added[:, piece]
-        return np.asarray(_by_piece(peak, bounds) + pushed + within + largest)
+        return np.asarray(_by_piece(peak, bounds) + pushed + within + largest), np.asarray(bound)
 
     def _rounded(self, reached: Array, driven: Array, rows: bool) -> tuple[Array, Array]:
         """What rounding changes over every fine piece and within it, at most, ``(r, L', q)`` each, where block norms
@@ -360,6 +425,22 @@ def lift(system: LinearSystem, grid: TimeGrid, initial_state: Array, centre: Arr
         _row_sizes(driven[1][1].sum(axis=0) + slack @ slack_W, basis.starts),
         block_norms(state[1][:, 0], basis.starts),
     )
+
+
+def lift_legs(
+    system: System, grid: TimeGrid, initial_state: Array, centre: Array, radius: Array
+) -> tuple[LiftedSystem, ...]:
+    """The lifted systems of the modes that take turns, each from where it begins; one for a system that stays."""
+    if grid.mode is None:
+        return (lift(system.modes[0], grid, initial_state, centre, radius),)
+    legs: list[LiftedSystem] = []
+    for number, mode in enumerate(system.modes):
+        leg = lift(mode, grid.leg(number), initial_state, centre, radius)
+        if legs:
+            turn, slip = leg.decoupling.vector(legs[-1].transform)
+            leg = replace(leg, past=Past(legs[-1], turn, slip, leg.starts))
+        legs.append(leg)
+    return tuple(legs)
 
 
 def _row_sizes(entries: Array, starts: np.ndarray) -> Array:

@@ -56,7 +56,7 @@ class MeasurableSupport:
     ) -> Float[Array, " k"]:
         unique, which = np.unique(directions, axis=0, return_inverse=True)
         which = which.reshape(-1)
-        A, _, E = self.response.system.matrices(parameter[None])
+        A, _, E = self.response.system.modes[0].matrices(parameter[None])
         tables = self._known(A[0], E[0], unique, parameter)
         grid = self.response.grid
         pieces = grid.locate(times)

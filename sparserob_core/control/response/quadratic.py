@@ -72,25 +72,25 @@ def nominal_pieces(problem: OptimalControlProblem, breakpoints: Array) -> Nomina
     system, (state, _, final) = problem.system, problem.cost.terms
     d, m, horizon = system.states, system.controls, float(breakpoints[-1])
     given = np.zeros(m) if problem.initial_control is None else np.asarray(problem.initial_control, dtype=float)
-    grid = merge_grids(breakpoints, np.array([0.0, horizon]), system.delay, given, int(system.c is not None))
+    ends, constants = np.array([0.0, horizon]), int(system.c is not None)
+    grid = merge_grids(breakpoints, ends, system.delay, given, constants, system.switches)
     parameter = np.zeros(0) if system.parameters is None else nominal_point(system.parameters)
-    A, B, E = (matrix[0] for matrix in system.forced.matrices(parameter[None]))
+    modes = [[matrix[0] for matrix in mode.matrices(parameter[None])] for mode in system.forced.modes]
     reference = np.zeros(d) if state is None else state.reference
-    drift = A @ reference + B[:, m:].sum(axis=1)
-    if problem.disturbance is not None:
-        drift = drift + E @ nominal_point(problem.disturbance)
+    noise = np.zeros(system.disturbances) if problem.disturbance is None else nominal_point(problem.disturbance)
     M = np.zeros((d + 1 + m, d + 1 + m))
     if state is not None:
         M[:d, :d] = state.Q
-    decided = grid.control_piece >= 0
+    decided, mode = grid.control_piece >= 0, np.zeros(grid.pieces) if grid.mode is None else grid.mode
     kinds, which = np.unique(
-        np.column_stack([np.round(grid.lengths / horizon, 13), decided]), axis=0, return_inverse=True
+        np.column_stack([np.round(grid.lengths / horizon, 13), decided, mode]), axis=0, return_inverse=True
     )
     which = which.reshape(-1)
     means = np.bincount(which, grid.lengths) / np.bincount(which)  # the rounding of equal pieces must not add up
     flows, weights = [], []
-    for length, acting in zip(means, kinds[:, 1], strict=True):
-        F = np.zeros_like(M)
+    for length, (_, acting, number) in zip(means, kinds, strict=True):
+        F, (A, B, E) = np.zeros_like(M), modes[int(number)]
+        drift = A @ reference + B[:, m:].sum(axis=1) + E @ noise
         F[:d, :d], F[:d, d] = A, drift if acting else drift + B[:, :m] @ given
         F[:d, d + 1 :] = B[:, :m] if acting else 0.0
         flow, weight = _integrated(F, M, float(length))

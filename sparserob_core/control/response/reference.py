@@ -82,7 +82,7 @@ class Direct:
 
     def on(self, start: Array, stop: Array) -> Array:
         """``G u`` on cells ``[start, stop]`` (``(k,)``), ``(k, r)``."""
-        piece = np.searchsorted(self.dictionary.breakpoints, stop) - 1
+        piece = np.searchsorted(self.dictionary.breakpoints, (start + stop) / 2) - 1
         return (self.G @ self.control[:, np.clip(piece, 0, self.dictionary.pieces - 1)]).T
 
     @property

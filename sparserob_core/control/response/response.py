@@ -8,14 +8,16 @@ On every piece of the merged time grid the inputs are constant, so the state fol
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
-from sparserob_core.control.enclosures.matrix_exponential import Transitions, transitions
-from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.enclosures.matrix_exponential import EPSILON, Transitions, transitions
+from sparserob_core.control.problem.system import System
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 
@@ -31,7 +33,9 @@ class TimeGrid:
 
     ``breakpoints (L+1,)``; ``control_piece (L,)`` and ``disturbance_piece (L,)``: which piece of each dictionary acts
     on a piece of the grid; -1 where the control ``before (m,)`` still does. ``constants``: columns of ``B`` beyond
-    those of the control, whose input is always 1 (a drift).
+    those of the control, whose input is always 1 (a drift). ``mode (L,)``: which of several systems that take turns
+    acts; ``None`` where there is one. ``elapsed``: what went before the time that is called 0 here, where that is a
+    later one.
     """
 
     breakpoints: Array
@@ -39,6 +43,8 @@ class TimeGrid:
     disturbance_piece: np.ndarray
     before: Array | None = None
     constants: int = 0
+    mode: np.ndarray | None = None
+    elapsed: float = 0.0
 
     @property
     def pieces(self) -> int:
@@ -60,6 +66,46 @@ class TimeGrid:
         if self.before is not None:
             acting = np.where(self.control_piece >= 0, acting, self.before[:, None])
         return np.vstack([acting, np.ones((self.constants, self.pieces))]) if self.constants else acting
+
+    @cached_property
+    def turns(self) -> list[slice]:
+        """The pieces on which every mode acts, one mode after another."""
+        if self.mode is None:
+            return [slice(0, self.pieces)]
+        ends = np.searchsorted(self.mode, np.arange(int(self.mode[-1]) + 2))
+        return [slice(int(start), int(stop)) for start, stop in pairwise(ends)]
+
+    def through(self, gains: Array, matrices: Array) -> Array:
+        """``gains @ matrices``: weights ``(..., L, d)`` on what drives every piece as weights ``(..., L, m)`` on its
+        inputs; ``matrices (..., d, J m)`` are those of the ``J`` modes side by side."""
+        if self.mode is None:
+            return np.asarray(gains @ matrices)
+        parts = np.split(matrices, len(self.turns), axis=-1)
+        return np.concatenate(
+            [gains[..., turn, :] @ part for turn, part in zip(self.turns, parts, strict=True)], axis=-2
+        )
+
+    def driven(self, matrices: Array, inputs: Array) -> Array:
+        """What drives every piece, ``(..., L, d)``, from inputs ``(..., m, L)``; as in `through`."""
+        if self.mode is None:
+            return np.asarray(np.swapaxes(matrices @ inputs, -1, -2))
+        parts = np.split(matrices, len(self.turns), axis=-1)
+        force = [part @ inputs[..., turn] for turn, part in zip(self.turns, parts, strict=True)]
+        return np.swapaxes(np.concatenate(force, axis=-1), -1, -2)
+
+    def leg(self, mode: int) -> TimeGrid:
+        """The pieces of one mode, in times from where it begins."""
+        turn, breaks = self.turns[mode], self.breakpoints
+        start = float(breaks[turn.start])
+        points = breaks[turn.start : turn.stop + 1] - start
+        acting, pushing = self.control_piece[turn], self.disturbance_piece[turn]
+        return TimeGrid(points, acting, pushing, self.before, self.constants, elapsed=start)
+
+    def refined(self, times: Array) -> TimeGrid:
+        """A grid on other times, ``(T,)`` from 0 to the horizon, that include the breakpoints; its inputs are given on
+        the pieces of this grid."""
+        origin = self.locate((times[:-1] + times[1:]) / 2)
+        return TimeGrid(times, origin, origin, mode=None if self.mode is None else self.mode[origin])
 
     @shaped
     def distinct(self, durations: Float[Array, " k"]) -> tuple[Float[Array, " u"], Int[np.ndarray, " k"]]:
@@ -92,9 +138,10 @@ def merge_grids(
     delay: float = 0.0,
     before: Float[Array, " m"] | None = None,
     constants: int = 0,
+    switches: Sequence[float] = (),
 ) -> TimeGrid:
     """The merged grid of two sets of breakpoints over the same horizon; a control acts later by ``delay``, less than
-    the horizon, and ``before (m,)`` acts until then.
+    the horizon, and ``before (m,)`` acts until then. The mode changes at ``switches``.
 
     A breakpoint of the disturbance that is one of the control's but for rounding is taken for it. Two breakpoints of
     one set are never taken for one, however near they are, so that no piece of either is lost.
@@ -103,20 +150,29 @@ def merge_grids(
     if delay > 0.0:
         begin, horizon = control + delay, float(control[-1])
         control = np.concatenate([[0.0], begin[begin < horizon - SAME_TIME * horizon], [horizon]])
-    after = np.clip(np.searchsorted(control, disturbance), 1, control.size - 1)
-    nearest = np.where(disturbance - control[after - 1] <= control[after] - disturbance, after - 1, after)
-    near = np.abs(disturbance - control[nearest]) <= SAME_TIME * float(control[-1])
-    same = near & (np.diff(np.where(near, nearest, -1), prepend=-1) != 0)  # the first of those near one breakpoint
-    points = np.union1d(control, disturbance[~same])
+    points = _joined(control, disturbance)
+    if switches:
+        points = _joined(points, np.array(switches))
     middles = (points[:-1] + points[1:]) / 2
     acting, pushing = np.searchsorted(begin, middles) - 1, np.searchsorted(disturbance, middles) - 1
-    return TimeGrid(points, acting, pushing, before if delay > 0.0 else None, constants)
+    mode = np.searchsorted(switches, middles) if switches else None
+    return TimeGrid(points, acting, pushing, before if delay > 0.0 else None, constants, mode)
+
+
+def _joined(points: Array, others: Array) -> Array:
+    """Both sets of breakpoints, those of the second that are one of the first but for rounding left out."""
+    after = np.clip(np.searchsorted(points, others), 1, points.size - 1)
+    nearest = np.where(others - points[after - 1] <= points[after] - others, after - 1, after)
+    near = np.abs(others - points[nearest]) <= SAME_TIME * float(points[-1])
+    same = near & (np.diff(np.where(near, nearest, -1), prepend=-1) != 0)  # the first of those near one breakpoint
+    return np.union1d(points, others[~same])
 
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """Matrices at ``v`` parameters and their transitions over whole pieces of ``q`` distinct lengths:
-    ``Phi = e^{A h}`` and ``Gamma = int_0^h e^{A s} ds``, ``(v, q, d, d)`` each."""
+    """Matrices at ``v`` parameters, ``A (v, J, d, d)`` of every mode and ``B``, ``E`` of all modes side by side, and
+    their transitions over whole pieces of ``q`` distinct modes and lengths: ``Phi = e^{A h}`` and
+    ``Gamma = int_0^h e^{A s} ds``, ``(v, q, d, d)`` each."""
 
     A: Array
     B: Array
@@ -135,22 +191,32 @@ class Propagator:
     """What the responses of one system on one time grid share, from whatever initial state: transition matrices, and
     functionals as weights. ``propagate`` takes the place of `transitions` for matrices with a structure."""
 
-    system: LinearSystem
+    system: System
     grid: TimeGrid
     propagate: Transitions | None = None
     _steps: dict[bytes, Steps] = field(default_factory=dict, repr=False)
 
     @cached_property
     def which(self) -> np.ndarray:
-        """Which of the distinct lengths, in the order of `Steps`, every piece has, ``(L,)``."""
-        _, which = np.unique(np.round(self.grid.lengths / self.grid.breakpoints[-1], 13), return_inverse=True)
-        return which
+        """Which of the distinct modes and lengths, in the order of `Steps`, every piece has, ``(L,)``."""
+        lengths = np.round(self.grid.lengths / self.grid.breakpoints[-1], 13)
+        mode = np.zeros(lengths.size) if self.grid.mode is None else self.grid.mode
+        _, which = np.unique(np.stack([mode, lengths]), axis=1, return_inverse=True)
+        return np.asarray(which.reshape(-1))
 
     @cached_property
     def _lengths(self) -> Array:
-        """The distinct lengths ``(q,)``, as means: the rounding must not add up."""
+        """The lengths ``(q,)`` of distinct modes and lengths, as means: the rounding must not add up."""
         means: Array = np.bincount(self.which, self.grid.lengths) / np.bincount(self.which)
         return means
+
+    @cached_property
+    def _modes(self) -> np.ndarray:
+        """The mode ``(q,)`` of every entry of `Steps`."""
+        modes = np.zeros(self._lengths.size, dtype=int)
+        if self.grid.mode is not None:
+            modes[self.which] = self.grid.mode
+        return modes
 
     @shaped
     def steps(self, parameters: Float[Array, "v nu"]) -> Steps:
@@ -158,8 +224,12 @@ class Propagator:
         # no parameters: any number of rows has the same bytes
         key = bytes(str(parameters.shape), "ascii") + parameters.tobytes()
         if key not in self._steps:
-            A, B, E = self.system.matrices(parameters)
-            Phi, Gamma = self._transitions(A[:, None], self._lengths[None, :])
+            every = [mode.matrices(parameters) for mode in self.system.modes]
+            A, B, E = (
+                np.stack([one[0] for one in every], axis=1),
+                *(np.concatenate([one[part] for one in every], axis=2) for part in (1, 2)),
+            )
+            Phi, Gamma = self._transitions(A[:, self._modes], self._lengths[None, :])
             remember(self._steps, key, Steps(A, B, E, Phi, Gamma), STEPS_KEPT)
         return self._steps[key]
 
@@ -170,8 +240,8 @@ class Propagator:
         """The functional ``c'x(t)`` of each index, as weights on the initial state and on what drives every piece.
 
         ``times (k,)``, ``directions (k, d)``, ``parameters (k, nu)`` give ``free (k, d) = e^{A't} c``,
-        ``gains (k, L, d) = int_{piece, s < t} e^{A'(t-s)} c ds``, and the input matrices ``B (k, d, m)``,
-        ``E (k, d, mw)`` at the parameters.
+        ``gains (k, L, d) = int_{piece, s < t} e^{A'(t-s)} c ds``, and the input matrices ``B (k, d, J m)``,
+        ``E (k, d, J mw)`` at the parameters, those of several modes side by side (`TimeGrid.through`).
         """
         unique, which = _unique_rows(parameters)
         steps = self.steps(unique)
@@ -180,7 +250,7 @@ class Propagator:
             return self._adjoint_of_few(steps, times, directions, pieces)
         order = np.argsort(-pieces, kind="stable")
         within = np.clip(times - self.grid.breakpoints[pieces], 0.0, None)
-        Phi, Gamma = self._partial(steps, which, within)
+        Phi, Gamma = self._partial(steps, which, within, pieces)
         d = directions.shape[1]
         rows = np.ascontiguousarray(directions[order], dtype=float)[:, None, :]
         gains = np.zeros((times.size, self.grid.pieces, d))
@@ -209,7 +279,7 @@ class Propagator:
         """`adjoint` of a known system on equal pieces, without a loop over them: what a piece still gives depends on
         its age only."""
         within = np.clip(times - self.grid.breakpoints[pieces], 0.0, None)
-        Phi, Gamma = self._partial(steps, np.zeros_like(pieces), within)
+        Phi, Gamma = self._partial(steps, np.zeros_like(pieces), within, pieces)
         rows = np.einsum("kd,kde->ke", directions, Phi)
         gains = np.zeros((times.size, self.grid.pieces, directions.shape[1]))
         by_age = np.einsum("kd,dle->kle", rows, self.kernel[:, : pieces.max()])
@@ -219,25 +289,26 @@ class Propagator:
         free = np.einsum("kd,kde->ke", rows, self._powers[pieces])
         return free, gains, np.repeat(steps.B, times.size, axis=0), np.repeat(steps.E, times.size, axis=0)
 
-    def _partial(self, steps: Steps, which: np.ndarray, within: Array) -> tuple[Array, Array]:
+    def _partial(self, steps: Steps, which: np.ndarray, within: Array, pieces: np.ndarray) -> tuple[Array, Array]:
         horizon = self.grid.breakpoints[-1]
         shares = np.round(within / horizon, 15)
-        if steps.A.shape[0] == 1:
+        if steps.A.shape[:2] == (1, 1):
             distinct, inverse = np.unique(shares, return_inverse=True)
-            Phi, Gamma = self._transitions(steps.A, distinct * horizon)
+            Phi, Gamma = self._transitions(steps.A[:, 0], distinct * horizon)
         else:
-            pairs, inverse = np.unique(np.stack([which, shares]), axis=1, return_inverse=True)
-            Phi, Gamma = self._transitions(steps.A[pairs[0].astype(int)], pairs[1] * horizon)
+            modes = np.zeros_like(which) if self.grid.mode is None else self.grid.mode[pieces]
+            cases, inverse = np.unique(np.stack([which, modes, shares]), axis=1, return_inverse=True)
+            Phi, Gamma = self._transitions(steps.A[cases[0].astype(int), cases[1].astype(int)], cases[2] * horizon)
         return Phi[inverse.reshape(-1)], Gamma[inverse.reshape(-1)]
 
     @property
     def uniform(self) -> bool:
-        """Whether all pieces of the grid are equally long."""
+        """Whether all pieces of the grid are equally long, and of one mode."""
         return bool(self._lengths.size == 1)
 
     def flows(self, durations: Array) -> tuple[Array, Array]:
         """``e^{A r}`` and its integral ``(k, d, d)`` for durations ``(k,)``; for a known system."""
-        return self._transitions(self.steps(np.zeros((1, 0))).A[0], durations)
+        return self._transitions(self.steps(np.zeros((1, 0))).A[0, 0], durations)
 
     def _transitions(self, A: Array, durations: Array) -> tuple[Array, Array]:
         return (self.propagate or transitions)(A, durations)
@@ -253,7 +324,7 @@ class Propagator:
         and equal pieces, whose response is a convolution (a Toeplitz matrix) with this kernel. ``(d, L, d)``, so that
         products with rows run through memory."""
         steps = self.steps(np.zeros((1, 0)))
-        powers = np.empty((self.grid.pieces, *steps.A.shape[1:]))
+        powers = np.empty((self.grid.pieces, *steps.A.shape[2:]))
         powers[0] = steps.Gamma[0, 0]
         doublings = 2 ** np.arange((self.grid.pieces - 1).bit_length())  # e^{A (done + i) h} = e^{A done h} e^{A i h}
         for done, leap in zip(doublings.tolist(), self.flows(doublings * self._lengths[0])[0], strict=True):
@@ -265,8 +336,8 @@ class Propagator:
     def lateness(self) -> tuple[float, float]:
         """How far durations that are used may be from those that are meant: of pieces, where nearly equal ones are
         taken for equal, and within a piece, where they are rounded (`TimeGrid.distinct`)."""
-        unequal = np.abs(self.grid.lengths - self._lengths[self.which]).max()
-        return float(unequal), float(SAME_DURATION * self.grid.breakpoints[-1])
+        unequal, elapsed = np.abs(self.grid.lengths - self._lengths[self.which]).max(), self.grid.elapsed
+        return float(unequal + EPSILON * elapsed), float(SAME_DURATION * (self.grid.breakpoints[-1] + elapsed))
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,7 +348,7 @@ class Response:
     (`from_state`) share.
     """
 
-    system: LinearSystem
+    system: System
     grid: TimeGrid
     initial_state: Array
     propagate: Transitions | None = None
@@ -348,13 +419,9 @@ class Response:
         """
         steps = self.steps(parameters)
         count = max(part.shape[0] for part in (parameters, disturbance, deviations) if part is not None)
-        drive = np.einsum("vdm,ml->vld", steps.B, self.grid.inputs(control))
+        drive = self.grid.driven(steps.B, self.grid.inputs(control))
         if disturbance is not None:
-            drive = drive + np.einsum(
-                "vdi,vil->vld",
-                np.broadcast_to(steps.E, (count, *steps.E.shape[1:])),
-                disturbance[:, :, self.grid.disturbance_piece],
-            )
+            drive = drive + self.grid.driven(steps.E, disturbance[:, :, self.grid.disturbance_piece])
         path = np.empty((count, self.grid.pieces + 1, self.initial_state.size))
         path[:, 0] = self.initial_state if deviations is None else self.initial_state + deviations
         shared, lengths = steps.Phi.shape[0] == 1, self.which.tolist()

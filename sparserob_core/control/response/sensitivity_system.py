@@ -14,7 +14,7 @@ import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.taylor import TaylorSpace
-from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.response import Response
 from sparserob_core.errors import NotEnclosable
@@ -36,16 +36,22 @@ def tangent(response: Response) -> Response:
     system, blocks = response.system, 1 + response.system.parameter_count
     if blocks == 1:
         return response
+    modes = [_larger(mode) for mode in system.modes]
+    ends = (*system.switches, float(response.grid.breakpoints[-1]))
+    larger = modes[0] if len(modes) == 1 else SwitchedSystem(list(zip(ends, modes, strict=True)))
+    return Response(
+        larger, response.grid, np.concatenate([response.initial_state, np.zeros((blocks - 1) * system.states)])
+    )
+
+
+def _larger(system: LinearSystem) -> LinearSystem:
     at = Derivatives(system)
-    larger = LinearSystem(
+    return LinearSystem(
         lambda p: _acting_on_rows(at(p)[0]),
         lambda p: np.concatenate(at(p)[1]),
         lambda p: np.concatenate(at(p)[2]),
         parameters=system.parameters,
         names=system.names,
-    )
-    return Response(
-        larger, response.grid, np.concatenate([response.initial_state, np.zeros((blocks - 1) * system.states)])
     )
 
 

@@ -78,7 +78,7 @@ def worst_signal(functionals: WorstCase, time: float, direction: Array, paramete
     grid, model = functionals.response.grid, functionals.disturbance
     if model is None or model.kind != "measurable":
         return grid.breakpoints, functionals.worst_disturbance(time, direction, parameter)
-    A, _, W = (matrix[0] for matrix in functionals.response.system.matrices(parameter[None]))
+    A, _, W = (matrix[0] for matrix in functionals.response.system.modes[0].matrices(parameter[None]))
     starts = np.concatenate(
         [
             left + (right - left) * np.arange(PARTS) / PARTS

@@ -119,6 +119,11 @@ class Horizons:
                 "of: horizon: a delay is no share of the horizon, so that nothing can be proven of an interval of"
                 " horizons; expected a problem without system.delay"
             )
+        if len(self.problem.system.modes) > 1:
+            raise InputError(
+                "of: horizon: the times at which a system changes are no shares of the horizon, so that nothing can be"
+                " proven of an interval of horizons; expected a problem without system.pieces"
+            )
         if not self.control.is_complete:
             raise InputError(
                 "of: horizon: the control's dictionary has fewer functions than pieces; expected one that takes any"
@@ -156,7 +161,7 @@ class Horizons:
     def _lifted(self, parameter: Array, low: float, high: float) -> LiftedSystem:
         """The system at one parameter in the time ``s``, over the horizons of an interval."""
         at = (parameter / self._units.parameters)[None]
-        A, B, E = (matrix[0] for matrix in self._own.system.forced.matrices(at))
+        A, B, E = (matrix[0] for matrix in self._own.system.forced.modes[0].matrices(at))
         scaled = LinearSystem(
             lambda T: A * T[0],
             lambda T: B * T[0],

@@ -19,8 +19,8 @@ def fine_times(response: Response, parameters: ParameterIndex, more: Array) -> A
     """The breakpoints, ``more (k,)`` times, and times inside every piece: three of them, or more where the system moves
     on it; ``(T,)``."""
     grid = response.grid
-    A, _, _ = response.system.matrices(parameters.lattice()[0])
-    rate = float(np.linalg.norm(A, axis=(1, 2)).max())
+    points = parameters.lattice()[0]
+    rate = max(float(np.linalg.norm(mode.matrices(points)[0], axis=(1, 2)).max()) for mode in response.system.modes)
     counts = np.clip(np.ceil(rate * grid.lengths / SMOOTH), INSIDE + 1, MOST_INSIDE).astype(int)
     inside = np.concatenate(
         [
@@ -34,8 +34,7 @@ def fine_times(response: Response, parameters: ParameterIndex, more: Array) -> A
 def finer(grid: TimeGrid, times: Array) -> TimeGrid:
     """A grid on other times, ``(T,)`` from 0 to the horizon, that include the breakpoints; its inputs are given on the
     pieces of ``grid``."""
-    origin = grid.locate((times[:-1] + times[1:]) / 2)
-    return TimeGrid(times, origin, origin)
+    return grid.refined(times)
 
 
 def walk(
@@ -52,20 +51,24 @@ def walk(
     ``parameters (n, nu)``: the variation of constants over each piece, in which both inputs are constant.
     """
     grid = response.grid
-    A, B, W = (
-        np.moveaxis(matrix, 0, -1) if parameters.shape[1] else matrix[0]
-        for matrix in response.system.matrices(parameters if parameters.shape[1] else parameters[:1])
-    )
+    modes = [
+        [np.moveaxis(matrix, 0, -1) if parameters.shape[1] else matrix[0] for matrix in mode.matrices(points)]
+        for points in [parameters if parameters.shape[1] else parameters[:1]]
+        for mode in response.system.modes
+    ]
     signal = None if disturbances is None else np.ascontiguousarray(disturbances.transpose(2, 1, 0))
     lengths, which = grid.distinct(grid.lengths)
-    flows, integrals = _transitions(A, lengths)
     state = np.repeat(response.initial_state[:, None], parameters.shape[0], axis=1)
     if initial_states is not None:
         state = np.ascontiguousarray(initial_states.T)
     yield state
-    before, sigma = (-1, -1, -1), np.zeros(0)
+    before, sigma, mode = (-1, -1, -1, -1), np.zeros(0), -1
     for piece in range(grid.pieces):
-        inputs = (int(which[piece]), int(grid.control_piece[piece]), int(grid.disturbance_piece[piece]))
+        acting = 0 if grid.mode is None else int(grid.mode[piece])
+        if acting != mode:
+            mode, (A, B, W) = acting, modes[acting]
+            flows, integrals = _transitions(A, lengths)
+        inputs = (int(which[piece]), int(grid.control_piece[piece]), int(grid.disturbance_piece[piece]), mode)
         if inputs != before:
             drive = _times(B, control[:, inputs[1], None])
             sigma, before = (

@@ -32,10 +32,10 @@ def rough_units(problem: OptimalControlProblem) -> Units:
         disturbances = power_of_two(extent(bound))
     index = ParameterIndex(system.parameters)
     parameters = np.ones(0) if system.parameters is None else power_of_two(_widths(system.parameters))
-    A, B, E = (np.abs(matrix) for matrix in system.forced.matrices(looked_at(index)))
-    A, B, E = A.max(axis=0), B.max(axis=0), E.max(axis=0)
+    every = [mode.matrices(looked_at(index)) for mode in system.forced.modes]
+    A, B, E = (np.abs(np.concatenate([one[part] for one in every])).max(axis=0) for part in range(3))
     # a fast system is coupled through for a time of about 1/norm only; the eigenvalues do not depend on the units
-    fastest = float(np.abs(np.linalg.eigvals(system.matrices(looked_at(index))[0])).max())  # LAPACK balances
+    fastest = max(float(np.abs(np.linalg.eigvals(one[0])).max()) for one in every)  # LAPACK balances
     lasting = float(power_of_two(np.array(min(time, 1.0 / fastest if fastest > 0.0 else np.inf))))
     inputs = controls if problem.initial_control is None else np.maximum(controls, np.abs(problem.initial_control))
     inputs = np.concatenate([inputs, np.ones(B.shape[1] - inputs.size)])  # that of a drift is 1
@@ -148,7 +148,7 @@ def reaches(
     for begin in range(0, at.size, size):
         part = slice(begin, begin + size)
         free, gains, B, W = functionals.response.adjoint(at[part], directions[part], p[part])
-        every = gains @ B
+        every = functionals.response.grid.through(gains, B)
         on_control, known = functionals.decided(every), functionals.given(every)
         rest = free @ functionals.response.initial_state + known
         up[part], down[part] = (
@@ -164,7 +164,7 @@ def reaches(
             down[part] += initial.support(-free)
             added[part] += np.abs(free) @ extent(initial)
         if model is not None:
-            on_noise = gains @ W
+            on_noise = functionals.response.grid.through(gains, W)
             up[part] += model.support(on_noise)
             down[part] += model.support(-on_noise)
             added[part] += np.abs(on_noise @ np.diag(extent(model.bound))).sum(axis=(1, 2))

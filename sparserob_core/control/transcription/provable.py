@@ -6,7 +6,7 @@ import numpy as np
 
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.problem.system import System
 from sparserob_core.control.response.functional import WITHOUT_PROOF
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.sets.sets import Equality
@@ -39,7 +39,8 @@ def unprovable(problem: OptimalControlProblem) -> str | None:
     box = ParameterIndex(parameters).box
     try:
         space = TaylorSpace(problem.system.parameter_count, 1)
-        problem.system.forced.taylor(space, parameters.interior_point(), TINY * (box.upper - box.lower) / 2)
+        for mode in problem.system.forced.modes:
+            mode.taylor(space, parameters.interior_point(), TINY * (box.upper - box.lower) / 2)
     except NotEnclosable as error:
         return str(error)
     return None
@@ -61,14 +62,15 @@ def remark(problem: OptimalControlProblem) -> str:
     )
 
 
-def growth(system: LinearSystem, horizon: float) -> float:
+def growth(system: System, horizon: float) -> float:
     """By which power of ``e`` the state can grow over the horizon: the largest real part of an eigenvalue of ``A(p)``,
     at a lattice of parameters, times the horizon; 0 where nothing grows."""
-    A = system.matrices(ParameterIndex(system.parameters).lattice()[0])[0]
-    return max(0.0, float(np.linalg.eigvals(A).real.max()) * horizon)
+    points = ParameterIndex(system.parameters).lattice()[0]
+    rate = max(float(np.linalg.eigvals(mode.matrices(points)[0]).real.max()) for mode in system.modes)
+    return max(0.0, rate * horizon)
 
 
-def hindrance(system: LinearSystem, horizon: float) -> str:
+def hindrance(system: System, horizon: float) -> str:
     """What of a system keeps the bounds of a cell wide however small the cell is, and what would help; empty where it
     is not the system."""
     exponent = growth(system, horizon)

@@ -68,11 +68,12 @@ def _added(model: Transcription, result: Result) -> float:
     sizes = np.abs(free) @ np.abs(model.response.initial_state)
     if model.problem.initial_set is not None:
         sizes += np.abs(free) @ _far(model.problem.initial_set)
-    weights, functionals = gains @ B, model.functionals
+    functionals, grid = model.functionals, model.response.grid
+    weights = grid.through(gains, B)
     sizes += np.einsum("klm,ml->k", np.abs(weights), np.abs(functionals.known))
     sizes += (np.abs(functionals.decided(weights)) @ _far(model.problem.control)).sum(axis=1)
     if model.problem.disturbance is not None:
-        sizes += (np.abs(gains @ E) @ _far(model.problem.disturbance)).sum(axis=1)
+        sizes += (np.abs(grid.through(gains, E)) @ _far(model.problem.disturbance)).sum(axis=1)
     return float(multipliers @ sizes) + besides
 
 

@@ -97,7 +97,9 @@ def _functionals(
     system, before = problem.system.forced, np.zeros(problem.system.controls)
     before = before if problem.initial_control is None else np.asarray(problem.initial_control, dtype=float)
     constants = system.controls - problem.system.controls
-    grid = merge_grids(control.breakpoints, disturbance.breakpoints, problem.system.delay, before, constants)
+    grid = merge_grids(
+        control.breakpoints, disturbance.breakpoints, problem.system.delay, before, constants, system.switches
+    )
     model: DisturbanceModel | None = None
     if problem.disturbance is not None:
         model = disturbance_model(problem.disturbance_class, problem.disturbance, disturbance, grid)
@@ -495,17 +497,19 @@ def _reached(problem: OptimalControlProblem, parameters: ParameterIndex, state: 
         return False
     system, box = problem.system.forced, parameters.box
     try:
-        parts = system.taylor(
-            TaylorSpace(parameters.count, 1), (box.lower + box.upper) / 2, (box.upper - box.lower) / 2
-        )
+        middle, radius = (box.lower + box.upper) / 2, (box.upper - box.lower) / 2
+        every = [mode.taylor(TaylorSpace(parameters.count, 1), middle, radius) for mode in system.modes]
     except NotEnclosable:
         return True
-    uncertain = [np.any(parts[k][1:] != 0, axis=(0, 2)) | np.any(parts[k + 1] != 0, axis=1) for k in (0, 2, 4)]
-    linked = np.any(parts[0] != 0, axis=0) | (parts[1] != 0)
+    counted = (0, 2) if problem.disturbance is None else (0, 2, 4)
+    rows, linked = np.zeros(system.states, dtype=bool), np.zeros((system.states,) * 2, dtype=bool)
+    for parts in every:  # of systems that take turns, whatever any of them links
+        for k in counted:
+            rows |= np.any(parts[k][1:] != 0, axis=(0, 2)) | np.any(parts[k + 1] != 0, axis=1)
+        linked |= np.any(parts[0] != 0, axis=0) | (parts[1] != 0)
     reaching = np.arange(system.states) == state
     for _ in range(system.states):
         reaching = reaching | linked[reaching].any(axis=0)
-    rows = uncertain[0] | uncertain[1] | (uncertain[2] if problem.disturbance is not None else False)
     return bool(rows[reaching].any())
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import keyword
 from collections.abc import Mapping
-from typing import Annotated, Literal, TypeAlias, final
+from typing import Annotated, Any, Literal, TypeAlias, final
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +19,7 @@ from sparserob_core.control.problem.problem import (
     PathConstraint,
     ProblemFactory,
 )
-from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
 from sparserob_core.control.sets.sets import Box, ConvexSet, Equality
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.config.option_kinds import (
@@ -81,9 +81,11 @@ Parameters: TypeAlias = Annotated[
 
 
 @final
-class SystemOptions(Options):
-    """``x'(t) = A(p) x(t) + B(p) u(t - delay) + E(p) w(t) + c(p)``; entries are numbers, or arithmetic expressions in
-    the parameters."""
+class PieceOptions(Options):
+    """What a system is until a known time; entries are numbers, or arithmetic expressions in the parameters."""
+
+    until: float = Field(gt=0.0)
+    """When this piece ends; that of the last one is the horizon."""
 
     A: Rows
     """Square matrix, row by row."""
@@ -92,7 +94,29 @@ class SystemOptions(Options):
     """As many rows as ``A``, one column per control."""
 
     E: Rows | None = None
+    """How the disturbance enters; the identity unless given."""
+
+    c: Annotated[list[Entry], Field(min_length=1)] | None = None
+    """Constant drift, one entry per state; none unless given."""
+
+
+@final
+class SystemOptions(Options):
+    """``x'(t) = A(p) x(t) + B(p) u(t - delay) + E(p) w(t) + c(p)``, or ``pieces`` of such systems that take turns at
+    known times; entries are numbers, or arithmetic expressions in the parameters."""
+
+    A: Rows | None = None
+    """Square matrix, row by row."""
+
+    B: Rows | None = None
+    """As many rows as ``A``, one column per control."""
+
+    E: Rows | None = None
     """How the disturbance enters, one column per component of it; the identity unless given."""
+
+    pieces: Annotated[list[PieceOptions], Field(min_length=1)] | None = None
+    """Instead of ``A``, ``B``, ``E`` and ``c``: systems with their own, each ``until`` a known time; they share the
+    parameters and the delay."""
 
     parameters: Parameters | None = None
     """Intervals ``{name: [lower, upper]}``, or names and a set, as ``{names: [...], polytope: {H: ..., h: ...}}``; none
@@ -120,25 +144,32 @@ class SystemOptions(Options):
             raise InputError(f"a name occurs twice, got {', '.join(given)}", path="system.parameters.names")
         return tuple(given)
 
-    def build(self) -> LinearSystem:
+    def matrices(self) -> list[tuple[str, float | None, Matrices]]:
+        """``A``, ``B``, ``E`` and ``c`` of every piece, with its key and when it ends; of one that has no end where
+        there are no pieces. Raises `InputError` where both are given, or neither."""
+        if self.pieces is None:
+            for key, rows in (("A", self.A), ("B", self.B)):
+                if rows is None:
+                    raise InputError(path=f"system.{key}", expected="a matrix, or pieces of the system", got="none")
+            assert self.A is not None and self.B is not None
+            return [("system", None, (self.A, self.B, self.E, self.c))]
+        for key in ("A", "B", "E", "c"):
+            if getattr(self, key) is not None:
+                raise InputError(path=f"system.{key}", expected="none beside pieces, which have their own", got="both")
+        return [
+            (f"system.pieces.{i}", piece.until, (piece.A, piece.B, piece.E, piece.c))
+            for i, piece in enumerate(self.pieces)
+        ]
+
+    def build(self) -> LinearSystem | SwitchedSystem:
         """The system; raises `InputError` that begins with the key."""
         names = self.names()
-        d = len(self.A)
-        for key, rows in (("A", self.A), ("B", self.B), ("E", self.E)):
-            if rows is not None and len(rows) != d:
-                raise InputError(path=f"system.{key}", expected=f"{d} rows, as A has", got=f"{len(rows)}")
-        if any(len(row) != d for row in self.A):
-            raise InputError(
-                path="system.A",
-                expected=f"a square matrix, {d} numbers in each of its {d} rows",
-                got=f"{[len(row) for row in self.A]}",
-            )
-        A, B = parse_matrix("system.A", self.A, names), parse_matrix("system.B", self.B, names)
-        E = None if self.E is None else parse_matrix("system.E", self.E, names)
-        if self.c is not None and len(self.c) != d:
-            raise InputError(path="system.c", expected=f"{d} entries, one per state", got=f"{len(self.c)}")
-        c = None if self.c is None else parse_column("system.c", self.c, names)
-        return LinearSystem(A, B, E, self._parameter_set(names), names, c, self.delay)
+        parameters, every = self._parameter_set(names), self.matrices()
+        where, until, first = every[0]
+        if until is None:
+            return _system(where, first, parameters, names, self.delay)
+        made = [(float(stop or 0.0), _system(key, of, parameters, names)) for key, stop, of in every]
+        return SwitchedSystem(made, self.delay)
 
     def _parameter_set(self, names: tuple[str, ...]) -> ConvexSet | None:
         if isinstance(self.parameters, ParameterSetOptions):
@@ -265,6 +296,36 @@ class CostOptions(Sparse):
         )
 
 
+Matrices: TypeAlias = tuple[list[list[Any]], list[list[Any]], list[list[Any]] | None, list[Any] | None]
+
+
+def _system(
+    where: str, of: Matrices, parameters: ConvexSet | None, names: tuple[str, ...], delay: float = 0.0
+) -> LinearSystem:
+    A, B, E, c = of
+    d = len(A)
+    for key, rows in (("A", A), ("B", B), ("E", E)):
+        if rows is not None and len(rows) != d:
+            raise InputError(path=f"{where}.{key}", expected=f"{d} rows, as A has", got=f"{len(rows)}")
+    if any(len(row) != d for row in A):
+        raise InputError(
+            path=f"{where}.A",
+            expected=f"a square matrix, {d} numbers in each of its {d} rows",
+            got=f"{[len(row) for row in A]}",
+        )
+    if c is not None and len(c) != d:
+        raise InputError(path=f"{where}.c", expected=f"{d} entries, one per state", got=f"{len(c)}")
+    return LinearSystem(
+        parse_matrix(f"{where}.A", A, names),
+        parse_matrix(f"{where}.B", B, names),
+        None if E is None else parse_matrix(f"{where}.E", E, names),
+        parameters,
+        names,
+        None if c is None else parse_column(f"{where}.c", c, names),
+        delay,
+    )
+
+
 class LinearKeys(ProblemFactory, Options):
     """The keys that problems about a linear system share; what the control is, they say themselves."""
 
@@ -323,7 +384,7 @@ class LinearKeys(ProblemFactory, Options):
             return None
         return self.initial_state.around("initial_state", states)[1]
 
-    def noise(self, system: LinearSystem) -> ConvexSet | None:
+    def noise(self, system: LinearSystem | SwitchedSystem) -> ConvexSet | None:
         """The set of disturbances; raises `InputError`."""
         return None if self.disturbance is None else self.disturbance.build("disturbance", system.disturbances)
 

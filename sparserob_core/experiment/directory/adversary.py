@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sparserob_core.control.response.response import Response, TimeGrid
+from sparserob_core.control.response.response import Response
 from sparserob_core.control.studies.adversary import Adversary, find_adversary
 from sparserob_core.control.studies.simulate import fine_times, finer, walk
 from sparserob_core.control.transcription.record import Transcription
@@ -58,12 +58,12 @@ def propagated(model: Transcription, theta: Array, arrays: Mapping[str, Array]) 
     their own among them."""
     response, control = model.response, model.functionals.on_grid(theta)
     breakpoints = arrays["breakpoints"]
-    which = response.grid.locate((breakpoints[:-1] + breakpoints[1:]) / 2)
-    grid = TimeGrid(breakpoints, which, which)
+    grid = response.grid.refined(breakpoints)
     times = fine_times(Response(response.system, grid, response.initial_state), model.parameters, arrays["times"])
     fine = Response(response.system, finer(grid, times), response.initial_state)
     disturbances = arrays["disturbances"] if arrays["disturbances"].shape[1] else None
-    states = np.stack(list(walk(fine, control[:, which], arrays["parameters"], disturbances, arrays["initial_states"])))
+    acting, begun = control[:, grid.control_piece], arrays["initial_states"]
+    states = np.stack(list(walk(fine, acting, arrays["parameters"], disturbances, begun)))
     return times, np.ascontiguousarray(states.transpose(2, 1, 0))
 
 

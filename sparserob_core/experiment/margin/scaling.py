@@ -111,7 +111,7 @@ def _parameters(problem: OptimalControlProblem) -> Scaling:
         "parameters",
         "factor on the set of parameters",
         "largest",
-        lambda f: replace(problem, system=replace(problem.system, parameters=resized(f))),
+        lambda f: replace(problem, system=problem.system.with_parameters(resized(f))),
         "largest half-width of a parameter",
         _times(_half_width(bound)),
         affine=False,
