@@ -143,13 +143,9 @@ def _tail(size: arb, terms: int) -> arb:
 
 def norm(matrix: arb_mat) -> arb:
     """The Frobenius norm, which bounds the 2-norm."""
-    from flint import arb
-
-    return sum((x * x for x in matrix.entries()), arb(0)).nonnegative_part().sqrt()
+    return (matrix.transpose() * matrix).trace().nonnegative_part().sqrt()
 
 
 def upper(ball: arb) -> arb:
     """The upper end of a ball, as an exact number."""
-    from flint import arb
-
-    return arb(ball.upper())
+    return ball.upper()
