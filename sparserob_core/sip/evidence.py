@@ -154,10 +154,12 @@ class Activity:
     """What is proven of the least count of a program (`SemiInfiniteProgram.activity`) over all feasible decisions, as
     shares of the largest: at least ``lower``, by multipliers ``dual`` of a program of its own or, where that is
     ``None``, by those of the cost; at most ``upper``, the count of the decision that is returned, or of another one,
-    ``decision``, with the ``proofs`` of it; ``None`` where neither is proven."""
+    ``decision``, with the ``proofs`` of it; ``None`` where neither is proven. ``norm``: whether the cost of the program
+    is a sum of absolute values."""
 
     lower: float
     upper: float | None
     dual: Dual | None = None
     decision: Array | None = None
     proofs: Sequence[Proof] = ()
+    norm: bool = True

@@ -12,6 +12,7 @@ import pytest
 
 import sparserob_core as sr
 from tests.known_answers.test_fewest_active import SPRING, integrator, solved
+from tests.support.places import CONFIGS
 
 SPARSEST = {"method": {"name": "sparsest"}}
 LETTERS = {"method": {"name": "sparsest", "alphabet": [-1, 0, 1]}}
@@ -188,3 +189,38 @@ def test_units_change_nothing(tmp_path: Path) -> None:
     other, _ = solved(scaled, 4, tmp_path / "other", dictionaries=UNEVEN, **SPARSEST)
     assert (one.result.cost, one.result.lower_bound) == (other.result.cost, other.result.lower_bound)
     assert other.summary["J"] == 1024.0 * one.summary["J"]
+
+
+@pytest.mark.parametrize("penalty", ["logarithm", "capped"])
+def test_another_penalty_never_acts_more_than_l1_and_claims_what_it_proves(penalty: str, tmp_path: Path) -> None:
+    plain, before = solved(SPRING, 40, tmp_path / "exchange")
+    found, after = solved(SPRING, 40, tmp_path / "other", method={"name": "reweighted", "penalty": penalty})
+    assert found.control is not None
+    assert plain.control is not None
+    assert np.count_nonzero(plain.control) == 7
+    assert np.count_nonzero(found.control) == 6  # which is the least: 0.6356 / 0.125 = 5.08
+    assert (before["lower"], after["upper"]) == (pytest.approx(6 / 40), pytest.approx(6 / 40))
+    assert found.result.cost > plain.result.cost
+    assert found.result.lower_bound == pytest.approx(plain.result.lower_bound, rel=1e-10)
+    assert found.status == "verified"
+
+
+@pytest.mark.slow
+def test_who_reaches_the_fewest_pieces_is_as_the_page_says(tmp_path: Path) -> None:
+    study = sr.sweep(CONFIGS / "studies" / "sparser.yaml", out=tmp_path / "study")
+    counts: dict[str, int] = {}
+    for row in study.table:
+        key = "problem.disturbance.box", "dictionaries.control.pieces"
+        exact = next(
+            other
+            for other in study.table
+            if other["method"] == "sparsest" and all(other[name] == row[name] for name in key)
+        )
+        least = exact["sparsity.fewest_active.upper"]
+        assert exact["sparsity.fewest_active.lower"] == pytest.approx(least)
+        upper, pieces = row["sparsity.fewest_active.upper"], row["dictionaries.control.pieces"]
+        assert row["sparsity.fewest_active.lower"] <= least + 1e-9 <= upper + 2e-9
+        assert (upper - least) * pieces <= 1 + 1e-6
+        name = str(row["method"])
+        counts[name] = counts.get(name, 0) + (upper - least < 1e-9)
+    assert sorted(counts.values()) == [5, 6, 6, 10]

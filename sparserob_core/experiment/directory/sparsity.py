@@ -43,8 +43,10 @@ def verdict(result: Result) -> str | None:
     told with how much less, in the units of time.
     """
     found, known = result.sparsest, result.activity
+    if result.status != "certified" or known is None or known.upper is None or not known.norm:
+        return None
     if found is not None:
-        if result.status != "certified" or found.plain_count is None or found.plain is None:
+        if found.plain_count is None or found.plain is None:
             return None
         less = found.plain_count - result.cost
         if less <= SAME * found.plain_count:
@@ -52,8 +54,6 @@ def verdict(result: Result) -> str | None:
         same = found.norm - found.plain <= SAME * max(abs(found.plain), abs(found.norm))
         rest = ", at the same cost, for the optimum is not unique" if same else ""
         return f"the sparsest control acts {less:.6g} less than the optimum: here it is{rest}"
-    if result.status != "certified" or known is None or known.upper is None:
-        return None
     if known.decision is not None:
         return "not decided: another admissible control acts less; method sparsest finds the one that acts least"
     if known.upper - known.lower <= SAME * known.upper:

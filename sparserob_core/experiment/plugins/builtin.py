@@ -36,6 +36,11 @@ def sparserob_methods() -> Iterator[MethodPlugin]:
         summary="The fewest active pieces exactly, or a control that takes the values of an alphabet only.",
     )
     yield MethodPlugin(
+        name="reweighted",
+        factory="sparserob_core.sip.methods.reweighted:Reweighted",
+        summary="Reweighted L1 or the capped L1 norm, in the hope of fewer active pieces; bounds and proof as ever.",
+    )
+    yield MethodPlugin(
         name="nominal",
         factory="sparserob_core.sip.methods.baselines:Nominal",
         summary="Baseline: the same problem as if nothing were uncertain.",

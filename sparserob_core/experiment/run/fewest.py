@@ -31,9 +31,11 @@ def with_activity(experiment: ControlExperiment, result: Result, tools: Tools) -
     program, proven = experiment.program, result.status in PROVEN
     if result.status in ENDED or program.activity is None or result.decision is None:
         return result
+    base = program.finite
+    norm = base.P is None and base.blocks is None and not base.q.any()
     if result.sparsest is not None and result.sparsest.letters is None:  # its own bounds are those of the count
         upper = _share(program, result.cost) if proven else None
-        return replace(result, activity=Activity(_share(program, result.lower_bound) or 0.0, upper))
+        return replace(result, activity=Activity(_share(program, result.lower_bound) or 0.0, upper, norm=norm))
     # the number of a sample tells nobody else
     told = result.sparsest is None and all(cut.formulation != "sampled" for cut in result.dual.cuts)
     factor = multiple(program) if told else None
@@ -41,7 +43,7 @@ def with_activity(experiment: ControlExperiment, result: Result, tools: Tools) -
     most, other = count(program, np.asarray(result.decision)) if proven else np.inf, None
     if factor is None or (proven and not is_vertex(program, result)):
         other = _other(experiment, result, tools, most)
-    activity = Activity(_share(program, least) or 0.0, _share(program, most))
+    activity = Activity(_share(program, least) or 0.0, _share(program, most), norm=norm)
     if other is not None and _safe(program, other.lower_bound) > least:
         least = _safe(program, other.lower_bound)
         activity = replace(activity, lower=_share(program, least) or 0.0, dual=other.dual)

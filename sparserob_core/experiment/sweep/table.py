@@ -7,7 +7,7 @@ import csv
 import io
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,8 @@ FIRST = (
     "worst.time",
     "sparsity.active_fraction",
     "sparsity.switches",
+    "sparsity.fewest_active.lower",
+    "sparsity.fewest_active.upper",
 )
 LAST = ("stopped", "message", "run", "hash", "seconds")
 """Columns at the end; ``seconds`` is the last one, for it alone differs when a study is repeated."""
@@ -47,6 +49,8 @@ MEANING = {
     "worst.time": ("time", "when"),
     "sparsity.active_fraction": ("1", "share of the time at which the control acts"),
     "sparsity.switches": ("1", "how often it switches"),
+    "sparsity.fewest_active.lower": ("1", "share of the time that every admissible control acts at least"),
+    "sparsity.fewest_active.upper": ("1", "share of the time for which some admissible control acts"),
     "stopped": ("", "the limit that ended the run early"),
     "message": ("", "the result in a sentence, or why there is none"),
     "run": ("", "the run's directory below runs"),
@@ -61,12 +65,24 @@ def row_of(axes: Mapping[str, Any], summary: Mapping[str, Any] | None, run: str,
     object as ``object.name``. Without a summary the status is ``failed``, and ``said`` says why."""
     found: Row = {"status": "failed", "message": said} if summary is None else {}
     for name, value in (summary or {}).items():
-        inside = {f"{name}.{key}": one for key, one in value.items()} if isinstance(value, Mapping) else {name: value}
+        inside = dict(_entries(name, value))
         if name not in LEFT:
             found |= {
                 key: one for key, one in inside.items() if key not in LEFT and not isinstance(one, list | Mapping)
             }
     return {**axes, **{key: one for key, one in found.items() if key not in axes}, "run": run, "hash": digest}
+
+
+def _entries(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """What is inside an entry, under its full name; of objects within an object only those of ``sparsity``."""
+    if not isinstance(value, Mapping):
+        yield name, value
+        return
+    for key, one in value.items():
+        if name == "sparsity" and isinstance(one, Mapping):
+            yield from _entries(f"{name}.{key}", one)
+        else:
+            yield f"{name}.{key}", one
 
 
 def columns_of(axes: Sequence[str], rows: Iterable[Row]) -> list[str]:

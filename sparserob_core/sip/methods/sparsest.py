@@ -25,6 +25,7 @@ from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.methods.branching import Branching, proposed
 from sparserob_core.sip.methods.counting import DUST, count, counted_below, prices_of
 from sparserob_core.sip.methods.exchange import Exchange
+from sparserob_core.sip.methods.reweighted import imposed_cuts, on_support
 from sparserob_core.sip.program import TOLERANCE, SemiInfiniteProgram
 from sparserob_core.sip.proof.branch_and_bound import prove
 from sparserob_core.sip.proof.verdict import verdict, witness, worst_of
@@ -155,7 +156,6 @@ class _Search:
     def root(self) -> Result | None:
         """The convex program below the count; its result where nothing is feasible."""
         below = counted_below(self.bounded)
-        start = [(cut.index[None], np.array([cut.row]), cut.family) for cut in self.rows.cuts]
 
         def heard(event: RoundFinished) -> RoundFinished:
             self.told = replace(event, upper_bound=np.inf, gap=np.inf)
@@ -163,7 +163,7 @@ class _Search:
 
         tools = replace(self.tools, notify=forwarded(self.tools.notify, RoundFinished, heard), regulariser=None)
         method = Exchange(tolerance=self.method.tolerance, rounds=self.method.rounds)
-        result = method.close(below.program, tools, lambda x: (), start)
+        result = method.close(below.program, tools, lambda x: (), imposed_cuts(self.rows.cuts))
         if result.status == "infeasible":
             if self.letters is None:
                 return result
@@ -201,14 +201,8 @@ class _Search:
         if float(prices[acts].sum()) >= self.least * (1.0 - SAME) or key in self.tried:
             return False
         self.tried.add(key)
-        off = ~acts & (prices > 0.0)
-        narrow = replace(
-            self.program, lower=np.where(off, 0.0, base.lower), upper=np.where(off, 0.0, base.upper), twin=None
-        )
-        start = [(cut.index[None], np.array([cut.row]), cut.family) for cut in self.rows.cuts]
         method = Exchange(tolerance=self.method.tolerance, rounds=self.method.rounds)
-        tools = replace(self.tools, notify=ignore)
-        result = method.close(narrow, tools, lambda u: prove(self.program, u, deadline=tools.deadline), start)
+        result = on_support(self.program, x, self.tools, method, self.rows.cuts)
         fresh = self._keep([*result.indices, *result.dual.cuts])
         if result.status in PROVEN and result.decision is not None:
             counted = count(self.program, result.decision)

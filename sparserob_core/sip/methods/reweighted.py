@@ -1,0 +1,127 @@
+"""Sparser by another penalty: reweighted L1 and the capped L1 norm, each a few exchanges with other weights.
+
+Both penalties are concave in ``|s|``, so the tangent at the last decision is above them, and minimising it lowers them
+(Hunter and Lange 2004): a weighted L1 program each time. Nothing says that what they find is sparsest; the interval
+that every run reports says how far from it that can be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from sparserob_core.errors import InputError
+from sparserob_core.options import Options
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.events import ignore
+from sparserob_core.sip.evidence import Cut
+from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
+from sparserob_core.sip.methods.counting import DUST, count, prices_of
+from sparserob_core.sip.methods.exchange import Exchange
+from sparserob_core.sip.program import SemiInfiniteProgram
+from sparserob_core.sip.proof.branch_and_bound import prove
+from sparserob_core.sip.proof.verdict import verdict
+from sparserob_core.sip.result import Result, relative_gap
+
+FEWER = 1e-9  # relative: a count that is less by no more than this is the same
+PROVEN = ("certified", "verified")
+
+
+class Reweighted(Method, Options):
+    """Reweighted L1, or another concave penalty, from an optimum of L1 on; what is returned costs least among the
+    decisions that act on the entries that were found."""
+
+    penalty: Literal["logarithm", "capped"] = "logarithm"
+    """``logarithm``: log(1 + |u| / scale), reweighted L1 (Candes, Wakin and Boyd 2008); ``capped``: min(|u|, scale)
+    (Zhang 2010). Values of a channel are shares of its largest."""
+
+    scale: float = Field(default=0.1, gt=0.0, le=1.0)
+    """Where the penalty bends, as a share of the largest value."""
+
+    passes: int = Field(default=10, ge=1, le=1000)
+    """Weighted programs at most."""
+
+    tolerance: float = Field(default=GAP_TOLERANCE, gt=0.0, le=1.0)
+    """Relative gap at which the bounds of each exchange have met."""
+
+    rounds: int = Field(default=200, ge=1)
+    """Rounds of each exchange at most."""
+
+    def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
+        if program.activity is None or program.finite.blocks is not None:
+            raise InputError("method: reweighted needs a control whose channels count one by one; expected exchange")
+        first = Exchange(tolerance=self.tolerance, rounds=self.rounds).solve(program, tools)
+        if first.decision is None or first.status not in PROVEN or first.stopped:
+            return first
+        best = x = first.decision
+        known = [*first.indices, *first.dual.cuts]
+        plain = replace(tools, notify=ignore, regulariser=None)
+        exchange = Exchange(tolerance=self.tolerance, rounds=self.rounds)
+        for _ in range(self.passes):
+            if tools.deadline.passed:
+                break
+            heavier = replace(program, weights=program.finite.weights * self._weights(program, x), twin=None)
+            found = exchange.close(heavier, plain, lambda u: (), imposed_cuts(known))
+            if found.decision is None or found.status not in PROVEN:
+                break
+            known = [*first.indices, *first.dual.cuts, *found.indices]
+            settled, x = bool(np.allclose(found.decision, x, rtol=0.0, atol=FEWER)), found.decision
+            best = x if count(program, x) < count(program, best) * (1.0 - FEWER) else best
+            if settled:
+                break
+        if best is first.decision:
+            return first
+        result = on_support(program, best, tools, exchange, known)
+        if (
+            result.decision is None
+            or result.status not in PROVEN
+            or count(program, result.decision) >= count(program, first.decision)
+        ):
+            return first
+        gap = relative_gap(first.lower_bound, result.cost, program.cost_scale)
+        status, message = verdict(result.proofs, gap, self.tolerance)
+        return replace(
+            result,
+            status=status,
+            message=message,
+            lower_bound=min(first.lower_bound, result.cost),
+            dual=first.dual,
+            history=first.history,
+            cost_scale=first.cost_scale,
+            counts=first.counts,
+            seconds=first.seconds + result.seconds,
+        )
+
+    def _weights(self, program: SemiInfiniteProgram, x: Array) -> Array:
+        """The slope of the penalty at ``x (n,)``, ``(k,)``, 1 at 0; 1 where nothing counts."""
+        base, counted = program.finite, prices_of(program) > 0.0
+        reach = np.maximum(np.abs(base.lower), np.abs(base.upper))
+        usable = counted & np.isfinite(reach) & (reach > 0.0)
+        share = np.where(usable, np.abs(base.image(x)) / np.where(usable, reach, 1.0), 0.0)
+        if self.penalty == "capped":
+            return np.where(share < self.scale, 1.0, 0.0)
+        return np.asarray(self.scale / (share + self.scale))
+
+
+def on_support(
+    program: SemiInfiniteProgram, x: Array, tools: Tools, exchange: Exchange, known: Sequence[Cut]
+) -> Result:
+    """The decision of least cost, proven, that acts on no other entries than ``x (n,)`` does; ``known`` constraints are
+    imposed from the beginning."""
+    base, prices = program.finite, prices_of(program)
+    reach = np.maximum(np.abs(base.lower), np.abs(base.upper))
+    acts = np.abs(base.image(x)) > DUST * np.where(np.isfinite(reach), reach, 1.0)
+    off = ~acts & (prices > 0.0)
+    lower, upper = np.where(off, 0.0, base.lower), np.where(off, 0.0, base.upper)
+    narrow, quiet = replace(program, lower=lower, upper=upper, twin=None), replace(tools, notify=ignore)
+    return exchange.close(narrow, quiet, lambda u: prove(program, u, deadline=tools.deadline), imposed_cuts(known))
+
+
+def imposed_cuts(cuts: Sequence[Cut]) -> list[tuple[Array, np.ndarray, str]]:
+    """Constraints in the program's own units, one by one, each once."""
+    once = {(cut.family, cut.row, cut.index.tobytes()): cut for cut in cuts}
+    return [(cut.index[None], np.array([cut.row]), cut.family) for cut in once.values()]
