@@ -41,6 +41,8 @@ EXPECTED: dict[str, tuple[str, float | None, float]] = {
     "rate_limits": ("certified", 4.211898, 1e-6),
     "tracking_corridor": ("certified", 1.420693, 1e-5),
     "singular": ("certified", 1.0, 1e-9),
+    "quadratic_cost": ("certified", 0.983009, 1e-6),
+    "rendezvous": ("certified", 0.5584942610, 2e-7),
     "walsh": ("certified", 0.537065, 5e-6),
 }
 UNCHECKED = {("experiment1_scenario", "lower bound")}  # its constraints are samples

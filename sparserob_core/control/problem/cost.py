@@ -102,7 +102,9 @@ class Cost:
         )
 
     def words(self) -> str:
-        """What the cost is, in a few words."""
+        """What is added up to the cost, in a few words; empty where that is the L1 norm alone."""
+        if self.is_linear and self.l1 == 1.0:
+            return ""
         state, control, final = self.terms
         parts = []
         if self.l1 > 0.0:

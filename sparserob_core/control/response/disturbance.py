@@ -18,7 +18,7 @@ from sparserob_core.control.response.response import TimeGrid
 from sparserob_core.control.sets.sets import NormBall, Polytope
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, shaped
-from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +50,14 @@ class DisturbanceModel:
         if self.scale is not None and self.functions is not None:
             return float(np.linalg.norm(self.scale) * np.abs(self.functions).max())
         return self.bound.radius_bound
+
+    @shaped
+    def held(self, point: Float[Array, " mw"]) -> DisturbanceModel | None:
+        """The one disturbance that stays at a ``point (mw,)``; ``None`` where that is 0."""
+        if not point.any():
+            return None
+        single = Box(point, point)
+        return DisturbanceModel("piecewise_constant", single, single, self.grid, starts=np.arange(self.grid.pieces))
 
     @property
     def by_piece(self) -> bool:

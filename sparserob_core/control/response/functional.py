@@ -11,6 +11,7 @@ import numpy as np
 
 from sparserob_core.control.enclosures.combination import Combination
 from sparserob_core.control.enclosures.matrix_exponential import transitions
+from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.names import UNNAMED, Names
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
@@ -22,7 +23,7 @@ from sparserob_core.control.response.measurable import MeasurableCellSupport, Me
 from sparserob_core.control.response.response import Response
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.shapes import Float, shaped
-from sparserob_core.sip.convex_set import Array, Box, ConvexSet
+from sparserob_core.sip.convex_set import Array, ConvexSet
 
 # said where it is met, and before anything is solved
 WITHOUT_PROOF = "measurable disturbances are proven only for known systems and sets with flat sides"
@@ -88,6 +89,15 @@ class WorstCase:
         control before the first one acts; 0 elsewhere."""
         return self.response.grid.inputs(np.zeros((self.channels, self.dictionary.pieces)))
 
+    def central(self) -> WorstCase:
+        """The functionals along the nominal trajectory: the disturbance and the initial state at the `nominal_point` of
+        their sets; the parameters stay in the index."""
+        response, model = self.response, self.disturbance
+        if self.initial is not None:
+            response = response.from_state(response.initial_state + nominal_point(self.initial))
+        held = None if model is None else model.held(nominal_point(model.bound))
+        return replace(self, response=response, disturbance=held, shared=None, initial=None)
+
     def nominal(self) -> WorstCase:
         """The functionals of the system at an interior point of its parameters, from the centre of the initial states,
         under one admissible disturbance: none, where it may be."""
@@ -98,12 +108,7 @@ class WorstCase:
         known = modes[0] if len(modes) == 1 else SwitchedSystem(list(zip(ends, modes, strict=True)))
         if model is not None:
             zero = np.zeros(model.channels)
-            point = zero if model.bound.contains(zero) else model.bound.interior_point()
-            single = Box(point, point)
-            fixed = DisturbanceModel(
-                "piecewise_constant", single, single, model.grid, starts=np.arange(model.grid.pieces)
-            )
-            model = fixed if point.any() else None
+            model = model.held(zero if model.bound.contains(zero) else model.bound.interior_point())
         response = Response(known, self.response.grid, self.response.initial_state)
         return WorstCase(response, self.dictionary, model, names=self.names)
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.studies.adversary import Adversary, find_adversary
@@ -46,8 +47,9 @@ class Signal:
 @final
 @dataclass(frozen=True, eq=False)
 class Tube:
-    """Where the states are at ``times (T,)``: the ``nominal`` ones, and the least and largest values that any
-    disturbance brings them to, ``lower`` and ``upper``, ``(d, T)`` each, at the parameters of a lattice."""
+    """Where the states are at ``times (T,)``: the ``nominal`` ones, at the centre of every uncertainty set, and the
+    least and largest values that any disturbance brings them to, ``lower`` and ``upper``, ``(d, T)`` each, at the
+    parameters of a lattice."""
 
     times: Array
     nominal: Array
@@ -118,7 +120,9 @@ def _read(
 
 def tube(model: Transcription, theta: Array, times: Array) -> Tube:
     """The tube at a decision ``theta (m N,)`` and at ``times (T,)``."""
-    functionals, known = model.functionals, replace(model.functionals, disturbance=None)
+    functionals, known = model.functionals, model.functionals.central()
+    bound = model.problem.system.parameters
+    centre = np.zeros(0) if bound is None else nominal_point(bound)
     lattice, _ = model.parameters.lattice()
     if len(lattice) > PARAMETERS:
         lattice = lattice[np.unique(np.linspace(0, len(lattice) - 1, PARAMETERS).round().astype(int))]
@@ -128,7 +132,7 @@ def tube(model: Transcription, theta: Array, times: Array) -> Tube:
     for start in range(0, times.size, size):
         part = slice(start, start + size)
         at, p = np.tile(times[part], count), np.repeat(lattice, times[part].size, axis=0)
-        middle = lattice[count // 2][None].repeat(times[part].size, axis=0)
+        middle = centre[None].repeat(times[part].size, axis=0)
         for state in range(d):
             direction = np.tile(np.eye(d)[state], (at.size, 1))
             above, below = (functionals.values(theta, at, side * direction, p) for side in (1.0, -1.0))

@@ -300,9 +300,19 @@ def _near(said: object, point: object) -> bool:
 
 WORST = {"violation", "constraint", "time", "parameter", "initial_state"}
 SPARSITY = {"active_fraction", "switches", "fewest_active"}
+
+
+def _added_up(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
+    """What the cost is made of, in words."""
+    words = case.problem.cost.words()
+    said = summary.get("cost_of", words)
+    return [] if said == words else [f"cost_of is {said!r}, not {words!r}"]
+
+
 COMPARED: dict[str, Callable[[Case, Mapping[str, Any]], list[str] | None]] = {
     "gap": _gap,
     "cost_scale": _largest_cost,
+    "cost_of": _added_up,
     "sparsity": _sparsity,
     "value": _value,
     "worst": _worst,

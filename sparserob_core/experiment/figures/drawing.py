@@ -91,6 +91,7 @@ def _data(
         active_times=active_times,
         history=history,
         cost_scale=experiment.program.cost_scale,
+        cost_of=problem.cost.words(),
         active_fraction=sparsity(control, dictionary.breakpoints).active_fraction,
         cost=cost,
         names=problem.names,

@@ -55,7 +55,8 @@ class FigureData:
     ``times (T,)`` with the nominal ``state (d, T)`` and the worst case ``tube_lower``, ``tube_upper`` ``(d, T)`` over
     every disturbance and parameter; ``walls`` the path and terminal constraints on single components; ``active_times``
     the times of the imposed constraints that carry a multiplier; ``history`` the rounds of the method. ``tolerance`` is
-    the relative gap that was asked for, ``cost_scale`` the largest possible cost, ``names`` what everything is called.
+    the relative gap that was asked for, ``cost_scale`` the largest possible cost, ``cost_of`` what is
+    added up to it, where that is not the L1 norm alone, ``names`` what everything is called.
     """
 
     title: str
@@ -74,6 +75,7 @@ class FigureData:
     cost: float | None = None
     tolerance: float | None = None
     cost_scale: float = UNKNOWN_SCALE
+    cost_of: str = ""
     names: Names = UNNAMED
 
     def __post_init__(self) -> None:

@@ -128,7 +128,8 @@ def _title(ax: Axes, title: str, summary: str) -> None:
 
 
 def _summary(data: FigureData) -> str:
-    parts = [] if data.cost is None else [f"$J$ = {data.cost:.6g}"]
+    said = f" ({data.cost_of})" if data.cost_of else ""
+    parts = [] if data.cost is None else [f"$J$ = {data.cost:.6g}{said}"]
     if data.active_fraction is not None:
         parts.append(f"active {100 * data.active_fraction:.1f} % of the time")
     return "  ·  ".join(parts)

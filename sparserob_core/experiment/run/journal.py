@@ -44,6 +44,7 @@ class Journal(Observer):
         summary = {
             "title": self.experiment.title,
             **summary_of(result, control, self._dictionary),
+            **self._added_up(result),
             "seed": config.seed,
             "versions": versions(),
             "config": config.digest(),
@@ -51,6 +52,13 @@ class Journal(Observer):
         }
         self.directory.write_json("result.json", summary)
         return control, summary
+
+    def _added_up(self, result: Result) -> dict[str, str]:
+        """What the cost is made of, where that is not the L1 norm alone."""
+        if not isinstance(self.experiment, ControlExperiment) or result.sparsest is not None:
+            return {}
+        words = self.experiment.problem.cost.words()
+        return {"cost_of": words} if words else {}
 
     @property
     def _dictionary(self) -> Dictionary | None:

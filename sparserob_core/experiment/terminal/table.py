@@ -51,6 +51,7 @@ def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     rows = [
         ("status", f"{summary['status']}: {summary['message']}"),
         ("cost", _number(summary["cost"], ".9g")),
+        ("cost of", summary.get("cost_of") or "unknown"),
         ("lower bound", _number(summary["lower_bound"], ".9g")),
         ("upper bound", _number(summary["upper_bound"], ".9g")),
         ("relative gap", _number(summary["gap"], ".2e")),

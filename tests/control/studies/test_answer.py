@@ -40,6 +40,27 @@ def test_the_control_is_a_function_of_time(result):
             control(wrong)
 
 
+def test_the_nominal_states_begin_at_the_centre_and_are_pushed_by_the_middle_of_the_disturbances(tmp_path):
+    lopsided = {
+        "name": "linear",
+        "system": {"A": [[0, 1], [0, 0]], "B": [[0], [1]]},
+        "horizon": 2.0,
+        "initial_state": {"centre": [1, 0], "box": {"lower": [-0.1, 0.0], "upper": [0.3, 0.0]}},
+        "control": {"box": 1.0},
+        "disturbance": {"box": {"lower": [0.0, 0.0], "upper": [0.2, 0.0]}},
+        "terminal": [{"box": [5, 5]}],
+    }
+    config = {
+        "problem": lopsided,
+        "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 4}},
+        "observers": [],
+    }
+    outcome = sr.run(config, out=tmp_path / "run", quiet=True, figures=False)
+    tube = outcome.tube([0.0, 2.0])
+    np.testing.assert_allclose(tube.nominal, [[1.1, 1.1 + 0.1 * 2.0], [0.0, 0.0]], atol=1e-9)
+    np.testing.assert_allclose(tube.upper + tube.lower, 2 * tube.nominal, atol=1e-9)
+
+
 def test_the_tube_is_what_the_worst_disturbance_does(result):
     times = np.array([0.0, 1.234, 5.0])
     tube = result.tube(times)
