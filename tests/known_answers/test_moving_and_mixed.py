@@ -108,6 +108,7 @@ def test_bounds_of_the_control_alone_in_a_window_are_kept(tmp_path):
     assert check(outcome.directory).status == "verified", check(outcome.directory).claims
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("entry", [MIXED, MOVING], ids=["mixed", "moving"])
 @pytest.mark.parametrize(
     "changes",
@@ -126,7 +127,13 @@ def test_other_dictionaries_systems_and_delays_are_certified_and_checked(entry, 
     assert check(outcome.directory).status == "verified", check(outcome.directory).claims
 
 
-@pytest.mark.parametrize("curved", [{"ellipsoid": {"shape": [[0.49, 0], [0, 4]]}}, {"norm": {"p": 2, "radius": 1.4}}])
+@pytest.mark.parametrize(
+    "curved",
+    [
+        pytest.param({"ellipsoid": {"shape": [[0.49, 0], [0, 4]]}}, marks=pytest.mark.slow),
+        {"norm": {"p": 2, "radius": 1.4}},
+    ],
+)
 def test_a_round_set_that_moves_is_proven_and_never_left(curved, tmp_path):
     moved = [[0.5, 0.1, 0.2], [1.7, 0.2, -0.3], [5, -0.1, 0]]
     outcome = run(tmp_path / "run", {**curved, "from": 0.6, "relative_to": moved}, pieces=25)
@@ -240,6 +247,35 @@ def test_records_say_the_same_as_keys(tmp_path):
     assert sr.solve(program, tolerance=1e-8).cost == pytest.approx(0.541961, rel=2e-6)
 
 
+FIRST = {**MOVING, "from": 0.5}
+
+
+def shortest(of: str, tmp_path: Path, **changes: Any) -> sr.Margin:
+    problem = {**SPRING, "path": [FIRST, MIXED], "control_step": {"box": 0.4}, **changes}
+    dictionary = {"control": {"name": "piecewise_constant", "pieces": 20}}
+    return sr.margin({"problem": problem, "dictionaries": dictionary, "observers": []}, of=of, out=tmp_path / "margin")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("of", ["path.1", "control_step", "path.0.from"])
+def test_margins_of_what_is_new_are_proven_from_both_sides(of, tmp_path):
+    found = shortest(of, tmp_path)
+    assert found.status == "certified", found.message
+    assert found.upper - found.lower <= 1e-5 * max(1.0, found.upper)
+    for factor, status in ((found.upper + 1e-3, "certified"), (found.lower - 1e-3, "infeasible")):
+        first = {**FIRST, "from": factor} if of == "path.0.from" else FIRST
+        mixed = {**MIXED, "mixed": {**MIXED["mixed"], "h": 1.2 * factor}} if of == "path.1" else MIXED
+        step = 0.4 * factor if of == "control_step" else 0.4
+        outcome = run(tmp_path / status, first, mixed, pieces=20, control_step={"box": step})
+        assert outcome.result.status == status, (factor, outcome.result.message)
+
+
+def test_the_start_of_a_moving_window_is_varied_only_where_it_is_known(tmp_path):
+    late = {**BOX, "from": 0.5, "relative_to": [[0.4, 0, 0], [5, 0, 0]]}
+    with pytest.raises(sr.InputError, match=r"relative_to begins at 0\.4"):
+        shortest("path.0.from", tmp_path, path=[late])
+
+
 @pytest.fixture(scope="module")
 def honest(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("honest")
@@ -293,8 +329,8 @@ def drop(files: Forgery) -> None:
         ("mixed", "lower bound", priced(direction=[0.0, 1.0, 0.4])),
         ("mixed", "lower bound", priced(direction=[0.0, 1.0])),
         ("mixed", "lower bound", priced(piece=None)),
-        ("mixed", "lower bound", priced(piece=49)),
-        ("mixed", "lower bound", priced(piece=-1)),
+        pytest.param("mixed", "lower bound", priced(piece=49), marks=pytest.mark.slow),
+        pytest.param("mixed", "lower bound", priced(piece=-1), marks=pytest.mark.slow),
         ("mixed", "lower bound", elsewhere),
     ],
 )

@@ -60,7 +60,7 @@ def run(problem: dict[str, Any], pieces: int, out: Path, **more: Any) -> sr.Outc
     "step",
     [
         {"box": 0.25},
-        {"norm": {"p": 2, "radius": 0.25}},
+        pytest.param({"norm": {"p": 2, "radius": 0.25}}, marks=pytest.mark.slow),
         {"ellipsoid": {"shape": [[0.0625]]}},
         {"polytope": {"H": [[3], [-7]], "h": [0.75, 1.75]}},
     ],

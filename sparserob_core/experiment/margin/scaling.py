@@ -17,6 +17,7 @@ Sense: TypeAlias = Literal["largest", "smallest"]
 LARGEST = 1e6  # factors beyond are not looked at
 MOST_UNCERTAIN = 1024.0  # the same for factors on a set of parameters, whose matrices change with them
 CONTROL = "factor on the control set"
+SHORT = 1e-9  # of a window, what is left of it where a control must last in it
 POINT = 1e-6  # the factor of a curved set that stands for 0: such a set has an interior
 
 
@@ -61,6 +62,7 @@ def scaling(
         "disturbance": problem.disturbance,
         "parameters": problem.system.parameters,
         "path": problem.path,
+        "control_step": problem.control_step,
         "terminal": problem.terminal,
     }
     part = of.split(".", maxsplit=1)[0]
@@ -80,6 +82,8 @@ def _choices(
         yield "parameters", lambda: _parameters(problem)
     yield "initial_state", lambda: _initial_state(problem)
     yield "control", lambda: _control(problem)
+    if problem.control_step is not None:
+        yield "control_step", lambda: _control_step(problem)
     for i, positions in enumerate(members):
         if positions:
             yield f"path.{i}", lambda i=i, positions=positions: _path(problem, f"path.{i}", positions)  # type: ignore[misc]
@@ -163,6 +167,19 @@ def _control(problem: OptimalControlProblem) -> Scaling:
     )
 
 
+def _control_step(problem: OptimalControlProblem) -> Scaling:
+    assert problem.control_step is not None
+    resized = _resizing("control_step", problem.control_step)
+    return Scaling(
+        "control_step",
+        "factor on the steps of the control",
+        "smallest",
+        lambda f: replace(problem, control_step=resized(f)),
+        "largest step of a control",
+        lambda f: _reach(resized(f)),
+    )
+
+
 def _path(problem: OptimalControlProblem, of: str, positions: Sequence[int]) -> Scaling:
     paths = _entries(problem)
     resized = {i: _resized(of, paths[i]) for i in positions}
@@ -206,6 +223,15 @@ def _terminal(problem: OptimalControlProblem, of: str, positions: Sequence[int])
 def _window(problem: OptimalControlProblem, path: str, positions: Sequence[int]) -> Scaling:
     paths = _entries(problem)
     latest = min(problem.horizon if paths[i].stop is None else float(paths[i].stop or 0.0) for i in positions)
+    if any(isinstance(paths[i], MixedConstraint) for i in positions):
+        latest *= 1.0 - SHORT  # a control lasts
+    for i in positions:
+        moved = getattr(paths[i], "relative_to", None)
+        if moved is not None and np.asarray(moved)[0, 0] > 0.0:
+            raise InputError(
+                f"of: {path}.from is varied from 0 on, relative_to begins at {np.asarray(moved)[0, 0]:g}; expected rows"
+                " that say where the set is from time 0 on"
+            )
     return Scaling(
         f"{path}.from",
         f"start of the window of {path} [unit of time]",
