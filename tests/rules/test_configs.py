@@ -38,8 +38,11 @@ EXPECTED: dict[str, tuple[str, float | None, float]] = {
     "initial_set": ("certified", 0.502958, 1e-6),
     "motor_voltage": ("certified", 0.799768, 1e-6),
     "parameters_and_disturbance": ("certified", None, 0.0),
+    "powered_descent": ("certified", 64.64 / 0.99, 1e-7),  # gravity, the fall and the drift, at the weakest thrust
     "rate_limits": ("certified", 4.211898, 1e-6),
+    "tank_levels": ("certified", 28.0047023, 1e-7),
     "tracking_corridor": ("certified", 1.420693, 1e-5),
+    "two_modes": ("certified", 0.6343468, 2e-6),
     "singular": ("certified", 1.0, 1e-9),
     "quadratic_cost": ("certified", 0.983009, 1e-6),
     "rendezvous": ("certified", 0.5584942610, 2e-7),
