@@ -97,21 +97,12 @@ def assemble(loaded: Loaded) -> Experiment:
     problem = problem_of(loaded)
     if isinstance(problem, SemiInfiniteProgram):
         return PlainExperiment(loaded, problem)
-    _of_time_alone(loaded)
+    policy: Policy = build(loaded, "policy", loaded.config.policy)
     control, disturbance = dictionaries_of(loaded, problem.horizon)
     try:
-        return ControlExperiment(loaded, prepare(problem, control, disturbance))
+        return ControlExperiment(loaded, prepare(problem, control, disturbance, policy=policy))
     except InputError as error:
-        raise loaded.located(("problem",), error) from error
-
-
-def _of_time_alone(loaded: Loaded) -> None:
-    """Refuse a policy that the transcription does not know: its controls are functions of time."""
-    policy: Policy = build(loaded, "policy", loaded.config.policy)
-    if policy.knows:
-        known = ", ".join(sorted(policy.knows))
-        error = InputError(expected="a policy that knows nothing, such as open_loop", got=f"one that knows the {known}")
-        raise loaded.located(("policy", "name"), error)
+        raise loaded.located(() if error.path[:1] == ("policy",) else ("problem",), error) from error
 
 
 def problem_of(loaded: Loaded) -> OptimalControlProblem | SemiInfiniteProgram:

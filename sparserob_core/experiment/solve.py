@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict, overload
 import numpy as np
 
 from sparserob_core.arguments import share, whole
+from sparserob_core.control.policies.policy import Policy
 from sparserob_core.control.problem.dictionary import Dictionary, DictionaryFactory
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.errors import InputError, named
@@ -86,6 +87,7 @@ def solve(
     seed: int = 0,
     control: Choice | DictionaryFactory | Dictionary | None = None,
     disturbance: Choice | DictionaryFactory | Dictionary | None = None,
+    policy: Choice | Policy = "open_loop",
     continuation: Continuation | Mapping[str, float] | None = None,
     budget: int = 2000,
     polish: float = 0.0,
@@ -97,7 +99,8 @@ def solve(
 
     A component is a name, a mapping such as ``{"name": "exchange", "tolerance": 1e-9}``, or the component itself.
     ``tolerance`` is the relative gap, for a method that has such an option. ``control`` is by default 100 equal pieces,
-    and ``disturbance`` one indicator function on each piece of the control; both are for control problems only.
+    and ``disturbance`` one indicator function on each piece of the control; both are for control problems only, as is
+    the ``policy``, such as `AffinePolicy`: under feedback the decision begins with the nominal control.
     ``regulariser`` is by default the ridge for control problems, whose optimisers are to be unique, and none for other
     programs, so that ``value`` is the cost. ``budget``: evaluations per search of the maximiser, of which the share
     ``polish`` goes to a local method at its end. ``seconds``: the time after which it returns what it knows, as it does
@@ -108,7 +111,7 @@ def solve(
     deadline, registry = Deadline(as_seconds(seconds)), load_registry()
     if isinstance(problem, OptimalControlProblem):
         deadline = _announced(problem, deadline)
-    model = _stated(registry, problem, control, disturbance)
+    model = _stated(registry, problem, control, disturbance, policy)
     program = model if isinstance(model, SemiInfiniteProgram) else model.program
     if regulariser == "default":
         regulariser = None if program.lengths is None else "ridge"
@@ -313,12 +316,13 @@ def indicators(on: Dictionary) -> Dictionary:
 
 
 def _stated(
-    registry: Registry, problem: object, control: object, disturbance: object
+    registry: Registry, problem: object, control: object, disturbance: object, policy: object
 ) -> SemiInfiniteProgram | Transcription:
+    chosen: Policy = component(registry, "policy", policy, Policy)
     if isinstance(problem, SemiInfiniteProgram):
-        if control is not None or disturbance is not None:
+        if control is not None or disturbance is not None or chosen.knows:
             raise InputError(
-                "control, disturbance: dictionaries are for an OptimalControlProblem, got a SemiInfiniteProgram"
+                "control, disturbance, policy: these are for an OptimalControlProblem, got a SemiInfiniteProgram"
             )
         return problem
     if not isinstance(problem, OptimalControlProblem):
@@ -329,7 +333,7 @@ def _stated(
 
     controls = dictionary(registry, PIECES if control is None else control, problem.horizon)
     disturbances = indicators(controls) if disturbance is None else dictionary(registry, disturbance, problem.horizon)
-    return prepare(problem, controls, disturbances)
+    return prepare(problem, controls, disturbances, policy=chosen)
 
 
 def _continuation(given: Mapping[str, float]) -> Continuation:

@@ -15,6 +15,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, Box, as_bound
 from sparserob_core.sip.finite import Blocks, FiniteProgram
+from sparserob_core.sip.uncertain import Spread, UncertainRows
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
@@ -143,7 +144,10 @@ class ConstraintFamily:
     ``hindrance(lower (d,), upper (d,))``  what keeps the enclosure of a cell wide, and what would help, in words;
     ``row_units (r,)``, ``index_units (d,)``  what a violation of 1 and each coordinate of an index are in the user's
         units, for a family in units of its own (`OwnUnits`);
-    ``explain(index (d,), row)``  one constraint for people (an `Explanation`).
+    ``explain(index (d,), row)``  one constraint for people (an `Explanation`);
+    ``uncertain(index (d,))``  for rows that must hold for every deviation in the program's `Spread`: these rows. Such a
+        family is not linear in the decision: ``rows`` refuses, ``excess(x, indices (k, d))`` are its violations
+        ``(k, r)``, and ``start (k, d)`` the indices that a method begins with.
     """
 
     name: str
@@ -163,6 +167,9 @@ class ConstraintFamily:
     hindrance: Callable[[Array, Array], str] | None = None
     row_units: Array | None = None
     index_units: Array | None = None
+    uncertain: Callable[[Array], UncertainRows] | None = None
+    excess: Callable[[Array, Array], Array] | None = None
+    start: Array | None = None
     formulation: Formulation = "reduced"
     source: object = None
 
@@ -190,6 +197,8 @@ class ConstraintFamily:
     @shaped
     def violations(self, x: Float[Array, " n"], indices: Float[Array, "k d"]) -> Float[Array, "k r"]:
         """``rows(xi) x - rhs(xi)`` at indices ``(k, d)``, as ``(k, r)``; positive where violated."""
+        if self.excess is not None:
+            return self.excess(x, indices)
         G, h = self.rows(indices)
         return np.asarray(G @ x - h, dtype=float)
 
@@ -208,6 +217,7 @@ class SemiInfiniteProgram:
     ``blocks (k,)``: images with the same number of at least 0 count together, with their weight times their Euclidean
     norm; -1 is one that counts alone. ``largest``: the largest possible cost, where it is known, of which a gap is a
     share (`cost_scale`).
+    ``spread``: the deviations for all of which the ``uncertain`` rows of its families hold.
     """
 
     n: int
@@ -230,6 +240,7 @@ class SemiInfiniteProgram:
     constant: float = 0.0
     blocks: npt.ArrayLike | None = None
     largest: float | None = None
+    spread: Spread | None = None
     twin: Callable[[], OwnUnits] | None = field(default=None, repr=False)
     finite: FiniteProgram = field(init=False, repr=False)
 

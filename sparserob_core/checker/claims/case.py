@@ -17,6 +17,7 @@ from sparserob_core.checker.claims.window import Beside, Window
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import stacked
+from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem
 from sparserob_core.control.sets.sets import ConvexSet, Equality
@@ -30,7 +31,8 @@ if TYPE_CHECKING:
 @dataclass(frozen=True, eq=False)
 class Case:
     """What is checked: a certificate (plain data) against a problem on its two dictionaries. ``counts``: its cost is
-    the time that the control acts, which may take the values ``letters`` only where there are any."""
+    the time that the control acts, which may take the values ``letters`` only where there are any; ``policy``: the
+    control answers what it measures."""
 
     problem: OptimalControlProblem
     control: Dictionary
@@ -39,6 +41,7 @@ class Case:
     clock: Clock = field(default_factory=Clock)
     counts: bool = False
     letters: tuple[float, ...] | None = None
+    policy: AffinePolicy | None = None
 
     @cached_property
     def windows(self) -> list[Window]:

@@ -10,10 +10,11 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.claims import activity
-from sparserob_core.checker.claims.case import Case, listed, number, numbers
+from sparserob_core.checker.claims.case import Case, Window, listed, number, numbers
 from sparserob_core.checker.claims.constraints import bounded
 from sparserob_core.checker.claims.duality import Row
 from sparserob_core.checker.claims.equalities import equalities
+from sparserob_core.checker.claims.feedback import feedback_of
 from sparserob_core.checker.claims.replay import reached
 from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import TOLERANCE, Broken, Finding, Unchecked
@@ -54,7 +55,7 @@ def check(case: Case, gap_tolerance: float | None) -> list[Finding]:
             claims.append(judged("control_step", lambda: _steps(case)))
         if case.equalities:
             claims.append(judged("equalities", lambda: equalities(case)))
-        claims += [judged(window.name, lambda window=window: bounded(case, window)) for window in case.windows]  # type: ignore[misc]
+        claims += [judged(window.name, lambda window=window: _kept(case, window)) for window in case.windows]  # type: ignore[misc]
         return [*claims, judged("status", lambda: _status(case, str(status), gap_tolerance, claims))]
 
 
@@ -95,8 +96,14 @@ def judged(name: str, derive: Callable[[], str]) -> Finding:
         return Finding(name, "not checked", "a ball around a divisor holds 0")
 
 
+def _kept(case: Case, window: Window) -> str:
+    return bounded(case, window) if case.policy is None else feedback_of(case).bounded(window)
+
+
 def _control(case: Case) -> str:
     """Every piece of the control in its set."""
+    if case.policy is not None:
+        return feedback_of(case).control()
     worst = 0.0
     for start, piece in zip(case.control.breakpoints[:-1], case.pieces, strict=True):
         case.clock.check()
@@ -128,7 +135,7 @@ def _steps(case: Case) -> str:
 def _cost(case: Case) -> str:
     if case.counts:
         return _counted(case)
-    derived = case.price.of(case.pieces)
+    derived = case.price.of(case.pieces) if case.policy is None else feedback_of(case).cost()
     _agrees("cost", number(case.certificate, "cost"), derived, SMALL_COST * case.price.largest)
     return f"J = {float(derived.mid()):.12g}"
 
@@ -157,16 +164,16 @@ def _agrees(name: str, written: float, derived: arb, scale: float) -> None:
 def _multiplied(case: Case, priced: bool) -> arb:
     """The bound that the certificate's multipliers give."""
     data = case.certificate.get("multipliers")
+    if case.policy is not None:
+        return feedback_of(case).multiplied(_entries(data), priced)
     rows, pieces = _weighted(case, data)
     if not priced:
         return case.duality.bound(rows, pieces, None)
     return case.duality.bound(rows, pieces, case.price, _touched(case, data))
 
 
-def _weighted(case: Case, data: object) -> tuple[list[tuple[float, Row]], Any]:
-    """Multipliers with their constraints, and those of the control's pieces."""
-    from flint import arb
-
+def _entries(data: object) -> Sequence[Any]:
+    """The constraints that a certificate gives multipliers of."""
     if data is None:
         raise Unchecked("the certificate holds no multipliers, which this method does not offer")
     if not isinstance(data, Mapping):
@@ -174,7 +181,15 @@ def _weighted(case: Case, data: object) -> tuple[list[tuple[float, Row]], Any]:
     entries = listed(data, "constraints")
     if len(entries) > MOST_MULTIPLIERS:
         raise Broken(f"{len(entries)} multipliers are too many to be checked")
-    rows = [_row(case, entry) for entry in entries]
+    return entries
+
+
+def _weighted(case: Case, data: object) -> tuple[list[tuple[float, Row]], Any]:
+    """Multipliers with their constraints, and those of the control's pieces."""
+    from flint import arb
+
+    rows = [_row(case, entry) for entry in _entries(data)]
+    assert isinstance(data, Mapping)
     nu = numbers(listed(data, "equalities"), "equalities")
     if nu.shape != (len(case.equalities),):
         raise Broken(f"{nu.size} multipliers of equalities, expected {len(case.equalities)}")
@@ -389,6 +404,8 @@ def largest_cost(case: Case) -> float:
 def _witness(case: Case) -> str:
     """The state that the witness leads to, and by how much it leaves the constraint."""
     data = case.certificate.get("witness")
+    if case.policy is not None:
+        raise Unchecked("the checker does not drive a closed loop by a witness")
     if not isinstance(data, Mapping):
         raise Unchecked("the certificate holds no witness")
     window, time = case.window(str(data.get("constraint"))), number(data, "time")

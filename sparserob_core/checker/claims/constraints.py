@@ -45,7 +45,7 @@ def bounded(case: Case, window: Window) -> str:
     if lower.shape == (0, 0):
         raise Unchecked("the certificate holds no cells for a constraint that was not proven on cells")
     normals = _normals(window, entry.get("normals"))
-    _covered(case, window, lower, upper)
+    covered(case, window, lower, upper)
     basis, gains, work = _work(case, window, normals, lower, upper)
     found = prove(
         _tubes(case, basis, lower, upper),
@@ -81,7 +81,7 @@ def _parameters(case: Case) -> Parameters:
     return Parameters(None if bound is None else known(bound))
 
 
-def _covered(case: Case, window: Window, lower: Array, upper: Array) -> None:
+def covered(case: Case, window: Window, lower: Array, upper: Array) -> None:
     """The cells must fill the times and parameters, and for a curved set every face of the cube of directions too."""
     nu = case.problem.system.parameter_count
     b = 0 if window.seen.facets is not None else window.seen.spanned
@@ -132,7 +132,7 @@ def _work(case: Case, window: Window, normals: Array, lower: Array, upper: Array
         case.clock.check()
         sides = Sides.cell(curved, np.array(a[nu:]), np.array(b[nu:])) if curved is not None else flat
         assert sides is not None
-        intervals = [part for i in members for part in _cut(case, cuts, float(lower[i, 0]), float(upper[i, 0]))]
+        intervals = [part for i in members for part in cut(case, cuts, float(lower[i, 0]), float(upper[i, 0]))]
         work.append(((a[:nu], b[:nu]), sides, intervals))
     return normals if curved is not None else basis, gains, work
 
@@ -150,7 +150,7 @@ def _facets(window: Window, units: RowUnits) -> tuple[Array, Array, Sides | None
     return basis[:, : window.states], basis[:, window.states :], Sides(rows)
 
 
-def _cut(case: Case, cuts: Sequence[float], start: float, stop: float) -> list[Interval]:
+def cut(case: Case, cuts: Sequence[float], start: float, stop: float) -> list[Interval]:
     """The parts between the ``cuts``, each with the piece of the grid that it lies in."""
     grid, every = np.array(case.grid), np.array(cuts)
     inside = every[(every > start) & (every < stop)].tolist()

@@ -112,6 +112,16 @@ class Duality:
                     constant = constant + known(self.problem.disturbance).support(weights)
         return Row(constant, slope)
 
+    def pushed(self, direction: Array, time: float) -> list[list[arb]]:
+        """What every block of the disturbance gives to ``c'x(t)`` of a known system, ``(mw,)`` each."""
+        if not self.changes:
+            return []
+        every, jumps = flows(self.problem.system, ()), self.changes
+        parts = every[0].parts
+        first, mw = direction.size + parts["B"][0].ncols(), parts["E"][0].ncols()
+        lags = self._lags(every, direction, time, {0.0, *(s for s in jumps if s < time)})
+        return _differences([lags[s][first:] if s < time else None for s in jumps], mw)
+
     def _lags(self, every: Sequence[Flow], direction: Array, time: float, since: set[float]) -> dict[float, list[arb]]:
         """``c'e^{A (t - s)}`` and its integrals from each of the times ``since`` to ``time``, times ``B`` and ``E``;
         back through the systems that took turns until then."""

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import final
+
+import numpy as np
 
 import numpy as np
 
 from sparserob_core.control.constraints.state import StateConstraint
+from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.response.closed_loop import ClosedLoop
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.response import Response
@@ -32,6 +37,15 @@ class RowUnits:
         return np.where(self.entered[:, None], A, 0.0) / self.fixed[:, None], b / self.fixed
 
 
+@final
+@dataclass(frozen=True, eq=False)
+class Feedback:
+    """How the control of a transcribed problem answers what it measures: its ``policy`` and the closed ``loop``."""
+
+    policy: AffinePolicy
+    loop: ClosedLoop
+
+
 @dataclass(frozen=True, eq=False)
 class Transcription:
     """A problem on its dictionaries and the semi-infinite program that it became.
@@ -39,7 +53,8 @@ class Transcription:
     ``constraints`` are the path and terminal constraints, named and ordered as the families of the ``program``;
     terminal equalities are not among them, they are rows of the program. ``functionals`` are what every family is built
     from, ``formulation`` says what the indices of the families are. ``rows``: what rows were divided by, where the
-    problem is in its own units.
+    problem is in its own units. ``feedback``: how the control answers what it measures; the decision then begins with
+    the nominal control.
     """
 
     problem: OptimalControlProblem
@@ -51,6 +66,7 @@ class Transcription:
     program: SemiInfiniteProgram
     formulation: Formulation = "reduced"
     rows: RowUnits | None = None
+    feedback: Feedback | None = None
 
     @property
     def response(self) -> Response:
@@ -58,8 +74,13 @@ class Transcription:
         return self.functionals.response
 
     def pieces(self, theta: Array) -> Array:
-        """The control ``(m, K)`` on the pieces of its dictionary, of a decision ``theta (m, N)`` or ``(m N,)``."""
-        return self.control.control(theta)
+        """The control ``(m, K)`` on the pieces of its dictionary, of a decision ``theta (m, N)`` or ``(m N,)``; under
+        feedback the nominal one."""
+        return self.control.control(self.nominal(theta))
+
+    def nominal(self, decision: Array) -> Array:
+        """The coefficients ``(m N,)`` of the control, or under feedback of the nominal one, in a decision."""
+        return np.asarray(decision, dtype=float).ravel()[: self.problem.system.controls * self.control.functions]
 
     def family(self, constraint: StateConstraint) -> ConstraintFamily:
         """The family of the program that was made of one of the constraints."""

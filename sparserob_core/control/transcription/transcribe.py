@@ -16,6 +16,8 @@ from sparserob_core.control.constraints.scenario import ScenarioConstraint
 from sparserob_core.control.constraints.sensitivity import Sensitivity
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.taylor import TaylorSpace
+from sparserob_core.control.policies.affine import AffinePolicy
+from sparserob_core.control.policies.policy import Policy
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
 from sparserob_core.control.problem.units import Units, power_of_two
@@ -26,6 +28,7 @@ from sparserob_core.control.response.quadratic import quadratic_cost
 from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.response.response import SAME_TIME, Response, merge_grids
 from sparserob_core.control.sets.sets import Equality
+from sparserob_core.control.transcription.feedback import with_feedback
 from sparserob_core.control.transcription.own_units import (
     RESOLVED,
     extent,
@@ -54,17 +57,19 @@ def transcribe(
     control: Dictionary,
     disturbance: Dictionary | None = None,
     formulation: Literal["reduced", "literal"] = "reduced",
+    policy: Policy | None = None,
 ) -> SemiInfiniteProgram:
     """The convex semi-infinite program of a problem (the paper's (7)).
 
     The decision is ``theta (m, N)`` raveled; its image ``S theta`` is the control on every piece, channel-major
     ``(m K,)``. ``disturbance`` defaults to the control's dictionary. ``formulation``: ``reduced`` eliminates the
-    disturbance exactly, by support functions; ``literal`` keeps its coefficients as part of the index. Raises
-    `InputError` when a dictionary does not span the horizon.
+    disturbance exactly, by support functions; ``literal`` keeps its coefficients as part of the index. ``policy``: an
+    `AffinePolicy` answers what is measured; its gains follow ``theta`` in the decision. Raises `InputError` when a
+    dictionary does not span the horizon.
     """
     if formulation not in ("reduced", "literal"):
         raise InputError(f"formulation: expected reduced or literal, got {formulation!r}")
-    return prepare(problem, control, disturbance or control, formulation).program
+    return prepare(problem, control, disturbance or control, formulation, policy).program
 
 
 def prepare(
@@ -72,10 +77,11 @@ def prepare(
     control: Dictionary,
     disturbance: Dictionary,
     formulation: Literal["reduced", "literal"] = "reduced",
+    policy: Policy | None = None,
 ) -> Transcription:
     """The program of a problem on its dictionaries, with everything that it was made of. Raises `InputError` when a
-    dictionary does not span the horizon, and for terminal equalities that no control can meet, or steps that none can
-    take."""
+    dictionary does not span the horizon, for terminal equalities that no control can meet, or steps that none can take,
+    and for a policy that is neither `OpenLoop` (as none is) nor `AffinePolicy`."""
     for name, dictionary in (("control", control), ("disturbance", disturbance)):
         if abs(dictionary.horizon - problem.horizon) > 1e-12 * problem.horizon:
             raise InputError(
@@ -88,6 +94,15 @@ def prepare(
             )
     refuse_without_steps(problem, control)
     model = _assembled(problem, control, disturbance, formulation)
+    if isinstance(policy, AffinePolicy):
+        if formulation != "reduced":
+            raise InputError(f"formulation: expected reduced with policy: affine, got {formulation!r}")
+        return with_feedback(model, *in_own_units(model), policy)
+    if policy is not None and policy.knows:
+        known = ", ".join(sorted(policy.knows))
+        raise InputError(
+            path="policy.name", expected="open_loop or affine", got=f"one that knows the {known}"
+        )
     return replace(model, program=model.program.mirrored(lambda _: _in_own_units(model)))
 
 

@@ -51,7 +51,8 @@ def check(directory: str | Path, plugins: Iterable[str | Path] = (), seconds: fl
     """
     from sparserob_core.checker.claims.case import Case
     from sparserob_core.checker.claims.claims import check as derive
-    from sparserob_core.experiment.assemble import counting, dictionaries_of, gap_tolerance, problem_of
+    from sparserob_core.control.policies.affine import AffinePolicy
+    from sparserob_core.experiment.assemble import build, counting, dictionaries_of, gap_tolerance, problem_of
 
     if type(seconds) not in (int, float) or not seconds > 0:
         raise InputError(path="seconds", expected="a positive number", got=repr(seconds))
@@ -67,7 +68,9 @@ def check(directory: str | Path, plugins: Iterable[str | Path] = (), seconds: fl
             f"{path}: expected the run of a control problem; certificates of other programs cannot be checked"
         )
     control, disturbance = dictionaries_of(loaded, problem.horizon)
-    case = Case(problem, control, disturbance, data, clock, *counting(loaded))
+    policy = build(loaded, "policy", loaded.config.policy)
+    answering = policy if isinstance(policy, AffinePolicy) else None
+    case = Case(problem, control, disturbance, data, clock, *counting(loaded), answering)
     derived = derive(case, gap_tolerance(loaded))
     files = compared(stored, loaded, case, summary)
     claims = (_config(loaded, data, summary), *derived, *files.claims)

@@ -77,7 +77,7 @@ BEGUN = {"deviation"}
 def _unread(case: Case) -> set[str]:
     """The names ``key.key`` of what a certificate says besides what its claims rest on."""
     data = case.certificate
-    read = CERTIFICATE.get(str(data.get("status")), FIGURED)
+    read = CERTIFICATE.get(str(data.get("status")), FIGURED) | (set() if case.policy is None else {"gains"})
     left = {name for name, value in data.items() if name not in read and not (name in SOMETIMES and value in NOTHING)}
     pieced = {window.name for window in case.windows if window.is_mixed}
     proof, witness, fewest = (data.get(name) for name in ("proof", "witness", "fewest_active"))
@@ -94,7 +94,8 @@ def _unread(case: Case) -> set[str]:
         entries = multipliers.get("constraints")
         for entry in entries if isinstance(entries, list) else []:
             mixed = isinstance(entry, Mapping) and str(entry.get("constraint")) in pieced
-            left |= _besides("multipliers.constraints", entry, MULTIPLIER | {"piece"} if mixed else MULTIPLIER)
+            more = ({"piece"} if mixed else set()) | (set() if case.policy is None else {"disturbance"})
+            left |= _besides("multipliers.constraints", entry, MULTIPLIER | more)
             left |= {"multipliers.constraints.parameter"} if _of_a_curved_set_of_controls(case, entry) else set()
     if "proof" in read and isinstance(proof, Mapping):
         shapes = {window.name: window.shape for window in case.windows}
@@ -344,9 +345,11 @@ def _solution(stored: StoredRun, case: Case) -> Verdicts:
         theta, control, breakpoints, flat = (arrays[name] for name in STORED)
         decision = np.array(case.certificate["decision"], dtype=float)
         size = np.abs(decision) @ np.abs(case.control.values)
+        gains = np.array(case.certificate.get("gains", []), dtype=float)
         same = (
             np.array_equal(theta, decision)
-            and np.array_equal(flat, decision.ravel())
+            and np.array_equal(flat[: decision.size], decision.ravel())
+            and (flat.size == decision.size if case.policy is None else np.array_equal(arrays["gains"], gains))
             and np.array_equal(breakpoints, case.control.breakpoints)
             and control.shape == size.shape
             and bool((np.abs(control - decision @ case.control.values) <= FIGURES * size).all())
@@ -357,7 +360,8 @@ def _solution(stored: StoredRun, case: Case) -> Verdicts:
         return [f"it holds no array {error}"], "", []
     except (ValueError, TypeError, OverflowError):
         return ["its control and the certificate's are no arrays of one shape"], "", []
-    left = sorted(set(arrays) - {*STORED} - set(_witnessed(case, arrays)))
+    stored_gains = set() if case.policy is None else {"gains"}
+    left = sorted(set(arrays) - {*STORED} - stored_gains - set(_witnessed(case, arrays)))
     different = [] if same else ["its control is not the certificate's"]
     different += [text for text in _witnessed(case, arrays).values() if text]
     return different, "it holds the certificate's control", left

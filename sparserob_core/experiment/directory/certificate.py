@@ -37,7 +37,8 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
     multipliers of a program of its own, or those of the cost where there are none, and with the decision that acts
     least and its proof where that is another one. Where the cost is the time that the control acts, ``J`` is beside it,
     and ``tree`` holds the parts of the controls, each with multipliers of its own. ``witness``: what refutes the
-    decision.
+    decision. Under feedback ``decision`` is the nominal control, ``gains (K, K, m, d)`` are what answers the
+    innovations, and every constraint with a multiplier is one at a ``disturbance``.
     """
     if not isinstance(experiment, ControlExperiment) or result.status == "failed":
         return None
@@ -47,8 +48,10 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
     theta = (
         None
         if result.decision is None
-        else np.asarray(result.decision).reshape(program.channels, experiment.control.functions)
+        else experiment.transcription.nominal(result.decision).reshape(program.channels, experiment.control.functions)
     )
+    feedback = experiment.transcription.feedback
+    answered = {} if feedback is None or theta is None else {"gains": feedback.loop.gains(np.asarray(result.decision))}
     return {
         "format": FORMAT,
         "config": experiment.loaded.config.digest(),
@@ -57,6 +60,7 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
         "lower_bound": result.lower_bound,
         "gap_tolerance": experiment.gap_tolerance,
         "decision": theta,
+        **answered,
         **_counted(experiment, result),
         **_fewest(experiment, result.activity),
         "proof": _proofs(experiment, result.proofs),
@@ -106,11 +110,15 @@ def _fewest(experiment: ControlExperiment, activity: Activity | None) -> dict[st
 
 
 def _proofs(experiment: ControlExperiment, proofs: Sequence[Proof]) -> dict[str, Any]:
-    return {proof.family: _cells(experiment, proof) for proof in proofs if proof.verdict == "proven"}
+    """Per constraint; under feedback not of those on the control, which need no cells."""
+    about = {one.name for one in experiment.transcription.constraints}
+    kept = [one for one in proofs if experiment.transcription.feedback is None or one.family in about]
+    return {proof.family: _cells(experiment, proof) for proof in kept if proof.verdict == "proven"}
 
 
 def _multipliers(experiment: ControlExperiment, dual: Dual) -> dict[str, Any] | None:
-    """``None`` unless every constraint can be stated in numbers: a sampled one, of the scenario approach, cannot."""
+    """``None`` unless every constraint can be stated in numbers: a sampled one, of the scenario approach, cannot. Under
+    feedback a constraint is one at a disturbance, on its own pieces ``(mw, pieces)``."""
     problem, program, z = experiment.problem, experiment.program, dual.z
     steps = Steps.of(problem, experiment.control)
     explained = [
@@ -128,6 +136,7 @@ def _multipliers(experiment: ControlExperiment, dual: Dual) -> dict[str, Any] | 
                 "parameter": [] if cut.family == "control_step" else _parameter(problem, said),
                 **_direction(said),
                 "multiplier": cut.multiplier,
+                **({} if program.spread is None else {"disturbance": _admissible(problem, said)}),
             }
             for cut, said in explained
         ]
@@ -178,6 +187,15 @@ def _direction(said: TimedExplanation) -> dict[str, Any]:
     if said.gain is None:
         return {"direction": said.direction + 0.0}  # no negative zeros
     return {"direction": np.concatenate([said.direction, said.gain]) + 0.0, "piece": said.piece}
+
+
+def _admissible(problem: OptimalControlProblem, said: TimedExplanation) -> Array | None:
+    """The disturbance of a constraint, certainly in its set on every piece; ``None`` without one."""
+    bound = problem.disturbance
+    if bound is None or said.disturbance is None:
+        return None
+    middle = bound.middle()
+    return np.array([_inside(bound, column, middle) for column in said.disturbance.T]).reshape(-1, bound.dimension).T
 
 
 def _inside(bound: ConvexSet, point: Array, middle: Array) -> Array:

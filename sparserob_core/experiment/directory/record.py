@@ -90,17 +90,27 @@ def control_of(result: Result, program: SemiInfiniteProgram, dictionary: Diction
     kind."""
     if result.decision is None or dictionary is None:
         return None
-    theta = np.asarray(result.decision).reshape(program.channels, dictionary.functions)
+    theta = _nominal(result.decision, program, dictionary)
     return np.asarray(theta @ dictionary.values)
 
 
+def _nominal(decision: Array | None, program: SemiInfiniteProgram, dictionary: Dictionary) -> Array:
+    """The coefficients ``(m, N)`` of the control; under feedback of the nominal one, with which a decision begins."""
+    count = program.channels * dictionary.functions
+    return np.asarray(decision)[:count].reshape(program.channels, dictionary.functions)
+
+
 def arrays_of(
-    result: Result, program: SemiInfiniteProgram, dictionary: Dictionary | None, control: Array | None
+    result: Result,
+    program: SemiInfiniteProgram,
+    dictionary: Dictionary | None,
+    control: Array | None,
+    gains: Array | None = None,
 ) -> dict[str, Any]:
     """``solution.npz``: the decision, and for a control problem ``breakpoints``, ``control``, ``theta``; one row per
     imposed index in ``times``, ``indices`` (padded with NaN where families differ in dimension), ``rows``,
     ``families``, ``formulations`` (what its index says) and ``multipliers``; ``worst_disturbance (mw, pieces)`` where
-    the worst constraint has one."""
+    the worst constraint has one; ``gains (K, K, m, n)`` under feedback."""
     cuts = list(result.indices)
     width = max((np.size(cut.index) for cut in cuts), default=0)
     indices = np.full((len(cuts), width), np.nan)
@@ -119,10 +129,12 @@ def arrays_of(
         arrays["breakpoints"] = dictionary.breakpoints
     if isinstance(result.worst, Witness) and result.worst.disturbance is not None:
         arrays["worst_disturbance"] = result.worst.disturbance
+    if gains is not None:
+        arrays["gains"] = gains
     if control is not None and dictionary is not None:
         arrays |= {
             "control": control,
-            "theta": np.asarray(result.decision).reshape(program.channels, dictionary.functions),
+            "theta": _nominal(result.decision, program, dictionary),
         }
     return arrays
 

@@ -53,7 +53,15 @@ def _bounded(experiment: ControlExperiment, result: Result) -> Result:
     from sparserob_core.checker.claims.claims import derived_bound
     from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 
-    case = Case(experiment.problem, experiment.control, experiment.disturbance, finite(data), Clock(SECONDS))
+    feedback = experiment.transcription.feedback
+    case = Case(
+        experiment.problem,
+        experiment.control,
+        experiment.disturbance,
+        finite(data),
+        Clock(SECONDS),
+        policy=None if feedback is None else feedback.policy,
+    )
     try:
         derived = derived_bound(case)
     except (Broken, Unchecked, ZeroDivisionError):

@@ -104,7 +104,8 @@ class Journal(Observer):
         `StudyProgress` where a figure takes longer."""
         experiment, write = self.experiment, self.directory
         control, summary = self.record(result)
-        write.write_arrays("solution.npz", arrays_of(result, experiment.program, self._dictionary, control))
+        gains = gains_of(experiment, result)
+        write.write_arrays("solution.npz", arrays_of(result, experiment.program, self._dictionary, control, gains))
         rounds = self.rounds or list(result.history)
         write.write_arrays("trace.npz", trace_columns(rounds))
         kept = round_arrays(rounds)
@@ -125,3 +126,9 @@ class Journal(Observer):
         if worst:
             write.write_arrays(ADVERSARY, worst)
         return control, summary, drawn(experiment, result, write.path, worst, notify) if figures else ()
+
+
+def gains_of(experiment: Experiment, result: Result) -> Array | None:
+    """The gains ``(K, K, m, n)`` of a decision; ``None`` without feedback."""
+    feedback = experiment.transcription.feedback if isinstance(experiment, ControlExperiment) else None
+    return None if feedback is None or result.decision is None else feedback.loop.gains(np.asarray(result.decision))

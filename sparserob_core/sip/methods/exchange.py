@@ -24,6 +24,7 @@ from sparserob_core.sip.inner.vertex import vertex
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.methods.counting import count, tidied
 from sparserob_core.sip.methods.ledger import Answer, Found, Ledger, Prover
+from sparserob_core.sip.methods.robust import robust_exchange
 from sparserob_core.sip.methods.unbounded import bounding_rows, falls_for_ever
 from sparserob_core.sip.program import EQUALITY, TOLERANCE, ConstraintFamily, SemiInfiniteProgram, Separation
 from sparserob_core.sip.proof.branch_and_bound import prove
@@ -67,6 +68,8 @@ class Exchange(Method, Options):
         constraints to impose from the beginning."""
         if not self.exact and tools.regulariser is None:
             raise InputError(path="exact", expected="true, for there is no regulariser", got="false")
+        if program.spread is not None:
+            return robust_exchange(program, tools, prover, self.tolerance, self.rounds)
         relaxed = RelaxedProgram(program, tools.solver, tools.regulariser, deadline=tools.deadline)
         ledger = Ledger(program, relaxed, tools, self.tolerance)
         try:

@@ -1,0 +1,398 @@
+"""The claims of a run whose control answers what it measures, each derived anew from its gains in ball arithmetic."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Mapping
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.balls import balls, below
+from sparserob_core.checker.claims.case import Case, Window, number, numbers
+from sparserob_core.checker.claims.constraints import covered, cut
+from sparserob_core.checker.outcome import RESOLVED, TOLERANCE, Broken, Unchecked
+from sparserob_core.checker.reach.closed_loop import ClosedLoop
+from sparserob_core.checker.reach.flow import stacked
+from sparserob_core.checker.sets.shapes import facets, limit, member, support, units
+from sparserob_core.control.sets.sets import Ellipsoid, NormBall
+from sparserob_core.sip.convex_set import Array, ConvexSet
+
+if TYPE_CHECKING:
+    from flint import arb, arb_mat
+
+MOST_CELLS = 40_000  # cells of time examined for each constraint
+PEAK, CONTROL = "peak", "control"
+
+
+@final
+class FeedbackClaims:
+    """What a certificate claims of a policy: nominal control and ``gains (K, K, m, d)``."""
+
+    def __init__(self, case: Case) -> None:
+        self.case = case
+
+    @cached_property
+    def gains(self) -> Array:
+        """The gains; raises `Broken` where they answer what is not yet measured, or is forgotten."""
+        case, policy = self.case, self.case.policy
+        assert policy is not None
+        K, m, d = case.control.pieces, case.problem.system.controls, case.problem.system.states
+        gains = numbers(case.certificate.get("gains"), "gains")
+        if gains.shape != (K, K, m, d):
+            raise Broken(f"the gains have shape {gains.shape}, expected {(K, K, m, d)}")
+        times = case.control.breakpoints
+        for k, j in np.argwhere(gains.any(axis=(2, 3))).tolist():
+            if j > k or j == 0:
+                raise Broken(f"the control from t = {float(times[k]):.6g} on answers what is not measured yet")
+            old = float(times[k]) - float(times[j])
+            if policy.memory is not None and old > policy.memory + 1e-12 * case.problem.horizon:
+                raise Broken(f"the control from t = {float(times[k]):.6g} on answers what is {old:.6g} old")
+        return gains
+
+    @cached_property
+    def loop(self) -> ClosedLoop:
+        """The system under the nominal control and the gains."""
+        return self._loop(self.case.theta, self.gains)
+
+    def _loop(self, nominal: Array, gains: Array) -> ClosedLoop:
+        case = self.case
+        if case.problem.system.parameter_count:
+            raise Unchecked("the checker knows feedback of known systems only")
+        return ClosedLoop(
+            case.problem.system,
+            [float(v) for v in np.asarray(case.problem.initial_state)],
+            nominal,
+            gains,
+            case.grid,
+            [float(t) for t in case.control.breakpoints],
+            case.changes or [],
+            case.problem.disturbance,
+        )
+
+    def control(self) -> str:
+        """Every piece of the control in its set, for every disturbance."""
+        shape = self.case.problem.control
+        flat = facets(shape)
+        if flat is None:
+            raise Unchecked("the checker knows feedback into sets with flat sides only")
+        worst, loop = -np.inf, self.loop
+        for k, effect in enumerate(loop.effects):
+            self.case.clock.check()
+            v = balls(loop.nominal[:, k])
+            for (c, b), unit in zip(flat, units(shape), strict=True):
+                along = [_dot(c, [row[q] for row in effect]) for q in range(len(effect[0]))] if effect else []
+                height = _dot(c, v) + loop.support(along)
+                unit = max(unit, RESOLVED * float((abs(height) + abs(b)).mid())) or 1.0
+                over = float((height - b).upper()) / unit
+                if over > TOLERANCE:
+                    raise Broken(f"it leaves its set by {over:.3g} of its own unit, on piece {k + 1}, for some disturbance")
+                worst = max(worst, over)
+        return f"{len(loop.effects)} pieces in their set for every disturbance, to {worst:.1e} of its own units"
+
+    def cost(self) -> arb:
+        """The cost of the policy."""
+        from flint import arb
+
+        case, total = self.case, arb(0)
+        assert case.policy is not None
+        weights, times = np.asarray(case.problem.weights), case.control.breakpoints
+        for k in range(case.control.pieces):
+            length = arb(float(times[k + 1])) - arb(float(times[k]))
+            for i, w in enumerate(weights):
+                u = arb(float(case.theta[i, k]))
+                if case.policy.cost == PEAK:
+                    row = self.loop.effects[k][i]
+                    height = (u + self.loop.support(row)).max(-u + self.loop.support([-x for x in row]))
+                else:
+                    height = abs(u)
+                total = total + length * arb(float(w)) * height
+        return total
+
+    def bounded(self, window: Window) -> str:
+        """Show that a constraint is kept at every time, for every disturbance."""
+        case, loop = self.case, self.loop
+        data = case.certificate.get("proof", {})
+        entry = data.get(window.name) if isinstance(data, Mapping) else None
+        if not isinstance(entry, Mapping):
+            if case.certificate.get("status") == "undecided":
+                raise Unchecked("the certificate does not claim it")
+            raise Broken("the certificate holds no proof of it")
+        tolerance = number(entry, "tolerance")
+        if not 0 < tolerance <= TOLERANCE * (1.0 + 1e-12):
+            raise Broken(f"a violation of {tolerance:g} is to count as none, of its own unit at most {TOLERANCE:g} may")
+        flat = facets(window.shape)
+        if flat is None:
+            raise Unchecked("the checker knows feedback with sets with flat sides only")
+        lower, upper = numbers(entry.get("lower"), "lower"), numbers(entry.get("upper"), "upper")
+        covered(case, window, lower, upper)
+        rows = np.array([c for c, _ in flat]).reshape(len(flat), -1)
+        limits, unit = np.array([below(b) for _, b in flat]), case.units(window).rows
+        todo = [part for a, b in zip(lower, upper, strict=True) for part in cut(case, float(a[0]), float(b[0]))]
+        known: dict[tuple[int, float], Array] = {}
+        count, most = 0, -np.inf
+
+        def heights(piece: int, time: float) -> Array:
+            if (piece, time) not in known:
+                found = loop.heights(loop.state(piece, time), rows)
+                known[piece, time] = np.array([[float(x.upper()), float(x.lower())] for x in found])
+                over = (known[piece, time][:, 1] - limits) / unit
+                if (over > TOLERANCE).any():
+                    raise Broken(f"it is exceeded at t = {time:.6g}, by {over.max():.1e} of its unit")
+            return known[piece, time][:, 0]
+
+        while todo:
+            case.clock.check()
+            piece, start, stop = todo.pop()
+            count += 1
+            if count > MOST_CELLS:
+                raise Unchecked(f"neither shown nor refuted after {count} cells")
+            ends = np.nextafter(np.maximum(heights(piece, start), heights(piece, stop)), np.inf)
+            over = (ends + loop.bent(piece, start, stop, rows) - limits) * (1.0 + 1e-15) / unit
+            if (over <= TOLERANCE).all():
+                most = max(most, float(over.max()))
+                continue
+            half = (start + stop) / 2
+            if not start < half < stop:
+                raise Unchecked(f"the times around {start!r} cannot be halved any more")
+            todo += [(piece, start, half), (piece, half, stop)]
+        return f"kept for every disturbance, to {most:.1e} of its own unit ({count} cells)"
+
+    def multiplied(self, entries: list[Any], priced: bool) -> arb:
+        """The bound that multipliers of constraints at single disturbances prove, for every policy of the kind.
+
+        Of the nominal control ``v`` and, with the cost ``peak``, of the peaks only the sets are used; of the gains that
+        the control they cause is no wider than its set, ``h(F_kl) + h(-F_kl) <= width`` summed over the blocks ``l``.
+        """
+        from flint import arb
+
+        case = self.case
+        assert case.policy is not None
+        K, m, d = case.control.pieces, case.problem.system.controls, case.problem.system.states
+        loop = self._loop(np.zeros((m, K)), np.zeros((K, K, m, d)))
+        rows = [_Row.of(case, loop, entry, case.policy.cost == PEAK) for entry in entries]
+        total = sum((row.multiplier * row.constant for row in rows), arb(0))
+        slope = [[sum((r.multiplier * r.nominal[k][i] for r in rows if not r.nominal[k][i].is_zero()), arb(0))
+                  for i in range(m)] for k in range(K)]  # fmt: skip
+        times, peaks = case.control.breakpoints, case.policy.cost == PEAK
+        weights = np.asarray(case.problem.weights, dtype=float)
+        for k in range(K):
+            length = arb(float(times[k + 1])) - arb(float(times[k]))
+            prices = [arb(float(w)) * length if priced else arb(0) for w in weights]
+            if peaks:
+                for i in range(m):
+                    asked = prices[i] - sum((r.multiplier for r in rows if r.peak == (k, i)), arb(0))
+                    total = total + (asked * _reach(case.problem.control, i)).min(arb(0))
+                prices = [arb(0)] * m
+            total = total + case.duality.least(prices, slope[k])
+        return total - self._of_gains(loop, rows)
+
+    def _of_gains(self, loop: ClosedLoop, rows: list[_Row]) -> arb:
+        """How much the gains can lower the weighted sum of the rows, at most."""
+        from flint import arb
+
+        case, total = self.case, arb(0)
+        shape = case.problem.disturbance
+        rows = [row for row in rows if any(not x.is_zero() for part in row.innovations for x in part)]
+        if shape is None or not rows:
+            return total
+        K, m = case.control.pieces, case.problem.system.controls
+        d = case.problem.system.states
+        left = stacked([[r.multiplier * r.nominal[k][i] for r in rows] for k in range(K) for i in range(m)])
+        right = stacked([[x for part in r.innovations for x in part] for r in rows])
+        product = (left * right).tolist()
+        chords, width = _chords(shape, loop.middle), [_width(case.problem.control, i) for i in range(m)]
+        for k in range(1, K):
+            clusters = self._clusters(loop, k)
+            for i in range(m):
+                sizes = [arb(0)]
+                for members, inverse, blocks in clusters:
+                    z = (inverse * stacked([[product[k * m + i][j * d + s]] for j in members for s in range(d)])).entries()
+                    sizes += [
+                        sum((abs(z[n * loop.width + b]) / chords[b] for b in range(loop.width)), arb(0))
+                        for n in range(len(blocks))
+                    ]
+                total = total + width[i] * _largest(sizes)
+        return total
+
+    def _clusters(self, loop: ClosedLoop, k: int) -> list[tuple[list[int], arb_mat, list[int]]]:
+        """The breakpoints that the control on a piece answers, those that see a block in common together; for each what
+        gives, from a combination of the states seen there, a combination of the blocks, ``(q, J d)``."""
+        policy, times = self.case.policy, self.case.control.breakpoints
+        assert policy is not None
+        slack = 1e-12 * self.case.problem.horizon
+        oldest = -np.inf if policy.memory is None else float(times[k]) - policy.memory - slack
+        groups: list[tuple[list[int], set[int]]] = []
+        for j in range(1, k + 1):
+            if float(times[j]) < oldest or not loop.seen[j]:
+                continue
+            mine, rest = ([j], set(loop.seen[j])), []
+            for members, blocks in groups:
+                if blocks & mine[1]:
+                    mine = (members + mine[0], mine[1] | blocks)
+                else:
+                    rest.append((members, blocks))
+            groups = [*rest, mine]
+        return [(sorted(members), *self._inverse(loop, tuple(sorted(members)))) for members, _ in groups]
+
+    def _inverse(self, loop: ClosedLoop, members: tuple[int, ...]) -> tuple[arb_mat, list[int]]:
+        """A left inverse of what is seen, or a right one where more acts than is seen."""
+        from flint import arb
+
+        if members not in self._inverses:
+            blocks = sorted({block for j in members for block in loop.seen[j]})
+            d, zero = loop.parts["A"].nrows(), [arb(0)] * loop.width
+            table = []
+            for j in members:
+                lists = {block: push.tolist() for block, push in loop.seen[j].items()}
+                for s in range(d):
+                    table.append([x for block in blocks for x in (lists[block][s] if block in lists else zero)])
+            D = stacked(table)
+            if D.ncols() <= D.nrows():
+                inverse = (D.transpose() * D).inv() * D.transpose()
+            else:
+                inverse = D.transpose() * (D * D.transpose()).inv()
+            self._inverses[members] = (inverse, blocks)
+        return self._inverses[members]
+
+    @cached_property
+    def _inverses(self) -> dict[tuple[int, ...], tuple[arb_mat, list[int]]]:
+        return {}
+
+
+@lru_cache(maxsize=2)
+def feedback_of(case: Case) -> FeedbackClaims:
+    """What is claimed of the policy of a case, made once."""
+    return FeedbackClaims(case)
+
+
+@final
+class _Row:
+    """One constraint at one disturbance: ``constant + sum_k nominal_k (v_k + sum_j M_kj innovations_j)``, less the peak
+    ``(k, i)`` where it compares with one, is at most 0 for every feasible policy."""
+
+    def __init__(
+        self,
+        multiplier: float,
+        constant: arb,
+        nominal: list[list[arb]],
+        innovations: list[list[arb]],
+        peak: tuple[int, int] | None,
+    ) -> None:
+        from flint import arb
+
+        self.multiplier, self.constant, self.nominal = arb(multiplier), constant, nominal
+        self.innovations, self.peak = innovations, peak
+
+    @staticmethod
+    def of(case: Case, loop: ClosedLoop, entry: object, peaks: bool) -> _Row:
+        """The constraint that an entry of the certificate names, which must be one of the problem's."""
+        from flint import arb
+
+        case.clock.check()
+        if not isinstance(entry, Mapping):
+            raise Broken("multipliers: expected a constraint, a time, a direction, a disturbance and a number each")
+        name = str(entry.get("constraint"))
+        direction, time = numbers(entry.get("direction"), f"{name}: direction"), number(entry, "time")
+        y = number(entry, "multiplier")
+        if not y > 0:
+            raise Broken(f"a multiplier of {name} is {y!r}, expected a positive number")
+        if numbers(entry.get("parameter", []), f"{name}: parameter").size:
+            raise Broken(f"{name}: a parameter is given of a known system")
+        z = _deviations(case, loop, entry.get("disturbance"), name)
+        K, m, d = case.control.pieces, case.problem.system.controls, case.problem.system.states
+        innovations = [
+            [sum((push[s, b] * z[block][b] for block, push in seen.items() for b in range(loop.width)), arb(0))
+             for s in range(d)] for seen in loop.seen
+        ]  # fmt: skip
+        nominal = [[arb(0)] * m for _ in range(K)]
+        if name in (CONTROL, PEAK):
+            if direction.shape != (m,):
+                raise Broken(f"{name}: {direction.size} numbers where {m} are expected")
+            piece = int(np.clip(bisect_right(loop.breakpoints, time) - 1, 0, K - 1))
+            nominal[piece] = balls(direction)
+            innovations = [part if j <= piece else [arb(0)] * d for j, part in enumerate(innovations)]
+            if name == CONTROL:
+                return _Row(y, -limit(case.problem.control, direction), nominal, innovations, None)
+            channel = int(np.abs(direction).argmax())
+            if not peaks or sorted(np.abs(direction).tolist()) != [0.0] * (m - 1) + [1.0]:
+                raise Broken(f"{name}: the direction {direction.tolist()} is not that of a peak of this policy")
+            return _Row(y, arb(0), nominal, innovations, (piece, channel))
+        window = case.window(name)
+        if direction.shape != (d,):
+            raise Broken(f"{name}: {direction.size} numbers where {d} are expected")
+        if not window.start <= time <= window.stop:
+            raise Broken(f"{name}: t = {time!r} is not within {window.start:g} to {window.stop:g}")
+        row = case.duality.row(direction, time, [], limit(window.shape, direction), disturbed=False)
+        constant = row.constant
+        for block, weights in enumerate(case.duality.pushed(direction, time)):
+            for b, weight in enumerate(weights):
+                constant = constant + weight * (arb(float(loop.middle[b])) + z[block][b])
+        return _Row(y, constant, row.slope, innovations, None)
+
+
+def _deviations(case: Case, loop: ClosedLoop, signal: object, name: str) -> list[list[arb]]:
+    """The deviations of a disturbance ``(mw, blocks)``, which must be in its set."""
+    from flint import arb
+
+    if case.problem.disturbance is None:
+        return []
+    w = numbers(signal, f"{name}: disturbance")
+    if w.shape != (loop.width, loop.blocks):
+        raise Broken(f"{name}: a disturbance of shape {w.shape}, expected {(loop.width, loop.blocks)}")
+    for block in range(loop.blocks):
+        if not member(case.problem.disturbance, w[:, block]):
+            raise Broken(f"{name}: the disturbance {w[:, block].tolist()} is not shown to be in its set")
+    return [[arb(float(v)) - arb(float(c)) for v, c in zip(column, loop.middle, strict=True)] for column in w.T]
+
+
+def _dot(c: Array, x: list[arb]) -> arb:
+    from flint import arb
+
+    return sum((arb(float(a)) * v for a, v in zip(c, x, strict=True) if a), arb(0))
+
+
+def _axis(shape: ConvexSet, channel: int, sign: float) -> arb:
+    return support(shape, balls([sign * float(i == channel) for i in range(shape.dimension)]))
+
+
+def _width(shape: ConvexSet, channel: int) -> arb:
+    return _axis(shape, channel, 1.0) + _axis(shape, channel, -1.0)
+
+
+def _reach(shape: ConvexSet, channel: int) -> arb:
+    return _axis(shape, channel, 1.0).max(_axis(shape, channel, -1.0)).max(_axis(shape, channel, 1.0) * 0)
+
+
+def _chords(shape: ConvexSet, middle: Array) -> list[arb]:
+    """Numbers ``c_b`` such that the width of a set along any ``a`` is at least ``c_b |a_b|``: how long it is along the
+    axes through its middle."""
+    from flint import arb
+
+    if isinstance(shape, NormBall):
+        return [2 * arb(shape.radius)] * shape.dimension
+    if isinstance(shape, Ellipsoid):
+        inverse = stacked([[arb(float(v)) for v in row] for row in shape.shape]).inv()
+        return [2 / inverse[b, b].sqrt() for b in range(shape.dimension)]
+    flat = facets(shape)
+    if flat is None:
+        raise Unchecked("the checker does not know how long the disturbance's set is along the axes")
+    found = []
+    for axis in range(shape.dimension):
+        reach = []
+        for sign in (1.0, -1.0):
+            ends = [(b - _dot(c, balls(middle))) / arb(abs(float(c[axis]))) for c, b in flat if sign * c[axis] > 0]
+            least = ends[0]
+            for end in ends[1:]:
+                least = least.min(end)
+            reach.append(least)
+        found.append(reach[0] + reach[1])
+    return found
+
+
+def _largest(values: list[arb]) -> arb:
+    largest = values[0]
+    for value in values[1:]:
+        largest = largest.max(value)
+    return largest

@@ -1,0 +1,253 @@
+"""What a system does whose control answers what it measures, in balls: from the gains alone.
+
+The control on piece ``k`` is ``u_k = v_k + sum_j M_kj e_j``, where ``e_j`` is what the state at the breakpoint ``tau_j``
+has beyond what the state at ``tau_{j-1}``, the control in between and the middle of the disturbance predict. With
+``w = m + z`` for the middle ``m``, it is ``e_j = sum_l D_jl z_l`` over the blocks ``l`` on which the disturbance is constant.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.series import norm
+from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.checker.reach.flow import Flow, held, stacked
+from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
+from sparserob_core.checker.sets.shapes import centre, corners, known, member, radius, support
+from sparserob_core.control.sets.sets import Box, ConvexSet, Polytope
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from flint import arb, arb_mat
+
+    from sparserob_core.control.problem.system import LinearSystem
+
+TERMS = 8  # of the expansion that bounds a second derivative
+
+
+def middle(shape: ConvexSet) -> Array:
+    """The middle ``(d,)`` of a bounded set: that of its bounding box."""
+    known(shape)
+    if isinstance(shape, Box):
+        return np.asarray((shape.lower + shape.upper) / 2)
+    if not isinstance(shape, Polytope):
+        return centre(shape)
+    points = np.array([[float(v) for v in point] for point in corners(shape)])
+    found: Array = (points.min(axis=0) + points.max(axis=0)) / 2
+    if not member(shape, found):
+        raise Unchecked("the checker does not know the middle of a polytope whose bounding box has its middle outside")
+    return found
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class ClosedLoop:
+    """A known system from ``initial_state`` under the nominal control ``(m, K)`` and ``gains (K, K, m, d)``; ``grid``:
+    every breakpoint; ``breakpoints``: those of the control; ``changes``: where the disturbance may jump."""
+
+    system: LinearSystem
+    initial_state: list[float]
+    nominal: Array
+    gains: Array
+    grid: list[float]
+    breakpoints: list[float]
+    changes: list[float]
+    shape: ConvexSet | None
+    _steps: dict[float, tuple[arb_mat, arb_mat]] = field(default_factory=dict, repr=False)
+
+    @cached_property
+    def parts(self) -> dict[str, arb_mat]:
+        """``A``, ``B``, ``E``."""
+        flow = Flow(self.system, (), (), 0)
+        return {name: matrices[0] for name, matrices in flow.parts.items()}
+
+    @property
+    def drift(self) -> list[arb]:
+        """What drives every state beside control and disturbance: the columns of ``B`` beyond those of the control."""
+        from flint import arb
+
+        m = self.gains.shape[2]
+        return [sum(row[m:], arb(0)) for row in self.parts["B"].tolist()]
+
+    @property
+    def blocks(self) -> int:
+        """How many blocks the disturbance has."""
+        return len(self.changes) if self.shape is not None else 0
+
+    @property
+    def width(self) -> int:
+        """How many entries a block has."""
+        return int(self.parts["E"].ncols())
+
+    @cached_property
+    def middle(self) -> Array:
+        """What deviations are counted from, ``(mw,)``."""
+        return np.zeros(self.width) if self.shape is None else middle(self.shape)
+
+    def _places(self, piece: int) -> tuple[int, int]:
+        """Of a piece of the grid the piece of the control and the block of the disturbance."""
+        inside = (self.grid[piece] + self.grid[piece + 1]) / 2
+        return bisect_right(self.breakpoints, inside) - 1, bisect_right(self.changes, inside) - 1
+
+    def _held(self, start: float, stop: float) -> tuple[arb_mat, arb_mat]:
+        """``e^{A s}`` and its integral, ``s`` from one time to another."""
+        from flint import arb, arb_mat
+
+        length = arb(stop) - arb(start)
+        key = stop - start
+        if key in self._steps and self._exact(start, stop, key):
+            return self._steps[key]
+        d = self.parts["A"].nrows()
+        identity = arb_mat([[int(i == j) for j in range(d)] for i in range(d)])
+        found = held(self.parts["A"], identity, length)
+        if self._exact(start, stop, key):
+            self._steps[key] = found
+        return found
+
+    @staticmethod
+    def _exact(start: float, stop: float, key: float) -> bool:
+        """Whether the difference of two times is the float that it was rounded to."""
+        from fractions import Fraction
+
+        return Fraction(stop) - Fraction(start) == Fraction(key)
+
+    @cached_property
+    def seen(self) -> list[dict[int, arb_mat]]:
+        """``D_jl``: what every innovation is of every block, ``(d, mw)``; blocks that are not seen are left out."""
+        K = len(self.breakpoints) - 1
+        found: list[dict[int, arb_mat]] = [{} for _ in range(K)]
+        for piece in range(len(self.grid) - 1 if self.blocks else 0):
+            k, block = self._places(piece)
+            if k + 1 >= K:
+                continue
+            Gamma = self._held(self.grid[piece], self.grid[piece + 1])[1]
+            Phi = self._held(self.grid[piece + 1], self.breakpoints[k + 1])[0]
+            push = Phi * Gamma * self.parts["E"]
+            if any(not x.is_zero() for x in push.entries()):
+                found[k + 1][block] = found[k + 1][block] + push if block in found[k + 1] else push
+        return found
+
+    @cached_property
+    def effects(self) -> list[list[list[arb]]]:
+        """``F_k (m, Q)``: how the control on each piece depends on the deviations."""
+        from flint import arb
+
+        m, mw, zero = self.gains.shape[2], self.width, arb(0)
+        table = []
+        for k in range(self.gains.shape[0]):
+            rows = [[zero] * (self.blocks * mw) for _ in range(m)]
+            for j in range(k + 1):
+                if not self.gains[k, j].any():
+                    continue
+                M = stacked([[arb(float(v)) for v in row] for row in self.gains[k, j]])
+                for block, push in self.seen[j].items():
+                    for i, row in enumerate((M * push).tolist()):
+                        for b, value in enumerate(row):
+                            rows[i][block * mw + b] = rows[i][block * mw + b] + value
+            table.append(rows)
+        return table
+
+    @cached_property
+    def drives(self) -> list[arb_mat]:
+        """What drives the nominal state and every response on each piece of the grid, ``(d, 1 + Q)``."""
+        from flint import arb
+
+        m, E, mw, found = self.gains.shape[2], self.parts["E"], self.width, []
+        B, drift = stacked([row[:m] for row in self.parts["B"].tolist()]), self.drift
+        onto = [E * stacked([[arb(float(v))] for v in self.middle])] if self.blocks else []
+        by_control = {}
+        for k, effect in enumerate(self.effects):
+            v = [[arb(float(value))] for value in self.nominal[:, k]]
+            by_control[k] = B * stacked([head + row for head, row in zip(v, effect, strict=True)])
+        for piece in range(len(self.grid) - 1):
+            k, block = self._places(piece)
+            rows = by_control[k].tolist()
+            for i, c in enumerate(drift):
+                rows[i][0] = rows[i][0] + c
+            if self.blocks:
+                for i in range(len(rows)):
+                    rows[i][0] = rows[i][0] + onto[0][i, 0]
+                    for b in range(mw):
+                        at = 1 + block * mw + b
+                        rows[i][at] = rows[i][at] + E[i, b]
+            found.append(stacked(rows))
+        return found
+
+    @cached_property
+    def nodes(self) -> list[arb_mat]:
+        """The nominal state and every response at the breakpoints of the grid, ``(d, 1 + Q)``."""
+        from flint import arb
+
+        zero = [arb(0)] * (self.blocks * self.width)
+        found = [stacked([[arb(float(v)), *zero] for v in self.initial_state])]
+        for piece, drive in enumerate(self.drives):
+            Phi, Gamma = self._held(self.grid[piece], self.grid[piece + 1])
+            found.append(Phi * found[-1] + Gamma * drive)
+        return found
+
+    def state(self, piece: int, time: float) -> arb_mat:
+        """The nominal state and every response at a time in a piece of the grid."""
+        if time == self.grid[piece]:
+            return self.nodes[piece]
+        if time == self.grid[piece + 1]:
+            return self.nodes[piece + 1]
+        Phi, Gamma = self._held(self.grid[piece], time)
+        return Phi * self.nodes[piece] + Gamma * self.drives[piece]
+
+    @cached_property
+    def radii(self) -> Array:
+        """How far each entry of a deviation comes from 0, ``(Q,)``, rounded up."""
+        if self.shape is None:
+            return np.zeros(0)
+        far = np.array(radius(self.shape)) + np.abs(self.middle) if self.middle.any() else np.array(radius(self.shape))
+        if isinstance(self.shape, Box):
+            far = np.maximum(self.shape.upper - self.middle, self.middle - self.shape.lower)
+        return np.tile(np.nextafter(far * OUTWARD, np.inf), self.blocks)
+
+    def support(self, a: list[arb]) -> arb:
+        """``max z'a`` over all deviations, ``a (Q,)`` in balls."""
+        from flint import arb
+
+        if self.shape is None:
+            return arb(0)
+        mw, total = self.width, arb(0)
+        for first in range(0, len(a), mw):
+            block = a[first : first + mw]
+            if any(not x.is_zero() for x in block):
+                total = total + support(self.shape, block)
+                for x, m in zip(block, self.middle, strict=True):
+                    total = total - x * arb(float(m)) if m else total
+        return total
+
+    def heights(self, state: arb_mat, rows: Array) -> list[arb]:
+        """``max c'x`` over all deviations for every row ``c`` of ``rows (r, d)``, at a time with this `state`."""
+        from flint import arb
+
+        along = (stacked([[arb(float(v)) for v in row] for row in rows]) * state).tolist()
+        return [row[0] + self.support(row[1:]) for row in along]
+
+    def bent(self, piece: int, start: float, stop: float, rows: Array) -> Array:
+        """By how much ``max c'x(t)`` may lie above its chord on ``[start, stop]``, a part of a piece of the grid, at
+        most, ``(r,)``: ``(stop - start)^2 / 8`` times the largest second derivatives of the nominal state and of every
+        response, each times how far its deviation goes."""
+        from flint import arb
+
+        A, h = self.parts["A"], arb(stop) - arb(start)
+        rate = A * self.state(piece, start) + self.drives[piece]
+        row, factor, total = stacked([[arb(float(v)) for v in c] for c in rows]) * A, arb(1), 0.0
+        for order in range(TERMS):
+            found = Enclosed.of(row * rate)
+            total = total + (np.abs(found.mid) + found.rad) * float((factor * OUTWARD).upper())
+            row, factor = row * A, factor * h / (order + 1)
+        sizes = np.concatenate([[1.0], self.radii])
+        most = Enclosed.of(rate)
+        speed = float((np.sqrt(((np.abs(most.mid) + most.rad) ** 2).sum(axis=0)) @ sizes) * OUTWARD)
+        tail = float((factor * (norm(A) * h).exp()).upper()) * speed
+        lengths = np.array([float(norm(stacked([line])).upper()) for line in row.tolist()])
+        summed = total @ sizes * (1.0 + rounding(sizes.size)) + tail * lengths
+        return np.asarray(float((h * h / 8).upper()) * summed * OUTWARD)

@@ -1,0 +1,237 @@
+"""State and control constraints under feedback, as families whose rows must hold for every deviation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import final
+
+import numpy as np
+
+from sparserob_core.control.constraints.explanation import TimedExplanation
+from sparserob_core.control.constraints.flat import FlatConstraint
+from sparserob_core.control.constraints.local_maxima import local_maxima
+from sparserob_core.control.response.closed_loop import ROUND_OFF, ClosedLoop, shared
+from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.program import ConstraintFamily, Enclosure, Explanation, Separation
+from sparserob_core.sip.uncertain import UncertainRows
+
+INSIDE = 4  # times sampled on every piece
+KEPT = 12  # separated times for each row and round
+ZOOMED, ZOOMS, CLOSER = 9, 14, 4.0  # samples around a maximum, and how often they are drawn so many times closer
+BEGUN = 6  # times of a window that a method begins with
+STATES = 60_000_000  # numbers in the states that are sampled at once
+
+
+def _not_linear(indices: Array) -> tuple[Array, Array]:
+    raise InputError("under feedback a constraint is no row of the decision: the method exchange knows such programs")
+
+
+def _family(
+    constraint: FeedbackConstraint | FeedbackControl, index_set: Box, start: Array, source: object
+) -> ConstraintFamily:
+    family = ConstraintFamily(
+        name=constraint.name,
+        index_set=index_set,
+        rows=_not_linear,
+        excess=constraint.excess,
+        uncertain=constraint.uncertain,
+        start=start,
+        worst=constraint.worst,
+        enclosure=constraint.enclosure,
+        cells=constraint.cells,
+        explain=constraint.explain,
+        source=source,
+    )
+    far = np.concatenate([constraint.loop.spread.radii])
+    box = Box(np.concatenate([index_set.lower, -far]), np.concatenate([index_set.upper, far]))
+    literal = replace(
+        family, index_set=box, formulation="literal", reduced=family, explain=constraint.explain, worst=None, excess=None
+    )
+    return replace(family, literal=literal)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class FeedbackConstraint:
+    """``H x(t) <= h`` for all times of a window and every disturbance, with the control that it causes; the index is
+    ``(t,)``, or with the deviations of the disturbance ``(t, w)``. ``flat``: the same constraint without feedback."""
+
+    flat: FlatConstraint
+    loop: ClosedLoop
+
+    @property
+    def name(self) -> str:
+        """The name of the constraint."""
+        return self.flat.name
+
+    def family(self) -> ConstraintFamily:
+        """The constraint as a family."""
+        start, stop = self.flat.start, self.flat.stop
+        begun = np.unique(np.linspace(0, self.times.size - 1, min(BEGUN, self.times.size)).round().astype(int))
+        return _family(self, Box(np.array([start]), np.array([stop])), self.times[begun][:, None], self.flat)
+
+    @cached_property
+    def times(self) -> Array:
+        """Sampled times: the ends of the window, the breakpoints in it, and a few in every piece."""
+        return np.unique(np.concatenate([self.flat.cells[0][:, 0], self.flat.cells[1][:, 0]]))
+
+    @cached_property
+    def sampled(self) -> Array:
+        """`times`, and some between them."""
+        inner = self.times[:-1, None] + np.diff(self.times)[:, None] * np.arange(INSIDE) / INSIDE
+        return np.append(inner.ravel(), self.times[-1])
+
+    def excess(self, x: Array, indices: Array) -> Array:
+        """Violations ``(k, r)`` at times ``(k, 1)`` under the worst disturbances."""
+        return self.loop.values(x, indices[:, 0], self.flat.H) - self.flat.h
+
+    def uncertain(self, index: Array) -> UncertainRows:
+        """The rows at one time."""
+        return self.loop.state_rows(float(index[0]), self.flat.H, self.flat.h, *self._shared)
+
+    @cached_property
+    def _shared(self) -> tuple[np.ndarray, Array]:
+        return shared(self.flat.H, self.loop.spread)
+
+    def worst(self, x: Array) -> Separation:
+        """The largest local maxima of the violation over the window, refined between the samples."""
+        times = self.sampled
+        step = max(1, STATES // ((1 + self.loop.spread.size) * self.flat.H.shape[1]))
+        values = np.concatenate(
+            [self.excess(x, times[first : first + step, None]) for first in range(0, times.size, step)]
+        )
+        positions = local_maxima(values.T[None], (1,), KEPT)
+        rows, at = positions[:, 1], positions[:, 2]
+        best, found = times[at].copy(), values[at, rows].copy()
+        width = np.maximum(
+            times[np.minimum(at + 1, times.size - 1)] - times[at], times[at] - times[np.maximum(at - 1, 0)]
+        )
+        likely = np.argsort(-found, kind="stable")[: 4 * KEPT]
+        best, found, rows, width = best[likely], found[likely], rows[likely], width[likely]
+        offsets = np.linspace(-1.0, 1.0, ZOOMED)
+        for _ in range(ZOOMS if width.any() else 0):
+            star = np.clip(best[:, None] + width[:, None] * offsets, self.flat.start, self.flat.stop)
+            heights = self.excess(x, star.reshape(-1, 1)).reshape(*star.shape, -1)
+            heights = np.take_along_axis(heights, rows[:, None, None], axis=2)[..., 0]
+            highest = heights.argmax(axis=1)
+            moved = heights[np.arange(rows.size), highest] > found
+            best = np.where(moved, star[np.arange(rows.size), highest], best)
+            found = np.where(moved, heights[np.arange(rows.size), highest], found)
+            width = width / CLOSER
+        order = np.argsort(-found, kind="stable")
+        return Separation(best[order][:, None], rows[order], found[order])
+
+    @property
+    def cells(self) -> tuple[Array, Array]:
+        """The window cut at the breakpoints."""
+        return self.flat.cells
+
+    def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
+        """Proven upper bounds of the violation on cells of time, each within one piece."""
+        bounds = (self.loop.bounds(x, lower[:, 0], upper[:, 0], self.flat.H) - self.flat.h).max(axis=1)
+        return Enclosure(bounds, np.zeros(bounds.size, dtype=int))
+
+    def explain(self, index: Array, row: int) -> Explanation:
+        """One constraint for people, at every disturbance, or at the deviations that the index says."""
+        said = self.flat.explain(index[:1], row)
+        assert isinstance(said, TimedExplanation)
+        return _told(said, self.loop, index)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class FeedbackControl:
+    """``H u_k <= h`` on every piece for every disturbance; with ``bound``, the first of the variables ``p (m, K)``,
+    ``H u_k <= p_k`` instead. An index is the middle of a piece, or with the deviations ``(t, w)``."""
+
+    name: str
+    loop: ClosedLoop
+    H: Array
+    h: Array
+    bound: int | None = None
+
+    def family(self) -> ConstraintFamily:
+        """The constraint as a family."""
+        horizon = float(self.breakpoints[-1])
+        return _family(self, Box(np.array([0.0]), np.array([horizon])), self.middles[:, None], self)
+
+    @property
+    def breakpoints(self) -> Array:
+        """Where the control may change."""
+        return self.loop.functionals.dictionary.breakpoints
+
+    @property
+    def middles(self) -> Array:
+        """A time of every piece."""
+        return (self.breakpoints[:-1] + self.breakpoints[1:]) / 2
+
+    def pieces(self, times: Array) -> np.ndarray:
+        """The piece that each time is in."""
+        return np.clip(np.searchsorted(self.breakpoints, times, side="right") - 1, 0, self.breakpoints.size - 2)
+
+    def limits(self, x: Array) -> Array:
+        """The right-hand sides ``(K, r)``."""
+        K = self.breakpoints.size - 1
+        if self.bound is None:
+            return np.broadcast_to(self.h, (K, self.h.size))
+        p = x[self.bound : self.bound + self.H.shape[1] * K].reshape(-1, K)
+        return np.asarray((np.abs(self.H) @ p).T)
+
+    def heights(self, x: Array) -> tuple[Array, Array]:
+        """Violations ``(K, r)`` on all pieces, and the sizes of the numbers that were added up."""
+        nominal, effects, limits = (self.H @ self.loop.nominal(x)).T, self.H @ self.loop.effects(x), self.limits(x)
+        found = nominal + self.loop.spread.support(effects) - limits
+        size = np.abs(nominal) + np.abs(effects) @ self.loop.spread.radii + np.abs(limits)
+        return found, size
+
+    def excess(self, x: Array, indices: Array) -> Array:
+        """Violations ``(k, r)`` on the pieces of times ``(k, 1)`` under the worst disturbances."""
+        return self.heights(x)[0][self.pieces(indices[:, 0])]
+
+    def uncertain(self, index: Array) -> UncertainRows:
+        """The rows on the piece of one time."""
+        piece = int(self.pieces(index[:1])[0])
+        if self.bound is None:
+            return self.loop.control_rows(piece, self.H, self.h)
+        K, extra = self.breakpoints.size - 1, np.zeros((self.h.size, self.loop.variables))
+        for row, channel in enumerate(np.abs(self.H).argmax(axis=1)):
+            extra[row, self.bound + channel * K + piece] = -np.abs(self.H[row, channel])
+        return self.loop.control_rows(piece, self.H, self.h, extra)
+
+    def worst(self, x: Array) -> Separation:
+        """The worst row of every piece, worst first."""
+        found, _ = self.heights(x)
+        rows = found.argmax(axis=1)
+        heights = found[np.arange(rows.size), rows]
+        order = np.argsort(-heights, kind="stable")
+        return Separation(self.middles[order][:, None], rows[order], heights[order], float(found.max()))
+
+    @property
+    def cells(self) -> tuple[Array, Array]:
+        """The pieces."""
+        return self.breakpoints[:-1, None], self.breakpoints[1:, None]
+
+    def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
+        """The violation itself: the control is constant on a piece."""
+        found, size = self.heights(x)
+        bounds = (found + ROUND_OFF * size).max(axis=1)[self.pieces((lower[:, 0] + upper[:, 0]) / 2)]
+        return Enclosure(bounds, np.zeros(bounds.size, dtype=int))
+
+    def explain(self, index: Array, row: int) -> Explanation:
+        """One constraint for people."""
+        time, direction = float(index[0]), self.H[row]
+        terms = [f"{'-' if v < 0 else ''}{'' if abs(v) == 1 else f'{abs(v):.4g} '}u{i + 1}({time:.6g})"
+                 for i, v in enumerate(direction) if v]  # fmt: skip
+        right = "its peak" if self.bound is not None else f"{self.h[row]:.6g}"
+        text = f"{self.name}: {' + '.join(terms)} <= {right}"
+        return _told(TimedExplanation(text, self.name, text, time, direction), self.loop, index)
+
+
+def _told(said: TimedExplanation, loop: ClosedLoop, index: Array) -> TimedExplanation:
+    text = f"{said.statement} for every disturbance"
+    signal = None
+    if index.size > 1:
+        signal = (loop.spread.middle + index[1:]).reshape(-1, loop.steps.E.shape[2]).T
+    return replace(said, text=text, disturbance=signal, quantity="")

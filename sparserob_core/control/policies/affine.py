@@ -1,0 +1,34 @@
+"""A control that answers affinely what it has measured."""
+
+from __future__ import annotations
+
+from typing import Literal, final
+
+from pydantic import Field
+
+from sparserob_core.control.policies.policy import Policy, Quantity
+from sparserob_core.options import Options
+
+
+@final
+class AffinePolicy(Policy, Options):
+    """The state is measured at every breakpoint ``tau_j`` of the control's dictionary; the control on piece ``k`` is
+    ``u_k = v_k + sum_{j <= k} M_kj e_j`` with the innovation ``e_j``: what the state at ``tau_j`` has beyond what the
+    state one breakpoint before, the drift, every control in between and the middle of the disturbance's set predict.
+
+    The nominal control ``v (m, K)`` and the gains ``M (K, K, m, n)`` are the decision. Every set of the problem holds for
+    all disturbances with the control that they cause. For a fixed disturbance everything is linear in the decision
+    (Goulart, Kerrigan and Maciejowski 2006).
+    """
+
+    cost: Literal["nominal", "peak"] = "nominal"
+    """``nominal``: the L1 norm of the nominal control; ``peak``: the weighted integral of the largest ``|u_i(t)|`` that
+    any disturbance causes, which is 0 exactly where the control is off whatever happens."""
+
+    memory: float | None = Field(default=None, ge=0.0)
+    """An innovation is answered for so long at most, in the time unit of the problem; everything by default."""
+
+    @property
+    def knows(self) -> frozenset[Quantity]:
+        """The state, at the breakpoints."""
+        return frozenset({"state"})

@@ -1,0 +1,246 @@
+"""What the state does when the control answers the disturbance: linear in the deviations, exactly, at all times.
+
+With the effects ``F`` of the gains, the control on piece ``k`` is ``u_k = v_k + F_k w``, and the state
+``x(t) = x_v(t) + sum_q y_q(t) w_q``: every ``y_q`` is the state of the same system from 0, driven by column ``q`` of the
+effects and by its own entry of the disturbance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+
+from sparserob_core.control.response.functional import WorstCase
+from sparserob_core.control.response.innovations import KNOWN, Answers
+from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.uncertain import Spread, UncertainRows
+
+if TYPE_CHECKING:
+    from sparserob_core.control.response.response import Steps
+
+TERMS = 8  # of the Taylor expansion that bounds a curvature
+ROUND_OFF = 2.0**-46  # of the numbers that are added up
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class ClosedLoop:
+    """The functionals of one system whose control answers what it sees.
+
+    The decision ``x (n,)`` begins with the nominal control ``v (m, K)``, raveled; the variables of ``answers`` follow,
+    and then whatever else the program has. ``spread``: the deviations of the disturbance, block after block.
+    """
+
+    functionals: WorstCase
+    answers: Answers
+    spread: Spread
+    variables: int
+    _paths: dict[bytes, tuple[Array, Array]] = field(default_factory=dict, repr=False)
+
+    @property
+    def nominal_size(self) -> int:
+        """How many variables the nominal control has."""
+        return self.functionals.variables
+
+    def nominal(self, x: Array) -> Array:
+        """The nominal control ``(m, K)``."""
+        return x[: self.nominal_size].reshape(-1, self.functionals.dictionary.pieces)
+
+    def effects(self, x: Array) -> Array:
+        """``F (K, m, Q)``."""
+        return self.answers.effects(x[self.nominal_size : self.nominal_size + self.answers.variables])
+
+    def gains(self, x: Array) -> Array:
+        """``M (K, K, m, d)``."""
+        return self.answers.gains(x[self.nominal_size : self.nominal_size + self.answers.variables])
+
+    @cached_property
+    def steps(self) -> Steps:
+        """Matrices and transitions of the system."""
+        return self.functionals.response.steps(KNOWN)
+
+    @cached_property
+    def entries(self) -> Array:
+        """Which entries of the deviations act on every piece of the grid, and how: ``(L, mw, Q)``."""
+        model, grid = self.functionals.disturbance, self.functionals.response.grid
+        table = np.zeros((grid.pieces, self.steps.E.shape[2], self.spread.size))
+        if model is not None:
+            assert model.starts is not None
+            block = np.searchsorted(model.starts, np.arange(grid.pieces), side="right") - 1
+            width = model.channels
+            for i in range(width):
+                table[np.arange(grid.pieces), i, block * width + i] = 1.0
+        return table
+
+    @cached_property
+    def middles(self) -> Array:
+        """The middle of the disturbance on every piece of the grid, ``(L, mw)``."""
+        return np.asarray(self.entries @ self.spread.middle)
+
+    def drives(self, x: Array) -> Array:
+        """What drives the nominal state and every response, on the pieces of the grid: ``(L, d, 1 + Q)``."""
+        grid, m = self.functionals.response.grid, self.answers.shape[1]
+        B, E = self.steps.B[0], self.steps.E[0]
+        nominal = grid.inputs(self.nominal(x)).T @ B.T + self.middles @ E.T
+        answered = B[:, :m] @ self.effects(x)[grid.control_piece] + E @ self.entries
+        return np.concatenate([nominal[:, :, None], answered], axis=2)
+
+    def path(self, x: Array) -> tuple[Array, Array]:
+        """The nominal state and every response at the breakpoints of the grid, ``(L + 1, d, 1 + Q)``, and what drives
+        them; those of the last few decisions are remembered."""
+        key = x.tobytes()
+        if key not in self._paths:
+            response, drives = self.functionals.response, self.drives(x)
+            nodes = np.zeros((drives.shape[0] + 1, *drives.shape[1:]))
+            nodes[0, :, 0] = response.initial_state
+            for piece, length in enumerate(response.which.tolist()):
+                nodes[piece + 1] = (
+                    self.steps.Phi[0, length] @ nodes[piece] + self.steps.Gamma[0, length] @ drives[piece]
+                )
+            while len(self._paths) > 1:
+                self._paths.pop(next(iter(self._paths)))
+            self._paths[key] = (nodes, drives)
+        return self._paths[key]
+
+    def states(self, x: Array, times: Array, pieces: np.ndarray | None = None) -> Array:
+        """The nominal state and every response at ``times (k,)``, which lie in these pieces: ``(k, d, 1 + Q)``."""
+        grid = self.functionals.response.grid
+        pieces = grid.locate(times) if pieces is None else pieces
+        nodes, drives = self.path(x)
+        distinct, which = grid.distinct(np.clip(times - grid.breakpoints[pieces], 0.0, None))
+        flow, driven = self.functionals.response.flows(distinct)
+        return np.asarray(flow[which] @ nodes[pieces] + driven[which] @ drives[pieces])
+
+    def height(self, along: Array) -> Array:
+        """``max_w`` of functionals ``(..., 1 + Q)`` of the nominal state and the responses."""
+        return np.asarray(along[..., 0] + self.spread.support(along[..., 1:]))
+
+    def values(self, x: Array, times: Array, H: Array) -> Array:
+        """``max_w H x(t)`` at ``times (k,)`` for ``H (r, d)``: ``(k, r)``."""
+        return self.height(H @ self.states(x, times))
+
+    def bounds(self, x: Array, lower: Array, upper: Array, H: Array) -> Array:
+        """Upper bounds ``(k, r)`` of ``max_w H x(t)`` over cells of time ``[lower, upper] (k,)``, each within one piece
+        of the grid.
+
+        On a cell every functional is within ``(b - a)^2 / 8`` times its largest second derivative of its chord, and a
+        support function of a chord lies below the chord of the support functions.
+        """
+        grid, A = self.functionals.response.grid, self.steps.A[0]
+        pieces = grid.locate((lower + upper) / 2)
+        ends = [self.states(x, times, pieces) for times in (lower, upper)]
+        along = [H @ end for end in ends]
+        h = (upper - lower)[:, None, None]
+        rates = A @ ends[0] + self.path(x)[1][pieces]
+        second, row, factor = np.zeros(along[0].shape), H @ A, np.ones_like(h)
+        for order in range(TERMS):
+            second += factor * np.abs(row @ rates)
+            row, factor = row @ A, factor * h / (order + 1)
+        growth = np.linalg.norm(A, 2) * h
+        with np.errstate(over="ignore", invalid="ignore"):
+            tail = factor * np.exp(growth) * np.linalg.norm(row, axis=1)[:, None] * np.linalg.norm(
+                rates, axis=1, keepdims=True
+            )
+        bent = second + tail
+        radii = np.concatenate([[1.0], self.spread.radii])
+        size = np.abs(H) @ np.maximum(np.abs(ends[0]), np.abs(ends[1]))
+        allowance = (h[..., 0] ** 2 / 8.0) * (bent @ radii) + ROUND_OFF * (size @ radii)
+        found = np.maximum(self.height(along[0]), self.height(along[1])) + allowance
+        return np.asarray(np.where(np.isnan(found), np.inf, found))
+
+    def worst(self, x: Array, time: float, direction: Array) -> Array:
+        """A deviation ``(Q,)`` that attains the worst case of ``c'x(t)``."""
+        along = direction @ self.states(x, np.array([time]))[0]
+        return self.spread.worst(along[1:])
+
+    def signal(self, deviation: Array) -> Array:
+        """The disturbance ``(mw, L)`` on the pieces of the grid of a deviation ``(Q,)``."""
+        return np.asarray((self.entries @ (self.spread.middle + deviation)).T)
+
+    def state_rows(self, time: float, H: Array, h: Array, part: np.ndarray, factor: Array) -> UncertainRows:
+        """The rows ``H x(t) <= h`` at one time, as `UncertainRows`: row ``r`` is ``factor_r`` times the direction of its
+        ``part_r``, the first row with which it shares it."""
+        from scipy.sparse import csr_array
+
+        count = H.shape[0]
+        firsts = [int(np.flatnonzero(part == p)[0]) for p in range(int(part.max()) + 1)]
+        free, gains, B, W = self.functionals.response.adjoint(np.full(count, time), H, np.zeros((count, 0)))
+        on_control = self.functionals.on_decision(gains @ B)  # (r, m K), channel-major
+        offset = free @ self.functionals.response.initial_state + self.functionals.given(gains @ B)
+        on_noise = gains @ W  # (r, L, mw)
+        offset = offset + np.einsum("rli,li->r", on_noise, self.middles)
+        K = self.functionals.dictionary.pieces
+        at, which, value = self.answers.effect
+        m, Q = self.answers.shape[1], self.spread.size
+        position, entry = at // Q, at % Q
+        piece, channel = position // m, position % m
+        parts = []
+        for first in firsts:
+            data = on_control[first].reshape(m, K)[channel, piece] * value
+            kept = data != 0.0
+            place = (entry[kept], self.nominal_size + which[kept])
+            parts.append(csr_array((data[kept], place), shape=(Q, self.variables)))
+        g = np.zeros((count, self.variables))
+        g[:, : self.nominal_size] = on_control
+        d = np.einsum("pli,liq->pq", on_noise[firsts], self.entries)
+        return UncertainRows(csr_array(g), h - offset, part, factor, tuple(parts), d)
+
+    def control_rows(self, piece: int, H: Array, h: Array, extra: Array | None = None) -> UncertainRows:
+        """The rows ``H u_k <= h`` on one piece for every deviation; ``extra (r, n)`` is added on the left."""
+        from scipy.sparse import csr_array
+
+        part, factor = shared(H, self.spread)
+        firsts = [int(np.flatnonzero(part == p)[0]) for p in range(int(part.max()) + 1)]
+        at, which, value = self.of_piece(piece)
+        m, Q, K = self.answers.shape[1], self.spread.size, self.functionals.dictionary.pieces
+        channel, entry = at // Q, at % Q
+        parts = []
+        for first in firsts:
+            data = H[first][channel] * value
+            kept = data != 0.0
+            place = (entry[kept], self.nominal_size + which[kept])
+            parts.append(csr_array((data[kept], place), shape=(Q, self.variables)))
+        rows, channels = np.nonzero(H)
+        g = csr_array((H[rows, channels], (rows, channels * K + piece)), shape=(H.shape[0], self.variables))
+        if extra is not None:
+            g = csr_array(g + csr_array(extra))
+        return UncertainRows(g, h, part, factor, tuple(parts), np.zeros((len(firsts), Q)))
+
+    def of_piece(self, piece: int) -> tuple[np.ndarray, np.ndarray, Array]:
+        """Of `Answers.effect` what is about one piece: positions in ``(m, Q)``, variables and values."""
+        at, which, value = self.answers.effect
+        first, last = self._bounds_of_pieces[piece : piece + 2]
+        m, Q = self.answers.shape[1], self.spread.size
+        return at[first:last] - piece * m * Q, which[first:last], value[first:last]
+
+    @cached_property
+    def _bounds_of_pieces(self) -> np.ndarray:
+        """Where the entries of `Answers.effect` of every piece begin; they come piece by piece."""
+        K, m, Q, _ = self.answers.shape
+        return np.searchsorted(self.answers.effect[0] // max(1, m * Q), np.arange(K + 1))
+
+
+def shared(H: Array, spread: Spread) -> tuple[np.ndarray, Array]:
+    """Which rows of ``H (r, d)`` look the same way or, where deviations are symmetric, opposite ways: the part of every
+    row and the factor that it is of the first row of that part."""
+    part, factor = np.zeros(H.shape[0], dtype=int), np.ones(H.shape[0])
+    firsts: list[int] = []
+    for row in range(H.shape[0]):
+        for p, first in enumerate(firsts):
+            at = int(np.abs(H[first]).argmax())
+            share = H[row, at] / H[first, at]
+            if np.array_equal(H[row], share * H[first]) and (share > 0.0 or spread.is_box):
+                part[row], factor[row] = p, share
+                break
+        else:
+            part[row] = len(firsts)
+            firsts.append(row)
+    return part, factor
+
+
+def deviations_of(bound: ConvexSet | None, blocks: int) -> Spread:
+    """The deviations of a disturbance with values in ``bound``, ``blocks`` times."""
+    return Spread(() if bound is None else ((blocks, bound),))

@@ -1,0 +1,168 @@
+"""What is seen of the disturbance at the breakpoints, and coordinates of the gains that answer it.
+
+The innovation ``e_j`` is linear in the deviations ``w`` of the disturbance from its middle: ``e_j = D_j w``. A gain acts
+through its *effect* ``F_k = sum_j M_kj D_j``, how the control on piece ``k`` depends on ``w``, alone. So the variables
+are entries of ``F_k``, at as many entries of ``w`` as are independent of one another in what is seen, and the gains that
+have these effects are ``M_k = F_k D^+``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+
+from sparserob_core.control.response.response import SAME_TIME, Response
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from sparserob_core.control.problem.dictionary import Dictionary
+    from sparserob_core.control.response.disturbance import DisturbanceModel
+
+DEPENDENT = 1e-9  # of its own size, the rest of a column that is a combination of others
+KNOWN = np.zeros((1, 0))
+
+
+def innovations_seen(response: Response, control: Dictionary, model: DisturbanceModel | None) -> Array:
+    """``D (K, d, Q)``: what every innovation is of the deviations, block after block; ``e_0`` is 0 from one initial
+    state."""
+    K, d = control.pieces, response.initial_state.size
+    if model is None:
+        return np.zeros((K, d, 0))
+    grid, E = response.grid, response.steps(KNOWN).E[0]
+    assert model.starts is not None
+    block = np.searchsorted(model.starts, np.arange(grid.pieces), side="right") - 1
+    ends = control.breakpoints[grid.control_piece + 1]
+    flows = response.flows(np.concatenate([ends - grid.breakpoints[1:], grid.lengths]))
+    moved = flows[0][: grid.pieces] @ flows[1][grid.pieces :] @ E
+    D = np.zeros((K, d, model.block_count, E.shape[1]))
+    for piece in range(grid.pieces):
+        if grid.control_piece[piece] + 1 < K:  # what happens on the last piece is seen when all is over
+            D[grid.control_piece[piece] + 1, :, block[piece]] += moved[piece]
+    return D.reshape(K, d, -1)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Answers:
+    """The variables of the gains: ``variables`` numbers, each the effect on channel ``channel`` of the control on piece
+    ``piece`` of the entry ``entry`` of the deviations, ``(n,)`` each.
+
+    Effects ``F (K, m, Q)`` and gains ``M (K, K, m, d)`` are sparse linear functions of them: ``effect`` and ``gain``
+    list flat positions, variables and values.
+    """
+
+    shape: tuple[int, int, int, int]
+    piece: np.ndarray
+    channel: np.ndarray
+    entry: np.ndarray
+    effect: tuple[np.ndarray, np.ndarray, Array]
+    gain: tuple[np.ndarray, np.ndarray, Array]
+
+    @property
+    def variables(self) -> int:
+        """How many."""
+        return int(self.piece.size)
+
+    def effects(self, numbers: Array) -> Array:
+        """``F (K, m, Q)``."""
+        K, m, Q, _ = self.shape
+        at, which, value = self.effect
+        return np.bincount(at, value * numbers[which], K * m * Q).reshape(K, m, Q)
+
+    def gains(self, numbers: Array) -> Array:
+        """``M (K, K, m, d)``: ``M[k, j]`` acts on ``e_j``, zero for ``j > k``."""
+        K, m, _, d = self.shape
+        at, which, value = self.gain
+        return np.bincount(at, value * numbers[which], K * K * m * d).reshape(K, K, m, d)
+
+    @cached_property
+    def single(self) -> bool:
+        """Whether every entry of the effects is one variable, or 0."""
+        at, _, value = self.effect
+        return bool(np.unique(at).size == at.size and (value == 1.0).all())
+
+
+def answers(D: Array, breakpoints: Array, channels: int, memory: float | None) -> Answers:
+    """The coordinates of gains that answer innovations ``D (K, d, Q)`` for ``memory`` at most; in units in which states
+    and deviations are of ordinary size."""
+    K, d, Q = D.shape
+    clusters = _clusters((D != 0.0).any(axis=1))
+    pieces, channel, entry = [], [], []
+    effect: list[tuple[Array, Array, Array]] = []
+    gain: list[tuple[Array, Array, Array]] = []
+    count, known = 0, {}
+    horizon = breakpoints[-1]
+    for k in range(K):
+        oldest = -np.inf if memory is None else breakpoints[k] - memory - SAME_TIME * horizon
+        for number, cluster in enumerate(clusters):
+            seen = cluster[(cluster <= k) & (breakpoints[cluster] >= oldest)]
+            if not seen.size:
+                continue
+            key = (number, int(seen[0]), int(seen[-1]))
+            if key not in known:
+                known[key] = _coordinates(D[seen])
+            columns, free, Z, G = known[key]
+            r = free.size
+            if not r:
+                continue
+            for i in range(channels):
+                names = count + np.arange(r)
+                count += r
+                pieces.append(np.full(r, k))
+                channel.append(np.full(r, i))
+                entry.append(free)
+                rows, cols = np.nonzero(Z)
+                effect.append(((k * channels + i) * Q + columns[cols], names[rows], Z[rows, cols]))
+                rows, cols = np.nonzero(G)
+                j, state = seen[cols // d], cols % d
+                gain.append((((k * K + j) * channels + i) * d + state, names[rows], G[rows, cols]))
+    return Answers(
+        (K, channels, Q, d), _whole(pieces), _whole(channel), _whole(entry), _joined(effect), _joined(gain)
+    )
+
+
+def _clusters(where: np.ndarray) -> list[np.ndarray]:
+    """The breakpoints ``(K, Q)`` that see something in common, together; those that see nothing are left out."""
+    clusters: list[tuple[set[int], np.ndarray]] = []
+    for j in np.flatnonzero(where.any(axis=1)):
+        mine, rest = ({int(j)}, where[j].copy()), []
+        for members, columns in clusters:
+            if (columns & mine[1]).any():
+                mine = (mine[0] | members, mine[1] | columns)
+            else:
+                rest.append((members, columns))
+        clusters = [*rest, mine]
+    return [np.array(sorted(members)) for members, _ in sorted(clusters, key=lambda one: min(one[0]))]
+
+
+def _coordinates(seen: Array) -> tuple[np.ndarray, np.ndarray, Array, Array]:
+    """Of innovations ``(J, d, Q)``: the entries of the deviations that they see ``(c,)``, those of them that are
+    independent ``(r,)``, what the effect of each is on all, ``(r, c)``, and gains of such effects, ``(r, J d)``."""
+    from scipy.linalg import qr
+
+    flat = seen.reshape(-1, seen.shape[2])
+    sizes = np.linalg.norm(flat, axis=0)
+    columns = np.flatnonzero(sizes > 0.0)
+    unit = flat[:, columns] / sizes[columns]
+    _, R, order = qr(unit, mode="economic", pivoting=True)
+    chosen = np.sort(order[: int((np.abs(np.diag(R)) > DEPENDENT).sum())])
+    inverse = np.linalg.pinv(unit[:, chosen])  # well conditioned: every column is of size 1
+    rest = np.setdiff1d(np.arange(columns.size), chosen)
+    Z = np.zeros((chosen.size, columns.size))
+    Z[np.arange(chosen.size), chosen] = 1.0
+    Z[:, rest] = inverse @ unit[:, rest]
+    Z[np.abs(Z) < DEPENDENT] = 0.0
+    far = sizes[columns]
+    return columns, columns[chosen], Z * far / far[chosen][:, None], inverse / far[chosen][:, None]
+
+
+def _whole(parts: list[np.ndarray]) -> np.ndarray:
+    return np.concatenate([np.zeros(0, dtype=int), *parts])
+
+
+def _joined(parts: list[tuple[Array, Array, Array]]) -> tuple[np.ndarray, np.ndarray, Array]:
+    at, which, value = zip(*parts, strict=True) if parts else ((), (), ())
+    return _whole(list(at)), _whole(list(which)), np.concatenate([np.zeros(0), *value])

@@ -1,0 +1,339 @@
+"""The robust counterpart of finitely many uncertain rows as one sparse linear program, and what its multipliers prove.
+
+Where the deviations are entry by entry within ``[-r, r]``, the worst case of a row is ``g x + sum_q r_q |a_q| <= h`` with
+``a = C x + d``. Absolute values are split into two parts that are not negative, those of variables at once, others by
+one equality (Ben-Tal, El Ghaoui and Nemirovski 2009, section 1.3): an extended formulation, with all deviations at once.
+For other sets the support function of every block is replaced by the largest over finitely many of its points, which
+grow in number.
+
+By the duality of linear programs the multipliers of a row with those of its equalities say one deviation in the set,
+a mean of extreme ones. The row at this deviation is linear in the decision: so finitely many cuts, one for each row,
+prove the same bound, and nothing but these cuts has to be believed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.finite import FiniteProgram
+from sparserob_core.sip.uncertain import Spread, UncertainRows
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+ACCURACY = 1e-10  # of rows and reduced costs: the least that HiGHS takes
+SAME = 1e-12  # points of a set that are closer are one
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class RobustAnswer:
+    """``x (n,)``, multipliers ``y (r,)`` of all rows in order and the deviation ``(r, Q)`` of each, ``mu (e,)``;
+    ``slack``: by how much the rows must be relaxed, where that was asked for. ``solved``: whether there is an answer;
+    ``said``: the solver's words."""
+
+    solved: bool
+    said: str
+    x: Array
+    y: Array
+    deviations: Array
+    mu: Array
+    slack: float = 0.0
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """What stands for the worst case of one part: ``columns`` times ``sizes``, and a ``constant``; ``entries`` of the
+    deviations and the numbers ``at`` of the equalities whose multipliers say them. For sets that are no boxes, of every
+    block its entries, its variable, its known points and the numbers of their rows."""
+
+    columns: np.ndarray
+    sizes: Array
+    constant: float
+    entries: np.ndarray
+    at: np.ndarray
+    single: bool = False
+    points: tuple[tuple[slice, int, list[Array], list[int]], ...] = ()
+
+
+@final
+@dataclass(eq=False)
+class Counterpart:
+    """Uncertain rows over one program and one spread, to which rows are added; solved by HiGHS, from the last basis.
+
+    Its columns are the positive and the negative parts of the decision, a slack of all rows where it is ``elastic`` (and
+    the only cost), and what rows need beside them.
+    """
+
+    program: FiniteProgram
+    spread: Spread
+    elastic: bool = False
+    calls: int = 0
+    blocks: list[UncertainRows] = field(default_factory=list)
+    _imposed: list[tuple[np.ndarray, Array, list[_Part]]] = field(default_factory=list, repr=False)
+    _margin: float = 0.0
+
+    def __post_init__(self) -> None:
+        self._linear = _Linear()
+        program, n = self.program, self.program.n
+        low, high = program.lower, program.upper
+        priced = not self.elastic
+        for side, sign in ((1.0, 1.0), (-1.0, -1.0)):
+            ends = (low, high) if side > 0 else (-high, -low)
+            cost = (program.weights + sign * program.q) * priced
+            self._linear.variables(np.maximum(ends[0], 0.0), np.maximum(ends[1], 0.0), cost)
+        if self.elastic:
+            self._linear.variables(np.zeros(1), np.full(1, np.inf), np.ones(1))
+        self._fixed = np.zeros(0, dtype=int)
+        if program.b.size:
+            row, column = np.nonzero(program.A)
+            entries = _both(row, column, program.A[row, column], n)
+            self._fixed = self._linear.rows([entries], program.b, program.b)
+
+    def add(self, block: UncertainRows) -> None:
+        """Impose rows from now on."""
+        parts = [self._part(C, d) for C, d in zip(block.C, block.d, strict=True)]
+        g, count, limits = block.g.tocoo(), block.h.size, block.h.copy()
+        entries = [_both(g.row, g.col, g.data, self.program.n)]
+        for p, part in enumerate(parts):
+            mine = np.flatnonzero(block.part == p)
+            scale = np.abs(block.factor[mine])
+            limits[mine] -= scale * part.constant
+            row, column = np.repeat(mine, part.columns.size), np.tile(part.columns, mine.size)
+            entries.append((row, column, (scale[:, None] * part.sizes).ravel()))
+        if self.elastic:
+            entries.append((np.arange(count), np.full(count, 2 * self.program.n), -np.ones(count)))
+        where = self._linear.rows(entries, np.full(count, -np.inf), limits - self._margin)
+        self.blocks.append(block)
+        self._imposed.append((where, limits, parts))
+
+    def _part(self, C: csr_array, d: Array) -> _Part:
+        if not self.spread.is_box:
+            return self._pointed(C, d)
+        radii, counts, n = self.spread.radii, np.diff(C.indptr), self.program.n
+        entries = np.flatnonzero(counts)
+        constant = float(radii[counts == 0] @ np.abs(d[counts == 0]))
+        if not (counts > 1).any() and not d[entries].any():
+            sizes = np.abs(C.data) * radii[entries]
+            columns, none = np.concatenate([C.indices, C.indices + n]), np.zeros(0, dtype=int)
+            return _Part(columns, np.tile(sizes, 2), constant, entries, none, single=True)
+        count = entries.size
+        free, nothing = np.full(count, np.inf), np.zeros(count)
+        pairs = [self._linear.variables(nothing, free, nothing) for _ in range(2)]
+        inner, rows, ones = C[entries].tocoo(), np.arange(count), np.ones(count)
+        split = [_both(inner.row, inner.col, inner.data, n), (rows, pairs[0], -ones), (rows, pairs[1], ones)]
+        at = self._linear.rows(split, -d[entries], -d[entries])
+        return _Part(np.concatenate(pairs), np.tile(radii[entries], 2), constant, entries, at)
+
+    def _pointed(self, C: csr_array, d: Array) -> _Part:
+        """One variable for each block of the spread, above the part at every known point of the block: at 0, to begin
+        with."""
+        points: list[tuple[slice, int, list[Array], list[int]]] = []
+        for part, count, convex, _ in self.spread.parts:
+            q = convex.dimension
+            for a in range(part.start, part.start + count * q, q):
+                if C.indptr[a + q] > C.indptr[a] or d[a : a + q].any():
+                    (name,) = self._linear.variables(np.zeros(1), np.full(1, np.inf), np.zeros(1)).tolist()
+                    points.append((slice(a, a + q), name, [], []))
+        names, none = np.array([name for _, name, _, _ in points], dtype=int), np.zeros(0, dtype=int)
+        return _Part(names, np.ones(names.size), 0.0, none, none, points=tuple(points))
+
+    def sharpen(self, x: Array) -> bool:
+        """Where the sets are no boxes: impose the worst points at ``x (n,)`` of every imposed row; ``False`` where all
+        were known."""
+        if self.spread.is_box:
+            return False
+        entries: list[tuple[np.ndarray, np.ndarray, Array]] = []
+        limits: list[float] = []
+        first = self._linear.count
+        for block, (_, _, parts) in zip(self.blocks, self._imposed, strict=True):
+            for part, C, d, worst in zip(
+                parts, block.C, block.d, self.spread.worst(block.coefficients(x)), strict=True
+            ):
+                for place, name, known, at in part.points:
+                    point = worst[place]
+                    if any(np.abs(point - other).max() <= SAME for other in known):
+                        continue
+                    known.append(point)
+                    at.append(first + len(limits))
+                    row = (C[place].T @ point).reshape(-1)
+                    column = np.flatnonzero(row)
+                    number = np.full(column.size, len(limits))
+                    entries.append(_both(number, column, row[column], self.program.n))
+                    entries.append((np.array([len(limits)]), np.array([name]), -np.ones(1)))
+                    limits.append(-float(point @ d[place]))
+        if limits:
+            self._linear.rows(entries, np.full(len(limits), -np.inf), np.array(limits))
+        return bool(limits)
+
+    def solve(self, margin: float = 0.0) -> RobustAnswer:
+        """The optimum with every row tightened by ``margin``; where it is elastic, how far the rows must be relaxed so
+        that they can be met."""
+        self.calls += 1
+        if margin != self._margin:
+            self._margin = margin
+            for where, limits, _ in self._imposed:
+                self._linear.limit(where, limits - margin)
+        solved, said, columns, rows = self._linear.solve()
+        if not solved:
+            none = np.zeros(0)
+            return RobustAnswer(False, said, none, none, np.zeros((0, 0)), none)
+        n, mu = self.program.n, rows[self._fixed]
+        y, deviations = self._multipliers(rows, mu)
+        slack = float(columns[2 * n]) if self.elastic else 0.0
+        return RobustAnswer(True, said, columns[:n] - columns[n : 2 * n], y, deviations, mu, slack)
+
+    def _multipliers(self, even: Array, mu: Array) -> tuple[Array, Array]:
+        """The multipliers ``(r,)`` of all rows, and the deviations ``(r, Q)`` that those of the parts stand for."""
+        y = np.maximum(np.concatenate([np.zeros(0), *(even[where] for where, _, _ in self._imposed)]), 0.0)
+        deviations = np.zeros((y.size, self.spread.size))
+        slope = mu @ self.program.A + (0.0 if self.elastic else self.program.q)
+        late: list[tuple[UncertainRows, int, _Part, np.ndarray, float]] = []
+        first = 0
+        for block, (where, _, parts) in zip(self.blocks, self._imposed, strict=True):
+            mine = y[first : first + where.size]
+            slope = slope + block.g.T @ mine
+            for p, part in enumerate(parts):
+                rows = np.flatnonzero(block.part == p)
+                total = float(mine[rows] @ np.abs(block.factor[rows]))
+                if total <= 0.0:
+                    continue
+                if part.single:
+                    late.append((block, p, part, first + rows, total))
+                    continue
+                w = self._at_rest(block, p)
+                limit = self.spread.radii[part.entries]
+                w[part.entries] = np.clip(even[part.at] / total, -limit, limit)
+                for place, _, known, at in part.points:
+                    shares = np.maximum(even[np.array(at, dtype=int)], 0.0)
+                    most = max(total, float(shares.sum()))  # what is missing to it is the share of 0
+                    w[place] = shares @ np.array(known) / most if known else 0.0
+                slope = slope + total * (block.C[p].T @ w)
+                deviations[first + rows] = np.sign(block.factor[rows])[:, None] * w
+            first += where.size
+        self._balance(slope, deviations, late)
+        return y, deviations
+
+    def _at_rest(self, block: UncertainRows, p: int) -> Array:
+        """The worst deviations where no decision enters a part; 0 elsewhere."""
+        w = np.zeros(self.spread.size)
+        if self.spread.is_box:
+            bare = np.diff(block.C[p].indptr) == 0
+            w[bare] = np.sign(block.d[p][bare]) * self.spread.radii[bare]
+        return w
+
+    def _balance(
+        self, slope: Array, deviations: Array, late: list[tuple[UncertainRows, int, _Part, np.ndarray, float]]
+    ) -> None:
+        """Deviations of the parts whose entries are single variables: such that no slope is left in these, as far as
+        their sets allow, shared by the rows in which a variable is."""
+        most = np.zeros(self.program.n)
+        for block, p, part, _, total in late:
+            np.add.at(most, block.C[p].indices, total * np.abs(block.C[p].data) * self.spread.radii[part.entries])
+        share = np.zeros(self.program.n)
+        np.divide(-slope, most, out=share, where=most > 0.0)
+        share = np.clip(share, -1.0, 1.0)
+        for block, p, part, rows, _ in late:
+            w = self._at_rest(block, p)
+            w[part.entries] = np.sign(block.C[p].data) * share[block.C[p].indices] * self.spread.radii[part.entries]
+            at = rows - rows[0] + np.flatnonzero(block.part == p)[0]
+            deviations[rows] = np.sign(block.factor[at])[:, None] * w
+
+
+@final
+class _Linear:
+    """A sparse linear program that grows, solved by HiGHS from where it was."""
+
+    def __init__(self) -> None:
+        import highspy
+
+        self.highs = highspy.Highs()
+        self.columns = self.count = 0
+        for name, value in {
+            "output_flag": False,
+            "threads": 1,
+            "primal_feasibility_tolerance": ACCURACY,
+            "dual_feasibility_tolerance": ACCURACY,
+        }.items():
+            self.highs.setOptionValue(name, value)
+
+    def variables(self, lower: Array, upper: Array, cost: Array) -> np.ndarray:
+        """New columns with these bounds and costs, by number."""
+        none = np.zeros(0, dtype=np.int32)
+        starts = np.zeros(lower.size, dtype=np.int32)
+        self.highs.addCols(lower.size, cost, lower, upper, 0, starts, none, np.zeros(0))
+        self.columns += lower.size
+        return np.arange(self.columns - lower.size, self.columns)
+
+    def rows(self, entries: list[tuple[np.ndarray, np.ndarray, Array]], lower: Array, upper: Array) -> np.ndarray:
+        """New rows, by number; ``entries`` are rows counted from 0, columns and values."""
+        from scipy.sparse import csr_array
+
+        row, column, value = (np.concatenate(part) for part in zip(*entries, strict=True))
+        table = csr_array((value, (row, column)), shape=(upper.size, self.columns))
+        starts, places = table.indptr[:-1].astype(np.int32), table.indices.astype(np.int32)
+        self.highs.addRows(upper.size, lower, upper, table.nnz, starts, places, table.data)
+        self.count += upper.size
+        return np.arange(self.count - upper.size, self.count)
+
+    def limit(self, rows: np.ndarray, upper: Array) -> None:
+        """Other limits of rows."""
+        for row, value in zip(rows.tolist(), upper.tolist(), strict=True):
+            self.highs.changeRowBounds(row, -np.inf, value)
+
+    def solve(self) -> tuple[bool, str, Array, Array]:
+        """Whether it was solved, in the solver's words, the values of the columns and the multipliers of the rows."""
+        import highspy
+
+        self.highs.run()
+        status = self.highs.getModelStatus()
+        said = f"HiGHS: {self.highs.modelStatusToString(status)}"
+        if status != highspy.HighsModelStatus.kOptimal:
+            return False, said, np.zeros(0), np.zeros(0)
+        found = self.highs.getSolution()
+        return True, said, np.array(found.col_value), -np.array(found.row_dual)
+
+
+def _both(row: np.ndarray, column: np.ndarray, value: Array, n: int) -> tuple[np.ndarray, np.ndarray, Array]:
+    """Entries of the decision in its positive and its negative part."""
+    return np.concatenate([row, row]), np.concatenate([column, column + n]), np.concatenate([value, -value])
+
+
+def robust_bound(
+    program: FiniteProgram, blocks: list[UncertainRows], y: Array, deviations: Array, mu: Array, priced: bool
+) -> tuple[float, float]:
+    """A lower bound of the cost by weak duality, from multipliers ``y (r,) >= 0`` of rows at ``deviations (r, Q)`` and
+    ``mu (e,)``: the minimum over the bounds of the program alone. Not ``priced``: of the weighted sum of the rows, which
+    is positive only where nothing is feasible. With it the sum of the numbers that were added up."""
+    slope, constant = (program.q.copy() if priced else np.zeros(program.n)), -float(mu @ program.b)
+    slope = slope + mu @ program.A
+    size, noise, first = abs(constant), np.abs(slope) + np.abs(mu) @ np.abs(program.A), 0
+    for block in blocks:
+        mine, w = y[first : first + block.h.size], deviations[first : first + block.h.size]
+        first += block.h.size
+        used = np.flatnonzero(mine)
+        if not used.size:
+            continue
+        slope = slope + block.g.T @ mine
+        noise = noise + abs(block.g).T @ mine
+        for p in np.unique(block.part[used]):
+            rows = used[block.part[used] == p]
+            weight = (mine[rows] * block.factor[rows]) @ w[rows]
+            slope = slope + block.C[p].T @ weight
+            constant += float(weight @ block.d[p])
+            noise = noise + abs(block.C[p]).T @ np.abs(weight)
+            size += float(np.abs(weight) @ np.abs(block.d[p]))
+        constant -= float(mine @ block.h)
+        size += float(mine @ np.abs(block.h))
+    weights = program.weights if priced else np.zeros(program.n)
+    ends = np.stack([program.lower, program.upper, np.clip(0.0, program.lower, program.upper)])
+    with np.errstate(invalid="ignore"):
+        least = (weights * np.abs(ends) + np.where(slope == 0.0, 0.0, slope * ends)).min(axis=0)
+        far = np.where(noise > 0.0, noise * np.abs(ends[:2]).max(axis=0), 0.0)
+    bound = constant + float(least.sum())
+    return (bound, size + float(far.sum())) if np.isfinite(bound) else (-np.inf, size)

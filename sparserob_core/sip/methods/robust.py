@@ -1,0 +1,213 @@
+"""Exchange for rows that must hold for every deviation: times are exchanged, deviations are all in the relaxed program.
+
+A round solves the robust counterpart at the imposed indices (`inner.counterpart`), separates every family in closed form
+and imposes what is violated. The lower bound is that of cuts: every row with a multiplier, at the deviation that its
+multipliers say (weak duality over the bounds of the program). It ends as the other exchange does: by proof.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.evidence import Cut, Dual, InfeasibleSubsystem
+from sparserob_core.sip.finite import FiniteSolution
+from sparserob_core.sip.inner.counterpart import Counterpart, RobustAnswer, robust_bound
+from sparserob_core.sip.methods.ledger import Answer, Ledger, Prover
+from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram, WorstConstraint
+from sparserob_core.sip.proof.verdict import NAMED, explained, worst_of
+from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
+from sparserob_core.sip.result import SMALL_COST, Result
+from sparserob_core.sip.separation.separation import separate
+
+if TYPE_CHECKING:
+    from sparserob_core.sip.method import Tools
+
+ALLOWED = TOLERANCE / 2  # a violation that the search may leave to the proof
+ROUNDING = 2.0**-46  # of the numbers of which a bound is made
+FIRST, LARGEST, SMALLEST = 1e-8, 1e-6, 2e-9  # margins by which rows are tightened, in their own units
+THINNER = 0.1  # share of a margin that leaves nothing feasible, which is tried next
+FARKAS = 1e-9  # a weighted sum of rows is violated by more than that: nothing is feasible
+
+
+@dataclass(eq=False)
+class Robust:
+    """The imposed indices of every family, and the counterpart at them."""
+
+    program: SemiInfiniteProgram
+    counterpart: Counterpart
+    cuts: list[Cut] = field(default_factory=list)
+    known: set[tuple[str, bytes]] = field(default_factory=set)
+    margin: float = FIRST
+    slater: bool = True
+
+    @staticmethod
+    def start(program: SemiInfiniteProgram) -> Robust:
+        """What every family begins with."""
+        assert program.spread is not None
+        working = Robust(program, Counterpart(program.finite, program.spread))
+        for family in program.families:
+            assert family.start is not None
+            working.add(family, family.start)
+        return working
+
+    def add(self, family: ConstraintFamily, indices: Array) -> int:
+        """Impose all rows of a family at indices ``(k, d)``; how many indices were new."""
+        assert family.uncertain is not None
+        added = 0
+        for index in indices:
+            key = (family.name, index.tobytes())
+            if key in self.known:
+                continue
+            rows = family.uncertain(index)
+            self.known.add(key)
+            self.counterpart.add(rows)
+            self.cuts += [Cut(family.name, index, row) for row in range(rows.h.size)]
+            added += 1
+        return added
+
+    def dual(self, answer: RobustAnswer, priced: bool) -> Dual:
+        """What the multipliers of an answer prove, with the cuts that prove it."""
+        blocks = self.counterpart.blocks
+        bound, size = robust_bound(self.program.finite, blocks, answer.y, answer.deviations, answer.mu, priced)
+        cuts = tuple(
+            replace(cut, index=np.concatenate([cut.index, w]), multiplier=float(y), formulation="literal")
+            for cut, y, w in zip(self.cuts, answer.y, answer.deviations, strict=True)
+            if y > 0.0
+        )
+        return Dual(bound - ROUNDING * size, cuts, answer.mu)
+
+
+def robust_exchange(
+    program: SemiInfiniteProgram, tools: Tools, prover: Prover, tolerance: float, rounds: int
+) -> Result:
+    """Close the gap of a program with uncertain rows; ends as `Exchange.close` does."""
+    relaxed = RelaxedProgram(program, tools.solver, None, deadline=tools.deadline)
+    ledger = Ledger(program, relaxed, tools, tolerance)
+    try:
+        with tools.deadline.enforced():
+            return _exchange(ledger, prover, rounds)
+    except KeyboardInterrupt as error:
+        return ledger.stopped(error, prover)
+
+
+def _exchange(ledger: Ledger, prover: Prover, rounds: int) -> Result:
+    program, tools, working = ledger.program, ledger.tools, Robust.start(ledger.program)
+    for number in range(1, rounds + 1):
+        tools.deadline.check()
+        last = number == rounds
+
+        # Relax: the counterpart at the imposed indices; its cuts are a lower bound.
+        solved = _solved(working, ledger)
+        if isinstance(solved, Result):
+            return solved
+        answer, found = solved, separate(program, solved.solution.x, tools, ALLOWED, number)
+        x = answer.solution.x
+
+        # Separate, and exchange: the times at which the continuum is violated most.
+        violated = [(family, one.indices[one.violations > ALLOWED]) for family, one in found]
+        feasible = not any(indices.size for _, indices in violated)
+        ledger.tell(number, answer, found, program.cost(x) if feasible else np.inf, kept=len(working.cuts))
+        if not last:
+            added = sum(working.add(family, indices) for family, indices in violated)
+            sharper = not feasible and working.counterpart.sharpen(x)
+            if added or sharper:
+                continue
+            if not feasible and working.slater and working.margin < LARGEST:
+                working.margin = min(LARGEST, 4.0 * working.margin)  # imposed and violated: by the solver's accuracy
+                continue
+            if feasible and ledger.open(x) and working.margin > SMALLEST:
+                working.margin = max(SMALLEST, 0.2 * working.margin)
+                continue
+
+        # Prove: over the whole continuum; a witness that the proof meets is one more index to impose.
+        proofs = prover(x)
+        again = 0
+        if not last and not tools.deadline.passed:
+            for proof in proofs:
+                if proof.verdict == "refuted" and proof.index is not None:
+                    again += working.add(program.family(proof.family), proof.index[None])
+            tight = any(proof.verdict == "undecided" for proof in proofs) and working.margin < LARGEST
+            if not again and tight and working.slater:
+                working.margin, again = min(LARGEST, 4.0 * working.margin), 1
+        if again:
+            continue
+        ending = f"the {rounds} rounds of the method are used up" if last else ""
+        if tools.deadline.passed:
+            ending = tools.deadline.reason
+        return ledger.judged(answer, worst_of(found), proofs, ending)
+    raise AssertionError("the last round returns")
+
+
+def _solved(working: Robust, ledger: Ledger) -> Answer | Result:
+    """The optimum of the counterpart with the rows tightened; where that leaves nothing, less and less so, and in the end
+    the proof that nothing is feasible."""
+    while True:
+        answer = working.counterpart.solve(working.margin)
+        ledger.relaxed.solves = ledger.relaxed.counted.calls = working.counterpart.calls
+        if answer.solved:
+            break
+        if working.margin > 0.0:
+            working.margin = THINNER * working.margin if working.margin > SMALLEST * THINNER else 0.0
+            working.slater = working.margin > 0.0
+            if working.margin > 0.0:
+                continue
+        return _infeasible(working, ledger, answer.said)
+    program = working.program
+    x = np.clip(answer.x, program.finite.lower, program.finite.upper)
+    dual = working.dual(answer, priced=True)
+    ledger.improve(dual)
+    price = float(answer.y.sum())
+    budget = 0.4 * ledger.tolerance * max(SMALL_COST * program.cost_scale, program.cost(x))
+    if working.slater and price * working.margin > budget:
+        working.margin = max(SMALLEST, min(working.margin, budget / price))
+    value, none = program.cost(x), np.zeros(0)
+    solution = FiniteSolution(
+        "optimal", x, value, dual.bound, answer.y, answer.mu, none, program.finite.residual(x), value - dual.bound
+    )
+    return Answer(solution, _rows(working), 0.0, value)
+
+
+def _rows(working: Robust) -> Rows:
+    """The imposed rows by name; what they are depends on the deviations."""
+    return Rows(np.zeros((len(working.cuts), 0)), np.zeros(len(working.cuts)), tuple(working.cuts))
+
+
+def _infeasible(working: Robust, ledger: Ledger, said: str) -> Result:
+    """``infeasible`` where multipliers prove it, else ``failed``."""
+    program, none = working.program, np.zeros(0)
+    relaxing = Counterpart(program.finite, working.counterpart.spread, elastic=True)
+    for block in working.counterpart.blocks:
+        relaxing.add(block)
+    elastic = relaxing.solve()
+    while elastic.solved and relaxing.sharpen(elastic.x):
+        elastic = relaxing.solve()
+    ledger.relaxed.solves = ledger.relaxed.counted.calls = working.counterpart.calls + relaxing.calls
+    dual = working.dual(elastic, priced=False) if elastic.solved else None
+    if dual is None or not dual.bound > FARKAS:
+        found = FiniteSolution("failed", np.zeros(program.n), np.nan, -np.inf, none, none, none, np.inf, np.inf, said)
+        return ledger.result("failed", f"the relaxed program was not solved: {said}", Answer(found, _rows(working), 0.0, np.nan))
+    solution = FiniteSolution(
+        "infeasible", elastic.x, np.inf, np.inf, elastic.y, elastic.mu, none, np.inf, 0.0, said, (), dual.bound
+    )
+    ledger.dual = dual
+    told, worst = _reason(program, dual)
+    answer = Answer(solution, _rows(working), 0.0, np.inf)
+    return replace(ledger.result("infeasible", told.sentence(), answer, worst), infeasible=told)
+
+
+def _reason(program: SemiInfiniteProgram, dual: Dual) -> tuple[InfeasibleSubsystem, WorstConstraint | None]:
+    """The constraints that cannot hold together, those with the largest multipliers first."""
+    units = {family.name: family for family in program.families}
+    order = sorted(dual.cuts, key=lambda cut: -cut.multiplier)
+    told = [units[cut.family].explanation(cut.index[: units[cut.family].index_set.dimension], cut.row) for cut in order]
+    first = order[0]
+    bare = WorstConstraint(dual.bound, first.family, first.index[: units[first.family].index_set.dimension], first.row)
+    members = tuple(one.text for one in told[:NAMED])
+    found = InfeasibleSubsystem(
+        members=members, others=max(0, len(told) - NAMED), equalities=bool(program.finite.b.size), decides="policy"
+    )
+    return found, explained(program, bare)
