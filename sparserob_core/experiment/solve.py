@@ -20,7 +20,7 @@ from sparserob_core.experiment.plugins.registry import load_registry
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.events import Event, ignore
 from sparserob_core.sip.maximiser import Maximiser, Report
-from sparserob_core.sip.method import GAP_TOLERANCE, Continuation, Deadline, Method, Tools, as_seconds
+from sparserob_core.sip.method import GAP_TOLERANCE, Continuation, Deadline, Method, Tools, as_seconds, require_suited
 from sparserob_core.sip.methods.own_units import solve_in_own_units
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.regulariser import Regulariser
@@ -128,6 +128,7 @@ def solve(
         deadline=deadline,
     )
     chosen: Method = component(registry, "method", _with_tolerance(registry, method, tolerance), Method)
+    require_suited(chosen, program)
     result = solve_in_own_units(chosen, program, tools)
     if isinstance(model, SemiInfiniteProgram):
         return result

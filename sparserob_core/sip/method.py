@@ -208,11 +208,23 @@ class Method(ABC):
 
     ``searches``: whether it maximises ``g`` over tuples of indices, so that its `EvaluationsFinished` are about tuples;
     observers then show the search. ``counts``: whether the cost of its result is the time that a control acts.
+    ``robust``: whether it solves programs whose rows must hold for every deviation (`SemiInfiniteProgram.spread`).
     """
 
     searches: ClassVar[bool] = False
     counts: ClassVar[bool] = False
+    robust: ClassVar[bool] = False
 
     @abstractmethod
     def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
         """Return a `Result` for every well-posed program; a status never claims more than was proven."""
+
+
+def require_suited(method: Method, program: SemiInfiniteProgram, name: str = "") -> None:
+    """Raise `InputError` for a program with deviations, under feedback, where the method is for plain rows."""
+    if program.spread is not None and not method.robust:
+        raise InputError(
+            path="method.name",
+            expected="exchange: with a policy that answers what is measured, a constraint is no row of the decision",
+            got=name or type(method).__name__,
+        )

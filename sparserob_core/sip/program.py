@@ -14,8 +14,7 @@ import numpy.typing as npt
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, Box, as_bound
-from sparserob_core.sip.finite import Blocks, FiniteProgram
-from sparserob_core.sip.uncertain import Spread, UncertainRows
+from sparserob_core.sip.finite import Blocks, FiniteProgram, Spread, UncertainRows
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
@@ -147,7 +146,8 @@ class ConstraintFamily:
     ``explain(index (d,), row)``  one constraint for people (an `Explanation`);
     ``uncertain(index (d,))``  for rows that must hold for every deviation in the program's `Spread`: these rows. Such a
         family is not linear in the decision: ``rows`` refuses, ``excess(x, indices (k, d))`` are its violations
-        ``(k, r)``, and ``start (k, d)`` the indices that a method begins with.
+        ``(k, r)``, and ``start (k, d)`` the indices that a method begins with; ``defines``: whether it only bounds
+        variables that the program's ``settle`` puts at what bounds them, so that it is never the worst one.
     """
 
     name: str
@@ -170,6 +170,7 @@ class ConstraintFamily:
     uncertain: Callable[[Array], UncertainRows] | None = None
     excess: Callable[[Array, Array], Array] | None = None
     start: Array | None = None
+    defines: bool = False
     formulation: Formulation = "reduced"
     source: object = None
 
@@ -217,7 +218,9 @@ class SemiInfiniteProgram:
     ``blocks (k,)``: images with the same number of at least 0 count together, with their weight times their Euclidean
     norm; -1 is one that counts alone. ``largest``: the largest possible cost, where it is known, of which a gap is a
     share (`cost_scale`).
-    ``spread``: the deviations for all of which the ``uncertain`` rows of its families hold.
+    ``spread``: the deviations for all of which the ``uncertain`` rows of its families hold;
+    ``settle(x)``: a decision that meets the same constraints and costs no more, such as one whose bounds are no looser
+    than they must be.
     """
 
     n: int
@@ -241,6 +244,7 @@ class SemiInfiniteProgram:
     blocks: npt.ArrayLike | None = None
     largest: float | None = None
     spread: Spread | None = None
+    settle: Callable[[Array], Array] | None = None
     twin: Callable[[], OwnUnits] | None = field(default=None, repr=False)
     finite: FiniteProgram = field(init=False, repr=False)
 

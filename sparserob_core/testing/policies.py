@@ -17,7 +17,7 @@ class PolicyContract(Contract[Policy], kind="policy"):
 
     ``knows`` is a property: the frozen set of the quantities (``state``, ``disturbance``, ``parameters``) whose *past*
     values are known when the control is chosen. Nothing can be known of the future. It is a promise about the whole
-    run, so it never changes. A policy that knows something cannot be transcribed yet, and is refused.
+    run, so it never changes. Of the policies that know something only `AffinePolicy` can be transcribed.
     """
 
     def known(self, policy: Policy) -> frozenset[str]:

@@ -56,13 +56,17 @@ def test_a_config_may_name_its_policy_and_its_executor(tmp_path, policy):
     assert (config.policy.name, config.executor.name) == ("open_loop", "serial")
 
 
-def test_a_policy_that_knows_something_cannot_be_transcribed_yet(tmp_path):
+def test_an_affine_policy_knows_the_state(registry):
+    assert registry.build("policy", "affine", {"cost": "peak"}).knows == {"state"}
+
+
+def test_a_policy_that_knows_something_else_cannot_be_transcribed(tmp_path):
     (tmp_path / "feedback.py").write_text(
         "import sparserob_core as sr\nclass Feedback(sr.Policy, sr.Options):\n"
         "    @property\n    def knows(self):\n        return frozenset({'state'})\n"
         "@sr.hookimpl\ndef sparserob_policies():\n    yield sr.PolicyPlugin(name='feedback', factory=Feedback)\n"
     )
-    with pytest.raises(sr.ConfigError, match=r"policy\.name: expected a policy that knows nothing.* knows the state"):
+    with pytest.raises(sr.ConfigError, match=r"policy\.name: expected open_loop or affine.* knows the state"):
         sr.run({**CONFIG, "policy": "feedback", "plugins": [str(tmp_path / "feedback.py")]}, out=tmp_path / "run")
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.claims import activity
-from sparserob_core.checker.claims.case import Case, Window, listed, number, numbers
+from sparserob_core.checker.claims.case import Case, listed, number, numbers
 from sparserob_core.checker.claims.constraints import bounded
 from sparserob_core.checker.claims.duality import Row
 from sparserob_core.checker.claims.equalities import equalities

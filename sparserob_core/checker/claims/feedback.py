@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls, below
-from sparserob_core.checker.claims.case import Case, Window, number, numbers
+from sparserob_core.checker.claims.case import Case, number, numbers
 from sparserob_core.checker.claims.constraints import covered, cut
+from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import RESOLVED, TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.reach.closed_loop import ClosedLoop
 from sparserob_core.checker.reach.flow import stacked
-from sparserob_core.checker.sets.shapes import facets, limit, member, support, units
+from sparserob_core.checker.sets.known import known
+from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Ellipsoid, NormBall
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -58,7 +60,7 @@ class FeedbackClaims:
 
     def _loop(self, nominal: Array, gains: Array) -> ClosedLoop:
         case = self.case
-        if case.problem.system.parameter_count:
+        if not isinstance(case.problem.system, LinearSystem) or case.problem.system.parameter_count:
             raise Unchecked("the checker knows feedback of known systems only")
         return ClosedLoop(
             case.problem.system,
@@ -74,20 +76,22 @@ class FeedbackClaims:
     def control(self) -> str:
         """Every piece of the control in its set, for every disturbance."""
         shape = self.case.problem.control
-        flat = facets(shape)
+        flat = known(shape).facets
         if flat is None:
             raise Unchecked("the checker knows feedback into sets with flat sides only")
         worst, loop = -np.inf, self.loop
         for k, effect in enumerate(loop.effects):
             self.case.clock.check()
             v = balls(loop.nominal[:, k])
-            for (c, b), unit in zip(flat, units(shape), strict=True):
+            for (c, b), unit in zip(flat, known(shape).units(), strict=True):
                 along = [_dot(c, [row[q] for row in effect]) for q in range(len(effect[0]))] if effect else []
                 height = _dot(c, v) + loop.support(along)
                 unit = max(unit, RESOLVED * float((abs(height) + abs(b)).mid())) or 1.0
                 over = float((height - b).upper()) / unit
                 if over > TOLERANCE:
-                    raise Broken(f"it leaves its set by {over:.3g} of its own unit, on piece {k + 1}, for some disturbance")
+                    raise Broken(
+                        f"it leaves its set by {over:.3g} of its own unit, on piece {k + 1}, for some disturbance"
+                    )
                 worst = max(worst, over)
         return f"{len(loop.effects)} pieces in their set for every disturbance, to {worst:.1e} of its own units"
 
@@ -97,61 +101,40 @@ class FeedbackClaims:
 
         case, total = self.case, arb(0)
         assert case.policy is not None
-        weights, times = np.asarray(case.problem.weights), case.control.breakpoints
+        times = case.control.breakpoints
         for k in range(case.control.pieces):
             length = arb(float(times[k + 1])) - arb(float(times[k]))
-            for i, w in enumerate(weights):
+            for i, w in enumerate(case.price.weights):
                 u = arb(float(case.theta[i, k]))
                 if case.policy.cost == PEAK:
                     row = self.loop.effects[k][i]
                     height = (u + self.loop.support(row)).max(-u + self.loop.support([-x for x in row]))
                 else:
                     height = abs(u)
-                total = total + length * arb(float(w)) * height
+                total = total + length * w * height
         return total
 
     def bounded(self, window: Window) -> str:
         """Show that a constraint is kept at every time, for every disturbance."""
-        case, loop = self.case, self.loop
-        data = case.certificate.get("proof", {})
-        entry = data.get(window.name) if isinstance(data, Mapping) else None
-        if not isinstance(entry, Mapping):
-            if case.certificate.get("status") == "undecided":
-                raise Unchecked("the certificate does not claim it")
-            raise Broken("the certificate holds no proof of it")
-        tolerance = number(entry, "tolerance")
-        if not 0 < tolerance <= TOLERANCE * (1.0 + 1e-12):
-            raise Broken(f"a violation of {tolerance:g} is to count as none, of its own unit at most {TOLERANCE:g} may")
-        flat = facets(window.shape)
+        case, entry, flat = self.case, self._entry(window), window.seen.facets
         if flat is None:
             raise Unchecked("the checker knows feedback with sets with flat sides only")
         lower, upper = numbers(entry.get("lower"), "lower"), numbers(entry.get("upper"), "upper")
         covered(case, window, lower, upper)
-        rows = np.array([c for c, _ in flat]).reshape(len(flat), -1)
-        limits, unit = np.array([below(b) for _, b in flat]), case.units(window).rows
-        todo = [part for a, b in zip(lower, upper, strict=True) for part in cut(case, float(a[0]), float(b[0]))]
-        known: dict[tuple[int, float], Array] = {}
+        sides = _Sides(self.loop, flat, case.units(window).rows)
+        todo = [
+            part for a, b in zip(lower, upper, strict=True) for part in cut(case, case.grid, float(a[0]), float(b[0]))
+        ]
         count, most = 0, -np.inf
-
-        def heights(piece: int, time: float) -> Array:
-            if (piece, time) not in known:
-                found = loop.heights(loop.state(piece, time), rows)
-                known[piece, time] = np.array([[float(x.upper()), float(x.lower())] for x in found])
-                over = (known[piece, time][:, 1] - limits) / unit
-                if (over > TOLERANCE).any():
-                    raise Broken(f"it is exceeded at t = {time:.6g}, by {over.max():.1e} of its unit")
-            return known[piece, time][:, 0]
-
         while todo:
             case.clock.check()
             piece, start, stop = todo.pop()
             count += 1
             if count > MOST_CELLS:
                 raise Unchecked(f"neither shown nor refuted after {count} cells")
-            ends = np.nextafter(np.maximum(heights(piece, start), heights(piece, stop)), np.inf)
-            over = (ends + loop.bent(piece, start, stop, rows) - limits) * (1.0 + 1e-15) / unit
-            if (over <= TOLERANCE).all():
-                most = max(most, float(over.max()))
+            over = sides.over(piece, start, stop)
+            if over <= TOLERANCE:
+                most = max(most, over)
                 continue
             half = (start + stop) / 2
             if not start < half < stop:
@@ -159,7 +142,43 @@ class FeedbackClaims:
             todo += [(piece, start, half), (piece, half, stop)]
         return f"kept for every disturbance, to {most:.1e} of its own unit ({count} cells)"
 
-    def multiplied(self, entries: list[Any], priced: bool) -> arb:
+    def _entry(self, window: Window) -> Mapping[str, Any]:
+        """What the certificate says of the proof of a constraint."""
+        data = self.case.certificate.get("proof", {})
+        entry = data.get(window.name) if isinstance(data, Mapping) else None
+        if not isinstance(entry, Mapping):
+            if self.case.certificate.get("status") == "undecided":
+                raise Unchecked("the certificate does not claim it")
+            raise Broken("the certificate holds no proof of it")
+        tolerance = number(entry, "tolerance")
+        if not 0 < tolerance <= TOLERANCE * (1.0 + 1e-12):
+            raise Broken(f"a violation of {tolerance:g} is to count as none, of its own unit at most {TOLERANCE:g} may")
+        return entry
+
+    def exceeded(self, said: Mapping[str, object]) -> tuple[list[float], float]:
+        """By how much the worst disturbance exceeds each row of a constraint at one time, and how closely that is
+        known: `said` holds the names ``constraint``, ``time`` and ``violation``."""
+        case, loop, name, time = self.case, self.loop, str(said.get("constraint")), number(said, "time")
+        number(said, "violation")
+        if name == CONTROL:
+            k = int(np.clip(bisect_right(loop.breakpoints, time) - 1, 0, case.control.pieces - 1))
+            sides = known(case.problem.control).facets or []
+            v, effect = balls(loop.nominal[:, k]), loop.effects[k]
+            columns = [[row[q] for row in effect] for q in range(len(effect[0]))]
+            over = [_dot(c, v) + loop.support([_dot(c, column) for column in columns]) - b for c, b in sides]
+            return [float(value.mid()) for value in over], TOLERANCE * max(
+                known(case.problem.control).units(), default=1.0
+            )
+        window = case.window(name)
+        if not window.start <= time <= window.stop:
+            raise Broken(f"t = {time!r} is not within {window.start:g} to {window.stop:g}")
+        flat = window.seen.facets or []
+        piece = min(max(bisect_right(case.grid, time) - 1, 0), len(case.grid) - 2)
+        found = loop.heights(loop.state(piece, time), np.array([c for c, _ in flat]))
+        slack = TOLERANCE * float(case.units(window).rows.max(initial=0.0))
+        return [float((height - b).mid()) for height, (_, b) in zip(found, flat, strict=True)], slack
+
+    def multiplied(self, entries: Sequence[Any], priced: bool) -> arb:
         """The bound that multipliers of constraints at single disturbances prove, for every policy of the kind.
 
         Of the nominal control ``v`` and, with the cost ``peak``, of the peaks only the sets are used; of the gains that
@@ -176,16 +195,15 @@ class FeedbackClaims:
         slope = [[sum((r.multiplier * r.nominal[k][i] for r in rows if not r.nominal[k][i].is_zero()), arb(0))
                   for i in range(m)] for k in range(K)]  # fmt: skip
         times, peaks = case.control.breakpoints, case.policy.cost == PEAK
-        weights = np.asarray(case.problem.weights, dtype=float)
         for k in range(K):
             length = arb(float(times[k + 1])) - arb(float(times[k]))
-            prices = [arb(float(w)) * length if priced else arb(0) for w in weights]
+            prices = [w * length if priced else arb(0) for w in case.price.weights]
             if peaks:
                 for i in range(m):
                     asked = prices[i] - sum((r.multiplier for r in rows if r.peak == (k, i)), arb(0))
                     total = total + (asked * _reach(case.problem.control, i)).min(arb(0))
                 prices = [arb(0)] * m
-            total = total + case.duality.least(prices, slope[k])
+            total = total + known(case.problem.control).least(prices, prices, slope[k])
         return total - self._of_gains(loop, rows)
 
     def _of_gains(self, loop: ClosedLoop, rows: list[_Row]) -> arb:
@@ -208,7 +226,9 @@ class FeedbackClaims:
             for i in range(m):
                 sizes = [arb(0)]
                 for members, inverse, blocks in clusters:
-                    z = (inverse * stacked([[product[k * m + i][j * d + s]] for j in members for s in range(d)])).entries()
+                    z = (
+                        inverse * stacked([[product[k * m + i][j * d + s]] for j in members for s in range(d)])
+                    ).entries()
                     sizes += [
                         sum((abs(z[n * loop.width + b]) / chords[b] for b in range(loop.width)), arb(0))
                         for n in range(len(blocks))
@@ -243,11 +263,12 @@ class FeedbackClaims:
         if members not in self._inverses:
             blocks = sorted({block for j in members for block in loop.seen[j]})
             d, zero = loop.parts["A"].nrows(), [arb(0)] * loop.width
-            table = []
+            table: list[list[arb]] = []
             for j in members:
                 lists = {block: push.tolist() for block, push in loop.seen[j].items()}
-                for s in range(d):
-                    table.append([x for block in blocks for x in (lists[block][s] if block in lists else zero)])
+                table += [
+                    [x for block in blocks for x in (lists[block][s] if block in lists else zero)] for s in range(d)
+                ]
             D = stacked(table)
             if D.ncols() <= D.nrows():
                 inverse = (D.transpose() * D).inv() * D.transpose()
@@ -259,6 +280,33 @@ class FeedbackClaims:
     @cached_property
     def _inverses(self) -> dict[tuple[int, ...], tuple[arb_mat, list[int]]]:
         return {}
+
+
+@final
+class _Sides:
+    """The rows of a flat set, seen along the trajectories of a closed loop; ``unit (r,)`` is that of each."""
+
+    def __init__(self, loop: ClosedLoop, flat: Sequence[tuple[Array, arb]], unit: Array) -> None:
+        self.loop, self.unit = loop, unit
+        self.rows = np.array([c for c, _ in flat]).reshape(len(flat), -1)
+        self.limits = np.array([below(b) for _, b in flat])
+        self._known: dict[tuple[int, float], Array] = {}
+
+    def over(self, piece: int, start: float, stop: float) -> float:
+        """By how much of its unit a row is exceeded on a cell of time at most; raises `Broken` where one certainly is
+        at an end by more than counts as none."""
+        ends = np.nextafter(np.maximum(self._heights(piece, start), self._heights(piece, stop)), np.inf)
+        found = (ends + self.loop.bent(piece, start, stop, self.rows) - self.limits) * (1.0 + 1e-15) / self.unit
+        return float(found.max())
+
+    def _heights(self, piece: int, time: float) -> Array:
+        if (piece, time) not in self._known:
+            found = self.loop.heights(self.loop.state(piece, time), self.rows)
+            self._known[piece, time] = np.array([float(x.upper()) for x in found])
+            over = (np.array([float(x.lower()) for x in found]) - self.limits) / self.unit
+            if (over > TOLERANCE).any():
+                raise Broken(f"it is exceeded at t = {time:.6g}, by {over.max():.1e} of its unit")
+        return self._known[piece, time]
 
 
 @lru_cache(maxsize=2)
@@ -301,35 +349,54 @@ class _Row:
         if numbers(entry.get("parameter", []), f"{name}: parameter").size:
             raise Broken(f"{name}: a parameter is given of a known system")
         z = _deviations(case, loop, entry.get("disturbance"), name)
-        K, m, d = case.control.pieces, case.problem.system.controls, case.problem.system.states
-        innovations = [
-            [sum((push[s, b] * z[block][b] for block, push in seen.items() for b in range(loop.width)), arb(0))
-             for s in range(d)] for seen in loop.seen
-        ]  # fmt: skip
-        nominal = [[arb(0)] * m for _ in range(K)]
         if name in (CONTROL, PEAK):
-            if direction.shape != (m,):
-                raise Broken(f"{name}: {direction.size} numbers where {m} are expected")
-            piece = int(np.clip(bisect_right(loop.breakpoints, time) - 1, 0, K - 1))
-            nominal[piece] = balls(direction)
-            innovations = [part if j <= piece else [arb(0)] * d for j, part in enumerate(innovations)]
-            if name == CONTROL:
-                return _Row(y, -limit(case.problem.control, direction), nominal, innovations, None)
-            channel = int(np.abs(direction).argmax())
-            if not peaks or sorted(np.abs(direction).tolist()) != [0.0] * (m - 1) + [1.0]:
-                raise Broken(f"{name}: the direction {direction.tolist()} is not that of a peak of this policy")
-            return _Row(y, arb(0), nominal, innovations, (piece, channel))
-        window = case.window(name)
+            return _Row._of_control(case, loop, (name, direction, time, y), z, peaks)
+        window, d = case.window(name), case.problem.system.states
         if direction.shape != (d,):
             raise Broken(f"{name}: {direction.size} numbers where {d} are expected")
         if not window.start <= time <= window.stop:
             raise Broken(f"{name}: t = {time!r} is not within {window.start:g} to {window.stop:g}")
-        row = case.duality.row(direction, time, [], limit(window.shape, direction), disturbed=False)
+        row = case.duality.row(direction, time, [], window.limit(direction, time), disturbed=False)
         constant = row.constant
         for block, weights in enumerate(case.duality.pushed(direction, time)):
             for b, weight in enumerate(weights):
                 constant = constant + weight * (arb(float(loop.middle[b])) + z[block][b])
-        return _Row(y, constant, row.slope, innovations, None)
+        return _Row(y, constant, row.slope, _seen(loop, z, d), None)
+
+    @staticmethod
+    def _of_control(
+        case: Case, loop: ClosedLoop, said: tuple[str, Array, float, float], z: list[list[arb]], peaks: bool
+    ) -> _Row:
+        """A constraint on the control on one piece, or on its peak."""
+        from flint import arb
+
+        name, direction, time, y = said
+        K, m, d = case.control.pieces, case.problem.system.controls, case.problem.system.states
+        if direction.shape != (m,):
+            raise Broken(f"{name}: {direction.size} numbers where {m} are expected")
+        nominal = [[arb(0)] * m for _ in range(K)]
+        piece = int(np.clip(bisect_right(loop.breakpoints, time) - 1, 0, K - 1))
+        nominal[piece] = balls(direction)
+        seen = [part if j <= piece else [arb(0)] * d for j, part in enumerate(_seen(loop, z, d))]
+        if name == CONTROL:
+            return _Row(y, -known(case.problem.control).limit(direction), nominal, seen, None)
+        channel = int(np.abs(direction).argmax())
+        if not peaks or sorted(np.abs(direction).tolist()) != [0.0] * (m - 1) + [1.0]:
+            raise Broken(f"{name}: the direction {direction.tolist()} is not that of a peak of this policy")
+        return _Row(y, arb(0), nominal, seen, (piece, channel))
+
+
+def _seen(loop: ClosedLoop, z: list[list[arb]], d: int) -> list[list[arb]]:
+    """The innovations ``(K, d)`` of deviations, block by block."""
+    from flint import arb
+
+    return [
+        [
+            sum((push[s, b] * z[block][b] for block, push in seen.items() for b in range(loop.width)), arb(0))
+            for s in range(d)
+        ]
+        for seen in loop.seen
+    ]
 
 
 def _deviations(case: Case, loop: ClosedLoop, signal: object, name: str) -> list[list[arb]]:
@@ -342,7 +409,7 @@ def _deviations(case: Case, loop: ClosedLoop, signal: object, name: str) -> list
     if w.shape != (loop.width, loop.blocks):
         raise Broken(f"{name}: a disturbance of shape {w.shape}, expected {(loop.width, loop.blocks)}")
     for block in range(loop.blocks):
-        if not member(case.problem.disturbance, w[:, block]):
+        if not known(case.problem.disturbance).contains(w[:, block]):
             raise Broken(f"{name}: the disturbance {w[:, block].tolist()} is not shown to be in its set")
     return [[arb(float(v)) - arb(float(c)) for v, c in zip(column, loop.middle, strict=True)] for column in w.T]
 
@@ -354,7 +421,7 @@ def _dot(c: Array, x: list[arb]) -> arb:
 
 
 def _axis(shape: ConvexSet, channel: int, sign: float) -> arb:
-    return support(shape, balls([sign * float(i == channel) for i in range(shape.dimension)]))
+    return known(shape).support(balls([sign * float(i == channel) for i in range(shape.dimension)]))
 
 
 def _width(shape: ConvexSet, channel: int) -> arb:
@@ -375,7 +442,7 @@ def _chords(shape: ConvexSet, middle: Array) -> list[arb]:
     if isinstance(shape, Ellipsoid):
         inverse = stacked([[arb(float(v)) for v in row] for row in shape.shape]).inv()
         return [2 / inverse[b, b].sqrt() for b in range(shape.dimension)]
-    flat = facets(shape)
+    flat = known(shape).facets
     if flat is None:
         raise Unchecked("the checker does not know how long the disturbance's set is along the axes")
     found = []

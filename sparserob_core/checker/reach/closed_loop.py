@@ -1,8 +1,10 @@
 """What a system does whose control answers what it measures, in balls: from the gains alone.
 
-The control on piece ``k`` is ``u_k = v_k + sum_j M_kj e_j``, where ``e_j`` is what the state at the breakpoint ``tau_j``
-has beyond what the state at ``tau_{j-1}``, the control in between and the middle of the disturbance predict. With
-``w = m + z`` for the middle ``m``, it is ``e_j = sum_l D_jl z_l`` over the blocks ``l`` on which the disturbance is constant.
+The control on piece ``k`` is ``u_k = v_k + sum_j M_kj e_j``, where ``e_j`` is what the state at the breakpoint
+``tau_j`` has beyond what the state at ``tau_{j-1}``, the control in between and the middle of the disturbance predict.
+With
+``w = m + z`` for the middle ``m``, it is ``e_j = sum_l D_jl z_l`` over the blocks ``l`` on which the disturbance is
+constant.
 """
 
 from __future__ import annotations
@@ -17,9 +19,9 @@ import numpy as np
 from sparserob_core.checker.arithmetic.series import norm
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.reach.flow import Flow, held, stacked
+from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
-from sparserob_core.checker.sets.shapes import centre, corners, known, member, radius, support
-from sparserob_core.control.sets.sets import Box, ConvexSet, Polytope
+from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -31,16 +33,10 @@ TERMS = 8  # of the expansion that bounds a second derivative
 
 
 def middle(shape: ConvexSet) -> Array:
-    """The middle ``(d,)`` of a bounded set: that of its bounding box."""
-    known(shape)
-    if isinstance(shape, Box):
-        return np.asarray((shape.lower + shape.upper) / 2)
-    if not isinstance(shape, Polytope):
-        return centre(shape)
-    points = np.array([[float(v) for v in point] for point in corners(shape)])
-    found: Array = (points.min(axis=0) + points.max(axis=0)) / 2
-    if not member(shape, found):
-        raise Unchecked("the checker does not know the middle of a polytope whose bounding box has its middle outside")
+    """The middle ``(d,)`` of a bounded set."""
+    found = shape.middle()  # any point of the set would be right: what is claimed is claimed of deviations from it
+    if not known(shape).contains(found):
+        raise Unchecked(f"the middle of the {shape.kind} is not shown to be in it")
     return found
 
 
@@ -204,9 +200,7 @@ class ClosedLoop:
         """How far each entry of a deviation comes from 0, ``(Q,)``, rounded up."""
         if self.shape is None:
             return np.zeros(0)
-        far = np.array(radius(self.shape)) + np.abs(self.middle) if self.middle.any() else np.array(radius(self.shape))
-        if isinstance(self.shape, Box):
-            far = np.maximum(self.shape.upper - self.middle, self.middle - self.shape.lower)
+        far = np.array(known(self.shape).radius) + np.abs(self.middle)
         return np.tile(np.nextafter(far * OUTWARD, np.inf), self.blocks)
 
     def support(self, a: list[arb]) -> arb:
@@ -219,7 +213,7 @@ class ClosedLoop:
         for first in range(0, len(a), mw):
             block = a[first : first + mw]
             if any(not x.is_zero() for x in block):
-                total = total + support(self.shape, block)
+                total = total + known(self.shape).support(block)
                 for x, m in zip(block, self.middle, strict=True):
                     total = total - x * arb(float(m)) if m else total
         return total
@@ -239,7 +233,8 @@ class ClosedLoop:
 
         A, h = self.parts["A"], arb(stop) - arb(start)
         rate = A * self.state(piece, start) + self.drives[piece]
-        row, factor, total = stacked([[arb(float(v)) for v in c] for c in rows]) * A, arb(1), 0.0
+        row, factor = stacked([[arb(float(v)) for v in c] for c in rows]) * A, arb(1)
+        total = np.zeros((rows.shape[0], 1 + self.blocks * self.width))
         for order in range(TERMS):
             found = Enclosed.of(row * rate)
             total = total + (np.abs(found.mid) + found.rad) * float((factor * OUTWARD).upper())

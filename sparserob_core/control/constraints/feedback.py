@@ -11,13 +11,12 @@ import numpy as np
 from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.local_maxima import local_maxima
-from sparserob_core.control.response.closed_loop import ROUND_OFF, ClosedLoop, shared
+from sparserob_core.control.feedback.closed_loop import ROUND_OFF, ClosedLoop, shared
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.finite import UncertainRows
 from sparserob_core.sip.program import ConstraintFamily, Enclosure, Explanation, Separation
-from sparserob_core.sip.uncertain import UncertainRows
 
-INSIDE = 4  # times sampled on every piece
 KEPT = 12  # separated times for each row and round
 ZOOMED, ZOOMS, CLOSER = 9, 14, 4.0  # samples around a maximum, and how often they are drawn so many times closer
 BEGUN = 6  # times of a window that a method begins with
@@ -47,7 +46,13 @@ def _family(
     far = np.concatenate([constraint.loop.spread.radii])
     box = Box(np.concatenate([index_set.lower, -far]), np.concatenate([index_set.upper, far]))
     literal = replace(
-        family, index_set=box, formulation="literal", reduced=family, explain=constraint.explain, worst=None, excess=None
+        family,
+        index_set=box,
+        formulation="literal",
+        reduced=family,
+        explain=constraint.explain,
+        worst=None,
+        excess=None,
     )
     return replace(family, literal=literal)
 
@@ -74,14 +79,8 @@ class FeedbackConstraint:
 
     @cached_property
     def times(self) -> Array:
-        """Sampled times: the ends of the window, the breakpoints in it, and a few in every piece."""
+        """The ends of the window, and the breakpoints in it."""
         return np.unique(np.concatenate([self.flat.cells[0][:, 0], self.flat.cells[1][:, 0]]))
-
-    @cached_property
-    def sampled(self) -> Array:
-        """`times`, and some between them."""
-        inner = self.times[:-1, None] + np.diff(self.times)[:, None] * np.arange(INSIDE) / INSIDE
-        return np.append(inner.ravel(), self.times[-1])
 
     def excess(self, x: Array, indices: Array) -> Array:
         """Violations ``(k, r)`` at times ``(k, 1)`` under the worst disturbances."""
@@ -97,7 +96,7 @@ class FeedbackConstraint:
 
     def worst(self, x: Array) -> Separation:
         """The largest local maxima of the violation over the window, refined between the samples."""
-        times = self.sampled
+        times = self.flat.times
         step = max(1, STATES // ((1 + self.loop.spread.size) * self.flat.H.shape[1]))
         values = np.concatenate(
             [self.excess(x, times[first : first + step, None]) for first in range(0, times.size, step)]
@@ -155,7 +154,8 @@ class FeedbackControl:
     def family(self) -> ConstraintFamily:
         """The constraint as a family."""
         horizon = float(self.breakpoints[-1])
-        return _family(self, Box(np.array([0.0]), np.array([horizon])), self.middles[:, None], self)
+        family = _family(self, Box(np.array([0.0]), np.array([horizon])), self.middles[:, None], self)
+        return family if self.bound is None else replace(family, defines=True)
 
     @property
     def breakpoints(self) -> Array:
@@ -177,7 +177,7 @@ class FeedbackControl:
         if self.bound is None:
             return np.broadcast_to(self.h, (K, self.h.size))
         p = x[self.bound : self.bound + self.H.shape[1] * K].reshape(-1, K)
-        return np.asarray((np.abs(self.H) @ p).T)
+        return np.asarray((np.abs(self.H) @ p).T, dtype=float)
 
     def heights(self, x: Array) -> tuple[Array, Array]:
         """Violations ``(K, r)`` on all pieces, and the sizes of the numbers that were added up."""
@@ -186,9 +186,20 @@ class FeedbackControl:
         size = np.abs(nominal) + np.abs(effects) @ self.loop.spread.radii + np.abs(limits)
         return found, size
 
+    def settled(self, x: Array) -> Array:
+        """The same decision with the peaks at what they bound."""
+        assert self.bound is not None
+        peaks = np.zeros((self.H.shape[1], self.breakpoints.size - 1))
+        found = self.heights(np.concatenate([x[: self.bound], peaks.ravel()]))[0]
+        for row, channel in enumerate(np.abs(self.H).argmax(axis=1)):
+            peaks[channel] = np.maximum(peaks[channel], found[:, row])
+        settled: Array = np.concatenate([x[: self.bound], peaks.ravel(), x[self.bound + peaks.size :]])
+        return settled
+
     def excess(self, x: Array, indices: Array) -> Array:
         """Violations ``(k, r)`` on the pieces of times ``(k, 1)`` under the worst disturbances."""
-        return self.heights(x)[0][self.pieces(indices[:, 0])]
+        found: Array = self.heights(x)[0][self.pieces(indices[:, 0])]
+        return found
 
     def uncertain(self, index: Array) -> UncertainRows:
         """The rows on the piece of one time."""

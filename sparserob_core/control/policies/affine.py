@@ -16,8 +16,8 @@ class AffinePolicy(Policy, Options):
     ``u_k = v_k + sum_{j <= k} M_kj e_j`` with the innovation ``e_j``: what the state at ``tau_j`` has beyond what the
     state one breakpoint before, the drift, every control in between and the middle of the disturbance's set predict.
 
-    The nominal control ``v (m, K)`` and the gains ``M (K, K, m, n)`` are the decision. Every set of the problem holds for
-    all disturbances with the control that they cause. For a fixed disturbance everything is linear in the decision
+    The nominal control ``v (m, K)`` and the gains ``M (K, K, m, n)`` are the decision. Every set of the problem holds
+    for all disturbances with the control that they cause. For a fixed disturbance everything is linear in the decision
     (Goulart, Kerrigan and Maciejowski 2006).
     """
 

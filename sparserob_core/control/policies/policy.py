@@ -13,7 +13,7 @@ Quantity: TypeAlias = Literal["state", "disturbance", "parameters"]
 class Policy(ABC):
     """How the control is decided while the system runs; the transcription and the checker both ask it.
 
-    Only policies without knowledge can be transcribed today: the control is a function of time alone.
+    Two can be transcribed: `OpenLoop`, where the control is a function of time alone, and `AffinePolicy`.
     """
 
     @property

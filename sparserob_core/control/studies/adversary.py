@@ -7,10 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sparserob_core.control.constraints.feedback import FeedbackConstraint
+from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.matrix_exponential import transitions
+from sparserob_core.control.feedback.closed_loop import ClosedLoop
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.functional import WorstCase
+from sparserob_core.control.transcription.record import Feedback
 from sparserob_core.sip.convex_set import Array
 
 PARTS = 4  # equal parts of every piece on which a measurable worst case is looked for
@@ -41,9 +45,11 @@ class Adversary:
     initial_state: Array
 
 
-def find_adversary(constraint: StateConstraint, decision: Array) -> Adversary | None:
+def find_adversary(constraint: StateConstraint, decision: Array, feedback: Feedback | None = None) -> Adversary | None:
     """The `Adversary` of a constraint, at the largest violation that its separation finds; ``None`` if it finds
-    none."""
+    none. Under ``feedback`` that of the closed loop."""
+    if feedback is not None:
+        return _of_loop(constraint, decision, feedback.loop)
     found = constraint.worst(decision)
     if not found.violations.size:
         return None
@@ -64,6 +70,26 @@ def find_adversary(constraint: StateConstraint, decision: Array) -> Adversary | 
         disturbance=disturbance,
         initial_state=constraint.functionals.response.initial_state
         + constraint.functionals.worst_deviations(np.array([time]), directions[None], parameters[None])[0],
+    )
+
+
+def _of_loop(constraint: StateConstraint, decision: Array, loop: ClosedLoop) -> Adversary:
+    assert isinstance(constraint, FlatConstraint)
+    worst = FeedbackConstraint(constraint, loop).worst(decision)
+    row, time = int(worst.rows[0]), float(worst.indices[0, 0])
+    response, direction = constraint.functionals.response, constraint.H[row]
+    disturbed = constraint.functionals.disturbance is not None
+    return Adversary(
+        name=constraint.name,
+        row=row,
+        time=time,
+        direction=direction,
+        bound=float(constraint.h[row]),
+        parameter=np.zeros(0),
+        initial_state=response.initial_state,
+        violation=float(worst.violations[0]),
+        breakpoints=response.grid.breakpoints,
+        disturbance=loop.signal(loop.worst(decision, time, direction)) if disturbed else None,
     )
 
 

@@ -9,6 +9,7 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.control.policies.policy import Policy
 from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -94,7 +95,7 @@ class ControlResult(Result):
         if constraint not in named:
             known = ", ".join(named) or "none on the state"
             raise InputError(path="constraint", expected=f"one of {known}", got=f"{constraint!r}")
-        found = find_adversary(named[constraint], self._decided())
+        found = find_adversary(named[constraint], self._decided(), self.model.feedback)
         if found is None:
             raise InputError(f"the constraint {constraint} has no worst case at this decision")
         return found
@@ -107,19 +108,30 @@ class ControlResult(Result):
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         model = self.model
         plain = Result(**{one.name: getattr(self, one.name) for one in fields(Result)})
-        return _read, (plain, model.problem, model.control, model.disturbance, model.formulation)
+        policy = None if model.feedback is None else model.feedback.policy
+        return _read, (plain, model.problem, model.control, model.disturbance, model.formulation, policy)
 
 
 def _read(
-    result: Result, problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary, form: Any
+    result: Result,
+    problem: OptimalControlProblem,
+    control: Dictionary,
+    disturbance: Dictionary,
+    form: Any,
+    policy: Policy | None = None,
 ) -> ControlResult:
     from sparserob_core.control.transcription.transcribe import prepare
 
-    return ControlResult.of(result, prepare(problem, control, disturbance, form))
+    return ControlResult.of(result, prepare(problem, control, disturbance, form, policy))
 
 
 def tube(model: Transcription, theta: Array, times: Array) -> Tube:
-    """The tube at a decision ``theta (m N,)`` and at ``times (T,)``."""
+    """The tube at a decision ``theta (m N,)``, or the whole one under feedback, and at ``times (T,)``."""
+    if model.feedback is not None:
+        loop = model.feedback.loop
+        states = loop.states(theta, times)
+        above, below = (loop.spread.support(sign * states[:, :, 1:]) for sign in (1.0, -1.0))
+        return Tube(times, states[:, :, 0].T, (states[:, :, 0] - below).T, (states[:, :, 0] + above).T)
     functionals, known = model.functionals, model.functionals.central()
     bound = model.problem.system.parameters
     centre = np.zeros(0) if bound is None else nominal_point(bound)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -39,7 +39,7 @@ def finer(grid: TimeGrid, times: Array) -> TimeGrid:
 
 def walk(
     response: Response,
-    control: Array,
+    control: Array | Callable[[int, Array], Array],
     parameters: Array,
     disturbances: Array | None,
     initial_states: Array | None = None,
@@ -47,7 +47,8 @@ def walk(
     """The states ``(d, n)`` of ``n`` trajectories at every breakpoint of the response's grid, one time after another,
     from ``initial_states (n, d)``, or from that of the response.
 
-    ``control (m, K)`` and ``disturbances (n, mw, M)`` (or ``None``) on the pieces that the grid refers to,
+    ``control (m, K)``, or what it is on a piece that begins in states ``(d, n)``, and ``disturbances (n, mw, M)`` (or
+    ``None``) on the pieces that the grid refers to,
     ``parameters (n, nu)``: the variation of constants over each piece, in which both inputs are constant.
     """
     grid = response.grid
@@ -63,6 +64,7 @@ def walk(
         state = np.ascontiguousarray(initial_states.T)
     yield state
     before, sigma, mode = (-1, -1, -1, -1), np.zeros(0), -1
+    driven = np.zeros(0)
     for piece in range(grid.pieces):
         acting = 0 if grid.mode is None else int(grid.mode[piece])
         if acting != mode:
@@ -70,7 +72,11 @@ def walk(
             flows, integrals = _transitions(A, lengths)
         inputs = (int(which[piece]), int(grid.control_piece[piece]), int(grid.disturbance_piece[piece]), mode)
         if inputs != before:
-            drive = _times(B, control[:, inputs[1], None])
+            if callable(control):
+                driven = control(inputs[1], state) if inputs[1] != before[1] else driven
+            else:
+                driven = control[:, inputs[1], None]
+            drive = _times(B, driven)
             sigma, before = (
                 _times(integrals[inputs[0]], drive if signal is None else drive + _times(W, signal[inputs[2]])),
                 inputs,

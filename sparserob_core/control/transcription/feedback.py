@@ -8,11 +8,12 @@ import numpy as np
 
 from sparserob_core.control.constraints.feedback import FeedbackConstraint, FeedbackControl
 from sparserob_core.control.constraints.flat import FlatConstraint
+from sparserob_core.control.feedback.closed_loop import ClosedLoop, deviations_of
+from sparserob_core.control.feedback.innovations import Answers, answers, innovations_seen
 from sparserob_core.control.policies.affine import AffinePolicy
-from sparserob_core.control.problem.cost import Cost
+from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
 from sparserob_core.control.problem.units import Units
-from sparserob_core.control.response.closed_loop import ClosedLoop, deviations_of
-from sparserob_core.control.response.innovations import Answers, answers, innovations_seen
 from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.transcription.record import Feedback, Transcription
 from sparserob_core.errors import InputError
@@ -24,8 +25,7 @@ CONTROL, PEAK = "control", "peak"  # names of the families that are about the co
 
 def with_feedback(model: Transcription, own: Transcription, units: Units, policy: AffinePolicy) -> Transcription:
     """The program of a problem under a policy, from its transcription ``model`` without feedback and the same in its
-    ``own`` ``units``. Raises `InputError` for what a policy cannot be transcribed with."""
-    _refuse(model)
+    ``own`` ``units``."""
     blocks = 0 if own.functionals.disturbance is None else own.functionals.disturbance.block_count
     deviations = np.tile(units.disturbances[: own.problem.system.disturbances], blocks)
     seen = innovations_seen(own.response, own.control, own.functionals.disturbance)
@@ -33,9 +33,7 @@ def with_feedback(model: Transcription, own: Transcription, units: Units, policy
     scaled = answers(seen, own.control.breakpoints, own.problem.system.controls, memory)
     known = _in_users(scaled, units, deviations)
 
-    mine, theirs = (
-        _program(one, policy, each, blocks) for one, each in ((model, known), (own, scaled))
-    )
+    mine, theirs = (_program(one, policy, each, blocks) for one, each in ((model, known), (own, scaled)))
     told = [
         _told_by(family, other, units, deviations, own)
         for family, other in zip(theirs[0].families, mine[0].families, strict=True)
@@ -53,36 +51,48 @@ def with_feedback(model: Transcription, own: Transcription, units: Units, policy
     return replace(model, program=program, feedback=Feedback(policy, mine[1]))
 
 
-def _refuse(model: Transcription) -> None:
+def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary) -> None:
     """Raise `InputError` for what a policy is not built for, in one sentence."""
-    problem, disturbed = model.problem, model.problem.disturbance is not None
-    curved = [one.name for one in model.constraints if not isinstance(one, FlatConstraint)]
-    named = [one.name for one in model.constraints if one.name in (CONTROL, PEAK)]
-    reasons = [
-        (not model.control.is_indicators, "control in indicators of its pieces (piecewise_constant)"),
-        (problem.system.parameter_count > 0, "system without uncertain parameters: else what is measured is not the"
-         " disturbance alone"),
-        (disturbed and problem.disturbance_class != "piecewise_constant", "disturbance of the class piecewise_constant,"
-         f" not {problem.disturbance_class}"),
-        (disturbed and not model.disturbance.is_complete, "disturbance that takes any value on each of its pieces"),
-        (bool(curved), f"state in sets with flat sides, which those of {', '.join(curved)} have not"),
-        (problem.control.halfspaces() is None, f"control in a set with flat sides, which the {problem.control.kind} has not"),
-        (bool(named), f"state constraint of another name than {', '.join(named)}, which is one on the control"),
-        (problem.system.delay > 0.0, "control that acts at once, without a delay"),
-        (problem.initial_set is not None, "single initial state"),
-        (problem.control_step is not None, "control whose steps are free, without control_step"),
-        (problem.cost != Cost(), "cost that is the L1 norm alone"),
-        (any(isinstance(end, Equality) for end in problem.terminal), "terminal set with an interior: equals is not built"
-         " for feedback"),
-    ]  # fmt: skip
-    for hindered, wanted in reasons:
+    disturbed = problem.disturbance is not None
+    paths = [entry for entry in problem.path if isinstance(entry, PathConstraint)]
+    sets = [entry.set for entry in paths] + [end for end in problem.terminal if not isinstance(end, Equality)]
+    curved = [one.kind for one in sets if one.halfspaces() is None]
+    named = [entry.name for entry in paths if entry.name in (CONTROL, PEAK)]
+    plain = problem.disturbance_class == "piecewise_constant"
+    reasons = {
+        "control in indicators of its pieces (piecewise_constant)": not control.is_indicators,
+        "system without uncertain parameters: else what is measured is not the disturbance alone": bool(
+            problem.system.parameter_count
+        ),
+        f"disturbance of the class piecewise_constant, not {problem.disturbance_class}": disturbed and not plain,
+        "disturbance that takes any value on each of its pieces": disturbed and not disturbance.is_complete,
+        f"state in sets with flat sides, which the {' and the '.join(curved)} has not": bool(curved),
+        f"control in a set with flat sides, which the {problem.control.kind} has not": problem.control.halfspaces()
+        is None,
+        f"path constraint of another name than {' or '.join(map(str, named))}, which is one on the control": bool(
+            named
+        ),
+        "control that acts at once, without a delay": problem.system.delay > 0.0,
+        "single linear system, without pieces": bool(problem.system.switches),
+        "path constraint on the state alone, without mixed": any(
+            isinstance(one, MixedConstraint) for one in problem.path
+        ),
+        "path set that stands still, without relative_to": any(entry.relative_to is not None for entry in paths),
+        "single initial state": problem.initial_set is not None,
+        "control whose steps are free, without control_step": problem.control_step is not None,
+        "cost that is the L1 norm alone, without group": not problem.cost.is_linear,
+        "terminal set with an interior: equals is not built for feedback": any(
+            isinstance(end, Equality) for end in problem.terminal
+        ),
+    }
+    for wanted, hindered in reasons.items():
         if hindered:
             raise InputError(f"affine needs a {wanted}", path="policy.name")
 
 
 def _in_users(own: Answers, units: Units, deviations: Array) -> Answers:
     """The same coordinates of gains in the user's units; powers of two change no number but its exponent."""
-    _, m, Q, d = own.shape
+    _, _, Q, d = own.shape
     at, which, value = own.effect
     effect = (at, which, value * deviations[own.entry[which]] / deviations[at % Q])
     at, which, value = own.gain
@@ -111,10 +121,13 @@ def _program(
     most = (high - low)[known.channel] / loop.spread.chords[known.entry]
     low, high = np.repeat(low, pieces), np.repeat(high, pieces)
     weights, lower, upper = np.zeros(size), np.concatenate([low, -most]), np.concatenate([high, most])
-    cost = np.kron(np.asarray(problem.weights, dtype=float), model.control.lengths)
+    cost = problem.cost.l1 * np.kron(np.asarray(problem.weights, dtype=float), model.control.lengths)
+    settle = None
     if policy.cost == "peak":
         both = np.vstack([axes, -axes])
-        families.append(FeedbackControl(PEAK, loop, both, np.zeros(len(both)), first).family())
+        peaks = FeedbackControl(PEAK, loop, both, np.zeros(len(both)), first)
+        families.append(peaks.family())
+        settle = peaks.settled
         weights[first:] = cost
         lower = np.concatenate([lower, np.zeros(nominal)])
         upper = np.concatenate([upper, np.maximum(np.abs(low), np.abs(high))])
@@ -129,6 +142,7 @@ def _program(
         channels=problem.system.controls,
         lengths=np.tile(model.control.lengths, problem.system.controls),
         spread=loop.spread,
+        settle=settle,
     )
     return program, loop
 

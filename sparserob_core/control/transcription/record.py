@@ -7,13 +7,11 @@ from typing import final
 
 import numpy as np
 
-import numpy as np
-
 from sparserob_core.control.constraints.state import StateConstraint
+from sparserob_core.control.feedback.closed_loop import ClosedLoop
 from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.response.closed_loop import ClosedLoop
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.response import Response

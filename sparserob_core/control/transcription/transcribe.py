@@ -28,7 +28,7 @@ from sparserob_core.control.response.quadratic import quadratic_cost
 from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.response.response import SAME_TIME, Response, merge_grids
 from sparserob_core.control.sets.sets import Equality
-from sparserob_core.control.transcription.feedback import with_feedback
+from sparserob_core.control.transcription.feedback import refuse, with_feedback
 from sparserob_core.control.transcription.own_units import (
     RESOLVED,
     extent,
@@ -93,6 +93,8 @@ def prepare(
                 f"which is rounding for a horizon of {problem.horizon:g}"
             )
     refuse_without_steps(problem, control)
+    if isinstance(policy, AffinePolicy):
+        refuse(problem, control, disturbance)
     model = _assembled(problem, control, disturbance, formulation)
     if isinstance(policy, AffinePolicy):
         if formulation != "reduced":
@@ -100,9 +102,7 @@ def prepare(
         return with_feedback(model, *in_own_units(model), policy)
     if policy is not None and policy.knows:
         known = ", ".join(sorted(policy.knows))
-        raise InputError(
-            path="policy.name", expected="open_loop or affine", got=f"one that knows the {known}"
-        )
+        raise InputError(path="policy.name", expected="open_loop or affine", got=f"one that knows the {known}")
     return replace(model, program=model.program.mirrored(lambda _: _in_own_units(model)))
 
 

@@ -262,9 +262,13 @@ def _attained(case: Case, said: Mapping[str, Any]) -> list[str]:
     named where there are several."""
     from sparserob_core.checker.arithmetic.balls import balls
     from sparserob_core.checker.claims.case import numbers
+    from sparserob_core.checker.claims.feedback import feedback_of
     from sparserob_core.checker.claims.replay import exceeded
 
-    found = [("", *exceeded(case, said))]
+    if case.policy is not None:
+        found = [("", *feedback_of(case).exceeded(said))]
+    else:
+        found = [("", *exceeded(case, said))]
     if case.problem.initial_set is not None:
         begun = numbers(said.get("initial_state"), "initial_state")
         centre = np.asarray(case.problem.initial_state)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from sparserob_core.control.response.response import Response
 from sparserob_core.control.studies.adversary import Adversary, find_adversary
+from sparserob_core.control.studies.measuring import Measuring
 from sparserob_core.control.studies.simulate import fine_times, finer, walk
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
@@ -44,7 +45,7 @@ def adversaries(experiment: Experiment, decision: Array) -> dict[str, Array]:
     if not isinstance(experiment, ControlExperiment):
         return {}
     model, theta = experiment.transcription, np.asarray(decision, dtype=float).ravel()
-    found = [find_adversary(constraint, theta) for constraint in model.constraints]
+    found = [find_adversary(constraint, theta, model.feedback) for constraint in model.constraints]
     kept = [one for one in found if one is not None]
     if not kept:
         return {}
@@ -56,15 +57,24 @@ def adversaries(experiment: Experiment, decision: Array) -> dict[str, Array]:
 def propagated(model: Transcription, theta: Array, arrays: Mapping[str, Array]) -> tuple[Array, Array]:
     """The state trajectories ``(f, d, T)`` that stored adversaries cause at a decision ``(m N,)``, at times ``(T,)``,
     their own among them."""
-    response, control = model.response, model.functionals.on_grid(theta)
+    response = model.response
     breakpoints = arrays["breakpoints"]
     grid = response.grid.refined(breakpoints)
     times = fine_times(Response(response.system, grid, response.initial_state), model.parameters, arrays["times"])
     fine = Response(response.system, finer(grid, times), response.initial_state)
     disturbances = arrays["disturbances"] if arrays["disturbances"].shape[1] else None
-    acting, begun = control[:, grid.control_piece], arrays["initial_states"]
+    acting, begun = controlled(model, theta, grid.control_piece), arrays["initial_states"]
     states = np.stack(list(walk(fine, acting, arrays["parameters"], disturbances, begun)))
     return times, np.ascontiguousarray(states.transpose(2, 1, 0))
+
+
+def controlled(model: Transcription, decision: Array, which: np.ndarray) -> Array | Callable[[int, Array], Array]:
+    """What `walk` drives a system with at a decision, on pieces that lie in the pieces ``which`` of the grid: inputs
+    ``(m, pieces)``, or under feedback what answers the states."""
+    if model.feedback is None:
+        return model.functionals.on_grid(model.nominal(decision))[:, which]
+    measuring = Measuring.of(model, decision)
+    return lambda piece, state: measuring(int(which[piece]), state)
 
 
 def attained(arrays: Mapping[str, Array], times: Array, states: Array) -> Array:

@@ -194,7 +194,7 @@ def _admissible(problem: OptimalControlProblem, said: TimedExplanation) -> Array
     bound = problem.disturbance
     if bound is None or said.disturbance is None:
         return None
-    middle = bound.middle()
+    middle = bound.interior_point()
     return np.array([_inside(bound, column, middle) for column in said.disturbance.T]).reshape(-1, bound.dimension).T
 
 

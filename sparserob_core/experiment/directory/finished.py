@@ -148,6 +148,20 @@ class FinishedRun:
     theta: Array
 
     @property
+    def decision(self) -> Array:
+        """The whole decision ``(n,)``: ``theta``, and under feedback the variables of the gains. Raises `InputError`
+        where ``solution.npz`` does not hold it."""
+        if self.experiment.transcription.feedback is None:
+            return self.theta.ravel()
+        found, shape = self.solution.get("decision", np.zeros(0)), (self.experiment.program.n,)
+        if found.shape != shape or found.dtype.kind != "f" or not np.isfinite(found).all():
+            raise InputError(
+                f"{self.directory / 'solution.npz'}: decision: expected finite numbers of shape {shape}, as config.yaml"
+                f" says, got {found.dtype} of shape {found.shape}"
+            )
+        return found
+
+    @property
     def directory(self) -> Path:
         """Where it is."""
         return self.stored.directory

@@ -4,6 +4,7 @@ them."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from sparserob_core.control.problem.problem import OptimalControlProblem, PathCo
 from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.studies.answer import tube
+from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment
 from sparserob_core.experiment.directory.sparsity import sparsity
@@ -33,8 +35,8 @@ def draw_experiment(
     cost: float | None,
     worst: Mapping[str, Array],
 ) -> list[Path]:
-    """Draw the figures of a decision ``theta (m, N)`` into ``directory/figures``; raises `InputError` when there is
-    nothing to draw.
+    """Draw the figures of a decision (``theta (m, N)``, or whole) into ``directory/figures``; raises `InputError` when
+    there is nothing to draw.
 
     ``worst``: the arrays of `adversaries`, empty when there is no constraint to be driven against.
     """
@@ -51,7 +53,8 @@ def draw_experiment(
 def figure_data(
     experiment: Experiment, theta: Array, active_times: Array, history: Sequence[RoundFinished], cost: float | None
 ) -> FigureData:
-    """What figures of a decision ``theta (m, N)`` show; raises `InputError` when the program is no control problem."""
+    """What figures of a decision (``theta (m, N)``, or whole) show; raises `InputError` when the program is no
+    control problem."""
     if not isinstance(experiment, ControlExperiment):
         raise InputError("figures: they are for control problems; this is a semi-infinite program of another kind")
     return _data(experiment, theta, active_times, history, cost)
@@ -76,7 +79,9 @@ def _data(
     axes = np.eye(problem.system.controls)
     shown = _shown(model.response.grid.breakpoints.size)
     tolerance = experiment.loaded.config.method.options.get("tolerance")
-    around = tube(model, np.ravel(theta), model.response.grid.breakpoints[shown])
+    decision, times = np.ravel(theta), model.response.grid.breakpoints[shown]
+    around = tube(model, decision, times)
+    answered = {} if model.feedback is None else _answered(model, decision, times)
     return FigureData(
         title=printable(experiment.title),
         breakpoints=dictionary.breakpoints,
@@ -96,7 +101,23 @@ def _data(
         cost=cost,
         names=problem.names,
         tolerance=tolerance if isinstance(tolerance, float) else None,
+        **answered,
     )
+
+
+def _answered(model: Transcription, decision: Array, times: Array) -> dict[str, Array]:
+    """What feedback adds to the figures: the tube that the nominal control alone has, how far the disturbance moves the
+    control, and the gains."""
+    assert model.feedback is not None
+    loop, alone = model.feedback.loop, tube(replace(model, feedback=None), model.nominal(decision), times)
+    nominal, effects = loop.nominal(decision), loop.effects(decision)
+    return {
+        "alone_lower": alone.lower,
+        "alone_upper": alone.upper,
+        "control_least": nominal - loop.spread.support(-effects).T,
+        "control_most": nominal + loop.spread.support(effects).T,
+        "gains": loop.gains(decision),
+    }
 
 
 def _shown(count: int) -> np.ndarray[Any, np.dtype[np.intp]]:

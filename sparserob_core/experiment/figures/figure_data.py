@@ -57,6 +57,10 @@ class FigureData:
     the times of the imposed constraints that carry a multiplier; ``history`` the rounds of the method. ``tolerance`` is
     the relative gap that was asked for, ``cost_scale`` the largest possible cost, ``cost_of`` what is
     added up to it, where that is not the L1 norm alone, ``names`` what everything is called.
+
+    Under feedback the control is the nominal one, ``control_least``, ``control_most (m, K)`` are how far the
+    disturbance moves it, ``gains (K, K, m, d)`` answer what is measured, and ``alone_lower``, ``alone_upper (d, T)``
+    is the tube that the nominal control alone has.
     """
 
     title: str
@@ -76,6 +80,11 @@ class FigureData:
     tolerance: float | None = None
     cost_scale: float = UNKNOWN_SCALE
     cost_of: str = ""
+    alone_lower: Array | None = None
+    alone_upper: Array | None = None
+    control_least: Array | None = None
+    control_most: Array | None = None
+    gains: Array | None = None
     names: Names = UNNAMED
 
     def __post_init__(self) -> None:

@@ -30,6 +30,8 @@ def write_figures(directory: Path, data: FigureData) -> list[Path]:
     with style():
         files = write_figure(directory / "control", draw_control(data))
         files += write_figure(directory / "states", draw_states(data))
+        if data.gains is not None:
+            files += write_figure(directory / "gains", draw_gains(data))
         if data.history:
             files += write_figure(directory / "convergence", draw_convergence(data))
     return files
@@ -41,7 +43,22 @@ def draw_control(data: FigureData) -> Figure:
     for channel, ax in enumerate(axes):
         steps = data.control[channel]
         ax.axhline(0.0, color=look.GREY, linewidth=0.6, zorder=1)
-        ax.stairs(steps, data.breakpoints, baseline=0.0, fill=True, color=look.SKY, alpha=0.35, linewidth=0, zorder=2)
+        if data.control_least is None or data.control_most is None:
+            ax.stairs(
+                steps, data.breakpoints, baseline=0.0, fill=True, color=look.SKY, alpha=0.35, linewidth=0, zorder=2
+            )
+        else:
+            ax.stairs(
+                data.control_most[channel],
+                data.breakpoints,
+                baseline=data.control_least[channel],
+                fill=True,
+                color=look.SKY,
+                alpha=0.45,
+                linewidth=0,
+                zorder=2,
+                label="under any disturbance",
+            )
         ax.stairs(steps, data.breakpoints, baseline=None, color=look.BLUE, linewidth=1.5, zorder=3, label="control")
         _bounds(ax, float(data.control_lower[channel]), float(data.control_upper[channel]), steps)
         _rug(ax, data.active_times)
@@ -64,8 +81,19 @@ def draw_states(data: FigureData) -> Figure:
             alpha=0.45,
             linewidth=0,
             zorder=2,
-            label="worst case",
+            label="worst case" if data.gains is None else "worst case, with feedback",
         )
+        for outer in (data.alone_lower, data.alone_upper):
+            if outer is not None:
+                ax.plot(
+                    data.times,
+                    outer[component],
+                    color=look.GREY,
+                    linewidth=0.9,
+                    linestyle=(0, (4, 2)),
+                    zorder=2,
+                    label="worst case of the nominal control alone",
+                )
         for edge in (data.tube_lower[component], data.tube_upper[component]):
             ax.plot(data.times, edge, color=look.SKY, linewidth=0.8, zorder=2)
         ax.plot(data.times, data.state[component], color=look.BLUE, linewidth=1.5, zorder=3, label="nominal")
@@ -77,6 +105,24 @@ def draw_states(data: FigureData) -> Figure:
     draw_time_axis(axes[-1], data)
     axes[0].set_title(data.title)
     draw_legend(figure, axes)
+    return figure
+
+
+def draw_gains(data: FigureData) -> Figure:
+    """Every gain as a picture: rows are the pieces of the control, columns the times at which an innovation is seen."""
+    assert data.gains is not None
+    K, _, m, d = data.gains.shape
+    figure, axes = panels(m * d, 2.6, extra=0.3)
+    for number, ax in enumerate(axes):
+        channel, state = divmod(number, d)
+        table = np.where(np.tril(np.ones((K, K))) > 0, data.gains[:, :, channel, state], np.nan)
+        most = float(np.nanmax(np.abs(table))) or 1.0
+        ends = data.breakpoints
+        mesh = ax.pcolormesh(ends, ends, table, cmap="PuOr", vmin=-most, vmax=most, rasterized=True)
+        ax.set_ylabel(f"{data.control_label(channel)} answers at")
+        figure.colorbar(mesh, ax=ax, pad=0.01).set_label(f"gain on {data.state_label(state)}")
+    axes[0].set_title(data.title)
+    axes[-1].set_xlabel(f"innovation seen at {data.time_label()}")
     return figure
 
 

@@ -36,7 +36,7 @@ def draw_run(directory: Path, plugins: Iterable[str | Path] = (), notify: Notify
     if "theta" in run.solution:
         finished = read_finished(directory, plugins)
         experiment: Experiment = finished.experiment
-        worst = adversaries(experiment, finished.theta)
+        worst = adversaries(experiment, finished.decision)
     elif run.summary["status"] == "infeasible" or run.evaluations is not None:
         experiment = assemble(run.config(plugins))
     else:
@@ -70,8 +70,10 @@ def drawings(
     if isinstance(experiment, ControlExperiment) and result.status == "infeasible":
         yield lambda: draw_clash(experiment, result, directory)
     elif isinstance(experiment, ControlExperiment) and result.decision is not None:
-        active = np.unique([cut.index[0] for cut in result.indices if cut.multiplier > 0])
-        decision = np.asarray(result.decision).reshape(-1, experiment.control.functions)
+        about = {one.name for one in experiment.transcription.constraints}
+        kept = [cut for cut in result.indices if cut.family in about or experiment.transcription.feedback is None]
+        active = np.unique([cut.index[0] for cut in kept if cut.multiplier > 0])
+        decision = np.asarray(result.decision, dtype=float).ravel()
         yield lambda: draw_experiment(experiment, decision, active, result.history, directory, result.cost, worst)
     trace = result.trace
     if trace is not None and np.isfinite(trace.value).any():

@@ -103,10 +103,8 @@ class Inspection:
         program that is no control problem."""
         from sparserob_core.experiment.figures.drawing import figure_data
 
-        experiment, theta = self._experiment, np.asarray(decision, dtype=float)
-        if isinstance(experiment, ControlExperiment):
-            theta = theta.reshape(-1, experiment.control.functions)
-        return figure_data(experiment, theta, np.empty(0) if active_times is None else active_times, (), None)
+        theta = np.asarray(decision, dtype=float)
+        return figure_data(self._experiment, theta, np.empty(0) if active_times is None else active_times, (), None)
 
     def clash(self, result: Result) -> list[Strip]:
         """Of an infeasible result the quantities that clash: what is allowed, where the control can bring them, and

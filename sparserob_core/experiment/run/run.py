@@ -29,7 +29,7 @@ from sparserob_core.experiment.run.journal import Journal
 from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.experiment.terminal.table import result_rows
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.method import Deadline, ExecutorFactory, Method, Tools
+from sparserob_core.sip.method import Deadline, ExecutorFactory, Method, Tools, require_suited
 from sparserob_core.sip.methods.own_units import solve_in_own_units
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.result import Result
@@ -193,6 +193,10 @@ def _run(
     tools = replace(tools, deadline=deadline)
     watching = [*_observers(loaded), *((type(observer).__name__, observer) for observer in observers)]
     method: Method = build(loaded, "method", loaded.config.method)
+    try:
+        require_suited(method, experiment.program, loaded.config.method.name)
+    except InputError as error:
+        raise loaded.located((), error) from error
     with create_directory(out, name_of(loaded), loaded.config.digest()) as directory:
         journal = Journal(directory, experiment, origin)
         broadcast = Broadcast([("journal", journal), *watching])

@@ -28,7 +28,7 @@ def write_simulation(
 
     Raises `InputError` when the file cannot be written.
     """
-    data = figure_data(finished.experiment, finished.theta, active_times(finished.solution), (), None)
+    data = figure_data(finished.experiment, finished.decision, active_times(finished.solution), (), None)
     if worst is not None:
         write_adversary(file, worst, data)
         return

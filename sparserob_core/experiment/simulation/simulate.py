@@ -17,7 +17,13 @@ from sparserob_core.control.studies.laws import LawName, Uncertainty
 from sparserob_core.control.studies.simulate import fine_times, finer, trajectories_at_once, walk
 from sparserob_core.control.transcription.own_units import row_units
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.directory.adversary import adversaries, attained, propagated, read_adversaries
+from sparserob_core.experiment.directory.adversary import (
+    adversaries,
+    attained,
+    controlled,
+    propagated,
+    read_adversaries,
+)
 from sparserob_core.experiment.directory.artefacts import RunDirectory
 from sparserob_core.experiment.directory.finished import FinishedRun, read_finished
 from sparserob_core.experiment.plugins.messages import nearest
@@ -75,11 +81,11 @@ def simulate(
             f"{finished.directory}: there is no path or terminal constraint that a trajectory could violate"
         )
     started = time.perf_counter()
-    worst = adversaries(finished.experiment, finished.theta)
+    worst = adversaries(finished.experiment, finished.decision)
     replayed: Mapping[str, Array] | None = None
     if law == ADVERSARY:
         replayed = read_adversaries(finished.directory, model) or worst
-        moments, states = propagated(model, finished.theta.ravel(), replayed)
+        moments, states = propagated(model, finished.decision, replayed)
         replayed = {**replayed, "state_times": moments, "states": states}
         found = _replayed(finished, replayed, started)
     else:
@@ -103,7 +109,7 @@ def _sampled(
 ) -> Simulation:
     model = finished.experiment.transcription
     response, parameters = model.response, model.parameters
-    control = model.functionals.on_grid(finished.theta.ravel())
+    control = controlled(model, finished.decision, np.arange(response.grid.pieces))
     ends = [moment for constraint in model.constraints for moment in (constraint.start, constraint.stop)]
     times = fine_times(response, parameters, np.concatenate([ends, worst.get("times", np.zeros(0))]))
     fine = Response(response.system, finer(response.grid, times), response.initial_state)

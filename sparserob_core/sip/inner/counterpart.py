@@ -1,10 +1,11 @@
 """The robust counterpart of finitely many uncertain rows as one sparse linear program, and what its multipliers prove.
 
-Where the deviations are entry by entry within ``[-r, r]``, the worst case of a row is ``g x + sum_q r_q |a_q| <= h`` with
+Where the deviations are entry by entry within ``[-r, r]``, the worst case of a row is ``g x + sum_q r_q |a_q| <= h``
+with
 ``a = C x + d``. Absolute values are split into two parts that are not negative, those of variables at once, others by
-one equality (Ben-Tal, El Ghaoui and Nemirovski 2009, section 1.3): an extended formulation, with all deviations at once.
-For other sets the support function of every block is replaced by the largest over finitely many of its points, which
-grow in number.
+one equality (Ben-Tal, El Ghaoui and Nemirovski 2009, section 1.3): an extended formulation, with all deviations at
+once. For other sets the support function of every block is replaced by the largest over finitely many of its points,
+which grow in number.
 
 By the duality of linear programs the multipliers of a row with those of its equalities say one deviation in the set,
 a mean of extreme ones. The row at this deviation is linear in the decision: so finitely many cuts, one for each row,
@@ -14,13 +15,12 @@ prove the same bound, and nothing but these cuts has to be believed.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.finite import FiniteProgram
-from sparserob_core.sip.uncertain import Spread, UncertainRows
+from sparserob_core.sip.finite import FiniteProgram, Spread, UncertainRows
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -66,8 +66,8 @@ class _Part:
 class Counterpart:
     """Uncertain rows over one program and one spread, to which rows are added; solved by HiGHS, from the last basis.
 
-    Its columns are the positive and the negative parts of the decision, a slack of all rows where it is ``elastic`` (and
-    the only cost), and what rows need beside them.
+    Its columns are the positive and the negative parts of the decision, a slack of all rows where it is ``elastic``
+    (and the only cost), and what rows need beside them.
     """
 
     program: FiniteProgram
@@ -252,7 +252,7 @@ class _Linear:
     def __init__(self) -> None:
         import highspy
 
-        self.highs = highspy.Highs()
+        self.highs: Any = highspy.Highs()
         self.columns = self.count = 0
         for name, value in {
             "output_flag": False,
@@ -308,8 +308,8 @@ def robust_bound(
     program: FiniteProgram, blocks: list[UncertainRows], y: Array, deviations: Array, mu: Array, priced: bool
 ) -> tuple[float, float]:
     """A lower bound of the cost by weak duality, from multipliers ``y (r,) >= 0`` of rows at ``deviations (r, Q)`` and
-    ``mu (e,)``: the minimum over the bounds of the program alone. Not ``priced``: of the weighted sum of the rows, which
-    is positive only where nothing is feasible. With it the sum of the numbers that were added up."""
+    ``mu (e,)``: the minimum over the bounds of the program alone. Not ``priced``: of the weighted sum of the rows,
+    which is positive only where nothing is feasible. With it the sum of the numbers that were added up."""
     slope, constant = (program.q.copy() if priced else np.zeros(program.n)), -float(mu @ program.b)
     slope = slope + mu @ program.A
     size, noise, first = abs(constant), np.abs(slope) + np.abs(mu) @ np.abs(program.A), 0

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 from pydantic import Field
@@ -53,6 +53,8 @@ class Exchange(Method, Options):
 
     rounds: int = Field(default=200, ge=1)
     """Rounds at most."""
+
+    robust: ClassVar[bool] = True
 
     exact: bool = True
     """Solve the unregularised problem, with the regulariser only as heavy as that allows; false: solve the regularised

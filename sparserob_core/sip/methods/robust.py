@@ -1,19 +1,20 @@
 """Exchange for rows that must hold for every deviation: times are exchanged, deviations are all in the relaxed program.
 
-A round solves the robust counterpart at the imposed indices (`inner.counterpart`), separates every family in closed form
-and imposes what is violated. The lower bound is that of cuts: every row with a multiplier, at the deviation that its
-multipliers say (weak duality over the bounds of the program). It ends as the other exchange does: by proof.
+A round solves the robust counterpart at the imposed indices (`inner.counterpart`), separates every family in closed
+form and imposes what is violated. The lower bound is that of cuts: every row with a multiplier, at the deviation that
+its multipliers say (weak duality over the bounds of the program). It ends as the other exchange does: by proof.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.evidence import Cut, Dual, InfeasibleSubsystem
+from sparserob_core.sip.evidence import Cut, Dual, InfeasibleSubsystem, Proof
 from sparserob_core.sip.finite import FiniteSolution
 from sparserob_core.sip.inner.counterpart import Counterpart, RobustAnswer, robust_bound
 from sparserob_core.sip.methods.ledger import Answer, Ledger, Prover
@@ -101,50 +102,66 @@ def _exchange(ledger: Ledger, prover: Prover, rounds: int) -> Result:
         last = number == rounds
 
         # Relax: the counterpart at the imposed indices; its cuts are a lower bound.
-        solved = _solved(working, ledger)
-        if isinstance(solved, Result):
-            return solved
-        answer, found = solved, separate(program, solved.solution.x, tools, ALLOWED, number)
+        answer = _solved(working, ledger)
+        if isinstance(answer, Result):
+            return answer
         x = answer.solution.x
 
-        # Separate, and exchange: the times at which the continuum is violated most.
+        # Separate: the times at which the continuum is violated most.
+        found = separate(program, x, tools, ALLOWED, number)
+        told = [(family, one) for family, one in found if not family.defines]
         violated = [(family, one.indices[one.violations > ALLOWED]) for family, one in found]
         feasible = not any(indices.size for _, indices in violated)
-        ledger.tell(number, answer, found, program.cost(x) if feasible else np.inf, kept=len(working.cuts))
-        if not last:
-            added = sum(working.add(family, indices) for family, indices in violated)
-            sharper = not feasible and working.counterpart.sharpen(x)
-            if added or sharper:
-                continue
-            if not feasible and working.slater and working.margin < LARGEST:
-                working.margin = min(LARGEST, 4.0 * working.margin)  # imposed and violated: by the solver's accuracy
-                continue
-            if feasible and ledger.open(x) and working.margin > SMALLEST:
-                working.margin = max(SMALLEST, 0.2 * working.margin)
-                continue
+        ledger.tell(number, answer, told, program.cost(x) if feasible else np.inf, kept=len(working.cuts))
+
+        # Exchange: impose them, or sharpen what stands for the imposed ones, or choose another margin.
+        if not last and _advanced(working, ledger, x, violated, feasible):
+            continue
 
         # Prove: over the whole continuum; a witness that the proof meets is one more index to impose.
         proofs = prover(x)
-        again = 0
-        if not last and not tools.deadline.passed:
-            for proof in proofs:
-                if proof.verdict == "refuted" and proof.index is not None:
-                    again += working.add(program.family(proof.family), proof.index[None])
-            tight = any(proof.verdict == "undecided" for proof in proofs) and working.margin < LARGEST
-            if not again and tight and working.slater:
-                working.margin, again = min(LARGEST, 4.0 * working.margin), 1
-        if again:
+        if not last and not tools.deadline.passed and _learned(working, x, proofs):
             continue
         ending = f"the {rounds} rounds of the method are used up" if last else ""
-        if tools.deadline.passed:
-            ending = tools.deadline.reason
-        return ledger.judged(answer, worst_of(found), proofs, ending)
+        ending = tools.deadline.reason if tools.deadline.passed else ending
+        return ledger.judged(answer, worst_of(told), proofs, ending)
     raise AssertionError("the last round returns")
 
 
+def _advanced(
+    working: Robust, ledger: Ledger, x: Array, violated: list[tuple[ConstraintFamily, Array]], feasible: bool
+) -> bool:
+    """Whether the next round has something new to solve."""
+    added = sum(working.add(family, indices) for family, indices in violated)
+    if (not feasible or added or ledger.open(x)) and (working.counterpart.sharpen(x) or added):
+        return True
+    if not feasible and working.slater and working.margin < LARGEST:
+        working.margin = min(LARGEST, 4.0 * working.margin)  # imposed and violated: by the solver's accuracy
+        return True
+    if feasible and ledger.open(x) and working.margin > SMALLEST:
+        working.margin = max(SMALLEST, 0.2 * working.margin)
+        return True
+    return False
+
+
+def _learned(working: Robust, x: Array, proofs: Sequence[Proof]) -> bool:
+    """Whether a proof that failed has told something new to solve."""
+    again = 0
+    for proof in proofs:
+        if proof.verdict == "refuted" and proof.index is not None:
+            again += working.add(working.program.family(proof.family), proof.index[None])
+            again += working.counterpart.sharpen(x)
+    if again:
+        return True
+    if any(proof.verdict == "undecided" for proof in proofs) and working.slater and working.margin < LARGEST:
+        working.margin = min(LARGEST, 4.0 * working.margin)
+        return True
+    return False
+
+
 def _solved(working: Robust, ledger: Ledger) -> Answer | Result:
-    """The optimum of the counterpart with the rows tightened; where that leaves nothing, less and less so, and in the end
-    the proof that nothing is feasible."""
+    """The optimum of the counterpart with the rows tightened; where that leaves nothing, less and less so, and in the
+    end the proof that nothing is feasible."""
     while True:
         answer = working.counterpart.solve(working.margin)
         ledger.relaxed.solves = ledger.relaxed.counted.calls = working.counterpart.calls
@@ -158,6 +175,7 @@ def _solved(working: Robust, ledger: Ledger) -> Answer | Result:
         return _infeasible(working, ledger, answer.said)
     program = working.program
     x = np.clip(answer.x, program.finite.lower, program.finite.upper)
+    x = x if program.settle is None else program.settle(x)
     dual = working.dual(answer, priced=True)
     ledger.improve(dual)
     price = float(answer.y.sum())
@@ -189,7 +207,9 @@ def _infeasible(working: Robust, ledger: Ledger, said: str) -> Result:
     dual = working.dual(elastic, priced=False) if elastic.solved else None
     if dual is None or not dual.bound > FARKAS:
         found = FiniteSolution("failed", np.zeros(program.n), np.nan, -np.inf, none, none, none, np.inf, np.inf, said)
-        return ledger.result("failed", f"the relaxed program was not solved: {said}", Answer(found, _rows(working), 0.0, np.nan))
+        return ledger.result(
+            "failed", f"the relaxed program was not solved: {said}", Answer(found, _rows(working), 0.0, np.nan)
+        )
     solution = FiniteSolution(
         "infeasible", elastic.x, np.inf, np.inf, elastic.y, elastic.mu, none, np.inf, 0.0, said, (), dual.bound
     )

@@ -76,7 +76,7 @@ def witness(program: SemiInfiniteProgram, searched: WorstConstraint, proofs: Seq
     found = [
         WorstConstraint(proof.violation, proof.family, proof.index, proof.row, proof.formulation)
         for proof in proofs
-        if proof.index is not None
+        if proof.index is not None and not program.family(proof.family).defines
     ]
     return explained(program, max([searched, *found], key=lambda one: one.violation))
 

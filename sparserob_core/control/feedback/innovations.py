@@ -1,9 +1,9 @@
 """What is seen of the disturbance at the breakpoints, and coordinates of the gains that answer it.
 
-The innovation ``e_j`` is linear in the deviations ``w`` of the disturbance from its middle: ``e_j = D_j w``. A gain acts
-through its *effect* ``F_k = sum_j M_kj D_j``, how the control on piece ``k`` depends on ``w``, alone. So the variables
-are entries of ``F_k``, at as many entries of ``w`` as are independent of one another in what is seen, and the gains that
-have these effects are ``M_k = F_k D^+``.
+The innovation ``e_j`` is linear in the deviations ``w`` of the disturbance from its middle: ``e_j = D_j w``. A gain
+acts through its *effect* ``F_k = sum_j M_kj D_j``, how the control on piece ``k`` depends on ``w``, alone. So the
+variables are entries of ``F_k``, at as many entries of ``w`` as are independent of one another in what is seen, and
+the gains that have these effects are ``M_k = F_k D^+``.
 """
 
 from __future__ import annotations
@@ -70,13 +70,15 @@ class Answers:
         """``F (K, m, Q)``."""
         K, m, Q, _ = self.shape
         at, which, value = self.effect
-        return np.bincount(at, value * numbers[which], K * m * Q).reshape(K, m, Q)
+        found: Array = np.bincount(at, value * numbers[which], K * m * Q).astype(float).reshape(K, m, Q)
+        return found
 
     def gains(self, numbers: Array) -> Array:
         """``M (K, K, m, d)``: ``M[k, j]`` acts on ``e_j``, zero for ``j > k``."""
         K, m, _, d = self.shape
         at, which, value = self.gain
-        return np.bincount(at, value * numbers[which], K * K * m * d).reshape(K, K, m, d)
+        found: Array = np.bincount(at, value * numbers[which], K * K * m * d).astype(float).reshape(K, K, m, d)
+        return found
 
     @cached_property
     def single(self) -> bool:
@@ -91,8 +93,8 @@ def answers(D: Array, breakpoints: Array, channels: int, memory: float | None) -
     K, d, Q = D.shape
     clusters = _clusters((D != 0.0).any(axis=1))
     pieces, channel, entry = [], [], []
-    effect: list[tuple[Array, Array, Array]] = []
-    gain: list[tuple[Array, Array, Array]] = []
+    effect: list[tuple[np.ndarray, np.ndarray, Array]] = []
+    gain: list[tuple[np.ndarray, np.ndarray, Array]] = []
     count, known = 0, {}
     horizon = breakpoints[-1]
     for k in range(K):
@@ -119,9 +121,7 @@ def answers(D: Array, breakpoints: Array, channels: int, memory: float | None) -
                 rows, cols = np.nonzero(G)
                 j, state = seen[cols // d], cols % d
                 gain.append((((k * K + j) * channels + i) * d + state, names[rows], G[rows, cols]))
-    return Answers(
-        (K, channels, Q, d), _whole(pieces), _whole(channel), _whole(entry), _joined(effect), _joined(gain)
-    )
+    return Answers((K, channels, Q, d), _whole(pieces), _whole(channel), _whole(entry), _joined(effect), _joined(gain))
 
 
 def _clusters(where: np.ndarray) -> list[np.ndarray]:
@@ -163,6 +163,6 @@ def _whole(parts: list[np.ndarray]) -> np.ndarray:
     return np.concatenate([np.zeros(0, dtype=int), *parts])
 
 
-def _joined(parts: list[tuple[Array, Array, Array]]) -> tuple[np.ndarray, np.ndarray, Array]:
+def _joined(parts: list[tuple[np.ndarray, np.ndarray, Array]]) -> tuple[np.ndarray, np.ndarray, Array]:
     at, which, value = zip(*parts, strict=True) if parts else ((), (), ())
     return _whole(list(at)), _whole(list(which)), np.concatenate([np.zeros(0), *value])

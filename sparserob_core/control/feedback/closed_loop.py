@@ -1,8 +1,8 @@
 """What the state does when the control answers the disturbance: linear in the deviations, exactly, at all times.
 
 With the effects ``F`` of the gains, the control on piece ``k`` is ``u_k = v_k + F_k w``, and the state
-``x(t) = x_v(t) + sum_q y_q(t) w_q``: every ``y_q`` is the state of the same system from 0, driven by column ``q`` of the
-effects and by its own entry of the disturbance.
+``x(t) = x_v(t) + sum_q y_q(t) w_q``: every ``y_q`` is the state of the same system from 0, driven by column ``q`` of
+the effects and by its own entry of the disturbance.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
+from sparserob_core.control.feedback.innovations import KNOWN, Answers
 from sparserob_core.control.response.functional import WorstCase
-from sparserob_core.control.response.innovations import KNOWN, Answers
 from sparserob_core.sip.convex_set import Array, ConvexSet
-from sparserob_core.sip.uncertain import Spread, UncertainRows
+from sparserob_core.sip.finite import Spread, UncertainRows
 
 if TYPE_CHECKING:
     from sparserob_core.control.response.response import Steps
@@ -141,8 +141,11 @@ class ClosedLoop:
             row, factor = row @ A, factor * h / (order + 1)
         growth = np.linalg.norm(A, 2) * h
         with np.errstate(over="ignore", invalid="ignore"):
-            tail = factor * np.exp(growth) * np.linalg.norm(row, axis=1)[:, None] * np.linalg.norm(
-                rates, axis=1, keepdims=True
+            tail = (
+                factor
+                * np.exp(growth)
+                * np.linalg.norm(row, axis=1)[:, None]
+                * np.linalg.norm(rates, axis=1, keepdims=True)
             )
         bent = second + tail
         radii = np.concatenate([[1.0], self.spread.radii])
@@ -161,7 +164,8 @@ class ClosedLoop:
         return np.asarray((self.entries @ (self.spread.middle + deviation)).T)
 
     def state_rows(self, time: float, H: Array, h: Array, part: np.ndarray, factor: Array) -> UncertainRows:
-        """The rows ``H x(t) <= h`` at one time, as `UncertainRows`: row ``r`` is ``factor_r`` times the direction of its
+        """The rows ``H x(t) <= h`` at one time, as `UncertainRows`: row ``r`` is ``factor_r`` times the direction of
+        its
         ``part_r``, the first row with which it shares it."""
         from scipy.sparse import csr_array
 
@@ -195,7 +199,7 @@ class ClosedLoop:
         part, factor = shared(H, self.spread)
         firsts = [int(np.flatnonzero(part == p)[0]) for p in range(int(part.max()) + 1)]
         at, which, value = self.of_piece(piece)
-        m, Q, K = self.answers.shape[1], self.spread.size, self.functionals.dictionary.pieces
+        Q, K = self.spread.size, self.functionals.dictionary.pieces
         channel, entry = at // Q, at % Q
         parts = []
         for first in firsts:

@@ -1,0 +1,1 @@
+"""What a control that answers its measurements makes of the state: innovations, gains, the closed loop."""

@@ -1,0 +1,59 @@
+"""The control of a policy while the system runs: from the states that are measured, and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import final
+
+import numpy as np
+
+from sparserob_core.control.feedback.innovations import KNOWN
+from sparserob_core.control.transcription.record import Transcription
+from sparserob_core.sip.convex_set import Array
+
+
+@final
+@dataclass(eq=False)
+class Measuring:
+    """Of many systems at once, what acts on each piece of the grid, from the states at the control's breakpoints.
+
+    ``nominal (m, K)``, ``gains (K, K, m, d)``. Pieces are asked for in order; piece 0 begins anew.
+    """
+
+    model: Transcription
+    nominal: Array
+    gains: Array
+    _predicted: Array | None = None
+    _inputs: Array | None = None
+    _innovations: list[Array] = field(default_factory=list)
+
+    @staticmethod
+    def of(model: Transcription, decision: Array) -> Measuring:
+        """The control of a decision."""
+        assert model.feedback is not None
+        return Measuring(model, model.pieces(decision), model.feedback.loop.gains(decision))
+
+    def __call__(self, piece: int, state: Array) -> Array:
+        """What acts through the columns of ``B`` on a piece of the grid that begins in ``state (d, n)``: ``(mc,
+        n)``."""
+        response, loop = self.model.response, self.model.feedback
+        assert loop is not None
+        grid, steps = response.grid, response.steps(KNOWN)
+        k = int(grid.control_piece[piece])
+        if piece == 0 or k != grid.control_piece[piece - 1]:
+            if piece == 0:
+                self._innovations = [np.zeros_like(state)]
+            else:
+                assert self._predicted is not None
+                self._innovations.append(state - self._predicted)
+            u = np.repeat(self.nominal[:, k, None], state.shape[1], axis=1)
+            for j, innovation in enumerate(self._innovations):
+                if self.gains[k, j].any():
+                    u = u + self.gains[k, j] @ innovation
+            self._inputs = np.vstack([u, np.ones((grid.constants, state.shape[1]))])
+            self._predicted = state
+        assert self._inputs is not None and self._predicted is not None
+        length = int(response.which[piece])
+        drive = steps.B[0] @ self._inputs + (steps.E[0] @ loop.loop.middles[piece])[:, None]
+        self._predicted = steps.Phi[0, length] @ self._predicted + steps.Gamma[0, length] @ drive
+        return self._inputs

@@ -1,0 +1,353 @@
+"""Guards policy affine: known values, an independent linear program on a fine grid, all kinds of disturbances and
+grids, closed loops that measure, forged certificates, other units."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.optimize import linprog
+from scipy.sparse import coo_array
+
+import sparserob_core as sr
+from sparserob_core.experiment.check.check import check
+
+SPRING: dict[str, Any] = {
+    "name": "linear",
+    "system": {"A": [[0, 1], [-2, -0.5]], "B": [[0], [1]]},
+    "horizon": 5.0,
+    "initial_state": [-1, 1],
+    "control": {"box": 1.0},
+    "disturbance": {"box": [0.25, 0.25]},
+    "path": [{"box": [0.7, None], "from": 0.5}],
+    "terminal": [{"box": [0.3, 0.3]}],
+}
+DOUBLE: dict[str, Any] = {
+    "name": "linear",
+    "system": {"A": [[0, 1], [0, 0]], "B": [[0], [1]], "E": [[0], [1]]},
+    "horizon": 5.0,
+    "initial_state": [4, 0],
+    "control": {"box": 1.0},
+    "disturbance": {"box": 0.1},
+    "path": [{"box": [4.2, 1.6]}],
+    "terminal": [{"box": [0.5, 0.4]}],
+}
+MASSES: dict[str, Any] = {
+    "name": "linear",
+    "system": {
+        "A": [[0, 0, 1, 0], [0, 0, 0, 1], [-2, 1, -0.1, 0], [1, -2, 0, -0.1]],
+        "B": [[0, 0], [0, 0], [1, 0], [0, 1]],
+        "E": [[0, 0], [0, 0], [1, 0], [0, 1]],
+    },
+    "horizon": 6.0,
+    "initial_state": [0.8, 0.3, 0.4, -0.2],
+    "control": {"box": 0.6},
+    "disturbance": {"box": [0.1, 0.1]},
+    "path": [{"polytope": {"H": [[1, -1, 0, 0], [-1, 1, 0, 0]], "h": [0.5, 0.5]}, "from": 0.5}],
+    "terminal": [{"box": [0.2, 0.2, 0.2, 0.2]}],
+}
+
+
+def config(problem: dict[str, Any], pieces: int, cost: str = "nominal", **more: Any) -> dict[str, Any]:
+    disturbance = more.pop("disturbance", None)
+    dictionaries: dict[str, Any] = {"control": {"name": "piecewise_constant", "pieces": pieces}}
+    if disturbance is not None:
+        dictionaries["disturbance"] = {"name": "piecewise_constant", "pieces": disturbance}
+    policy = {"name": "affine", "cost": cost, **more.pop("policy", {})}
+    return {"problem": problem, "dictionaries": dictionaries, "policy": policy, "observers": [], **more}
+
+
+def run(problem: dict[str, Any], pieces: int, out: Path, cost: str = "nominal", **more: Any) -> sr.Outcome:
+    return sr.run(config(problem, pieces, cost, **more), out=out, quiet=True, figures=False)
+
+
+def springs(w: float, start: float) -> dict[str, Any]:
+    return {**SPRING, "disturbance": {"box": [w, w]}, "path": [{"box": [0.7, None], "from": start}]}
+
+
+def proven(outcome: sr.Outcome) -> None:
+    """The run is certified, and its check holds."""
+    assert outcome.status == "certified", outcome.result.message
+    found = check(outcome.directory)
+    assert found.status == "verified", [claim for claim in found.claims if claim.verdict != "holds"]
+
+
+@pytest.mark.parametrize(
+    ("problem", "pieces", "cost", "value"),
+    [
+        ({**DOUBLE, "disturbance": {"box": 0.1}}, 20, "nominal", 1.195),
+        ({**DOUBLE, "disturbance": {"box": 0.3}}, 20, "nominal", 1.31346154),
+        ({**DOUBLE, "disturbance": {"box": 0.2}}, 20, "peak", 2.33846154),
+        (springs(0.2, 0.3), 20, "peak", 2.17147527),
+        ({**MASSES, "disturbance": {"box": [0.08, 0.08]}}, 12, "peak", 1.86338920),
+        pytest.param(springs(0.3, 0.5), 40, "nominal", 0.54529401, marks=pytest.mark.slow),
+        pytest.param(springs(0.2, 0.3), 40, "peak", 2.08708204, marks=pytest.mark.slow),
+        pytest.param(springs(0.25, 0.5), 40, "peak", 2.61864192, marks=pytest.mark.slow),
+        pytest.param(
+            {**MASSES, "disturbance": {"box": [0.15, 0.15]}}, 16, "nominal", 1.04791863, marks=pytest.mark.slow
+        ),
+    ],
+)
+def test_known_values_are_met_and_certified(
+    problem: dict[str, Any], pieces: int, cost: str, value: float, tmp_path: Path
+) -> None:
+    outcome = run(problem, pieces, tmp_path / "run", cost)
+    proven(outcome)
+    assert outcome.result.cost == pytest.approx(value, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("problem", "pieces", "cost", "value", "within"),
+    [
+        (springs(0.3, 0.5), 20, "nominal", 0.74611518, 2e-6),
+        (springs(0.25, 0.5), 20, "peak", 2.68082505, 6e-6),
+        (springs(0.25, 0.3), 20, "nominal", 0.79648774, 2e-5),
+        pytest.param(springs(0.35, 0.5), 40, "nominal", 0.87352974, 4e-6, marks=pytest.mark.slow),
+        pytest.param(
+            {**MASSES, "disturbance": {"box": [0.1, 0.1]}}, 12, "nominal", 1.16782006, 2e-6, marks=pytest.mark.slow
+        ),
+    ],
+)
+def test_references_that_saw_times_less_densely_are_lower_bounds(
+    problem: dict[str, Any], pieces: int, cost: str, value: float, within: float, tmp_path: Path
+) -> None:
+    """These values come from programs that impose the path at finitely many times; a proof over all times costs more.
+    A program with 40 times a piece, for the third of them, gives 0.7964988 where all times give 0.7964993."""
+    outcome = run(problem, pieces, tmp_path / "run", cost)
+    proven(outcome)
+    assert value <= outcome.result.lower_bound * (1 + 1e-9)
+    assert outcome.result.cost == pytest.approx(value, rel=within)
+
+
+@pytest.mark.parametrize("cost", ["nominal", "peak"])
+def test_more_disturbance_than_any_policy_withstands_is_infeasible_with_its_reason(cost: str, tmp_path: Path) -> None:
+    outcome = run(springs(0.3, 0.3), 20, tmp_path / "run", cost)
+    assert outcome.status == "infeasible"
+    assert "for every disturbance" in outcome.result.message
+    assert check(outcome.directory).status == "verified"
+
+
+def pushed(A: np.ndarray, h: float, pieces: int, t: float, row: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+    """What every piece that has begun by ``t`` gives to ``row x(t)``, what the initial state gives, the last piece."""
+
+    def flow(r: float) -> tuple[np.ndarray, np.ndarray]:
+        both = expm(np.block([[A, np.eye(2)], [np.zeros((2, 4))]]) * r)
+        return both[:2, :2], both[:2, 2:]
+
+    last = min(int(np.ceil(t / h - 1e-9)) - 1, pieces - 1)
+    weights = np.zeros((pieces, 2))
+    for piece in range(last, -1, -1):
+        Phi, Gamma = flow(t - last * h if piece == last else h)
+        weights[piece], row = row @ Gamma, row @ Phi
+    return weights, row, last
+
+
+def dense(problem: dict[str, Any], pieces: int, within: int, cost: str) -> float:
+    """The same problem as one linear program with ``within`` times a piece, of a spring and a box: a lower bound."""
+    A, B = np.array(problem["system"]["A"], dtype=float), np.array(problem["system"]["B"], dtype=float)
+    T, w, start = problem["horizon"], problem["disturbance"]["box"][0], problem["path"][0]["from"]
+    x0, h = np.array(problem["initial_state"], dtype=float), problem["horizon"] / pieces
+    pairs = [(k, seen, i) for k in range(pieces) for seen in range(k) for i in (0, 1)]
+    first, size = 2 * pieces, 2 * pieces + len(pairs)  # v, |v| or its peak, F, |F|, then absolute values of every row
+    place = {pair: first + n for n, pair in enumerate(pairs)}
+    count = size + len(pairs)
+    rows: list[tuple[dict[int, float], float]] = []
+    for n in range(len(pairs)):
+        rows += [({first + n: s, size + n: -1.0}, 0.0) for s in (1.0, -1.0)]
+    for k in range(pieces):
+        spread = {at - first + size: w for (piece, _, _), at in place.items() if piece == k}
+        for s in (1.0, -1.0):
+            rows += [({k: s, **spread}, 1.0), ({k: s, pieces + k: -1.0, **(spread if cost == "peak" else {})}, 0.0)]
+    times = [(t, 0, 0.7) for t in np.linspace(0, T, pieces * within + 1) if t > start] + [(start, 0, 0.7)]
+    for t, state, limit in [*times, (T, 0, 0.3), (T, 1, 0.3)]:
+        weights, free, last = pushed(A, h, pieces, t, np.eye(2)[state])
+        acting, sizes = weights @ B[:, 0], {}
+        for seen, i in np.ndindex(last + 1, 2):
+            inner = {place[k, seen, i]: acting[k] for k in range(seen + 1, last + 1)}
+            for s in (1.0, -1.0):
+                rows.append(({**{c: s * v for c, v in inner.items()}, count: -1.0}, -s * weights[seen, i]))
+            sizes[count] = w
+            count += 1
+        for s in (1.0, -1.0):
+            rows.append(({**{k: s * acting[k] for k in range(last + 1)}, **sizes}, limit - s * float(free @ x0)))
+    entries = [(r, c, v) for r, (row, _) in enumerate(rows) for c, v in row.items()]
+    r, c, v = (np.array(part) for part in zip(*entries, strict=True))
+    objective = np.zeros(count)
+    objective[pieces:first] = h
+    bounds = [(-1, 1)] * pieces + [(0, None)] * pieces + [(None, None)] * len(pairs) + [(0, None)] * (count - size)
+    table = coo_array((v, (r.astype(int), c.astype(int))), shape=(len(rows), count)).tocsr()
+    found = linprog(objective, A_ub=table, b_ub=[b for _, b in rows], bounds=bounds, method="highs-ds")
+    return float(found.fun)
+
+
+@pytest.mark.parametrize("cost", ["nominal", "peak"])
+def test_an_independent_linear_program_on_a_grid_comes_near_from_below(cost: str, tmp_path: Path) -> None:
+    problem = springs(0.25, 0.5)
+    outcome = run(problem, 10, tmp_path / "run", cost)
+    proven(outcome)
+    coarse, fine = (dense(problem, 10, within, cost) for within in (2, 8))
+    assert coarse <= fine <= outcome.result.cost * (1 + 1e-9)
+    assert outcome.result.cost == pytest.approx(fine, rel=2e-3)
+
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    "coarser pieces of the disturbance": {"disturbance": 5},
+    "finer pieces of the disturbance": {"disturbance": 20},
+    "pieces of the disturbance across those of the control": {"disturbance": 7},
+    "memory": {"policy": {"memory": 1.0}},
+}
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+@pytest.mark.parametrize("cost", ["nominal", "peak"])
+def test_grids_and_memory_keep_every_guarantee(name: str, cost: str, tmp_path: Path) -> None:
+    proven(run(springs(0.2, 0.5), 10, tmp_path / "run", cost, **json.loads(json.dumps(VARIANTS[name]))))
+
+
+SETS: dict[str, dict[str, Any]] = {
+    "an uneven box": {"box": {"lower": [-0.2, -0.1], "upper": [0.1, 0.2]}},
+    "an ellipsoid": {"ellipsoid": {"centre": [0, 0], "shape": [[0.02, 0.01], [0.01, 0.03]]}},
+    "a ball of the 1-norm": {"norm": {"p": 1, "radius": 0.2}},
+    "a triangle": {"polytope": {"H": [[1, 0], [0, 1], [-1, -1]], "h": [0.15, 0.15, 0.1]}},
+}
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_sets_of_disturbances_keep_every_guarantee(name: str, tmp_path: Path) -> None:
+    proven(run({**SPRING, "disturbance": SETS[name]}, 8, tmp_path / "run", "peak"))
+
+
+def test_without_a_disturbance_feedback_changes_nothing(tmp_path: Path) -> None:
+    still = {**SPRING, "disturbance": None}
+    answering = run(still, 20, tmp_path / "answering")
+    proven(answering)
+    plain = {**config(still, 20), "policy": {"name": "open_loop"}}
+    fixed = sr.run(plain, out=tmp_path / "fixed", quiet=True, figures=False)
+    assert answering.result.cost == pytest.approx(fixed.result.cost, rel=1e-6)
+
+
+def test_a_drift_is_answered_too(tmp_path: Path) -> None:
+    system = {**SPRING["system"], "c": [0, 0.3]}
+    proven(run({**springs(0.1, 0.5), "system": system}, 10, tmp_path / "run", "peak"))
+
+
+def test_other_units_change_nothing(tmp_path: Path) -> None:
+    """The spring in seconds and metres, and in units of 1/4 s and 1/1024 m: factors of two."""
+    first = run(springs(0.25, 0.5), 10, tmp_path / "first", "peak")
+    scaled: dict[str, Any] = {
+        **SPRING,
+        "system": {"A": [[0, 1], [-2 / 16, -0.5 / 4]], "B": [[0], [64]], "E": [[256, 0], [0, 64]]},
+        "horizon": 20.0,
+        "initial_state": [-1024, 256],
+        "control": {"box": 1.0},
+        "path": [{"box": [0.7 * 1024, None], "from": 2.0}],
+        "terminal": [{"box": [0.3 * 1024, 0.3 * 256]}],
+    }
+    second = run(scaled, 10, tmp_path / "second", "peak")
+    proven(second)
+    assert second.result.cost == 4 * first.result.cost
+    assert second.result.lower_bound == pytest.approx(4 * first.result.lower_bound, rel=1e-12)
+
+
+def test_the_loop_that_measures_meets_the_worst_case_that_was_predicted(tmp_path: Path) -> None:
+    outcome = run({**MASSES, "disturbance": {"box": [0.08, 0.08]}}, 12, tmp_path / "run", "peak")
+    found = sr.simulate(outcome.directory, law="adversary")
+    for one in found.constraints:
+        assert one.largest == pytest.approx(one.worst, abs=1e-11)
+    sampled = sr.simulate(outcome.directory, law="vertices", trajectories=500)
+    assert sampled.any_violated is not None and sampled.any_violated.violated == 0
+
+
+def test_the_stored_gains_answer_only_what_was_seen(tmp_path: Path) -> None:
+    outcome = run(springs(0.2, 0.5), 10, tmp_path / "run", policy={"memory": 1.0})
+    gains = np.load(outcome.directory / "solution.npz")["gains"]
+    assert gains.shape == (10, 10, 1, 2)
+    k, j = np.indices((10, 10))
+    assert not gains[(j > k) | (j == 0) | ((k - j) * 0.5 > 1.0 + 1e-9)].any()
+    assert gains.any()
+
+
+def test_a_peak_is_zero_where_the_control_is_off_whatever_happens(tmp_path: Path) -> None:
+    outcome = run(springs(0.2, 0.3), 20, tmp_path / "run", "peak")
+    assert outcome.control is not None
+    gains = np.load(outcome.directory / "solution.npz")["gains"]
+    moves = np.abs(gains).max(axis=(1, 2, 3)) > 1e-6
+    acts = np.abs(outcome.control[0]) > 1e-6
+    off = int((~moves & ~acts).sum())
+    assert 3 <= off < 20
+
+
+FORGERIES: dict[str, Any] = {
+    "a gain": lambda data: data["gains"][5][3][0].__setitem__(1, data["gains"][5][3][0][1] + 0.5),
+    "a gain on the future": lambda data: data["gains"][3][7][0].__setitem__(0, 0.1),
+    "a gain on what is not measured": lambda data: data["gains"][3][0][0].__setitem__(0, 0.1),
+    "a nominal control": lambda data: data["decision"][0].__setitem__(2, data["decision"][0][2] + 0.01),
+    "a disturbance outside of its set": lambda data: data["multipliers"]["constraints"][0]["disturbance"][
+        0
+    ].__setitem__(0, 0.21),
+    "a smaller gap": lambda data: data.__setitem__("lower_bound", data["cost"]),
+    "a multiplier": lambda data: data["multipliers"]["constraints"][0].__setitem__("multiplier", 2.0),
+    "a cell that is missing": lambda data: (data["proof"]["path"]["lower"].pop(), data["proof"]["path"]["upper"].pop()),
+    "gains of another shape": lambda data: data["gains"].pop(),
+}
+
+
+@pytest.mark.parametrize("name", FORGERIES)
+def test_a_forged_policy_is_found(name: str, tmp_path: Path, policies: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(policies, copy)
+    file = copy / "certificate.json"
+    data = json.loads(file.read_text())
+    FORGERIES[name](data)
+    file.write_text(json.dumps(data))
+    assert check(copy).status == "refuted"
+
+
+@pytest.fixture(scope="module")
+def policies(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    outcome = run(springs(0.2, 0.5), 10, tmp_path_factory.mktemp("policy") / "run")
+    proven(outcome)
+    return outcome.directory
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"disturbance_class": "measurable"}, "piecewise_constant"),
+        ({"terminal": [{"ellipsoid": {"centre": [0, 0], "shape": [[0.1, 0], [0, 0.1]]}}]}, "flat sides"),
+        ({"terminal": [{"equals": [0, 0]}]}, "interior"),
+        ({"control_step": {"box": 0.3}}, "control_step"),
+    ],
+)
+def test_what_is_not_built_is_refused_in_one_sentence(changed: dict[str, Any], said: str, tmp_path: Path) -> None:
+    with pytest.raises(sr.InputError, match=said):
+        run({**SPRING, **changed}, 10, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("method", ["sparserob", "nominal", "scenario"])
+def test_other_methods_are_refused_before_anything_is_written(method: str, tmp_path: Path) -> None:
+    with pytest.raises(sr.InputError, match="exchange"):
+        run(SPRING, 10, tmp_path / "run", method={"name": method})
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_record_is_solved_without_files() -> None:
+    problem = sr.OptimalControlProblem(
+        system=sr.LinearSystem([[0, 1], [0, 0]], [[0], [1]], [[0], [1]]),
+        horizon=5.0,
+        initial_state=[4, 0],
+        control=sr.Box([-1.0], [1.0]),
+        disturbance=sr.Box([-0.1], [0.1]),
+        path=[sr.Box([-4.2, -1.6], [4.2, 1.6])],
+        terminal=[sr.Box([-0.5, -0.4], [0.5, 0.4])],
+    )
+    pieces = {"name": "piecewise_constant", "pieces": 20}
+    result = sr.solve(problem, control=pieces, policy=sr.AffinePolicy())
+    assert result.status == "certified"
+    assert result.cost == pytest.approx(1.195, rel=1e-6)
