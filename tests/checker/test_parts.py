@@ -15,8 +15,8 @@ import sparserob_core as sr
 from sparserob_core.checker.arithmetic.bernstein import highest
 from sparserob_core.checker.arithmetic.jets import Monomials, expanded
 from sparserob_core.checker.arithmetic.series import Series
+from sparserob_core.checker.arithmetic.subdivision import fill
 from sparserob_core.checker.claims.duality import Duality
-from sparserob_core.checker.claims.subdivision import fill
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import Flow, stacked

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls, below
+from sparserob_core.checker.arithmetic.subdivision import fill
 from sparserob_core.checker.claims.case import Case, number, numbers
 from sparserob_core.checker.claims.cells import Interval, Work, prove
-from sparserob_core.checker.claims.subdivision import fill
 from sparserob_core.checker.claims.units import RowUnits
 from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import TOLERANCE, Broken, Unchecked

@@ -129,7 +129,7 @@ class ClosedLoop:
         On a cell every functional is within ``(b - a)^2 / 8`` times its largest second derivative of its chord, and a
         support function of a chord lies below the chord of the support functions.
         """
-        grid, A = self.functionals.response.grid, self.steps.A[0]
+        grid, A = self.functionals.response.grid, self.steps.A[0, 0]
         pieces = grid.locate((lower + upper) / 2)
         ends = [self.states(x, times, pieces) for times in (lower, upper)]
         along = [H @ end for end in ends]
