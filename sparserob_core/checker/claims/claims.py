@@ -12,7 +12,7 @@ from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.claims import activity
 from sparserob_core.checker.claims.case import Case, listed, number, numbers
 from sparserob_core.checker.claims.constraints import bounded
-from sparserob_core.checker.claims.duality import Row
+from sparserob_core.checker.claims.duality import Row, before, steps
 from sparserob_core.checker.claims.equalities import equalities
 from sparserob_core.checker.claims.feedback import feedback_of
 from sparserob_core.checker.claims.replay import reached
@@ -118,18 +118,18 @@ def _steps(case: Case) -> str:
     """Every change of the control from piece to piece in its set."""
     bound, worst = case.problem.control_step, 0.0
     assert bound is not None
-    steps = case.duality.steps
-    for k in steps:
+    found = steps(case.problem, case.control)
+    for k in found:
         case.clock.check()
-        before = case.duality.before if k == 0 else case.pieces[k - 1].entries()
-        over, where = known(bound).excess([u - v for u, v in zip(case.pieces[k].entries(), before, strict=True)])
+        last = balls(before(case.problem)) if k == 0 else case.pieces[k - 1].entries()
+        over, where = known(bound).excess([u - v for u, v in zip(case.pieces[k].entries(), last, strict=True)])
         if over > TOLERANCE:
             where = "the change of the control" if where == "it" else f"the change of {where}"
             raise Broken(
                 f"{where} leaves its set by {over:.3g} of its own unit, at t = {float(case.control.breakpoints[k]):.6g}"
             )
         worst = max(worst, over)
-    return f"{len(steps)} steps in their set" + (f", to {worst:.1e} of its own units" if worst > 0 else "")
+    return f"{len(found)} steps in their set" + (f", to {worst:.1e} of its own units" if worst > 0 else "")
 
 
 def _cost(case: Case) -> str:

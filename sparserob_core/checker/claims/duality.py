@@ -58,21 +58,11 @@ class Duality:
         slope[piece] = [_exact(c) for c in direction]
         return Row(-known(self.problem.control).support(slope[piece]), slope)
 
-    @property
-    def before(self) -> list[arb]:
-        """The control before time 0."""
-        return [_exact(float(u)) for u in np.asarray(self.problem.initial_control, dtype=float)]
-
-    @property
-    def steps(self) -> range:
-        """The pieces whose beginning is a step from what was before."""
-        return range(0 if self.problem.initial_control is not None else 1, self.control.pieces)
-
     def step_row(self, direction: Array, time: float) -> Row:
         """``c'(u_k - u_{k-1}) <= h(c)`` for the step at a breakpoint, ``u_{-1}`` the control before time 0."""
         if self.problem.control_step is None:
             raise Broken("the problem has no constraint 'control_step'")
-        found = [k for k in self.steps if float(self.control.breakpoints[k]) == time]
+        found = [k for k in steps(self.problem, self.control) if float(self.control.breakpoints[k]) == time]
         if not found:
             raise Broken(f"control_step: there is no step at t = {time!r}")
         (k,) = found
@@ -82,7 +72,9 @@ class Duality:
         if k > 0:
             slope[k - 1] = [-_exact(c) for c in direction]
         else:
-            constant -= sum((_exact(c) * u for c, u in zip(direction, self.before, strict=True)), _exact(0.0))
+            constant -= sum(
+                (_exact(c) * u for c, u in zip(direction, map(_exact, before(self.problem)), strict=True)), _exact(0.0)
+            )
         return Row(constant, slope)
 
     def row(self, direction: Array, time: float, parameter: Sequence[float], limit: arb, disturbed: bool = True) -> Row:
@@ -247,6 +239,11 @@ class Duality:
         V = stacked([[_exact(v) for v in row] for row in self.control.values])
         table: list[list[arb]] = ((V * V.transpose()).inv() * V).tolist()
         return table
+
+
+def steps(problem: OptimalControlProblem, control: Dictionary) -> range:
+    """The pieces of a control whose beginning is a step from what was before."""
+    return range(0 if problem.initial_control is not None else 1, control.pieces)
 
 
 def before(problem: OptimalControlProblem) -> list[float]:

@@ -99,8 +99,14 @@ class TimedExplanation(Explanation):
 
     def apart(self, other: Explanation, share: float, amount: float) -> str:
         known = isinstance(other, TimedExplanation) and self.quantity and other.quantity
-        if not isinstance(other, TimedExplanation) or not known or self.gain is not None or other.gain is not None:
+        if not isinstance(other, TimedExplanation) or not known:
             return super().apart(other, share, amount)
+        if self.gain is not None or other.gain is not None:
+            left, right = (np.zeros(1) if one.gain is None else one.gain for one in (self, other))
+            off = np.abs(left + share * right) > SAME * max(np.abs(left).max(), np.abs(right).max())
+            turned = np.abs(self.direction + share * other.direction) > SAME * np.abs(self.direction).max(initial=0.0)
+            if off.any() or turned.any():
+                return super().apart(other, share, amount)
         rest = self.direction + share * other.direction
         rest = np.where(np.abs(rest) <= SAME * np.abs(self.direction).max(), 0.0, rest)
         allowed = self.sign * self.limit + share * other.sign * other.limit

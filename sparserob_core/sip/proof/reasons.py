@@ -39,12 +39,13 @@ class Reason:
 def reasons(program: SemiInfiniteProgram) -> list[Reason]:
     """What is impossible at the corners and centres of every family's cells, at most one reason for every row of a
     family."""
-    return [
+    found = [
         reason
         for family in program.families
         if family.uncertain is None
         for reason in _of_family(program.finite, family.reduced or family)
     ]
+    return list({reason.text: reason for reason in reversed(found)}.values())[::-1]  # none is told twice
 
 
 def _of_family(base: FiniteProgram, family: ConstraintFamily) -> Iterator[Reason]:
