@@ -111,6 +111,19 @@ def test_the_shortest_horizon_at_an_uncertain_rate() -> None:
     assert_between(margin({**RATE, "system": system}, tolerance=1e-4), 2.0 * math.log(4.0 / 2.5), 2e-3)
 
 
+@pytest.mark.parametrize("change", [1.8, 1.0])
+def test_beyond_a_change_of_the_system_horizons_are_looked_at_one_by_one(change: float) -> None:
+    """x' = u until the change, x' = u / 2 afterwards: 1.5 to go, from the change on at half the speed."""
+    pieces = [{"until": change, **RATE["system"]}, {"until": 4.0, "A": [[0]], "B": [[0.5]]}]
+    found = margin({**RATE, "system": {"pieces": pieces}}, tolerance=1e-3)
+    if change > 1.5:
+        assert_between(found, 1.5, 2e-2)
+        return
+    assert found.status == "undecided" and "the system changes at 1" in found.message
+    assert found.lower == 1.0
+    assert 2.0 - 1e-9 <= found.upper <= 2.01
+
+
 @pytest.mark.slow
 def test_sets_that_move_stay_where_they_are_while_the_horizon_varies() -> None:
     """x' = u, |x - r| <= 0.5 from time 1 on, r from 0 at time 0 to 2 at time 4: 2 - t <= r + 0.5 from 1 on; and at the

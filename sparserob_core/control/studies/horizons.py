@@ -19,7 +19,7 @@ from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.polynomial import polynomial_bound
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import SHORTEST, OptimalControlProblem, PathConstraint
-from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.response.disturbance import DisturbanceModel, disturbance_model
 from sparserob_core.control.response.disturbance_support import DisturbanceSupport, summed
@@ -77,7 +77,8 @@ class Multiplier:
 
 def at_horizon(problem: OptimalControlProblem, horizon: float) -> OptimalControlProblem:
     """The problem with another, shorter ``horizon``: windows that lasted until the end do so still, those that would
-    begin later are gone. Raises `InputError` for a window that ends before the horizon of the problem."""
+    begin later are gone, as are the systems that would take their turn later. Raises `InputError` for a window that
+    ends before the horizon of the problem."""
     windows = []
     for i, entry in enumerate(problem.path):
         assert not isinstance(entry, ConvexSet)
@@ -91,7 +92,20 @@ def at_horizon(problem: OptimalControlProblem, horizon: float) -> OptimalControl
         lasts = horizon - entry.start > SHORTEST * horizon
         if lasts or (entry.start <= horizon and isinstance(entry, PathConstraint)):
             windows.append(replace(entry, stop=None))
-    return replace(problem, horizon=horizon, path=windows)
+    return replace(problem, horizon=horizon, path=windows, system=_until(problem.system, horizon))
+
+
+def _until(system: System, horizon: float) -> System:
+    if isinstance(system, LinearSystem):
+        return system
+    begins = (0.0, *system.switches)
+    kept = [
+        (min(until, horizon), one)
+        for begin, (until, one) in zip(begins, system.pieces, strict=True)
+        if horizon - begin > SHORTEST * horizon
+    ]
+    kept[-1] = (horizon, kept[-1][1])
+    return kept[0][1] if len(kept) == 1 else SwitchedSystem(kept, system.delay)
 
 
 def stretched(dictionary: Dictionary, horizon: float) -> Dictionary:
@@ -119,11 +133,6 @@ class Horizons:
                 "of: horizon: a delay is no share of the horizon, so that nothing can be proven of an interval of"
                 " horizons; expected a problem without system.delay"
             )
-        if len(self.problem.system.modes) > 1:
-            raise InputError(
-                "of: horizon: the times at which a system changes are no shares of the horizon, so that nothing can be"
-                " proven of an interval of horizons; expected a problem without system.pieces"
-            )
         if not self.control.is_complete:
             raise InputError(
                 "of: horizon: the control's dictionary has fewer functions than pieces; expected one that takes any"
@@ -132,13 +141,20 @@ class Horizons:
         at_horizon(self.problem, self.problem.horizon)
         object.__setattr__(self, "control", self.control.merged())
 
+    @property
+    def changes(self) -> float:
+        """The time at which the system changes first, ``inf`` where it does not: nothing is proven of intervals of
+        horizons beyond it, since the time of a change is no share of the horizon."""
+        system = self.problem.system
+        return system.switches[0] if isinstance(system, SwitchedSystem) and system.switches else np.inf
+
     def amount(self, multipliers: Sequence[Multiplier], low: float, high: float) -> float:
         """A proven lower bound of the weighted sum of violations, over all controls and all horizons in
         ``[low, high]``: where it is positive, none of them is feasible (Farkas). Rows whose window begins after ``low``
         count for nothing; ``-inf`` where nothing can be enclosed."""
         rows = [one for one in multipliers if np.isfinite(one.share_from(low))]
         size = sum(abs(one.weight) for one in rows)
-        if not size > 0.0:
+        if not size > 0.0 or high > self.changes:
             return -np.inf
         lifted: dict[bytes, LiftedSystem] = {}
         total = None
@@ -215,11 +231,17 @@ class Horizons:
 
     @cached_property
     def _units(self) -> Units:
-        return rough_units(self.problem)
+        return rough_units(self._unchanged)
 
     @cached_property
     def _own(self) -> OptimalControlProblem:
-        return self._units.of_problem(self.problem)
+        return self._units.of_problem(self._unchanged)
+
+    @property
+    def _unchanged(self) -> OptimalControlProblem:
+        """The problem as it is up to the first change of the system."""
+        system = self.problem.system
+        return replace(self.problem, system=system.modes[0]) if isinstance(system, SwitchedSystem) else self.problem
 
     @cached_property
     def _start(self) -> Array:

@@ -110,6 +110,7 @@ class HorizonSearch:
         """Cover horizons from 0 on by cells on each of which nothing is feasible, until one is feasible; where that did
         not succeed, why."""
         starts = [entry.start for entry in self.problem.path if not isinstance(entry, ConvexSet)]
+        starts.append(self._cells.changes)
         # windows that begin after 0 part cells: their rows are there beyond only
         points = sorted({0.0, *scan, *(start for start in starts if 0.0 < start < self.problem.horizon)})
         cells, best = list(pairwise(points))[::-1], np.inf
@@ -130,7 +131,7 @@ class HorizonSearch:
                 break
             stuck = self._stuck(low, high, short)
             if stuck:
-                self._descend([point for point in points if low < point < best])
+                self._descend(low, [point for point in (*points, best) if low < point <= best and np.isfinite(point)])
                 return stuck
             cells += [((low + high) / 2, high), (low, (low + high) / 2)]
         return ""
@@ -140,6 +141,8 @@ class HorizonSearch:
         point = self.points[high]
         if point.status not in (*FEASIBLE, "infeasible"):
             return f"the run at {high:.9g} is {point.status}: {point.message}"
+        if point.status == "infeasible" and high > self._cells.changes:
+            return f"the system changes at {self._cells.changes:g}, and beyond horizons are looked at one by one only"
         if short:
             left_out = (
                 "" if self.problem.control_step is None else "; control_step is left out of what excludes horizons"
@@ -147,13 +150,13 @@ class HorizonSearch:
             return f"no multipliers exclude {low:.9g} to {high:.9g}{left_out}"
         return f"{MOST} runs did not suffice" if len(self.points) > MOST else ""
 
-    def _descend(self, points: list[float]) -> None:
-        """The first feasible one of ``points``, and the shortest feasible horizon next to it: what is left to do where
-        horizons could not be covered any further."""
-        before = points[0] if points else 0.0
+    def _descend(self, low: float, points: list[float]) -> None:
+        """The first feasible one of ``points`` beyond ``low``, and the shortest feasible horizon next to it: what is
+        left to do where horizons could not be covered any further."""
+        before = low
         for point in points:
             if self._run(point).status in FEASIBLE:
-                while point - before > self.width and point > before:
+                while point - before > self.width:
                     middle = (before + point) / 2
                     before, point = (before, middle) if self._run(middle).status in FEASIBLE else (middle, point)
                 return

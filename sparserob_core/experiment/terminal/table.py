@@ -112,4 +112,6 @@ def _worst(worst: Mapping[str, Any]) -> str:
     at = "" if worst["time"] is None else f" at t = {worst['time']:.6g}"
     if worst["parameter"] is not None and len(worst["parameter"]):
         at += ", p = (" + ", ".join(f"{value:.6g}" for value in worst["parameter"]) + ")"
+    if worst.get("initial_state") is not None:
+        at += ", from (" + ", ".join(f"{value:.6g}" for value in worst["initial_state"]) + ")"
     return f"{worst['violation']:.2e} in {worst['constraint']}{at}"
