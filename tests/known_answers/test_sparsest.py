@@ -224,3 +224,12 @@ def test_who_reaches_the_fewest_pieces_is_as_the_page_says(tmp_path: Path) -> No
         name = str(row["method"])
         counts[name] = counts.get(name, 0) + (upper - least < 1e-9)
     assert sorted(counts.values()) == [5, 6, 6, 10]
+
+
+def test_a_time_of_action_is_not_compared_with_a_cost(tmp_path: Path) -> None:
+    problem = integrator([1.0], {"box": 1.0})
+    for name in ("exchange", "sparsest"):
+        solved(problem, 20, tmp_path / name, method={"name": name})
+    with pytest.raises(sr.InputError, match="runs whose costs mean the same"):
+        sr.compare([tmp_path / "sparsest", tmp_path / "exchange"])
+    assert sr.compare([tmp_path / "sparsest"]).exact == pytest.approx(0.9)

@@ -171,6 +171,12 @@ def _text(value: float, form: str) -> str:
 
 
 def _require_same_problem(first: Curve, other: Curve) -> None:
+    if first.counts is not other.counts:
+        counting, plain = (first, other) if first.counts else (other, first)
+        raise InputError(
+            f"{counting.directory}: its cost is the time that the control acts, that of {plain.directory} is J; "
+            "expected runs whose costs mean the same"
+        )
     for section in ("problem", "dictionaries"):
         found = difference(first.config.get(section), other.config.get(section), section)
         if found is not None:

@@ -52,6 +52,8 @@ class Curve:
     all_seconds: float
     dimension: int = 0
     """Coordinates of what is searched, or variables of a decision; 0: it is not known."""
+    counts: bool = False
+    """Whether its cost is the time that the control acts."""
 
     def reached_after(self, target: float) -> float:
         """The seconds after which the bound was at least ``target``; infinite when it never was."""
@@ -96,6 +98,7 @@ def read_curve(directory: Path) -> Curve:
         all_evaluations=spent,
         all_seconds=seconds,
         dimension=_dimension(directory, searched) if status not in WITHOUT_CURVE else 0,
+        counts="J" in summary,
     )
 
 

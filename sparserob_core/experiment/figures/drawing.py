@@ -16,7 +16,7 @@ from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.studies.answer import tube
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.assemble import ControlExperiment, Experiment
+from sparserob_core.experiment.assemble import ControlExperiment, Experiment, counting
 from sparserob_core.experiment.directory.sparsity import sparsity
 from sparserob_core.experiment.figures.figure_data import FigureData, Wall
 from sparserob_core.experiment.terminal.printing import printable
@@ -74,7 +74,7 @@ def _data(
     history: Sequence[RoundFinished],
     cost: float | None,
 ) -> FigureData:
-    problem, model = experiment.problem, experiment.transcription
+    problem, model, program = experiment.problem, experiment.transcription, experiment.program
     control, dictionary = model.pieces(theta), model.control
     axes = np.eye(problem.system.controls)
     shown = _shown(model.response.grid.breakpoints.size)
@@ -82,6 +82,8 @@ def _data(
     decision, times = np.ravel(theta), model.response.grid.breakpoints[shown]
     around = tube(model, decision, times)
     answered = {} if model.feedback is None else _answered(model, decision, times)
+    longest = 0.0 if program.activity is None else float(program.activity.sum())
+    counts = counting(experiment.loaded)[0] and longest > 0.0
     return FigureData(
         title=printable(experiment.title),
         breakpoints=dictionary.breakpoints,
@@ -95,8 +97,9 @@ def _data(
         walls=list(_walls(problem)),
         active_times=active_times,
         history=history,
-        cost_scale=experiment.program.cost_scale,
-        cost_of=problem.cost.words(),
+        cost_scale=longest if counts else program.cost_scale,
+        counts=counts,
+        cost_of="" if counts else problem.cost.words(),
         active_fraction=sparsity(control, dictionary.breakpoints).active_fraction,
         cost=cost,
         names=problem.names,

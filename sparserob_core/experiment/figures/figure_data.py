@@ -56,7 +56,8 @@ class FigureData:
     every disturbance and parameter; ``walls`` the path and terminal constraints on single components; ``active_times``
     the times of the imposed constraints that carry a multiplier; ``history`` the rounds of the method. ``tolerance`` is
     the relative gap that was asked for, ``cost_scale`` the largest possible cost, ``cost_of`` what is
-    added up to it, where that is not the L1 norm alone, ``names`` what everything is called.
+    added up to it, where that is not the L1 norm alone, ``counts`` whether cost means the time that the control acts,
+    ``names`` what everything is called.
 
     Under feedback the control is the nominal one, ``control_least``, ``control_most (m, K)`` are how far the
     disturbance moves it, ``gains (K, K, m, d)`` answer what is measured, and ``alone_lower``, ``alone_upper (d, T)``
@@ -85,6 +86,7 @@ class FigureData:
     control_least: Array | None = None
     control_most: Array | None = None
     gains: Array | None = None
+    counts: bool = False
     names: Names = UNNAMED
 
     def __post_init__(self) -> None:

@@ -137,6 +137,7 @@ def draw_convergence(data: FigureData) -> Figure:
     upper = np.array([entry.upper_bound for entry in data.history])
     best = float(upper.min())
     _draw_bounds(bounds, rounds, lower, upper, best)
+    bounds.set_ylabel("time of action" if data.counts else "cost $J$")
     _draw_gaps(gaps, rounds, np.array([relative_gap(bound, best, data.cost_scale) for bound in lower]), data)
     bounds.set_title(data.title)
     gaps.set_xlim(0.6, len(data.history) + 0.4)
@@ -154,7 +155,6 @@ def _draw_bounds(ax: Axes, rounds: Array, lower: Array, upper: Array, best: floa
         ax.axhline(best, color=look.VERMILLION, linewidth=0.9, zorder=2)
     _series(ax, rounds, upper, look.VERMILLION, "v", "upper bound")
     _series(ax, rounds, lower, look.BLUE, "^", "lower bound")
-    ax.set_ylabel("cost $J$")
 
 
 def _draw_gaps(ax: Axes, rounds: Array, gap: Array, data: FigureData) -> None:
@@ -175,7 +175,8 @@ def _title(ax: Axes, title: str, summary: str) -> None:
 
 def _summary(data: FigureData) -> str:
     said = f" ({data.cost_of})" if data.cost_of else ""
-    parts = [] if data.cost is None else [f"$J$ = {data.cost:.6g}{said}"]
+    known = [] if data.cost is None else [f"{data.cost:.6g}"]
+    parts = [f"acts for {text}" if data.counts else f"$J$ = {text}{said}" for text in known]
     if data.active_fraction is not None:
         parts.append(f"active {100 * data.active_fraction:.1f} % of the time")
     return "  ·  ".join(parts)
