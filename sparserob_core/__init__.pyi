@@ -68,6 +68,7 @@ from sparserob_core.errors import InputError as InputError
 from sparserob_core.errors import PluginError as PluginError
 from sparserob_core.errors import SolverError as SolverError
 from sparserob_core.errors import SparseRobError as SparseRobError
+from sparserob_core.errors import TimeLimitError as TimeLimitError
 from sparserob_core.errors import UnknownPluginError as UnknownPluginError
 
 # To write a component, and to register it.

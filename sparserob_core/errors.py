@@ -69,6 +69,12 @@ class ConfigError(InputError):
     """A config is at fault; each line of the message is ``file:line:column: key: what is wrong``."""
 
 
+class TimeLimitError(SparseRobError):
+    """The limit ``limits.seconds`` was reached before anything was known of the problem."""
+
+    exit_status = 4
+
+
 class NotEnclosable(InputError):
     """A function of the parameters has no rigorous enclosure on a cell: a singularity, or an operation that is not
     supported."""

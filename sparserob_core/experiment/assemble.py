@@ -14,11 +14,11 @@ from sparserob_core.control.policies.policy import Policy
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.transcription.record import Transcription
-from sparserob_core.errors import InputError
+from sparserob_core.errors import InputError, TimeLimitError
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.plugins.guards import guarded
 from sparserob_core.experiment.solve import indicators
-from sparserob_core.sip.method import Deadline, Tools
+from sparserob_core.sip.method import Deadline, OutOfTime, Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.regulariser import Regulariser
 from sparserob_core.sip.solver import Solver
@@ -89,9 +89,22 @@ class PlainExperiment(Experiment):
         return self.stated
 
 
-def assemble(loaded: Loaded) -> Experiment:
-    """Build what a checked config describes, and its program; raises `ConfigError` with the place of the key at
-    fault."""
+def assemble(loaded: Loaded, deadline: Deadline | None = None) -> Experiment:
+    """Build what a checked config describes, and its program; raises `ConfigError` with the place of the key at fault,
+    and `TimeLimitError` when that is not done by the ``deadline``."""
+    if deadline is None:
+        return _assembled(loaded)
+    try:
+        with deadline.enforced():
+            return _assembled(loaded)
+    except OutOfTime as late:
+        raise TimeLimitError(
+            f"{late} while the problem was transcribed, before anything is known of it; fewer pieces and parameters"
+            " take less, or limits.seconds gives more"
+        ) from late
+
+
+def _assembled(loaded: Loaded) -> Experiment:
     from sparserob_core.control.transcription.transcribe import prepare
 
     problem = problem_of(loaded)

@@ -61,7 +61,8 @@ def initial_states(
     whole("values", values, 0)
     limit = _limit(within)
     loaded = load_config(config, overrides)
-    experiment = assemble(loaded)
+    tools = tools_of(loaded)
+    experiment = assemble(loaded, tools.deadline)
     if not isinstance(experiment, ControlExperiment):
         raise InputError("problem: expected a control problem, which has an initial state, got a semi-infinite program")
     model = experiment.transcription
@@ -73,7 +74,7 @@ def initial_states(
     size = np.full(2, _far(own.problem)) if limit is None else limit / x
     least = THINNEST * size * np.minimum(1.0, walls(own.problem)[list(pair)])
     plane = InitialPlane(own, pair, np.zeros(2), size)
-    search = InitialStatesSearch(plane, tools_of(loaded), _tolerance(loaded), notify, least, x, limit is not None)
+    search = InitialStatesSearch(plane, tools, _tolerance(loaded), notify, least, x, limit is not None)
 
     def find() -> InitialStates:
         found = search.states(experiment.title, directions, values)

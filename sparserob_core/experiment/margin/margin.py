@@ -46,9 +46,10 @@ def margin(
     the two sides are to be, relative to the factor, or to 1 if that is larger (for a window to its end, for the horizon
     to the config's). ``curve``: the cost at so many factors on the feasible side, each by a run of its own; at so many
     horizons, feasible or not. ``out``: a new or empty directory for ``margin.json`` and ``margin.png``; with ``write``
-    and none given it is ``runs/NAME-margin/STAMP-HASH``. ``notify`` receives `StudyProgress`. An interrupt ends the
-    search with what it has proven by then, ``undecided``. Raises `InputError` when an argument or the config is at
-    fault.
+    and none given it is ``runs/NAME-margin/STAMP-HASH``. ``notify`` receives `StudyProgress`. An interrupt, and the
+    limit ``limits.seconds`` of the config, end the search with what it has proven by then, ``undecided``. Raises
+    `InputError` when an argument or the config is at fault, and `TimeLimitError` when the limit comes before there is
+    anything to solve.
     """
     if not hasattr(tolerance, "__float__") or not 1e-9 <= tolerance <= 0.1:
         raise InputError(f"tolerance: expected a number from 1e-9 to 0.1, got {tolerance!r}")
@@ -115,7 +116,8 @@ def _between(lower: float, upper: float) -> str:
 def _search(loaded: Loaded, of: str, tolerance: float, notify: Notify) -> MarginSearch | HorizonSearch:
     from sparserob_core.control.transcription.transcribe import in_own_units, like, prepare, transcribe
 
-    experiment = assemble(loaded)
+    tools = tools_of(loaded)
+    experiment = assemble(loaded, tools.deadline)
     if not isinstance(experiment, ControlExperiment):
         raise InputError(
             "config: expected a control problem, whose sets can be scaled, got a semi-infinite program of another kind"
@@ -123,7 +125,7 @@ def _search(loaded: Loaded, of: str, tolerance: float, notify: Notify) -> Margin
     problem, control, disturbance = experiment.problem, experiment.control, experiment.disturbance
     if of == HORIZON:
         both, method = (control, disturbance), _method(loaded)
-        return horizon_search(experiment.title, problem, both, method, tools_of(loaded), tolerance, notify)
+        return horizon_search(experiment.title, problem, both, method, tools, tolerance, notify)
     chosen = scaling(problem, of, *_positions(loaded, problem))
     programs = ParametricProgram(lambda factor: transcribe(chosen.at(factor), control=control, disturbance=disturbance))
     joined: ParametricProgram | None = None
@@ -131,7 +133,7 @@ def _search(loaded: Loaded, of: str, tolerance: float, notify: Notify) -> Margin
         own, units = in_own_units(prepare(chosen.at(1.0), control, disturbance))
         joined = ParametricProgram(lambda factor: like(own, units.of_problem(chosen.at(factor))))
     width = tolerance * (1.0 if chosen.relative else chosen.highest)
-    return MarginSearch(experiment.title, programs, joined, chosen, _method(loaded), tools_of(loaded), width, notify)
+    return MarginSearch(experiment.title, programs, joined, chosen, _method(loaded), tools, width, notify)
 
 
 def _positions(loaded: Loaded, problem: OptimalControlProblem) -> tuple[list[list[int]], list[list[int]]]:

@@ -111,10 +111,7 @@ class MarginSearch:
         sides: Sides | None = None
         try:
             self._tell(f"looking for the {self.scaling.sense} factor of {self.scaling.of}")
-            found = critical_factor(
-                self.programs, self.joined, self.scaling, self.tools, self.width, self.notify, self.seen
-            )
-            sides = self._sides(found)
+            sides = self._sides(self._found())
             feasible = sides[2]
             curve = self._curve(feasible, sides[0], count) if feasible is not None else ()
         except KeyboardInterrupt as pressed:
@@ -143,6 +140,13 @@ class MarginSearch:
             seconds=time.perf_counter() - started,
         )
 
+    def _found(self) -> Critical:
+        """The critical factor; of a largest one the factor 0 is run before, so that a search that is ended early knows
+        whether anything is feasible."""
+        if self.scaling.sense == "largest" and self.scaling.nested and self.run(0.0).status == "infeasible":
+            return Critical("never")
+        return critical_factor(self.programs, self.joined, self.scaling, self.tools, self.width, self.notify, self.seen)
+
     def _tell(self, text: str) -> None:
         self.notify(StudyProgress(text=text))
 
@@ -157,7 +161,8 @@ class MarginSearch:
         feasible, infeasible = proven[last] if proven else None, refused[first] if refused else None
         looked = [f"{answer} at {factor:.4g}" for factor, answer in sorted(self.seen.items())]
         seems = f"; not proven: it seems {', '.join(looked)}" if looked else ""
-        return ("undecided", f"{said} after {len(self.points)} runs{seems}", feasible, infeasible), tuple(proven)
+        none = "" if proven or refused else ", of which none proves anything" if self.points else ": nothing is proven"
+        return ("undecided", f"{said} after {len(self.points)} runs{none}{seems}", feasible, infeasible), tuple(proven)
 
     def _sides(self, found: Critical) -> Sides:
         largest = self.scaling.sense == "largest"
@@ -209,7 +214,10 @@ class MarginSearch:
         return None
 
     def run(self, factor: float) -> Point:
-        """An ordinary run at a factor; a factor at which the problem is not defined fails."""
+        """An ordinary run at a factor, made once; a factor at which the problem is not defined fails."""
+        for point in self.points:
+            if point.factor == factor:
+                return point
         try:
             result = solve_in_own_units(self.method, self.programs.program(factor), self.tools)
         except InputError as error:

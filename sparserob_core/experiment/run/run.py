@@ -147,7 +147,8 @@ def run(
     ``config`` is a file or a mapping, ``overrides`` a mapping such as ``{"solver.name": "clarabel"}`` or texts
     ``key=value``. ``observers`` watch beside those that the config names. ``limits.seconds`` of the config bounds its
     time: the method then ends as at an interrupt.
-    Raises `ConfigError` or another `InputError` before anything is solved. An interrupt ends the method with what it
+    Raises `ConfigError` or another `InputError` before anything is solved, and `TimeLimitError` when the limit comes
+    before there is anything to solve. An interrupt ends the method with what it
     knows by then: the outcome is that of the last round, ``undecided`` unless more was proven. An error, or an
     interrupt before there was a decision, leaves a directory with the config, the rounds so far and the status
     ``failed``.
@@ -186,7 +187,7 @@ def _run(
     observers: Iterable[Observer],
 ) -> Outcome:
     deadline = Deadline(loaded.config.limits.seconds)  # the transcription counts too
-    experiment = assemble(loaded)
+    experiment = assemble(loaded, deadline)
     why = unprovable(experiment.problem) if isinstance(experiment, ControlExperiment) else None
     if why is not None:
         deadline, why = (deadline if deadline.bounded else Deadline(SECONDS)), announced(why, deadline.bounded)

@@ -181,6 +181,85 @@ def test_an_interrupted_margin_leaves_what_it_has_proven(tmp_path: Path) -> None
         assert not found.upper < whole.lower
 
 
+SLOW = """\
+import time
+from pathlib import Path
+
+import sparserob_core as sr
+from sparserob_piqp import Piqp
+
+
+class Slow(Piqp):
+    def solve(self, program, accuracy):
+        claim = super().solve(program, accuracy)
+        with Path("solved").open("a") as file:
+            file.write("x")
+        time.sleep(0.3 if len(Path("solved").read_text()) >= 4 else 0.0)
+        return claim
+
+
+@sr.hookimpl
+def sparserob_solvers():
+    yield sr.SolverPlugin(name="slow", factory=Slow, summary="Takes its time after the fourth program.")
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", WORDS)
+@pytest.mark.parametrize(
+    ("command", "file", "words"),
+    [
+        (("margin", "--curve", "0"), "margin.json", "undecided: {} after"),
+        (("initial-states", "--directions", "32"), "initial_states.json", "{}"),
+    ],
+)
+def test_a_study_that_is_ended_by_a_signal_writes_what_is_known(
+    command: tuple[str, ...], file: str, words: str, number: int, tmp_path: Path
+) -> None:
+    (tmp_path / "config.yaml").write_text(MARGIN + "solver: {name: slow}\nplugins: [slow.py]\nobservers: []\n")
+    (tmp_path / "slow.py").write_text(SLOW)
+    name, *options = command
+    with started(name, "config.yaml", *options, "--out", "out", cwd=tmp_path) as process:
+        wait_for(lambda: (tmp_path / "solved").exists() and len((tmp_path / "solved").read_text()) >= 5)
+        os.kill(process.pid, number)
+        table, said = process.communicate(timeout=60)
+    assert process.returncode == 130, said
+    assert words.format(WORDS[signal.Signals(number)]) in table + said
+    assert "Traceback" not in said
+    assert WORDS[signal.Signals(number)] in json.loads((tmp_path / "out" / file).read_text())["message"]
+
+
+LARGE = """\
+problem:
+  name: linear
+  system:
+    A: [[0, 1, 0, 0], ["-1 - p1", -0.1, "p2", 0], [0, 0, 0, 1], ["p1 * p2", 0, "-2 - p2", -0.1]]
+    B: [[0], [1], [0], ["1 + p1"]]
+    E: [[0], [1], [0], [1]]
+    parameters: {p1: [-0.1, 0.1], p2: [-0.1, 0.1]}
+  horizon: 20.0
+  initial_state: [1, 0, 0.5, 0]
+  control: {box: 2.0}
+  disturbance: {box: 0.01}
+  path: [{box: 5.0}]
+dictionaries: {control: {pieces: 1000}}
+limits: {seconds: 0.02}
+observers: []
+"""
+
+
+def test_a_limit_ends_a_transcription_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sparserob_core.sip.method.GRACE", 0.0)
+    (tmp_path / "large.yaml").write_text(LARGE)
+    for study in (sr.run, sr.margin, sr.initial_states):
+        with pytest.raises(
+            sr.TimeLimitError, match=r"the limit of 0.02 s is reached while the problem was transcribed"
+        ):
+            study(tmp_path / "large.yaml", out=tmp_path / "out")
+        assert not (tmp_path / "out").exists()
+    assert sr.TimeLimitError.exit_status == 4
+
+
 def test_interrupted_initial_states_leave_true_polygons(tmp_path: Path) -> None:
     file = tmp_path / "states.yaml"
     file.write_text(MARGIN)

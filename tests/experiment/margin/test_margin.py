@@ -230,11 +230,24 @@ def test_the_command_ends_with_the_status_of_what_it_found(command, tmp_path):
     assert "did you mean 'disturbance'" in done.stderr
 
 
-def test_a_limit_ends_a_margin_with_what_is_proven_by_then():
+def test_a_limit_ends_a_margin_with_what_is_proven_by_then(monkeypatch):
+    monkeypatch.setattr("sparserob_core.sip.method.GRACE", 60.0)  # the transcription is let finish
     config = Path(__file__).resolve().parents[3] / "configs" / "experiment1_repaired.yaml"
     found = sr.margin(config, "disturbance", {"observers": [], "limits.seconds": 0.01})
     assert found.status == "undecided"
-    assert found.message.startswith("the limit of 0.01 s is reached")
+    assert found.message.startswith("the limit of 0.01 s is reached after 1 runs, of which none proves anything")
+
+
+def test_a_margin_that_is_ended_in_its_first_program_knows_whether_anything_is_feasible(monkeypatch):
+    def pressed(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sparserob_core.experiment.margin.search.critical_factor", pressed)
+    found = sr.margin(config(disturbance={"box": 0.1}, path=[{"box": 4.0}]), "disturbance")
+    assert (found.status, found.lower, found.feasible.status) == ("undecided", 0.0, "certified")
+    assert np.isnan(found.upper)
+    never = sr.margin(config(disturbance={"box": 0.1}, path=[{"box": [0.5, None]}]), "disturbance")
+    assert (never.status, never.infeasible.factor) == ("infeasible", 0.0)
 
 
 @pytest.mark.parametrize(
