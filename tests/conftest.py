@@ -10,7 +10,9 @@ import pytest
 os.environ["SPARSEROB_SHAPES"] = "1"  # before anything else of the package: shapes in annotations are checked here
 import sparserob_core.shapes
 
-del os.environ["SPARSEROB_SHAPES"]  # processes that a test starts run as a user's do
+# processes that a test starts run as a user's do; where nobody compiles for the next one, each takes half a second more
+del os.environ["SPARSEROB_SHAPES"]
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 from hypothesis import settings
 

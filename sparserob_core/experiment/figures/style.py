@@ -86,6 +86,7 @@ def write_figure(file: Path, figure: Figure) -> list[Path]:
     for one in files:
         stream, kind = BytesIO(), one.suffix.lower()
         figure.savefig(stream, format=kind[1:], **KINDS[kind])
+        figure.set_layout_engine("none")  # everything has its place now, in the next file too
         try:
             write_whole(one, stream.getvalue())
         except SparseRobError as error:

@@ -15,7 +15,7 @@ from sparserob_core.experiment.figures.run_figures import draw_control, draw_con
 from sparserob_core.sip.events import RoundFinished
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def data() -> FigureData:
     times = np.linspace(0.0, 2.0, 21)
     state = np.stack([np.cos(times), -np.sin(times)])
@@ -41,16 +41,20 @@ def data() -> FigureData:
     )
 
 
-def test_every_figure_is_written_as_a_vector_and_as_a_picture(data: FigureData, tmp_path: Path) -> None:
-    files = write_figures(tmp_path / "figures", data)
+@pytest.fixture(scope="module")
+def files(data: FigureData, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    return write_figures(tmp_path_factory.mktemp("figures"), data)
+
+
+def test_every_figure_is_written_as_a_vector_and_as_a_picture(files: list[Path]) -> None:
     expected = {f"{name}.{kind}" for name in ("control", "states", "convergence") for kind in ("pdf", "png")}
     assert {file.name for file in files} == expected
     assert all(file.read_bytes()[:4] in (b"%PDF", b"\x89PNG") for file in files)
 
 
-def test_the_same_data_gives_the_same_bytes(data: FigureData, tmp_path: Path) -> None:
-    first, second = (write_figures(tmp_path / name, data) for name in ("first", "second"))
-    assert [file.read_bytes() for file in first] == [file.read_bytes() for file in second]
+def test_the_same_data_gives_the_same_bytes(files: list[Path], data: FigureData, tmp_path: Path) -> None:
+    again = write_figures(tmp_path, data)
+    assert [file.read_bytes() for file in files] == [file.read_bytes() for file in again]
 
 
 def test_the_drawn_steps_are_the_control(data: FigureData) -> None:

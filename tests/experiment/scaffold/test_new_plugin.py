@@ -67,6 +67,7 @@ def test_packages_are_as_clean_as_this_one_whatever_the_length_of_their_names(tm
     run(["-m", "ruff", "format", "--check", "--no-cache", "."], tmp_path)
 
 
+@pytest.mark.slow
 def test_a_package_passes_its_tests_as_it_is_written(tmp_path):
     folder = new_plugin("selection", "trial", tmp_path)
     said = run(["-m", "pytest", "-q", "-p", "no:cacheprovider"], folder, folder)
