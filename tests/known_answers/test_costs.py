@@ -102,24 +102,43 @@ HARD: dict[str, Any] = {  # everything at once: drift, delay, a parameter, sets 
 }
 
 
-def test_the_cost_is_that_of_the_physics_integrated_by_another_program(tmp_path):
-    outcome = run(HARD, 17, tmp_path / "run")
+LATER = {"A": [[0, 1], ["-3 + 2 * p", -0.2]], "B": [[0.1], [1.5]], "E": [[1, 0], [0.5, 1]], "c": [0.0, -0.2]}
+SWITCHED = {
+    **HARD,
+    "terminal": [{"box": [1.0, 1.0]}],
+    "system": {
+        "pieces": [
+            {"until": 2.2, **{name: HARD["system"][name] for name in ("A", "B", "c")}},
+            {"until": 5.0, **LATER},
+        ],
+        "delay": 0.15,
+        "parameters": {"p": [-0.05, 0.15]},
+    },
+}
+
+
+@pytest.mark.parametrize("problem", [HARD, SWITCHED], ids=["one system", "two systems that take turns"])
+def test_the_cost_is_that_of_the_physics_integrated_by_another_program(problem, tmp_path):
+    outcome = run(problem, 17, tmp_path / "run")
     cost, control = certified(outcome), outcome.control[0]
     edges, delay, Q, r = np.linspace(0.0, 5.0, 18), 0.15, np.array([[1, 0.5], [0.5, 0.25]]), np.array([0.2, -0.1])
 
     def commanded(t):
         return 0.3 if t < 0.0 else control[min(int(np.searchsorted(edges, t, side="right")) - 1, 16)]
 
-    def rates(t, z, u):
-        x = z[:2]
-        push = np.array([0.005, 0.02 + 0.1 + u])
-        return [*(np.array([[0, 1], [-2 + 0.05, -0.5]]) @ x + push), (x - r) @ Q @ (x - r)]
+    def rates(t, z, u, later):
+        x, w = z[:2], np.array([0.005, 0.02])
+        A, B, c = np.array([[0, 1], [-2 + 0.05, -0.5]]), np.array([0.0, 1.0]), np.array([0.0, 0.1])
+        if later:
+            A, B, c = np.array([[0, 1], [-3 + 2 * 0.05, -0.2]]), np.array([0.1, 1.5]), np.array([0.0, -0.2])
+            w = np.array([[1, 0], [0.5, 1]]) @ w
+        return [*(A @ x + B * u + w + c), (x - r) @ Q @ (x - r)]
 
-    z, times = np.array([-0.99, 1.0, 0.0]), np.unique(np.concatenate([edges, edges + delay, [delay]]))
+    z, times = np.array([-0.99, 1.0, 0.0]), np.unique(np.concatenate([edges, edges + delay, [delay, 2.2]]))
     times = times[times <= 5.0]
     for start, stop in pairwise(times):
-        u = commanded((start + stop) / 2 - delay)
-        z = solve_ivp(rates, (start, stop), z, args=(u,), rtol=1e-12, atol=1e-14).y[:, -1]
+        u, later = commanded((start + stop) / 2 - delay), problem is SWITCHED and start >= 2.2
+        z = solve_ivp(rates, (start, stop), z, args=(u, later), rtol=1e-12, atol=1e-14).y[:, -1]
     lengths = np.diff(edges)
     wanted = z[2] + 0.25 * lengths @ np.abs(control) + 0.05 * lengths @ control**2 + z[:2] @ z[:2]
     assert cost == pytest.approx(wanted, rel=1e-9)
@@ -405,6 +424,32 @@ def test_the_python_record_means_what_the_config_means():
     pieces = sr.load_registry().build("dictionary", "piecewise_constant", {"pieces": 50}).build(5.0)
     result = sr.solve(sr.transcribe(problem, pieces), method="exchange", solver="piqp")
     assert result.cost == pytest.approx(0.983009, rel=1e-6)
+
+
+def test_minimum_attention_weighs_the_rate_and_the_control_apart(tmp_path):
+    problem = {
+        "name": "minimum_attention",
+        "system": {"A": [[0]], "B": [[1]]},
+        "horizon": 4.0,
+        "initial_state": [1.0],
+        "rate": {"box": 1.0},
+        "terminal": [{"equals": [0]}],
+        "cost": {"l1": 0.5, "control": {"R": [[2.0]]}, "state": {"Q": [[0.3]], "reference": [0.1]}},
+    }
+    outcome = run(problem, 16, tmp_path / "run")
+    cost, rate = certified(outcome), outcome.control[0]
+    h = 0.25
+    ends = np.concatenate([[0.0], np.cumsum(h * rate)])
+    of_the_control = (h * (ends[:-1] ** 2 + ends[:-1] * ends[1:] + ends[1:] ** 2) / 3).sum()
+    x, of_the_state = 1.0, 0.0
+    nodes, weights = np.polynomial.legendre.leggauss(4)
+    for u, v in zip(ends[:-1], rate, strict=True):
+        s = h * (nodes + 1) / 2
+        of_the_state += h / 2 * weights @ (x + u * s + v * s**2 / 2 - 0.1) ** 2
+        x += u * h + v * h**2 / 2
+    assert cost == pytest.approx(0.5 * h * np.abs(rate).sum() + 2.0 * of_the_control + 0.3 * of_the_state, rel=1e-9)
+    with pytest.raises(sr.InputError, match=r"cost\.control\.R: .*eigenvalue -1"):
+        run({**problem, "cost": {"control": {"R": [[-1.0]]}}}, 16, tmp_path / "wrong")
 
 
 def test_a_program_with_norms_and_a_constant_has_the_value_of_its_closed_form():
