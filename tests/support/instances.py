@@ -1,5 +1,5 @@
 """Random robust problems over any sets, in any units, and what is true of them: programs sampled on fine grids of
-times, directions and parameters, by matrix exponentials and HiGHS. Nothing of the package is used.
+times, directions and parameters, by matrix exponentials, HiGHS and Clarabel. Nothing of the package is used.
 
 The truth of a known system is proven: a trajectory departs from its chords by at most ``step^2 / 8`` times its
 curvature, and a curved set lies between the polytope of its tangents and a smaller copy of that. Of an uncertain one
@@ -14,9 +14,11 @@ from functools import cache
 from itertools import product
 from typing import Any
 
+import clarabel
 import numpy as np
 from scipy.linalg import expm
 from scipy.optimize import linprog
+from scipy.sparse import csc_matrix
 from scipy.spatial import HalfspaceIntersection
 
 
@@ -141,6 +143,38 @@ def tangents(d: int, p: float) -> tuple[np.ndarray, float]:
 
 
 @dataclass(frozen=True)
+class Charge:
+    """``l1`` times the absolute values, or the norm of all channels where they are ``grouped``, and quadratic terms of
+    the state where every parameter, disturbance and deviation is at the centre of its set: ``Q``, ``R`` and ``final``,
+    none where empty."""
+
+    l1: float = 1.0
+    grouped: bool = False
+    Q: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    reference: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    R: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    final: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+
+    def config(self, units: Units) -> dict[str, Any]:
+        """The key ``cost`` in the user's units, in which weights have the cost's factor."""
+        found: dict[str, Any] = {"l1": self.l1}
+        price, X = units.cost, np.outer(units.states, units.states)
+        if self.grouped:
+            found["group"] = "all"
+        if self.Q.size:
+            found["state"] = {"Q": _even(price * self.Q / X), "reference": (self.reference * units.states).tolist()}
+        if self.R.size:
+            found["control"] = {"R": _even(price * self.R / np.outer(units.controls, units.controls))}
+        if self.final.size:
+            found["final"] = {"Q": _even(price * units.time * self.final / X)}
+        return found
+
+
+def _even(matrix: np.ndarray) -> list[list[float]]:
+    return ((matrix + matrix.T) / 2).tolist()
+
+
+@dataclass(frozen=True)
 class Instance:
     """``x' = (A + sum_k p_k slopes_k) x + B u + E w`` with ``|p_k| <= 1``, all sets about 0, the control and the
     disturbance constant between ``edges``; ``x(0)`` anywhere in ``initial_state`` plus ``initial_set``."""
@@ -159,11 +193,22 @@ class Instance:
     slopes: list[np.ndarray] = field(default_factory=list)
     dictionary: str = "piecewise_constant"
     initial_set: Shape | None = None
+    charge: Charge | None = None
 
     @property
     def price(self) -> np.ndarray:
         """The price ``(m K,)`` of ``|u|`` on every piece."""
-        return np.outer(self.weights, np.diff(self.edges)).ravel()
+        factor = 1.0 if self.charge is None else self.charge.l1
+        return factor * np.outer(self.weights, np.diff(self.edges)).ravel()
+
+    @property
+    def largest(self) -> float:
+        """A cost that is not small: the largest of the absolute values, and what no control at all costs."""
+        found = float(self.price @ self.bounds)
+        if self.charge is None:
+            return found
+        P, _, constant = quadratic(self)
+        return found + constant + float(self.bounds @ np.abs(P) @ self.bounds) / 2
 
     @property
     def sides(self) -> np.ndarray:
@@ -272,6 +317,98 @@ def control_rows(problem: Instance, tight: bool) -> Rows:
     )
 
 
+def nominal(shape: Shape | None, size: int) -> np.ndarray:
+    """The middle of the bounding box where that is inside, else the mean of the corners."""
+    if shape is None or isinstance(shape, Curved):
+        return np.zeros(size)
+    eye = np.eye(size)
+    middle = (shape.support(eye) - shape.support(-eye)) / 2
+    return middle if (shape.H @ middle <= shape.h + 1e-9).all() else _vertices(shape).mean(axis=0)
+
+
+def quadratic(problem: Instance) -> tuple[np.ndarray, np.ndarray, float]:
+    """The quadratic terms as ``u'P u/2 + q'u + constant``, by Boole's rule on a fine grid."""
+    charge, steps = problem.charge, 24
+    assert charge is not None
+    some = sample(replace(problem, slopes=[]), steps, np.zeros(0))
+    free = some.free + np.einsum("aidk,d->ai", some.noise, nominal(problem.disturbance, problem.E.shape[1]))
+    free = free + some.flow @ nominal(problem.initial_set, len(problem.A))
+    n, d = len(problem.price), len(problem.A)
+    P, q, constant = np.zeros((n, n)), np.zeros(n), 0.0
+    weights = np.zeros(len(some.times))
+    for k, length in enumerate(np.diff(problem.edges)):
+        for first in range(k * steps, (k + 1) * steps, 4):
+            weights[first : first + 5] += 2 * length / steps / 45 * np.array([7, 32, 12, 32, 7])
+    for Q, r, share in (
+        (charge.Q, charge.reference, weights),
+        (charge.final, np.zeros(d), np.eye(len(weights))[-1]),
+    ):
+        if Q.size:
+            away, driven = free - r, some.response.transpose(1, 0, 2)
+            P += 2 * np.einsum("iak,ij,jal->kl", driven * share[:, None], Q, driven, optimize=True)
+            q += 2 * np.einsum("iak,ij,aj->k", driven * share[:, None], Q, away, optimize=True)
+            constant += float(np.einsum("a,ai,ij,aj->", share, away, Q, away))
+    if charge.R.size:
+        P += 2 * np.kron(charge.R, np.diag(np.diff(problem.edges)))
+    return P, q, constant
+
+
+def charged(
+    problem: Instance,
+    rows: np.ndarray,
+    limits: np.ndarray,
+    equal: np.ndarray | None,
+    at: np.ndarray | None,
+    side: float,
+) -> tuple[float, np.ndarray | None]:
+    """The least `Charge` of controls ``(m K,)`` under ``rows u <= limits`` and ``equal u = at``, with bounds drawn in
+    to ``side``, by a solver for cones; ``inf`` where there is none."""
+    P, q, constant = quadratic(problem)
+    n, m, K = len(q), len(problem.weights), len(problem.edges) - 1
+    grouped = problem.charge is not None and problem.charge.grouped
+    tops = K if grouped else n
+    bare, own = np.zeros((n, tops)), np.eye(n)
+    some = np.isfinite(limits)
+    blocks, right = [np.hstack([rows[some], np.zeros((int(some.sum()), tops))])], [limits[some]]
+    high, low = problem.sides * side
+    blocks += [np.hstack([own, bare]), np.hstack([-own, bare])]
+    right += [high, low]
+    if not grouped:
+        blocks += [np.hstack([own, -own]), np.hstack([-own, -own])]
+        right += [np.zeros(n), np.zeros(n)]
+    cones: list[Any] = [clarabel.NonnegativeConeT(sum(len(part) for part in right))]
+    if grouped:
+        for k in range(K):
+            block = np.zeros((m + 1, n + tops))
+            block[0, n + k] = -1.0
+            block[1 + np.arange(m), np.arange(m) * K + k] = -1.0
+            blocks.append(block)
+            right.append(np.zeros(m + 1))
+            cones.append(clarabel.SecondOrderConeT(m + 1))
+    if equal is not None and at is not None and at.size:
+        blocks.append(np.hstack([equal, np.zeros((len(at), tops))]))
+        right.append(at)
+        cones.append(clarabel.ZeroConeT(len(at)))
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-10
+    whole = np.zeros((n + tops, n + tops))
+    whole[:n, :n] = P
+    answer = clarabel.DefaultSolver(
+        csc_matrix(np.triu(whole)),
+        np.concatenate([q, problem.price[:tops] if grouped else problem.price]),
+        csc_matrix(np.vstack(blocks)),
+        np.concatenate(right),
+        cones,
+        settings,
+    ).solve()
+    if "PrimalInfeasible" in str(answer.status):
+        return np.inf, None
+    if "Solved" not in str(answer.status):
+        raise ArithmeticError(str(answer.status))
+    return answer.obj_val + constant, np.array(answer.x[:n])
+
+
 def optimum(
     problem: Instance, samples: list[Sampled], tight: bool, spare: float = 0.0
 ) -> tuple[float, np.ndarray | None]:
@@ -288,6 +425,17 @@ def optimum(
     size, used, inside = len(problem.price), np.zeros(len(h), dtype=bool), problem.control.rows()[2]
     for _ in range(200):
         both = np.concatenate([rows, G[used]])
+        if problem.charge is not None:
+            half = None if equal is None else equal[:, :size]
+            fun, u = charged(problem, both, np.concatenate([limits, h[used]]), half, at, inside if tight else 1.0)
+            if u is None:
+                return np.inf, None
+            excess = np.where(used, -np.inf, G @ u - h)
+            if not (excess > 1e-9).any():
+                return fun, u
+            worst = np.argsort(-excess)[:60]
+            used[worst[excess[worst] > 1e-9]] = True
+            continue
         answer = linprog(
             np.tile(problem.price, 2),
             np.hstack([both, -both]),
@@ -409,6 +557,8 @@ def config(problem: Instance, units: Units) -> dict[str, Any]:
         "path": windows,
         "terminal": ends,
     }
+    if problem.charge is not None:
+        stated["cost"] = problem.charge.config(units)
     if problem.disturbance is not None:
         stated["disturbance"] = problem.disturbance.config(units.disturbances, units.rows)
     control = pieces if problem.dictionary == "piecewise_constant" else {**pieces, "name": problem.dictionary}
@@ -532,7 +682,7 @@ def on_the_boundary(rng: np.random.Generator, share: float) -> Instance | None:
 
 def instance(seed: int) -> tuple[Instance, Units]:
     """Number ``seed``: every tenth one on the boundary, feasible or infeasible by 1e-6; every third of the others from
-    a set of initial states."""
+    a set of initial states, and every fourth with another cost than the L1 norm."""
     rng = np.random.default_rng(seed)
     problem = on_the_boundary(rng, 1e-6 if seed % 20 else -1e-6) if seed % 10 == 0 else None
     problem = problem if problem is not None else drawn(rng)
@@ -540,4 +690,25 @@ def instance(seed: int) -> tuple[Instance, Units]:
         own = np.random.default_rng([seed, 1])  # the numbers of what was drawn before stay as they are
         widths = own.uniform(0.002, 0.05, len(problem.A))
         problem = replace(problem, initial_set=shape(own, widths, bounded=True))
-    return problem, drawn_units(rng, problem)
+    units = drawn_units(rng, problem)
+    if seed % 4 == 2 and seed % 10:
+        own = np.random.default_rng([seed, 2])
+        problem = replace(problem, charge=charge(own, *problem.B.shape))
+        if problem.charge is not None and problem.charge.grouped:  # one weight and one unit for all of a group
+            m = len(problem.weights)
+            problem = replace(problem, weights=np.full(m, problem.weights[0]))
+            units = replace(units, controls=np.full(m, units.controls[0]))
+    return problem, units
+
+
+def charge(rng: np.random.Generator, d: int, m: int) -> Charge:
+    """Some terms of a cost, semidefinite ones of any rank."""
+
+    def some(size: int) -> np.ndarray:
+        root = rng.normal(size=(size, int(rng.integers(1, size + 1))))
+        return root @ root.T + 1e-6 * np.eye(size) if rng.random() < 0.5 else np.zeros((0, 0))
+
+    found = Charge(Q=some(d), reference=0.3 * rng.normal(size=d), R=some(m), final=some(d))
+    plain = not (found.Q.size or found.R.size or found.final.size)
+    l1 = float(rng.choice([0.2, 1.0, 3.0] if plain else [0.0, 0.2, 1.0, 3.0]))
+    return replace(found, l1=l1, grouped=bool(l1 and m > 1 and rng.random() < 0.5))

@@ -332,7 +332,8 @@ def _sparser(
         looked = separate(program, other, ledger.tools, ALLOWED, number)
         above = [one for family, separation in looked if (one := _above(family, separation))[1].size]
         if not above:
-            kept = replace(answer, solution=replace(answer.solution, x=other)), looked
+            value = program.cost(other) if answer.epsilon == 0.0 else answer.value
+            kept = replace(answer, solution=replace(answer.solution, x=other), value=value), looked
             violated, least = [], count(program, other)
         elif answer.epsilon == 0.0:
             violated = above
