@@ -52,7 +52,8 @@ class InfeasibleSubsystem:
 
     ``amount``: of the members one is violated by at least that many times the norm of its row; infinite where the
     decision enters none of them. ``others``: how many further reasons or members there are. ``equalities``: whether the
-    program has some, which belong to every subsystem. ``demand``: what a weighted sum of the members asks for.
+    program has some, which belong to every subsystem. ``irreducible``: whether no member can be spared. ``demand``:
+    what a weighted sum of the members asks for.
     """
 
     reasons: tuple[str, ...] = ()
@@ -62,6 +63,7 @@ class InfeasibleSubsystem:
     equalities: bool = False
     demand: str = ""
     decides: str = "decision"
+    irreducible: bool = True
 
     def sentence(self, amounts: bool = True) -> str:
         """All of it for people; without ``amounts`` where the units of the rows mean nothing to them."""
@@ -76,7 +78,7 @@ class InfeasibleSubsystem:
             by = f": one is missed by at least {self.amount:.4g} times its norm" if missed else ""
             return f"the {what} cannot be met within the bounds, {whatever}{by}"
         if len(self.members) + self.others > 1:
-            head = "these cannot hold together, though all but any one of them can"
+            head = "these cannot hold together" + (", though all but any one of them can" if self.irreducible else "")
         else:
             head = "nothing meets this " + ("and the equalities" if self.equalities else "within the bounds")
         by = f" (one is violated by at least {self.amount:.4g} times its norm, {whatever})" if missed else ""

@@ -29,6 +29,7 @@ def with_feedback(model: Transcription, own: Transcription, units: Units, policy
     blocks = 0 if own.functionals.disturbance is None else own.functionals.disturbance.block_count
     deviations = np.tile(units.disturbances[: own.problem.system.disturbances], blocks)
     seen = innovations_seen(own.response, own.control, own.functionals.disturbance)
+    seen = seen * (deviations_of(own.problem.disturbance, blocks).chords > 0.0)  # what cannot deviate is not answered
     memory = None if policy.memory is None else policy.memory / units.time
     scaled = answers(seen, own.control.breakpoints, own.problem.system.controls, memory)
     known = _in_users(scaled, units, deviations)

@@ -66,6 +66,12 @@ def initial_states(
     if not isinstance(experiment, ControlExperiment):
         raise InputError("problem: expected a control problem, which has an initial state, got a semi-infinite program")
     model = experiment.transcription
+    if model.feedback is not None:
+        raise InputError(
+            path="policy.name",
+            expected="open_loop: the set of feasible initial states is one of controls",
+            got="affine",
+        )
     if about is not None:
         model = from_state(model, _about(about, model.problem))
     pair = check_states(states, model.problem.system.states)

@@ -15,6 +15,7 @@ from sparserob_core.experiment.run.events import StudyProgress
 from sparserob_core.sip.events import Notify
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.methods.exchange import Exchange
+from sparserob_core.sip.methods.robust import least_slack
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.relaxed.parametric import ParametricProgram, extreme_program, slack_program
 
@@ -104,6 +105,8 @@ def _slack(programs: ParametricProgram, factor: float, tools: Tools) -> float:
     try:
         program = programs.program(factor)
         program = program if program.own_units is None else program.own_units.program
+        if program.spread is not None:
+            return least_slack(program, tools)
         bounds = _room(program)
         result = Exchange(tolerance=1e-9).close(
             slack_program(program, *bounds), replace(tools, regulariser=None), lambda x: ()

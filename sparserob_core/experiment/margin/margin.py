@@ -123,13 +123,17 @@ def _search(loaded: Loaded, of: str, tolerance: float, notify: Notify) -> Margin
             "config: expected a control problem, whose sets can be scaled, got a semi-infinite program of another kind"
         )
     problem, control, disturbance = experiment.problem, experiment.control, experiment.disturbance
+    feedback = experiment.transcription.feedback
+    policy = None if feedback is None else feedback.policy
     if of == HORIZON:
+        if policy is not None:
+            raise InputError(path="policy.name", expected="open_loop for the margin of the horizon", got="affine")
         both, method = (control, disturbance), _method(loaded)
         return horizon_search(experiment.title, problem, both, method, tools, tolerance, notify)
     chosen = scaling(problem, of, *_positions(loaded, problem))
-    programs = ParametricProgram(lambda factor: transcribe(chosen.at(factor), control=control, disturbance=disturbance))
+    programs = ParametricProgram(lambda factor: transcribe(chosen.at(factor), control, disturbance, policy=policy))
     joined: ParametricProgram | None = None
-    if chosen.affine:  # programs at several factors become one: in the units of the factor 1
+    if chosen.affine and policy is None:  # programs at several factors become one: in the units of the factor 1
         own, units = in_own_units(prepare(chosen.at(1.0), control, disturbance))
         joined = ParametricProgram(lambda factor: like(own, units.of_problem(chosen.at(factor))))
     width = tolerance * (1.0 if chosen.relative else chosen.highest)

@@ -67,12 +67,13 @@ class Counterpart:
     """Uncertain rows over one program and one spread, to which rows are added; solved by HiGHS, from the last basis.
 
     Its columns are the positive and the negative parts of the decision, a slack of all rows where it is ``elastic``
-    (and the only cost), and what rows need beside them.
+    (the only cost, at least ``lowest``), and what rows need beside them.
     """
 
     program: FiniteProgram
     spread: Spread
     elastic: bool = False
+    lowest: float = 0.0
     calls: int = 0
     blocks: list[UncertainRows] = field(default_factory=list)
     _imposed: list[tuple[np.ndarray, Array, list[_Part]]] = field(default_factory=list, repr=False)
@@ -88,7 +89,7 @@ class Counterpart:
             cost = (program.weights + sign * program.q) * priced
             self._linear.variables(np.maximum(ends[0], 0.0), np.maximum(ends[1], 0.0), cost)
         if self.elastic:
-            self._linear.variables(np.zeros(1), np.full(1, np.inf), np.ones(1))
+            self._linear.variables(np.full(1, self.lowest), np.full(1, np.inf), np.ones(1))
         self._fixed = np.zeros(0, dtype=int)
         if program.b.size:
             row, column = np.nonzero(program.A)

@@ -31,6 +31,8 @@ ALLOWED = TOLERANCE / 2  # a violation that the search may leave to the proof
 ROUNDING = 2.0**-46  # of the numbers of which a bound is made
 FIRST, LARGEST, SMALLEST = 1e-8, 1e-6, 2e-9  # margins by which rows are tightened, in their own units
 THINNER = 0.1  # share of a margin that leaves nothing feasible, which is tried next
+ROOM = 1e3  # units of the rows that they may have to spare
+SLACKENED = 200  # rounds of `least_slack` at most
 FARKAS = 1e-9  # a weighted sum of rows is violated by more than that: nothing is feasible
 
 
@@ -228,6 +230,37 @@ def _reason(program: SemiInfiniteProgram, dual: Dual) -> tuple[InfeasibleSubsyst
     bare = WorstConstraint(dual.bound, first.family, first.index[: units[first.family].index_set.dimension], first.row)
     members = tuple(one.text for one in told[:NAMED])
     found = InfeasibleSubsystem(
-        members=members, others=max(0, len(told) - NAMED), equalities=bool(program.finite.b.size), decides="policy"
+        members=members,
+        others=max(0, len(told) - NAMED),
+        equalities=bool(program.finite.b.size),
+        decides="policy",
+        irreducible=False,
     )
     return found, explained(program, bare)
+
+
+def least_slack(program: SemiInfiniteProgram, tools: Tools, accuracy: float = 1e-9) -> float:
+    """By how much all rows must be relaxed alike, in their own units, until some decision meets them; negative where
+    they have that much to spare. Infinite where that was not found."""
+    assert program.spread is not None
+    relaxing = Counterpart(program.finite, program.spread, elastic=True, lowest=-ROOM)
+    families = [family for family in program.families if not family.defines and family.uncertain is not None]
+    new = [(family, index) for family in families if family.start is not None for index in family.start]
+    known: set[tuple[str, bytes]] = set()
+    for _ in range(SLACKENED):
+        tools.deadline.check()
+        fresh = [(family, index) for family, index in new if (family.name, index.tobytes()) not in known]
+        for family, index in fresh:
+            assert family.uncertain is not None
+            known.add((family.name, index.tobytes()))
+            relaxing.add(family.uncertain(index))
+        answer = relaxing.solve()
+        if not answer.solved:
+            return np.inf
+        beyond = answer.slack + accuracy
+        found = [(family, family.worst(answer.x)) for family in families if family.worst is not None]
+        new = [(family, index) for family, one in found for index in one.indices[one.violations > beyond]]
+        unknown = any((family.name, index.tobytes()) not in known for family, index in new)
+        if not new or not (relaxing.sharpen(answer.x) or unknown):
+            return answer.slack
+    return np.inf
