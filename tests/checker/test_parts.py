@@ -106,6 +106,19 @@ def test_a_linear_bound_of_a_thin_ellipsoid_loses_nothing_to_cancellation(thin):
     assert short <= 0.0
 
 
+@pytest.mark.parametrize("thin", [1e-4, 1e-8, 1e-12])
+def test_a_point_far_out_in_a_thin_ellipsoid_is_at_its_edge(thin):
+    """Rounded to floats it would be outside by 1e-16 of the longest axis, or far inside."""
+    turn, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
+    S = (turn * np.array([1.0, 1e-2, thin])) @ turn.T
+    shape, direction = known(Ellipsoid(np.zeros(3), (S + S.T) / 2)), turn[:, 2]
+    with ctx.workprec(96):
+        point = shape.point(direction)
+        reached = sum((a * x for a, x in zip(exact(direction), point, strict=True)), arb(0))
+        assert shape.holds(point)
+        assert 1.0 - reached / shape.support(exact(direction)) < 1e-15
+
+
 def test_a_linear_bound_of_a_polytope_loses_nothing_to_the_units_of_its_coordinates():
     units = np.array([1e6, 1e-6])
     plain = Polytope(np.vstack([np.eye(2), -np.eye(2)]), np.ones(4))

@@ -157,8 +157,9 @@ def _turn(
     place: Place, sides: Sides, interval: Interval, failed: Sequence[tuple[Bounded, Polynomial]], worst: float
 ) -> bool:
     """Whether a cell fails, by at most ``worst``, because its directions differ too much: the one in its middle does
-    not fail, and the others lose more than half of what smaller cells of time and parameters would gain. Stops at a
-    violation that is certain: at the cell's start."""
+    not fail, and the others lose more than what smaller cells of time and parameters would gain. That may be twice the
+    error: neighbours on both sides of a switch see different worst disturbances. Stops at a violation that is certain:
+    at the cell's start."""
     middle = sides.centre
     if middle is None:
         if sides.curved is None:
@@ -168,7 +169,7 @@ def _turn(
     if not top <= 0.0:
         top, poly = _closer(place, middle, interval, poly, top)
     _refute(place, interval, [(middle, poly)])
-    return top <= 0.0 and worst - top > 0.5 * (poly.expansion + poly.kinks)
+    return top <= 0.0 and worst - top > 2.0 * (poly.expansion + poly.kinks)
 
 
 def _refute(place: Place, interval: Interval, rows: Sequence[tuple[Bounded, Polynomial]]) -> None:

@@ -36,8 +36,13 @@ class Ellipsoidal(Shape):
         quadratic = total(a * along(row, direction) for a, row in zip(direction, self.source.shape, strict=True))
         return along(self.centre, direction) + quadratic.nonnegative_part().sqrt()
 
-    def contains(self, point: Sequence[float] | Array) -> bool:
-        return bool(self._square([x - m for x, m in zip(balls(point), balls(self.centre), strict=True)]) <= 1)
+    def holds(self, point: Sequence[arb]) -> bool:
+        return bool(self._square([x - m for x, m in zip(point, balls(self.centre), strict=True)]) <= 1)
+
+    def far(self, direction: Sequence[arb]) -> list[arb]:
+        images = [along(row, direction) for row in self.source.shape]
+        size = total(c * v for c, v in zip(direction, images, strict=True)).nonnegative_part().sqrt()
+        return [v / size for v in images]
 
     def gauge(self, offsets: Sequence[arb]) -> arb:
         return self._square(offsets).nonnegative_part().sqrt()
@@ -96,11 +101,19 @@ class Ball(Shape):
         summed = total(_power(size, q) for size in sizes if not size.is_zero())
         return summed if summed.is_zero() else _power(summed, 1 / q)
 
-    def contains(self, point: Sequence[float] | Array) -> bool:
+    def far(self, direction: Sequence[arb]) -> list[arb]:
+        from flint import arb
+
+        q = arb(self.source.p) / (arb(self.source.p) - 1)
+        steep = [_power(c, q - 1) if not c.is_zero() else c for c in direction]
+        size = self.gauge(steep)
+        return [v / size if c > 0 else -v / size for c, v in zip(direction, steep, strict=True)]
+
+    def holds(self, point: Sequence[arb]) -> bool:
         from flint import arb
 
         p, radius = self.source.p, arb(self.source.radius)
-        offsets = [x - m for x, m in zip(balls(point), balls(self.centre), strict=True)]
+        offsets = [x - m for x, m in zip(point, balls(self.centre), strict=True)]
         if p == 2.0:
             return bool(total(v * v for v in offsets) <= radius**2)
         return bool(total(abs(v) ** arb(p) for v in offsets if not v.is_zero()) <= radius ** arb(p))
@@ -163,14 +176,14 @@ class Cylindrical(Shape):
             raise Broken("a direction points where its set is unbounded")
         return self.base.support(direction[: self.spanned])
 
-    def contains(self, point: Sequence[float] | Array) -> bool:
-        return self.base.contains(np.asarray(point)[: self.spanned])
+    def holds(self, point: Sequence[arb]) -> bool:
+        return self.base.holds(point[: self.spanned])
 
     def gauge(self, offsets: Sequence[arb]) -> arb:
         return self.base.gauge(offsets[: self.spanned])
 
-    def point(self, direction: Array) -> Array:
-        return np.concatenate([self.base.point(direction[: self.spanned]), np.zeros(self.dimension - self.spanned)])
+    def far(self, direction: Sequence[arb]) -> list[arb]:
+        return [*self.base.far(direction[: self.spanned]), *balls(np.zeros(self.dimension - self.spanned))]
 
     def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:
         raise Broken("a disturbance is unbounded")

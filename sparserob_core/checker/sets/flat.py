@@ -34,8 +34,8 @@ class Flat(Shape):
         assert self.facets is not None
         return self.facets
 
-    def contains(self, point: Sequence[float] | Array) -> bool:
-        return all(bool(dot(c, point) <= b) for c, b in self.sides)
+    def holds(self, point: Sequence[arb]) -> bool:
+        return all(bool(along(c, point) <= b) for c, b in self.sides)
 
     @property
     def holding(self) -> list[Facet]:
@@ -247,12 +247,12 @@ class Segments(Flat):
                 found.setdefault(tuple(str(v / lead) for v in minors), [v / size for v in minors])
         return [tuple(Fraction(int(v.p), int(v.q)) for v in normal) for normal in found.values()]
 
-    def contains(self, point: Sequence[float] | Array) -> bool:
+    def holds(self, point: Sequence[arb]) -> bool:
         if self.facets is None:
             raise Unchecked(
                 "the checker cannot tell who is in a zonotope without an interior, or with very many facets"
             )
-        return super().contains(point)
+        return super().holds(point)
 
     def support(self, direction: Sequence[arb]) -> arb:
         heights = total(abs(along(g, direction)) for g in self.source.generators)

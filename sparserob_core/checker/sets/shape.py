@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from flint import arb
 
 PARALLEL = 1e-12  # of unit vectors: rows that differ by less are opposite ones
-INSIDE = 1.0 - 1e-14  # a point that is to be in a set is drawn inwards by rounding
+SPARE = 20  # bits of the working precision by which a point that is to be in a set is drawn inwards
 
 Facet: TypeAlias = "tuple[Array, arb]"
 """``c'x <= b`` as ``c (d,)``, exact numbers, and ``b``."""
@@ -43,8 +43,12 @@ class Shape(ABC):
         """``h(c)``, ``c`` a vector of balls ``(d,)``; raises `Broken` where the set is unbounded."""
 
     @abstractmethod
+    def holds(self, point: Sequence[arb]) -> bool:
+        """Whether a point is proven to be in the set, ``(d,)`` balls."""
+
     def contains(self, point: Sequence[float] | Array) -> bool:
         """Whether an exact point is proven to be in the set."""
+        return self.holds(balls(point))
 
     @abstractmethod
     def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:
@@ -118,14 +122,21 @@ class Shape(ABC):
         """How many times as large the set must be to reach ``centre + offsets``."""
         raise Unchecked(f"the checker cannot tell who is in a {self.source.kind}")
 
-    def point(self, direction: Array) -> Array:
-        """A point of the set far out in a direction, proven to be in it; the middle when nothing better is."""
-        middle, far, share = self.centre, self.source.support_point(direction[None])[0], INSIDE
-        while share > 0.5:
-            point: Array = middle + share * (far - middle)
-            if self.contains(point):
+    def far(self, direction: Sequence[arb]) -> list[arb]:
+        """What takes the centre to the point farthest out in a direction, nearly."""
+        raise Unchecked(f"the checker does not know how far a {self.source.kind} reaches")
+
+    def point(self, direction: Array) -> list[arb]:
+        """A point of the set far out in a direction, exact numbers, proven to be in it; the middle when nothing better
+        is. Floats would not do: in a thin set that is turned, a rounded point is far outside."""
+        from flint import arb, ctx
+
+        middle, far, spare = balls(self.centre), self.far(balls(direction)), arb(2) ** (SPARE - ctx.prec)
+        while spare < 0.5:
+            point = [(m + (1 - spare) * v).mid() for m, v in zip(middle, far, strict=True)]
+            if self.holds(point):
                 return point
-            share = 1.0 - 10.0 * (1.0 - share)
+            spare = spare * 1024
         return middle
 
     # All of them

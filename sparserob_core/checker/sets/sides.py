@@ -11,7 +11,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import below
 from sparserob_core.checker.outcome import RESOLVED, TOLERANCE, Unchecked
-from sparserob_core.checker.sets.shape import Shape, along, dot
+from sparserob_core.checker.sets.shape import Shape, along, dot, total
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -49,11 +49,11 @@ class Curved:
     normals: Array
     sums: Array
 
-    def bounded(self, z: Array, inside: Array) -> Bounded:
+    def bounded(self, z: Array, inside: Sequence[arb]) -> Bounded:
         """The constraint in one direction with a point ``inside`` the set as its limit. Its unit is the width of the
         set from its centre to there, so that an excess is judged along the gauge."""
         c = self.balls(z)
-        height, middle = along(inside, c), along(self.shape.centre, c)
+        height, middle = total(a * x for a, x in zip(c, inside, strict=True)), along(self.shape.centre, c)
         unit = max(0.0, below(height - middle))
         return self._row(z, below(height), unit)
 
