@@ -169,6 +169,20 @@ def test_help_and_lists_import_neither_scipy_nor_a_solver(arguments: list[str]) 
     assert not loaded & {"scipy", "qpsolvers", "piqp", "clarabel", "proxsuite", "rerun", "nevergrad", "matplotlib"}
 
 
+def test_a_small_run_imports_neither_an_optimiser_nor_the_checker_nor_what_draws(
+    repository: Path, tmp_path: Path
+) -> None:
+    arguments = [str(repository / "configs" / "experiment1_repaired.yaml"), "--no-figures", "--quiet"]
+    program = (
+        "import sys\nfrom sparserob_core.experiment.cli.main import _status\n"
+        f"assert _status(['run', *{arguments!r}, '--out', {str(tmp_path / 'run')!r}]) == 0\nprint(*sorted(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    assert "scipy.sparse" in loaded
+    assert not loaded & {"scipy.optimize", "piqp", "sparserob_core.checker", "matplotlib", "rich", "flint"}
+
+
 def test_a_reader_that_stops_reading_is_no_error(tmp_path: Path) -> None:
     done = subprocess.run(
         f"{sys.executable} -m sparserob_core plugins | head -n 1; exit ${{PIPESTATUS[0]}}",
