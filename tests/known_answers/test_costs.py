@@ -222,6 +222,14 @@ def test_thrust_as_one_vector_approaches_the_closed_form_of_the_double_integrato
     assert 0.0 < cost - (4.0 - np.sqrt(8.0)) < 5e-4
 
 
+def test_a_vector_acts_where_it_is_not_0_though_a_channel_may_be(tmp_path):
+    outcome = run({**PLANE, "initial_state": [2.0, 0.0, 0.0, 0.0], "control": {"box": 1.0}}, 8, tmp_path / "run")
+    certified(outcome)
+    assert np.abs(outcome.control[1]).max() <= 1e-9 < np.abs(outcome.control[0]).max()
+    acts = (outcome.control != 0.0).any(axis=0).mean()
+    assert outcome.result.activity.upper == pytest.approx(acts, abs=1e-12)
+
+
 TWO_GROUPS: dict[str, Any] = {  # three thrusters on a turning platform, the first two as one vector
     "name": "linear",
     "system": {

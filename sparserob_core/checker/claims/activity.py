@@ -30,9 +30,12 @@ Rows = list[tuple[float, Row]]
 
 
 def acted(case: Case) -> float:
-    """The share of time, weighted over the channels, that the certificate's control acts."""
+    """The share of time, weighted over the channels, that the certificate's control acts; every channel of a group
+    where one of them does."""
     values = np.asarray(case.control.values, dtype=float)
     acts = np.abs(case.theta @ values) > ROUNDED * (np.abs(case.theta) @ np.abs(values))
+    for block in case.price.blocks:
+        acts[block] = acts[block].any(axis=0)
     counts = _counts(case)
     return float(counts[acts].sum() / counts.sum())
 

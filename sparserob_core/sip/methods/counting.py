@@ -85,10 +85,13 @@ def acting(coefficients: Float[Array, "m n"], values: Float[Array, "n k"]) -> np
 
 
 def count(program: SemiInfiniteProgram, x: Array) -> float:
-    """The count of a decision ``x (n,)``, in the user's units."""
-    base = program.finite
+    """The count of a decision ``x (n,)``, in the user's units; all entries of a block count where one is not 0."""
+    base, blocks = program.finite, program.finite.blocks
     terms = np.abs(x) if base.S is None else abs(base.S) @ np.abs(x)
-    return math.fsum(prices_of(program)[np.abs(base.image(x)) > ROUNDED * terms])
+    acts = np.abs(base.image(x)) > ROUNDED * terms
+    if blocks is not None:
+        acts[blocks.entries] = (np.bincount(blocks.of, acts[blocks.entries]) > 0)[blocks.of]
+    return math.fsum(prices_of(program)[acts])
 
 
 def share_of(program: SemiInfiniteProgram, counted: float) -> float:
