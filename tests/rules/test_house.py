@@ -209,7 +209,7 @@ def test_importing_the_package_costs_little_more_than_numpy() -> None:
     assert not (HEAVY | {"pluggy", "pydantic", "ruamel", "click"}) & loaded_after("import sparserob_core")
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["plugins"], ["plugins", "piqp"]], ids=" ".join)
+@pytest.mark.parametrize("arguments", [["run", "--help"], ["plugins"], ["plugins", "piqp"]], ids=" ".join)
 def test_asking_for_help_or_plugins_loads_no_solver(arguments: list[str]) -> None:
     command = f"sys.argv = {['sparserob', *arguments]!r}; from sparserob_core.experiment.cli.main import main; main()"
     loaded = loaded_after(command)

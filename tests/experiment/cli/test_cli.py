@@ -158,17 +158,6 @@ def test_every_config_of_the_repository_fits_the_schema_also_when_resolved(repos
         validator.validate(loaded.config.plain())
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["plugins"], ["run", "--help"]])
-def test_help_and_lists_import_neither_scipy_nor_a_solver(arguments: list[str]) -> None:
-    program = (
-        "import sys\nfrom sparserob_core.experiment.cli.main import _status\n"
-        f"_status({arguments!r})\nprint('heavy:', *sorted(name for name in sys.modules if '.' not in name))"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    loaded = set(done.stdout.split("heavy:")[-1].split())
-    assert not loaded & {"scipy", "qpsolvers", "piqp", "clarabel", "proxsuite", "rerun", "nevergrad", "matplotlib"}
-
-
 def test_a_small_run_imports_neither_an_optimiser_nor_the_checker_nor_what_draws(
     repository: Path, tmp_path: Path
 ) -> None:
