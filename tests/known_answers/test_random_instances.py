@@ -1,5 +1,6 @@
-"""Guards answers on random problems: sets of every kind, parameters, equalities, unequal pieces, in any units, against
-programs that share no code with the package (tests/support/instances.py); and `check` of every fifth run.
+"""Guards answers on random problems: sets of every kind, parameters, equalities, unequal pieces, other costs, drift,
+delay and two modes, in any units, against programs that share no code with the package (tests/support/instances.py);
+and `check` of every fifth run.
 
 The instances are those of fixed numbers. ``SPARSEROB_INSTANCES`` is how many the second stage takes (300 unless given),
 ``SPARSEROB_FIRST_INSTANCE`` the number of the first.

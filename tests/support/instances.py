@@ -177,7 +177,10 @@ def _even(matrix: np.ndarray) -> list[list[float]]:
 @dataclass(frozen=True)
 class Instance:
     """``x' = (A + sum_k p_k slopes_k) x + B u + E w`` with ``|p_k| <= 1``, all sets about 0, the control and the
-    disturbance constant between ``edges``; ``x(0)`` anywhere in ``initial_state`` plus ``initial_set``."""
+    disturbance constant between ``edges``; ``x(0)`` anywhere in ``initial_state`` plus ``initial_set``.
+
+    ``drift (d,)`` is added to ``x'``. The control acts ``late`` pieces later, ``before (m,)`` until then. From the edge
+    of that number on, ``second`` gives other ``A``, ``B`` and drift."""
 
     A: np.ndarray
     B: np.ndarray
@@ -194,6 +197,16 @@ class Instance:
     dictionary: str = "piecewise_constant"
     initial_set: Shape | None = None
     charge: Charge | None = None
+    drift: np.ndarray | None = None
+    late: int = 0
+    before: np.ndarray | None = None
+    second: tuple[int, np.ndarray, np.ndarray, np.ndarray] | None = None
+
+    def mode(self, piece: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """``A``, ``B`` and the drift on a piece."""
+        if self.second is not None and piece >= self.second[0]:
+            return self.second[1:]
+        return self.A, self.B, np.zeros(len(self.A)) if self.drift is None else self.drift
 
     @property
     def price(self) -> np.ndarray:
@@ -238,22 +251,26 @@ class Sampled:
 
 def sample(problem: Instance, per_piece: int, parameter: np.ndarray) -> Sampled:
     """Step through the fine grid with the exact discretisation of one step."""
-    A = problem.A + sum(
-        (p * slope for p, slope in zip(parameter, problem.slopes, strict=True)), np.zeros_like(problem.A)
-    )
+    varied = sum((p * slope for p, slope in zip(parameter, problem.slopes, strict=True)), np.zeros_like(problem.A))
     (d, m), q, K = problem.B.shape, problem.E.shape[1], len(problem.edges) - 1
     steps = np.repeat(np.diff(problem.edges) / per_piece, per_piece)
     count = K * per_piece + 1
     free, response, noise = np.zeros((count, d)), np.zeros((count, d, m, K)), np.zeros((count, d, q, K))
     free[0], flow = problem.initial_state, np.broadcast_to(np.eye(d), (count, d, d)).copy()
     for j in range(count - 1):
+        piece = j // per_piece
         if j % per_piece == 0:
-            size = d + m + q
-            big = expm(steps[j] * np.vstack([np.hstack([A, problem.B, problem.E]), np.zeros((m + q, size))]))
-            Ad, Bd, Ed = big[:d, :d], big[:d, d : d + m], big[:d, d + m :]
-        free[j + 1], flow[j + 1] = Ad @ free[j], Ad @ flow[j]
+            A, B, c = problem.mode(piece)
+            size = d + m + q + 1
+            block = np.hstack([A + varied, B, problem.E, c[:, None]])
+            big = expm(steps[j] * np.vstack([block, np.zeros((size - d, size))]))
+            Ad, Bd, Ed, cd = big[:d, :d], big[:d, d : d + m], big[:d, d + m : -1], big[:d, -1]
+        free[j + 1], flow[j + 1] = Ad @ free[j] + cd, Ad @ flow[j]
         response[j + 1] = np.einsum("ij,jmk->imk", Ad, response[j])
-        response[j + 1, :, :, j // per_piece] += Bd
+        if piece >= problem.late:
+            response[j + 1, :, :, piece - problem.late] += Bd
+        elif problem.before is not None:
+            free[j + 1] += Bd @ problem.before
         noise[j + 1] = np.einsum("ij,jqk->iqk", Ad, noise[j])
         noise[j + 1, :, :, j // per_piece] += Ed
     times = np.concatenate([[0.0], np.cumsum(steps)])
@@ -265,8 +282,12 @@ def sample(problem: Instance, per_piece: int, parameter: np.ndarray) -> Sampled:
     both = deviations(problem, sampled, np.vstack([np.eye(d), -np.eye(d)]))
     deviation = np.maximum(both[:, :d], both[:, d:])
     farthest = np.abs(free) + np.abs(sampled.response) @ problem.bounds + deviation
-    inputs = np.abs(problem.B) @ problem.bounds[:: len(problem.edges) - 1] + np.abs(problem.E) @ w
-    curvature = np.abs(A @ A) @ farthest.max(axis=0) + np.abs(A) @ inputs
+    largest = problem.bounds[:: len(problem.edges) - 1]
+    largest = largest if problem.before is None else np.maximum(largest, np.abs(problem.before))
+    curvature = np.zeros(d)
+    for A, B, c in (problem.mode(0), problem.mode(K - 1)):
+        inputs, here = np.abs(B) @ largest + np.abs(problem.E) @ w + np.abs(c), A + varied
+        curvature = np.maximum(curvature, np.abs(here @ here) @ farthest.max(axis=0) + np.abs(here) @ inputs)
     return replace(sampled, sag=curvature * steps.max() ** 2 / 8)
 
 
@@ -512,18 +533,18 @@ class Units:
         return self.time * self.cost
 
 
-def config(problem: Instance, units: Units) -> dict[str, Any]:
-    """The instance in the user's units, as a config of the package."""
-    X, to = units.states[:, None], 1.0 / units.time
-    A = to * X * problem.A / units.states
-    system: dict[str, Any] = {"A": A.tolist(), "B": (to * X * problem.B / units.controls).tolist()}
+def _system(problem: Instance, units: Units, mode: tuple[np.ndarray, np.ndarray, np.ndarray]) -> dict[str, Any]:
+    """One mode in the user's units."""
+    X, to, d = units.states[:, None], 1.0 / units.time, len(problem.A)
+    A = to * X * mode[0] / units.states
+    system: dict[str, Any] = {"A": A.tolist(), "B": (to * X * mode[1] / units.controls).tolist()}
     if problem.disturbance is not None:
         system["E"] = (to * X * problem.E / units.disturbances).tolist()
+    if mode[2].any():
+        system["c"] = (to * units.states * mode[2]).tolist()
     if problem.slopes:
         sides = units.parameters[: len(problem.slopes)]
         slopes = [to * X * s / units.states / side for s, side in zip(problem.slopes, sides, strict=True)]
-        system["parameters"] = {f"p{k}": [-float(side), float(side)] for k, side in enumerate(sides)}
-        d = len(A)
         system["A"] = [
             [
                 repr(float(A[i, j])) + "".join(f" + ({float(s[i, j])!r})*p{k}" for k, s in enumerate(slopes))
@@ -531,6 +552,21 @@ def config(problem: Instance, units: Units) -> dict[str, Any]:
             ]
             for i in range(d)
         ]
+    return system
+
+
+def config(problem: Instance, units: Units) -> dict[str, Any]:
+    """The instance in the user's units, as a config of the package."""
+    system = _system(problem, units, problem.mode(0))
+    if problem.second is not None:
+        until = problem.edges[[problem.second[0], -1]] * units.time
+        modes = (system, _system(problem, units, problem.second[1:]))
+        system = {"pieces": [{"until": float(t), **one} for t, one in zip(until, modes, strict=True)]}
+    if problem.slopes:
+        sides = units.parameters[: len(problem.slopes)]
+        system["parameters"] = {f"p{k}": [-float(side), float(side)] for k, side in enumerate(sides)}
+    if problem.late:
+        system["delay"] = float(problem.edges[problem.late] * units.time)
     horizon = float(problem.edges[-1] * units.time)
     equal = problem.edges.size < 3 or np.ptp(np.diff(problem.edges)) < 1e-12
     pieces = {"name": "piecewise_constant", "pieces": problem.edges.size - 1}
@@ -559,6 +595,8 @@ def config(problem: Instance, units: Units) -> dict[str, Any]:
     }
     if problem.charge is not None:
         stated["cost"] = problem.charge.config(units)
+    if problem.before is not None:
+        stated["initial_control"] = (problem.before * units.controls).tolist()
     if problem.disturbance is not None:
         stated["disturbance"] = problem.disturbance.config(units.disturbances, units.rows)
     control = pieces if problem.dictionary == "piecewise_constant" else {**pieces, "name": problem.dictionary}
@@ -682,7 +720,8 @@ def on_the_boundary(rng: np.random.Generator, share: float) -> Instance | None:
 
 def instance(seed: int) -> tuple[Instance, Units]:
     """Number ``seed``: every tenth one on the boundary, feasible or infeasible by 1e-6; every third of the others from
-    a set of initial states, and every fourth with another cost than the L1 norm."""
+    a set of initial states, every fourth with another cost than the L1 norm, and of the others every sixth with what
+    `in_time` draws."""
     rng = np.random.default_rng(seed)
     problem = on_the_boundary(rng, 1e-6 if seed % 20 else -1e-6) if seed % 10 == 0 else None
     problem = problem if problem is not None else drawn(rng)
@@ -698,6 +737,8 @@ def instance(seed: int) -> tuple[Instance, Units]:
             m = len(problem.weights)
             problem = replace(problem, weights=np.full(m, problem.weights[0]))
             units = replace(units, controls=np.full(m, units.controls[0]))
+    if seed % 6 == 2 and seed % 10 and problem.ends_at is None and problem.charge is None:
+        problem = in_time(np.random.default_rng([seed, 3]), problem)
     return problem, units
 
 
@@ -712,3 +753,16 @@ def charge(rng: np.random.Generator, d: int, m: int) -> Charge:
     plain = not (found.Q.size or found.R.size or found.final.size)
     l1 = float(rng.choice([0.2, 1.0, 3.0] if plain else [0.0, 0.2, 1.0, 3.0]))
     return replace(found, l1=l1, grouped=bool(l1 and m > 1 and rng.random() < 0.5))
+
+
+def in_time(rng: np.random.Generator, problem: Instance) -> Instance:
+    """The same with a drift, a delay of whole pieces where these are equal, and a second mode, each or not."""
+    (d, m), K = problem.B.shape, len(problem.edges) - 1
+    if rng.random() < 0.6:
+        problem = replace(problem, drift=rng.normal(size=d) * 0.03)
+    if rng.random() < 0.5 and np.ptp(np.diff(problem.edges)) < 1e-12:
+        problem = replace(problem, late=int(rng.integers(1, max(2, K // 3))), before=rng.normal(size=m) * 0.1)
+    if rng.random() < 0.6:
+        A, B = problem.A + 0.2 * rng.normal(size=(d, d)), problem.B * rng.uniform(0.7, 1.4)
+        problem = replace(problem, second=(int(rng.integers(1, K)), A, B, rng.normal(size=d) * 0.02))
+    return problem
