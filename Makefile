@@ -36,7 +36,7 @@ help:
 	@echo "make test-slow   the second stage: larger instances of what the first one tests"
 	@echo "make bench       time the certified solve, and solvers and maximisers beside other people's"
 	@echo "make docs        write the reference and the schema anew, and build the site (minutes, the first time)"
-	@echo "make docs-pictures  the pictures of docs/live.md anew (minutes; needs a Vulkan driver, no display)"
+	@echo "make docs-pictures  the pictures of docs/gallery.md and docs/live.md anew (minutes; needs a Vulkan driver, no display)"
 	@echo "make install     set up $(VENV) with everything, whatever is there of it"
 	@echo "make clean       remove $(VENV) and every cache"
 
@@ -95,6 +95,7 @@ docs: $(WRITERS)
 	@echo "the site is site/html/index.html"
 
 docs-pictures: $(INSTALLED)
+	$(BIN)/python docs/build_gallery.py
 	$(BIN)/python docs/build_pictures.py
 
 clean:
