@@ -32,8 +32,10 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as place:
         for name, figures in STORIES.items():
             click.echo(name)
-            command = [sys.executable, "-m", "sparserob_core", "run", f"configs/{name}.yaml", "--out", f"{place}/{name}"]
-            done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+            run = ["run", f"configs/{name}.yaml", "--out", f"{place}/{name}"]
+            done = subprocess.run(
+                [sys.executable, "-m", "sparserob_core", *run], cwd=ROOT, capture_output=True, text=True, check=False
+            )
             if done.returncode:
                 click.echo(done.stdout + done.stderr, err=True)
                 return 1
