@@ -217,6 +217,7 @@ def test_another_unit_of_time_gives_the_same_horizons_to_the_last_bit(unit: floa
     [
         ({"system": {**RATE["system"], "delay": 0.1}}, {}, "a delay is no share of the horizon"),
         ({"path": [{"box": [3], "from": 0, "to": 3}]}, {}, "a window that lasts until the horizon, 4"),
+        ({"disturbance": {"box": 0.1}}, {"policy": {"name": "affine"}}, "open_loop for the margin of the horizon"),
         (
             {},
             {"dictionaries": {"control": {"name": "walsh", "pieces": 8, "functions": 3}}},
