@@ -4,7 +4,7 @@ between them."""
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -13,6 +13,7 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.finite import FiniteProgram
 from sparserob_core.sip.inner.duality import dual_bound
+from sparserob_core.sip.inner.vertex import simplex
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
 from sparserob_core.sip.relaxed.relaxed import Rows
 
@@ -99,6 +100,14 @@ def least_of(base: FiniteProgram, G: Array, h: Array) -> Array:
         )
         least[i] = dual_bound(single, zero, zero) - h[i]
     return least
+
+
+def least_within(base: FiniteProgram, row: Array) -> float:
+    """A proven lower bound of ``g'x`` over the bounds and the rows of the program, by the multipliers of a linear
+    program; ``-inf`` where that is not solved."""
+    alone = replace(base, q=row, weights=np.zeros_like(base.weights), P=None, constant=0.0, blocks=None)
+    corner = simplex(alone)
+    return dual_bound(alone, corner.y, corner.mu, corner.z) if corner.status == "optimal" else -np.inf
 
 
 def _looked_at(family: ConstraintFamily) -> Array:

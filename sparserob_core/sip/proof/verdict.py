@@ -18,7 +18,7 @@ from sparserob_core.sip.program import (
     WorstConstraint,
     told_apart,
 )
-from sparserob_core.sip.proof.reasons import least_of, reasons, sentence
+from sparserob_core.sip.proof.reasons import least_of, least_within, reasons, sentence
 from sparserob_core.sip.relaxed.relaxed import Rows
 from sparserob_core.sip.result import MEANING, Status
 
@@ -99,10 +99,12 @@ def infeasible_subsystem(
     active = np.flatnonzero(multipliers > 0)
     if active.size == 1 and not equalities and (program.finite.S is not None or not found) and len(found) < 2:
         i = int(active[0])
-        # Farkas multipliers say more where the decision has more than bounds of its own (a polytope of controls)
+        # more is known where the decision has more than bounds of its own (a polytope of controls): by Farkas'
+        # multipliers, or by a linear program in which nothing but this row counts
         norms = np.linalg.norm(np.vstack([program.finite.G, rows.G]), axis=1)
         farkas = amount * float(y @ norms / multipliers[i])
-        alone = max(float(least_of(program.finite, rows.G[[i]], rows.h[[i]])[0]), farkas)
+        known = float(least_of(program.finite, rows.G[[i]], rows.h[[i]])[0])
+        alone = max(known, farkas, least_within(program.finite, rows.G[i]) - float(rows.h[i]))
         if alone > max((reason.amount for reason in found), default=0.0):
             family = program.family(rows.cuts[i].family)
             text = sentence("out of reach", family, rows.take(np.array([i])), np.ones(1), alone)
@@ -128,7 +130,9 @@ def _together(
     share = 1.0 / y.max()
     y, weights = y * share, multipliers * share  # of rows in the user's units, and in their own
     asked = -float(weights[order] @ rows.h[order])
-    missing = float(least_of(program.finite, (weights[order] @ rows.G[order])[None], np.array([-asked]))[0])
+    together = weights[order] @ rows.G[order]
+    known = float(least_of(program.finite, together[None], np.array([-asked]))[0])
+    missing = max(known, least_within(program.finite, together) + asked)
     demand, decides = "", told[0].decides
     if missing > 0 and asked > 0:
         more, less = told_apart(asked, asked - missing)

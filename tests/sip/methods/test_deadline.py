@@ -225,6 +225,19 @@ def test_a_decision_that_misses_a_bound_by_more_than_its_own_tolerance_is_no_ans
         assert result.status in ("infeasible", "failed"), f"{factor}: {result.message}"
 
 
+def test_what_a_polytope_of_controls_can_give_is_told_exactly():
+    problem = sr.OptimalControlProblem(
+        system=sr.LinearSystem([[0.0]], [[1.0, 1.0]]),
+        horizon=1.0,
+        initial_state=[0.0],
+        control=sr.Polytope([[1, 1], [-1, 0], [0, -1], [1, 0], [0, 1]], [0.5, 1, 1, 1, 1]),
+        terminal=[sr.Box([0.6], [2.0])],
+    )
+    result = sr.solve(problem, control={"name": "piecewise_constant", "pieces": 4})
+    assert result.status == "infeasible"
+    assert "the control can raise x1(1) by at most 0.5, and 0.6 is needed" in result.message
+
+
 def test_the_gap_is_relative_to_the_cost_or_a_millionth_of_the_largest_possible_one():
     assert relative_gap(0.0, 0.0, 5.0) == 0.0
     assert relative_gap(1.0, 2.0, 5.0) == 0.5
