@@ -137,3 +137,17 @@ def test_units_do_not_change_it(tmp_path: Path) -> None:
     scaled = integrator([1024.0], {"box": {"lower": [-512.0], "upper": [1024.0]}}, terminal=[{"box": [102.4]}])
     _, other = solved(scaled, 20, tmp_path / "other")
     assert one == other
+
+
+def test_channels_that_are_one_vector_act_together(tmp_path: Path) -> None:
+    """A way of 1 at a speed of at most 1 along (0.6, 0.8): a vector of thrust acts for 1 of 2, whatever its axes."""
+    problem = integrator([0.6, 0.8], {"norm": {"p": 2, "radius": 1.0}}, terminal=[{"equals": [0, 0]}])
+    outcome, interval = solved({**problem, "cost": {"group": "all"}}, 20, tmp_path / "run")
+    assert outcome.result.cost == pytest.approx(1.0, rel=1e-7)
+    assert interval["lower"] == pytest.approx(0.5, abs=1e-12)
+    assert interval["upper"] >= 0.5
+    boxed = integrator([0.6, 0.8], {"box": 1.0}, terminal=[{"equals": [0, 0]}], cost={"group": "all"})
+    _, interval = solved(boxed, 20, tmp_path / "boxed")
+    assert 1.0 / np.sqrt(8.0) <= interval["lower"] <= 0.4 + 1e-12 <= interval["upper"] + 2e-12
+    with pytest.raises(sr.InputError, match="without groups"):
+        solved({**problem, "cost": {"group": "all"}}, 20, tmp_path / "refused", method={"name": "sparsest"})

@@ -18,6 +18,7 @@ from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.claims.duality import Row
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.sets.known import known
+from sparserob_core.control.sets.curved import NormBall
 
 if TYPE_CHECKING:
     from flint import arb
@@ -30,11 +31,10 @@ Rows = list[tuple[float, Row]]
 
 
 def acted(case: Case) -> float:
-    """The share of time, weighted over the channels, that the certificate's control acts; every channel of a group
-    where one of them does."""
+    """The share of time, weighted over the channels, that the certificate's control acts."""
     values = np.asarray(case.control.values, dtype=float)
     acts = np.abs(case.theta @ values) > ROUNDED * (np.abs(case.theta) @ np.abs(values))
-    for block in case.price.blocks:
+    for block in case.price.blocks:  # channels that make one vector act together
         acts[block] = acts[block].any(axis=0)
     counts = _counts(case)
     return float(counts[acts].sum() / counts.sum())
@@ -60,7 +60,41 @@ def least(case: Case, rows: Rows, pieces: Sequence[Sequence[float]] | None) -> f
     for count, slope in zip(counts, slopes, strict=True):
         case.clock.check()
         total = total + _least(case, ranges, count, slope)
-    table = _counts(case)
+    return _whole(case, total)
+
+
+def least_of_cost(case: Case, cost: arb) -> float:
+    """The share below which no admissible control acts, where none costs less than ``cost``: a vector of channels that
+    is not 0 costs at most its weight times the longest that it can be."""
+    from flint import arb
+
+    factors = [
+        arb(len(block)) / (arb(case.problem.cost.l1) * _longest(case, block))
+        for block in case.price.blocks
+        if _longest(case, block) > 0
+    ]
+    if not factors:
+        return 0.0
+    return _whole(case, cost * reduce(lambda one, other: one.min(other), factors))
+
+
+def _longest(case: Case, block: Sequence[int]) -> arb:
+    """At least how long the vector of some channels can be."""
+    from flint import arb
+
+    bound, ranges = case.problem.control, _ranges(case)
+    reach = [abs(ranges[i][0]).max(abs(ranges[i][1])) for i in block]
+    size = sum((r * r for r in reach), arb(0)).sqrt()
+    if isinstance(bound, NormBall) and bound.p == 2.0:
+        middle = sum((arb(float(bound.centre[i])) ** 2 for i in block), arb(0)).sqrt()
+        size = size.min(arb(bound.radius) + middle)
+    return size
+
+
+def _whole(case: Case, total: arb) -> float:
+    """A bound of the time of action as a share of the largest, rounded up where all that counts, counts the same."""
+    counts = _counts(case)
+    table = np.array([counts[block].sum(axis=0) for block in case.price.blocks])
     bound = float(np.nextafter(float(total.lower()), -np.inf))
     if np.ptp(table) <= EQUAL * table.max():
         one = float(table.mean())

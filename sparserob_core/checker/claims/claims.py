@@ -227,10 +227,12 @@ def _fewest(case: Case, status: str) -> str:
         if not 0.0 <= written <= min(derived, acted if proven else np.inf) + FIGURES:
             raise Broken(f"lower is {written!r}, the leaves prove {derived!r}")
         return f"no admissible control acts for a share of time below {written:.6g}"
-    rows, pieces = _weighted(case, case.certificate.get("multipliers") if own is None else own)
-    if own is None:
-        rows, pieces = activity.shared(case, rows, pieces)
-    derived = activity.least(case, rows, pieces)
+    if own is None and case.problem.cost.blocks and not case.problem.cost.is_quadratic:
+        derived = activity.least_of_cost(case, _multiplied(case, priced=True))
+    else:
+        rows, pieces = _weighted(case, case.certificate.get("multipliers") if own is None else own)
+        rows, pieces = activity.shared(case, rows, pieces) if own is None else (rows, pieces)
+        derived = activity.least(case, rows, pieces)
     if not 0.0 <= written <= derived + FIGURES or (proven and written > acted + FIGURES):
         raise Broken(f"lower is {written!r}, the multipliers prove {derived!r}")
     below = f"no admissible control acts for a share of time below {written:.6g}"

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from sparserob_core.control.sets.curved import NormBall
+from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.control.transcription.rounding import rounded_down
 from sparserob_core.experiment.assemble import ControlExperiment
 from sparserob_core.sip.evidence import Activity
@@ -38,7 +41,7 @@ def with_activity(experiment: ControlExperiment, result: Result, tools: Tools) -
         return replace(result, activity=Activity(_share(program, result.lower_bound) or 0.0, upper, norm=norm))
     # the number of a sample tells nobody else
     told = result.sparsest is None and all(cut.formulation != "sampled" for cut in result.dual.cuts)
-    factor = multiple(program) if told else None
+    factor = _factor(experiment) if told else None
     least = -np.inf if factor is None else _safe(program, factor * result.lower_bound)
     most, other = count(program, np.asarray(result.decision)) if proven else np.inf, None
     if factor is None or (proven and not is_vertex(program, result)):
@@ -52,6 +55,28 @@ def with_activity(experiment: ControlExperiment, result: Result, tools: Tools) -
         activity = replace(activity, upper=_share(program, most), decision=other.decision, proofs=other.proofs)
     lower = activity.lower if activity.upper is None else min(activity.lower, activity.upper)
     return replace(result, activity=replace(activity, lower=lower))
+
+
+def _factor(experiment: ControlExperiment) -> float | None:
+    """The count is at least this times the cost; with vectors of channels that act together by the longest that each
+    can be, for ``[u != 0] >= |u| / max |u|``. ``None`` where the cost says nothing."""
+    program, cost = experiment.program, experiment.problem.cost
+    if program.finite.blocks is None or cost.is_quadratic or not cost.l1:
+        return multiple(program)
+    channels = experiment.problem.system.controls
+    taken = {channel for block in cost.blocks for channel in block}
+    groups = [*cost.blocks, *((channel,) for channel in range(channels) if channel not in taken)]
+    lengths = [longest(experiment.problem.control, group) for group in groups]
+    shares = [len(group) / (cost.l1 * size) for group, size in zip(groups, lengths, strict=True) if size > 0.0]
+    return min(shares) * (1.0 - INWARDS) if shares else None
+
+
+def longest(bound: ConvexSet, channels: Sequence[int]) -> float:
+    """At least how long the vector of some channels can be: exact for a box and for a Euclidean ball."""
+    reach = float(np.linalg.norm(bound.reach(np.eye(bound.dimension))[list(channels)]))
+    if isinstance(bound, NormBall) and bound.p == 2.0:
+        return min(reach, bound.radius + float(np.linalg.norm(bound.centre[list(channels)])))
+    return reach
 
 
 def _safe(program: SemiInfiniteProgram, least: float) -> float:

@@ -7,8 +7,12 @@ lemma, evaluated by `inner.duality`; whoever doubts the tree follows it with the
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Sequence
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -223,14 +227,33 @@ def proposed(program: SemiInfiniteProgram, relaxed: RelaxedProgram, rows: Rows, 
         for part, low, high in plain
         if part.shape[0]
     ]
-    found = milp(
-        np.concatenate([np.zeros(n), cost]),
-        constraints=couplings,
-        integrality=np.concatenate([np.zeros(n), np.ones(count)]),
-        bounds=Bounds(np.repeat([-np.inf, 0.0], [n, count]), np.repeat([np.inf, 1.0], [n, count])),
-        options={"time_limit": SECONDS if left is None else min(SECONDS, left)},
-    )
+    with _silent():
+        found = milp(
+            np.concatenate([np.zeros(n), cost]),
+            constraints=couplings,
+            integrality=np.concatenate([np.zeros(n), np.ones(count)]),
+            bounds=Bounds(np.repeat([-np.inf, 0.0], [n, count]), np.repeat([np.inf, 1.0], [n, count])),
+            options={"time_limit": SECONDS if left is None else min(SECONDS, left)},
+        )
     return None if found.x is None else np.asarray(found.x[:n])
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Nothing of what is written to the standard output meanwhile: HiGHS leaves remarks there, whatever it is told."""
+    try:
+        sys.stdout.flush()
+        kept = os.dup(1)
+    except (OSError, AttributeError, ValueError):  # there is none
+        yield
+        return
+    try:
+        with Path(os.devnull).open("wb") as nowhere:
+            os.dup2(nowhere.fileno(), 1)
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
 
 
 def _off_or_on(S: Any, finite: FiniteProgram, prices: Array) -> tuple[Array, list[Any]]:

@@ -85,18 +85,31 @@ def acting(coefficients: Float[Array, "m n"], values: Float[Array, "n k"]) -> np
 
 
 def count(program: SemiInfiniteProgram, x: Array) -> float:
-    """The count of a decision ``x (n,)``, in the user's units; all entries of a block count where one is not 0."""
-    base, blocks = program.finite, program.finite.blocks
+    """The count of a decision ``x (n,)``, in the user's units: entries that make one vector count together."""
+    base = program.finite
     terms = np.abs(x) if base.S is None else abs(base.S) @ np.abs(x)
     acts = np.abs(base.image(x)) > ROUNDED * terms
-    if blocks is not None:
-        acts[blocks.entries] = (np.bincount(blocks.of, acts[blocks.entries]) > 0)[blocks.of]
-    return math.fsum(prices_of(program)[acts])
+    return math.fsum(together(program)[np.unique(_numbers(program)[acts & (prices_of(program) > 0.0)])])
+
+
+def together(program: SemiInfiniteProgram) -> Array:
+    """What counts together, ``(g,)``: every block of entries, and every entry that counts alone; 0 where none does."""
+    return np.asarray(np.bincount(_numbers(program), prices_of(program)), dtype=float)
+
+
+def _numbers(program: SemiInfiniteProgram) -> np.ndarray:
+    """With which others each image counts, ``(k,)``."""
+    alone, blocks = np.arange(program.finite.weights.size), program.finite.blocks
+    if blocks is None:
+        return alone
+    first = np.full(int(blocks.number.max(initial=-1)) + 1, -1)
+    first[blocks.number[blocks.first]] = blocks.first
+    return np.asarray(np.where(blocks.number >= 0, first[blocks.number], alone))
 
 
 def share_of(program: SemiInfiniteProgram, counted: float) -> float:
     """What a count is of the largest."""
-    prices = prices_of(program)
+    prices = together(program)
     prices = prices[prices > 0.0]
     one = _one(prices)
     return float(np.rint(counted / one) / prices.size if one else counted / math.fsum(prices))
@@ -105,11 +118,11 @@ def share_of(program: SemiInfiniteProgram, counted: float) -> float:
 def whole(program: SemiInfiniteProgram, least: float) -> float:
     """The least count that is at least ``least`` but for rounding, where all that count, count the same: a whole number
     of them. ``least`` itself otherwise."""
-    prices = prices_of(program)
+    prices = together(program)
     one = _one(prices[prices > 0.0])
-    return (
-        float(min(np.count_nonzero(prices), max(0.0, np.ceil(least / one - MISSED)))) * one if one else max(0.0, least)
-    )
+    if not one:
+        return max(0.0, least)
+    return float(min(np.count_nonzero(prices), max(0.0, np.ceil(least / one - MISSED)))) * one
 
 
 def _one(prices: Array) -> float:

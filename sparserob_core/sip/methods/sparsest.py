@@ -70,6 +70,8 @@ class SparsestMethod(Method, Options):
 
     def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
         started = time.perf_counter()
+        if program.finite.blocks is not None:
+            raise InputError("method: sparsest counts channels one by one; expected a cost without groups")
         if program.activity is None or program.n != program.activity.size:
             raise InputError(
                 "method: sparsest counts pieces, for which a control needs a function per piece; expected a dictionary"
