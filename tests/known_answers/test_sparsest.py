@@ -233,3 +233,12 @@ def test_a_time_of_action_is_not_compared_with_a_cost(tmp_path: Path) -> None:
     with pytest.raises(sr.InputError, match="runs whose costs mean the same"):
         sr.compare([tmp_path / "sparsest", tmp_path / "exchange"])
     assert sr.compare([tmp_path / "sparsest"]).exact == pytest.approx(0.9)
+
+
+def test_what_no_control_can_do_is_proven_and_checked(tmp_path: Path) -> None:
+    impossible = {**SPRING, "disturbance": {"box": [0.3, 0.3]}}
+    for method in (SPARSEST, LETTERS):
+        where = tmp_path / str(len(str(method)))
+        outcome, interval = solved(impossible, 20, where, **method)
+        assert (outcome.status, interval) == ("infeasible", None)
+        assert result_of(where)["cost_scale"] == pytest.approx(5.0)

@@ -79,7 +79,9 @@ class SparsestMethod(Method, Options):
             )
         bounded, letters = self._bounded(program)
         plain = self._plain(program, tools)
-        if plain is not None and (plain.status == "infeasible" or plain.decision is None):
+        if plain is not None and plain.status == "infeasible":
+            return _none(program, plain, ())
+        if plain is not None and plain.decision is None:
             return plain
         state = _Search(self, program, bounded, tools, letters, plain)
         root = state.root()
@@ -167,12 +169,9 @@ class _Search:
         method = Exchange(tolerance=self.method.tolerance, rounds=self.method.rounds)
         result = method.close(below.program, tools, lambda x: (), imposed_cuts(self.rows.cuts))
         if result.status == "infeasible":
-            if self.letters is None:
-                return result
-            leaf, letters = Leaf(result.dual, feasible=False), tuple(self.method.alphabet or ())
-            alone = Sparsest(np.nan, None, None, (leaf,), letters)
-            said = f"no control with values in {list(letters)}: {result.message}"
-            return replace(result, message=said, sparsest=alone)
+            letters = tuple(self.method.alphabet or ())
+            said = f"no control with values in {list(letters)}: {result.message}" if letters else result.message
+            return _none(self.program, replace(result, message=said), letters)
         self._keep([*result.indices, *result.dual.cuts])
         self.rounds = list(result.history)
         self.tree = Branching(self.bounded, self.relaxed, self.rows, self.letters, tuple(self.method.alphabet or ()))
@@ -354,6 +353,12 @@ class _Search:
             seconds=seconds,
             cost_scale=total / unit,
         )
+
+
+def _none(program: SemiInfiniteProgram, result: Result, letters: Sequence[float]) -> Result:
+    """The result where nothing is feasible, by one set of multipliers: a tree of one leaf."""
+    tree = Sparsest(np.nan, None, None, (Leaf(result.dual, feasible=False),), letters or None)
+    return replace(result, sparsest=tree, cost_scale=float(prices_of(program).sum()) / program.cost_unit)
 
 
 def _identity(size: int) -> object:
