@@ -295,6 +295,10 @@ def test_a_piece_that_is_changed_afterwards_is_found_by_what_it_does(
         ({"pieces": [{"until": 5, **FIRST, "c": [1, "q"]}]}, r"system\.pieces\.0\.c\.1: .*unknown name"),
         ({"pieces": [{"until": 5, **FIRST, "delay": 1}]}, r"system\.pieces\.0\.delay: unknown key"),
         ({"pieces": []}, r"system\.pieces: "),
+        (
+            {"pieces": [{"until": 2, **FIRST}, {"until": 2 + 1e-13, **SECOND}, {"until": 5, **FIRST}]},
+            r"system\.pieces\.1\.until: expected a time that is after 2 by more than rounding",
+        ),
     ],
 )
 def test_wrong_pieces_are_named_with_their_key(system: dict[str, Any], said: str) -> None:

@@ -139,6 +139,15 @@ class OptimalControlProblem:
 
     def _check_pieces(self, system: SwitchedSystem) -> None:
         last = len(system.pieces) - 1
+        begin = 0.0
+        for i, (until, _) in enumerate(system.pieces):
+            if until - begin <= SHORTEST * self.horizon:
+                raise InputError(
+                    path=f"system.pieces.{i}.until",
+                    expected=f"a time that is after {begin:g} by more than rounding",
+                    got=f"{until!r}",
+                )
+            begin = until
         if abs(system.pieces[last][0] - self.horizon) > SHORTEST * self.horizon:
             raise InputError(
                 path=f"system.pieces.{last}.until",

@@ -216,6 +216,8 @@ class LinearSystem:
             given = _AsColumn(given)
         elif not callable(given):
             array = np.asarray(given, dtype=object)
+            if array.ndim == 0:
+                raise InputError(path="system.c", expected=f"{d} numbers, one per state", got=f"{given!r}")
             given = array[:, None].tolist() if array.ndim == 1 else given
         object.__setattr__(self, "c", self._matrix("c", given))
         if self._shape("c") != (d, 1):
