@@ -19,7 +19,7 @@ from sparserob_core.sip.program import ConstraintFamily, Enclosure, Explanation,
 
 KEPT = 12  # separated times for each row and round
 ZOOMED, ZOOMS, CLOSER = 9, 14, 4.0  # samples around a maximum, and how often they are drawn so many times closer
-BEGUN = 6  # times of a window that a method begins with
+BEGUN = 20  # times of a window that a method begins with
 STATES = 60_000_000  # numbers in the states that are sampled at once
 
 
