@@ -180,7 +180,10 @@ class Instance:
     disturbance constant between ``edges``; ``x(0)`` anywhere in ``initial_state`` plus ``initial_set``.
 
     ``drift (d,)`` is added to ``x'``. The control acts ``late`` pieces later, ``before (m,)`` until then. From the edge
-    of that number on, ``second`` gives other ``A``, ``B`` and drift."""
+    of that number on, ``second`` gives other ``A``, ``B`` and drift.
+
+    ``reference (q, 1 + d)``: where the set of the path is about, with kinks at edges. ``mixed``: ``H x + G u <= h`` in
+    a window from and to the middle of a piece. ``step``: the set of every ``u_{k+1} - u_k``, and of ``u_0`` itself."""
 
     A: np.ndarray
     B: np.ndarray
@@ -201,6 +204,9 @@ class Instance:
     late: int = 0
     before: np.ndarray | None = None
     second: tuple[int, np.ndarray, np.ndarray, np.ndarray] | None = None
+    reference: np.ndarray | None = None
+    mixed: tuple[np.ndarray, np.ndarray, np.ndarray, float, float] | None = None
+    step: Shape | None = None
 
     def mode(self, piece: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """``A``, ``B`` and the drift on a piece."""
@@ -321,21 +327,48 @@ def path_rows(problem: Instance, sampled: Sampled, tight: bool, spare: float) ->
         if tight:  # with one more time on either side, the chords cover the whole window
             first, last = np.searchsorted(times, [start, stop], side="right")
             inside = np.arange(max(first - 1, 0), min(last + 1, len(times)))
-        path.append(rows(shape, inside, sampled.sag if tight else 0 * sampled.sag))
+        G, room = rows(shape, inside, sampled.sag if tight else 0 * sampled.sag)
+        if problem.reference is not None:
+            at, *points = problem.reference.T
+            moved = np.stack([np.interp(times[inside], at, column) for column in points], axis=1)
+            room = room + (moved @ shape.rows()[0].T).ravel()
+        path.append((G, room))
+    if problem.mixed is not None:
+        path += mixed_rows(problem, sampled, sampled.sag if tight else 0 * sampled.sag, spare)
     last = np.array([len(times) - 1])
     end += [rows(shape, last, 0 * sampled.sag) for shape in problem.terminal]
     return tuple(tuple(np.concatenate(part) for part in zip(*some, strict=True)) for some in (path, end))  # type: ignore[return-value]
 
 
+def mixed_rows(problem: Instance, sampled: Sampled, sag: np.ndarray, spare: float) -> list[Rows]:
+    """Rows of the bounds of state and control together, piece by piece; both ends of a piece are looked at with its own
+    control."""
+    assert problem.mixed is not None
+    H, own, h, start, stop = problem.mixed
+    found, times, K = [], sampled.times, len(problem.edges) - 1
+    for k in range(K):
+        low, high = max(start, problem.edges[k]), min(stop, problem.edges[k + 1])
+        which = np.flatnonzero((times >= low - 1e-9) & (times <= high + 1e-9)) if low < high else np.zeros(0, dtype=int)
+        G = np.einsum("rd,jdk->jrk", H, sampled.response[which]) + np.kron(own, np.eye(K)[k])
+        room = h * (1 - spare) - np.abs(H) @ sag - sampled.free[which] @ H.T - deviations(problem, sampled, H)[which]
+        found.append((G.reshape(-1, G.shape[2]), room.ravel()))
+    return found
+
+
 def control_rows(problem: Instance, tight: bool) -> Rows:
-    """Rows ``G u <= h`` of the set of controls, piece by piece."""
+    """Rows ``G u <= h`` of the set of controls, piece by piece, and of the set of their steps."""
     m, K = len(problem.weights), len(problem.edges) - 1
     H, h, inside = problem.control.rows()
     slanted = (H != 0).sum(axis=1) > 1  # the others are bounds
     H, h = H[slanted], h[slanted]
-    return np.vstack([np.kron(H, np.eye(K)[k]) for k in range(K)]).reshape(-1, m * K), np.tile(
-        h * (inside if tight else 1.0), K
-    )
+    rows = np.vstack([np.kron(H, np.eye(K)[k]) for k in range(K)]).reshape(-1, m * K)
+    limits = np.tile(h * (inside if tight else 1.0), K)
+    if problem.step is None:
+        return rows, limits
+    H, h, inside = problem.step.rows()
+    steps = np.eye(K) - np.eye(K, k=-1)  # the first is from 0
+    rows = np.vstack([rows, *(np.kron(H, steps[k]) for k in range(K))])
+    return rows, np.append(limits, np.tile(h * (inside if tight else 1.0), K))
 
 
 def nominal(shape: Shape | None, size: int) -> np.ndarray:
@@ -555,6 +588,28 @@ def _system(problem: Instance, units: Units, mode: tuple[np.ndarray, np.ndarray,
     return system
 
 
+def control_config(problem: Instance, units: Units) -> dict[str, Any]:
+    """What is said of the control beside its set, in the user's units."""
+    if problem.step is not None:
+        return {"control_step": problem.step.config(units.controls, None), "initial_control": 0.0}
+    return {} if problem.before is None else {"initial_control": (problem.before * units.controls).tolist()}
+
+
+def path_config(problem: Instance, units: Units, horizon: float) -> list[dict[str, Any]]:
+    """The entries of the path in the user's units."""
+    windows: list[dict[str, Any]] = [
+        {**shape.config(units.states, units.rows), "from": start * units.time, "to": min(stop * units.time, horizon)}
+        for shape, start, stop in problem.path
+    ]
+    if problem.reference is not None and windows:
+        windows[0]["relative_to"] = (problem.reference * np.append(units.time, units.states)).tolist()
+    if problem.mixed is not None:
+        H, G, h, start, stop = problem.mixed
+        mixed = {"H": (H / units.states).tolist(), "G": (G / units.controls).tolist(), "h": h.tolist()}
+        windows.append({"mixed": mixed, "from": start * units.time, "to": stop * units.time})
+    return windows
+
+
 def config(problem: Instance, units: Units) -> dict[str, Any]:
     """The instance in the user's units, as a config of the package."""
     system = _system(problem, units, problem.mode(0))
@@ -573,10 +628,7 @@ def config(problem: Instance, units: Units) -> dict[str, Any]:
     if not equal:
         edges = (problem.edges * units.time).tolist()
         pieces = {"name": "piecewise_constant", "breakpoints": [*edges[:-1], horizon]}
-    windows = [
-        {**shape.config(units.states, units.rows), "from": start * units.time, "to": min(stop * units.time, horizon)}
-        for shape, start, stop in problem.path
-    ]
+    windows = path_config(problem, units, horizon)
     ends: list[dict[str, Any]] = [shape.config(units.states, units.rows) for shape in problem.terminal]
     if problem.ends_at is not None:
         ends.append({"equals": [float(v) if np.isfinite(v) else None for v in problem.ends_at * units.states]})
@@ -595,8 +647,7 @@ def config(problem: Instance, units: Units) -> dict[str, Any]:
     }
     if problem.charge is not None:
         stated["cost"] = problem.charge.config(units)
-    if problem.before is not None:
-        stated["initial_control"] = (problem.before * units.controls).tolist()
+    stated |= control_config(problem, units)
     if problem.disturbance is not None:
         stated["disturbance"] = problem.disturbance.config(units.disturbances, units.rows)
     control = pieces if problem.dictionary == "piecewise_constant" else {**pieces, "name": problem.dictionary}
@@ -617,7 +668,7 @@ def drawn_units(rng: np.random.Generator, problem: Instance) -> Units:
     return Units(
         time=float(10.0 ** rng.uniform(-4 * far, 4 * far)),
         states=some(problem.B.shape[0], 6 * far, states),
-        controls=some(problem.B.shape[1], 6 * far, [problem.control]),
+        controls=some(problem.B.shape[1], 6 * far, [problem.control, problem.step]),
         disturbances=some(problem.E.shape[1], 6 * far, [problem.disturbance]),
         parameters=10.0 ** rng.uniform(-6 * far, 6 * far, 2),
         cost=float(10.0 ** rng.uniform(-6 * far, 6 * far)),
@@ -729,6 +780,8 @@ def instance(seed: int) -> tuple[Instance, Units]:
         own = np.random.default_rng([seed, 1])  # the numbers of what was drawn before stay as they are
         widths = own.uniform(0.002, 0.05, len(problem.A))
         problem = replace(problem, initial_set=shape(own, widths, bounded=True))
+    if seed % 6 == 3 and seed % 10:
+        problem = richer(np.random.default_rng([seed, 4]), problem)
     units = drawn_units(rng, problem)
     if seed % 4 == 2 and seed % 10:
         own = np.random.default_rng([seed, 2])
@@ -766,3 +819,22 @@ def in_time(rng: np.random.Generator, problem: Instance) -> Instance:
         A, B = problem.A + 0.2 * rng.normal(size=(d, d)), problem.B * rng.uniform(0.7, 1.4)
         problem = replace(problem, second=(int(rng.integers(1, K)), A, B, rng.normal(size=d) * 0.02))
     return problem
+
+
+def richer(rng: np.random.Generator, problem: Instance) -> Instance:
+    """With a set that moves, bounds of state and control together, or bounded steps."""
+    (d, m), K, edges = problem.B.shape, len(problem.edges) - 1, problem.edges
+    kind = rng.choice(["moving", "mixed", "step"] if problem.path else ["mixed", "step"])
+    if kind == "step":
+        return replace(problem, step=shape(rng, rng.uniform(0.2, 1.0) * problem.control.support(np.eye(m)), True))
+    reach = np.abs(sample(problem, 1, np.zeros(len(problem.slopes))).free).max(axis=0) + 0.1
+    if kind == "moving":
+        kept = np.unique(np.concatenate([[0, K], rng.integers(0, K + 1, 3)]))
+        points = 0.2 * reach * rng.normal(size=(kept.size, d))
+        return replace(problem, reference=np.hstack([edges[kept, None], points]))
+    rows = int(rng.integers(1, 3))
+    H, G = rng.normal(size=(rows, d)), rng.normal(size=(rows, m))
+    h = rng.uniform(0.5, 1.2) * (np.abs(H) @ reach + np.abs(G) @ problem.control.support(np.eye(m)))
+    first, last = np.sort(rng.choice(K, 2, replace=False))
+    middle = (edges[:-1] + edges[1:]) / 2
+    return replace(problem, mixed=(H, G, h, float(middle[first]), float(middle[last])))

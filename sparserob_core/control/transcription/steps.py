@@ -73,8 +73,10 @@ class Steps:
         return (self.lower[:, None] + first).ravel(), (self.upper[:, None] + first).ravel()
 
     def priced(self, z: Array) -> list[tuple[float, Array, float]]:
-        """Time, normal ``(m,)`` and multiplier of every side that multipliers ``z (r q,)`` of the entries stand for."""
+        """Time, normal ``(m,)`` and multiplier of every side that multipliers ``z (r q,)`` of the entries stand for; a
+        side that there is not has none, where its multiplier is rounding."""
         table = z.reshape(self.upper.size, self.times.size)
+        table = np.where(np.isfinite(np.where(table > 0.0, self.upper[:, None], self.lower[:, None])), table, 0.0)
         return [
             (float(self.times[k]), np.sign(table[row, k]) * self.H[row], abs(float(table[row, k])))
             for row, k in np.argwhere(table)
