@@ -214,21 +214,23 @@ def _newton(
 
 def _tried(case: _Case) -> FiniteSolution:
     """Form after form, accuracy after accuracy."""
-    program = case.program
-    for form, factor in ATTEMPTS:
+    program, attempts = case.program, ATTEMPTS
+    if program.P is not None and program.S is None and diagonal(program.P, program.n) is None:
+        attempts = (ATTEMPTS[1], ATTEMPTS[0], *ATTEMPTS[2:])  # parts would double a dense matrix
+    for form, factor in attempts:
         claim, answer = _ask(case, program, form, factor * case.tolerance)
         proof = _proof(case, answer, "the solver's ray") if claim is not None and claim.status == "infeasible" else None
         for solution in _candidates(case, answer) if proof is None else ():
             believed = case.judge(solution, f"{form} form")
             if believed is not None:
                 return believed
-        if (form, factor) == ATTEMPTS[0] and proof is None:
+        if (form, factor) == attempts[0] and proof is None:
             believed = _more_digits(case, claim)
             if believed is not None:
                 return believed
         if case.blunt is not None:
             return case.blunt
-        if proof is not None or form == ATTEMPTS[0][0] or (claim is not None and claim.status == "infeasible"):
+        if proof is not None or form == attempts[0][0] or (claim is not None and claim.status == "infeasible"):
             proof = _elastic_proof(case, proof)
         if proof is not None:
             return proof
