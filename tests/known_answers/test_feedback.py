@@ -211,6 +211,7 @@ def test_grids_and_memory_keep_every_guarantee(name: str, cost: str, tmp_path: P
 
 SETS: dict[str, dict[str, Any]] = {
     "an uneven box": {"box": {"lower": [-0.2, -0.1], "upper": [0.1, 0.2]}},
+    "a box that is thin": {"box": [0.2, 0.0]},
     "an ellipsoid": {"ellipsoid": {"centre": [0, 0], "shape": [[0.02, 0.01], [0.01, 0.03]]}},
     "a ball of the 1-norm": {"norm": {"p": 1, "radius": 0.2}},
     "a triangle": {"polytope": {"H": [[1, 0], [0, 1], [-1, -1]], "h": [0.15, 0.15, 0.1]}},

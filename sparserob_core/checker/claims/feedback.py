@@ -188,8 +188,8 @@ class FeedbackClaims:
 
         case = self.case
         assert case.policy is not None
-        K, m, d = case.control.pieces, case.problem.system.controls, case.problem.system.states
-        loop = self._loop(np.zeros((m, K)), np.zeros((K, K, m, d)))
+        K, m = case.control.pieces, case.problem.system.controls
+        loop = self.loop_at_rest
         rows = [_Row.of(case, loop, entry, case.policy.cost == PEAK) for entry in entries]
         total = sum((row.multiplier * row.constant for row in rows), arb(0))
         slope = [[sum((r.multiplier * r.nominal[k][i] for r in rows if not r.nominal[k][i].is_zero()), arb(0))
@@ -213,14 +213,14 @@ class FeedbackClaims:
         case, total = self.case, arb(0)
         shape = case.problem.disturbance
         rows = [row for row in rows if any(not x.is_zero() for part in row.innovations for x in part)]
-        if shape is None or not rows:
+        if shape is None or not rows or not self._chords:
             return total
         K, m = case.control.pieces, case.problem.system.controls
         d = case.problem.system.states
         left = stacked([[r.multiplier * r.nominal[k][i] for r in rows] for k in range(K) for i in range(m)])
         right = stacked([[x for part in r.innovations for x in part] for r in rows])
         product = (left * right).tolist()
-        chords, width = _chords(shape, loop.middle), [_width(case.problem.control, i) for i in range(m)]
+        chords, width = self._chords, [_width(case.problem.control, i) for i in range(m)]
         for k in range(1, K):
             clusters = self._clusters(loop, k)
             for i in range(m):
@@ -230,7 +230,7 @@ class FeedbackClaims:
                         inverse * stacked([[product[k * m + i][j * d + s]] for j in members for s in range(d)])
                     ).entries()
                     sizes += [
-                        sum((abs(z[n * loop.width + b]) / chords[b] for b in range(loop.width)), arb(0))
+                        sum((abs(z[n * len(chords) + b]) / chord for b, chord in enumerate(chords.values())), arb(0))
                         for n in range(len(blocks))
                     ]
                 total = total + width[i] * _largest(sizes)
@@ -262,12 +262,13 @@ class FeedbackClaims:
 
         if members not in self._inverses:
             blocks = sorted({block for j in members for block in loop.seen[j]})
-            d, zero = loop.parts["A"].nrows(), [arb(0)] * loop.width
+            d, zero = loop.parts["A"].nrows(), arb(0)
             table: list[list[arb]] = []
             for j in members:
                 lists = {block: push.tolist() for block, push in loop.seen[j].items()}
                 table += [
-                    [x for block in blocks for x in (lists[block][s] if block in lists else zero)] for s in range(d)
+                    [lists[block][s][b] if block in lists else zero for block in blocks for b in self._chords]
+                    for s in range(d)
                 ]
             D = stacked(table)
             if D.ncols() <= D.nrows():
@@ -276,6 +277,20 @@ class FeedbackClaims:
                 inverse = D.transpose() * (D * D.transpose()).inv()
             self._inverses[members] = (inverse, blocks)
         return self._inverses[members]
+
+    @cached_property
+    def _chords(self) -> dict[int, arb]:
+        """How long the disturbance's set is along its axes, those along which it is a point left out: what cannot
+        deviate is never seen."""
+        shape = self.case.problem.disturbance
+        assert shape is not None
+        return {b: chord for b, chord in enumerate(_chords(shape, self.loop_at_rest.middle)) if chord > 0}
+
+    @cached_property
+    def loop_at_rest(self) -> ClosedLoop:
+        """The same system without any control."""
+        K, m, d = self.case.control.pieces, self.case.problem.system.controls, self.case.problem.system.states
+        return self._loop(np.zeros((m, K)), np.zeros((K, K, m, d)))
 
     @cached_property
     def _inverses(self) -> dict[tuple[int, ...], tuple[arb_mat, list[int]]]:
