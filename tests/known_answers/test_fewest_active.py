@@ -121,6 +121,10 @@ def test_without_a_regulariser_the_control_is_a_vertex_of_the_optimal_face(tmp_p
     assert outcome.result.cost == pytest.approx(3.0, rel=1e-7)
     assert interval["lower"] == pytest.approx(0.6, abs=1e-12)
     assert interval["upper"] <= 0.6 + 2 / 50 + 1e-12
+    spread, beside = solved(problem, 50, tmp_path / "regularised")
+    assert spread.control is not None
+    assert np.count_nonzero(spread.control) > 40  # what a regulariser chooses acts nearly always
+    assert beside == interval
 
 
 def test_a_refuted_control_is_no_upper_bound_and_an_infeasible_problem_has_no_interval(tmp_path: Path) -> None:

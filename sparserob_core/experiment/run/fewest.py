@@ -50,11 +50,17 @@ def with_activity(experiment: ControlExperiment, result: Result, tools: Tools) -
     if other is not None and _safe(program, other.lower_bound) > least:
         least = _safe(program, other.lower_bound)
         activity = replace(activity, lower=_share(program, least) or 0.0, dual=other.dual)
-    if other is not None and other.decision is not None and other.status in PROVEN and other.proofs:
+    if other is not None and other.decision is not None and _admissible(program, other, most):
         most = count(program, other.decision)
         activity = replace(activity, upper=_share(program, most), decision=other.decision, proofs=other.proofs)
     lower = activity.lower if activity.upper is None else min(activity.lower, activity.upper)
     return replace(result, activity=replace(activity, lower=lower))
+
+
+def _admissible(program: SemiInfiniteProgram, other: Result, most: float) -> bool:
+    """Whether another decision counts less than ``most`` and is proven, family by family."""
+    proven = other.status in PROVEN and len(other.proofs) == len(program.families)
+    return proven and np.isfinite(most) and count(program, np.asarray(other.decision)) < most * (1.0 - INWARDS)
 
 
 def _factor(experiment: ControlExperiment) -> float | None:

@@ -156,4 +156,19 @@ def tidied(program: SemiInfiniteProgram, x: Array) -> Array:
     return moved if count(program, moved) < count(program, x) else x
 
 
+def met(program: SemiInfiniteProgram, x: Array) -> Array:
+    """The decision ``x (n,)`` with its equalities met to rounding, by those entries alone that are neither 0 nor at a
+    bound; ``x`` itself where there is nothing to meet, or the image is not the decision."""
+    base = program.finite
+    if not base.b.size or base.S is not None:
+        return x
+    reach = np.where(np.isfinite(base.upper - base.lower), base.upper - base.lower, 1.0)
+    free = (np.abs(x) > DUST * reach) & (x > base.lower + DUST * reach) & (x < base.upper - DUST * reach)
+    moved = x.copy()
+    for _ in range(REFINED):
+        moved[free] -= np.linalg.lstsq(base.A[:, free], base.excess(moved), rcond=None)[0]
+    return moved
+
+
+REFINED = 3
 LARGE = 2000  # variables that images are solved for

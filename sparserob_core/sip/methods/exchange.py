@@ -22,7 +22,7 @@ from sparserob_core.sip.evidence import Proof
 from sparserob_core.sip.finite import FiniteSolution
 from sparserob_core.sip.inner.vertex import vertex
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
-from sparserob_core.sip.methods.counting import count, tidied
+from sparserob_core.sip.methods.counting import count, met, tidied
 from sparserob_core.sip.methods.ledger import Answer, Found, Ledger, Prover
 from sparserob_core.sip.methods.robust import robust_exchange
 from sparserob_core.sip.methods.unbounded import bounding_rows, falls_for_ever
@@ -324,7 +324,7 @@ def _sparser(
         rows = working.rows
         norms = np.linalg.norm(rows.G, axis=1)
         corner = vertex(ledger.relaxed.finite(rows.G, rows.h - working.margin * norms, 0.0))
-        candidates += [] if corner is None else [tidied(program, corner)]
+        candidates += [] if corner is None else [met(program, tidied(program, corner))]
     kept, violated, least = (answer, found), list[tuple[Array, np.ndarray, str]](), count(program, x)
     for other in candidates:
         if other is x or count(program, other) >= least or not _fits(ledger, other):
