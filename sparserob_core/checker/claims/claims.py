@@ -324,6 +324,8 @@ def _lower(case: Case) -> str:
             raise Broken(f"{written!r} is written, the leaves prove {least!r}")
         return f"no control of these acts for less than {written:.9g}"
     written, derived = number(case.certificate, "lower_bound"), _multiplied(case, priced=True)
+    if written <= 0.0:  # absolute values, lengths and positive semidefinite squares: no multiplier is needed for that
+        return f"no control costs less than {written:.12g}, for no term of the cost is negative"
     if not derived >= written:
         raise Broken(f"{written!r} is written, the multipliers prove {float(derived.lower())!r}")
     return f"no control costs less than {written:.12g}" + (
