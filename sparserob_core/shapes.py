@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         return function
 
 elif CHECKED:
+    import random
     from functools import wraps
     from itertools import count
 
@@ -41,12 +42,26 @@ elif CHECKED:
     # whole numbers may stand where numbers are asked for: numpy computes with them, and shapes are what matters here
     Bool, Float, Int = _Checked(jaxtyping.Bool), _Checked(jaxtyping.Real), _Checked(jaxtyping.Integer)
 
+    def _undrawn(function: Any) -> Any:
+        """Give back what a check has drawn: beartype looks at one item of a list, and takes the random numbers of the
+        whole process to choose it, which components are tested not to touch."""
+
+        @wraps(function)
+        def undrawn(*arguments: Any, **keywords: Any) -> Any:
+            before = random.getstate()
+            try:
+                return function(*arguments, **keywords)
+            finally:
+                random.setstate(before)
+
+        return undrawn
+
     FIRST, EVERY = 100, 100  # calls that are checked one by one; then one in so many, since a check takes 40 us
 
     def shaped(function: Any) -> Any:
         """Check the shapes in the annotations of a function at its first calls, and now and then; at every call of
         what it has as ``checked``."""
-        checked = jaxtyping.jaxtyped(function, typechecker=beartype)
+        checked = _undrawn(jaxtyping.jaxtyped(function, typechecker=beartype))
         calls = count()
 
         @wraps(function)

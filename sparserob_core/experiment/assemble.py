@@ -145,8 +145,10 @@ def gap_tolerance(loaded: Loaded) -> float | None:
 
 def counting(loaded: Loaded) -> tuple[bool, tuple[float, ...] | None]:
     """Whether the cost of the config's method is the time that a control acts, and the only values that this may take,
-    where it is restricted to some."""
+    where it is restricted to some. A method that is not known, where a directory of others is read, does neither."""
     entry = loaded.config.method
+    if entry.name not in loaded.registry.names("method"):
+        return False, None
     method = loaded.registry.build("method", entry.name, entry.options)
     letters = getattr(method, "alphabet", None)
     return bool(getattr(method, "counts", False)), None if letters is None else tuple(letters)

@@ -45,7 +45,7 @@ def load(*files: Path) -> Registry:
 
 def test_the_framework_registers_its_own_components_like_anybody_else() -> None:
     registry = load()
-    assert registry.names("method") == ["exchange", "nominal", "scenario", "sparserob"]
+    assert registry.names("method") == ["exchange", "nominal", "reweighted", "scenario", "sparserob", "sparsest"]
     assert registry.get("problem", "linear").plugin == "core"
     assert registry.names("solver") == []
 
@@ -186,7 +186,7 @@ def test_a_disabled_plugin_is_not_even_imported(
         registry.get("solver", "piqp")
 
 
-@pytest.mark.parametrize("name", ["exchange", "nominal", "scenario", "sparserob"])
+@pytest.mark.parametrize("name", ["exchange", "nominal", "reweighted", "scenario", "sparserob", "sparsest"])
 def test_a_method_of_the_framework_is_its_own_options(name: str) -> None:
     registry = load()
     assert isinstance(registry.build("method", name), registry.get("method", name).options_type())
@@ -205,7 +205,7 @@ def test_where_directories_of_others_are_read_only_this_distribution_is_imported
     entry_points(Entry("alpha", broken), Entry("piqp", broken))
     registry = discovery.load_own_registry()
     assert registry.failures == ()
-    assert registry.names("method") == ["exchange", "nominal", "scenario", "sparserob"]
+    assert registry.names("method") == ["exchange", "nominal", "reweighted", "scenario", "sparserob", "sparsest"]
     with pytest.raises(sr.PluginError, match=r"(?s)no regulariser is named 'mine'.*--plugins FILE"):
         registry.get("regulariser", "mine")
     assert discovery.load_own_registry([plugin(GOOD)]).names("regulariser") == ["mine"]

@@ -141,7 +141,7 @@ def test_a_directory_at_fault_is_found_before_anything_is_solved(config: Path, t
         ({"solver": "piq"}, "no solver is named 'piq'; did you mean 'piqp'"),
         ({"maximiser": {"name": "direct", "epsilon": 1}}, "maximiser direct: epsilon: unknown key"),
         ({"continuation": {"factor": 2}}, "continuation.factor: "),
-        ({"control": "piecewise_constant"}, "dictionaries are for an OptimalControlProblem"),
+        ({"control": "piecewise_constant"}, "control, disturbance, policy: these are for an OptimalControlProblem"),
     ],
 )
 def test_an_argument_of_solve_at_fault_is_named(arguments: dict[str, object], said: str) -> None:
