@@ -52,6 +52,9 @@ class Expression:
         with np.errstate(all="ignore"):
             return self.evaluation(values)
 
+    def __reduce__(self) -> tuple[Callable[..., Expression], tuple[str, tuple[str, ...]]]:
+        return parse_expression, (self.text, tuple(sorted(self.names)))
+
 
 def parse_expression(source: str | float, names: Sequence[str]) -> Expression:
     """Parse numbers, the given names, ``pi``, ``e``, ``+ - * / **``, parentheses and the functions sin, cos, tan, exp,

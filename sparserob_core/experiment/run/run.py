@@ -227,7 +227,7 @@ def _run(
                     raise
             if isinstance(experiment, ControlExperiment):
                 known = bounded(experiment, result) if result.sparsest is None else result
-                result = ControlResult.of(with_activity(experiment, known, tools), experiment.transcription)
+                result = with_activity(experiment, known, tools)
             ending = RunFinished(
                 status=result.status,
                 message=result.message,

@@ -121,6 +121,17 @@ CONFIG = {
 }
 
 
+def test_expressions_of_parameters_can_be_pickled_too(tmp_path):
+    system = {"A": [["-1 + 0.1*p", 0.5], [0, -1]], "B": [[0], ["1 + p"]], "parameters": {"p": [-0.1, 0.1]}}
+    uncertain = {**CONFIG, "problem": {**CONFIG["problem"], "system": system, "disturbance": None}}
+    outcome = sr.run(uncertain, out=tmp_path / "run", quiet=True, figures=False)
+    again = pickle.loads(pickle.dumps(outcome.result))
+    np.testing.assert_array_equal(again.tube([2.0]).upper, outcome.tube([2.0]).upper)
+    at = np.array([[0.05]])
+    for mine, other in zip(outcome.problem.system.matrices(at), again.problem.system.matrices(at), strict=True):
+        np.testing.assert_array_equal(mine, other)
+
+
 def test_an_outcome_is_an_object_too(tmp_path):
     outcome = sr.run(CONFIG, out=tmp_path / "run", quiet=True)
     assert isinstance(outcome.result, sr.ControlResult)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -80,7 +81,9 @@ def test_a_run_begins_and_ends_once_and_everything_is_in_between(
     outcome = watched(method, listener)
     assert [type(event) for event in (listener.heard[0], listener.heard[-1])] == [sr.RunStarted, sr.RunFinished]
     assert len(listener.only(sr.RunStarted)) == len(listener.only(sr.RunFinished)) == listener.closed == 1
-    assert listener.only(sr.RunFinished)[0].result is outcome.result
+    told = listener.only(sr.RunFinished)[0].result
+    assert told is not None
+    assert all(getattr(told, one.name) is getattr(outcome.result, one.name) for one in fields(sr.Result))
     assert [event.round for event in listener.only(sr.RoundFinished)] == list(range(1, len(outcome.result.history) + 1))
     assert len(listener.heard) >= 3
 
