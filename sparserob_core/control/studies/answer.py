@@ -74,6 +74,11 @@ class ControlResult(Result):
         return ControlResult(**{one.name: getattr(result, one.name) for one in fields(Result)}, model=model)
 
     @property
+    def plain(self) -> Result:
+        """The same result without its problem."""
+        return Result(**{one.name: getattr(self, one.name) for one in fields(Result)})
+
+    @property
     def problem(self) -> OptimalControlProblem:
         """The control problem."""
         return self.model.problem
@@ -107,9 +112,8 @@ class ControlResult(Result):
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         model = self.model
-        plain = Result(**{one.name: getattr(self, one.name) for one in fields(Result)})
         policy = None if model.feedback is None else model.feedback.policy
-        return _read, (plain, model.problem, model.control, model.disturbance, model.formulation, policy)
+        return _read, (self.plain, model.problem, model.control, model.disturbance, model.formulation, policy)
 
 
 def _read(

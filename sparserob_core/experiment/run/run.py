@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
 
@@ -98,8 +98,7 @@ class Outcome:
         return page(self.experiment.title, result_rows(self.summary), self.directory / "figures" / "control.png")
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
-        result = self.result
-        plain = Result(**{one.name: getattr(result, one.name) for one in fields(Result)})
+        plain = self.result.plain if isinstance(self.result, ControlResult) else self.result
         loaded = self.experiment.loaded
         stated = Source(loaded.source.name, loaded.source.folder, loaded.config.plain())
         return _read, (stated, plain, self.directory, self.control, self.summary, self.remarks, self.interrupted)
