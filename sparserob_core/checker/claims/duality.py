@@ -114,6 +114,10 @@ class Duality:
         lags = self._lags(every, direction, time, {0.0, *(s for s in jumps if s < time)})
         return _differences([lags[s][first:] if s < time else None for s in jumps], mw)
 
+    def carried(self, direction: Array, time: float) -> list[arb]:
+        """What the initial state of a known system gives to ``c'x(t)``, ``(d,)``."""
+        return self._lags(flows(self.problem.system, ()), direction, time, {0.0})[0.0][: direction.size]
+
     def _lags(self, every: Sequence[Flow], direction: Array, time: float, since: set[float]) -> dict[float, list[arb]]:
         """``c'e^{A (t - s)}`` and its integrals from each of the times ``since`` to ``time``, times ``B`` and ``E``;
         back through the systems that took turns until then."""

@@ -46,7 +46,7 @@ class FeedbackClaims:
             raise Broken(f"the gains have shape {gains.shape}, expected {(K, K, m, d)}")
         times = case.control.breakpoints
         for k, j in np.argwhere(gains.any(axis=(2, 3))).tolist():
-            if j > k or j == 0:
+            if j > k or (j == 0 and case.problem.initial_set is None):
                 raise Broken(f"the control from t = {float(times[k]):.6g} on answers what is not measured yet")
             old = float(times[k]) - float(times[j])
             if policy.memory is not None and old > policy.memory + 1e-12 * case.problem.horizon:
@@ -71,6 +71,7 @@ class FeedbackClaims:
             [float(t) for t in case.control.breakpoints],
             case.changes or [],
             case.problem.disturbance,
+            case.problem.initial_set,
         )
 
     def control(self) -> str:
@@ -211,17 +212,16 @@ class FeedbackClaims:
         from flint import arb
 
         case, total = self.case, arb(0)
-        shape = case.problem.disturbance
         rows = [row for row in rows if any(not x.is_zero() for part in row.innovations for x in part)]
-        if shape is None or not rows or not self._chords:
+        if not rows:
             return total
         K, m = case.control.pieces, case.problem.system.controls
         d = case.problem.system.states
         left = stacked([[r.multiplier * r.nominal[k][i] for r in rows] for k in range(K) for i in range(m)])
         right = stacked([[x for part in r.innovations for x in part] for r in rows])
         product = (left * right).tolist()
-        chords, width = self._chords, [_width(case.problem.control, i) for i in range(m)]
-        for k in range(1, K):
+        width = [_width(case.problem.control, i) for i in range(m)]
+        for k in range(K):
             clusters = self._clusters(loop, k)
             for i in range(m):
                 sizes = [arb(0)]
@@ -229,9 +229,10 @@ class FeedbackClaims:
                     z = (
                         inverse * stacked([[product[k * m + i][j * d + s]] for j in members for s in range(d)])
                     ).entries()
+                    shares = iter(z)
                     sizes += [
-                        sum((abs(z[n * len(chords) + b]) / chord for b, chord in enumerate(chords.values())), arb(0))
-                        for n in range(len(blocks))
+                        sum((abs(next(shares)) / chord for chord in self._chords[block].values()), arb(0))
+                        for block in blocks
                     ]
                 total = total + width[i] * _largest(sizes)
         return total
@@ -244,10 +245,11 @@ class FeedbackClaims:
         slack = 1e-12 * self.case.problem.horizon
         oldest = -np.inf if policy.memory is None else float(times[k]) - policy.memory - slack
         groups: list[tuple[list[int], set[int]]] = []
-        for j in range(1, k + 1):
-            if float(times[j]) < oldest or not loop.seen[j]:
+        for j in range(k + 1):
+            seen = {block for block in loop.seen[j] if self._chords[block]}
+            if float(times[j]) < oldest or not seen:
                 continue
-            mine, rest = ([j], set(loop.seen[j])), []
+            mine, rest = ([j], seen), []
             for members, blocks in groups:
                 if blocks & mine[1]:
                     mine = (members + mine[0], mine[1] | blocks)
@@ -261,13 +263,13 @@ class FeedbackClaims:
         from flint import arb
 
         if members not in self._inverses:
-            blocks = sorted({block for j in members for block in loop.seen[j]})
+            blocks = sorted({block for j in members for block in loop.seen[j] if self._chords[block]})
             d, zero = loop.parts["A"].nrows(), arb(0)
             table: list[list[arb]] = []
             for j in members:
                 lists = {block: push.tolist() for block, push in loop.seen[j].items()}
                 table += [
-                    [lists[block][s][b] if block in lists else zero for block in blocks for b in self._chords]
+                    [lists[block][s][b] if block in lists else zero for block in blocks for b in self._chords[block]]
                     for s in range(d)
                 ]
             D = stacked(table)
@@ -279,12 +281,12 @@ class FeedbackClaims:
         return self._inverses[members]
 
     @cached_property
-    def _chords(self) -> dict[int, arb]:
-        """How long the disturbance's set is along its axes, those along which it is a point left out: what cannot
+    def _chords(self) -> list[dict[int, arb]]:
+        """Of every block how long its set is along the axes, those along which it is a point left out: what cannot
         deviate is never seen."""
-        shape = self.case.problem.disturbance
-        assert shape is not None
-        return {b: chord for b, chord in enumerate(_chords(shape, self.loop_at_rest.middle)) if chord > 0}
+        loop = self.loop_at_rest
+        found = {id(shape): _chords(shape, about) for shape, about in loop.sets}
+        return [{b: chord for b, chord in enumerate(found[id(shape)]) if chord > 0} for shape, _ in loop.sets]
 
     @cached_property
     def loop_at_rest(self) -> ClosedLoop:
@@ -351,8 +353,6 @@ class _Row:
     @staticmethod
     def of(case: Case, loop: ClosedLoop, entry: object, peaks: bool) -> _Row:
         """The constraint that an entry of the certificate names, which must be one of the problem's."""
-        from flint import arb
-
         case.clock.check()
         if not isinstance(entry, Mapping):
             raise Broken("multipliers: expected a constraint, a time, a direction, a disturbance and a number each")
@@ -363,7 +363,7 @@ class _Row:
             raise Broken(f"a multiplier of {name} is {y!r}, expected a positive number")
         if numbers(entry.get("parameter", []), f"{name}: parameter").size:
             raise Broken(f"{name}: a parameter is given of a known system")
-        z = _deviations(case, loop, entry.get("disturbance"), name)
+        z = _deviations(case, loop, entry, name)
         if name in (CONTROL, PEAK):
             return _Row._of_control(case, loop, (name, direction, time, y), z, peaks)
         window, d = case.window(name), case.problem.system.states
@@ -372,11 +372,7 @@ class _Row:
         if not window.start <= time <= window.stop:
             raise Broken(f"{name}: t = {time!r} is not within {window.start:g} to {window.stop:g}")
         row = case.duality.row(direction, time, [], window.limit(direction, time), disturbed=False)
-        constant = row.constant
-        for block, weights in enumerate(case.duality.pushed(direction, time)):
-            for b, weight in enumerate(weights):
-                constant = constant + weight * (arb(float(loop.middle[b])) + z[block][b])
-        return _Row(y, constant, row.slope, _seen(loop, z, d), None)
+        return _Row(y, row.constant + _given(case, loop, direction, time, z), row.slope, _seen(loop, z, d), None)
 
     @staticmethod
     def _of_control(
@@ -401,32 +397,59 @@ class _Row:
         return _Row(y, arb(0), nominal, seen, (piece, channel))
 
 
+def _given(case: Case, loop: ClosedLoop, direction: Array, time: float, z: list[list[arb]]) -> arb:
+    """What the disturbance and the initial state, that deviate by ``z`` from their middles, give to ``c'x(t)`` where no
+    control answers them."""
+    from flint import arb
+
+    weights = case.duality.pushed(direction, time)
+    weights += [] if case.problem.initial_set is None else [case.duality.carried(direction, time)]
+    return sum(
+        (
+            weight * (arb(float(m)) + off)
+            for row, (_, about), block in zip(weights, loop.sets, z, strict=True)
+            for weight, m, off in zip(row, about, block, strict=True)
+        ),
+        arb(0),
+    )
+
+
 def _seen(loop: ClosedLoop, z: list[list[arb]], d: int) -> list[list[arb]]:
     """The innovations ``(K, d)`` of deviations, block by block."""
     from flint import arb
 
     return [
         [
-            sum((push[s, b] * z[block][b] for block, push in seen.items() for b in range(loop.width)), arb(0))
+            sum((push[s, b] * x for block, push in seen.items() for b, x in enumerate(z[block])), arb(0))
             for s in range(d)
         ]
         for seen in loop.seen
     ]
 
 
-def _deviations(case: Case, loop: ClosedLoop, signal: object, name: str) -> list[list[arb]]:
-    """The deviations of a disturbance ``(mw, blocks)``, which must be in its set."""
+def _deviations(case: Case, loop: ClosedLoop, entry: Mapping[str, Any], name: str) -> list[list[arb]]:
+    """The deviations, block by block, of the ``disturbance (mw, blocks)`` and of the initial state, ``deviation (d,)``
+    from its centre, that an entry names, which must be in their sets."""
     from flint import arb
 
-    if case.problem.disturbance is None:
-        return []
-    w = numbers(signal, f"{name}: disturbance")
-    if w.shape != (loop.width, loop.blocks):
-        raise Broken(f"{name}: a disturbance of shape {w.shape}, expected {(loop.width, loop.blocks)}")
-    for block in range(loop.blocks):
-        if not known(case.problem.disturbance).contains(w[:, block]):
-            raise Broken(f"{name}: the disturbance {w[:, block].tolist()} is not shown to be in its set")
-    return [[arb(float(v)) - arb(float(c)) for v, c in zip(column, loop.middle, strict=True)] for column in w.T]
+    points: list[Array] = []
+    if case.problem.disturbance is not None:
+        w = numbers(entry.get("disturbance"), f"{name}: disturbance")
+        if w.shape != (loop.width, loop.blocks):
+            raise Broken(f"{name}: a disturbance of shape {w.shape}, expected {(loop.width, loop.blocks)}")
+        points = list(w.T)
+    if case.problem.initial_set is not None:
+        points.append(numbers(entry.get("deviation"), f"{name}: deviation"))
+        if points[-1].shape != (case.problem.system.states,):
+            raise Broken(f"{name}: a deviation of the initial state of shape {points[-1].shape}")
+    for number_of, (point, (shape, _)) in enumerate(zip(points, loop.sets, strict=True)):
+        if not known(shape).contains(point):
+            what = "disturbance" if number_of < loop.blocks else "deviation of the initial state"
+            raise Broken(f"{name}: the {what} {point.tolist()} is not shown to be in its set")
+    return [
+        [arb(float(v)) - arb(float(c)) for v, c in zip(point, about, strict=True)]
+        for point, (_, about) in zip(points, loop.sets, strict=True)
+    ]
 
 
 def _dot(c: Array, x: list[arb]) -> arb:

@@ -4,7 +4,8 @@ The control on piece ``k`` is ``u_k = v_k + sum_j M_kj e_j``, where ``e_j`` is w
 ``tau_j`` has beyond what the state at ``tau_{j-1}``, the control in between and the middle of the disturbance predict.
 With
 ``w = m + z`` for the middle ``m``, it is ``e_j = sum_l D_jl z_l`` over the blocks ``l`` on which the disturbance is
-constant.
+constant. Where the initial states are a set, ``e_0`` is what the initial state has beyond the middle of it: the last
+block.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import accumulate
 from typing import TYPE_CHECKING, final
 
 import numpy as np
@@ -44,7 +46,8 @@ def middle(shape: ConvexSet) -> Array:
 @dataclass(frozen=True, eq=False)
 class ClosedLoop:
     """A known system from ``initial_state`` under the nominal control ``(m, K)`` and ``gains (K, K, m, d)``; ``grid``:
-    every breakpoint; ``breakpoints``: those of the control; ``changes``: where the disturbance may jump."""
+    every breakpoint; ``breakpoints``: those of the control; ``changes``: where the disturbance may jump; ``initial``:
+    the set of deviations of the initial state."""
 
     system: LinearSystem
     initial_state: list[float]
@@ -54,6 +57,7 @@ class ClosedLoop:
     breakpoints: list[float]
     changes: list[float]
     shape: ConvexSet | None
+    initial: ConvexSet | None = None
     _steps: dict[float, tuple[arb_mat, arb_mat]] = field(default_factory=dict, repr=False)
 
     @cached_property
@@ -85,6 +89,18 @@ class ClosedLoop:
         """What deviations are counted from, ``(mw,)``."""
         return np.zeros(self.width) if self.shape is None else middle(self.shape)
 
+    @cached_property
+    def sets(self) -> list[tuple[ConvexSet, Array]]:
+        """The set and the middle of every block of the deviations: those of the disturbance, that of the initial
+        state."""
+        held = [] if self.shape is None else [(self.shape, self.middle)] * self.blocks
+        return held if self.initial is None else [*held, (self.initial, middle(self.initial))]
+
+    @cached_property
+    def starts(self) -> list[int]:
+        """Where the entries of every block begin, and how many there are."""
+        return [0, *accumulate(shape.dimension for shape, _ in self.sets)]
+
     def _places(self, piece: int) -> tuple[int, int]:
         """Of a piece of the grid the piece of the control and the block of the disturbance."""
         inside = (self.grid[piece] + self.grid[piece + 1]) / 2
@@ -92,18 +108,23 @@ class ClosedLoop:
 
     def _held(self, start: float, stop: float) -> tuple[arb_mat, arb_mat]:
         """``e^{A s}`` and its integral, ``s`` from one time to another."""
-        from flint import arb, arb_mat
+        from flint import arb
 
         length = arb(stop) - arb(start)
         key = stop - start
         if key in self._steps and self._exact(start, stop, key):
             return self._steps[key]
-        d = self.parts["A"].nrows()
-        identity = arb_mat([[int(i == j) for j in range(d)] for i in range(d)])
-        found = held(self.parts["A"], identity, length)
+        found = held(self.parts["A"], self._identity, length)
         if self._exact(start, stop, key):
             self._steps[key] = found
         return found
+
+    @property
+    def _identity(self) -> arb_mat:
+        from flint import arb_mat
+
+        d = self.parts["A"].nrows()
+        return arb_mat([[int(i == j) for j in range(d)] for i in range(d)])
 
     @staticmethod
     def _exact(start: float, stop: float, key: float) -> bool:
@@ -117,6 +138,8 @@ class ClosedLoop:
         """``D_jl``: what every innovation is of every block, ``(d, mw)``; blocks that are not seen are left out."""
         K = len(self.breakpoints) - 1
         found: list[dict[int, arb_mat]] = [{} for _ in range(K)]
+        if self.initial is not None:
+            found[0][self.blocks] = self._identity
         for piece in range(len(self.grid) - 1 if self.blocks else 0):
             k, block = self._places(piece)
             if k + 1 >= K:
@@ -133,10 +156,10 @@ class ClosedLoop:
         """``F_k (m, Q)``: how the control on each piece depends on the deviations."""
         from flint import arb
 
-        m, mw, zero = self.gains.shape[2], self.width, arb(0)
+        m, zero, starts = self.gains.shape[2], arb(0), self.starts
         table = []
         for k in range(self.gains.shape[0]):
-            rows = [[zero] * (self.blocks * mw) for _ in range(m)]
+            rows = [[zero] * starts[-1] for _ in range(m)]
             for j in range(k + 1):
                 if not self.gains[k, j].any():
                     continue
@@ -144,7 +167,7 @@ class ClosedLoop:
                 for block, push in self.seen[j].items():
                     for i, row in enumerate((M * push).tolist()):
                         for b, value in enumerate(row):
-                            rows[i][block * mw + b] = rows[i][block * mw + b] + value
+                            rows[i][starts[block] + b] = rows[i][starts[block] + b] + value
             table.append(rows)
         return table
 
@@ -179,8 +202,13 @@ class ClosedLoop:
         """The nominal state and every response at the breakpoints of the grid, ``(d, 1 + Q)``."""
         from flint import arb
 
+        begin, answers = [arb(float(v)) for v in self.initial_state], self._identity.tolist()
+        if self.initial is None:
+            answers = [[] for _ in begin]
+        else:
+            begin = [v + arb(float(m)) for v, m in zip(begin, self.sets[-1][1], strict=True)]
         zero = [arb(0)] * (self.blocks * self.width)
-        found = [stacked([[arb(float(v)), *zero] for v in self.initial_state])]
+        found = [stacked([[v, *zero, *row] for v, row in zip(begin, answers, strict=True)])]
         for piece, drive in enumerate(self.drives):
             Phi, Gamma = self._held(self.grid[piece], self.grid[piece + 1])
             found.append(Phi * found[-1] + Gamma * drive)
@@ -198,23 +226,19 @@ class ClosedLoop:
     @cached_property
     def radii(self) -> Array:
         """How far each entry of a deviation comes from 0, ``(Q,)``, rounded up."""
-        if self.shape is None:
-            return np.zeros(0)
-        far = np.array(known(self.shape).radius) + np.abs(self.middle)
-        return np.tile(np.nextafter(far * OUTWARD, np.inf), self.blocks)
+        far = [np.array(known(shape).radius) + np.abs(about) for shape, about in self.sets]
+        return np.nextafter(np.concatenate([np.zeros(0), *far]) * OUTWARD, np.inf)
 
     def support(self, a: list[arb]) -> arb:
         """``max z'a`` over all deviations, ``a (Q,)`` in balls."""
         from flint import arb
 
-        if self.shape is None:
-            return arb(0)
-        mw, total = self.width, arb(0)
-        for first in range(0, len(a), mw):
-            block = a[first : first + mw]
+        total = arb(0)
+        for first, (shape, about) in zip(self.starts, self.sets, strict=False):
+            block = a[first : first + shape.dimension]
             if any(not x.is_zero() for x in block):
-                total = total + known(self.shape).support(block)
-                for x, m in zip(block, self.middle, strict=True):
+                total = total + known(shape).support(block)
+                for x, m in zip(block, about, strict=True):
                     total = total - x * arb(float(m)) if m else total
         return total
 
@@ -234,7 +258,7 @@ class ClosedLoop:
         A, h = self.parts["A"], arb(stop) - arb(start)
         rate = A * self.state(piece, start) + self.drives[piece]
         row, factor = stacked([[arb(float(v)) for v in c] for c in rows]) * A, arb(1)
-        total = np.zeros((rows.shape[0], 1 + self.blocks * self.width))
+        total = np.zeros((rows.shape[0], 1 + self.starts[-1]))
         for order in range(TERMS):
             found = Enclosed.of(row * rate)
             total = total + (np.abs(found.mid) + found.rad) * float((factor * OUTWARD).upper())

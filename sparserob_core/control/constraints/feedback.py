@@ -241,8 +241,16 @@ class FeedbackControl:
 
 
 def _told(said: TimedExplanation, loop: ClosedLoop, index: Array) -> TimedExplanation:
-    text = f"{said.statement} for every disturbance"
-    signal = None
-    if index.size > 1:
-        signal = (loop.spread.middle + index[1:]).reshape(-1, loop.steps.E.shape[2]).T
-    return replace(said, text=text, disturbance=signal, quantity="")
+    problem = loop.functionals
+    every = ("disturbance", problem.disturbance), ("initial state", problem.initial)
+    text = f"{said.statement} for every {' and '.join(name for name, one in every if one is not None) or 'disturbance'}"
+    if index.size == 1:
+        return replace(said, text=text, disturbance=None, begun=None, deviation=None, quantity="")
+    point, width = loop.spread.middle + index[1:], loop.steps.E.shape[2]
+    own = point[: point.size - int(loop.begins.sum())]
+    signal = None if problem.disturbance is None else own.reshape(-1, width).T
+    if problem.initial is None:
+        return replace(said, text=text, disturbance=signal, quantity="")
+    deviation = loop.begins @ point
+    begun = problem.response.initial_state + deviation
+    return replace(said, text=text, disturbance=signal, begun=begun, deviation=deviation, quantity="")

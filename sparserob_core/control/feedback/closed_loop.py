@@ -2,7 +2,7 @@
 
 With the effects ``F`` of the gains, the control on piece ``k`` is ``u_k = v_k + F_k w``, and the state
 ``x(t) = x_v(t) + sum_q y_q(t) w_q``: every ``y_q`` is the state of the same system from 0, driven by column ``q`` of
-the effects and by its own entry of the disturbance.
+the effects and by its own entry of the disturbance; where the initial states are a set, its last columns begin there.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ class ClosedLoop:
     """The functionals of one system whose control answers what it sees.
 
     The decision ``x (n,)`` begins with the nominal control ``v (m, K)``, raveled; the variables of ``answers`` follow,
-    and then whatever else the program has. ``spread``: the deviations of the disturbance, block after block.
+    and then whatever else the program has. ``spread``: the deviations of the disturbance, block after block, and of the
+    initial state where there is a set of them.
     """
 
     functionals: WorstCase
@@ -76,6 +77,19 @@ class ClosedLoop:
         return table
 
     @cached_property
+    def begins(self) -> Array:
+        """Which entries of the deviations are those of the initial state, ``(d, Q)``."""
+        d = self.functionals.response.initial_state.size
+        count = 0 if self.functionals.initial is None else d
+        return np.hstack([np.zeros((d, self.spread.size - count)), np.eye(d, count)])
+
+    @cached_property
+    def start(self) -> Array:
+        """The initial state ``(d,)`` that deviations are counted from."""
+        begun: Array = self.functionals.response.initial_state + self.begins @ self.spread.middle
+        return begun
+
+    @cached_property
     def middles(self) -> Array:
         """The middle of the disturbance on every piece of the grid, ``(L, mw)``."""
         return np.asarray(self.entries @ self.spread.middle)
@@ -95,7 +109,7 @@ class ClosedLoop:
         if key not in self._paths:
             response, drives = self.functionals.response, self.drives(x)
             nodes = np.zeros((drives.shape[0] + 1, *drives.shape[1:]))
-            nodes[0, :, 0] = response.initial_state
+            nodes[0] = np.column_stack([self.start, self.begins])
             for piece, length in enumerate(response.which.tolist()):
                 nodes[piece + 1] = (
                     self.steps.Phi[0, length] @ nodes[piece] + self.steps.Gamma[0, length] @ drives[piece]
@@ -163,6 +177,10 @@ class ClosedLoop:
         """The disturbance ``(mw, L)`` on the pieces of the grid of a deviation ``(Q,)``."""
         return np.asarray((self.entries @ (self.spread.middle + deviation)).T)
 
+    def begun(self, deviation: Array) -> Array:
+        """The initial state ``(d,)`` of a deviation ``(Q,)``."""
+        return np.asarray(self.start + self.begins @ deviation)
+
     def state_rows(self, time: float, H: Array, h: Array, part: np.ndarray, factor: Array) -> UncertainRows:
         """The rows ``H x(t) <= h`` at one time, as `UncertainRows`: row ``r`` is ``factor_r`` times the direction of
         its
@@ -173,7 +191,7 @@ class ClosedLoop:
         firsts = [int(np.flatnonzero(part == p)[0]) for p in range(int(part.max()) + 1)]
         free, gains, B, W = self.functionals.response.adjoint(np.full(count, time), H, np.zeros((count, 0)))
         on_control = self.functionals.on_decision(gains @ B)  # (r, m K), channel-major
-        offset = free @ self.functionals.response.initial_state + self.functionals.given(gains @ B)
+        offset = free @ self.start + self.functionals.given(gains @ B)
         on_noise = gains @ W  # (r, L, mw)
         offset = offset + np.einsum("rli,li->r", on_noise, self.middles)
         K = self.functionals.dictionary.pieces
@@ -189,7 +207,7 @@ class ClosedLoop:
             parts.append(csr_array((data[kept], place), shape=(Q, self.variables)))
         g = np.zeros((count, self.variables))
         g[:, : self.nominal_size] = on_control
-        d = np.einsum("pli,liq->pq", on_noise[firsts], self.entries)
+        d = np.einsum("pli,liq->pq", on_noise[firsts], self.entries) + free[firsts] @ self.begins
         return UncertainRows(csr_array(g), h - offset, part, factor, tuple(parts), d)
 
     def control_rows(self, piece: int, H: Array, h: Array, extra: Array | None = None) -> UncertainRows:
@@ -245,6 +263,7 @@ def shared(H: Array, spread: Spread) -> tuple[np.ndarray, Array]:
     return part, factor
 
 
-def deviations_of(bound: ConvexSet | None, blocks: int) -> Spread:
-    """The deviations of a disturbance with values in ``bound``, ``blocks`` times."""
-    return Spread(() if bound is None else ((blocks, bound),))
+def deviations_of(bound: ConvexSet | None, blocks: int, initial: ConvexSet | None = None) -> Spread:
+    """The deviations of a disturbance with values in ``bound``, ``blocks`` times, and of the initial state where its
+    own are in ``initial``."""
+    return Spread(tuple((count, one) for count, one in ((blocks, bound), (1, initial)) if one is not None))

@@ -25,12 +25,17 @@ DEPENDENT = 1e-9  # of its own size, the rest of a column that is a combination 
 KNOWN = np.zeros((1, 0))
 
 
-def innovations_seen(response: Response, control: Dictionary, model: DisturbanceModel | None) -> Array:
-    """``D (K, d, Q)``: what every innovation is of the deviations, block after block; ``e_0`` is 0 from one initial
-    state."""
+def innovations_seen(
+    response: Response, control: Dictionary, model: DisturbanceModel | None, begins: bool = False
+) -> Array:
+    """``D (K, d, Q)``: what every innovation is of the deviations, block after block, and then, where a set of initial
+    states ``begins``, of those of the initial state, of which ``e_0`` is all; ``e_0`` is 0 from one initial state."""
     K, d = control.pieces, response.initial_state.size
+    begun = np.zeros((K, d, d if begins else 0))
+    if begins:
+        begun[0] = np.eye(d)
     if model is None:
-        return np.zeros((K, d, 0))
+        return begun
     grid, E = response.grid, response.steps(KNOWN).E[0]
     assert model.starts is not None
     block = np.searchsorted(model.starts, np.arange(grid.pieces), side="right") - 1
@@ -41,7 +46,7 @@ def innovations_seen(response: Response, control: Dictionary, model: Disturbance
     for piece in range(grid.pieces):
         if grid.control_piece[piece] + 1 < K:  # what happens on the last piece is seen when all is over
             D[grid.control_piece[piece] + 1, :, block[piece]] += moved[piece]
-    return D.reshape(K, d, -1)
+    return np.concatenate([D.reshape(K, d, -1), begun], axis=2)
 
 
 @final

@@ -14,7 +14,8 @@ from sparserob_core.options import Options
 class AffinePolicy(Policy, Options):
     """The state is measured at every breakpoint ``tau_j`` of the control's dictionary; the control on piece ``k`` is
     ``u_k = v_k + sum_{j <= k} M_kj e_j`` with the innovation ``e_j``: what the state at ``tau_j`` has beyond what the
-    state one breakpoint before, the drift, every control in between and the middle of the disturbance's set predict.
+    state one breakpoint before, the drift, every control in between and the middle of the disturbance's set predict;
+    ``e_0`` is what ``x(0)`` has beyond the middle of the set of initial states, 0 from a single one.
 
     The nominal control ``v (m, K)`` and the gains ``M (K, K, m, n)`` are the decision. Every set of the problem holds
     for all disturbances with the control that they cause. For a fixed disturbance everything is linear in the decision

@@ -79,6 +79,7 @@ def _of_loop(constraint: StateConstraint, decision: Array, loop: ClosedLoop) -> 
     row, time = int(worst.rows[0]), float(worst.indices[0, 0])
     response, direction = constraint.functionals.response, constraint.H[row]
     disturbed = constraint.functionals.disturbance is not None
+    deviation = loop.worst(decision, time, direction)
     return Adversary(
         name=constraint.name,
         row=row,
@@ -86,10 +87,10 @@ def _of_loop(constraint: StateConstraint, decision: Array, loop: ClosedLoop) -> 
         direction=direction,
         bound=float(constraint.h[row]),
         parameter=np.zeros(0),
-        initial_state=response.initial_state,
+        initial_state=loop.begun(deviation),
         violation=float(worst.violations[0]),
         breakpoints=response.grid.breakpoints,
-        disturbance=loop.signal(loop.worst(decision, time, direction)) if disturbed else None,
+        disturbance=loop.signal(deviation) if disturbed else None,
     )
 
 

@@ -42,7 +42,8 @@ class Measuring:
         k = int(grid.control_piece[piece])
         if piece == 0 or k != grid.control_piece[piece - 1]:
             if piece == 0:
-                self._innovations = [np.zeros_like(state)]
+                begins = loop.loop.begins.any()  # from one initial state nothing is new in it
+                self._innovations = [state - loop.loop.start[:, None] if begins else np.zeros_like(state)]
             else:
                 assert self._predicted is not None
                 self._innovations.append(state - self._predicted)

@@ -28,8 +28,11 @@ def with_feedback(model: Transcription, own: Transcription, units: Units, policy
     ``own`` ``units``."""
     blocks = 0 if own.functionals.disturbance is None else own.functionals.disturbance.block_count
     deviations = np.tile(units.disturbances[: own.problem.system.disturbances], blocks)
-    seen = innovations_seen(own.response, own.control, own.functionals.disturbance)
-    seen = seen * (deviations_of(own.problem.disturbance, blocks).chords > 0.0)  # what cannot deviate is not answered
+    begins = own.problem.initial_set is not None
+    deviations = np.concatenate([deviations, units.states]) if begins else deviations
+    seen = innovations_seen(own.response, own.control, own.functionals.disturbance, begins)
+    spread = deviations_of(own.problem.disturbance, blocks, own.problem.initial_set)
+    seen = seen * (spread.chords > 0.0)  # what cannot deviate is not answered
     memory = None if policy.memory is None else policy.memory / units.time
     scaled = answers(seen, own.control.breakpoints, own.problem.system.controls, memory)
     known = _in_users(scaled, units, deviations)
@@ -79,7 +82,6 @@ def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dic
             isinstance(one, MixedConstraint) for one in problem.path
         ),
         "path set that stands still, without relative_to": any(entry.relative_to is not None for entry in paths),
-        "single initial state": problem.initial_set is not None,
         "control whose steps are free, without control_step": problem.control_step is not None,
         "cost that is the L1 norm alone, without group": not problem.cost.is_linear,
         "terminal set with an interior: equals is not built for feedback": any(
@@ -108,7 +110,7 @@ def _program(
     functionals, problem, pieces = model.functionals, model.problem, model.control.pieces
     nominal, first = functionals.variables, functionals.variables + known.variables
     size = first + (nominal if policy.cost == "peak" else 0)
-    loop = ClosedLoop(functionals, known, deviations_of(problem.disturbance, blocks), size)
+    loop = ClosedLoop(functionals, known, deviations_of(problem.disturbance, blocks, problem.initial_set), size)
     families = [
         FeedbackConstraint(constraint, loop).family()
         for constraint in model.constraints

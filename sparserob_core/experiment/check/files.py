@@ -71,7 +71,7 @@ MULTIPLIER = {"constraint", "time", "parameter", "direction", "multiplier"}
 CELLS = {"tolerance", "lower", "upper"}
 WITNESS = {"constraint", "time", "parameter", "direction", "disturbance", "violation"}
 BEGUN = {"deviation"}
-"""Of a witness, where the initial states are a set."""
+"""Of a witness, and of a multiplier under feedback, where the initial states are a set."""
 
 
 def _unread(case: Case) -> set[str]:
@@ -95,6 +95,7 @@ def _unread(case: Case) -> set[str]:
         for entry in entries if isinstance(entries, list) else []:
             mixed = isinstance(entry, Mapping) and str(entry.get("constraint")) in pieced
             more = ({"piece"} if mixed else set()) | (set() if case.policy is None else {"disturbance"})
+            more |= BEGUN if case.policy is not None and case.problem.initial_set is not None else set()
             left |= _besides("multipliers.constraints", entry, MULTIPLIER | more)
             left |= {"multipliers.constraints.parameter"} if _of_a_curved_set_of_controls(case, entry) else set()
     if "proof" in read and isinstance(proof, Mapping):
@@ -274,14 +275,14 @@ def _attained(case: Case, said: Mapping[str, Any]) -> list[str]:
         found = [("", *feedback_of(case).exceeded(said))]
     else:
         found = [("", *exceeded(case, said))]
-    if case.problem.initial_set is not None:
+    if case.problem.initial_set is not None and case.policy is None:
         begun = numbers(said.get("initial_state"), "initial_state")
         centre = np.asarray(case.problem.initial_state)
         if begun.shape != centre.shape or known(case.problem.initial_set).excess(balls(begun - centre))[0] > CLOSE:
             return [f"worst: {begun.tolist()} is no initial state"]
         found.append((f" from {begun.tolist()}", *exceeded(case, said, begun)))
     elif "initial_state" in said:
-        return ["worst: an initial state is named where there is one only"]
+        return ["worst: an initial state is named where there is one only, or none is known"]
     violation = said["violation"]
     return [
         f"worst: the violation is {violation!r}, derived are {', '.join(f'{value:.3g}' for value in most)}{where}"

@@ -38,7 +38,8 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
     least and its proof where that is another one. Where the cost is the time that the control acts, ``J`` is beside it,
     and ``tree`` holds the parts of the controls, each with multipliers of its own. ``witness``: what refutes the
     decision. Under feedback ``decision`` is the nominal control, ``gains (K, K, m, d)`` are what answers the
-    innovations, and every constraint with a multiplier is one at a ``disturbance``.
+    innovations, and every constraint with a multiplier is one at a ``disturbance``, and at a ``deviation`` of the
+    initial state from its centre where there is a set of them.
     """
     if not isinstance(experiment, ControlExperiment) or result.status == "failed":
         return None
@@ -137,6 +138,7 @@ def _multipliers(experiment: ControlExperiment, dual: Dual) -> dict[str, Any] | 
                 **_direction(said),
                 "multiplier": cut.multiplier,
                 **({} if program.spread is None else {"disturbance": _admissible(problem, said)}),
+                **({} if program.spread is None else _deviation(problem, said)),
             }
             for cut, said in explained
         ]
@@ -198,6 +200,14 @@ def _admissible(problem: OptimalControlProblem, said: TimedExplanation) -> Array
     return np.array([_inside(bound, column, middle) for column in said.disturbance.T]).reshape(-1, bound.dimension).T
 
 
+def _deviation(problem: OptimalControlProblem, said: TimedExplanation) -> dict[str, Array]:
+    """The deviation of the initial state that a constraint is at, certainly in its set; nothing without one."""
+    bound = problem.initial_set
+    if bound is None or said.deviation is None:
+        return {}
+    return {"deviation": _inside(bound, said.deviation, bound.interior_point())}
+
+
 def _inside(bound: ConvexSet, point: Array, middle: Array) -> Array:
     if bound.is_box:
         box = bound.bounding_box()
@@ -224,15 +234,12 @@ def _witness(problem: OptimalControlProblem, program: SemiInfiniteProgram, resul
     if signal is not None and problem.disturbance is not None:
         middle = problem.disturbance.interior_point()
         signal = np.array([_inside(problem.disturbance, column, middle) for column in np.asarray(signal).T]).T
-    begun: dict[str, Any] = {}
-    if problem.initial_set is not None and said.deviation is not None:
-        begun["deviation"] = _inside(problem.initial_set, said.deviation, problem.initial_set.interior_point())
     return {
         "constraint": worst.constraint,
         "time": said.time,
         "parameter": _parameter(problem, said),
         **_direction(said),
         "disturbance": signal,
-        **begun,
+        **_deviation(problem, said),
         "violation": worst.violation,
     }

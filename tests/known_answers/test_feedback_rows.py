@@ -1,0 +1,183 @@
+"""Guards what else may hold under policy affine, against linear programs that share nothing with the package: sets of
+initial states, and certificates of them that were forged."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sparserob_core as sr
+from sparserob_core.experiment.check.check import check
+from tests.support.policy_programs import PolicyProgram
+
+SPRING: dict[str, Any] = {
+    "name": "linear",
+    "system": {"A": [[0, 1], [-2, -0.5]], "B": [[0], [1]]},
+    "horizon": 5.0,
+    "initial_state": [-1, 1],
+    "control": {"box": 1.0},
+    "disturbance": {"box": [0.15, 0.15]},
+    "path": [{"box": [0.7, None], "from": 0.5}],
+    "terminal": [{"box": [0.3, 0.3]}],
+}
+PIECES = 10
+
+
+def config(problem: dict[str, Any], cost: str = "nominal", pieces: int = PIECES) -> dict[str, Any]:
+    return {
+        "problem": problem,
+        "dictionaries": {"control": {"name": "piecewise_constant", "pieces": pieces}},
+        "policy": {"name": "affine", "cost": cost},
+    }
+
+
+def run(problem: dict[str, Any], out: Path, cost: str = "nominal", pieces: int = PIECES) -> sr.Outcome:
+    return sr.run(config(problem, cost, pieces), out=out, quiet=True, figures=False)
+
+
+def proven(outcome: sr.Outcome) -> None:
+    """The run is certified, its check holds, and no loop that is driven leaves what was proven."""
+    assert outcome.status == "certified", outcome.result.message
+    found = check(outcome.directory)
+    assert found.status == "verified", [claim for claim in found.claims if claim.verdict != "holds"]
+    driven = sr.simulate(outcome.directory, law="adversary")
+    for one in driven.constraints:
+        assert one.largest == pytest.approx(one.worst, abs=1e-9)
+    sampled = sr.simulate(outcome.directory, law="vertices", trajectories=200)
+    assert sampled.any_violated is None or sampled.any_violated.violated == 0
+    assert not any(one.violated for one in sampled.constraints)
+
+
+def program(problem: dict[str, Any], pieces: int, width: list[float], begun: list[float]) -> PolicyProgram:
+    system = problem["system"]
+    A, B = np.array(system["A"], dtype=float), np.array(system["B"], dtype=float)
+    x0 = problem["initial_state"]
+    x0 = np.array(x0["centre"] if isinstance(x0, dict) else x0, dtype=float)
+    E = np.array(system.get("E", np.eye(len(A))), dtype=float)
+    return PolicyProgram(A, B, E, x0, problem["horizon"], pieces, np.array(width), np.array(begun))
+
+
+def spring_rows(independent: PolicyProgram, within: int, start: float = 0.5, end: bool = True) -> None:
+    """The rows of the spring, ``within`` times a piece."""
+    times = np.linspace(0.0, 5.0, independent.K * within + 1)
+    for t in np.unique(np.append(times[times > start], start)):
+        x = independent.state(float(t))
+        for sign in (1.0, -1.0):
+            independent.below(sign * x[0], 0.7)
+    x = independent.state(5.0)
+    for state in (0, 1) if end else ():
+        for sign in (1.0, -1.0):
+            independent.below(sign * x[state], 0.3)
+
+
+def bracketed(cost: float, programs: Callable[[int], float], within: float = 2e-3) -> None:
+    """The cost is no less than that of programs that see fewer times, and near that of one that sees many."""
+    coarse, fine = (programs(times) for times in (2, 8))
+    assert coarse <= fine <= cost * (1 + 1e-9) + 1e-9
+    assert cost == pytest.approx(fine, rel=within)
+
+
+@pytest.mark.parametrize("cost", ["nominal", "peak"])
+@pytest.mark.parametrize("begun", [[0.1, 0.1], [0.3, 0.0], [0.05, 0.4]])
+def test_a_box_of_initial_states_costs_what_a_linear_program_says(
+    cost: str, begun: list[float], tmp_path: Path
+) -> None:
+    problem = {**SPRING, "initial_state": {"centre": [-1, 1], "box": begun}}
+    outcome = run(problem, tmp_path / "run", cost)
+    proven(outcome)
+
+    def programs(within: int) -> float:
+        independent = program(problem, PIECES, [0.15, 0.15], begun)
+        spring_rows(independent, within)
+        return independent.solve(1.0, cost)
+
+    bracketed(outcome.result.cost, programs)
+
+
+STATES: dict[str, dict[str, Any]] = {
+    "an uneven box": {"box": {"lower": [-0.05, -0.1], "upper": [0.1, 0.0]}},
+    "an ellipsoid": {"ellipsoid": {"shape": [[0.01, 0.002], [0.002, 0.02]]}},
+    "a ball of the 1-norm": {"norm": {"p": 1, "radius": 0.1}},
+    "a triangle": {"polytope": {"H": [[1, 0], [0, 1], [-1, -1]], "h": [0.1, 0.1, 0.1]}},
+}
+
+
+@pytest.mark.parametrize("disturbed", [True, False])
+@pytest.mark.parametrize("name", STATES)
+def test_sets_of_initial_states_keep_every_guarantee(name: str, disturbed: bool, tmp_path: Path) -> None:
+    disturbance = SPRING["disturbance"] if disturbed else None
+    problem = {**SPRING, "initial_state": {"centre": [-1, 1], **STATES[name]}, "disturbance": disturbance}
+    proven(run(problem, tmp_path / "run", "peak"))
+
+
+def test_the_control_answers_the_initial_state_from_the_first_piece_on(tmp_path: Path) -> None:
+    """What is seen at time 0 is forgotten at once here, so that only the first piece can answer it; no plan takes such
+    initial states."""
+    problem = {**SPRING, "initial_state": {"centre": [-1, 1], "box": [0.35, 0.35]}, "disturbance": None}
+    assert sr.run({**config(problem), "policy": {"name": "open_loop"}}, quiet=True).status == "infeasible"
+    answering = {**config(problem), "policy": {"name": "affine", "memory": 0.0}}
+    outcome = sr.run(answering, out=tmp_path / "run", quiet=True, figures=False)
+    proven(outcome)
+    gains = np.load(outcome.directory / "solution.npz")["gains"]
+    assert np.abs(gains[0, 0]).max() > 1e-3
+    assert np.count_nonzero(gains.any(axis=(2, 3))) == 1
+
+
+def test_larger_initial_states_than_any_policy_can_take_are_infeasible_with_their_reason(tmp_path: Path) -> None:
+    problem = {**SPRING, "initial_state": {"centre": [-1, 1], "box": [0.6, 0.6]}}
+    outcome = run(problem, tmp_path / "run")
+    assert outcome.status == "infeasible"
+    assert "for every disturbance and initial state" in outcome.result.message
+    assert check(outcome.directory).status == "verified"
+
+
+def test_feedback_takes_more_initial_states_than_a_plan(tmp_path: Path) -> None:
+    problem = {**SPRING, "initial_state": {"centre": [-1, 1], "box": [0.1, 0.1]}, "disturbance": {"box": [0.03, 0.03]}}
+    found = [
+        sr.margin(
+            {**config(problem), "policy": {"name": name}}, of="initial_state", tolerance=1e-3, out=tmp_path / name
+        )
+        for name in ("open_loop", "affine")
+    ]
+    assert [one.status for one in found] == ["certified"] * 2
+    assert found[1].amounts[0] > 1.1 * found[0].amounts[1]
+
+
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    problem = {**SPRING, "initial_state": {"centre": [-1, 1], "box": [0.1, 0.2]}}
+    outcome = run(problem, tmp_path_factory.mktemp("begun") / "run", "peak")
+    proven(outcome)
+    return outcome.directory
+
+
+FORGERIES: dict[str, Any] = {
+    "a gain on the initial state": lambda data: data["gains"][0][0][0].__setitem__(1, data["gains"][0][0][0][1] + 0.5),
+    "an initial state outside of its set": lambda data: [
+        one["deviation"].__setitem__(0, 0.2) for one in data["multipliers"]["constraints"]
+    ],
+    "another initial state": lambda data: [
+        one["deviation"].__setitem__(1, -one["deviation"][1]) for one in data["multipliers"]["constraints"]
+    ],
+    "no initial state": lambda data: data["multipliers"]["constraints"][0].pop("deviation"),
+}
+
+
+def forged(directory: Path, copy: Path, forgery: Callable[[dict[str, Any]], object]) -> str:
+    """The status of the check of a copy whose certificate was changed."""
+    shutil.copytree(directory, copy)
+    data = json.loads((copy / "certificate.json").read_text())
+    forgery(data)
+    (copy / "certificate.json").write_text(json.dumps(data))
+    return check(copy).status
+
+
+@pytest.mark.parametrize("name", FORGERIES)
+def test_a_forged_initial_state_is_found(name: str, tmp_path: Path, begun: Path) -> None:
+    assert forged(begun, tmp_path / "copy", FORGERIES[name]) == "refuted"
