@@ -4,7 +4,9 @@ grids, closed loops that measure, forged certificates, other units."""
 from __future__ import annotations
 
 import json
+import pickle
 import shutil
+import time
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ from scipy.optimize import linprog
 from scipy.sparse import coo_array
 
 import sparserob_core as sr
+from sparserob_core.control.studies.answer import ControlResult
 from sparserob_core.experiment.check.check import check
 
 SPRING: dict[str, Any] = {
@@ -367,3 +370,110 @@ def test_a_record_is_solved_without_files() -> None:
     result = sr.solve(problem, control=pieces, policy=sr.AffinePolicy())
     assert result.status == "certified"
     assert result.cost == pytest.approx(1.195, rel=1e-6)
+
+
+def test_no_causal_policy_costs_less_than_a_tree_of_signals_proves(tmp_path: Path) -> None:
+    """An independent tree of about fifty signals proves 0.55099 where the affine policy costs 0.58605."""
+    outcome = run(springs(0.2, 0.5), 10, tmp_path / "run")
+    proven(outcome)
+    lower = outcome.summary["causal_lower_bound"]
+    assert 0.55099 <= lower <= outcome.summary["lower_bound"] + 1e-9
+    assert outcome.summary["lower_bound"] == pytest.approx(0.58605, abs=1e-5)
+    assert outcome.summary["causal_infeasible"] is False
+    assert outcome.summary["causal_ended"] == "settled"
+
+
+def test_the_bound_against_causal_policies_depends_on_no_clock_and_says_so_where_it_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from sparserob_core.sip.inner.counterpart import Growing
+
+    quick = run(springs(0.2, 0.5), 10, tmp_path / "quick").summary
+    solve = Growing.solve
+
+    def slowly(self: Growing, seconds: float = np.inf) -> Any:
+        time.sleep(0.02)
+        return solve(self, seconds)
+
+    monkeypatch.setattr(Growing, "solve", slowly)
+    slow = run(springs(0.2, 0.5), 10, tmp_path / "slow").summary
+    assert slow["causal_lower_bound"] == quick["causal_lower_bound"]
+    stopped = run(springs(0.2, 0.5), 10, tmp_path / "stopped", policy={"causal_seconds": 0.0}).summary
+    assert stopped["causal_ended"] == "seconds" and stopped["status"] == "certified"
+
+
+def test_the_bound_against_causal_policies_is_pickled_with_its_result(tmp_path: Path) -> None:
+    outcome = run(springs(0.2, 0.5), 10, tmp_path / "run")
+    for copy in (pickle.loads(pickle.dumps(outcome)).result, pickle.loads(pickle.dumps(outcome.result))):
+        assert isinstance(copy, ControlResult) and isinstance(outcome.result, ControlResult)
+        assert copy.causal is not None and outcome.result.causal is not None
+        assert copy.causal.lower == outcome.result.causal.lower == outcome.summary["causal_lower_bound"]
+        assert [row.multiplier for row in copy.causal.rows] == [row.multiplier for row in outcome.result.causal.rows]
+    assert outcome.result.plain.__class__ is sr.Result
+
+
+def test_where_no_causal_policy_exists_the_run_says_so_and_the_check_derives_it(tmp_path: Path) -> None:
+    """On experiment 1 with the path from 0.3 none withstands more than 0.2905."""
+    outcome = run(springs(0.3, 0.3), 20, tmp_path / "run")
+    assert outcome.status == "infeasible"
+    assert outcome.summary["causal_infeasible"] is True and outcome.summary["causal_lower_bound"] is None
+    assert "nor does any other causal policy" in outcome.summary["message"]
+    found = check(outcome.directory)
+    assert {claim.name: claim.verdict for claim in found.claims}["causal"] == "holds"
+    assert found.status == "verified"
+
+
+def test_no_bound_against_causal_policies_is_sought_with_no_signals(tmp_path: Path) -> None:
+    outcome = run(springs(0.2, 0.5), 10, tmp_path / "run", policy={"causal_signals": 0})
+    assert outcome.summary["causal_lower_bound"] is None and outcome.summary["causal_infeasible"] is False
+    assert "causal" not in json.loads((outcome.directory / "certificate.json").read_text())
+    proven(outcome)
+
+
+def test_a_forged_bound_against_causal_policies_is_refused(tmp_path: Path) -> None:
+    outcome = run(springs(0.2, 0.5), 10, tmp_path / "run")
+    certificate = json.loads((outcome.directory / "certificate.json").read_text())
+    causal = certificate["causal"]
+
+    def verdict(**changed: Any) -> str:
+        copy = tmp_path / "copy"
+        shutil.rmtree(copy, ignore_errors=True)
+        shutil.copytree(outcome.directory, copy)
+        (copy / "certificate.json").write_text(json.dumps({**certificate, "causal": {**causal, **changed}}))
+        return {claim.name: claim.verdict for claim in check(copy).claims}["causal"]
+
+    entries, signals = causal["multipliers"], causal["signals"]
+    assert verdict() == "holds"
+    assert verdict(lower_bound=causal["lower_bound"] + 1e-6) == "fails"
+    assert verdict(lower_bound=None) == "fails"
+    assert verdict(signals=[[[1.01 * v for v in row] for row in one] for one in signals]) == "fails"
+    assert verdict(signals=[[[0.0 * v for v in row] for row in one] for one in signals]) == "fails"
+    assert verdict(multipliers=[{**one, "multiplier": -one["multiplier"]} for one in entries]) == "fails"
+    assert verdict(multipliers=[{**one, "multiplier": 2.0 * one["multiplier"]} for one in entries]) == "fails"
+    assert verdict(multipliers=[{**one, "signal": len(signals)} for one in entries]) == "fails"
+    assert verdict(multipliers=[{**one, "time": 0.25} for one in entries]) == "fails"
+    assert verdict(multipliers=[{**one, "direction": [0.0, 0.0, 1.0]} for one in entries]) == "fails"
+    for wrong in (None, [], {}, "text", [None], [{}]):
+        assert verdict(multipliers=wrong) == "fails"
+        assert verdict(signals=wrong) == "fails"
+
+
+def test_a_result_that_says_another_causal_bound_than_the_certificate_is_noticed(tmp_path: Path) -> None:
+    outcome = run(springs(0.2, 0.5), 10, tmp_path / "run")
+    file = outcome.directory / "result.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), "causal_lower_bound": 0.58}))
+    assert {claim.name: claim.verdict for claim in check(outcome.directory).claims}["result.json"] == "fails"
+
+
+def test_the_margin_of_a_policy_says_above_which_factor_no_causal_policy_exists(tmp_path: Path) -> None:
+    """Experiment 1 with the path from 0.3, a breakpoint: u = 1 until then is the best for x1(0.3) whatever happens."""
+    A, c, x0 = np.array([[0.0, 1.0], [-2.0, -0.5]]), np.array([1.0, 0.0]), np.array([-1.0, 1.0])
+    fine = (np.arange(6000) + 0.5) * 0.3 / 6000
+    rows = np.array([c @ expm(A * s) for s in fine]) * 0.3 / 6000
+    cap = (0.7 + c @ expm(A * 0.3) @ x0 + rows[:, 1].sum()) / np.abs(rows).sum()
+    times = [0.0, 0.3, 1.0, 2.0, 3.0, 4.0, 5.0]
+    given = config({**springs(0.2, 0.3), "terminal": [{"box": [0.9, 1.2]}]}, 5)
+    given["dictionaries"] = {"control": {"name": "piecewise_constant", "breakpoints": times}}
+    found = sr.margin(given, tolerance=1e-4)
+    assert found.lower <= found.causal_upper
+    assert found.causal_upper * 0.2 <= cap * (1.0 + 1e-6)

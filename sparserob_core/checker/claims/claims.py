@@ -11,9 +11,9 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.claims import activity
 from sparserob_core.checker.claims.case import Case, listed, number, numbers
-from sparserob_core.checker.claims.constraints import bounded
+from sparserob_core.checker.claims.causal import causal_bound
+from sparserob_core.checker.claims.constraints import bounded, equalities
 from sparserob_core.checker.claims.duality import Row, before, steps
-from sparserob_core.checker.claims.equalities import equalities
 from sparserob_core.checker.claims.feedback import feedback_of
 from sparserob_core.checker.claims.replay import reached
 from sparserob_core.checker.claims.window import Window
@@ -31,6 +31,7 @@ FIGURES = 1e-11  # relative to the larger of it and 1: how closely a written fig
 SMALL_COST = 1e-6  # of the largest possible cost: a cost below this is judged as if it were this large
 SMALL_GAP = 1e-11  # what is subtracted from a lower bound for rounding may open a gap that was closed
 MOST_MULTIPLIERS = 100_000
+ASIDE = ("fewest active", "causal")  # claims that the status does not rest on
 
 
 def check(case: Case, gap_tolerance: float | None) -> list[Finding]:
@@ -41,14 +42,16 @@ def check(case: Case, gap_tolerance: float | None) -> list[Finding]:
     with ctx.workprec(_precision(case)):
         if type(case.certificate.get("format")) is not int or case.certificate["format"] != 1:
             return [Finding("certificate", "fails", f"its format is {case.certificate.get('format')!r}, expected 1")]
+        causal = [judged("causal", lambda: _causal(case))] if "causal" in case.certificate else []
         if status == "infeasible":
-            return [judged("infeasibility", lambda: _infeasible(case))]
+            return [judged("infeasibility", lambda: _infeasible(case)), *causal]
         if status not in ("certified", "verified", "refuted", "undecided"):
             return [Finding("status", "fails", f"it is {status!r}, which claims nothing")]
         claims = [judged("control", lambda: _control(case)), judged("cost", lambda: _cost(case))]
         claims += [judged("lower bound", lambda: _lower(case))]
         if "fewest_active" in case.certificate:
             claims.append(judged("fewest active", lambda: _fewest(case, str(status))))
+        claims += causal
         if status == "refuted":
             return [*claims, judged("violation", lambda: _witness(case))]
         if case.problem.control_step is not None:
@@ -66,6 +69,15 @@ def derived_bound(case: Case) -> float:
 
     with ctx.workprec(_precision(case)):
         return float(np.nextafter(float(_multiplied(case, priced=True).lower()), -np.inf))
+
+
+def derived_causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> float:
+    """What every causal policy costs at least, by these signals and multipliers, rounded downwards; not ``priced``: by
+    how much it misses their sum. Raises `Unchecked` and `Broken` where there is none."""
+    from flint import ctx
+
+    with ctx.workprec(_precision(case)):
+        return float(np.nextafter(float(causal_bound(case, data, priced).lower()), -np.inf))
 
 
 def _precision(case: Case) -> int:
@@ -335,6 +347,23 @@ def _lower(case: Case) -> str:
     )
 
 
+def _causal(case: Case) -> str:
+    """The bound against every causal policy."""
+    data = case.certificate["causal"]
+    if not isinstance(data, Mapping):
+        raise Broken("causal: expected lower_bound, signals and multipliers")
+    count = len(listed(data, "signals"))
+    if data.get("lower_bound") is None:
+        amount = causal_bound(case, data, priced=False)
+        if not amount > 0:
+            raise Broken(f"causal: the multipliers prove {float(amount.lower()):.3g}, expected a positive number")
+        return f"no causal policy exists: under {count} signals a weighted sum of constraints is always missed"
+    written, derived = number(data, "lower_bound"), causal_bound(case, data, priced=True)
+    if not derived >= written:
+        raise Broken(f"causal: {written!r} is written, the multipliers prove {float(derived.lower())!r}")
+    return f"no causal policy costs less than {written:.9g}, by {count} signals"
+
+
 def _tree(case: Case) -> float:
     """What the leaves of the certificate's tree prove of the time that a control acts."""
     data = case.certificate.get("tree")
@@ -375,11 +404,11 @@ def _status(case: Case, status: str, tolerance: float | None, claims: list[Findi
     """The status must follow from the claims before it."""
     if status == "undecided":
         return "nothing is claimed beyond the figures above"
-    kept = [claim for claim in claims if claim.name not in ("cost", "lower bound", "fewest active")]
+    kept = [claim for claim in claims if claim.name not in ("cost", "lower bound", *ASIDE)]
     wrong = [claim.name for claim in kept if claim.verdict == "fails"]
     if wrong:
         raise Broken(f"it is {status}, but {', '.join(wrong)} does not hold")
-    needed = kept if status == "verified" else [claim for claim in claims if claim.name != "fewest active"]
+    needed = kept if status == "verified" else [claim for claim in claims if claim.name not in ASIDE]
     if any(claim.verdict == "not checked" for claim in needed):
         raise Unchecked(f"{status} rests on claims that were not checked")
     cost, lower = number(case.certificate, "cost"), number(case.certificate, "lower_bound")

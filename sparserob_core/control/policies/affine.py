@@ -29,6 +29,14 @@ class AffinePolicy(Policy, Options):
     memory: float | None = Field(default=None, ge=0.0)
     """An innovation is answered for so long at most, in the time unit of the problem; everything by default."""
 
+    causal_signals: int = Field(default=40, ge=0, le=1000)
+    """A bound against every causal policy is sought with a tree of the signals of the disturbance that the policy's own
+    bound rests on, and so many more at most; 0: none is sought."""
+
+    causal_seconds: float = Field(default=60.0, ge=0.0)
+    """And for so long at most. The search ends much earlier, in proportion to what the policy itself took, by a count
+    that is the same on every machine; where this time did end it, ``result.json`` says so."""
+
     @property
     def knows(self) -> frozenset[Quantity]:
         """The state, at the breakpoints."""

@@ -14,6 +14,7 @@ from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.studies.adversary import Adversary, find_adversary
+from sparserob_core.control.studies.causal import CausalBound
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
@@ -60,18 +61,21 @@ class Tube:
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class ControlResult(Result):
-    """The `Result` of a control problem; ``model`` is what the problem became.
+    """The `Result` of a control problem; ``model`` is what the problem became; ``causal``, of a run under feedback, a
+    bound against every causal policy.
 
     ``control``, ``tube`` and ``adversary`` raise `InputError` where there is no decision. It can be pickled if the
     problem can: the program is then built anew where it is read.
     """
 
     model: Transcription = field(repr=False)
+    causal: CausalBound | None = field(default=None, repr=False)
 
     @staticmethod
-    def of(result: Result, model: Transcription) -> ControlResult:
+    def of(result: Result, model: Transcription, causal: CausalBound | None = None) -> ControlResult:
         """The result with its problem."""
-        return ControlResult(**{one.name: getattr(result, one.name) for one in fields(Result)}, model=model)
+        known = {one.name: getattr(result, one.name) for one in fields(Result)}
+        return ControlResult(**known, model=model, causal=causal)
 
     @property
     def plain(self) -> Result:
@@ -113,7 +117,8 @@ class ControlResult(Result):
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         model = self.model
         policy = None if model.feedback is None else model.feedback.policy
-        return _read, (self.plain, model.problem, model.control, model.disturbance, model.formulation, policy)
+        given = (model.problem, model.control, model.disturbance, model.formulation, policy)
+        return _read, (self.plain, *given, self.causal)
 
 
 def _read(
@@ -123,10 +128,11 @@ def _read(
     disturbance: Dictionary,
     form: Any,
     policy: Policy | None = None,
+    causal: CausalBound | None = None,
 ) -> ControlResult:
     from sparserob_core.control.transcription.transcribe import prepare
 
-    return ControlResult.of(result, prepare(problem, control, disturbance, form, policy))
+    return ControlResult.of(result, prepare(problem, control, disturbance, form, policy), causal)
 
 
 def tube(model: Transcription, theta: Array, times: Array) -> Tube:

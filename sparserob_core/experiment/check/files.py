@@ -77,12 +77,17 @@ BEGUN = {"deviation"}
 def _unread(case: Case) -> set[str]:
     """The names ``key.key`` of what a certificate says besides what its claims rest on."""
     data = case.certificate
-    read = CERTIFICATE.get(str(data.get("status")), FIGURED) | (set() if case.policy is None else {"gains"})
+    read = CERTIFICATE.get(str(data.get("status")), FIGURED) | (set() if case.policy is None else {"gains", "causal"})
     left = {name for name, value in data.items() if name not in read and not (name in SOMETIMES and value in NOTHING)}
     pieced = {window.name for window in case.windows if window.is_mixed}
     proof, witness, fewest = (data.get(name) for name in ("proof", "witness", "fewest_active"))
     of_activity = fewest.get("multipliers") if isinstance(fewest, Mapping) else None
     left |= _besides("fewest_active", fewest, {"lower", "upper", "multipliers", "decision", "proof"})
+    causal = data.get("causal") if case.policy is not None else None
+    left |= _besides("causal", causal, {"lower_bound", "signals", "multipliers"})
+    rows = causal.get("multipliers") if isinstance(causal, Mapping) else None
+    for entry in rows if isinstance(rows, list) else []:
+        left |= _besides("causal.multipliers", entry, (MULTIPLIER - {"parameter"}) | {"signal"})
     for multipliers in (data.get("multipliers"), of_activity):
         if not isinstance(multipliers, Mapping):
             continue
@@ -150,6 +155,7 @@ def _result(loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Verdicts:
             "undecided": (None, case.certificate.get("cost")),
         }.get(str(status), (case.certificate.get("cost"),)),
         "J": (case.certificate.get("J"),),
+        **_causal(case),
         "seed": (loaded.config.seed,),
         "title": (loaded.config.title, loaded.config.title or summary.get("title")),
     }
@@ -173,6 +179,16 @@ def _result(loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Verdicts:
     for name, read in (("worst", WORST), ("sparsity", SPARSITY)):
         left += sorted(_besides(name, summary.get(name), read)) if name not in left else []
     return different, "it says what the certificate says", left
+
+
+def _causal(case: Case) -> dict[str, tuple[object, ...]]:
+    """What is to be said of every causal policy."""
+    if case.policy is None:
+        return {}
+    claimed = case.certificate.get("causal")
+    lower = claimed.get("lower_bound") if isinstance(claimed, Mapping) else None
+    none = isinstance(claimed, Mapping) and lower is None
+    return {"causal_lower_bound": (lower,), "causal_infeasible": (none, *(() if none else (None,)))}
 
 
 def _gap(case: Case, summary: Mapping[str, Any]) -> list[str] | None:

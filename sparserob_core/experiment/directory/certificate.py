@@ -11,6 +11,8 @@ import numpy as np
 from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.sets.sets import ConvexSet
+from sparserob_core.control.studies.answer import ControlResult
+from sparserob_core.control.studies.causal import CausalBound
 from sparserob_core.control.transcription.steps import Steps
 from sparserob_core.control.transcription.transcribe import slanted
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment
@@ -38,8 +40,8 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
     least and its proof where that is another one. Where the cost is the time that the control acts, ``J`` is beside it,
     and ``tree`` holds the parts of the controls, each with multipliers of its own. ``witness``: what refutes the
     decision. Under feedback ``decision`` is the nominal control, ``gains (K, K, m, d)`` are what answers the
-    innovations, and every constraint with a multiplier is one at a ``disturbance``, and at a ``deviation`` of the
-    initial state from its centre where there is a set of them.
+    innovations, every constraint with a multiplier is one at a ``disturbance``, and at a ``deviation`` of the
+    initial state from its centre where there is a set of them, and ``causal`` is the bound against every causal policy.
     """
     if not isinstance(experiment, ControlExperiment) or result.status == "failed":
         return None
@@ -53,6 +55,7 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
     )
     feedback = experiment.transcription.feedback
     answered = {} if feedback is None or theta is None else {"gains": feedback.loop.gains(np.asarray(result.decision))}
+    causal = result.causal if isinstance(result, ControlResult) and result.causal and result.causal.rows else None
     return {
         "format": FORMAT,
         "config": experiment.loaded.config.digest(),
@@ -64,8 +67,28 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
         **answered,
         **_counted(experiment, result),
         **_fewest(experiment, result.activity),
+        **({} if causal is None else {"causal": causal_data(causal)}),
         "proof": _proofs(experiment, result.proofs),
         "witness": _witness(problem, program, result) if result.status == "refuted" else None,
+    }
+
+
+def causal_data(bound: CausalBound) -> dict[str, Any]:
+    """A bound against every causal policy: ``lower_bound``, ``null`` where none exists, the ``signals`` of the
+    disturbance, ``(mw, blocks)`` each, and the ``multipliers`` of constraints under one of them."""
+    return {
+        "lower_bound": bound.lower if np.isfinite(bound.lower) else None,
+        "signals": list(bound.signals),
+        "multipliers": [
+            {
+                "signal": row.signal,
+                "constraint": row.constraint,
+                "time": row.time,
+                "direction": row.direction + 0.0,
+                "multiplier": row.multiplier,
+            }
+            for row in bound.rows
+        ],
     }
 
 

@@ -16,12 +16,14 @@ from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.config.problems import LinearKeys
 from sparserob_core.experiment.config.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import RunDirectory, create_directory, finite
+from sparserob_core.experiment.margin.causal import causal_upper
 from sparserob_core.experiment.margin.horizon import HORIZON, HorizonSearch, horizon_search
 from sparserob_core.experiment.margin.scaling import Scaling, scaling
 from sparserob_core.experiment.margin.search import Margin, MarginSearch, Point
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.relaxed.parametric import ParametricProgram
+from sparserob_core.sip.result import Result
 
 __all__ = ["Margin", "Point", "margin", "margin_rows", "summary_of_margin"]
 
@@ -86,6 +88,8 @@ def margin_rows(found: Margin) -> list[tuple[str, str]]:
         (f"{found.sense} factor", _between(found.lower, found.upper)),
         (found.quantity, _between(*found.amounts)),
     ]
+    if np.isfinite(found.causal_upper):
+        rows.append(("no causal policy", f"from the factor {found.causal_upper:.9g} on"))
     for name, point in (("proven feasible", found.feasible), ("proven infeasible", found.infeasible)):
         if point is not None:
             cost = f", cost {point.upper_bound:.9g}" if np.isfinite(point.upper_bound) else ""
@@ -137,7 +141,20 @@ def _search(loaded: Loaded, of: str, tolerance: float, notify: Notify) -> Margin
         own, units = in_own_units(prepare(chosen.at(1.0), control, disturbance))
         joined = ParametricProgram(lambda factor: like(own, units.of_problem(chosen.at(factor))))
     width = tolerance * (1.0 if chosen.relative else chosen.highest)
-    return MarginSearch(experiment.title, programs, joined, chosen, _method(loaded), tools, width, notify)
+    search = MarginSearch(experiment.title, programs, joined, chosen, _method(loaded), tools, width, notify)
+    if policy is None or of != "disturbance":
+        return search
+
+    def beyond(results: dict[float, Result]) -> float:
+        return causal_upper(
+            lambda factor: prepare(chosen.at(factor), control, disturbance, policy=policy),
+            chosen,
+            results,
+            tools,
+            notify,
+        )
+
+    return replace(search, beyond=beyond)
 
 
 def _positions(loaded: Loaded, problem: OptimalControlProblem) -> tuple[list[list[int]], list[list[int]]]:

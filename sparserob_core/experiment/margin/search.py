@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, TypeAlias, final
@@ -18,7 +19,7 @@ from sparserob_core.sip.method import Tools
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.methods.own_units import solve_in_own_units
 from sparserob_core.sip.relaxed.parametric import ParametricProgram
-from sparserob_core.sip.result import Status
+from sparserob_core.sip.result import Result, Status
 
 Answer: TypeAlias = Literal["certified", "unbounded", "infeasible", "undecided"]
 FEASIBLE: tuple[Status, ...] = ("certified", "verified")
@@ -85,6 +86,7 @@ class Margin:
     seconds: float = 0.0
     directory: Path | None = None
     covered: tuple[tuple[float, float], ...] = ()
+    causal_upper: float = np.nan
 
 
 @final
@@ -92,7 +94,8 @@ class Margin:
 class MarginSearch:
     """One search. ``programs``: those of ordinary runs, by their factor; ``joined``: the same in units that do not
     depend on it, where the factor enters linearly. ``width``: how close the two sides are to be, relative to the factor
-    if that is above 1."""
+    if that is above 1. ``beyond``: what tells, of the ``results`` by their factor, above
+    which factor nothing exists that answers the disturbance in whatever way."""
 
     title: str
     programs: ParametricProgram
@@ -104,6 +107,8 @@ class MarginSearch:
     notify: Notify
     points: list[Point] = field(default_factory=list)
     seen: dict[float, str] = field(default_factory=dict)
+    results: dict[float, Result] = field(default_factory=dict)
+    beyond: Callable[[dict[float, Result]], float] | None = None
 
     def margin(self, count: int) -> Margin:
         """The margin, with a curve of ``count`` points."""
@@ -118,6 +123,12 @@ class MarginSearch:
             said = str(pressed) or "interrupted from the keyboard"
             sides, known = self._known(said, sides)
             curve = known if count else ()
+        causal = np.nan
+        if self.beyond is not None:
+            try:
+                causal = self.beyond(self.results)
+            except KeyboardInterrupt as pressed:
+                self.tools.deadline.interrupt(pressed)
         status, message, feasible, infeasible = sides
         inner, outer = feasible.factor if feasible else np.nan, infeasible.factor if infeasible else np.nan
         if status == "unbounded":
@@ -137,6 +148,7 @@ class MarginSearch:
             feasible=feasible,
             infeasible=infeasible,
             curve=curve,
+            causal_upper=causal,
             seconds=time.perf_counter() - started,
         )
 
@@ -222,6 +234,7 @@ class MarginSearch:
             result = solve_in_own_units(self.method, self.programs.program(factor), self.tools)
         except InputError as error:
             return Point(factor, self.scaling.amount(factor), "failed", str(error), -np.inf, np.inf)
+        self.results[factor] = result
         self._tell(f"{self.scaling.of} at {factor:.9g}: {result.status}")
         amount = self.scaling.amount(factor)
         point = Point(factor, amount, result.status, result.message, result.lower_bound, result.upper_bound)

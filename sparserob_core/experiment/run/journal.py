@@ -9,6 +9,7 @@ from typing import Any, final
 import numpy as np
 
 from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.studies.answer import ControlResult
 from sparserob_core.errors import SparseRobError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment
 from sparserob_core.experiment.directory.adversary import FILE as ADVERSARY
@@ -45,6 +46,7 @@ class Journal(Observer):
             "title": self.experiment.title,
             **summary_of(result, control, self._dictionary),
             **self._added_up(result),
+            **self._causal(result),
             "seed": config.seed,
             "versions": versions(),
             "config": config.digest(),
@@ -59,6 +61,19 @@ class Journal(Observer):
             return {}
         words = self.experiment.problem.cost.words()
         return {"cost_of": words} if words else {}
+
+    def _causal(self, result: Result) -> dict[str, Any]:
+        """Under feedback what no causal policy costs less than; ``null`` where nothing is proven, or none exists, and
+        why no more was sought."""
+        if not isinstance(self.experiment, ControlExperiment) or self.experiment.transcription.feedback is None:
+            return {}
+        bound = result.causal if isinstance(result, ControlResult) else None
+        lower = None if bound is None or not np.isfinite(bound.lower) else bound.lower
+        return {
+            "causal_lower_bound": lower,
+            "causal_infeasible": bound is not None and bound.lower == np.inf,
+            "causal_ended": None if bound is None else bound.ended,
+        }
 
     @property
     def _dictionary(self) -> Dictionary | None:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.studies.adversary import Adversary
 from sparserob_core.control.studies.answer import ControlResult, Tube
+from sparserob_core.control.studies.causal import CausalBound
 from sparserob_core.control.transcription.provable import SECONDS, announced, unprovable
 from sparserob_core.errors import InputError, named
 from sparserob_core.experiment.assemble import Anew, ControlExperiment, Experiment, assemble, build, name_of, tools_of
@@ -22,6 +23,7 @@ from sparserob_core.experiment.directory.artefacts import create_directory
 from sparserob_core.experiment.directory.finished import UNFINISHED
 from sparserob_core.experiment.directory.provenance import git_revision, provenance
 from sparserob_core.experiment.run.bound import bounded
+from sparserob_core.experiment.run.causal import with_causal
 from sparserob_core.experiment.run.events import Broadcast, Event, Observer, RunFinished, RunStarted
 from sparserob_core.experiment.run.fewest import with_activity
 from sparserob_core.experiment.run.inspection import Inspection
@@ -98,10 +100,12 @@ class Outcome:
         return page(self.experiment.title, result_rows(self.summary), self.directory / "figures" / "control.png")
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
-        plain = self.result.plain if isinstance(self.result, ControlResult) else self.result
+        of = self.result
+        plain, causal = (of.plain, of.causal) if isinstance(of, ControlResult) else (of, None)
         loaded = self.experiment.loaded
         stated = Source(loaded.source.name, loaded.source.folder, loaded.config.plain())
-        return _read, (stated, plain, self.directory, self.control, self.summary, self.remarks, self.interrupted)
+        kept = (self.directory, self.control, self.summary, self.remarks, self.interrupted)
+        return _read, (stated, plain, *kept, causal)
 
     def show(self, save: str | Path | None = None, *, serve: bool = False, connect: str | None = None) -> None:
         """Show the run in the viewer of Rerun: a new one, one that listens at ``connect``, a browser (``serve``), or
@@ -127,9 +131,13 @@ def _read(
     summary: Mapping[str, Any],
     remarks: Sequence[str],
     interrupted: bool,
+    causal: CausalBound | None = None,
 ) -> Outcome:
     """A pickled outcome; its experiment is built anew from its config."""
-    return Outcome(result, directory, assemble(load_config(stated)), control, summary, remarks, interrupted)
+    experiment = assemble(load_config(stated))
+    if isinstance(experiment, ControlExperiment):
+        result = ControlResult.of(result, experiment.transcription, causal)
+    return Outcome(result, directory, experiment, control, summary, remarks, interrupted)
 
 
 def run(
@@ -226,12 +234,13 @@ def _run(
                     raise
             if isinstance(experiment, ControlExperiment):
                 known = bounded(experiment, result) if result.sparsest is None else result
-                result = with_activity(experiment, known, tools)
+                known = with_activity(experiment, known, tools)
+                result = with_causal(ControlResult.of(known, experiment.transcription), tools)
             ending = RunFinished(
                 status=result.status,
                 message=result.message,
                 seconds=result.seconds,
-                result=result,
+                result=result.plain if isinstance(result, ControlResult) else result,
                 pressed=deadline.pressed,
             )
             control, summary, remarks = journal.finish(result, figures and complete, certify=complete, notify=broadcast)

@@ -55,6 +55,7 @@ def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("lower bound", _number(summary["lower_bound"], ".9g")),
         ("upper bound", _number(summary["upper_bound"], ".9g")),
         ("relative gap", _number(summary["gap"], ".2e")),
+        ("any causal policy", _causal(summary)),
         ("worst violation", _worst(worst)),
         ("proven to", _tolerances(summary.get("tolerances") or {})),
         ("equalities", _equalities(summary.get("equalities"))),
@@ -81,6 +82,14 @@ def _fewest(known: Mapping[str, Any] | None) -> str:
         else f", and {_number(upper, '.1%')} suffice" + (": none acts less" if upper == known["lower"] else "")
     )
     return f"every admissible control acts at least {lower} of the time{above}"
+
+
+def _causal(summary: Mapping[str, Any]) -> str:
+    """What no causal policy can do."""
+    if summary.get("causal_infeasible"):
+        return "none exists: proven"
+    lower = summary.get("causal_lower_bound")
+    return "unknown" if lower is None else f"costs at least {lower:.9g}"
 
 
 def _number(value: Any, form: str) -> str:

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 ACCURACY = 1e-10  # of rows and reduced costs: the least that HiGHS takes
+INNER = 20  # steps of the simplex method that one of an interior point method takes as long as
 SAME = 1e-12  # points of a set that are closer are one
 
 
@@ -80,7 +81,7 @@ class Counterpart:
     _margin: float = 0.0
 
     def __post_init__(self) -> None:
-        self._linear = _Linear()
+        self._linear = Growing()
         program, n = self.program, self.program.n
         low, high = program.lower, program.upper
         priced = not self.elastic
@@ -247,7 +248,7 @@ class Counterpart:
 
 
 @final
-class _Linear:
+class Growing:
     """A sparse linear program that grows, solved by HiGHS from where it was."""
 
     def __init__(self) -> None:
@@ -255,6 +256,7 @@ class _Linear:
 
         self.highs: Any = highspy.Highs()
         self.columns = self.count = 0
+        self.work = 0.0  # of the last solution: entries times steps
         for name, value in {
             "output_flag": False,
             "threads": 1,
@@ -287,11 +289,17 @@ class _Linear:
         for row, value in zip(rows.tolist(), upper.tolist(), strict=True):
             self.highs.changeRowBounds(row, -np.inf, value)
 
-    def solve(self) -> tuple[bool, str, Array, Array]:
-        """Whether it was solved, in the solver's words, the values of the columns and the multipliers of the rows."""
+    def solve(self, seconds: float = np.inf) -> tuple[bool, str, Array, Array]:
+        """Whether it was solved, in the solver's words, the values of the columns and the multipliers of the rows; it
+        is not where ``seconds`` do not suffice."""
         import highspy
 
+        if np.isfinite(seconds):
+            self.highs.setOptionValue("time_limit", self.highs.getRunTime() + max(seconds, 0.0))
         self.highs.run()
+        done = self.highs.getInfo()
+        steps = 1 + max(0, done.simplex_iteration_count) + INNER * max(0, done.ipm_iteration_count)
+        self.work = float(steps) * self.highs.getNumNz()
         status = self.highs.getModelStatus()
         said = f"HiGHS: {self.highs.modelStatusToString(status)}"
         if status != highspy.HighsModelStatus.kOptimal:

@@ -1,0 +1,158 @@
+"""The claim against every causal policy, derived anew in balls from signals and multipliers alone.
+
+A control on piece ``k`` depends on the disturbance before ``tau_k`` only: it is one vector for all signals that agree
+until then. So a weighted sum of constraints under the signals is, for every causal policy, at least what the least of
+every such vector over the set of the control leaves, its part of the cost included.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+
+from sparserob_core.checker.claims.case import Case, listed, number, numbers
+from sparserob_core.checker.claims.duality import Row
+from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.reach.closed_loop import middle
+from sparserob_core.checker.sets.known import known
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from flint import arb
+
+MOST = 100_000  # multipliers
+PEAK = "peak"
+Rows: TypeAlias = "dict[tuple[str, float, bytes], tuple[Row, list[list[arb]]]]"
+SHARE = 1.0 - 2.0**-40  # of a price, that is shared: so that rounding does not share more than there is
+
+
+def causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> arb:
+    """What every causal policy costs at least; not ``priced``: by how much it misses the weighted sum of the
+    constraints at least, which proves that there is none where it is positive."""
+    from flint import arb
+
+    _refuse(case)
+    signals, rest = _signals(case, data), middle_of(case)
+    K, m, total = case.control.pieces, case.problem.system.controls, arb(0)
+    changes = case.changes or []
+    seen = [bisect_left(changes, float(t)) for t in case.control.breakpoints[:-1]]  # blocks that began before
+    groups: list[dict[bytes, list[arb]]] = [{_until(rest, n): [arb(0)] * m} for n in seen]
+    entries = listed(data, "multipliers")
+    if len(entries) > MOST:
+        raise Broken(f"{len(entries)} multipliers are too many to be checked")
+    known_rows: Rows = {}
+    for entry in entries:
+        case.clock.check()
+        y, which, (row, pushed) = _row(case, entry, len(signals), known_rows)
+        weight, signal = arb(y), signals[which]
+        noise = [a * arb(float(w)) for block, column in zip(pushed, signal.T, strict=True)
+                 for a, w in zip(block, column, strict=True)]  # fmt: skip
+        total = total + weight * sum(noise, row.constant)
+        for k in range(K):
+            if any(not x.is_zero() for x in row.slope[k]):
+                group = groups[k].setdefault(_until(signal, seen[k]), [arb(0)] * m)
+                group[:] = [a + weight * x for a, x in zip(group, row.slope[k], strict=True)]
+    for k in range(K):
+        total = total + _of_piece(case, k, groups[k], _until(rest, seen[k]), priced)
+    return total
+
+
+def _refuse(case: Case) -> None:
+    if case.policy is None or case.problem.system.parameter_count or not case.problem.cost.is_linear:
+        raise Unchecked("the checker bounds causal policies of known systems, with the cost of an L1 norm, only")
+    if case.problem.initial_set is not None or not case.control.is_indicators or case.problem.system.delay:
+        raise Unchecked("the checker bounds causal policies from one initial state, with indicators, without delay")
+
+
+def _row(case: Case, entry: object, signals: int, rows: Rows) -> tuple[float, int, tuple[Row, list[list[arb]]]]:
+    """The multiplier of an entry, its signal, and the constraint that it names, with what the disturbance gives."""
+    if not isinstance(entry, Mapping):
+        raise Broken("causal: expected a signal, a constraint, a time, a direction and a number each")
+    name, time, y = str(entry.get("constraint")), number(entry, "time"), number(entry, "multiplier")
+    direction, which = numbers(entry.get("direction"), f"{name}: direction"), entry.get("signal")
+    if not y > 0:
+        raise Broken(f"causal: a multiplier of {name} is {y!r}, expected a positive number")
+    if not isinstance(which, int) or isinstance(which, bool) or not 0 <= which < signals:
+        raise Broken(f"causal: there is no signal {which!r}")
+    window = case.window(name)
+    if window.is_mixed or direction.shape != (case.problem.system.states,):
+        raise Broken(f"causal: {name}: {direction.size} numbers where {case.problem.system.states} are expected")
+    if not window.start <= time <= window.stop:
+        raise Broken(f"causal: {name}: t = {time!r} is not within {window.start:g} to {window.stop:g}")
+    key = (name, time, direction.tobytes())
+    if key not in rows:
+        row = case.duality.row(direction, time, [], window.limit(direction, time), disturbed=False)
+        rows[key] = row, case.duality.pushed(direction, time)
+    return y, which, rows[key]
+
+
+def middle_of(case: Case) -> Array:
+    """The nominal signal ``(mw, blocks)``: the middle of its set throughout."""
+    shape = case.problem.disturbance
+    if shape is None:
+        return np.zeros((0, 0))
+    return np.repeat(middle(shape)[:, None], len(case.changes or []), axis=1)
+
+
+def _until(signal: Array, blocks: int) -> bytes:
+    return np.ascontiguousarray(signal[:, :blocks] + 0.0).tobytes()
+
+
+def _signals(case: Case, data: Mapping[str, Any]) -> list[Array]:
+    """The signals ``(mw, blocks)``, which must be in the set of the disturbance."""
+    found, shape = [], case.problem.disturbance
+    for said in listed(data, "signals"):
+        case.clock.check()
+        if shape is None:
+            found.append(np.zeros((0, 0)))
+            continue
+        w = numbers(said, "causal: signal")
+        if w.shape != (shape.dimension, len(case.changes or [])):
+            raise Broken(f"causal: a signal of shape {w.shape}, expected {(shape.dimension, len(case.changes or []))}")
+        for column in np.unique(w.T, axis=0):
+            if not known(shape).contains(column):
+                raise Broken(f"causal: the disturbance {column.tolist()} is not shown to be in its set")
+        found.append(w)
+    return found
+
+
+def _of_piece(case: Case, k: int, groups: dict[bytes, list[arb]], nominal: bytes, priced: bool) -> arb:
+    """The least that the controls on one piece can cost and give to the weighted sum, those of every group of signals
+    together; the price of a peak is shared among the groups."""
+    from flint import arb
+
+    assert case.policy is not None
+    m, times, control = case.problem.system.controls, case.control.breakpoints, case.problem.control
+    length = arb(float(times[k + 1])) - arb(float(times[k]))
+    prices = [w * length if priced else arb(0) for w in case.price.weights]
+    total, zero = arb(0), [arb(0)] * m
+    shares = dict.fromkeys(groups, zero)
+    shares[nominal] = prices
+    if priced and case.policy.cost == PEAK:
+        shares = _shared(case, prices, groups)
+    for key, slope in groups.items():
+        total = total + known(control).least(shares[key], shares[key], slope)
+    return total
+
+
+def _shared(case: Case, prices: list[arb], groups: dict[bytes, list[arb]]) -> dict[bytes, list[arb]]:
+    """The price of a channel's peak, parted among the groups as far as the control can give: ``max_g |u_g|`` is at
+    least every mean of ``|u_g|``."""
+    from flint import arb
+
+    shares = {key: [arb(0)] * len(prices) for key in groups}
+    for i, price in enumerate(prices):
+        axis = [arb(float(j == i)) for j in range(len(prices))]
+        high, low = known(case.problem.control).support(axis), known(case.problem.control).support([-x for x in axis])
+        reach = {key: float((high if slope[i] < 0 else low).mid()) for key, slope in groups.items()}
+        left = float(price.lower()) * SHARE
+        for key in sorted(groups, key=lambda key: -reach[key]):
+            part = min(left, abs(float(groups[key][i].mid()))) if reach[key] > 0.0 else 0.0
+            part = max(part * SHARE, 0.0)
+            shares[key][i] = arb(part)
+            left -= part
+        shares[next(iter(groups))][i] += arb(max(left * SHARE, 0.0))
+    return shares

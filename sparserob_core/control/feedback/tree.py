@@ -1,0 +1,330 @@
+"""A bound against every causal policy: finitely many disturbance signals, and controls that may differ only once the
+signals did.
+
+Let ``w_1 .. w_S`` be signals of the disturbance's set. Whatever a causal policy does, its controls on piece ``k`` under
+two of them are equal unless the signals differ before ``tau_k``: a difference within the piece comes too late, and a
+policy that sees less than the disturbance itself can do no more. So the controls under the signals are a point of a
+linear program, the tree of the signals, and the value of this is a lower bound of the cost of every causal policy with
+this dictionary, affine or not (the scenarios of Hadjiyiannis, Goulart and Kuhn 2011, who have two stages; here with
+every stage, and with finitely many times).
+
+Most signals need no variables. A signal that leaves one of the tree at a block, and is the worst for one row from there
+on, is met by the controls that can know of it as that row would have it: the least of a linear function over the set of
+the control, a number. So every signal of the tree stands for many, and those that have multipliers are written out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import final
+
+import numpy as np
+
+from sparserob_core.control.feedback.closed_loop import ClosedLoop
+from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.inner.counterpart import Growing
+
+EXCEEDED = 1e-9  # of a row's size, beyond which it is imposed
+AT_ONCE = 3  # rows of every side that are imposed of each signal at once
+PASSES = 40  # solutions of one tree, each with more rows
+ROOM = 1.0  # how far a row may be kept within its limit, of its size
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Sampled:
+    """Constraints on the state at finitely many times: ``T u + N z <= b`` for the control ``u (m, K)`` and deviations
+    ``z (Q,)``; ``T (R, m, K)``, ``N (R, Q)``, ``b (R,)``. Of every row its ``constraint`` and ``side``, by number, and
+    its ``time``; ``begun (R,)``: how many blocks of the disturbance began before that."""
+
+    T: Array
+    N: Array
+    b: Array
+    constraint: np.ndarray
+    side: np.ndarray
+    time: Array
+    begun: np.ndarray
+
+    @staticmethod
+    def of(loop: ClosedLoop, constraints: list[tuple[Array, Array, Array]], starts: Array) -> Sampled:
+        """Of constraints ``H x(t) <= h`` at times each, ``(H, h, times)``; ``starts``: of the disturbance's blocks."""
+        parts: list[tuple[np.ndarray, ...]] = []
+        response, K = loop.functionals.response, loop.functionals.dictionary.pieces
+        for number, (H, h, times) in enumerate(constraints):
+            if not H.shape[0] or not times.size:
+                continue
+            at, side = np.repeat(times, H.shape[0]), np.tile(np.arange(H.shape[0]), times.size)
+            free, gains, B, W = response.adjoint(at, H[side], np.zeros((at.size, 0)))
+            weights = gains @ B
+            constant = free @ response.initial_state + loop.functionals.given(weights)
+            on_noise = gains @ W
+            constant = constant + np.einsum("rli,li->r", on_noise, loop.middles)
+            T = loop.functionals.on_decision(weights).reshape(at.size, -1, K)
+            N = np.einsum("rli,liq->rq", on_noise, loop.entries)
+            limits, numbers = h[side] - constant, np.full(at.size, number)
+            parts.append((T, N, limits, numbers, side, at, np.searchsorted(starts, at)))
+        m, Q = loop.answers.shape[1], loop.spread.size
+        if not parts:
+            none = np.zeros(0, dtype=int)
+            return Sampled(np.zeros((0, m, K)), np.zeros((0, Q)), np.zeros(0), none, none, np.zeros(0), none)
+        T, N, b, constraint, side, time, begun = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return Sampled(T, N, b, constraint, side, time, begun)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Grown:
+    """A solved tree: the controls ``u (S, m, K)`` under every signal, the ``value`` of its program, and of the rows
+    with a multiplier the signal, the row, the block from which on the worst for that row replaces the signal, and the
+    multiplier; ``x``: the columns."""
+
+    value: float
+    x: Array
+    u: Array
+    signals: np.ndarray
+    rows: np.ndarray
+    blocks: np.ndarray
+    multipliers: Array
+
+
+@final
+@dataclass(eq=False)
+class Tree:
+    """The program of a tree of signals, which grows. Deviations ``z (Q,)`` come in blocks of ``width``,
+    ``worst (R, Q)`` are those that are the worst for every row; ``seen (K,)``: how many blocks began before every piece
+    of the control; ``prices (m, K)``: what an absolute value costs. The first signal must be the nominal one; with
+    ``peaks`` the largest absolute value over all signals is charged, not that one's. With a ``highest`` factor its
+    program is that of the largest factor of all deviations, without prices. ``seconds`` tells how many a solution may
+    take; ``work`` counts what was done, the same on every machine.
+    """
+
+    sampled: Sampled
+    worst: Array
+    control: ConvexSet
+    prices: Array
+    seen: np.ndarray
+    width: int
+    peaks: bool
+    highest: float | None = None
+    seconds: Callable[[], float] = lambda: np.inf
+    work: float = 0.0
+    signals: list[Array] = field(default_factory=list)
+    _columns: list[np.ndarray] = field(default_factory=list)
+    _groups: dict[tuple[int, bytes], np.ndarray] = field(default_factory=dict)
+    _imposed: set[tuple[int, int, bytes]] = field(default_factory=set)
+    _order: list[tuple[int, int, int]] = field(default_factory=list)
+    _numbers: list[int] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        m, K = self.prices.shape
+        axes = np.eye(m)
+        self._low, self._high = -self.control.support(-axes), self.control.support(axes)
+        self._far = np.maximum(np.abs(self._low), np.abs(self._high))
+        self._linear = Growing()
+        high, price = (0.0, 0.0) if self.highest is None else (self.highest, -1.0)
+        self._linear.variables(np.zeros(1), np.array([high]), np.array([price]))
+        self._sizes = np.zeros((m, 0), dtype=int)
+        if self.priced:
+            prices = self.prices.ravel()
+            sizes = self._linear.variables(np.zeros(m * K), np.repeat(self._far, K), prices)
+            self._sizes = sizes.reshape(m, K)
+            row = np.zeros(sizes.size, dtype=int)
+            self._budget = int(self._linear.rows([(row, sizes, prices)], np.array([-np.inf]), np.array([np.inf]))[0])
+
+    @property
+    def priced(self) -> bool:
+        """Whether the program has a cost."""
+        return self.highest is None
+
+    @property
+    def blocks(self) -> int:
+        """How many blocks a signal has."""
+        return int(self.sampled.N.shape[1] // max(1, self.width))
+
+    @cached_property
+    def units(self) -> Array:
+        """What every row is divided by: how large it can be."""
+        s = self.sampled
+        size = np.einsum("rmk,m->r", np.abs(s.T), self._far) + np.abs(s.N * self.worst).sum(axis=1) + np.abs(s.b)
+        return np.where(size > 0.0, size, 1.0)
+
+    def add(self, z: Array) -> bool:
+        """One more signal, of deviations ``(Q,)``; whether it is new."""
+        z = np.asarray(z, dtype=float) + 0.0
+        if any(np.array_equal(z, other) for other in self.signals):
+            return False
+        m, K = self.prices.shape
+        columns, nominal, flat = np.zeros((m, K), dtype=int), not self.signals, None
+        if not self.control.is_box:
+            flat = self.control.halfspaces()
+        for k in range(K):
+            key = (k, self._until(z, int(self.seen[k])))
+            fresh = key not in self._groups
+            if fresh:
+                self._groups[key] = self._linear.variables(self._low, self._high, np.zeros(m))
+            columns[:, k] = self._groups[key]
+            if fresh and flat is not None:
+                row, channel = np.nonzero(flat[0])
+                self._rows([(row, columns[channel, k], flat[0][row, channel])], flat[1])
+            if fresh and self.priced and (nominal or self.peaks):
+                which = np.arange(m)
+                for sign in (1.0, -1.0):
+                    entries = [(which, columns[:, k], np.full(m, sign)), (which, self._sizes[:, k], np.full(m, -1.0))]
+                    self._rows(entries, np.zeros(m))
+        self.signals.append(z)
+        self._columns.append(columns)
+        return True
+
+    def _rows(self, entries: list[tuple[np.ndarray, np.ndarray, Array]], upper: Array) -> int:
+        return int(self._linear.rows(entries, np.full(upper.size, -np.inf), upper)[0])
+
+    def _until(self, z: Array, block: int) -> bytes:
+        return z[: block * self.width].tobytes()
+
+    def changed(self, signal: int, row: int, block: int) -> Array:
+        """The signal ``(Q,)`` that is one of the tree before a block, and the worst for a row from there on."""
+        z, begun = self.signals[signal].copy(), self.sampled.begun[row] * self.width
+        z[block * self.width : begun] = self.worst[row, block * self.width : begun]
+        return z
+
+    def _impose(self, signal: int, row: int, block: int) -> bool:
+        """One row under a `changed` signal; whether it was not there."""
+        s, z = self.sampled, self.signals[signal]
+        key = (row, block, self._until(z, block))
+        if key in self._imposed:
+            return False
+        self._imposed.add(key)
+        late, unit, end = self.seen > block, self.units[row], block * self.width
+        channel, piece = np.nonzero(s.T[row] * ~late)
+        noise = float(s.N[row, :end] @ z[:end]) + float(self._pushed[row, block])
+        columns, values = [self._columns[signal][channel, piece]], [s.T[row][channel, piece]]
+        columns.append(np.zeros(1, dtype=int))
+        values.append(np.array([-unit if self.priced else noise]))
+        limit = s.b[row] - (noise if self.priced else 0.0)
+        if self._limited:
+            columns.append(self._sizes[:, late].ravel())
+            values.append(-self._by_size[row][:, late].ravel())
+            limit -= float(self._fixed[row][:, late].sum())
+        else:
+            limit -= float(self._least[row, late].sum())
+        column, value = np.concatenate(columns), np.concatenate(values) / unit
+        self._numbers.append(self._rows([(np.zeros(column.size, dtype=int), column, value)], np.array([limit / unit])))
+        self._order.append((signal, row, block))
+        return True
+
+    @property
+    def _limited(self) -> bool:
+        """Whether controls are limited by variables."""
+        return self.peaks and self.priced
+
+    @cached_property
+    def _by_size(self) -> Array:
+        """How much a control no larger than its peak can take off every row, times the peak, ``(R, m, K)``."""
+        T = self.sampled.T
+        moves = np.where(T > 0.0, (self._low < 0.0)[:, None], (self._high > 0.0)[:, None])
+        return np.asarray(np.abs(T) * moves)
+
+    @cached_property
+    def _fixed(self) -> Array:
+        """What it must give to every row where 0 is out of its reach, ``(R, m, K)``."""
+        T = self.sampled.T
+        return np.asarray(
+            T * np.where(T > 0.0, np.maximum(self._low, 0.0)[:, None], np.minimum(self._high, 0.0)[:, None])
+        )
+
+    @cached_property
+    def _least(self) -> Array:
+        """The least that the control on every piece can give to every row, ``(R, K)``."""
+        return np.asarray(-self.control.support(-self.sampled.T.swapaxes(1, 2)))
+
+    @cached_property
+    def _pushed(self) -> Array:
+        """The most that the disturbance from every block on gives to every row, ``(R, blocks + 1)``."""
+        gives = self._by_block(self.sampled.N * self.worst).sum(axis=2)
+        return _sums(gives[:, ::-1])[:, ::-1]
+
+    def _by_block(self, a: Array) -> Array:
+        return a.reshape(*a.shape[:-1], self.blocks, max(1, self.width))
+
+    def least(self) -> Grown | None:
+        """The least cost, or the largest factor; ``None`` where nothing is feasible or nothing was solved."""
+        return self._solved()
+
+    def relaxed(self, budget: float = np.inf, central: bool = False) -> Grown | None:
+        """The least relaxation, in the rows' units, that a cost within a ``budget`` needs (below 0: how far within all
+        rows it can stay); the ``value`` is that. ``central``: in the middle of all controls that need no more."""
+        highs, sizes = self._linear.highs, self._sizes.ravel()
+        highs.changeColBounds(0, -ROOM, np.inf)
+        highs.changeColCost(0, 1.0)
+        for column in sizes.tolist():
+            highs.changeColCost(column, 0.0)
+        highs.changeRowBounds(self._budget, -np.inf, budget)
+        if central:
+            highs.setOptionValue("solver", "ipm")
+            highs.setOptionValue("run_crossover", "off")
+        try:
+            return self._solved(relaxed=True)
+        finally:
+            if central:
+                highs.setOptionValue("solver", "simplex")
+                highs.setOptionValue("run_crossover", "on")
+                highs.clearSolver()
+            highs.changeColBounds(0, 0.0, 0.0)
+            highs.changeColCost(0, 0.0)
+            for column, price in zip(sizes.tolist(), self.prices.ravel().tolist(), strict=True):
+                highs.changeColCost(column, price)
+            highs.changeRowBounds(self._budget, -np.inf, np.inf)
+
+    def _solved(self, relaxed: bool = False) -> Grown | None:
+        """The program with every sampled row, which are imposed as they are violated."""
+        found = None
+        for _ in range(PASSES):
+            done, _, x, y = self._linear.solve(self.seconds())
+            self.work += self._linear.work + len(self.signals) * (self.sampled.T.size + self.sampled.N.size)
+            if not done:
+                return None
+            u, mine = x[np.array(self._columns)], np.array([y[at] for at in self._numbers])
+            kept = np.flatnonzero(mine > 0.0)
+            signals, rows, blocks = np.array(self._order, dtype=int).reshape(-1, 3)[kept].T
+            value = float(x[0]) if relaxed or not self.priced else float((self.prices * x[self._sizes]).sum())
+            found = Grown(value, x, u, signals, rows, blocks, mine[kept] / self.units[rows])
+            if not self._separate(found):
+                break
+        return found
+
+    def _separate(self, found: Grown) -> bool:
+        s, over, grew = self.sampled, self.excess(found), False
+        kinds = s.constraint * (1 + s.side.max(initial=0)) + s.side
+        for kind in np.unique(kinds):
+            at = np.flatnonzero(kinds == kind)
+            some = over[:, at].reshape(over.shape[0], -1)
+            for signal, places in enumerate(np.argsort(-some, axis=1)[:, :AT_ONCE]):
+                for place in places[some[signal, places] > EXCEEDED].tolist():
+                    row, block = divmod(place, over.shape[2])
+                    grew |= self._impose(signal, int(at[row]), block)
+        return grew
+
+    def excess(self, found: Grown) -> Array:
+        """By how many units every row is exceeded under every `changed` signal, whatever the controls that can know of
+        the change, ``(S, R, blocks + 1)``; ``-inf`` where the change comes after the row."""
+        s = self.sampled
+        own, noise = np.einsum("rmk,smk->srk", s.T, found.u), s.N * np.array(self.signals)[:, None]
+        past = _sums(self._by_block(noise).sum(axis=3)) + self._pushed
+        best = self._least
+        if self._limited:
+            best = (self._fixed - self._by_size * found.x[self._sizes]).sum(axis=1)
+        rest = _sums(best[:, ::-1])[:, ::-1]  # of every piece and all later ones
+        blocks = np.arange(self.blocks + 1)
+        knows = np.searchsorted(self.seen, blocks, side="right")  # the first piece that can know of a block
+        past = past if self.priced else past * found.x[0]
+        over = (past + _sums(own)[:, :, knows] + rest[:, knows] - s.b[:, None]) / self.units[:, None]
+        if self.priced:
+            over = over - found.x[0]
+        return np.asarray(np.where(blocks <= s.begun[:, None], over, -np.inf))
+
+
+def _sums(a: Array) -> Array:
+    """The sums over the last axis of what is before each place, and of all."""
+    return np.concatenate([np.zeros((*a.shape[:-1], 1)), np.cumsum(a, axis=-1)], axis=-1)

@@ -1,0 +1,269 @@
+"""The search of a bound against every causal policy: which signals the tree should hold."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeAlias, final
+
+import numpy as np
+
+from sparserob_core.control.constraints.flat import FlatConstraint
+from sparserob_core.control.feedback.closed_loop import ClosedLoop
+from sparserob_core.control.feedback.tree import Grown, Sampled, Tree
+from sparserob_core.control.policies.affine import AffinePolicy
+from sparserob_core.control.transcription.record import Transcription
+from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.result import Result
+
+Ended: TypeAlias = Literal["settled", "signals", "work", "seconds"]
+
+INWARDS = 1.0 - 1e-13  # points that must be in a curved set are drawn inwards by rounding
+AT_ONCE = 8  # signals that a round adds
+TOWARDS = 0.9  # of the way from the bound to the policy's cost: the budget at which the tree is asked for room
+NONE = 1e-9  # a relaxation below is rounding
+IDLE = 2  # rounds without a better bound, after which the search ends
+WORK, EACH, PER = 1e7, 2e6, 3e3  # that a search may do anyway; for each of a run's programs, and for its columns
+CELLS = 2e7  # numbers of one kind about all signals of a tree: 160 MB
+INSIDE = 1  # times sampled within every piece, beside its ends and the times that the policy's bound rests on
+NEARLY = 1e-6  # of a factor, by which the first one that is excluded lies above the largest one that is not
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Weighed:
+    """A constraint ``direction'x(time)`` under the signal of that number, with its multiplier."""
+
+    signal: int
+    constraint: str
+    time: float
+    direction: Array
+    multiplier: float
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class CausalBound:
+    """What no causal policy can do: cost less than ``lower``; infinite: exist at all; ``-inf`` where nothing was
+    proven. ``signals``: values ``(mw, blocks)`` of the disturbance, ``rows``: constraints under them whose multipliers
+    prove it. ``ended``: why no more was sought."""
+
+    lower: float
+    signals: tuple[Array, ...] = ()
+    rows: tuple[Weighed, ...] = ()
+    ended: Ended = "settled"
+
+
+@final
+class Limits:
+    """When a search ends: at so many ``signals`` beside those at hand, after so much ``work`` (a count, the same on
+    every machine), and, as a brake, after ``seconds`` or when the time of the run has ``passed``."""
+
+    def __init__(self, signals: int, work: float, seconds: float, passed: Callable[[], bool]) -> None:
+        self.work, self._most, self._passed = work, signals, passed
+        self._beside = 0
+        self._until = time.perf_counter() + seconds
+        self.ended: Ended = "settled"
+
+    @staticmethod
+    def of(policy: AffinePolicy, results: Sequence[Result], columns: int, passed: Callable[[], bool]) -> Limits:
+        """In proportion to what the policy's own ``results`` took, with ``columns`` of their programs."""
+        programs = sum(result.counts.get("relaxed_programs", 0) for result in results)
+        return Limits(policy.causal_signals, WORK + programs * (EACH + PER * columns), policy.causal_seconds, passed)
+
+    @property
+    def seconds(self) -> float:
+        """That are left."""
+        return max(0.0, self._until - time.perf_counter())
+
+    def over(self, tree: Tree) -> bool:
+        """Whether the search for a tree ends, and why."""
+        s = tree.sampled
+        most = CELLS / max(1, s.T.shape[0] * max(s.N.shape[1], s.T.shape[1] * s.T.shape[2]))
+        if not self.seconds or self._passed():
+            self.ended = "seconds"
+        elif tree.work > self.work or len(tree.signals) > most:
+            self.ended = "work"
+        elif not self.room(tree):
+            self.ended = "signals"
+        return self.ended != "settled"
+
+    def begin(self, tree: Tree) -> None:
+        """The signals that are at hand do not count."""
+        self._beside = len(tree.signals)
+
+    def room(self, tree: Tree) -> int:
+        """How many signals may be added to the tree; before the search begins: as many as there are."""
+        return self._most + self._beside - len(tree.signals) if self._beside else 1
+
+
+@final
+class CausalSearch:
+    """The search for one problem under a policy, ``model``, at its ``decision``, where there is one; ``active``: names,
+    times and deviations of the constraints that the policy's own bound rests on."""
+
+    def __init__(
+        self, model: Transcription, decision: Array | None, active: Sequence[tuple[str, float, Array | None]]
+    ) -> None:
+        assert model.feedback is not None
+        self.model, self.loop, self.decision = model, model.feedback.loop, decision
+        self.constraints = [one for one in model.constraints if isinstance(one, FlatConstraint)]
+        grid, disturbance = model.response.grid, model.functionals.disturbance
+        places = np.zeros(0, dtype=int) if disturbance is None or disturbance.starts is None else disturbance.starts
+        self.starts = grid.breakpoints[places]
+        asked = [(one.H, one.h, self._times(one, active)) for one in self.constraints]
+        self.sampled = Sampled.of(self.loop, asked, self.starts)
+        self._active = active
+
+    def _times(self, one: FlatConstraint, active: Sequence[tuple[str, float, Array | None]]) -> Array:
+        points = self.model.response.grid.breakpoints
+        shares = np.arange(1, INSIDE + 1) / (INSIDE + 1)
+        inner = (points[:-1, None] + np.diff(points)[:, None] * shares).ravel()
+        inside = np.concatenate([points, inner])
+        own = [at for name, at, _ in active if name == one.name and one.start <= at <= one.stop]
+        return np.unique([one.start, one.stop, *own, *inside[(inside > one.start) & (inside < one.stop)]])
+
+    def tree(self, limits: Limits, highest: float | None = None) -> Tree:
+        """A tree of the nominal signal and those that the policy's bound rests on."""
+        loop, problem, feedback = self.loop, self.model.problem, self.model.feedback
+        assert feedback is not None
+        prices = problem.cost.l1 * np.outer(np.asarray(problem.weights, dtype=float), self.model.control.lengths)
+        seen = np.searchsorted(self.starts, self.model.control.breakpoints[:-1])
+        width = loop.spread.size // max(1, self.starts.size)
+        worst = extreme(loop, self.sampled.N)
+        peaks = feedback.policy.cost == "peak"
+        tree = Tree(self.sampled, worst, problem.control, prices, seen, width, peaks, highest)
+        tree.add(np.zeros(loop.spread.size))
+        tree.seconds = lambda: limits.seconds
+        for _, _, deviation in self._active:
+            if deviation is not None and deviation.any() and not limits.over(tree):
+                tree.add(extreme(loop, deviation))
+        limits.begin(tree)
+        return tree
+
+    def least_cost(self, cost: float, limits: Limits) -> tuple[Tree, Grown, bool] | None:
+        """The tree that was found, its multipliers, and whether they prove that no causal policy exists; ``cost``: of
+        the policy, an upper bound of what the tree can prove, infinite where none is known."""
+        tree = self.tree(limits)
+        best, idle = tree.least(), 0
+        while best is not None and idle < IDLE and not limits.over(tree):
+            aim = cost if np.isfinite(cost) else np.inf
+            centre = tree.relaxed(best.value + TOWARDS * max(aim - best.value, 0.0), central=True)
+            if centre is None or not self._grow(tree, centre, limits.room(tree)):
+                break
+            better = tree.least()
+            if better is None:  # nothing is feasible, or the solver did not finish
+                refused = self._refused(tree)
+                return (tree, best, False) if refused is None else (tree, refused, True)
+            idle = 0 if better.value > best.value + NONE * abs(better.value) else idle + 1
+            best = better
+        if best is not None:
+            return tree, best, False
+        refused = self._refused(tree)
+        return None if refused is None else (tree, refused, True)
+
+    @staticmethod
+    def _refused(tree: Tree) -> Grown | None:
+        found = tree.relaxed()
+        return found if found is not None and found.value > NONE else None
+
+    def largest_factor(self, highest: float, limits: Limits) -> tuple[Tree, Grown] | None:
+        """The largest factor of all deviations for which the tree is feasible, with its multipliers."""
+        tree = self.tree(limits, highest)
+        best, idle = tree.least(), 0
+        while best is not None and idle < IDLE and not limits.over(tree):
+            if not self._grow(tree, best, limits.room(tree)):
+                break
+            better = tree.least()
+            if better is None:
+                break
+            idle = 0 if better.value < best.value * (1.0 - NEARLY) else idle + 1
+            best = better
+        return None if best is None else (tree, best)
+
+    def _grow(self, tree: Tree, centre: Grown, most: int) -> bool:
+        """Signals that leave one of the tree at a block and are the worst for a row from there on, if the control
+        answers them as the policy does: those that exceed it most, no two of one signal and block; whether there are.
+        """
+        s, loop, scale = self.sampled, self.loop, 1.0 if tree.priced else max(centre.x[0], NONE)
+        K, Q = s.T.shape[2], loop.spread.size
+        effects = np.zeros((K, s.T.shape[1], Q)) if self.decision is None else loop.effects(self.decision)
+        answered = np.einsum("rmk,kmq->rq", s.T, effects)
+        closed = answered + s.N
+        closed = np.where(np.abs(closed) > NONE * np.abs(s.N), closed, s.N * NONE)
+        worst = extreme(loop, closed)
+        z = np.array(tree.signals)
+        own = np.einsum("rmk,smk->sr", s.T, centre.u)
+        past = _before(tree, s.N * z[:, None])
+        given = _after(tree, answered * z[:, None])
+        tree.work += z.shape[0] * (s.N.size + s.T.size)
+        over = own[:, :, None] - s.b[:, None] + scale * (past - given + _after(tree, closed * worst))
+        over = over / tree.units[:, None]
+        over[:, :, -1] = -np.inf
+        over = np.where(np.arange(over.shape[2]) < s.begun[:, None], over, -np.inf)
+        taken: set[tuple[int, int]] = set()
+        order = np.argsort(-over, axis=None)
+        for place in order.tolist():
+            signal, row, block = (int(v) for v in np.unravel_index(place, over.shape))
+            if over[signal, row, block] <= NONE or len(taken) >= min(AT_ONCE, most):
+                break
+            if (signal, block) in taken:
+                continue
+            child, width = z[signal].copy(), tree.width
+            child[block * width :] = worst[row, block * width :]
+            if tree.add(child):
+                taken.add((signal, block))
+        return bool(taken)
+
+    def bound(
+        self,
+        tree: Tree,
+        found: Grown,
+        lower: float,
+        disturbance: ConvexSet | None,
+        ended: Ended = "settled",
+        scale: float = 1.0,
+    ) -> CausalBound:
+        """The signals in the set of the ``disturbance``, with deviations times ``scale``, and the constraints that have
+        a multiplier."""
+        numbers, signals, rows = dict[bytes, int](), list[Array](), list[Weighed]()
+        for signal, row, block, y in zip(found.signals, found.rows, found.blocks, found.multipliers, strict=True):
+            z = tree.changed(int(signal), int(row), int(block))
+            number = numbers.setdefault(z.tobytes(), len(numbers))
+            if number == len(signals):
+                signals.append(_values(z * scale, disturbance, tree.blocks))
+            one, s = self.constraints[self.sampled.constraint[row]], self.sampled
+            rows.append(Weighed(number, one.name, float(s.time[row]), one.H[s.side[row]], float(y)))
+        return CausalBound(lower, tuple(signals), tuple(rows), ended)
+
+
+def _values(z: Array, disturbance: ConvexSet | None, blocks: int) -> Array:
+    """The disturbance ``(mw, blocks)`` of deviations, certainly in its set; 0 is exactly the middle."""
+    if disturbance is None:
+        return np.zeros((0, 0))
+    middle, deviations = disturbance.middle(), z.reshape(blocks, -1)
+    if disturbance.is_box:
+        box = disturbance.bounding_box()
+        values = np.clip(middle + deviations, box.lower, box.upper)
+    else:
+        values = middle + INWARDS * deviations
+    return np.asarray(np.where(deviations == 0.0, middle, values).T)
+
+
+def extreme(loop: ClosedLoop, along: Array) -> Array:
+    """An extreme deviation ``(..., Q)`` of the set that is the worst along ``(..., Q)``; any where nothing is."""
+    spread = loop.spread
+    if spread.is_box:
+        return np.asarray(np.where(along >= 0.0, 1.0, -1.0) * spread.radii)
+    return np.asarray(spread.worst(along))
+
+
+def _before(tree: Tree, a: Array) -> Array:
+    sums = a.reshape(*a.shape[:-1], tree.blocks, max(1, tree.width)).sum(axis=-1)
+    return np.concatenate([np.zeros((*sums.shape[:-1], 1)), np.cumsum(sums, axis=-1)], axis=-1)
+
+
+def _after(tree: Tree, a: Array) -> Array:
+    past = _before(tree, a)
+    return np.asarray(past[..., -1:] - past)

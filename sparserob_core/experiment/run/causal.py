@@ -1,0 +1,81 @@
+"""What no causal policy can do, beside what a policy does: sought after a run, and derived without rounding."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sparserob_core.control.constraints.explanation import TimedExplanation
+from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.studies.answer import ControlResult
+from sparserob_core.control.studies.causal import CausalBound, CausalSearch, Limits
+from sparserob_core.control.transcription.record import Transcription
+from sparserob_core.experiment.directory.artefacts import finite
+from sparserob_core.experiment.directory.certificate import causal_data
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.method import Tools
+from sparserob_core.sip.result import Result
+
+SECONDS = 20.0  # for a bound in ball arithmetic
+WORDS = "; nor does any other causal policy with this dictionary exist: {} signals of the disturbance prove it"
+
+
+def with_causal(result: ControlResult, tools: Tools) -> ControlResult:
+    """The result with a bound against every causal policy, where it has a policy; a run that was stopped seeks none."""
+    model = result.model
+    if model.feedback is None or result.status == "failed" or result.stopped or tools.deadline.passed:
+        return result
+    policy = model.feedback.policy
+    if not policy.causal_signals or model.problem.initial_set is not None:
+        return result
+    try:
+        search = CausalSearch(model, result.decision, active(model, result))
+        limits = Limits.of(policy, [result], model.program.n, lambda: tools.deadline.passed)
+        cost = result.cost if result.status in ("certified", "verified") else np.inf
+        found = search.least_cost(cost, limits)
+        nothing = replace(result, causal=CausalBound(-np.inf, ended=limits.ended))
+        if found is None:
+            return nothing
+        tree, grown, none = found
+        stated = search.bound(tree, grown, np.inf if none else grown.value, model.problem.disturbance, limits.ended)
+        derived = proven(model, model.problem, stated)
+    except KeyboardInterrupt as error:
+        tools.deadline.interrupt(error)
+        return result
+    if derived is None:
+        return nothing
+    if none:
+        said = WORDS.format(len(stated.signals)) if result.status == "infeasible" else ""
+        return replace(result, causal=replace(stated, lower=np.inf), message=result.message + said)
+    return replace(result, causal=replace(stated, lower=min(derived, cost)))
+
+
+def active(model: Transcription, result: Result) -> list[tuple[str, float, Array | None]]:
+    """Names, times and deviations of the constraints that the bound of a result rests on."""
+    assert model.feedback is not None
+    rest, found = model.feedback.loop.spread.middle, []
+    for cut in result.dual.cuts:
+        family = model.program.formulated(cut.family, cut.formulation)
+        said = None if family is None else family.explanation(cut.index, cut.row)
+        if isinstance(said, TimedExplanation):
+            signal = said.disturbance
+            found.append((cut.family, said.time, None if signal is None else np.asarray(signal).T.ravel() - rest))
+    return found
+
+
+def proven(model: Transcription, problem: OptimalControlProblem, stated: CausalBound) -> float | None:
+    """The lower bound of the cost that the multipliers prove, rounded downwards; where none is to exist, by how much
+    every policy misses their sum. ``None`` where that is not positive, and where it is not derived."""
+    from sparserob_core.checker.claims.case import Case
+    from sparserob_core.checker.claims.claims import derived_causal_bound
+    from sparserob_core.checker.outcome import Broken, Clock, Unchecked
+
+    assert model.feedback is not None
+    policy, none = model.feedback.policy, stated.lower == np.inf
+    case = Case(problem, model.control, model.disturbance, {}, Clock(SECONDS), policy=policy)
+    try:
+        derived = derived_causal_bound(case, finite(causal_data(stated)), priced=not none)
+    except (Broken, Unchecked, ZeroDivisionError):
+        return None
+    return None if none and not derived > 0.0 else derived
