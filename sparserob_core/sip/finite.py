@@ -282,6 +282,12 @@ class Spread:
         return np.concatenate([np.zeros(0), *middles])
 
     @cached_property
+    def inner(self) -> Array:
+        """A deviation that is well inside, ``(Q,)``."""
+        points = [np.tile(convex.interior_point() - middle, count) for _, count, convex, middle in self.parts]
+        return np.concatenate([np.zeros(0), *points])
+
+    @cached_property
     def radii(self) -> Array:
         """How far each entry comes from 0, ``(Q,)``."""
         found = [np.zeros(0)]
@@ -323,6 +329,13 @@ class Spread:
             total = total + (convex.support(blocks) - blocks @ middle).sum(axis=-1)
         return total
 
+    def holds(self, w: Array) -> bool:
+        """Whether ``w (Q,)`` is a deviation."""
+        return all(
+            bool((convex.violation(w[part].reshape(count, -1) + middle) <= 0.0).all())
+            for part, count, convex, middle in self.parts
+        )
+
     def worst(self, a: Array) -> Array:
         """A deviation ``(..., Q)`` that attains `support`."""
         if self.is_box:
@@ -340,7 +353,8 @@ class UncertainRows:
     """Rows ``g_r x + factor_r w'(C_p x + d_p) <= h_r`` for every deviation, with ``p = part_r``.
 
     ``g (r, n)`` and every ``C (Q, n)`` sparse, ``h (r,)``, ``d (p, Q)``. Rows that look opposite ways share a part,
-    with factors of opposite signs.
+    with factors of opposite signs. ``exact``: the second half of the rows are the opposites of the first, so that both
+    hold with equality, at every deviation.
     """
 
     g: csr_array
@@ -349,6 +363,19 @@ class UncertainRows:
     factor: Array
     C: tuple[csr_array, ...]
     d: Array
+    exact: bool = False
+
+    @cached_property
+    def equations(self) -> tuple[csr_array, Array]:
+        """Of exact rows ``N x = b``: every row of the first half, then its answers to the deviations, which are 0."""
+        from scipy.sparse import csr_array, vstack
+
+        tables, rhs = [], [np.zeros(0)]
+        for row in range(self.h.size // 2):
+            p, factor = int(self.part[row]), float(self.factor[row])
+            tables += [self.g[[row]], factor * self.C[p]]
+            rhs += [self.h[[row]], -factor * self.d[p]]
+        return csr_array(vstack(tables)), np.concatenate(rhs)
 
     def coefficients(self, x: Array) -> Array:
         """``C_p x + d_p``, ``(p, Q)``."""

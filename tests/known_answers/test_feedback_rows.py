@@ -1,5 +1,5 @@
 """Guards what else may hold under policy affine, against linear programs that share nothing with the package: sets of
-initial states, and certificates of them that were forged."""
+initial states, final states that are fixed, and certificates of them that were forged."""
 
 from __future__ import annotations
 
@@ -157,6 +157,82 @@ def begun(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return outcome.directory
 
 
+@pytest.mark.parametrize("cost", ["nominal", "peak"])
+@pytest.mark.parametrize("fixed", [[0.0, 0.0], [None, 0.1]])
+def test_final_states_are_fixed_from_every_initial_state(cost: str, fixed: list[float | None], tmp_path: Path) -> None:
+    start = {"centre": [-1, 1], "box": [0.1, 0.2]}
+    problem = {**SPRING, "initial_state": start, "disturbance": None, "terminal": [{"equals": fixed}]}
+    outcome = run(problem, tmp_path / "run", cost)
+    proven(outcome)
+
+    def programs(within: int) -> float:
+        independent = program(problem, PIECES, [0.0, 0.0], [0.1, 0.2])
+        spring_rows(independent, within, end=False)
+        x = independent.state(5.0)
+        for state, value in enumerate(fixed):
+            if value is not None:
+                independent.equal(x[state], value)
+        return independent.solve(1.0, cost)
+
+    bracketed(outcome.result.cost, programs)
+
+
+@pytest.mark.parametrize("name", STATES)
+def test_final_states_are_fixed_from_sets_of_every_kind(name: str, tmp_path: Path) -> None:
+    start = {"centre": [-1, 1], **STATES[name]}
+    problem = {**SPRING, "initial_state": start, "disturbance": None, "terminal": [{"equals": [0.1, 0.0]}]}
+    proven(run(problem, tmp_path / "run", "peak"))
+
+
+def test_what_the_last_piece_of_a_disturbance_reaches_is_fixed_by_nothing(tmp_path: Path) -> None:
+    fixed = {**SPRING, "system": {**SPRING["system"], "E": [[0], [1]]}, "disturbance": {"box": 0.1}}
+    problem = {**fixed, "path": [], "terminal": [{"equals": [0, 0]}]}
+    outcome = run(problem, tmp_path / "late")
+    assert outcome.status == "infeasible"
+    assert "equals: x" in outcome.result.message
+    assert "after the last measurement, at 4.5, reaches it unanswered" in outcome.result.message
+    assert check(outcome.directory).status == "verified"
+
+
+def test_what_no_disturbance_reaches_is_fixed_beside_what_it_reaches(tmp_path: Path) -> None:
+    """Two integrators side by side: the disturbance acts on the first alone, the second can be fixed."""
+    system = {"A": [[-1, 0], [0, 0]], "B": [[1, 0], [0, 1]], "E": [[1], [0]]}
+    problem = {
+        **SPRING,
+        "system": system,
+        "initial_state": {"centre": [1, 1], "box": [0.1, 0.1]},
+        "control": {"box": [1, 1]},
+        "disturbance": {"box": 0.2},
+        "path": [],
+        "terminal": [{"box": [0.1, None]}, {"equals": [None, 0.25]}],
+    }
+    outcome = run(problem, tmp_path / "run", "peak")
+    proven(outcome)
+    independent = program(problem, PIECES, [0.2], [0.1, 0.1])
+    x = independent.state(5.0)
+    for sign in (1.0, -1.0):
+        independent.below(sign * x[0], 0.1)
+    independent.equal(x[1], 0.25)
+    assert outcome.result.cost == pytest.approx(independent.solve(1.0, "peak"), rel=1e-6)
+
+
+def test_fixed_final_states_have_a_margin(tmp_path: Path) -> None:
+    start = {"centre": [-1, 1], "box": [0.1, 0.1]}
+    problem = {**SPRING, "initial_state": start, "disturbance": None, "terminal": [{"equals": [0, 0]}]}
+    found = sr.margin(config(problem), of="initial_state", tolerance=1e-3, out=tmp_path / "margin")
+    assert found.status == "certified", found.message
+
+    def cost(size: float) -> float:
+        independent = program(problem, PIECES, [0.0, 0.0], [size, size])
+        spring_rows(independent, 2, end=False)
+        for state in independent.state(5.0):
+            independent.equal(state, 0.0)
+        return independent.solve(1.0, "nominal")
+
+    assert np.isfinite(cost(found.amounts[0]))
+    assert np.isinf(cost(1.1 * found.amounts[1]))
+
+
 FORGERIES: dict[str, Any] = {
     "a gain on the initial state": lambda data: data["gains"][0][0][0].__setitem__(1, data["gains"][0][0][0][1] + 0.5),
     "an initial state outside of its set": lambda data: [
@@ -176,6 +252,33 @@ def forged(directory: Path, copy: Path, forgery: Callable[[dict[str, Any]], obje
     forgery(data)
     (copy / "certificate.json").write_text(json.dumps(data))
     return check(copy).status
+
+
+FIXED: dict[str, Any] = {
+    "another gain": lambda data: data["gains"][3][0][0].__setitem__(1, data["gains"][3][0][0][1] + 1e-9),
+    "another nominal control": lambda data: data["decision"][0].__setitem__(2, data["decision"][0][2] + 1e-9),
+    "a larger multiplier": lambda data: _equal(data)[0].__setitem__("multiplier", 1.01 * _equal(data)[0]["multiplier"]),
+    "a direction that is not fixed": lambda data: _equal(data)[0].__setitem__("direction", [1.0, 1.0]),
+    "another time": lambda data: _equal(data)[0].__setitem__("time", 4.9),
+}
+
+
+def _equal(data: dict[str, Any]) -> list[dict[str, Any]]:
+    return [one for one in data["multipliers"]["constraints"] if one["constraint"] == "equals"]
+
+
+@pytest.fixture(scope="module")
+def fixed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    start = {"centre": [-1, 1], "box": [0.1, 0.2]}
+    problem = {**SPRING, "initial_state": start, "disturbance": None, "terminal": [{"equals": [0, 0]}]}
+    outcome = run(problem, tmp_path_factory.mktemp("fixed") / "run", "peak")
+    proven(outcome)
+    return outcome.directory
+
+
+@pytest.mark.parametrize("name", FIXED)
+def test_a_forged_final_state_is_found(name: str, tmp_path: Path, fixed: Path) -> None:
+    assert forged(fixed, tmp_path / "copy", FIXED[name]) == "refuted"
 
 
 @pytest.mark.parametrize("name", FORGERIES)

@@ -57,7 +57,7 @@ def check(case: Case, gap_tolerance: float | None) -> list[Finding]:
         if case.problem.control_step is not None:
             claims.append(judged("control_step", lambda: _steps(case)))
         if case.equalities:
-            claims.append(judged("equalities", lambda: equalities(case)))
+            claims.append(judged("equalities", lambda: _equalities(case)))
         claims += [judged(window.name, lambda window=window: _kept(case, window)) for window in case.windows]  # type: ignore[misc]
         return [*claims, judged("status", lambda: _status(case, str(status), gap_tolerance, claims))]
 
@@ -110,6 +110,10 @@ def judged(name: str, derive: Callable[[], str]) -> Finding:
 
 def _kept(case: Case, window: Window) -> str:
     return bounded(case, window) if case.policy is None else feedback_of(case).bounded(window)
+
+
+def _equalities(case: Case) -> str:
+    return equalities(case) if case.policy is None else feedback_of(case).equalities()
 
 
 def _control(case: Case) -> str:

@@ -13,7 +13,7 @@ from sparserob_core.checker.arithmetic.balls import balls, below
 from sparserob_core.checker.claims.case import Case, number, numbers
 from sparserob_core.checker.claims.constraints import covered, cut
 from sparserob_core.checker.claims.window import Window
-from sparserob_core.checker.outcome import RESOLVED, TOLERANCE, Broken, Unchecked
+from sparserob_core.checker.outcome import EQUALITY, RESOLVED, TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.reach.closed_loop import ClosedLoop
 from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.sets.known import known
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from flint import arb, arb_mat
 
 MOST_CELLS = 40_000  # cells of time examined for each constraint
-PEAK, CONTROL = "peak", "control"
+PEAK, CONTROL, EQUALS = "peak", "control", "equals"
 
 
 @final
@@ -143,6 +143,41 @@ class FeedbackClaims:
             todo += [(piece, start, half), (piece, half, stop)]
         return f"kept for every disturbance, to {most:.1e} of its own unit ({count} cells)"
 
+    def equalities(self) -> str:
+        """Show that the fixed states are met for every disturbance and initial state; a sentence with the figures."""
+        case, worst = self.case, 0.0
+        state, rest = self._last(self.loop), self._last(self.loop_at_rest)
+        for row, value in case.equalities:
+            missed = self._missed(state, row, value)
+            sums = self._added(rest, row) + self._added(state, row)
+            most = EQUALITY * max(sums, abs(value))
+            if not missed <= most:
+                raise Broken(
+                    f"x{row + 1} is missed by up to {float(missed.upper()):.3g} for some disturbance or initial state,"
+                    f" rounding is at most {most:.1e}"
+                )
+            worst = max(worst, float(missed.upper()))
+        return f"kept for every disturbance to {worst:.1e}"
+
+    def _missed(self, state: list[list[arb]], row: int, value: float) -> arb:
+        """By how much a fixed state is missed at most."""
+        from flint import arb
+
+        line = state[row]
+        up, down = self.loop.support(line[1:]), self.loop.support([-x for x in line[1:]])
+        off = line[0] - arb(value)
+        return (off + up).max(down - off)
+
+    def _last(self, loop: ClosedLoop) -> list[list[arb]]:
+        """The nominal state and every response at the end, ``(d, 1 + Q)``."""
+        found: list[list[arb]] = loop.nodes[-1].tolist()
+        return found
+
+    def _added(self, state: list[list[arb]], row: int) -> float:
+        """The size of the numbers that are added up in a state."""
+        first, *answers = (float(abs(x).upper()) for x in state[row])
+        return first + float(np.array(answers) @ self.loop.radii)
+
     def _entry(self, window: Window) -> Mapping[str, Any]:
         """What the certificate says of the proof of a constraint."""
         data = self.case.certificate.get("proof", {})
@@ -169,6 +204,11 @@ class FeedbackClaims:
             over = [_dot(c, v) + loop.support([_dot(c, column) for column in columns]) - b for c, b in sides]
             return [float(value.mid()) for value in over], TOLERANCE * max(
                 known(case.problem.control).units(), default=1.0
+            )
+        if name == EQUALS and case.equalities:
+            state = self._last(loop)
+            return [float(self._missed(state, row, value).mid()) for row, value in case.equalities], TOLERANCE * max(
+                self._added(self._last(self.loop_at_rest), row) for row, _ in case.equalities
             )
         window = case.window(name)
         if not window.start <= time <= window.stop:
@@ -366,9 +406,13 @@ class _Row:
         z = _deviations(case, loop, entry, name)
         if name in (CONTROL, PEAK):
             return _Row._of_control(case, loop, (name, direction, time, y), z, peaks)
-        window, d = case.window(name), case.problem.system.states
+        d = case.problem.system.states
         if direction.shape != (d,):
             raise Broken(f"{name}: {direction.size} numbers where {d} are expected")
+        if name == EQUALS and case.equalities:
+            row = case.duality.row(direction, time, [], _fixed(case, direction, time), disturbed=False)
+            return _Row(y, row.constant + _given(case, loop, direction, time, z), row.slope, _seen(loop, z, d), None)
+        window = case.window(name)
         if not window.start <= time <= window.stop:
             raise Broken(f"{name}: t = {time!r} is not within {window.start:g} to {window.stop:g}")
         row = case.duality.row(direction, time, [], window.limit(direction, time), disturbed=False)
@@ -395,6 +439,17 @@ class _Row:
         if not peaks or sorted(np.abs(direction).tolist()) != [0.0] * (m - 1) + [1.0]:
             raise Broken(f"{name}: the direction {direction.tolist()} is not that of a peak of this policy")
         return _Row(y, arb(0), nominal, seen, (piece, channel))
+
+
+def _fixed(case: Case, direction: Array, time: float) -> arb:
+    """What ``c'x(T)`` must be, for a direction of one fixed state or its opposite."""
+    from flint import arb
+
+    values = dict(case.equalities)
+    states = np.flatnonzero(direction).tolist()
+    if len(states) != 1 or states[0] not in values or time != case.problem.horizon:
+        raise Broken(f"{EQUALS}: the direction {direction.tolist()} at t = {time!r} is not that of a fixed final state")
+    return arb(float(direction[states[0]])) * arb(values[states[0]])
 
 
 def _given(case: Case, loop: ClosedLoop, direction: Array, time: float, z: list[list[arb]]) -> arb:

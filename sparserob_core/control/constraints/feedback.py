@@ -21,6 +21,8 @@ KEPT = 12  # separated times for each row and round
 ZOOMED, ZOOMS, CLOSER = 9, 14, 4.0  # samples around a maximum, and how often they are drawn so many times closer
 BEGUN = 20  # times of a window that a method begins with
 STATES = 60_000_000  # numbers in the states that are sampled at once
+IDLE = 1e-14  # of the largest coefficient, one that is rounding
+SAME = 1e-12  # of the largest one, a singular value of equations that depend on one another
 
 
 def _not_linear(indices: Array) -> tuple[Array, Array]:
@@ -65,6 +67,8 @@ class FeedbackConstraint:
 
     flat: FlatConstraint
     loop: ClosedLoop
+    exact: bool = False
+    """Whether the second half of the rows are the opposites of the first: an equality."""
 
     @property
     def name(self) -> str:
@@ -75,7 +79,8 @@ class FeedbackConstraint:
         """The constraint as a family."""
         start, stop = self.flat.start, self.flat.stop
         begun = np.unique(np.linspace(0, self.times.size - 1, min(BEGUN, self.times.size)).round().astype(int))
-        return _family(self, Box(np.array([start]), np.array([stop])), self.times[begun][:, None], self.flat)
+        source = self if self.exact else self.flat
+        return _family(self, Box(np.array([start]), np.array([stop])), self.times[begun][:, None], source)
 
     @cached_property
     def times(self) -> Array:
@@ -88,7 +93,18 @@ class FeedbackConstraint:
 
     def uncertain(self, index: Array) -> UncertainRows:
         """The rows at one time."""
-        return self.loop.state_rows(float(index[0]), self.flat.H, self.flat.h, *self._shared)
+        rows = self.loop.state_rows(float(index[0]), self.flat.H, self.flat.h, *self._shared)
+        return replace(rows, exact=self.exact)
+
+    def met(self, x: Array) -> Array:
+        """The nearest decision that meets an equality to rounding; one that no control enters is left as it is."""
+        table, rhs = self.uncertain(np.array([self.flat.stop])).equations
+        entered = abs(table).max(axis=1).toarray().ravel() > IDLE * abs(table).max()
+        table, rhs = table[entered], rhs[entered]
+        square = (table @ table.T).toarray()
+        for _ in range(2):
+            x = x + table.T @ np.linalg.lstsq(square, rhs - table @ x, rcond=SAME)[0]
+        return x
 
     @cached_property
     def _shared(self) -> tuple[np.ndarray, Array]:
@@ -136,7 +152,22 @@ class FeedbackConstraint:
         """One constraint for people, at every disturbance, or at the deviations that the index says."""
         said = self.flat.explain(index[:1], row)
         assert isinstance(said, TimedExplanation)
-        return _told(said, self.loop, index)
+        told = _told(said, self.loop, index)
+        if not self._unanswered[row]:
+            return told
+        last = float(self.loop.functionals.dictionary.breakpoints[-2])
+        late = f"{told.text} (what comes after the last measurement, at {last:.6g}, reaches it unanswered)"
+        return replace(told, text=late)
+
+    @cached_property
+    def _unanswered(self) -> np.ndarray:
+        """The rows ``(r,)`` of an equality that deviations reach which no control answers."""
+        if not self.exact:
+            return np.zeros(self.flat.h.size, dtype=bool)
+        rows = self.uncertain(np.array([self.flat.stop]))
+        size = np.abs(rows.d) * self.loop.spread.radii
+        bare = np.array([np.diff(C.indptr) == 0 for C in rows.C])
+        return np.asarray((bare & (size > SAME * np.abs(self.flat.H).max())).any(axis=1)[rows.part])
 
 
 @final

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 
@@ -13,19 +15,25 @@ from sparserob_core.control.feedback.innovations import Answers, answers, innova
 from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
-from sparserob_core.control.problem.units import Units
+from sparserob_core.control.problem.units import Units, power_of_two
+from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.sets.sets import Equality
+from sparserob_core.control.transcription.own_units import reaches
 from sparserob_core.control.transcription.record import Feedback, Transcription
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.program import ConstraintFamily, OwnUnits, SemiInfiniteProgram
 
 CONTROL, PEAK = "control", "peak"  # names of the families that are about the control
+EQUALS = "equals"  # that of the terminal equalities
+FINER = 2.0**-11  # of the numbers that are added up, the unit of an equality: it is met to `EQUALITY` of them
 
 
-def with_feedback(model: Transcription, own: Transcription, units: Units, policy: AffinePolicy) -> Transcription:
-    """The program of a problem under a policy, from its transcription ``model`` without feedback and the same in its
-    ``own`` ``units``."""
+def with_feedback(
+    problem: OptimalControlProblem, model: Transcription, own: Transcription, units: Units, policy: AffinePolicy
+) -> Transcription:
+    """The program of a problem under a policy, from its transcription ``model`` without feedback and without terminal
+    equalities, and the same in its ``own`` ``units``."""
     blocks = 0 if own.functionals.disturbance is None else own.functionals.disturbance.block_count
     deviations = np.tile(units.disturbances[: own.problem.system.disturbances], blocks)
     begins = own.problem.initial_set is not None
@@ -37,7 +45,11 @@ def with_feedback(model: Transcription, own: Transcription, units: Units, policy
     scaled = answers(seen, own.control.breakpoints, own.problem.system.controls, memory)
     known = _in_users(scaled, units, deviations)
 
-    mine, theirs = (_program(one, policy, each, blocks) for one, each in ((model, known), (own, scaled)))
+    fixed = _fixed(problem, own, units)
+    mine, theirs = (
+        _program(one, policy, each, blocks, ends)
+        for one, each, ends in zip((model, own), (known, scaled), fixed, strict=True)
+    )
     told = [
         _told_by(family, other, units, deviations, own)
         for family, other in zip(theirs[0].families, mine[0].families, strict=True)
@@ -52,7 +64,24 @@ def with_feedback(model: Transcription, own: Transcription, units: Units, policy
         ]
     )[: scaled_program.n]
     program = mine[0].mirrored(lambda _: OwnUnits(scaled_program, decision, decision, np.zeros(0), units.cost))
-    return replace(model, program=program, feedback=Feedback(policy, mine[1]))
+    return replace(model, problem=problem, program=program, feedback=Feedback(policy, mine[1]))
+
+
+def _fixed(
+    problem: OptimalControlProblem, own: Transcription, units: Units
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """The terminal equalities as rows ``H x(T) <= h``, the second half of them the opposites of the first: in the
+    user's units, and in own ones divided by a small part of the numbers that are added up."""
+    ends = [(state, end.values[state]) for end in problem.terminal if isinstance(end, Equality) for state in end.fixed]
+    states = np.array([state for state, _ in ends], dtype=int)
+    H, h = np.eye(problem.system.states)[states], np.array([value for _, value in ends])
+    if not h.size:
+        return (H, h), (H, h)
+    horizon, values = np.array([own.problem.horizon]), h / units.states[states]
+    _, added = reaches(own.functionals, ParameterIndex(None), own.problem.control, H, horizon)
+    small = FINER * power_of_two(np.maximum(added, np.abs(values)))
+    scaled, both = H / small[:, None], values / small
+    return (np.vstack([H, -H]), np.append(h, -h)), (np.vstack([scaled, -scaled]), np.append(both, -both))
 
 
 def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary) -> None:
@@ -61,7 +90,7 @@ def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dic
     paths = [entry for entry in problem.path if isinstance(entry, PathConstraint)]
     sets = [entry.set for entry in paths] + [end for end in problem.terminal if not isinstance(end, Equality)]
     curved = [one.kind for one in sets if one.halfspaces() is None]
-    named = [entry.name for entry in paths if entry.name in (CONTROL, PEAK)]
+    named = [entry.name for entry in paths if entry.name in (CONTROL, PEAK, EQUALS)]
     plain = problem.disturbance_class == "piecewise_constant"
     reasons = {
         "control in indicators of its pieces (piecewise_constant)": not control.is_indicators,
@@ -73,9 +102,7 @@ def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dic
         f"state in sets with flat sides, which the {' and the '.join(curved)} has not": bool(curved),
         f"control in a set with flat sides, which the {problem.control.kind} has not": problem.control.halfspaces()
         is None,
-        f"path constraint of another name than {' or '.join(map(str, named))}, which is one on the control": bool(
-            named
-        ),
+        f"path constraint of another name than {' or '.join(map(str, named))}, which is taken": bool(named),
         "control that acts at once, without a delay": problem.system.delay > 0.0,
         "single linear system, without pieces": bool(problem.system.switches),
         "path constraint on the state alone, without mixed": any(
@@ -84,9 +111,6 @@ def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dic
         "path set that stands still, without relative_to": any(entry.relative_to is not None for entry in paths),
         "control whose steps are free, without control_step": problem.control_step is not None,
         "cost that is the L1 norm alone, without group": not problem.cost.is_linear,
-        "terminal set with an interior: equals is not built for feedback": any(
-            isinstance(end, Equality) for end in problem.terminal
-        ),
     }
     for wanted, hindered in reasons.items():
         if hindered:
@@ -104,9 +128,9 @@ def _in_users(own: Answers, units: Units, deviations: Array) -> Answers:
 
 
 def _program(
-    model: Transcription, policy: AffinePolicy, known: Answers, blocks: int
+    model: Transcription, policy: AffinePolicy, known: Answers, blocks: int, fixed: tuple[Array, Array]
 ) -> tuple[SemiInfiniteProgram, ClosedLoop]:
-    """The program of one transcription, in its units."""
+    """The program of one transcription, in its units; ``fixed``: the rows of its terminal equalities."""
     functionals, problem, pieces = model.functionals, model.problem, model.control.pieces
     nominal, first = functionals.variables, functionals.variables + known.variables
     size = first + (nominal if policy.cost == "peak" else 0)
@@ -116,6 +140,14 @@ def _program(
         for constraint in model.constraints
         if isinstance(constraint, FlatConstraint)
     ]
+    settled: list[Callable[[Array], Array]] = []
+    if fixed[1].size:
+        ends = (problem.horizon, problem.horizon)
+        equal = FeedbackConstraint(
+            FlatConstraint(EQUALS, functionals, *fixed, *ends, model.parameters), loop, exact=True
+        )
+        families.append(equal.family())
+        settled.append(equal.met)
     flat = problem.control.halfspaces()
     assert flat is not None
     families.append(FeedbackControl(CONTROL, loop, *flat).family())
@@ -125,12 +157,11 @@ def _program(
     low, high = np.repeat(low, pieces), np.repeat(high, pieces)
     weights, lower, upper = np.zeros(size), np.concatenate([low, -most]), np.concatenate([high, most])
     cost = problem.cost.l1 * np.kron(np.asarray(problem.weights, dtype=float), model.control.lengths)
-    settle = None
     if policy.cost == "peak":
         both = np.vstack([axes, -axes])
         peaks = FeedbackControl(PEAK, loop, both, np.zeros(len(both)), first)
         families.append(peaks.family())
-        settle = peaks.settled
+        settled.append(peaks.settled)
         weights[first:] = cost
         lower = np.concatenate([lower, np.zeros(nominal)])
         upper = np.concatenate([upper, np.maximum(np.abs(low), np.abs(high))])
@@ -145,7 +176,7 @@ def _program(
         channels=problem.system.controls,
         lengths=np.tile(model.control.lengths, problem.system.controls),
         spread=loop.spread,
-        settle=settle,
+        settle=None if not settled else lambda x: reduce(lambda at, settle: settle(at), settled, x),
     )
     return program, loop
 
@@ -158,12 +189,12 @@ def _told_by(
     assert literal is not None and other is not None
     if isinstance(family.source, FlatConstraint):
         rows = own.family(family.source).row_units
+    elif isinstance(family.source, FeedbackConstraint) and isinstance(theirs.source, FeedbackConstraint):
+        rows = _shares(family.source.flat.H, theirs.source.flat.H * units.states)
     else:
         mine, others = family.source, theirs.source
         assert isinstance(mine, FeedbackControl) and isinstance(others, FeedbackControl)
-        at = np.abs(mine.H).argmax(axis=1)[:, None]
-        shares = np.take_along_axis(others.H * units.controls, at, axis=1) / np.take_along_axis(mine.H, at, axis=1)
-        rows = shares[:, 0]
+        rows = _shares(mine.H, others.H * units.controls)
 
     def told(one: ConstraintFamily, scale: Array) -> ConstraintFamily:
         said = other.explain
@@ -173,3 +204,9 @@ def _told_by(
     time = np.array([units.time])
     reduced = told(family, time)
     return replace(reduced, literal=replace(told(literal, np.concatenate([time, deviations])), reduced=reduced))
+
+
+def _shares(mine: Array, theirs: Array) -> Array:
+    """What every row ``(r,)`` of one is of the other's, at its largest entry."""
+    at = np.abs(mine).argmax(axis=1)[:, None]
+    return np.asarray((np.take_along_axis(theirs, at, axis=1) / np.take_along_axis(mine, at, axis=1))[:, 0])

@@ -95,11 +95,12 @@ def prepare(
     refuse_without_steps(problem, control)
     if isinstance(policy, AffinePolicy):
         refuse(problem, control, disturbance)
-    model = _assembled(problem, control, disturbance, formulation)
-    if isinstance(policy, AffinePolicy):
         if formulation != "reduced":
             raise InputError(f"formulation: expected reduced with policy: affine, got {formulation!r}")
-        return with_feedback(model, *in_own_units(model), policy)
+        ends = [end for end in problem.terminal if not isinstance(end, Equality)]
+        model = _assembled(replace(problem, terminal=ends), control, disturbance, formulation)
+        return with_feedback(problem, model, *in_own_units(model), policy)
+    model = _assembled(problem, control, disturbance, formulation)
     if policy is not None and policy.knows:
         known = ", ".join(sorted(policy.knows))
         raise InputError(path="policy.name", expected="open_loop or affine", got=f"one that knows the {known}")

@@ -23,6 +23,7 @@ from sparserob_core.sip.result import Result
 
 FORMAT = 1
 INWARDS = 1.0 - 1e-13  # points that must be in a curved set are drawn inwards by rounding
+WELL = 1e-14  # of its distance from the middle: a point that is so far from the boundary needs not be drawn
 
 
 def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None:
@@ -235,6 +236,8 @@ def _inside(bound: ConvexSet, point: Array, middle: Array) -> Array:
     if bound.is_box:
         box = bound.bounding_box()
         return np.asarray(np.clip(point, box.lower, box.upper))
+    if float(bound.violation(point)) < -WELL * float(np.abs(point - middle).max()):
+        return point
     answer: Array = middle + INWARDS * (point - middle)
     return answer
 

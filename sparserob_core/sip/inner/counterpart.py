@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 ACCURACY = 1e-10  # of rows and reduced costs: the least that HiGHS takes
 INNER = 20  # steps of the simplex method that one of an interior point method takes as long as
 SAME = 1e-12  # points of a set that are closer are one
+DRAWN = (
+    2.0**-41
+)  # by which deviations of sets that are no boxes are drawn inwards, so that they are shown to be in them
 
 
 @final
@@ -98,7 +101,14 @@ class Counterpart:
             self._fixed = self._linear.rows([entries], program.b, program.b)
 
     def add(self, block: UncertainRows) -> None:
-        """Impose rows from now on."""
+        """Impose rows from now on; exact ones as equations, unless they may be relaxed."""
+        if block.exact and not (self.elastic and self.lowest == 0.0):
+            table, rhs = block.equations
+            table = table.tocoo()
+            at = self._linear.rows([_both(table.row, table.col, table.data, self.program.n)], rhs, rhs)
+            self.blocks.append(block)
+            self._imposed.append((at, rhs, []))
+            return
         parts = [self._part(C, d) for C, d in zip(block.C, block.d, strict=True)]
         g, count, limits = block.g.tocoo(), block.h.size, block.h.copy()
         entries = [_both(g.row, g.col, g.data, self.program.n)]
@@ -154,6 +164,8 @@ class Counterpart:
         limits: list[float] = []
         first = self._linear.count
         for block, (_, _, parts) in zip(self.blocks, self._imposed, strict=True):
+            if not parts:
+                continue
             for part, C, d, worst in zip(
                 parts, block.C, block.d, self.spread.worst(block.coefficients(x)), strict=True
             ):
@@ -179,8 +191,9 @@ class Counterpart:
         self.calls += 1
         if margin != self._margin:
             self._margin = margin
-            for where, limits, _ in self._imposed:
-                self._linear.limit(where, limits - margin)
+            for where, limits, parts in self._imposed:
+                if parts:
+                    self._linear.limit(where, limits - margin)
         solved, said, columns, rows = self._linear.solve()
         if not solved:
             none = np.zeros(0)
@@ -192,14 +205,15 @@ class Counterpart:
 
     def _multipliers(self, even: Array, mu: Array) -> tuple[Array, Array]:
         """The multipliers ``(r,)`` of all rows, and the deviations ``(r, Q)`` that those of the parts stand for."""
-        y = np.maximum(np.concatenate([np.zeros(0), *(even[where] for where, _, _ in self._imposed)]), 0.0)
-        deviations = np.zeros((y.size, self.spread.size))
+        y, deviations = self._plain(even)
         slope = mu @ self.program.A + (0.0 if self.elastic else self.program.q)
         late: list[tuple[UncertainRows, int, _Part, np.ndarray, float]] = []
         first = 0
         for block, (where, _, parts) in zip(self.blocks, self._imposed, strict=True):
-            mine = y[first : first + where.size]
+            mine = y[first : first + block.h.size]
             slope = slope + block.g.T @ mine
+            if not parts:
+                slope = slope + even[where] @ block.equations[0] - block.g.T @ mine
             for p, part in enumerate(parts):
                 rows = np.flatnonzero(block.part == p)
                 total = float(mine[rows] @ np.abs(block.factor[rows]))
@@ -217,9 +231,40 @@ class Counterpart:
                     w[place] = shares @ np.array(known) / most if known else 0.0
                 slope = slope + total * (block.C[p].T @ w)
                 deviations[first + rows] = np.sign(block.factor[rows])[:, None] * w
-            first += where.size
+            first += block.h.size
         self._balance(slope, deviations, late)
+        if not self.spread.is_box:
+            deviations = deviations + DRAWN * (self.spread.inner - deviations)
         return y, deviations
+
+    def _plain(self, even: Array) -> tuple[Array, Array]:
+        """The multipliers of all rows, and the deviations of exact ones, 0 for the others. The multipliers of equations
+        are those of one row at a deviation and of its opposite at none."""
+        y, deviations = [np.zeros(0)], [np.zeros((0, self.spread.size))]
+        for block, (where, _, parts) in zip(self.blocks, self._imposed, strict=True):
+            found, w = np.maximum(even[where], 0.0), np.zeros((block.h.size, self.spread.size))
+            if not parts:
+                half = block.h.size // 2
+                table = even[where].reshape(half, -1)
+                found = np.zeros(block.h.size)
+                for row, (plain, *answers) in enumerate(table):
+                    found[row], w[row] = self._at_one(float(plain), np.array(answers))
+                    found[half + row] = found[row] - plain
+            y.append(found)
+            deviations.append(w)
+        return np.concatenate(y), np.vstack(deviations)
+
+    def _at_one(self, plain: float, answers: Array) -> tuple[float, Array]:
+        """A multiplier of at least ``plain`` and a deviation whose product is ``answers (Q,)``."""
+        free = self.spread.radii > 0.0
+        answers = np.where(free, answers, 0.0)
+        size = max(plain, float((np.abs(answers[free]) / self.spread.radii[free]).max(initial=0.0)))
+        if size <= 0.0:
+            return 0.0, np.zeros(answers.size)
+        found = float(np.exp2(np.ceil(np.log2(size))))  # a power of two, by which nothing is rounded
+        while not self.spread.holds(answers / found):
+            found *= 2.0
+        return found, answers / found
 
     def _at_rest(self, block: UncertainRows, p: int) -> Array:
         """The worst deviations where no decision enters a part; 0 elsewhere."""
