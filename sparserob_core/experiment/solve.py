@@ -24,6 +24,7 @@ from sparserob_core.sip.method import GAP_TOLERANCE, Continuation, Deadline, Met
 from sparserob_core.sip.methods.own_units import solve_in_own_units
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.regulariser import Regulariser
+from sparserob_core.sip.relaxed.relaxed import require_separable
 from sparserob_core.sip.result import Result
 from sparserob_core.sip.solver import Solver
 
@@ -129,7 +130,8 @@ def solve(
     )
     chosen: Method = component(registry, "method", _with_tolerance(registry, method, tolerance), Method)
     require_suited(chosen, program)
-    result = solve_in_own_units(chosen, program, tools)
+    require_separable(program, tools.solver, tools.regulariser)
+    result = solve_in_own_units(chosen, program, tools).with_solver(_named(solver))
     if isinstance(model, SemiInfiniteProgram):
         return result
     from sparserob_core.control.studies.answer import ControlResult
@@ -289,6 +291,12 @@ def _careful(name: str, listener: Callable[..., object]) -> Callable[..., None]:
             warnings.warn(f"{name} raised {named(error)}; it is not called again", stacklevel=2)
 
     return heard
+
+
+def _named(choice: object) -> str:
+    """What a component is called: the name in a choice, or its class."""
+    named = choice.get("name") if isinstance(choice, Mapping) else choice
+    return named if isinstance(named, str) else type(choice).__name__
 
 
 def component(registry: Registry, kind: str, choice: object, expected: type[Any]) -> Any:

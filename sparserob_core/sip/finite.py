@@ -221,6 +221,9 @@ class Directions:
         return Directions(block[kept], vectors[kept])
 
 
+CLOSED_FORM, DUAL_NEWTON, HIGHS, SOLVER, NOBODY = "closed_form", "dual_newton", "highs", "solver", "nobody"
+
+
 @dataclass(frozen=True, eq=False)
 class FiniteSolution:
     """What was *checked* about a finite program; no number here was taken from a solver unread.
@@ -232,7 +235,8 @@ class FiniteSolution:
     ``gap = value - lower_bound``. ``directions``: those that norms of blocks were replaced by, the last time.
     ``infeasibility``: a proven lower bound of the smallest ``t`` for which
     ``G_i x <= h_i + t |G_i|`` and ``|A_i x - b_i| <= t |A_i|`` can be met within the bounds. ``attempts``: what was
-    tried and why it was not believed.
+    tried and why it was not believed. ``by``: whose answer it is, one of `CLOSED_FORM`, `DUAL_NEWTON`, `HIGHS`,
+    `SOLVER` (the solver that was named) and `NOBODY`.
     """
 
     status: Literal["optimal", "infeasible", "failed"]
@@ -248,6 +252,7 @@ class FiniteSolution:
     attempts: tuple[str, ...] = ()
     infeasibility: float = 0.0
     directions: Directions | None = None
+    by: str = ""
 
 
 @final

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import RoundFinished
 from sparserob_core.sip.evidence import NO_BOUND, Activity, Cut, Dual, InfeasibleSubsystem, Proof, Sparsest
+from sparserob_core.sip.finite import SOLVER
 from sparserob_core.sip.program import WorstConstraint
 
 if TYPE_CHECKING:
@@ -117,6 +118,7 @@ class Result:
     the decision misses an equality, relative to the numbers that are added up in it, where there are any; computed, not
     proven, and at most `EQUALITY` where something is claimed. ``activity``: between what the least count of the
     program lies, where it has one. ``sparsest``: there where the cost is that count, not J.
+    ``solved_by``: whose answers to relaxed programs were believed, and how many (`RelaxedProgram.solved_by`).
     """
 
     status: Status
@@ -130,6 +132,7 @@ class Result:
     worst: WorstConstraint | None = None
     indices: Sequence[Cut] = ()
     counts: Mapping[str, int] = field(default_factory=dict)
+    solved_by: Mapping[str, int] = field(default_factory=dict)
     history: Sequence[RoundFinished] = ()
     trace: SearchTrace | None = None
     dual: Dual = NO_BOUND
@@ -143,6 +146,14 @@ class Result:
     missed: float | None = None
     activity: Activity | None = None
     sparsest: Sparsest | None = None
+
+    def with_solver(self, name: str) -> Result:
+        """The same, where what the solver has solved counts under its name, be it nothing."""
+        if not self.solved_by:
+            return self
+        others = {one: count for one, count in self.solved_by.items() if one != SOLVER}
+        mine = self.solved_by.get(SOLVER, 0) + others.get(name, 0)
+        return replace(self, solved_by={**others, name: mine})
 
     def __repr__(self) -> str:
         lines = [

@@ -21,9 +21,10 @@ from sparserob_core.testing.solvers import (
 from tests.support.faults import fails
 
 REGISTRY = sr.load_registry()
-NAMES = [
+ALL = [
     name for name in REGISTRY.names("solver") if REGISTRY.get("solver", name).plugin != "qpsolvers"
 ]  # tests/plugins/test_qpsolvers.py has those
+NAMES = [name for name in ALL if name != "dual_newton"]  # which is for separable programs
 
 
 def test_there_are_solvers_to_be_tested():
@@ -42,11 +43,21 @@ class TestRegisteredSolver(SolverContract):
         return REGISTRY.build("solver", self.name)
 
 
+class TestDualNewton(SolverContract):
+    """Six of its programs have a cost that couples variables; tests/sip/inner/test_dual_newton.py allows no other
+    failure."""
+
+    may_fail = 6
+
+    def create(self):
+        return REGISTRY.build("solver", "dual_newton")
+
+
 def test_all_solvers_find_the_same_value():
     for instance in [*linear_instances(), *regularised_instances()]:
         values = [
             s.value
-            for name in NAMES
+            for name in ALL
             if (s := solve_finite(instance.program, REGISTRY.build("solver", name))).status == "optimal"
         ]
         assert values, instance.name

@@ -55,6 +55,7 @@ def summary_of(result: Result, control: Array | None, dictionary: Dictionary | N
             "rounds": len(result.history),
             "active_indices": len(result.indices),
             **result.counts,
+            **({"solved_by": dict(result.solved_by)} if result.solved_by else {}),
         },
         **({} if result.scenario_bound is None else {"scenario_bound": asdict(result.scenario_bound)}),
         "seconds": result.seconds,

@@ -11,6 +11,7 @@ from sparserob_core.experiment.plugins.hookspecs import (
     ProblemPlugin,
     SchedulePlugin,
     SelectionPlugin,
+    SolverPlugin,
     hookimpl,
 )
 
@@ -49,6 +50,16 @@ def sparserob_methods() -> Iterator[MethodPlugin]:
         name="scenario",
         factory="sparserob_core.sip.methods.baselines:Scenario",
         summary="Baseline: the constraints for a number of sampled uncertainties only.",
+    )
+
+
+@hookimpl
+def sparserob_solvers() -> Iterator[SolverPlugin]:
+    """The method that needs nobody else's code."""
+    yield SolverPlugin(
+        name="dual_newton",
+        factory="sparserob_core.sip.inner.dual_newton:DualNewton",
+        summary="Newton's method on the dual, for separable programs alone: exact, and of few unknowns.",
     )
 
 

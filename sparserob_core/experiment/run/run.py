@@ -34,6 +34,7 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.method import Deadline, ExecutorFactory, Method, Tools, require_suited
 from sparserob_core.sip.methods.own_units import solve_in_own_units
 from sparserob_core.sip.program import SemiInfiniteProgram
+from sparserob_core.sip.relaxed.relaxed import require_separable
 from sparserob_core.sip.result import Result
 
 ROWS = 4  # of a table, in a line each of what `repr` says
@@ -203,6 +204,7 @@ def _run(
     method: Method = build(loaded, "method", loaded.config.method)
     try:
         require_suited(method, experiment.program, loaded.config.method.name)
+        require_separable(experiment.program, tools.solver, tools.regulariser)
     except InputError as error:
         raise loaded.located((), error) from error
     with create_directory(out, name_of(loaded), loaded.config.digest()) as directory:
@@ -227,6 +229,7 @@ def _run(
             )
             try:
                 result = solve_in_own_units(method, experiment.program, _notifying(tools, broadcast))
+                result = result.with_solver(loaded.config.solver.name)
             except KeyboardInterrupt as pressed:  # a method that does not return what it knows
                 deadline.interrupt(pressed)
                 result, complete = journal.known(_said(pressed), time.perf_counter() - started), False

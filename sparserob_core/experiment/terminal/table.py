@@ -61,6 +61,7 @@ def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("equalities", _equalities(summary.get("equalities"))),
         ("active indices", str(counts["active_indices"])),
         ("rounds", str(counts["rounds"])),
+        ("solved by", _solved_by(counts.get("solved_by"))),
         ("share of time active", _number(sparsity["active_fraction"], ".1%")),
         ("J", _number(summary.get("J"), ".9g")),
         ("sparsest", sparsity.get("verdict") or "unknown"),
@@ -69,6 +70,23 @@ def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("seconds", f"{_number(summary['seconds'], '.3f')} of the method, which solves and proves"),
     ]
     return [(name, value) for name, value in rows if value != "unknown" or name in KNOWN]
+
+
+WHO = {
+    "closed_form": "in closed form, no row being active",
+    "dual_newton": "by the dual Newton method",
+    "highs": "by HiGHS",
+    "nobody": "not solved",
+}
+
+
+def _solved_by(counts: Mapping[str, int] | None) -> str:
+    """Who solved the relaxed programs; of the solver that was named, also that it was not needed."""
+    if not counts:
+        return "unknown"
+    parts = [f"{count} {WHO.get(name, f'by {name}')}" for name, count in counts.items() if count]
+    idle = [name for name, count in counts.items() if not count]
+    return ", ".join(parts) + "".join(f"; {name} was not needed" for name in idle)
 
 
 def _fewest(known: Mapping[str, Any] | None) -> str:

@@ -20,12 +20,22 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sparserob_core.errors import PluginError
-from sparserob_core.sip.finite import Blocks, Directions, FiniteProgram, FiniteSolution, diagonal
+from sparserob_core.sip.finite import (
+    CLOSED_FORM,
+    DUAL_NEWTON,
+    NOBODY,
+    SOLVER,
+    Blocks,
+    Directions,
+    FiniteProgram,
+    FiniteSolution,
+    diagonal,
+)
 from sparserob_core.sip.inner.change_of_variables import NewVariables, in_new_variables
+from sparserob_core.sip.inner.dual_newton import polish
 from sparserob_core.sip.inner.duality import farkas_margin, measure, minimisers, vertex_multipliers
 from sparserob_core.sip.inner.more_digits import refined
 from sparserob_core.sip.inner.norms import around, bent, near, of_the_rest, towards
-from sparserob_core.sip.inner.polish import polish
 from sparserob_core.sip.inner.standard_form import Form, Recovered, standard_form
 from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
 
@@ -99,10 +109,15 @@ def solve_finite(
     when the program's shapes or numbers are at fault; a hard program is ``failed``, never an exception.
     """
     program.validate()
-    case = _Case(program, solver, tolerance, small)
-    impossible = _contradiction(program, tolerance)
+    found = _answer(_Case(program, solver, tolerance, small), guess)
+    return found if found.by else replace(found, by=NOBODY if found.status == "failed" else SOLVER)
+
+
+def _answer(case: _Case, guess: FiniteSolution | None) -> FiniteSolution:
+    program = case.program
+    impossible = _contradiction(program, case.tolerance)
     if impossible is not None:
-        return impossible
+        return replace(impossible, by=CLOSED_FORM)
     for solution in _cheap(case, guess):
         believed = case.judge(solution, "without a solver")
         if believed is not None:
@@ -265,8 +280,10 @@ def _through(case: _Case, easier: NewVariables, guess: FiniteSolution | None) ->
     found = solve_finite(easier.program, case.solver, tolerance=case.tolerance, guess=start, small=case.small)
     x = easier.back(found.x)
     if found.status == "infeasible":
-        return _proof(case, (x, found.y, found.mu, None), "the program in other variables")
+        proof = _proof(case, (x, found.y, found.mu, None), "the program in other variables")
+        return proof if proof is None else replace(proof, by=found.by)
     measured = measure(program, x, found.y, found.mu, easier.dual(found.z), found.message)
+    measured = replace(measured, by="" if found.by == NOBODY else found.by)
     return case.judge(measured, "new variables") or case.blunt
 
 
@@ -285,11 +302,12 @@ def _cheap(case: _Case, guess: FiniteSolution | None) -> Iterator[FiniteSolution
     if curvature is not None:
         x = minimisers(program.weights, curvature, program.q, program.lower, program.upper)
         if np.isfinite(x).all() and program.residual(x) <= case.tolerance:
-            yield measure(program, x, np.zeros(program.h.size), np.zeros(program.b.size), message="no row is active")
+            free = measure(program, x, np.zeros(program.h.size), np.zeros(program.b.size), message="no row is active")
+            yield replace(free, by=CLOSED_FORM)
     if guess is not None:
         found = polish(program, guess.x, guess.y, guess.mu)
         if found is not None:
-            yield found
+            yield replace(found, by=DUAL_NEWTON)
 
 
 def _ask(

@@ -93,6 +93,7 @@ class Reweighted(Method, Options):
             history=first.history,
             cost_scale=first.cost_scale,
             counts=first.counts,
+            solved_by=first.solved_by,
             seconds=first.seconds + result.seconds,
         )
 

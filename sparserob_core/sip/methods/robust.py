@@ -15,7 +15,7 @@ import numpy as np
 
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Cut, Dual, InfeasibleSubsystem, Proof
-from sparserob_core.sip.finite import FiniteSolution
+from sparserob_core.sip.finite import HIGHS, FiniteSolution
 from sparserob_core.sip.inner.counterpart import Counterpart, RobustAnswer, robust_bound
 from sparserob_core.sip.methods.ledger import Answer, Ledger, Prover
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram, WorstConstraint
@@ -166,7 +166,8 @@ def _solved(working: Robust, ledger: Ledger) -> Answer | Result:
     end the proof that nothing is feasible."""
     while True:
         answer = working.counterpart.solve(working.margin)
-        ledger.relaxed.solves = ledger.relaxed.counted.calls = working.counterpart.calls
+        calls = working.counterpart.calls
+        ledger.relaxed.solves = ledger.relaxed.counted.calls = ledger.relaxed.solved_by[HIGHS] = calls
         if answer.solved:
             break
         if working.margin > 0.0:
@@ -205,7 +206,8 @@ def _infeasible(working: Robust, ledger: Ledger, said: str) -> Result:
     elastic = relaxing.solve()
     while elastic.solved and relaxing.sharpen(elastic.x):
         elastic = relaxing.solve()
-    ledger.relaxed.solves = ledger.relaxed.counted.calls = working.counterpart.calls + relaxing.calls
+    calls = working.counterpart.calls + relaxing.calls
+    ledger.relaxed.solves = ledger.relaxed.counted.calls = ledger.relaxed.solved_by[HIGHS] = calls
     dual = working.dual(elastic, priced=False) if elastic.solved else None
     if dual is None or not dual.bound > FARKAS:
         found = FiniteSolution("failed", np.zeros(program.n), np.nan, -np.inf, none, none, none, np.inf, np.inf, said)

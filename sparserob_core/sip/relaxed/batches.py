@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -36,12 +37,13 @@ START = 5.0
 class Valued:
     """What a chunk gave: ``values (k,)``; ``duals``, the lower bound from the multipliers of each tuple whose value was
     the best so far in its chunk, by its place in it; and how many programs were solved, by how many ``calls`` of the
-    solver. ``late``: why the time was over, if it was."""
+    solver, and by whom. ``late``: why the time was over, if it was."""
 
     values: Array
     duals: dict[int, Dual]
     solves: int
     calls: int
+    solved_by: Mapping[str, int] = field(default_factory=dict)
     late: str = ""
 
 
@@ -50,14 +52,15 @@ def value_chunk(g: TupleValue, points: Array, best: float) -> Valued:
     is of use."""
     g.forget()
     relaxed, duals = g.relaxed, dict[int, Dual]()
-    solves, calls = relaxed.solves, relaxed.counted.calls
+    solves, calls, known = relaxed.solves, relaxed.counted.calls, Counter(relaxed.solved_by)
     values = np.empty(len(points))
     for k, point in enumerate(points):
         values[k] = g.at(point)
         if np.isfinite(values[k]) and values[k] > best:
             best = float(values[k])
             duals[k] = relaxed.lower_bound(g.rows(), g.solution)
-    return Valued(values, duals, relaxed.solves - solves, relaxed.counted.calls - calls)
+    by = relaxed.solved_by - known
+    return Valued(values, duals, relaxed.solves - solves, relaxed.counted.calls - calls, dict(by))
 
 
 @dataclass(frozen=True)
@@ -166,6 +169,7 @@ class Batches:
                 self.sent += len(chunk)
                 g.relaxed.solves += one.solves
                 g.relaxed.counted.calls += one.calls
+                g.relaxed.solved_by.update(one.solved_by)
                 found.append(one)
         except Exception:  # noqa: BLE001  whatever it was: what is missing is done here, or raised here
             self.executor = None

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Cut, Dual
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution, diagonal
+from sparserob_core.sip.inner.dual_newton import DualNewton, not_separable
 from sparserob_core.sip.inner.duality import homogeneous, minimisers, proving, vertex_multipliers
 from sparserob_core.sip.inner.image import onto_stationary
 from sparserob_core.sip.inner.solve import solve_finite
@@ -130,6 +133,19 @@ class CountedSolver(Solver):
         return self.solver.solve(program, accuracy)
 
 
+def require_separable(program: SemiInfiniteProgram, solver: Solver, regulariser: Regulariser | None) -> None:
+    """Raise `InputError` where the solver is `DualNewton`, and the relaxed programs are not for it."""
+    if not isinstance(solver, DualNewton):
+        return
+    if program.spread is not None:
+        why = "under feedback rows hold for every deviation, which makes linear programs, and HiGHS solves these"
+    else:
+        relaxed, none = RelaxedProgram(program, solver, regulariser), Rows.none(program.n)
+        why = not_separable(relaxed.finite(none.G, none.h, 1.0))
+    if why:
+        raise InputError(path="solver.name", expected=f"another solver, such as piqp: {why}", got="dual_newton")
+
+
 def _touched(plain: FiniteProgram, y: Array, mu: Array, x: Array) -> Array:
     """Where the cost is replaced by its tangent, for a bound from these multipliers: at their own minimiser where that
     is explicit, which gives the bound of the cost itself; else at ``x``."""
@@ -146,8 +162,9 @@ def _touched(plain: FiniteProgram, y: Array, mu: Array, x: Array) -> Array:
 class RelaxedProgram:
     """``g(epsilon; indices)``: minimise ``J + epsilon rho`` over the finite constraints and the imposed indices.
 
-    It remembers the rows that were active and their multipliers, and starts from them at the next call. Raises
-    `OutOfTime` instead of solving one more program when its ``deadline`` has passed.
+    It remembers the rows that were active and their multipliers, and starts from them at the next call. ``solved_by``
+    counts whose answers the ``solves`` were (`FiniteSolution.by`). Raises `OutOfTime` instead of solving one more
+    program when its ``deadline`` has passed.
     """
 
     program: SemiInfiniteProgram
@@ -155,6 +172,7 @@ class RelaxedProgram:
     regulariser: Regulariser | None = None
     tolerance: float = 1e-9
     solves: int = 0
+    solved_by: Counter[str] = field(default_factory=Counter)
     deadline: Deadline = field(default_factory=Deadline)
     _terms: tuple[csc_array, Array] | None = None
     _last: RelaxedSolution | None = None
@@ -312,7 +330,9 @@ class RelaxedProgram:
         self.solves += 1
         small = SMALL_COST * self.program.cost_scale if epsilon == 0.0 else np.inf  # the bounds are to meet there
         finite = self.finite(G, h, epsilon)
-        return solve_finite(finite, self.counted, tolerance=self.tolerance, guess=guess, small=small)
+        solution = solve_finite(finite, self.counted, tolerance=self.tolerance, guess=guess, small=small)
+        self.solved_by[solution.by] += 1
+        return solution
 
     @shaped
     def finite(self, G: Float[Array, "r n"], h: Float[Array, " r"], epsilon: float) -> FiniteProgram:

@@ -12,8 +12,8 @@ from scipy.sparse import csc_array, diags_array
 
 import sparserob_core as sr
 from sparserob_core.sip.finite import FiniteProgram
+from sparserob_core.sip.inner.dual_newton import newton_solve, polish
 from sparserob_core.sip.inner.duality import dual_bound, farkas_bound
-from sparserob_core.sip.inner.polish import newton_solve, polish
 from sparserob_core.sip.inner.solve import elastic_program, solve_finite, unrelaxed
 from sparserob_core.sip.inner.standard_form import standard_form
 from sparserob_core.testing.solvers import (

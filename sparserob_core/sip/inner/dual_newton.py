@@ -1,30 +1,128 @@
-"""Polish a claim of a separable program to round-off.
+"""Newton's method on the dual of a separable program, whose unknowns are the rows, about ten.
 
-Newton's method on the dual, whose unknowns are the rows, about ten; and proximal points, each by Newton's method, where
-the curvature is too small for it alone.
+`DualNewton` is the solver ``dual_newton``, which begins with nothing; `polish` brings a claim that is near to
+round-off. Where the curvature is too small for Newton's method alone, both take proximal points, each by Newton's
+method.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field
 
+from sparserob_core.options import Options
 from sparserob_core.shapes import Bool, Float, shaped
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution, diagonal
+from sparserob_core.sip.inner.change_of_variables import in_new_variables
 from sparserob_core.sip.inner.duality import measure, minimisers
+from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
 
 ITERATIONS = 60
 PATIENCE = 10
 SEARCH = 25
 TARGET = 1e-12
+DAMPING, DAMPED = 1e-13, 1e4  # of the trace of a Hessian, and what that becomes where a step climbs nothing
 # below this, relative to the linear cost, the curvature amplifies round-off too much for Newton's method alone
 FLAT = 1e-4
 STILL = 1e-9  # a proximal point that moves by less, relative to the decision, has arrived
+HEAVIEST, LIGHTEST = 1e6, 1e-9  # weights of a proximal point, of the largest coefficient of the cost
+LIGHTER, HEAVIER = 0.1, 30.0  # what a weight becomes after a proximal point that was found, and one that was not
+NOT_SEPARABLE = "its quadratic cost couples variables: a separable program is needed"
+
+
+class DualNewton(Solver, Options):
+    """Separable programs alone, to round-off: bounds and costs of every entry for itself, coupled by few rows.
+
+    The dual of such a program has the rows for unknowns, is concave, and piecewise quadratic where the cost is strictly
+    convex: semismooth Newton (Qi and Sun 1993) ends after finitely many steps. Where it is not, or hardly, proximal
+    points (Rockafellar 1976) with a weight that falls as long as Newton's method follows. The work of a step is
+    ``O(r^2 n)`` for ``r`` rows and ``n`` entries, and what is claimed is checked like any other claim. A program whose
+    quadratic cost couples variables is given up; so is one without a solution, whose rows are then relaxed to prove it.
+    """
+
+    sparse: ClassVar[bool] = False
+
+    points: int = Field(default=60, ge=1, le=10_000)
+    """Proximal points before giving up."""
+
+    def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
+        """See `Solver.solve`; ``solved`` where residual and gap, both measured here, are at most ``accuracy``, or what
+        double precision can tell."""
+        if diagonal(program.P, program.q.size) is None:
+            none = np.full(program.q.size, np.nan)
+            return Claim("failed", none, np.zeros(program.h.size), np.zeros(program.b.size), none, NOT_SEPARABLE)
+        finite = FiniteProgram(
+            program.q,
+            np.zeros(program.q.size),
+            program.lower,
+            program.upper,
+            program.G.toarray(),
+            program.h,
+            program.A.toarray(),
+            program.b,
+            P=program.P if program.P.nnz else None,
+        )
+        found, steps = from_nothing(finite, accuracy, self.points)
+        bent = 0.0 if finite.P is None else finite.P @ found.x
+        slope = program.q + bent + found.y @ finite.G + found.mu @ finite.A
+        low, high = found.x <= program.lower, found.x >= program.upper
+        box = np.where(low, np.minimum(-slope, 0.0), 0.0) + np.where(high, np.maximum(-slope, 0.0), 0.0)
+        done = found.residual <= accuracy and found.gap <= max(accuracy, _noise(found))
+        said = f"{steps} proximal points; residual {found.residual:.1e}, gap {found.gap:.1e}"
+        return Claim("solved" if done else "failed", found.x, found.y, found.mu, box, said)
+
+
+def not_separable(program: FiniteProgram) -> str:
+    """Why a program is not one for `DualNewton`, in words; empty where it is."""
+    if program.blocks is not None:
+        return "its cost takes norms of several entries together"
+    easier = None if program.S is None else in_new_variables(program)
+    if program.S is not None and easier is None:
+        return "its costs and bounds are of sums of entries, and there are no variables in which each has its own"
+    if diagonal((easier.program if easier else program).P, program.n) is None:
+        return "its quadratic cost, or its regulariser, couples entries"
+    return ""
+
+
+def from_nothing(program: FiniteProgram, accuracy: float, points: int) -> tuple[FiniteSolution, int]:
+    """The best answer to a separable program that at most so many proximal points find from nothing, and how many it
+    took; it is not sought further once residual and gap are at most ``accuracy``."""
+    from scipy.sparse import dia_array
+
+    curvature = diagonal(program.P, program.n)
+    assert curvature is not None
+    least, cost = float(curvature.min(initial=np.inf)), _cost(program) or 1.0
+    y, mu, x = np.zeros(program.h.size), np.zeros(program.b.size), np.clip(0.0, program.lower, program.upper)
+    best = measure(program, x, y, mu, message="nothing")
+    weight, idle, number = cost, 0, 0
+    while number < points and idle <= PATIENCE and weight <= HEAVIEST * cost:
+        number += 1
+        if weight <= least:
+            near = newton_solve(program, y, mu)  # it is bent enough itself
+        else:
+            P = dia_array(((curvature + weight)[None], [0]), shape=(program.n, program.n)).tocsc()
+            near = newton_solve(replace(program, P=P, q=program.q - weight * x), y, mu)
+        if near is None:
+            weight = HEAVIER * weight
+            continue
+        found = measure(program, near.x, near.y, near.mu, message="dual Newton")
+        x, y, mu = found.x, found.y, found.mu
+        better = _size(found) < 0.5 * _size(best)
+        best, idle = (found, 0) if better else (best, idle + 1)
+        if best.residual <= accuracy and best.gap <= max(0.1 * accuracy, _noise(best)):
+            break
+        weight = max(LIGHTER * weight, LIGHTEST * cost)
+    return best, number
+
+
+def _size(solution: FiniteSolution) -> float:
+    return solution.residual + max(solution.gap, 0.0)
 
 
 @shaped
@@ -133,22 +231,27 @@ class _Dual:
         return float(np.abs(natural).max(initial=0.0))
 
     @shaped
-    def hessian(self, point: _Point) -> Float[Array, "v v"]:
+    def hessian(self, point: _Point, damping: float = DAMPING) -> Float[Array, "v v"]:
         """Minus the generalised Hessian, damped so that duplicated and flat directions stay solvable."""
         free = (point.x != 0) & (point.x > self.program.lower) & (point.x < self.program.upper)
         rows = self.M[:, free]
         hessian: Array = (rows / self.curvature[free]) @ rows.T
         flat = hessian.diagonal() <= 1e-14 / self.curvature.max()
-        damping = (
-            1e-13 * float(hessian.trace()) + np.where(flat, np.linalg.norm(point.gradient), 0.0) + np.finfo(float).tiny
+        hessian[np.diag_indices_from(hessian)] += (
+            damping * float(hessian.trace())
+            + np.where(flat, np.linalg.norm(point.gradient), 0.0)
+            + np.finfo(float).tiny
         )
-        hessian[np.diag_indices_from(hessian)] += damping
         return hessian
 
 
 @shaped
 def newton_solve(
-    program: FiniteProgram, y0: Float[Array, " r"], mu0: Float[Array, " e"] | None = None
+    program: FiniteProgram,
+    y0: Float[Array, " r"],
+    mu0: Float[Array, " e"] | None = None,
+    steps: int = ITERATIONS,
+    patience: int = PATIENCE,
 ) -> FiniteSolution | None:
     """The optimum of a program with identity image and a positive diagonal ``P``, from dual variables ``y0 (r,)``,
     ``mu0 (e,)``.
@@ -167,7 +270,7 @@ def newton_solve(
     start = np.concatenate([np.maximum(y0[keep], 0.0), np.zeros(program.b.size) if mu0 is None else mu0]) * norms
     dual = _Dual(program, curvature, M / norms[:, None], c / norms, np.arange(c.size) < int(keep.sum()))
     try:
-        point = _ascend(dual, start)
+        point = _ascend(dual, start, steps, patience)
     except np.linalg.LinAlgError:
         return None
     if point is None:
@@ -179,22 +282,25 @@ def newton_solve(
 
 
 @shaped
-def _ascend(dual: _Dual, start: Float[Array, " v"]) -> _Point | None:
+def _ascend(dual: _Dual, start: Float[Array, " v"], steps: int, patience: int) -> _Point | None:
     point = dual.at(start)
     scale = 1.0 + float(np.abs(point.x).max(initial=0.0))
     error = least = dual.error(point)
-    stalled = 0
-    for _ in range(ITERATIONS):
+    stalled, damping = 0, DAMPING
+    for _ in range(steps):
         if error <= TARGET * scale:
             return point
-        if not np.isfinite(error) or stalled > PATIENCE:
+        if not np.isfinite(error) or stalled > patience:
             return None
-        hessian = dual.hessian(point)
+        hessian = dual.hessian(point, damping)
         target = _non_negative(hessian, point.gradient + hessian @ point.dual, dual.signed, point.dual > 0)
         trial = dual.at(target)
         if not dual.error(trial) < 0.5 * least:
             step = target - point.dual
-            trial = dual.at(point.dual + _line_maximum(dual, point, step) * step)
+            length = _line_maximum(dual, point, step)
+            # where too few entries are free, a step is as good as any direction: nearer to the gradient then
+            damping = DAMPING if length > 0.0 else min(DAMPED * damping, 1.0)
+            trial = dual.at(point.dual + length * step)
         point, error = trial, dual.error(trial)
         stalled = 0 if error < 0.9 * least else stalled + 1
         least = min(least, error)

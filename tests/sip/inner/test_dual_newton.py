@@ -1,0 +1,144 @@
+"""Guards sip.inner.dual_newton: separable programs are solved from nothing, exactly, others are given up in words, and
+a run tells who solved what."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import sparserob_core as sr
+from sparserob_core.sip.finite import FiniteProgram
+from sparserob_core.sip.inner.dual_newton import DualNewton, from_nothing, not_separable
+from sparserob_core.sip.inner.solve import solve_finite
+from sparserob_core.testing.solvers import (
+    badly_scaled_instances,
+    coupled_instances,
+    infeasible_instances,
+    linear_instances,
+    regularised_instances,
+)
+from tests.support.places import ROOT
+
+DEMO = ROOT / "configs/double_integrator.yaml"
+
+
+class Untouched(sr.Solver):
+    """Must not be asked."""
+
+    def solve(self, program, accuracy):
+        raise AssertionError("asked")
+
+
+def separable(seed: int, rows: int, entries: int, curvature: float) -> FiniteProgram:
+    """A feasible program of that size, with equalities, fixed entries and bounds of very different widths."""
+    from scipy.sparse import csc_array, eye_array
+
+    rng = np.random.default_rng(seed)
+    upper = 10.0 ** rng.uniform(-1, 1, entries)
+    lower = np.where(rng.random(entries) < 0.2, 0.0, -upper)
+    lower[:2] = upper[:2] = 0.3
+    G, A = rng.standard_normal((rows, entries)), rng.standard_normal((2, entries))
+    inside = lower + rng.random(entries) * (upper - lower)
+    return FiniteProgram(
+        0.3 * rng.standard_normal(entries),
+        rng.uniform(0.5, 1.0, entries),
+        lower,
+        upper,
+        G,
+        G @ inside + 0.1 * rng.random(rows),
+        A,
+        A @ inside,
+        P=csc_array(curvature * eye_array(entries)) if curvature else None,
+    )
+
+
+@pytest.mark.parametrize("curvature", [0.0, 1e-6, 1e-2, 1.0])
+@pytest.mark.parametrize("seed", range(4))
+def test_from_nothing_it_finds_the_optimum_to_round_off(seed: int, curvature: float) -> None:
+    program = separable(seed, 6, 80, curvature)
+    found, _ = from_nothing(program, 1e-10, 60)
+    assert found.residual <= 1e-10
+    assert abs(found.gap) <= 1e-10 * max(1.0, abs(found.value))
+    other = solve_finite(program, sr.load_registry().build("solver", "clarabel"))
+    assert other.status == "optimal"
+    assert found.value == pytest.approx(other.value, rel=1e-7, abs=1e-7)
+
+
+def test_every_separable_program_of_the_contract_is_answered_and_no_other() -> None:
+    left = []
+    for instances in (linear_instances, badly_scaled_instances, regularised_instances, infeasible_instances):
+        for one in instances():
+            if not_separable(one.program):
+                left.append(one.name)
+                continue
+            solution = solve_finite(one.program, DualNewton())
+            assert solution.status == ("optimal" if one.feasible else "infeasible"), (one.name, solution.message)
+    assert left == ["bounded sums"]
+    curved = [one.program for one in coupled_instances() if one.program.P is not None]
+    assert len(curved) == 6
+    assert all(not_separable(program) for program in curved)
+
+
+def test_what_it_is_not_for_is_given_up_in_words() -> None:
+    coupled = next(one.program for one in coupled_instances() if one.program.P is not None)
+    solution = solve_finite(coupled, DualNewton())
+    assert solution.status == "failed"
+    assert any("couples variables" in said for said in solution.attempts)
+
+
+def test_a_program_that_no_answer_meets_is_not_claimed_to_be_solved() -> None:
+    program = separable(0, 6, 80, 0.0)
+    apart = replace(program, b=program.b + 1e3)
+    found, _ = from_nothing(apart, 1e-10, 60)
+    assert found.residual > 1e-3
+    assert solve_finite(apart, DualNewton()).status == "infeasible"
+
+
+def test_whose_answer_it_is_stands_in_the_solution() -> None:
+    program = separable(1, 6, 80, 1.0)
+    free = replace(program, h=program.h + 1e3, A=program.A[:0], b=program.b[:0])
+    assert solve_finite(free, Untouched()).by == "closed_form"
+    first = solve_finite(program, DualNewton())
+    assert first.by == "solver"
+    assert solve_finite(replace(program, h=program.h + 1e-4), Untouched(), guess=first).by == "dual_newton"
+    assert solve_finite(replace(program, lower=program.upper + 1.0), Untouched()).by == "closed_form"
+    coupled = next(one.program for one in coupled_instances() if one.program.P is not None)
+    assert solve_finite(coupled, DualNewton()).by == "nobody"
+
+
+@pytest.mark.parametrize("name", ["dual_newton", "piqp"])
+def test_a_run_tells_who_solved_how_many_relaxed_programs(name: str, tmp_path, capsys) -> None:
+    outcome = sr.run(DEMO, {"solver.name": name}, tmp_path / name, figures=False)
+    counts = json.loads((tmp_path / name / "result.json").read_text())["counts"]
+    assert outcome.status == "certified"
+    assert sum(counts["solved_by"].values()) == counts["relaxed_programs"]
+    assert name in counts["solved_by"]
+    assert counts["solved_by"]["dual_newton"] > 0
+    assert (counts["solved_by"].get("piqp") == 0) == (name == "piqp")
+
+
+def test_the_searching_method_counts_every_relaxed_program_too() -> None:
+    result = sr.run(
+        ROOT / "configs/experiment1_reduced.yaml",
+        {"maximiser.budget": 30, "method.sc1": {"name": "iterations", "count": 2}, "observers": []},
+        figures=False,
+    ).result
+    assert sum(result.solved_by.values()) == result.counts["relaxed_programs"] > 0
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        ({"dictionaries.control": {"name": "haar", "pieces": 16}}, "sums of entries"),
+        ({"regulariser": {"name": "smoothness"}}, "couples entries"),
+        ({"policy": {"name": "affine"}}, "HiGHS"),
+    ],
+)
+def test_where_programs_are_not_separable_the_first_second_says_so(overrides, words: str, tmp_path) -> None:
+    with pytest.raises(sr.InputError, match=words) as refusal:
+        sr.run(DEMO, {"solver.name": "dual_newton", **overrides}, tmp_path / "run", figures=False)
+    assert "solver.name: expected another solver, such as piqp" in str(refusal.value)
+    assert not (tmp_path / "run").exists()
