@@ -43,7 +43,7 @@ def with_causal(result: ControlResult, tools: Tools) -> ControlResult:
     except KeyboardInterrupt as error:
         tools.deadline.interrupt(error)
         return result
-    if derived is None:
+    if derived is None or not stated.rows:  # without rows it is 0, which is no news
         return nothing
     if none:
         said = WORDS.format(len(stated.signals)) if result.status == "infeasible" else ""
