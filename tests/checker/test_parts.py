@@ -6,6 +6,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from sparserob_core.checker.arithmetic.series import Series
 from sparserob_core.checker.arithmetic.subdivision import fill
 from sparserob_core.checker.claims.duality import Duality
 from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.reach import disturbance_support
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import Flow, stacked
 from sparserob_core.checker.reach.tube import Tube
@@ -256,6 +258,28 @@ def test_tubes_are_above_the_worst_case_and_not_far_above(nu, spread, degree, ne
                 assert (truth <= value + poly.error + 1e-13).all()
                 assert poly.error - poly.kinks <= near
                 assert (value - poly.error - poly.kinks <= truth + 1e-13).all()
+
+
+@pytest.mark.parametrize("name", ["box", "polytope", "zonotope"])
+def test_sums_over_equal_pieces_are_those_piece_by_piece_and_no_further_off(name):
+    rng, bound, control = np.random.default_rng(2), SETS[name], uniform(41, 2.0)
+    start, z = np.array([-1.0, 0.5]), rng.normal(size=(3, 2))
+    with ctx.workprec(96):
+        tubes = [
+            tube_of(plant(0, 0.0), control, control, bound, 0, rng.uniform(-1, 1, size=41), start)[0] for _ in range(2)
+        ]
+        for piece in (0, 7, 8, 40):
+            a, b = tubes[0].scene.grid[piece], tubes[0].scene.grid[piece + 1]
+            for begin, end in ((a, b), (a + 0.25 * (b - a), b), (b, b)):
+                ticks = tubes[0].scene.ticks(begin, end)
+                with patch.object(disturbance_support, "FEWEST_SUMMED", 1):
+                    sums = tubes[0].sigmas[0]._of_equal_pieces(known(bound), begin, ticks, z)
+                    assert sums is not None
+                    moved, error, kinks = sums
+                plain, off, _ = tubes[1].sigmas[0].bounds(begin, ticks, z, False)
+                assert (np.abs(moved - plain).sum(axis=(1, 2)) <= error + off).all()
+                assert (error <= 1.01 * off + 1e-14).all()
+                assert (kinks <= error).all()
 
 
 def test_the_remainder_is_needed_and_enough_on_a_wide_box():

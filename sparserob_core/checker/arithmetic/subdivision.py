@@ -28,21 +28,28 @@ def fill(lower: Array, upper: Array, low: Array, high: Array) -> None:
     if (lower < low).any() or (upper > high).any() or (lower > upper).any():
         raise Broken("a cell lies outside what is to be covered")
     thick = high > low
-    if lower.shape[0] > MOST_CELLS:
+    if lower.shape[0] > MOST_CELLS and thick.sum() > 1:
         raise Unchecked(f"{lower.shape[0]} cells are too many to be told apart one by one")
     if not thick.any():
         if lower.shape[0] != 1:
             raise Broken(f"{lower.shape[0]} cells stand for a single point, expected one")
         return
     a, b = lower[:, thick], upper[:, thick]
-    for i in range(a.shape[0]):
-        if ((a[i] < b[i + 1 :]) & (a[i + 1 :] < b[i])).all(axis=1).any():
-            raise Broken("two cells overlap")
+    if _overlap(a, b):
+        raise Broken("two cells overlap")
     missing = _volume(low[thick], high[thick]) - sum((_volume(x, y) for x, y in zip(a, b, strict=True)), Fraction(0))
     if missing != 0:
         raise Broken(
             f"the cells leave a share of {float(missing / _volume(low[thick], high[thick])):.3g} of the index set out"
         )
+
+
+def _overlap(a: Array, b: Array) -> bool:
+    """Whether two of the cells ``[a_i, b_i]`` share more than a face."""
+    if a.shape[1] == 1:  # in order, only neighbours can; of two that begin at once, the shorter is first
+        order = np.lexsort((b[:, 0], a[:, 0]))
+        return bool((b[order[:-1], 0] > a[order[1:], 0]).any())
+    return any(bool(((a[i] < b[i + 1 :]) & (a[i + 1 :] < b[i])).all(axis=1).any()) for i in range(a.shape[0]))
 
 
 def _volume(low: Array, high: Array) -> Fraction:

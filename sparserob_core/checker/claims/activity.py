@@ -32,8 +32,7 @@ Rows = list[tuple[float, Row]]
 
 def acted(case: Case) -> float:
     """The share of time, weighted over the channels, that the certificate's control acts."""
-    values = np.asarray(case.control.values, dtype=float)
-    acts = np.abs(case.theta @ values) > ROUNDED * (np.abs(case.theta) @ np.abs(values))
+    acts = np.abs(case.control.control(case.theta)) > ROUNDED * case.control.summands(case.theta)
     for block in case.price.blocks:  # channels that make one vector act together
         acts[block] = acts[block].any(axis=0)
     counts = _counts(case)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
@@ -92,8 +93,7 @@ class Case:
         not checked."""
         if self.problem.disturbance is None:
             return None
-        values = self.disturbance.values
-        jumps = np.flatnonzero((np.diff(values, axis=1) != 0).any(axis=0)) + 1
+        jumps = np.flatnonzero(self.disturbance.changes) + 1
         if self.problem.disturbance_class != "piecewise_constant":
             raise Unchecked(
                 "the checker knows piecewise constant disturbances, not those of the class"
@@ -141,12 +141,13 @@ class Case:
         """A control ``(m, 1)`` on every piece of its dictionary, from coefficients ``(m, N)``."""
         from flint import arb
 
-        values = self.control.values
-        if np.array_equal(values, np.eye(values.shape[0])):
-            return [stacked([[arb(float(v))] for v in column]) for column in coefficients.T]
-        theta = stacked([[arb(float(v)) for v in row] for row in coefficients])
-        table = (theta * stacked([[arb(float(v)) for v in row] for row in values])).transpose().tolist()
-        return [stacked([[x] for x in row]) for row in table]
+        columns, none = self.control.sparse.tocsc(), arb(0)
+        found = []
+        for start, stop in pairwise(columns.indptr.tolist()):
+            terms = list(zip(columns.indices[start:stop].tolist(), columns.data[start:stop].tolist(), strict=True))
+            rows = [sum((arb(float(row[i])) * arb(v) for i, v in terms), none) for row in coefficients]
+            found.append(stacked([[x] for x in rows]))
+        return found
 
     @cached_property
     def scene(self) -> Scene:

@@ -21,7 +21,8 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-MOST_CELLS = 40_000  # cells of time examined per constraint
+MOST_CELLS = 40_000  # cells of time examined per constraint, or `TIMES` those that it begins with
+TIMES = 4
 MOST_BOXES = 8_000  # boxes of parameters and cells of directions
 BLAME = 0.2  # share of the error from which the box of parameters is to blame for it
 
@@ -57,6 +58,7 @@ def prove(
     `Unchecked` where neither could be shown."""
     stack = list(reversed(work))
     found, cells, items = _Found(), 0, 0
+    most = max(MOST_CELLS, TIMES * sum(len(todo) for _, _, todo in work))
     while stack:
         box, sides, todo = stack.pop()
         if not parameters.meets(box):
@@ -65,7 +67,7 @@ def prove(
         left = _Left(np.zeros(len(box[0])))
         while todo:
             cells += len(todo)
-            if cells > MOST_CELLS or items > MOST_BOXES:
+            if cells > most or items > MOST_BOXES:
                 raise Unchecked(
                     f"neither shown nor refuted: after {cells} cells a violation of more than {TOLERANCE:.0e} of its"
                     " unit is not excluded"

@@ -164,7 +164,7 @@ def _counted(case: Case) -> str:
     _agrees("cost", number(case.certificate, "cost"), arb(acted * total), SMALL_COST * total)
     derived = case.price.of(case.pieces)
     _agrees("J", number(case.certificate, "J"), derived, SMALL_COST * case.price.largest)
-    if case.letters is not None and not np.isin(case.theta @ case.control.values, case.letters).all():
+    if case.letters is not None and not np.isin(case.control.control(case.theta), case.letters).all():
         raise Broken(f"the control takes other values than {list(case.letters)}")
     return f"it acts for {acted * total:.9g} of {total:.9g}, J = {float(derived.mid()):.12g}"
 

@@ -28,7 +28,7 @@ from sparserob_core.control.sets.sets import Box
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
 
     from flint import arb
 
@@ -131,6 +131,7 @@ def _work(case: Case, window: Window, normals: Array, lower: Array, upper: Array
     nu, units = case.problem.system.parameter_count, case.units(window)
     basis, gains, flat = _facets(window, units)
     cuts = sorted({*case.grid, *window.cuts(case.control.breakpoints.tolist())})
+    grid, every = np.array(case.grid), np.array(cuts)
     curved = None if flat is not None else Curved(window.seen, normals, units.sums)
     keys = [(tuple(a[1:].tolist()), tuple(b[1:].tolist())) for a, b in zip(lower, upper, strict=True)]
     order = sorted(range(len(keys)), key=lambda i: (keys[i], lower[i, 0]))
@@ -139,7 +140,7 @@ def _work(case: Case, window: Window, normals: Array, lower: Array, upper: Array
         case.clock.check()
         sides = Sides.cell(curved, np.array(a[nu:]), np.array(b[nu:])) if curved is not None else flat
         assert sides is not None
-        intervals = [part for i in members for part in cut(case, cuts, float(lower[i, 0]), float(upper[i, 0]))]
+        intervals = [part for i in members for part in cut(grid, every, float(lower[i, 0]), float(upper[i, 0]))]
         work.append(((a[:nu], b[:nu]), sides, intervals))
     return normals if curved is not None else basis, gains, work
 
@@ -157,10 +158,9 @@ def _facets(window: Window, units: RowUnits) -> tuple[Array, Array, Sides | None
     return basis[:, : window.states], basis[:, window.states :], Sides(rows)
 
 
-def cut(case: Case, cuts: Sequence[float], start: float, stop: float) -> list[Interval]:
-    """The parts between the ``cuts``, each with the piece of the grid that it lies in."""
-    grid, every = np.array(case.grid), np.array(cuts)
-    inside = every[(every > start) & (every < stop)].tolist()
+def cut(grid: Array, cuts: Array, start: float, stop: float) -> list[Interval]:
+    """The parts between the increasing ``cuts``, each with the piece of the ``grid`` that it lies in."""
+    inside = cuts[np.searchsorted(cuts, start, side="right") : np.searchsorted(cuts, stop)].tolist()
     parts = list(pairwise([start, *inside, stop]))
     pieces = np.searchsorted(grid, [a for a, _ in parts], side="right") - 1
     return [(int(k), a, b) for k, (a, b) in zip(np.clip(pieces, 0, grid.size - 2), parts, strict=True)]

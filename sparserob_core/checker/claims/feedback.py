@@ -123,9 +123,8 @@ class FeedbackClaims:
         lower, upper = numbers(entry.get("lower"), "lower"), numbers(entry.get("upper"), "upper")
         covered(case, window, lower, upper)
         sides = _Sides(self.loop, flat, case.units(window).rows)
-        todo = [
-            part for a, b in zip(lower, upper, strict=True) for part in cut(case, case.grid, float(a[0]), float(b[0]))
-        ]
+        grid = np.array(case.grid)
+        todo = [part for a, b in zip(lower, upper, strict=True) for part in cut(grid, grid, float(a[0]), float(b[0]))]
         count, most = 0, -np.inf
         while todo:
             case.clock.check()

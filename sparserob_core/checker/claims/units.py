@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from flint import arb, arb_mat
 
 MOST_TIMES = 64  # at which a window is looked at
+MOST_HELD = 16_000_000  # numbers that tell what inputs do on every piece, at once
 MOST_AXES = 4  # of the parameters, at whose ends a window is looked at
 
 
@@ -94,10 +95,15 @@ class RowUnits:
     def _measured(self, parameter: tuple[float, ...]) -> tuple[Array, Array]:
         """How far the normal of every facet, and every state, reach at one parameter ``(k + d,)``, and the largest sums
         of absolute numbers from which these are computed; by one walk back through the pieces from every time that is
-        looked at, all of them together."""
+        looked at, as many of them together as fit."""
         if parameter not in self._known:
             with np.errstate(over="ignore", invalid="ignore"):
-                found = self._walked(parameter)
+                nodes, places = self._nodes()
+                each = len(nodes) * (len(known(self.shape).facets or []) + self.problem.system.states)
+                each *= self.problem.system.controls + 1 + self.problem.system.disturbances
+                parts = np.array_split(places, min(places.size, -(-places.size * each // MOST_HELD)))
+                every = [self._walked(parameter, nodes[: part[-1] + 1], part) for part in parts]
+                found = np.max([one for one, _ in every], axis=0), np.max([sums for _, sums in every], axis=0)
             if not all(np.isfinite(numbers).all() for numbers in found):
                 raise Unchecked("the response grows beyond what numbers can hold")
             self._known[parameter] = found
@@ -107,13 +113,15 @@ class RowUnits:
     def _known(self) -> dict[tuple[float, ...], tuple[Array, Array]]:
         return {}
 
-    def _walked(self, parameter: tuple[float, ...]) -> tuple[Array, Array]:
+    def _walked(
+        self, parameter: tuple[float, ...], nodes: list[float], places: npt.NDArray[np.intp]
+    ) -> tuple[Array, Array]:
         system, bound = self.problem.system, self.problem.disturbance
         d, m, columns = system.states, system.controls, system.controls + (system.c is not None)
         normals, gains = np.split(
             np.array([c for c, _ in known(self.shape).facets or []]).reshape(-1, self.shape.dimension), [d], 1
         )
-        (nodes, places), step = self._nodes(), _Steps(self.problem, parameter, columns, self.scene.tick)
+        step = _Steps(self.problem, parameter, columns, self.scene.tick)
         v = np.tile(np.vstack([normals, np.eye(d)]), (len(places), 1, 1))
         count = len(nodes) - 1
         driven = np.zeros((count, *v.shape[:2], columns))

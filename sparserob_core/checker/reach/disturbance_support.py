@@ -23,6 +23,8 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
+TABLES_KEPT = 8  # parts of pieces whose integrals are remembered
+FEWEST_SUMMED = 256  # pieces from which sums over them are remembered
 SAME = 1e-14  # of the horizon: durations closer than this are treated as one ball that holds them all
 
 
@@ -84,6 +86,36 @@ class Table:
 
 @final
 @dataclass(frozen=True, eq=False)
+class Sums:
+    """Sums over the last pieces of the disturbance, ``(count, k, ...)``: coefficients of a bound, its errors, and what
+    of them is due to switching. Of every piece: the ``point (count, k, mw)`` of the set, and by how much the integral
+    since its beginning may be off, ``off`` of that shape."""
+
+    moved: Array
+    error: Array
+    kinks: Array
+    point: Array
+    off: Array
+
+    def joined(self, more: Sums) -> Sums:
+        """With what more pieces add, one by one."""
+        return Sums(
+            *(np.concatenate([old, old[-1:] + np.cumsum(new, axis=0)]) for old, new in self._pairs(more)[:3]),
+            *(np.concatenate(pair) for pair in self._pairs(more)[3:]),
+        )
+
+    def _pairs(self, more: Sums) -> list[tuple[Array, Array]]:
+        names = ("moved", "error", "kinks", "point", "off")
+        return [(getattr(self, name), getattr(more, name)) for name in names]
+
+    @staticmethod
+    def none(shape: tuple[int, ...], k: int, mw: int) -> Sums:
+        """Before the first piece: 0."""
+        return Sums(np.zeros((1, k, *shape)), *np.zeros((2, 1, k)), *np.zeros((2, 1, k, mw)))
+
+
+@final
+@dataclass(frozen=True, eq=False)
 class Operator:
     """Products with power series of ball matrices, as one matrix ``(outputs, M n)`` of floats with an error each."""
 
@@ -131,15 +163,21 @@ class DisturbanceSupports:
     _rows: tuple[list[int], list[Series]] | None = None
     _floats: dict[int, Enclosed] = field(default_factory=dict)
     _latest: tuple[tuple[float, int], Array, Array] | None = None
+    _sums: dict[tuple[int, int, bytes], Sums] = field(default_factory=dict)
 
     def bounds(self, start: float, ticks: int, z: Array, sharp: bool) -> tuple[Array, Array, Array]:
         """For every direction ``z_i'basis``, ``z (k, b)``: coefficients ``(k, J + 1, M)`` of a bound of the
         disturbance's support from ``start`` on for that many ticks, its error ``(k,)``, and how much of that, or of the
         coefficients, is due to switching. ``sharp``: less of it where the set is round, which takes longer."""
         assert self.scene.disturbance is not None
+        shape = known(self.scene.disturbance)
+        if self.before is None and (not sharp or shape.round is None):
+            found = self._of_equal_pieces(shape, start, ticks, z)
+            if found is not None:
+                return found
         if self._latest is None or self._latest[0] != (start, ticks):
             self._latest = ((start, ticks), *self.every(start, ticks))
-        return self._bounded(known(self.scene.disturbance), *self._latest[1:], z, sharp)
+        return self._bounded(shape, *self._latest[1:], z, sharp)
 
     def begun(self, start: float, ticks: int, z: Array, sharp: bool) -> tuple[Array, Array, Array]:
         """`bounds` of what the worst initial state adds to that of the centre: the support function of the set of
@@ -218,14 +256,9 @@ class DisturbanceSupports:
     def _bounded(self, shape: Shape, every: Array, errors: Array, z: Array, sharp: bool) -> tuple[Array, Array, Array]:
         """Bounds of the sum of a set's support functions at weights ``(pieces, J + 1, M, mw, b)`` that are off by at
         most ``errors``, for combinations ``z (k, b)`` of them: as in `bounds`."""
-        mid = np.einsum("ljkwb,ib->iljkw", every, z)
-        rad = np.einsum("ljkwb,ib->iljkw", errors + rounding(z.shape[1]) * np.abs(every), np.abs(z)) * OUTWARD
-        k, pieces, mw = mid.shape[0], mid.shape[1], mid.shape[-1]
-        value, spread = _ranges(mid, rad)
-        w, excess = shape.bound(value.reshape(-1, mw), spread.reshape(-1, mw))
-        w, kinks = w.reshape(k, pieces, mw), excess.reshape(k, pieces) * OUTWARD
-        lost = rad.sum(axis=(2, 3)) + rounding(pieces * mw) * np.abs(mid).sum(axis=(2, 3))
-        error = np.einsum("ilw,ilw->il", np.abs(w), lost) * OUTWARD + kinks
+        pieces = every.shape[0]
+        mid, w, lost, error, kinks = _linear(shape, every, errors, z, pieces)
+        k, mw = mid.shape[0], mid.shape[-1]
         if not sharp or shape.round is None:
             moved = np.einsum("ilw,iljkw->ijk", w, mid)
             return moved, error.sum(axis=1) * OUTWARD, kinks.sum(axis=1) * OUTWARD
@@ -249,7 +282,7 @@ class DisturbanceSupports:
         jumps = self._jumps[: np.searchsorted(self._jumps, start, side="right")]
         lags = np.rint((node - jumps) / self.scene.tick).astype(int).tolist()
         offset = round((start - node) / self.scene.tick)
-        table = self._tables.setdefault((offset, ticks), Table())
+        table = self._table(offset, ticks)
         # short ones first: each row starts from the one before
         missing = [lag for lag in dict.fromkeys(reversed(lags)) if lag not in table.places]
         if missing:
@@ -259,6 +292,73 @@ class DisturbanceSupports:
         rad[:-1] += rad[1:] + rounding(1) * (np.abs(mid[:-1]) + np.abs(mid[1:]))
         mid[:-1] -= mid[1:]
         return mid, rad
+
+    def _table(self, offset: int, ticks: int) -> Table:
+        if (offset, ticks) not in self._tables:
+            if len(self._tables) >= TABLES_KEPT:
+                self._tables.popitem()  # the latest: the first is that of whole pieces
+            self._tables[offset, ticks] = Table()
+        return self._tables[offset, ticks]
+
+    def _of_equal_pieces(self, shape: Shape, start: float, ticks: int, z: Array) -> tuple[Array, Array, Array] | None:
+        """`bounds` where what a piece adds depends on its age alone, since they are equally long: a sum over the ages,
+        which is remembered; ``None`` where they are not, or are few."""
+        grid, count = self.scene.grid, int(np.searchsorted(self._jumps, start, side="right"))
+        if count < FEWEST_SUMMED or self.scene.switches:
+            return None
+        # no piece begins at the end, which is looked at from the beginning of the last one
+        node = float(self._jumps[-1]) if start == grid[-1] else grid[bisect_right(grid, start) - 1]
+        ages = self._ages[:count]
+        # an age may be off by a tick, and its offset by half of one: two are allowed for (`_factors`)
+        if not np.abs((node - self._jumps[count - 1 :: -1]) / self.scene.tick - ages).max() <= 1.0:
+            return None
+        offset = round((start - node) / self.scene.tick)
+        key = (offset, ticks, z.tobytes())
+        sums = self._sums.get(key)
+        if sums is None or len(sums.error) <= count:
+            if sums is None and len(self._sums) >= TABLES_KEPT:
+                self._sums.popitem()
+            sums = self._sums[key] = self._by_age(shape, sums, count, offset, ticks, z)
+        outward = 1.0 + rounding(count)  # sums of so many numbers that are not negative
+        ends = (sums.off[count] * np.abs(sums.point[count])).sum(axis=1)
+        return sums.moved[count], (sums.error[count] + ends) * outward, sums.kinks[count] * outward
+
+    def _by_age(self, shape: Shape, sums: Sums | None, count: int, offset: int, ticks: int, z: Array) -> Sums:
+        """The sums over at least ``count`` pieces, in the order of their ages.
+
+        With a point ``w_i`` of the set for every piece, and the integrals ``I_i`` since it began, the bound is the sum
+        of ``w_i (I_i - I_{i-1})``, which is that of ``I_i (w_i - w_{i+1})``: what an integral is off by counts only
+        where the point changes, and at the oldest piece.
+        """
+        done = 0 if sums is None else len(sums.error) - 1
+        until = min(self._ages.size, max(count, 2 * done))
+        ages, table = self._ages[max(done - 1, 0) : until].tolist(), self._table(offset, ticks)
+        missing = [age for age in ages if age not in table.places]
+        if missing:
+            table.add(missing, *self._integrals(missing, offset, ticks))
+        places = [table.places[age] for age in ages]
+        every, errors = table.mid[places], table.rad[places]
+        first, change, rad = int(done > 0), every.copy(), errors.copy()
+        change[1:] -= every[:-1]
+        rad[1:] += errors[:-1] + rounding(1) * np.abs(change[1:])
+        change, rad = change[first:], rad[first:]
+        mid, w, _, _, kinks = _linear(shape, change, rad, z, self._ages.size)
+        size, terms = np.abs(z), rounding(self._ages.size * mid.shape[-1])
+        rounded = np.einsum("ljkwb,ib->liw", np.abs(change), size) * (rounding(1) + rounding(z.shape[1]))
+        rounded += terms * np.swapaxes(np.abs(mid).sum(axis=(2, 3)), 0, 1)
+        point, off = np.swapaxes(w, 0, 1), np.einsum("ljkwb,ib->liw", errors[first:], size) * OUTWARD
+        if sums is None:
+            sums = Sums.none(mid.shape[2:4], len(z), mid.shape[-1])
+        turned = np.concatenate([sums.off[-1:], off[:-1]]) * np.abs(
+            np.concatenate([sums.point[-1:], point[:-1]]) - point
+        )
+        lost = (np.abs(point) * rounded + turned).sum(axis=2) * OUTWARD + kinks.T
+        return sums.joined(Sums(np.einsum("ilw,iljkw->lijk", w, mid), lost, kinks.T, point, off))
+
+    @cached_property
+    def _ages(self) -> Array:
+        """How long before the latest jump every piece began, in ticks, first the latest."""
+        return np.asarray(np.rint((self._jumps[-1] - self._jumps[::-1]) / self.scene.tick).astype(int))
 
     @cached_property
     def _jumps(self) -> Array:
@@ -345,6 +445,23 @@ class DisturbanceSupports:
         size, d = self.flow.rows.parts[0].nrows(), self.basis.shape[1]
         columns = [[arb(float(c[i])) if i < d else arb(0) for c in self.basis] for i in range(size)]
         return Series.constant(self.flow.monomials, stacked(columns))
+
+
+def _linear(
+    shape: Shape, every: Array, errors: Array, z: Array, count: int
+) -> tuple[Array, Array, Array, Array, Array]:
+    """The weights ``(k, pieces, J + 1, M, mw)`` for combinations ``z (k, b)``, the points ``(k, pieces, mw)`` of the
+    set that are best at them or nearly, what is lost of the weights, ``(k, pieces, mw)``, where up to ``count``
+    pieces are added up, and by how much the points' products may be too small, ``(k, pieces)``; with what of that is
+    due to switching."""
+    mid = np.einsum("ljkwb,ib->iljkw", every, z)
+    rad = np.einsum("ljkwb,ib->iljkw", errors + rounding(z.shape[1]) * np.abs(every), np.abs(z)) * OUTWARD
+    k, pieces, mw = mid.shape[0], mid.shape[1], mid.shape[-1]
+    value, spread = _ranges(mid, rad)
+    w, excess = shape.bound(value.reshape(-1, mw), spread.reshape(-1, mw))
+    w, kinks = w.reshape(k, pieces, mw), excess.reshape(k, pieces) * OUTWARD
+    lost = rad.sum(axis=(2, 3)) + rounding(count * mw) * np.abs(mid).sum(axis=(2, 3))
+    return mid, w, lost, np.einsum("ilw,ilw->il", np.abs(w), lost) * OUTWARD + kinks, kinks
 
 
 def _ranges(mid: Array, rad: Array) -> tuple[Array, Array]:

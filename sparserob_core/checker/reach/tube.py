@@ -5,7 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from fractions import Fraction
 from functools import cached_property
+from itertools import pairwise
 from typing import TYPE_CHECKING, final
 
 import numpy as np
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 
 STEPS = 16  # of the horizon, after which the norms of the transition's coefficients are looked at anew
 STATES_KEPT = 20_000  # enclosures of the state, per box of parameters
+MANY = 1000  # pieces of the grid, from which none has a ball of a duration that also holds others: balls add up
 
 
 @final
@@ -48,9 +51,9 @@ class Tube:
     flows: Sequence[Flow]
     scene: Scene
     basis: Array
-    _lengths: dict[int, arb] = field(default_factory=dict)
-    _transitions: dict[tuple[int, int], tuple[Series, Series]] = field(default_factory=dict)
-    _growths: dict[tuple[int, int], tuple[arb_mat, arb_mat]] = field(default_factory=dict)
+    _lengths: dict[int | Fraction, arb] = field(default_factory=dict)
+    _transitions: dict[tuple[int, int | Fraction], tuple[Series, Series]] = field(default_factory=dict)
+    _growths: dict[tuple[int, int | Fraction], tuple[arb_mat, arb_mat]] = field(default_factory=dict)
     _inside: dict[tuple[int, int], Series] = field(default_factory=dict)
     _states: dict[tuple[int, float, int], Enclosed] = field(default_factory=dict)
 
@@ -123,33 +126,32 @@ class Tube:
     def _up(self, balls: arb_mat) -> arb_mat:
         return stacked([[upper(x)] for x in balls.entries()])
 
-    def _span(self, start: float, stop: float) -> int:
-        """The key of a duration; equal keys share one ball."""
+    @cached_property
+    def _spans(self) -> list[int | Fraction]:
+        """Of every piece of the grid the key of its duration; equal keys share one ball. Every duration is known before
+        one is used, since balls grow."""
         from flint import arb
 
-        length = arb(stop) - arb(start)
-        key = round((stop - start) / self.scene.tick)
-        self._lengths[key] = self._lengths[key].union(length) if key in self._lengths else length
-        return key
-
-    def _prepare(self) -> None:
-        """Every duration of the grid must be known before one is used, since balls may still grow."""
-        for start, stop in zip(self.scene.grid[:-1], self.scene.grid[1:], strict=True):
-            self._span(start, stop)
-
-    def __post_init__(self) -> None:
-        self._prepare()
+        found = list[int | Fraction]()
+        for start, stop in pairwise(self.scene.grid):
+            length = arb(stop) - arb(start)
+            key: int | Fraction = round((stop - start) / self.scene.tick)
+            if len(self.scene.grid) > MANY:
+                key = Fraction(stop) - Fraction(start)
+            self._lengths[key] = self._lengths[key].union(length) if key in self._lengths else length
+            found.append(key)
+        return found
 
     def _transition(self, piece: int) -> tuple[Series, Series]:
         """What a whole piece of the grid makes of a state and of an input."""
-        span, leg = self._span(self.scene.grid[piece], self.scene.grid[piece + 1]), self.scene.leg(piece)
+        span, leg = self._spans[piece], self.scene.leg(piece)
         if (leg, span) not in self._transitions:
             flow = self.flows[leg]
             self._transitions[leg, span] = flow.states.held(flow.inputs, self._lengths[span])
         return self._transitions[leg, span]
 
     def _growth(self, piece: int) -> tuple[arb_mat, arb_mat]:
-        span, leg = self._span(self.scene.grid[piece], self.scene.grid[piece + 1]), self.scene.leg(piece)
+        span, leg = self._spans[piece], self.scene.leg(piece)
         if (leg, span) not in self._growths:
             rest = self.remainders[leg]
             self._growths[leg, span] = held(rest.growth, rest.control, self._lengths[span])
