@@ -23,6 +23,7 @@ from sparserob_core.errors import PluginError
 from sparserob_core.sip.finite import (
     CLOSED_FORM,
     DUAL_NEWTON,
+    HIGHS,
     NOBODY,
     SOLVER,
     Blocks,
@@ -37,6 +38,7 @@ from sparserob_core.sip.inner.duality import farkas_margin, measure, minimisers,
 from sparserob_core.sip.inner.more_digits import refined
 from sparserob_core.sip.inner.norms import around, bent, near, of_the_rest, towards
 from sparserob_core.sip.inner.standard_form import Form, Recovered, standard_form
+from sparserob_core.sip.inner.vertex import many, sifted
 from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
 
 # The accuracy that a solver is asked for, in multiples of the tolerance, in each form, until it is believed.
@@ -296,7 +298,8 @@ def cost_scale(program: FiniteProgram, value: float) -> float:
 
 
 def _cheap(case: _Case, guess: FiniteSolution | None) -> Iterator[FiniteSolution]:
-    """What needs no solver: the optimum without rows, and Newton's method from a guess."""
+    """What needs no solver: the optimum without rows, the simplex method where few of many entries matter to it, and
+    Newton's method from a guess."""
     program = case.program
     curvature = diagonal(program.P, program.n) if program.S is None and program.blocks is None else None
     if curvature is not None:
@@ -304,6 +307,11 @@ def _cheap(case: _Case, guess: FiniteSolution | None) -> Iterator[FiniteSolution
         if np.isfinite(x).all() and program.residual(x) <= case.tolerance:
             free = measure(program, x, np.zeros(program.h.size), np.zeros(program.b.size), message="no row is active")
             yield replace(free, by=CLOSED_FORM)
+    if many(program):
+        corner = sifted(program, *((None, None) if guess is None else (guess.y, guess.mu)))
+        if corner.status == "optimal":
+            found = measure(program, corner.x, corner.y, corner.mu, message="simplex method")
+            yield replace(found, by=HIGHS)
     if guess is not None:
         found = polish(program, guess.x, guess.y, guess.mu)
         if found is not None:

@@ -6,7 +6,7 @@ vertex (Dantzig 1951). Nothing here is believed: whoever uses it checks decision
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -15,6 +15,9 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram
 
 ACCURACY = 1e-10  # the finest that the simplex method offers
+MANY = 5000  # entries of a separable program from which most are left out of the simplex method
+NEAREST = 1000  # of them, those that it begins with; or a share of them
+SHARE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,11 +32,78 @@ class Corner:
     z: Array | None = None
 
 
-def vertex(program: FiniteProgram) -> Array | None:
-    """An optimal vertex ``(n,)`` of a program without a quadratic cost; ``None`` where none is found."""
-    curved = program.P is not None or program.blocks is not None
-    corner = None if curved else simplex(program)
-    return corner.x if corner is not None and corner.status == "optimal" else None
+def vertex(program: FiniteProgram, y: Array | None = None, mu: Array | None = None) -> Array | None:
+    """An optimal vertex ``(n,)`` of a program without a quadratic cost; ``None`` where none is found. Multipliers
+    ``y (r,)``, ``mu (e,)`` that are nearly optimal spare most of the work."""
+    if program.P is not None or program.blocks is not None:
+        return None
+    corner = sifted(program, y, mu) if many(program) else simplex(program)
+    return corner.x if corner.status == "optimal" else None
+
+
+def many(program: FiniteProgram) -> bool:
+    """Whether a linear program is one for `sifted`: separable, with far more entries than rows."""
+    return bool(
+        program.n >= MANY
+        and program.h.size + program.b.size
+        and all(one is None for one in (program.P, program.S, program.blocks))
+    )
+
+
+def sifted(program: FiniteProgram, y: Array | None = None, mu: Array | None = None) -> Corner:
+    """`simplex` on the entries that may be between 0 and their bounds, while the others stay where the multipliers put
+    them; until none of these is in the wrong place (sifting, Bixby, Gregory, Lustig, Marsten and Shanno 1992).
+
+    ``y (r,)``, ``mu (e,)``: multipliers to begin with.
+    """
+    y = np.zeros(program.h.size) if y is None or y.shape != program.h.shape else y
+    mu = np.zeros(program.b.size) if mu is None or mu.shape != program.b.shape else mu
+    near, count = np.zeros(program.n, dtype=bool), max(NEAREST, int(SHARE * program.n))
+    near[:: max(1, program.n // count)] = True  # neighbours are alike: some of everything, then zoom in
+    x, doubt = _placed(program, y, mu)
+    while True:
+        count = min(count, program.n)
+        near[np.argpartition(doubt, count - 1)[:count]] = True
+        near |= doubt < 0.0
+        if near.sum() > program.n // 2:
+            return simplex(program)
+        far = np.where(near, 0.0, x)
+        found = simplex(_on(program, near, far))
+        if found.status != "optimal":  # what is left out may be what is needed
+            count *= 4
+            continue
+        now, doubt = _placed(program, found.y, found.mu)
+        wrong = np.flatnonzero(~near & (now != far))  # the others stay where they are: the next ones fit, as these do
+        if not wrong.size:
+            far[near] = found.x
+            return replace(found, x=far)
+        near[wrong[:: max(1, wrong.size // NEAREST)]] = True
+
+
+def _placed(program: FiniteProgram, y: Array, mu: Array) -> tuple[Array, Array]:
+    """Where multipliers put every entry, ``(n,)``, and how far its slope is from where it moves, ``(n,)``; -1 for one
+    that is put at infinity."""
+    slope = program.q + y @ program.G + mu @ program.A
+    ends = np.where(slope > 0.0, program.lower, program.upper)
+    x = np.clip(np.where(np.abs(slope) <= program.weights, 0.0, ends), program.lower, program.upper)
+    finite = np.isfinite(x)
+    return np.where(finite, x, 0.0), np.where(finite, np.abs(np.abs(slope) - program.weights), -1.0)
+
+
+def _on(program: FiniteProgram, near: np.ndarray, far: Array) -> FiniteProgram:
+    """The program in some of the entries, the others at ``far (n,)``."""
+    return replace(
+        program,
+        q=program.q[near],
+        weights=program.weights[near],
+        lower=program.lower[near],
+        upper=program.upper[near],
+        G=program.G[:, near],
+        h=program.h - program.G @ far,
+        A=program.A[:, near],
+        b=program.b - program.A @ far,
+        P=None,
+    )
 
 
 def simplex(program: FiniteProgram) -> Corner:

@@ -20,7 +20,7 @@ from sparserob_core.options import Options
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Proof
 from sparserob_core.sip.finite import FiniteSolution
-from sparserob_core.sip.inner.vertex import vertex
+from sparserob_core.sip.inner.vertex import MANY, vertex
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.methods.counting import count, met, tidied
 from sparserob_core.sip.methods.ledger import Answer, Found, Ledger, Prover
@@ -184,7 +184,8 @@ class Working:
 
     def plain_bound(self, ledger: Ledger) -> FiniteSolution:
         """The unregularised relaxed program: only its multipliers are wanted, for the lower bound."""
-        plain = ledger.relaxed.solve(self.rows, 0.0, self.margin)
+        guess = self.guess if self.program.n >= MANY else None  # of the multipliers, where the simplex method begins
+        plain = ledger.relaxed.solve(self.rows, 0.0, self.margin, guess)
         if _usable(plain):
             ledger.improve(ledger.relaxed.lower_bound(self.rows, plain))
         return plain
@@ -197,7 +198,7 @@ class Working:
         plain = self.plain_bound(ledger)
         if not ledger.wide(x) or not _usable(plain):
             return False
-        self.epsilon, self.guess = 0.0, None
+        self.epsilon, self.guess = 0.0, plain if self.program.n >= MANY else None
         return True
 
     def exchange(self, answer: Answer, violated: Violated, number: int) -> int:
@@ -323,7 +324,8 @@ def _sparser(
     if answer.epsilon == 0.0 and program.finite.P is None and program.blocks is None:
         rows = working.rows
         norms = np.linalg.norm(rows.G, axis=1)
-        corner = vertex(ledger.relaxed.finite(rows.G, rows.h - working.margin * norms, 0.0))
+        plain = ledger.relaxed.finite(rows.G, rows.h - working.margin * norms, 0.0)
+        corner = vertex(plain, answer.solution.y, answer.solution.mu)
         candidates += [] if corner is None else [met(program, tidied(program, corner))]
     kept, violated, least = (answer, found), list[tuple[Array, np.ndarray, str]](), count(program, x)
     for other in candidates:
