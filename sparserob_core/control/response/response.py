@@ -21,6 +21,8 @@ from sparserob_core.control.problem.system import System
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 
+LONG = 1000  # pieces from which the states are computed in blocks
+TINY = float(np.finfo(float).tiny)
 FEW = 128  # indices for which a table beats the loop over the pieces
 STEPS_KEPT = 16  # sets of parameters whose transitions are remembered
 SAME_DURATION = 1e-15  # of the horizon: durations that differ by less are computed once
@@ -306,6 +308,14 @@ class Propagator:
         """Whether all pieces of the grid are equally long, and of one mode."""
         return bool(self._lengths.size == 1)
 
+    def block(self, steps: Steps) -> int:
+        """How many equal pieces are taken together where the states of many are asked for; 1: none. No more than the
+        system moves little on, so that what a block adds from 0 is not much larger than the states."""
+        if self.grid.pieces < LONG:
+            return 1
+        pace = float(np.linalg.norm(steps.A, axis=(2, 3)).max()) * float(self._lengths[0])
+        return int(max(1.0, min(np.sqrt(self.grid.pieces), 1.0 / max(pace, TINY))))
+
     def flows(self, durations: Array) -> tuple[Array, Array]:
         """``e^{A r}`` and its integral ``(k, d, d)`` for durations ``(k,)``; for a known system."""
         return self._transitions(self.steps(np.zeros((1, 0))).A[0, 0], durations)
@@ -431,11 +441,35 @@ class Response:
 
         if self.uniform:
             path[:, 1:] = drive @ steps.Gamma[:, 0].swapaxes(1, 2)
+            block = self.propagator.block(steps)
+            if block > 1:
+                return self._in_blocks(path, steps, block)
         else:
             for piece, length in enumerate(lengths):
                 path[:, piece + 1] = moved(steps.Gamma[:, length], drive[:, piece])
         for piece, length in enumerate(lengths):
             path[:, piece + 1] += moved(steps.Phi[:, length], path[:, piece])
+        return path
+
+    def _in_blocks(self, path: Array, steps: Steps, block: int) -> Array:
+        """``x_{k+1} = Phi x_k + f_k`` from a ``path (v, L+1, d)`` that holds ``x_0, f_0, f_1, ...``: first from 0 in
+        every block of as many pieces, all blocks at once, then what each block begins with."""
+        count, d = self.grid.pieces // block, path.shape[2]
+        Phi = np.swapaxes(steps.Phi[:, 0], 1, 2)
+        inside = path[:, 1 : count * block + 1].reshape(path.shape[0], count, block, d)
+        powers = np.empty((Phi.shape[0], block, d, d))  # Phi', Phi'^2, ...
+        powers[:, 0] = Phi
+        for place in range(1, block):
+            inside[:, :, place] += inside[:, :, place - 1] @ Phi
+            powers[:, place] = powers[:, place - 1] @ Phi
+        begun = np.empty((path.shape[0], count, 1, d))
+        begun[:, 0, 0] = path[:, 0]
+        for number in range(1, count):
+            begun[:, number] = begun[:, number - 1] @ powers[:, -1] + inside[:, number - 1, -1:]
+        every = np.swapaxes(powers, 1, 2).reshape(Phi.shape[0], d, block * d)  # all powers side by side
+        inside += (begun[:, :, 0] @ every).reshape(inside.shape)
+        for piece in range(count * block, self.grid.pieces):
+            path[:, piece + 1] += (path[:, piece, None] @ Phi)[:, 0]
         return path
 
 

@@ -12,21 +12,21 @@ from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.response import Response, TimeGrid, distinct_times
 from sparserob_core.sip.convex_set import Array
 
+MANY = 10_000  # pieces, from which no times inside are looked at where the system hardly moves on one
 HELD = 2_000_000  # numbers of signals, or of transition matrices, that are held at once
 
 
 def fine_times(response: Response, parameters: ParameterIndex, more: Array) -> Array:
     """The breakpoints, ``more (k,)`` times, and times inside every piece: three of them, or more where the system moves
-    on it; ``(T,)``."""
+    on it, and fewer where there are many pieces; ``(T,)``."""
     grid = response.grid
     points = parameters.lattice()[0]
     rate = max(float(np.linalg.norm(mode.matrices(points)[0], axis=(1, 2)).max()) for mode in response.system.modes)
-    counts = np.clip(np.ceil(rate * grid.lengths / SMOOTH), INSIDE + 1, MOST_INSIDE).astype(int)
-    inside = np.concatenate(
-        [
-            left + (right - left) * np.arange(count) / count
-            for left, right, count in zip(grid.breakpoints[:-1], grid.breakpoints[1:], counts, strict=True)
-        ]
+    fewest = INSIDE + 1 if grid.pieces < MANY else 1
+    counts = np.clip(np.ceil(rate * grid.lengths / SMOOTH), fewest, MOST_INSIDE).astype(int)
+    place = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    inside = np.repeat(grid.breakpoints[:-1], counts) + np.repeat(grid.lengths, counts) * place / np.repeat(
+        counts, counts
     )
     return distinct_times(np.concatenate([inside, more, grid.breakpoints[-1:]]), float(grid.breakpoints[-1]))
 

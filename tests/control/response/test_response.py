@@ -266,3 +266,18 @@ def test_a_known_system_takes_any_number_of_rows_without_parameters_one_after_th
     many = response.states(control, np.zeros((5, 0)), disturbances)
     one = response.states(control, np.zeros((1, 0)), disturbances[:1])
     np.testing.assert_allclose(many, np.repeat(one, 5, axis=0), atol=1e-14)
+
+
+@pytest.mark.parametrize(("states", "pieces", "many"), [(2, 4003, 1), (6, 2500, 1), (3, 1009, 4)])
+def test_states_in_blocks_are_those_of_the_recursion(states: int, pieces: int, many: int) -> None:
+    rng = np.random.default_rng(pieces)
+    system = LinearSystem(rng.normal(size=(states, states)), rng.normal(size=(states, 2)), np.eye(states)[:, :1])
+    breakpoints = np.linspace(0.0, HORIZON, pieces + 1)
+    response = Response(system, merge_grids(breakpoints, breakpoints), rng.normal(size=states))
+    control, disturbance = rng.normal(size=(2, pieces)), rng.normal(size=(many, 1, pieces))
+    none = np.zeros((1, 0))
+    assert response.propagator.block(response.steps(none)) > 1
+    fast = response.states(control, none, disturbance)
+    with patch("sparserob_core.control.response.response.LONG", 10**9):
+        plain = response.states(control, none, disturbance)
+    np.testing.assert_allclose(fast, plain, rtol=0.0, atol=1e-12 * np.abs(plain).max())
