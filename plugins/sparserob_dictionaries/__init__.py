@@ -11,7 +11,8 @@ from pydantic import Field
 
 import sparserob_core as sr
 
-MOST_PIECES = 10_000
+MOST_PIECES = 1_000_000
+MOST_OF_HAAR = 2**17  # pieces, on each of which log2 of them and one functions are not 0
 
 
 @final
@@ -35,8 +36,7 @@ class PiecewiseConstant(sr.DictionaryFactory, sr.Options):
         times = self._times(horizon)
         pieces = times.size - 1
         functions = _functions(self.functions, pieces)
-        owner = np.arange(pieces) * functions // pieces
-        return sr.Dictionary(times, (owner == np.arange(functions)[:, None]).astype(float))
+        return sr.Dictionary.indicators(times, np.arange(pieces) * functions // pieces)
 
     def _times(self, horizon: float) -> sr.Array:
         given = [name for name in ("pieces", "step", "breakpoints") if getattr(self, name) is not None]
@@ -58,21 +58,29 @@ class PiecewiseConstant(sr.DictionaryFactory, sr.Options):
 class Haar(sr.DictionaryFactory, sr.Options):
     """The first Haar functions (Haar 1910) with values in -1, 0, 1: a constant, then ever shorter steps."""
 
-    pieces: int = Field(default=128, ge=1, le=MOST_PIECES)
+    pieces: int = Field(default=128, ge=1, le=MOST_OF_HAAR)
     """Number of equal pieces, a power of two."""
 
-    functions: int | None = Field(default=None, ge=1, le=MOST_PIECES)
+    functions: int | None = Field(default=None, ge=1, le=MOST_OF_HAAR)
     """Number of functions, at most the number of pieces; all unless given."""
 
     def build(self, horizon: float) -> sr.Dictionary:
         """The dictionary on ``[0, horizon]``; raises `InputError` when the options do not fit together."""
+        from scipy.sparse import csr_array
+
         K = _power_of_two(self.pieces)
-        values = np.zeros((_functions(self.functions, K), K))
-        values[0] = 1.0
-        for i in range(1, len(values)):
-            scale = 2 ** (i.bit_length() - 1)
-            half, first = K // scale // 2, (i - scale) * (K // scale)
-            values[i, first : first + half], values[i, first + half : first + 2 * half] = 1.0, -1.0
+        N = _functions(self.functions, K)
+        number = np.arange(K)
+        rows, columns, data = [np.zeros(K, dtype=int)], [number], [np.ones(K)]
+        scale = 1
+        while scale < N:  # functions scale, scale + 1, ... are 1 on half of K / scale pieces, and -1 on the other half
+            length = K // scale
+            rows.append(scale + number // length)
+            columns.append(number)
+            data.append(np.where(number % length < length // 2, 1.0, -1.0))
+            scale *= 2
+        entries = np.concatenate(data), (np.concatenate(rows), np.concatenate(columns))
+        values = csr_array(entries, shape=(max(scale, 1), K))[:N]
         return sr.Dictionary(np.linspace(0.0, horizon, K + 1), values)
 
 

@@ -321,7 +321,7 @@ def dictionary(registry: Registry, choice: object, horizon: float) -> Dictionary
 
 def indicators(on: Dictionary) -> Dictionary:
     """One indicator function on each piece of another dictionary."""
-    return Dictionary(on.breakpoints, np.eye(on.pieces))
+    return Dictionary.indicators(on.breakpoints)
 
 
 def _stated(

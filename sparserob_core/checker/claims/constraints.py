@@ -28,7 +28,7 @@ from sparserob_core.control.sets.sets import Box
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from flint import arb
 

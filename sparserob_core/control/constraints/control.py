@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +13,9 @@ from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.sets.directions import across, on_surface, sampled, unit
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.program import ConstraintFamily, Explanation, Separation
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 CLIMBED = 16  # pieces, those furthest outside, whose direction is refined per round
 
@@ -28,7 +32,7 @@ class ControlConstraint:
 
     name: str
     set: ConvexSet
-    values: Array
+    values: csr_array
     offset: Array
     starts: Array
     stop: float
@@ -42,7 +46,7 @@ class ControlConstraint:
         return ControlConstraint(
             "control",
             convex,
-            dictionary.values,
+            dictionary.sparse,
             np.zeros((dictionary.pieces, convex.dimension)),
             ends[:-1],
             float(ends[-1]),
@@ -58,7 +62,7 @@ class ControlConstraint:
         offset = np.zeros((steps.size, convex.dimension))
         if before is not None:
             offset[0] = -before
-        values = changes(dictionary.values, before is not None)
+        values = dictionary.sparse @ differences(dictionary.pieces, before is not None)
         return ControlConstraint(
             "control_step", convex, values, offset, steps, dictionary.horizon, steps, "the change of u at {}"
         )
@@ -81,7 +85,7 @@ class ControlConstraint:
     def rows(self, indices: Array) -> tuple[Array, Array]:
         """``G (k, 1, n)``, ``rhs (k, 1)`` at indices ``(k, 1 + m)``."""
         directions, places = unit(self.set, indices[:, 1:]), self._places(indices[:, 0])
-        G = np.einsum("kc,kn->kcn", directions, self.values[:, places].T).reshape(indices.shape[0], 1, -1)
+        G = np.einsum("kc,kn->kcn", directions, self.values[:, places].toarray().T).reshape(indices.shape[0], 1, -1)
         return G, (self.set.support(directions) - (directions * self.offset[places]).sum(axis=1))[:, None]
 
     def gradient(self, x: Array, indices: Array, rows: Array) -> Array:
@@ -127,8 +131,10 @@ class ControlConstraint:
         return np.clip(np.searchsorted(self.starts, times, side="right") - 1, 0, self.starts.size - 1)
 
 
-def changes(values: Array, at_start: bool) -> Array:
-    """What rows of values ``(N, K)`` change by from one to the next, ``(N, q)``; ``at_start``: from 0 before the first
-    too."""
-    answer: Array = np.diff(np.hstack([np.zeros((values.shape[0], int(at_start))), values]), axis=1)
-    return answer
+def differences(pieces: int, at_start: bool) -> csr_array:
+    """The matrix ``(K, q)`` from values on pieces to their changes from one to the next; ``at_start``: from 0 before
+    the first too."""
+    from scipy.sparse import csr_array, eye_array
+
+    every = csr_array(eye_array(pieces) - eye_array(pieces, k=1))
+    return every if at_start else every[:, 1:]

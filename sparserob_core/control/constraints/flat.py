@@ -234,7 +234,7 @@ class FlatConstraint(StateConstraint):
     def direct(self, times: Float[Array, " k"]) -> Float[Array, "q n"] | None:
         if self.gains is None:
             return None
-        values = self.functionals.dictionary.values[:, self._commanded(times)]
+        values = self.functionals.dictionary.at(self._commanded(times))
         return np.asarray(np.einsum("rm,nkr->krmn", self.gains, values).reshape(times.size * self.h.size, -1))
 
     @shaped

@@ -5,56 +5,114 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.errors import InputError
-from sparserob_core.shapes import Float, shaped
+from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
-@dataclass(frozen=True, eq=False)
+MOST_VALUES = 100_000_000  # entries of a table of values that is made when asked for (0.8 GB)
+
+
+@dataclass(frozen=True, eq=False, init=False)
 class Dictionary:
     """``N`` linearly independent functions of time, constant on ``K >= N`` pieces.
 
     ``breakpoints (K + 1,)``: increasing times, the first is 0, the last the horizon. ``values (N, K)``:
-    ``values[i, k]`` is function ``i`` on ``[breakpoints[k], breakpoints[k + 1])``. Raises `InputError` when any of that
-    fails.
+    ``values[i, k]`` is function ``i`` on ``[breakpoints[k], breakpoints[k + 1])``, as an array or as a sparse array of
+    scipy. Raises `InputError` when any of that fails.
+
+    What is kept of indicators is which function each piece has, and of a sparse array its entries: `control` and
+    `gathered` are the products with ``values`` and its transpose, and need no table of all of them.
     """
 
     breakpoints: Array
-    values: Array
+    _owner: ClassVar[np.ndarray | None] = None  # of indicators: the function (K,) that is 1 on each piece
+    _entries: ClassVar[csr_array | None] = None  # of a sparse array
 
-    if TYPE_CHECKING:  # what is given may be a list; what is kept is an array
-
-        def __init__(self, breakpoints: npt.ArrayLike, values: npt.ArrayLike) -> None: ...
-
-    def __post_init__(self) -> None:
-        breakpoints, values = _real("breakpoints", self.breakpoints), _real("values", self.values)
-        if breakpoints.ndim != 1 or breakpoints.size < 2 or breakpoints[0] != 0.0 or (np.diff(breakpoints) <= 0).any():
+    def __init__(self, breakpoints: npt.ArrayLike, values: npt.ArrayLike | csr_array) -> None:
+        times = _times(breakpoints)
+        entries = _sparse(values) if hasattr(values, "tocsr") else None
+        given = _real("values", values) if entries is None else entries
+        shape: tuple[int, ...] = given.shape
+        if len(shape) != 2 or shape[0] == 0 or shape[1] != times.size - 1:
             raise InputError(
-                f"breakpoints must increase from 0, at least two of them, got {_short(breakpoints)}", path="dictionary"
+                f"values must have shape (functions, {times.size - 1}), got {given.shape}", path="dictionary"
             )
-        if values.ndim != 2 or values.shape[0] == 0 or values.shape[1] != breakpoints.size - 1:
+        _at_most(shape[0], shape[1])
+        owner = _owner(given) if entries is None else None
+        if owner is not None:
+            self._keep(breakpoints=times, _owner=owner)
+        elif entries is not None:
+            self._keep(breakpoints=times, _entries=entries)
+            if not _orthogonal(entries) and not _independent(self.values):
+                raise _dependent(self.values)
+        elif not _independent(given):
+            raise _dependent(given)
+        else:
+            self._keep(breakpoints=times, values=given)
+
+    @classmethod
+    def indicators(cls, breakpoints: npt.ArrayLike, owner: npt.ArrayLike | None = None) -> Dictionary:
+        """One function for each piece, that is 1 on it and 0 elsewhere; or, with ``owner (K,)``, function ``owner[k]``
+        is 1 on piece ``k``: whole numbers from 0 on, each of them at least once. Takes memory for ``K`` numbers."""
+        times = _times(breakpoints)
+        owner = np.arange(times.size - 1) if owner is None else np.array(owner)
+        used = np.unique(owner)
+        if (
+            owner.shape != (times.size - 1,)
+            or owner.dtype.kind not in "iu"
+            or used[0] != 0
+            or used[-1] != used.size - 1
+        ):
             raise InputError(
-                f"values must have shape (functions, {breakpoints.size - 1}), got {values.shape}", path="dictionary"
-            )
-        if values.shape[0] > values.shape[1]:
-            raise InputError(
-                f"{values.shape[0]} functions on {values.shape[1]} pieces; there can be at most as many functions as"
-                " pieces, or they are linearly dependent",
+                f"owner must be {times.size - 1} whole numbers, all from 0 to the largest, got {_short(owner)}",
                 path="dictionary",
             )
-        if not _independent(values):
+        return cls._made(times, _owner=owner)
+
+    @classmethod
+    def _made(cls, breakpoints: Array, **kept: object) -> Dictionary:
+        made = cls.__new__(cls)
+        made._keep(breakpoints=breakpoints, **kept)
+        return made
+
+    def _keep(self, **kept: object) -> None:
+        self.__dict__.update(kept)
+
+    def on(self, breakpoints: npt.ArrayLike) -> Dictionary:
+        """The same functions on as many pieces between other ``breakpoints (K + 1,)``."""
+        times = _times(breakpoints)
+        if times.size != self.breakpoints.size:
+            raise InputError(f"expected {self.breakpoints.size} breakpoints, got {times.size}", path="dictionary")
+        return Dictionary._made(times, **self._kept)
+
+    @property
+    def _kept(self) -> dict[str, object]:
+        if self._owner is not None:
+            return {"_owner": self._owner}
+        return {"values": self.values} if self._entries is None else {"_entries": self._entries}
+
+    @cached_property
+    def values(self) -> Array:
+        """The table ``(N, K)`` of all functions on all pieces, made when it is asked for the first time; raises
+        `InputError` where that would take more than 0.8 GB."""
+        N, K = self.functions, self.pieces
+        if N * K > MOST_VALUES:
             raise InputError(
-                f"the {values.shape[0]} functions must be linearly independent, their rank is"
-                f" {np.linalg.matrix_rank(values)}",
+                f"the values of {N} functions on {K} pieces would take {8e-9 * N * K:.1f} GB;"
+                " expected less than 0.8 GB: ask for control(theta), gathered(weights), at(pieces) or sparse",
                 path="dictionary",
             )
-        object.__setattr__(self, "breakpoints", breakpoints)
-        object.__setattr__(self, "values", values)
+        if self._entries is not None:
+            return np.asarray(self._entries.toarray())
+        return self.at(np.arange(K))
 
     @property
     def horizon(self) -> float:
@@ -64,12 +122,14 @@ class Dictionary:
     @property
     def pieces(self) -> int:
         """Number ``K`` of pieces."""
-        return int(self.values.shape[1])
+        return int(self.breakpoints.size - 1)
 
-    @property
+    @cached_property
     def functions(self) -> int:
         """Number ``N`` of functions."""
-        return int(self.values.shape[0])
+        if self._owner is not None:
+            return int(self._owner.max()) + 1
+        return int((self.values if self._entries is None else self._entries).shape[0])
 
     @property
     def lengths(self) -> Array:
@@ -79,26 +139,94 @@ class Dictionary:
     @cached_property
     def is_indicators(self) -> bool:
         """Whether function ``k`` is the indicator of piece ``k``."""
-        return self.functions == self.pieces and np.array_equal(self.values, np.eye(self.pieces))
+        return self._owner is not None and np.array_equal(self._owner, np.arange(self.pieces))
+
+    @cached_property
+    def sparse(self) -> csr_array:
+        """``values (N, K)`` without the entries that are 0."""
+        from scipy.sparse import csr_array
+
+        if self._entries is not None:
+            return self._entries
+        if self._owner is None:
+            return csr_array(self.values)
+        places = (self._owner, np.arange(self.pieces))
+        return csr_array((np.ones(self.pieces), places), shape=(self.functions, self.pieces))
 
     @shaped
     def control(self, theta: Float[Array, "*n"]) -> Float[Array, "m K"]:
         """The control ``(m, K)`` on the pieces, from coefficients ``(m N,)``, raveled channel by channel."""
         coefficients = theta.reshape(-1, self.functions)
-        return coefficients if self.is_indicators else coefficients @ self.values
+        if self.is_indicators:
+            return coefficients
+        return coefficients[:, self._owner] if self._owner is not None else np.asarray(coefficients @ self._table)
+
+    @shaped
+    def summands(self, theta: Float[Array, "*n"]) -> Float[Array, "m K"]:
+        """The sum ``(m, K)`` of the absolute values of what is added up to `control`."""
+        size = np.abs(theta).reshape(-1, self.functions)
+        return self.control(size) if self._owner is not None else np.asarray(size @ np.abs(self._table))
+
+    @shaped
+    def gathered(self, weights: Float[Array, "*k K m"]) -> Float[Array, "*k N m"]:
+        """Weights ``(..., K, m)`` on the values of a control on the pieces, as weights ``(..., N, m)`` on its
+        coefficients."""
+        if self.is_indicators:
+            return weights
+        if self._owner is None and self._entries is None:
+            return np.asarray(self.values @ weights)
+        first = np.moveaxis(weights, -2, 0)
+        if self._owner is not None:
+            found = np.zeros((self.functions, *first.shape[1:]))
+            np.add.at(found, self._owner, first)
+        else:
+            assert self._entries is not None
+            found = (self._entries @ first.reshape(self.pieces, -1)).reshape(self.functions, *first.shape[1:])
+        return np.moveaxis(found, 0, -2)
+
+    @shaped
+    def at(self, pieces: Int[np.ndarray, "*k"]) -> Float[Array, "*nk"]:
+        """The functions on some of the pieces ``(...,)``: ``(N, ...)``."""
+        if self._owner is not None:
+            answer = np.zeros((self.functions, pieces.size))
+            answer[self._owner[pieces.ravel()], np.arange(pieces.size)] = 1.0
+            return answer.reshape(-1, *pieces.shape)
+        if self._entries is not None:
+            return np.asarray(self._entries[:, pieces.ravel()].toarray()).reshape(-1, *pieces.shape)
+        return np.asarray(self.values[:, pieces])
 
     def merged(self) -> Dictionary:
         """The same functions on the fewest pieces: adjacent pieces on which all of them agree become one."""
         if self.is_indicators:
             return self
-        changes = (np.diff(self.values, axis=1) != 0).any(axis=0)
-        keep = np.concatenate([[True], changes])
-        return Dictionary(self.breakpoints[np.concatenate([keep, [True]])], self.values[:, keep])
+        keep = np.concatenate([[True], self.changes])
+        breakpoints = self.breakpoints[np.concatenate([keep, [True]])]
+        if self._owner is not None:
+            return Dictionary._made(breakpoints, _owner=self._owner[keep])
+        if self._entries is not None:
+            return Dictionary._made(breakpoints, _entries=self._entries[:, np.flatnonzero(keep)])
+        return Dictionary._made(breakpoints, values=self.values[:, keep])
 
     @property
     def is_complete(self) -> bool:
         """Whether the functions span every piecewise constant function on the merged pieces."""
-        return self.is_indicators or self.functions == 1 + int((np.diff(self.values, axis=1) != 0).any(axis=0).sum())
+        return self.is_indicators or self.functions == 1 + int(self.changes.sum())
+
+    @cached_property
+    def changes(self) -> np.ndarray:
+        """Whether any function changes from one piece to the next, ``(K - 1,)``."""
+        if self._owner is not None:
+            return np.asarray(np.diff(self._owner) != 0)
+        if self._entries is None:
+            return np.asarray((np.diff(self.values, axis=1) != 0).any(axis=0))
+        difference = (self._entries[:, 1:] - self._entries[:, :-1]).tocsc()
+        difference.eliminate_zeros()
+        return np.asarray(np.diff(difference.indptr) > 0)
+
+    @property
+    def _table(self) -> Array | csr_array:
+        """``values (N, K)`` as they are kept."""
+        return self.values if self._entries is None else self._entries
 
 
 class DictionaryFactory(ABC):
@@ -109,6 +237,15 @@ class DictionaryFactory(ABC):
         """The dictionary on ``[0, horizon]``; raises `InputError` when the options do not fit the horizon."""
 
 
+def _times(value: object) -> Array:
+    breakpoints = _real("breakpoints", value)
+    if breakpoints.ndim != 1 or breakpoints.size < 2 or breakpoints[0] != 0.0 or (np.diff(breakpoints) <= 0).any():
+        raise InputError(
+            f"breakpoints must increase from 0, at least two of them, got {_short(breakpoints)}", path="dictionary"
+        )
+    return breakpoints
+
+
 def _real(name: str, value: object) -> Array:
     try:
         array = np.array(value, dtype=float)
@@ -117,6 +254,51 @@ def _real(name: str, value: object) -> Array:
     if not np.isfinite(array).all():
         raise InputError(f"{name} must be finite numbers", path="dictionary")
     return array
+
+
+def _sparse(values: object) -> csr_array:
+    from scipy.sparse import csr_array
+
+    try:
+        entries = csr_array(values, dtype=float, copy=True)
+    except (TypeError, ValueError) as error:
+        raise InputError("values must be an array of numbers", path="dictionary") from error
+    if not np.isfinite(entries.data).all():
+        raise InputError("values must be finite numbers", path="dictionary")
+    entries.sum_duplicates()
+    entries.eliminate_zeros()
+    return entries
+
+
+def _at_most(functions: int, pieces: int) -> None:
+    if functions > pieces:
+        raise InputError(
+            f"{functions} functions on {pieces} pieces; there can be at most as many functions as pieces, or they are"
+            " linearly dependent",
+            path="dictionary",
+        )
+
+
+def _dependent(values: Array) -> InputError:
+    return InputError(
+        f"the {values.shape[0]} functions must be linearly independent, their rank is {np.linalg.matrix_rank(values)}",
+        path="dictionary",
+    )
+
+
+def _owner(values: Array) -> np.ndarray | None:
+    """The function that is 1 on each piece, ``(K,)``; ``None`` for other functions than indicators."""
+    owner: np.ndarray = values.argmax(axis=0)
+    ones = values[owner, np.arange(owner.size)] == 1.0
+    if not ones.all() or np.count_nonzero(values) != owner.size or np.unique(owner).size != values.shape[0]:
+        return None
+    return owner
+
+
+def _orthogonal(entries: csr_array) -> bool:
+    """Whether the rows are orthogonal to one another, and none is 0."""
+    gram = (entries @ entries.T).tocoo()
+    return bool((np.diff(entries.indptr) > 0).all() and (gram.data[gram.row != gram.col] == 0.0).all())
 
 
 def _independent(values: Array) -> bool:
@@ -132,5 +314,5 @@ def _independent(values: Array) -> bool:
     return bool(np.linalg.matrix_rank(values) == values.shape[0])
 
 
-def _short(array: Array) -> str:
+def _short(array: np.ndarray) -> str:
     return np.array2string(array, threshold=8, precision=6)

@@ -39,7 +39,7 @@ class Units:
 
     def of_dictionary(self, dictionary: Dictionary) -> Dictionary:
         """The same functions of a time in these units."""
-        return Dictionary(dictionary.breakpoints / self.time, dictionary.values)
+        return dictionary.on(dictionary.breakpoints / self.time)
 
     def of_problem(self, problem: OptimalControlProblem) -> OptimalControlProblem:
         """The same problem with every number in these units."""

@@ -117,15 +117,16 @@ def disturbance_model(kind: str, bound: ConvexSet, dictionary: Dictionary, grid:
     piece; ``measurable``: every measurable function with values in ``bound``; ``l1_ball``: coefficients with
     ``||beta_i||_1 <= bound_i`` per channel (the paper's sufficient condition read as an uncertainty set, far smaller).
     """
-    on_grid = dictionary.values[:, grid.disturbance_piece]
     if kind == "measurable":
         return DisturbanceModel("measurable", bound, bound, grid, starts=np.arange(grid.pieces))
     if kind == "l1_ball":
         box = bound.bounding_box()
         if not bound.is_box or not np.array_equal(box.lower, -box.upper):
             raise InputError("l1_ball needs a disturbance box that is symmetric about 0", path="disturbance_class")
-        ball = NormBall(p=1.0, radius=1.0, dimension=dictionary.values.shape[0])
-        return DisturbanceModel("l1_ball", ball, bound, grid, functions=on_grid, scale=box.upper)
+        ball = NormBall(p=1.0, radius=1.0, dimension=dictionary.functions)
+        return DisturbanceModel(
+            "l1_ball", ball, bound, grid, functions=dictionary.at(grid.disturbance_piece), scale=box.upper
+        )
     merged = dictionary.merged()
     if dictionary.is_complete:
         which = np.clip(
@@ -143,9 +144,8 @@ def disturbance_model(kind: str, bound: ConvexSet, dictionary: Dictionary, grid:
         )
     H, h = flat
     rows = np.einsum("ri,jk->krij", H, merged.values).reshape(-1, H.shape[1] * merged.values.shape[0])
-    return DisturbanceModel(
-        "piecewise_constant", Polytope(rows, np.tile(h, merged.values.shape[1])), bound, grid, functions=on_grid
-    )
+    coupled = Polytope(rows, np.tile(h, merged.pieces))
+    return DisturbanceModel("piecewise_constant", coupled, bound, grid, functions=dictionary.at(grid.disturbance_piece))
 
 
 def _middles(grid: TimeGrid) -> Array:

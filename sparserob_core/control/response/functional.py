@@ -305,8 +305,7 @@ class WorstCase:
             every = np.zeros((weights.shape[0], self.dictionary.pieces, self.channels))
             every[:, acting[starts]] = on_pieces
             on_pieces = every
-        coefficients = on_pieces if self.dictionary.is_indicators else self.dictionary.values @ on_pieces
-        return coefficients.swapaxes(1, 2).reshape(-1, self.variables)
+        return self.dictionary.gathered(on_pieces).swapaxes(1, 2).reshape(-1, self.variables)
 
     @shaped
     def on_grid(self, theta: Float[Array, " n"]) -> Float[Array, "mc L"]:

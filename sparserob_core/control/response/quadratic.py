@@ -41,7 +41,7 @@ class QuadraticCost:
             return self
         from scipy.sparse import csc_array, eye_array, kron
 
-        V = csc_array(kron(eye_array(self.q.size // dictionary.pieces), csc_array(dictionary.values)))
+        V = csc_array(kron(eye_array(self.q.size // dictionary.pieces), dictionary.sparse))
         P = V @ self.P @ V.T
         return QuadraticCost(csc_array((P + P.T) / 2), np.asarray(V @ self.q), self.constant)
 

@@ -113,7 +113,7 @@ def stretched(dictionary: Dictionary, horizon: float) -> Dictionary:
     shares = dictionary.breakpoints / dictionary.horizon
     breakpoints = horizon * shares
     breakpoints[-1] = horizon
-    return Dictionary(breakpoints, dictionary.values)
+    return dictionary.on(breakpoints)
 
 
 @final

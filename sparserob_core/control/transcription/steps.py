@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.control.constraints.control import changes
+from sparserob_core.control.constraints.control import differences
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.problem.units import power_of_two
@@ -63,7 +63,8 @@ class Steps:
         """The entries as rows of the decision, ``(r q, m N)``."""
         from scipy.sparse import csc_array, kron
 
-        return csc_array(kron(csc_array(self.H), csc_array(changes(self.dictionary.values, self.before is not None).T)))
+        changes = self.dictionary.sparse @ differences(self.dictionary.pieces, self.before is not None)
+        return csc_array(kron(csc_array(self.H), changes.T))
 
     def bounds(self) -> tuple[Array, Array]:
         """The least and the largest value of every entry, ``(r q,)`` each."""
@@ -119,7 +120,7 @@ def refuse_without_steps(problem: OptimalControlProblem, dictionary: Dictionary)
     if step is None or (still and (start is None or bool(problem.control.contains(start)))):
         return
     K, units = 1 if still else dictionary.pieces, power_of_two(problem.control.reach(np.eye(m)))
-    steps = changes(np.eye(K), start is not None).T
+    steps = differences(K, start is not None).toarray().T
     first = np.zeros((len(steps), m)) if start is None else np.vstack([-start / units, np.zeros((K - 1, m))])
     held = [(problem.control.in_units(units), np.eye(K), np.zeros((K, m))), (step.in_units(units), steps, first)]
     if _cut_off(held, K, m):

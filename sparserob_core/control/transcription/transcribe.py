@@ -396,7 +396,7 @@ def _image(
     )
     priced = np.asarray(problem.cost.l1 * np.asarray(problem.weights), dtype=float)
     weights: Array = np.kron(priced, dictionary.lengths)
-    values = csc_array(dictionary.values.T)
+    values = csc_array(dictionary.sparse.T)
     H, h = slanted(bound)
     H, h = (H, h) if rows is None else (H / rows.sides[:, None], h / rows.sides)
     steps = Steps.of(problem, dictionary)

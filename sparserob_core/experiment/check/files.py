@@ -228,7 +228,7 @@ def _sparsity(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
         return [f"sparsity: fewest_active is {fewest!r}, the certificate says {claimed!r}"]
     if case.certificate.get("decision") is not None and case.certificate.get("status") != "infeasible":
         try:
-            derived = asdict(sparsity(case.theta @ case.control.values, case.control.breakpoints))
+            derived = asdict(sparsity(case.control.control(case.theta), case.control.breakpoints))
         except Broken as error:
             return [f"sparsity: {error}"]
     elif case.certificate.get("status") == "infeasible":
@@ -370,7 +370,7 @@ def _solution(stored: StoredRun, case: Case) -> Verdicts:
         arrays = stored.solution
         theta, control, breakpoints, flat = (arrays[name] for name in STORED)
         decision = np.array(case.certificate["decision"], dtype=float)
-        size = np.abs(decision) @ np.abs(case.control.values)
+        size = case.control.summands(decision)
         gains = np.array(case.certificate.get("gains", []), dtype=float)
         same = (
             np.array_equal(theta, decision)
@@ -378,7 +378,7 @@ def _solution(stored: StoredRun, case: Case) -> Verdicts:
             and (flat.size == decision.size if case.policy is None else np.array_equal(arrays["gains"], gains))
             and np.array_equal(breakpoints, case.control.breakpoints)
             and control.shape == size.shape
-            and bool((np.abs(control - decision @ case.control.values) <= FIGURES * size).all())
+            and bool((np.abs(control - case.control.control(decision)) <= FIGURES * size).all())
         )
     except InputError as error:
         return [f"it cannot be read: {error}"], "", []

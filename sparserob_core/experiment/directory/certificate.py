@@ -22,6 +22,7 @@ from sparserob_core.sip.program import TOLERANCE, Formulation, SemiInfiniteProgr
 from sparserob_core.sip.result import Result
 
 FORMAT = 1
+MANY_CELLS = 1000  # from which those that are whole pieces, and follow one another, are written as one
 INWARDS = 1.0 - 1e-13  # points that must be in a curved set are drawn inwards by rounding
 WELL = 1e-14  # of its distance from the middle: a point that is so far from the boundary needs not be drawn
 
@@ -244,9 +245,21 @@ def _inside(bound: ConvexSet, point: Array, middle: Array) -> Array:
 
 def _cells(experiment: ControlExperiment, proof: Proof) -> dict[str, Any]:
     lower, upper = proof.leaves if proof.leaves is not None else (np.zeros((0, 0)), np.zeros((0, 0)))
-    shape = next((one.shape for one in experiment.transcription.constraints if one.name == proof.family), None)
-    normals = {} if shape is None else {"normals": shape.frame}
+    about = next((one for one in experiment.transcription.constraints if one.name == proof.family), None)
+    normals = {} if about is None or about.shape is None else {"normals": about.shape.frame}
+    if about is not None and lower.shape[0] >= MANY_CELLS and lower.shape[1] == 1:
+        lower, upper = _joined(lower[:, 0], upper[:, 0], *about.cells)
     return {"tolerance": TOLERANCE, **normals, "lower": lower, "upper": upper}
+
+
+def _joined(lower: Array, upper: Array, first: Array, last: Array) -> tuple[Array, Array]:
+    """Cells of time ``[lower_i, upper_i]``, those that are among ``[first_j, last_j]`` (``(k, 1)``) joined with such
+    neighbours: whoever checks them cuts them where anything turns or jumps."""
+    order = np.argsort(lower, kind="stable")
+    lower, upper = lower[order], upper[order]
+    whole = np.isin(lower, first) & np.isin(upper, last)
+    begins = np.append(True, ~(whole[1:] & whole[:-1] & (upper[:-1] == lower[1:])))
+    return lower[begins, None], upper[np.append(begins[1:], True), None]
 
 
 def _witness(problem: OptimalControlProblem, program: SemiInfiniteProgram, result: Result) -> dict[str, Any] | None:

@@ -92,7 +92,7 @@ def control_of(result: Result, program: SemiInfiniteProgram, dictionary: Diction
     if result.decision is None or dictionary is None:
         return None
     theta = _nominal(result.decision, program, dictionary)
-    return np.asarray(theta @ dictionary.values)
+    return dictionary.control(theta)
 
 
 def _nominal(decision: Array | None, program: SemiInfiniteProgram, dictionary: Dictionary) -> Array:

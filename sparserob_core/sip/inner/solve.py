@@ -310,8 +310,8 @@ def _cheap(case: _Case, guess: FiniteSolution | None) -> Iterator[FiniteSolution
     if many(program):
         corner = sifted(program, *((None, None) if guess is None else (guess.y, guess.mu)))
         if corner.status == "optimal":
-            found = measure(program, corner.x, corner.y, corner.mu, message="simplex method")
-            yield replace(found, by=HIGHS)
+            at_vertex = measure(program, corner.x, corner.y, corner.mu, message="simplex method")
+            yield replace(at_vertex, by=HIGHS)
     if guess is not None:
         found = polish(program, guess.x, guess.y, guess.mu)
         if found is not None:
