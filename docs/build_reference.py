@@ -16,6 +16,7 @@ from sparserob_core.experiment.config.run_config import RunConfig
 from sparserob_core.experiment.config.schema import config_schema
 from sparserob_core.experiment.plugins.hookspecs import HOOKS
 from sparserob_core.experiment.terminal.printing import EXIT
+from sparserob_core.options import meanings
 
 ROOT = Path(__file__).resolve().parents[1]
 MEANING = {
@@ -128,7 +129,7 @@ def _config() -> list[str]:
     rows, defaults = [], RunConfig.model_construct(problem=None).model_dump(mode="json")
     for name, field in RunConfig.model_fields.items():
         default = "required" if field.is_required() else f"`{json.dumps(defaults[name])}`"
-        rows.append((f"`{name}`", default, field.description or ""))
+        rows.append((f"`{name}`", default, meanings(RunConfig)[name]))
     return [
         "## Keys of a config",
         "",

@@ -11,7 +11,7 @@ import numpy as np
 
 from sparserob_core.experiment.plugins.hookspecs import record_type
 from sparserob_core.experiment.plugins.registry import load_registry
-from sparserob_core.options import Options
+from sparserob_core.options import Options, meanings
 
 Component = TypeVar("Component")
 
@@ -83,7 +83,7 @@ class Contract(ABC, Generic[Component]):
     def test_every_option_is_documented(self) -> None:
         made = self.create()
         if isinstance(made, Options):
-            silent = [name for name, option in type(made).model_fields.items() if not option.description]
+            silent = [name for name, meaning in meanings(type(made)).items() if not meaning]
             demand(
                 not silent,
                 f"these options of {type(made).__name__} have no documentation: {', '.join(silent)}",

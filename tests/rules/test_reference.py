@@ -12,6 +12,7 @@ import sparserob_core as sr
 from sparserob_core.experiment.cli.main import commands
 from sparserob_core.experiment.config.option_rows import option_rows
 from sparserob_core.experiment.plugins.hookspecs import HOOKS
+from sparserob_core.options import meanings
 from sparserob_core.sip.result import MEANING
 from tests.support.places import ROOT
 
@@ -46,7 +47,7 @@ def test_every_public_name_has_a_docstring_of_its_own() -> None:
     things = {name: getattr(sr, name) for name in sr.__all__ if name != "Array"}
     silent = [name for name, thing in things.items() if not (thing.__doc__ or "").strip()]
     options = [(name, it) for name, it in things.items() if inspect.isclass(it) and issubclass(it, sr.Options)]
-    silent += [f"{name}.{key}" for name, it in options for key, one in it.model_fields.items() if not one.description]
+    silent += [f"{name}.{key}" for name, it in options for key, meaning in meanings(it).items() if not meaning]
     assert not silent
 
 

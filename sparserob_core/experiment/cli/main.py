@@ -3,6 +3,7 @@ or undecided, 5 failed, 130 interrupted."""
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from collections.abc import Sequence
@@ -24,10 +25,18 @@ from sparserob_core.experiment.cli.commands.run import run
 from sparserob_core.experiment.cli.commands.simulate import simulate
 from sparserob_core.experiment.cli.commands.sweep import sweep
 from sparserob_core.experiment.cli.commands.watch import watch
-from sparserob_core.experiment.cli.shell.process import INTERRUPTED, OutputError, drop_output, listen, open_streams
+from sparserob_core.experiment.cli.shell.process import (
+    INTERRUPTED,
+    OutputError,
+    drop_output,
+    listen,
+    open_streams,
+    spare_imports,
+)
 from sparserob_core.experiment.terminal.printing import printable
 
 DEBUG = "SPARSEROB_DEBUG"
+RARELY = (50_000, 20, 20)  # allocations between two searches for cycles: at first nearly all are of modules, which stay
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -35,6 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     Ctrl-C and SIGTERM end it with what is known by then, and the status 130; a second one ends it at once.
     """
+    gc.set_threshold(*RARELY)
     listen()
     open_streams()
     sys.exit(_status(arguments))
@@ -78,6 +88,7 @@ class Commands(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         """The command's exit status."""
+        spare_imports()
         try:
             return super().invoke(ctx)
         except BrokenPipeError:

@@ -18,7 +18,7 @@ class Entry(Exact):
     """A component by ``name``; the other keys are its options. A bare name stands for a component with its default
     options."""
 
-    model_config = ConfigDict(extra="allow", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="allow", frozen=True, defer_build=True)
 
     name: str
     """Which one; ``sparserob plugins`` lists them."""

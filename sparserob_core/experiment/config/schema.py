@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import core_schema
 
@@ -12,10 +13,20 @@ from sparserob_core.experiment.config.set_options import shorthand
 from sparserob_core.experiment.plugins.components import Registry
 from sparserob_core.experiment.plugins.components import parts as components
 from sparserob_core.experiment.plugins.records import Plugin
+from sparserob_core.options import meanings
 
 
 class _Lenient(GenerateJsonSchema):
-    """Says nothing about a type that JSON has no words for."""
+    """Says nothing about a type that JSON has no words for, and of every field what it means."""
+
+    def model_schema(self, schema: core_schema.ModelSchema) -> dict[str, Any]:
+        written = super().model_schema(schema)
+        model: type[BaseModel] = schema["cls"]
+        for name, meaning in meanings(model).items():
+            field = written.get("properties", {}).get(model.model_fields[name].alias or name)
+            if meaning and field is not None:
+                field.setdefault("description", meaning)
+        return written
 
     def handle_invalid_for_json_schema(self, schema: core_schema.CoreSchema, error_info: str) -> dict[str, Any]:
         return {}
@@ -96,7 +107,7 @@ def _choice(registry: Registry, kind: str, default: str | None, parts: dict[str,
 def _named(entry: dict[str, Any], record: Plugin, needs_name: bool) -> dict[str, Any]:
     properties = {"name": {"const": record.name, "description": record.summary}, **entry.get("properties", {})}
     if record.kind == "maximiser":
-        own = MaximiserEntry.model_json_schema()["properties"]
+        own = MaximiserEntry.model_json_schema(schema_generator=_Lenient)["properties"]
         properties |= {key: own[key] for key in own if key != "name"}
     required = (["name"] if needs_name else []) + entry.get("required", [])
     return {

@@ -426,3 +426,13 @@ def test_a_study_without_matplotlib_has_a_note_and_its_own_status(
     done = command(study[0], file, *study[1:], "--out", "out")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "no figure: matplotlib is not installed; `pip install 'sparserob[figures]'` brings it" in done.stdout
+
+
+def test_modules_that_scipy_looks_at_are_imported_only_when_something_of_them_is_used() -> None:
+    code = (
+        "import sys; from sparserob_core.experiment.cli.shell.process import spare_imports; spare_imports();"
+        " import scipy.sparse; before = 'numpy.f2py.crackfortran' in sys.modules; import numpy.f2py;"
+        " print(before, callable(numpy.f2py.get_include), callable(numpy.testing.assert_allclose))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "True", "True"]

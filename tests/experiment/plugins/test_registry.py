@@ -13,6 +13,7 @@ import sparserob_core as sr
 from sparserob_core.experiment.plugins import registry as discovery
 from sparserob_core.experiment.plugins.components import Registry
 from sparserob_core.experiment.plugins.messages import complaints
+from sparserob_core.options import meanings
 
 GOOD = """
 import sparserob_core as sr
@@ -61,8 +62,8 @@ def test_every_installed_component_has_a_summary_and_documented_options() -> Non
         assert record.summary, record
         if record.missing and record.open:
             continue
-        for name, field in record.options_type().model_fields.items():
-            assert field.description, f"{record}: option {name} has no description"
+        for name, meaning in meanings(record.options_type()).items():
+            assert meaning, f"{record}: option {name} has no description"
 
 
 def test_one_file_is_a_plugin(plugin: Callable[[str], Path]) -> None:

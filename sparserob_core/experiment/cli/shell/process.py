@@ -9,6 +9,7 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from importlib.util import LazyLoader, find_spec, module_from_spec
 from types import FrameType
 from typing import final
 
@@ -28,6 +29,21 @@ def listen() -> None:
             signal.signal(signal.SIGINT, _interrupted)
         if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
             signal.signal(signal.SIGTERM, _interrupted)
+
+
+def spare_imports() -> None:
+    """Load some modules of numpy only when something of them is used: scipy looks at every name that numpy has, and so
+    imports, at every start, what builds Fortran extensions and what tests arrays."""
+    import numpy as np
+
+    for name in ("f2py", "testing"):
+        known = f"{np.__name__}.{name}"
+        spec = None if known in sys.modules else find_spec(known)
+        if spec is not None and spec.loader is not None:
+            spec.loader = LazyLoader(spec.loader)
+            module = sys.modules[known] = module_from_spec(spec)
+            spec.loader.exec_module(module)
+            setattr(np, name, module)
 
 
 def status_unless_interrupted(status: int) -> int:
