@@ -323,7 +323,6 @@ def policies(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("changed", "said"),
     [
         ({"disturbance_class": "measurable"}, "piecewise_constant"),
-        ({"terminal": [{"ellipsoid": {"centre": [0, 0], "shape": [[0.1, 0], [0, 0.1]]}}]}, "flat sides"),
         ({"control_step": {"box": 0.3}}, "control_step"),
     ],
 )

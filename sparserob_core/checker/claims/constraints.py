@@ -51,7 +51,7 @@ def bounded(case: Case, window: Window) -> str:
     lower, upper = numbers(entry.get("lower"), "lower"), numbers(entry.get("upper"), "upper")
     if lower.shape == (0, 0):
         raise Unchecked("the certificate holds no cells for a constraint that was not proven on cells")
-    normals = _normals(window, entry.get("normals"))
+    normals = normals_of(window, entry.get("normals"))
     covered(case, window, lower, upper)
     basis, gains, work = _work(case, window, normals, lower, upper)
     found = prove(
@@ -67,7 +67,7 @@ def bounded(case: Case, window: Window) -> str:
     return f"kept to {found.bound:.1e}, {found.share:.1e} of its own unit ({size})"
 
 
-def _normals(window: Window, data: object) -> Array:
+def normals_of(window: Window, data: object) -> Array:
     """The coordinates of a curved set's directions, ``(b, d)``: they must be able to name every direction in which it
     is bounded. Those of the state where the certificate has none."""
     b, d = window.seen.spanned, window.shape.dimension

@@ -11,10 +11,11 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls, below
 from sparserob_core.checker.claims.case import Case, number, numbers
-from sparserob_core.checker.claims.constraints import covered, cut
+from sparserob_core.checker.claims.constraints import covered, cut, normals_of
 from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import EQUALITY, RESOLVED, TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.reach.closed_loop import ClosedLoop
+from sparserob_core.checker.reach.directions import Directions
 from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.system import LinearSystem
@@ -79,7 +80,7 @@ class FeedbackClaims:
         shape = self.case.problem.control
         flat = known(shape).facets
         if flat is None:
-            raise Unchecked("the checker knows feedback into sets with flat sides only")
+            return self._control_turning()
         worst, loop = -np.inf, self.loop
         for k, effect in enumerate(loop.effects):
             self.case.clock.check()
@@ -95,6 +96,22 @@ class FeedbackClaims:
                     )
                 worst = max(worst, over)
         return f"{len(loop.effects)} pieces in their set for every disturbance, to {worst:.1e} of its own units"
+
+    def _control_turning(self) -> str:
+        """Every piece of the control in its curved set, for every disturbance."""
+        shape, loop = known(self.case.problem.control), self.loop
+        every = Directions(loop, shape, np.diag(1.0 / np.array(shape.radius)), self._acting)
+        m, pieces = shape.dimension, len(loop.effects)
+        faces = [(-np.ones(m), np.ones(m)) for _ in range(2 * m)]
+        for place, (low, high) in enumerate(faces):
+            low[place // 2] = high[place // 2] = 1.0 if place % 2 else -1.0
+        count, most = self._shown(every, [(k, 0.0, 0.0, *face) for k in range(pieces) for face in faces])
+        return f"{pieces} pieces in their set for every disturbance, to {most:.1e} ({count} cells of directions)"
+
+    def _acting(self, k: int) -> arb_mat:
+        """The nominal control and its answers on a piece, ``(m, 1 + Q)``."""
+        nominal = balls(self.loop.nominal[:, k])
+        return stacked([[v, *row] for v, row in zip(nominal, self.loop.effects[k], strict=True)])
 
     def cost(self) -> arb:
         """The cost of the policy."""
@@ -119,7 +136,7 @@ class FeedbackClaims:
         """Show that a constraint is kept at every time, for every disturbance."""
         case, entry, flat = self.case, self._entry(window), window.seen.facets
         if flat is None:
-            raise Unchecked("the checker knows feedback with sets with flat sides only")
+            return self._turning(window, entry)
         lower, upper = numbers(entry.get("lower"), "lower"), numbers(entry.get("upper"), "upper")
         covered(case, window, lower, upper)
         sides = _Sides(self.loop, flat, case.units(window).rows)
@@ -141,6 +158,48 @@ class FeedbackClaims:
                 raise Unchecked(f"the times around {start!r} cannot be halved any more")
             todo += [(piece, start, half), (piece, half, stop)]
         return f"kept for every disturbance, to {most:.1e} of its own unit ({count} cells)"
+
+    def _turning(self, window: Window, entry: Mapping[str, Any]) -> str:
+        """The same for a curved set: cells of times and directions."""
+        case = self.case
+        lower, upper = numbers(entry.get("lower"), "lower"), numbers(entry.get("upper"), "upper")
+        normals = normals_of(window, entry.get("normals"))
+        covered(case, window, lower, upper)
+        every = Directions(self.loop, window.seen, normals)
+        grid = np.array(case.grid)
+        todo = [
+            (*part, low[1:], high[1:])
+            for low, high in zip(lower, upper, strict=True)
+            for part in cut(grid, grid, float(low[0]), float(high[0]))
+        ]
+        count, most = self._shown(every, todo)
+        return f"kept for every disturbance, to {most:.1e} ({count} cells)"
+
+    def _shown(self, every: Directions, todo: list[tuple[int, float, float, Array, Array]]) -> tuple[int, float]:
+        """How many cells of times and directions it took to show that a curved set is kept on all of these, and by how
+        much it is left at most."""
+        count, most = 0, -np.inf
+        while todo:
+            self.case.clock.check()
+            piece, start, stop, low, high = todo.pop()
+            count += 1
+            if count > MOST_CELLS:
+                raise Unchecked(f"neither shown nor refuted after {count} cells")
+            over, none, (late, wide) = every.over(piece, start, stop, low, high)
+            if over <= none:
+                most = max(most, over)
+                continue
+            half, axis = (start + stop) / 2, int((high - low).argmax())
+            if start < half < stop and (late > wide or not low[axis] < high[axis]):
+                todo += [(piece, start, half, low, high), (piece, half, stop, low, high)]
+                continue
+            middle = (low[axis] + high[axis]) / 2
+            if not low[axis] < middle < high[axis]:
+                raise Unchecked(f"the directions around {low.tolist()} cannot be halved any more")
+            at = np.arange(low.size) == axis
+            todo += [(piece, start, stop, low, np.where(at, middle, high))]
+            todo += [(piece, start, stop, np.where(at, middle, low), high)]
+        return count, most
 
     def equalities(self) -> str:
         """Show that the fixed states are met for every disturbance and initial state; a sentence with the figures."""
@@ -197,7 +256,9 @@ class FeedbackClaims:
         number(said, "violation")
         if name == CONTROL:
             k = int(np.clip(bisect_right(loop.breakpoints, time) - 1, 0, case.control.pieces - 1))
-            sides = known(case.problem.control).facets or []
+            sides = known(case.problem.control).facets
+            if sides is None:
+                raise Unchecked("the worst direction of a curved set is not told")
             v, effect = balls(loop.nominal[:, k]), loop.effects[k]
             columns = [[row[q] for row in effect] for q in range(len(effect[0]))]
             over = [_dot(c, v) + loop.support([_dot(c, column) for column in columns]) - b for c, b in sides]
@@ -212,7 +273,9 @@ class FeedbackClaims:
         window = case.window(name)
         if not window.start <= time <= window.stop:
             raise Broken(f"t = {time!r} is not within {window.start:g} to {window.stop:g}")
-        flat = window.seen.facets or []
+        flat = window.seen.facets
+        if flat is None:
+            raise Unchecked("the worst direction of a curved set is not told")
         piece = min(max(bisect_right(case.grid, time) - 1, 0), len(case.grid) - 2)
         found = loop.heights(loop.state(piece, time), np.array([c for c, _ in flat]))
         slack = TOLERANCE * float(case.units(window).rows.max(initial=0.0))

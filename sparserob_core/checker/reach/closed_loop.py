@@ -242,14 +242,12 @@ class ClosedLoop:
                     total = total - x * arb(float(m)) if m else total
         return total
 
-    def heights(self, state: arb_mat, rows: Array) -> list[arb]:
+    def heights(self, state: arb_mat, rows: Array | arb_mat) -> list[arb]:
         """``max c'x`` over all deviations for every row ``c`` of ``rows (r, d)``, at a time with this `state`."""
-        from flint import arb
-
-        along = (stacked([[arb(float(v)) for v in row] for row in rows]) * state).tolist()
+        along = (_matrix(rows) * state).tolist()
         return [row[0] + self.support(row[1:]) for row in along]
 
-    def bent(self, piece: int, start: float, stop: float, rows: Array) -> Array:
+    def bent(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:
         """By how much ``max c'x(t)`` may lie above its chord on ``[start, stop]``, a part of a piece of the grid, at
         most, ``(r,)``: ``(stop - start)^2 / 8`` times the largest second derivatives of the nominal state and of every
         response, each times how far its deviation goes."""
@@ -257,8 +255,8 @@ class ClosedLoop:
 
         A, h = self.parts["A"], arb(stop) - arb(start)
         rate = A * self.state(piece, start) + self.drives[piece]
-        row, factor = stacked([[arb(float(v)) for v in c] for c in rows]) * A, arb(1)
-        total = np.zeros((rows.shape[0], 1 + self.starts[-1]))
+        row, factor = _matrix(rows) * A, arb(1)
+        total = np.zeros((row.nrows(), 1 + self.starts[-1]))
         for order in range(TERMS):
             found = Enclosed.of(row * rate)
             total = total + (np.abs(found.mid) + found.rad) * float((factor * OUTWARD).upper())
@@ -270,3 +268,9 @@ class ClosedLoop:
         lengths = np.array([float(norm(stacked([line])).upper()) for line in row.tolist()])
         summed = total @ sizes * (1.0 + rounding(sizes.size)) + tail * lengths
         return np.asarray(float((h * h / 8).upper()) * summed * OUTWARD)
+
+
+def _matrix(rows: Array | arb_mat) -> arb_mat:
+    from flint import arb
+
+    return stacked([[arb(float(v)) for v in row] for row in rows]) if isinstance(rows, np.ndarray) else rows

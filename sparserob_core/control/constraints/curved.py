@@ -241,6 +241,11 @@ class CurvedConstraint(StateConstraint):
         return {} if self._sharing is None else self._sharing._combinations
 
     @property
+    def outer(self) -> FlatConstraint:
+        """The half-spaces of sampled directions: an outer polytope of the set."""
+        return self._flat
+
+    @property
     def _sharing(self) -> CurvedConstraint | None:
         """The ``shared`` constraint where it is the same but for its initial state."""
         given = self.shared

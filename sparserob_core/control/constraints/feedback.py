@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import final
+from typing import Protocol, final
 
 import numpy as np
 
@@ -29,9 +29,39 @@ def _not_linear(indices: Array) -> tuple[Array, Array]:
     raise InputError("under feedback a constraint is no row of the decision: the method exchange knows such programs")
 
 
-def _family(
-    constraint: FeedbackConstraint | FeedbackControl, index_set: Box, start: Array, source: object
-) -> ConstraintFamily:
+class Uncertain(Protocol):
+    """A constraint that must hold for every deviation."""
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+
+    @property
+    def loop(self) -> ClosedLoop:
+        """The loop that it is about."""
+
+    def excess(self, x: Array, indices: Array) -> Array:
+        """Violations ``(k, r)`` at indices, under the worst deviations."""
+
+    def uncertain(self, index: Array) -> UncertainRows:
+        """The rows at one index."""
+
+    def worst(self, x: Array) -> Separation:
+        """The largest violations."""
+
+    def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
+        """Proven bounds on cells."""
+
+    @property
+    def cells(self) -> tuple[Array, Array]:
+        """Those that a proof begins with."""
+
+    def explain(self, index: Array, row: int) -> Explanation:
+        """One constraint for people, at an index that may hold deviations too."""
+
+
+def indexed(constraint: Uncertain, index_set: Box, start: Array, source: object) -> ConstraintFamily:
+    """A constraint as a family; in its literal form, deviations are part of the index."""
     family = ConstraintFamily(
         name=constraint.name,
         index_set=index_set,
@@ -80,7 +110,7 @@ class FeedbackConstraint:
         start, stop = self.flat.start, self.flat.stop
         begun = np.unique(np.linspace(0, self.times.size - 1, min(BEGUN, self.times.size)).round().astype(int))
         source = self if self.exact else self.flat
-        return _family(self, Box(np.array([start]), np.array([stop])), self.times[begun][:, None], source)
+        return indexed(self, Box(np.array([start]), np.array([stop])), self.times[begun][:, None], source)
 
     @cached_property
     def times(self) -> Array:
@@ -152,12 +182,12 @@ class FeedbackConstraint:
         """One constraint for people, at every disturbance, or at the deviations that the index says."""
         said = self.flat.explain(index[:1], row)
         assert isinstance(said, TimedExplanation)
-        told = _told(said, self.loop, index)
+        found = told(said, self.loop, index[1:])
         if not self._unanswered[row]:
-            return told
+            return found
         last = float(self.loop.functionals.dictionary.breakpoints[-2])
-        late = f"{told.text} (what comes after the last measurement, at {last:.6g}, reaches it unanswered)"
-        return replace(told, text=late)
+        late = f"{found.text} (what comes after the last measurement, at {last:.6g}, reaches it unanswered)"
+        return replace(found, text=late)
 
     @cached_property
     def _unanswered(self) -> np.ndarray:
@@ -185,7 +215,7 @@ class FeedbackControl:
     def family(self) -> ConstraintFamily:
         """The constraint as a family."""
         horizon = float(self.breakpoints[-1])
-        family = _family(self, Box(np.array([0.0]), np.array([horizon])), self.middles[:, None], self)
+        family = indexed(self, Box(np.array([0.0]), np.array([horizon])), self.middles[:, None], self)
         return family if self.bound is None else replace(family, defines=True)
 
     @property
@@ -268,16 +298,17 @@ class FeedbackControl:
                  for i, v in enumerate(direction) if v]  # fmt: skip
         right = "its peak" if self.bound is not None else f"{self.h[row]:.6g}"
         text = f"{self.name}: {' + '.join(terms)} <= {right}"
-        return _told(TimedExplanation(text, self.name, text, time, direction), self.loop, index)
+        return told(TimedExplanation(text, self.name, text, time, direction), self.loop, index[1:])
 
 
-def _told(said: TimedExplanation, loop: ClosedLoop, index: Array) -> TimedExplanation:
+def told(said: TimedExplanation, loop: ClosedLoop, w: Array) -> TimedExplanation:
+    """What is said of a constraint, of every disturbance, or at deviations ``w (Q,)``."""
     problem = loop.functionals
     every = ("disturbance", problem.disturbance), ("initial state", problem.initial)
     text = f"{said.statement} for every {' and '.join(name for name, one in every if one is not None) or 'disturbance'}"
-    if index.size == 1:
+    if not w.size:
         return replace(said, text=text, disturbance=None, begun=None, deviation=None, quantity="")
-    point, width = loop.spread.middle + index[1:], loop.steps.E.shape[2]
+    point, width = loop.spread.middle + w, loop.steps.E.shape[2]
     own = point[: point.size - int(loop.begins.sum())]
     signal = None if problem.disturbance is None else own.reshape(-1, width).T
     if problem.initial is None:

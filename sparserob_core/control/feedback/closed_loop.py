@@ -138,7 +138,11 @@ class ClosedLoop:
 
     def bounds(self, x: Array, lower: Array, upper: Array, H: Array) -> Array:
         """Upper bounds ``(k, r)`` of ``max_w H x(t)`` over cells of time ``[lower, upper] (k,)``, each within one piece
-        of the grid.
+        of the grid."""
+        return self.bounded(x, lower, upper, H)[0]
+
+    def bounded(self, x: Array, lower: Array, upper: Array, H: Array) -> tuple[Array, Array]:
+        """The bounds, ``H (r, d)`` or ``(k, r, d)``, and how much of each is owed to the length of the cell.
 
         On a cell every functional is within ``(b - a)^2 / 8`` times its largest second derivative of its chord, and a
         support function of a chord lies below the chord of the support functions.
@@ -158,15 +162,15 @@ class ClosedLoop:
             tail = (
                 factor
                 * np.exp(growth)
-                * np.linalg.norm(row, axis=1)[:, None]
+                * np.linalg.norm(row, axis=-1)[..., None]
                 * np.linalg.norm(rates, axis=1, keepdims=True)
             )
         bent = second + tail
         radii = np.concatenate([[1.0], self.spread.radii])
         size = np.abs(H) @ np.maximum(np.abs(ends[0]), np.abs(ends[1]))
-        allowance = (h[..., 0] ** 2 / 8.0) * (bent @ radii) + ROUND_OFF * (size @ radii)
-        found = np.maximum(self.height(along[0]), self.height(along[1])) + allowance
-        return np.asarray(np.where(np.isnan(found), np.inf, found))
+        late = (h[..., 0] ** 2 / 8.0) * (bent @ radii)
+        found = np.maximum(self.height(along[0]), self.height(along[1])) + late + ROUND_OFF * (size @ radii)
+        return np.where(np.isnan(found), np.inf, found), late
 
     def worst(self, x: Array, time: float, direction: Array) -> Array:
         """A deviation ``(Q,)`` that attains the worst case of ``c'x(t)``."""

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sparserob_core.control.constraints.feedback import FeedbackConstraint
-from sparserob_core.control.constraints.flat import FlatConstraint
+from sparserob_core.control.constraints.feedback_curved import of_state
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.matrix_exponential import transitions
 from sparserob_core.control.feedback.closed_loop import ClosedLoop
@@ -74,10 +73,10 @@ def find_adversary(constraint: StateConstraint, decision: Array, feedback: Feedb
 
 
 def _of_loop(constraint: StateConstraint, decision: Array, loop: ClosedLoop) -> Adversary:
-    assert isinstance(constraint, FlatConstraint)
-    worst = FeedbackConstraint(constraint, loop).worst(decision)
+    worst = of_state(constraint, loop).worst(decision)
     row, time = int(worst.rows[0]), float(worst.indices[0, 0])
-    response, direction = constraint.functionals.response, constraint.H[row]
+    _, directions, _, bounds = constraint.functionals_at(worst.indices[:1])
+    response, direction = constraint.functionals.response, directions[row]
     disturbed = constraint.functionals.disturbance is not None
     deviation = loop.worst(decision, time, direction)
     return Adversary(
@@ -85,7 +84,7 @@ def _of_loop(constraint: StateConstraint, decision: Array, loop: ClosedLoop) -> 
         row=row,
         time=time,
         direction=direction,
-        bound=float(constraint.h[row]),
+        bound=float(bounds[row]),
         parameter=np.zeros(0),
         initial_state=loop.begun(deviation),
         violation=float(worst.violations[0]),

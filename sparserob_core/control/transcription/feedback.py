@@ -9,7 +9,9 @@ from functools import reduce
 import numpy as np
 
 from sparserob_core.control.constraints.feedback import FeedbackConstraint, FeedbackControl
+from sparserob_core.control.constraints.feedback_curved import FeedbackCurvedControl, of_state
 from sparserob_core.control.constraints.flat import FlatConstraint
+from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.feedback.closed_loop import ClosedLoop, deviations_of
 from sparserob_core.control.feedback.innovations import Answers, answers, innovations_seen
 from sparserob_core.control.policies.affine import AffinePolicy
@@ -88,8 +90,6 @@ def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dic
     """Raise `InputError` for what a policy is not built for, in one sentence."""
     disturbed = problem.disturbance is not None
     paths = [entry for entry in problem.path if isinstance(entry, PathConstraint)]
-    sets = [entry.set for entry in paths] + [end for end in problem.terminal if not isinstance(end, Equality)]
-    curved = [one.kind for one in sets if one.halfspaces() is None]
     named = [entry.name for entry in paths if entry.name in (CONTROL, PEAK, EQUALS)]
     plain = problem.disturbance_class == "piecewise_constant"
     reasons = {
@@ -99,9 +99,6 @@ def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dic
         ),
         f"disturbance of the class piecewise_constant, not {problem.disturbance_class}": disturbed and not plain,
         "disturbance that takes any value on each of its pieces": disturbed and not disturbance.is_complete,
-        f"state in sets with flat sides, which the {' and the '.join(curved)} has not": bool(curved),
-        f"control in a set with flat sides, which the {problem.control.kind} has not": problem.control.halfspaces()
-        is None,
         f"path constraint of another name than {' or '.join(map(str, named))}, which is taken": bool(named),
         "control that acts at once, without a delay": problem.system.delay > 0.0,
         "single linear system, without pieces": bool(problem.system.switches),
@@ -135,11 +132,7 @@ def _program(
     nominal, first = functionals.variables, functionals.variables + known.variables
     size = first + (nominal if policy.cost == "peak" else 0)
     loop = ClosedLoop(functionals, known, deviations_of(problem.disturbance, blocks, problem.initial_set), size)
-    families = [
-        FeedbackConstraint(constraint, loop).family()
-        for constraint in model.constraints
-        if isinstance(constraint, FlatConstraint)
-    ]
+    families = [of_state(constraint, loop).family() for constraint in model.constraints]
     settled: list[Callable[[Array], Array]] = []
     if fixed[1].size:
         ends = (problem.horizon, problem.horizon)
@@ -149,8 +142,8 @@ def _program(
         families.append(equal.family())
         settled.append(equal.met)
     flat = problem.control.halfspaces()
-    assert flat is not None
-    families.append(FeedbackControl(CONTROL, loop, *flat).family())
+    within = FeedbackCurvedControl(loop, problem.control) if flat is None else FeedbackControl(CONTROL, loop, *flat)
+    families.append(within.family())
     axes = np.eye(problem.system.controls)
     low, high = -problem.control.support(-axes), problem.control.support(axes)
     most = (high - low)[known.channel] / loop.spread.chords[known.entry]
@@ -187,10 +180,12 @@ def _told_by(
     """A family in own units, in both of its forms, that is explained as the user's is."""
     literal, other = family.literal, theirs.literal
     assert literal is not None and other is not None
-    if isinstance(family.source, FlatConstraint):
+    if isinstance(family.source, StateConstraint):
         rows = own.family(family.source).row_units
     elif isinstance(family.source, FeedbackConstraint) and isinstance(theirs.source, FeedbackConstraint):
         rows = _shares(family.source.flat.H, theirs.source.flat.H * units.states)
+    elif isinstance(family.source, FeedbackCurvedControl):
+        rows = np.ones(1)
     else:
         mine, others = family.source, theirs.source
         assert isinstance(mine, FeedbackControl) and isinstance(others, FeedbackControl)
@@ -201,9 +196,9 @@ def _told_by(
         assert said is not None
         return replace(one, explain=lambda index, row: said(index * scale, row), row_units=rows, index_units=scale)
 
-    time = np.array([units.time])
-    reduced = told(family, time)
-    return replace(reduced, literal=replace(told(literal, np.concatenate([time, deviations])), reduced=reduced))
+    at = np.append(units.time, np.ones(family.index_set.dimension - 1))  # directions are the same
+    reduced = told(family, at)
+    return replace(reduced, literal=replace(told(literal, np.concatenate([at, deviations])), reduced=reduced))
 
 
 def _shares(mine: Array, theirs: Array) -> Array:
