@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import sparserob_core as sr
-from sparserob_core.control.constraints.samples import sample_disturbances, sample_parameters
+from sparserob_core.control.constraints.scenario import sample_disturbances, sample_parameters
 from sparserob_core.control.transcription.record import Transcription
 
 TRAJECTORIES = 10_000

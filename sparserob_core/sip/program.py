@@ -219,6 +219,8 @@ class SemiInfiniteProgram:
     norm; -1 is one that counts alone. ``largest``: the largest possible cost, where it is known, of which a gap is a
     share (`cost_scale`).
     ``spread``: the deviations for all of which the ``uncertain`` rows of its families hold;
+    ``guide``: a program that is easier, whose decision begins with so many of the same entries: where a method may look
+    for this one's optimum;
     ``settle(x)``: a decision that meets the same constraints and costs no more, such as one whose bounds are no looser
     than they must be.
     """
@@ -245,6 +247,7 @@ class SemiInfiniteProgram:
     largest: float | None = None
     spread: Spread | None = None
     settle: Callable[[Array], Array] | None = None
+    guide: tuple[SemiInfiniteProgram, int] | None = field(default=None, repr=False)
     twin: Callable[[], OwnUnits] | None = field(default=None, repr=False)
     finite: FiniteProgram = field(init=False, repr=False)
 

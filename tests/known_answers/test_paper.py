@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.control.constraints.samples import sample_disturbances
+from sparserob_core.control.constraints.scenario import sample_disturbances
 from tests.support.places import CONFIGS
 
 TRAJECTORIES = 10_000

@@ -16,6 +16,7 @@ from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import EQUALITY, RESOLVED, TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.reach.closed_loop import ClosedLoop
 from sparserob_core.checker.reach.directions import Directions
+from sparserob_core.checker.reach.effort import at_most
 from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.system import LinearSystem
@@ -26,7 +27,8 @@ if TYPE_CHECKING:
     from flint import arb, arb_mat
 
 MOST_CELLS = 40_000  # cells of time examined for each constraint
-PEAK, CONTROL, EQUALS = "peak", "control", "equals"
+PEAK, CONTROL, EQUALS, WORST, EFFORT = "peak", "control", "equals", "worst", "effort"
+FIGURES, SMALL_COST = 1e-11, 1e-6  # of an effort, and of the largest possible one: how closely it is known
 
 
 @final
@@ -114,11 +116,15 @@ class FeedbackClaims:
         return stacked([[v, *row] for v, row in zip(nominal, self.loop.effects[k], strict=True)])
 
     def cost(self) -> arb:
-        """The cost of the policy."""
+        """The cost of the policy; where that is an effort, the written one, which is shown to be none too small."""
         from flint import arb
 
         case, total = self.case, arb(0)
         assert case.policy is not None
+        if case.policy.cost == WORST:
+            written = arb(number(case.certificate, "cost"))
+            self._effort(written + FIGURES * abs(written).max(arb(SMALL_COST * case.price.largest)))
+            return written
         times = case.control.breakpoints
         for k in range(case.control.pieces):
             length = arb(float(times[k + 1])) - arb(float(times[k]))
@@ -131,6 +137,24 @@ class FeedbackClaims:
                     height = abs(u)
                 total = total + length * w * height
         return total
+
+    def _effort(self, limit: arb) -> None:
+        """Show that no deviation causes an effort beyond a limit."""
+        from flint import arb
+
+        case, loop = self.case, self.loop
+        times, a, A = case.control.breakpoints, [], []
+        for k in range(case.control.pieces):
+            length = arb(float(times[k + 1])) - arb(float(times[k]))
+            for i, w in enumerate(case.price.weights):
+                a.append(length * w * arb(float(case.theta[i, k])))
+                A.append([length * w * x for x in loop.effects[k][i]])
+        reach = [
+            float(known(shape).support(balls([float(b == axis) for b in range(shape.dimension)])).mid()) - about[axis]
+            for shape, about in loop.sets
+            for axis in range(shape.dimension)
+        ]
+        at_most(a, A, loop.support, np.array(reach), limit, case.clock)
 
     def bounded(self, window: Window) -> str:
         """Show that a constraint is kept at every time, for every disturbance."""
@@ -284,7 +308,8 @@ class FeedbackClaims:
     def multiplied(self, entries: Sequence[Any], priced: bool) -> arb:
         """The bound that multipliers of constraints at single disturbances prove, for every policy of the kind.
 
-        Of the nominal control ``v`` and, with the cost ``peak``, of the peaks only the sets are used; of the gains that
+        Of the nominal control ``v`` and, with the costs ``peak`` and ``worst``, of the peaks and of the effort only the
+        sets are used, and how far these let them go; of the gains that
         the control they cause is no wider than its set, ``h(F_kl) + h(-F_kl) <= width`` summed over the blocks ``l``.
         """
         from flint import arb
@@ -293,20 +318,27 @@ class FeedbackClaims:
         assert case.policy is not None
         K, m = case.control.pieces, case.problem.system.controls
         loop = self.loop_at_rest
-        rows = [_Row.of(case, loop, entry, case.policy.cost == PEAK) for entry in entries]
+        rows = [_Row.of(case, loop, entry, case.policy.cost) for entry in entries]
         total = sum((row.multiplier * row.constant for row in rows), arb(0))
         slope = [[sum((r.multiplier * r.nominal[k][i] for r in rows if not r.nominal[k][i].is_zero()), arb(0))
                   for i in range(m)] for k in range(K)]  # fmt: skip
-        times, peaks = case.control.breakpoints, case.policy.cost == PEAK
+        times, peaks, most = case.control.breakpoints, case.policy.cost == PEAK, arb(0)
         for k in range(K):
             length = arb(float(times[k + 1])) - arb(float(times[k]))
-            prices = [w * length if priced else arb(0) for w in case.price.weights]
+            asked_of = [w * length for w in case.price.weights]
+            prices = asked_of if priced else [arb(0)] * m
+            if case.policy.cost == WORST:
+                most = most + sum((p * _reach(case.problem.control, i) for i, p in enumerate(asked_of)), arb(0))
+                prices = [arb(0)] * m
             if peaks:
                 for i in range(m):
                     asked = prices[i] - sum((r.multiplier for r in rows if r.peak == (k, i)), arb(0))
                     total = total + (asked * _reach(case.problem.control, i)).min(arb(0))
                 prices = [arb(0)] * m
             total = total + known(case.problem.control).least(prices, prices, slope[k])
+        if case.policy.cost == WORST:
+            left = arb(int(priced)) - sum((r.multiplier for r in rows if r.of_effort), arb(0))
+            total = total + (left * most).min(arb(0))
         return total - self._of_gains(loop, rows)
 
     def _of_gains(self, loop: ClosedLoop, rows: list[_Row]) -> arb:
@@ -437,7 +469,7 @@ def feedback_of(case: Case) -> FeedbackClaims:
 @final
 class _Row:
     """One constraint at one disturbance: ``constant + sum_k nominal_k (v_k + sum_j M_kj innovations_j)``, less the peak
-    ``(k, i)`` where it compares with one, is at most 0 for every feasible policy."""
+    ``(k, i)`` where it compares with one, or less the effort, is at most 0 for every feasible policy."""
 
     def __init__(
         self,
@@ -446,14 +478,15 @@ class _Row:
         nominal: list[list[arb]],
         innovations: list[list[arb]],
         peak: tuple[int, int] | None,
+        of_effort: bool = False,
     ) -> None:
         from flint import arb
 
         self.multiplier, self.constant, self.nominal = arb(multiplier), constant, nominal
-        self.innovations, self.peak = innovations, peak
+        self.innovations, self.peak, self.of_effort = innovations, peak, of_effort
 
     @staticmethod
-    def of(case: Case, loop: ClosedLoop, entry: object, peaks: bool) -> _Row:
+    def of(case: Case, loop: ClosedLoop, entry: object, cost: str) -> _Row:
         """The constraint that an entry of the certificate names, which must be one of the problem's."""
         case.clock.check()
         if not isinstance(entry, Mapping):
@@ -467,7 +500,9 @@ class _Row:
             raise Broken(f"{name}: a parameter is given of a known system")
         z = _deviations(case, loop, entry, name)
         if name in (CONTROL, PEAK):
-            return _Row._of_control(case, loop, (name, direction, time, y), z, peaks)
+            return _Row._of_control(case, loop, (name, direction, time, y), z, cost == PEAK)
+        if name == EFFORT and cost == WORST:
+            return _Row._of_effort(case, loop, direction, y, z)
         d = case.problem.system.states
         if direction.shape != (d,):
             raise Broken(f"{name}: {direction.size} numbers where {d} are expected")
@@ -501,6 +536,20 @@ class _Row:
         if not peaks or sorted(np.abs(direction).tolist()) != [0.0] * (m - 1) + [1.0]:
             raise Broken(f"{name}: the direction {direction.tolist()} is not that of a peak of this policy")
         return _Row(y, arb(0), nominal, seen, (piece, channel))
+
+    @staticmethod
+    def _of_effort(case: Case, loop: ClosedLoop, shares: Array, y: float, z: list[list[arb]]) -> _Row:
+        """The control at deviations, each entry of it times a share of ``[-1, 1]``, is at most the effort."""
+        K, m, d = case.control.pieces, case.problem.system.controls, case.problem.system.states
+        if shares.shape != (m * K,) or not (np.abs(shares) <= 1.0).all():
+            raise Broken(f"{EFFORT}: expected {m * K} numbers from -1 to 1")
+        from flint import arb
+
+        times, nominal = case.control.breakpoints, []
+        for k in range(K):
+            length = arb(float(times[k + 1])) - arb(float(times[k]))
+            nominal.append([length * w * arb(float(shares[i * K + k])) for i, w in enumerate(case.price.weights)])
+        return _Row(y, arb(0), nominal, _seen(loop, z, d), None, of_effort=True)
 
 
 def _fixed(case: Case, direction: Array, time: float) -> arb:

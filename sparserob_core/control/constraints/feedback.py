@@ -25,7 +25,8 @@ IDLE = 1e-14  # of the largest coefficient, one that is rounding
 SAME = 1e-12  # of the largest one, a singular value of equations that depend on one another
 
 
-def _not_linear(indices: Array) -> tuple[Array, Array]:
+def not_linear(indices: Array) -> tuple[Array, Array]:
+    """A family has no rows that are linear in the decision."""
     raise InputError("under feedback a constraint is no row of the decision: the method exchange knows such programs")
 
 
@@ -65,7 +66,7 @@ def indexed(constraint: Uncertain, index_set: Box, start: Array, source: object)
     family = ConstraintFamily(
         name=constraint.name,
         index_set=index_set,
-        rows=_not_linear,
+        rows=not_linear,
         excess=constraint.excess,
         uncertain=constraint.uncertain,
         start=start,

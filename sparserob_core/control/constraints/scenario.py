@@ -11,8 +11,9 @@ import numpy as np
 from sparserob_core.control.constraints.flat import KEPT
 from sparserob_core.control.constraints.local_maxima import local_maxima, vertices
 from sparserob_core.control.constraints.state import StateConstraint
+from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.response import SAME_TIME, Response, distinct_times
-from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.program import ConstraintFamily, Separation
 
 BLOCK = 2_000_000  # sampled violations that are held at once
@@ -133,3 +134,16 @@ class ScenarioConstraint:
     def _times(self) -> Array:
         answer: Array = np.clip(self._fine.grid.breakpoints[self._kept], self.base.start, self.base.stop)
         return answer
+
+
+def sample_disturbances(model: DisturbanceModel, count: int, rng: np.random.Generator) -> Array:
+    """``count`` disturbances ``(count, mw, L)`` on the grid's pieces: every block uniform in its set, independent of
+    the others."""
+    blocks = model.block_count
+    points = model.set.sample(count * blocks, rng).reshape(count, blocks, -1)
+    return model.signals(points)
+
+
+def sample_parameters(convex_set: ConvexSet | None, count: int, rng: np.random.Generator) -> Array:
+    """``count`` parameters ``(count, nu)``, uniform in their set."""
+    return np.zeros((count, 0)) if convex_set is None else convex_set.sample(count, rng)

@@ -22,9 +22,10 @@ class AffinePolicy(Policy, Options):
     (Goulart, Kerrigan and Maciejowski 2006).
     """
 
-    cost: Literal["nominal", "peak"] = "nominal"
+    cost: Literal["nominal", "peak", "worst"] = "nominal"
     """``nominal``: the L1 norm of the nominal control; ``peak``: the weighted integral of the largest ``|u_i(t)|`` that
-    any disturbance causes, which is 0 exactly where the control is off whatever happens."""
+    any disturbance causes, which is 0 exactly where the control is off whatever happens; ``worst``: the largest
+    weighted integral of ``|u_i(t)|`` that any disturbance causes, enclosed from both sides."""
 
     memory: float | None = Field(default=None, ge=0.0)
     """An innovation is answered for so long at most, in the time unit of the problem; everything by default."""

@@ -8,6 +8,7 @@ from functools import reduce
 
 import numpy as np
 
+from sparserob_core.control.constraints.effort import FeedbackEffort
 from sparserob_core.control.constraints.feedback import FeedbackConstraint, FeedbackControl
 from sparserob_core.control.constraints.feedback_curved import FeedbackCurvedControl, of_state
 from sparserob_core.control.constraints.flat import FlatConstraint
@@ -26,7 +27,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.program import ConstraintFamily, OwnUnits, SemiInfiniteProgram
 
-CONTROL, PEAK = "control", "peak"  # names of the families that are about the control
+CONTROL, PEAK, EFFORT = "control", "peak", "effort"  # names of the families that are about the control
 EQUALS = "equals"  # that of the terminal equalities
 FINER = 2.0**-11  # of the numbers that are added up, the unit of an equality: it is met to `EQUALITY` of them
 
@@ -62,7 +63,7 @@ def with_feedback(
         [
             np.repeat(units.controls, pieces),
             units.controls[scaled.channel] / deviations[scaled.entry],
-            np.repeat(units.controls, pieces),
+            np.full(1, units.cost) if policy.cost == "worst" else np.repeat(units.controls, pieces),
         ]
     )[: scaled_program.n]
     program = mine[0].mirrored(lambda _: OwnUnits(scaled_program, decision, decision, np.zeros(0), units.cost))
@@ -90,7 +91,7 @@ def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dic
     """Raise `InputError` for what a policy is not built for, in one sentence."""
     disturbed = problem.disturbance is not None
     paths = [entry for entry in problem.path if isinstance(entry, PathConstraint)]
-    named = [entry.name for entry in paths if entry.name in (CONTROL, PEAK, EQUALS)]
+    named = [entry.name for entry in paths if entry.name in (CONTROL, PEAK, EFFORT, EQUALS)]
     plain = problem.disturbance_class == "piecewise_constant"
     reasons = {
         "control in indicators of its pieces (piecewise_constant)": not control.is_indicators,
@@ -130,7 +131,7 @@ def _program(
     """The program of one transcription, in its units; ``fixed``: the rows of its terminal equalities."""
     functionals, problem, pieces = model.functionals, model.problem, model.control.pieces
     nominal, first = functionals.variables, functionals.variables + known.variables
-    size = first + (nominal if policy.cost == "peak" else 0)
+    size = first + {"nominal": 0, "peak": nominal, "worst": 1}[policy.cost]
     loop = ClosedLoop(functionals, known, deviations_of(problem.disturbance, blocks, problem.initial_set), size)
     families = [of_state(constraint, loop).family() for constraint in model.constraints]
     settled: list[Callable[[Array], Array]] = []
@@ -150,6 +151,7 @@ def _program(
     low, high = np.repeat(low, pieces), np.repeat(high, pieces)
     weights, lower, upper = np.zeros(size), np.concatenate([low, -most]), np.concatenate([high, most])
     cost = problem.cost.l1 * np.kron(np.asarray(problem.weights, dtype=float), model.control.lengths)
+    guide, largest = None, None
     if policy.cost == "peak":
         both = np.vstack([axes, -axes])
         peaks = FeedbackControl(PEAK, loop, both, np.zeros(len(both)), first)
@@ -158,6 +160,15 @@ def _program(
         weights[first:] = cost
         lower = np.concatenate([lower, np.zeros(nominal)])
         upper = np.concatenate([upper, np.maximum(np.abs(low), np.abs(high))])
+    elif policy.cost == "worst":
+        effort = FeedbackEffort(EFFORT, loop, cost, first)
+        families.append(effort.family())
+        settled.append(effort.settled)
+        guide = (_program(model, policy.model_copy(update={"cost": "peak"}), known, blocks, fixed)[0], first)
+        weights[first:] = 1.0
+        lower = np.append(lower, 0.0)
+        largest = float(cost @ np.maximum(np.abs(low), np.abs(high)))
+        upper = np.append(upper, 2.0 * largest)
     else:
         weights[:nominal] = cost
     program = SemiInfiniteProgram(
@@ -170,6 +181,8 @@ def _program(
         lengths=np.tile(model.control.lengths, problem.system.controls),
         spread=loop.spread,
         settle=None if not settled else lambda x: reduce(lambda at, settle: settle(at), settled, x),
+        guide=guide,
+        largest=largest,
     )
     return program, loop
 
@@ -180,7 +193,11 @@ def _told_by(
     """A family in own units, in both of its forms, that is explained as the user's is."""
     literal, other = family.literal, theirs.literal
     assert literal is not None and other is not None
-    if isinstance(family.source, StateConstraint):
+    index: Array = np.append(units.time, np.ones(family.index_set.dimension - 1))  # directions are the same
+    if isinstance(family.source, FeedbackEffort):
+        index = np.ones(family.index_set.dimension)
+        rows: Array | None = np.full(2, units.cost)
+    elif isinstance(family.source, StateConstraint):
         rows = own.family(family.source).row_units
     elif isinstance(family.source, FeedbackConstraint) and isinstance(theirs.source, FeedbackConstraint):
         rows = _shares(family.source.flat.H, theirs.source.flat.H * units.states)
@@ -196,9 +213,8 @@ def _told_by(
         assert said is not None
         return replace(one, explain=lambda index, row: said(index * scale, row), row_units=rows, index_units=scale)
 
-    at = np.append(units.time, np.ones(family.index_set.dimension - 1))  # directions are the same
-    reduced = told(family, at)
-    return replace(reduced, literal=replace(told(literal, np.concatenate([at, deviations])), reduced=reduced))
+    reduced = told(family, index)
+    return replace(reduced, literal=replace(told(literal, np.concatenate([index, deviations])), reduced=reduced))
 
 
 def _shares(mine: Array, theirs: Array) -> Array:

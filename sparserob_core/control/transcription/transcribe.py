@@ -11,8 +11,7 @@ from sparserob_core.control.constraints.control import ControlConstraint
 from sparserob_core.control.constraints.curved import CurvedConstraint
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.literal import LiteralConstraint
-from sparserob_core.control.constraints.samples import sample_disturbances, sample_parameters
-from sparserob_core.control.constraints.scenario import ScenarioConstraint
+from sparserob_core.control.constraints.scenario import ScenarioConstraint, sample_disturbances, sample_parameters
 from sparserob_core.control.constraints.sensitivity import Sensitivity
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.taylor import TaylorSpace

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 ALLOWED = TOLERANCE / 2  # a violation that the search may leave to the proof
 ROUNDING = 2.0**-46  # of the numbers of which a bound is made
 FIRST, LARGEST, SMALLEST = 1e-8, 1e-6, 2e-9  # margins by which rows are tightened, in their own units
+SHARES = (0.1, 0.5, 1.0)  # of the way from the best decision known to the relaxed optimum, where rows are sought
+CUTS, GUIDED = 4, 30  # of them at each; rounds of a guide
 THINNER = 0.1  # share of a margin that leaves nothing feasible, which is tried next
 ROOM = 1e3  # units of the rows that they may have to spare
 SLACKENED = 200  # rounds of `least_slack` at most
@@ -46,6 +48,8 @@ class Robust:
     known: set[tuple[str, bytes]] = field(default_factory=set)
     margin: float = FIRST
     slater: bool = True
+    raw: Array = field(default_factory=lambda: np.zeros(0))
+    best: Array = field(default_factory=lambda: np.zeros(0))
 
     @staticmethod
     def start(program: SemiInfiniteProgram) -> Robust:
@@ -90,15 +94,21 @@ def robust_exchange(
     """Close the gap of a program with uncertain rows; ends as `Exchange.close` does."""
     relaxed = RelaxedProgram(program, tools.solver, None, deadline=tools.deadline)
     ledger = Ledger(program, relaxed, tools, tolerance)
+    working = Robust.start(program)
     try:
         with tools.deadline.enforced():
-            return _exchange(ledger, prover, rounds)
+            return _exchange(working, ledger, prover, rounds)
     except KeyboardInterrupt as error:
+        best = working.best
+        if ledger.best is not None and best.size and program.cost(best) < program.cost(ledger.best.solution.x):
+            met = [(one, one.worst(best)) for one in program.families if not one.defines and one.worst is not None]
+            ledger.prefer(_at(working, ledger.best, best), met)
         return ledger.stopped(error, prover)
 
 
-def _exchange(ledger: Ledger, prover: Prover, rounds: int) -> Result:
-    program, tools, working = ledger.program, ledger.tools, Robust.start(ledger.program)
+def _exchange(working: Robust, ledger: Ledger, prover: Prover, rounds: int) -> Result:
+    program, tools = ledger.program, ledger.tools
+    _guided(working, ledger)
     for number in range(1, rounds + 1):
         tools.deadline.check()
         last = number == rounds
@@ -108,12 +118,20 @@ def _exchange(ledger: Ledger, prover: Prover, rounds: int) -> Result:
         if isinstance(answer, Result):
             return answer
         x = answer.solution.x
+        if working.best.size and ledger.open(x) and (last or not ledger.open(working.best)):
+            answer = _at(working, answer, working.best)
+            x = answer.solution.x
 
         # Separate: the times at which the continuum is violated most.
         found = separate(program, x, tools, ALLOWED, number)
         told = [(family, one) for family, one in found if not family.defines]
-        violated = [(family, one.indices[one.violations > ALLOWED]) for family, one in found]
+        violated = [(family, one.indices[one.violations > ALLOWED]) for family, one in told]
         feasible = not any(indices.size for _, indices in violated)
+        if not feasible and x is working.best and not last:
+            working.best = np.zeros(0)
+            continue
+        if program.guide is not None and (not feasible or ledger.open(x)):
+            violated += _undefined(working, x, feasible)
         ledger.tell(number, answer, told, program.cost(x) if feasible else np.inf, kept=len(working.cuts))
 
         # Exchange: impose them, or sharpen what stands for the imposed ones, or choose another margin.
@@ -123,11 +141,64 @@ def _exchange(ledger: Ledger, prover: Prover, rounds: int) -> Result:
         # Prove: over the whole continuum; a witness that the proof meets is one more index to impose.
         proofs = prover(x)
         if not last and not tools.deadline.passed and _learned(working, x, proofs):
+            working.best = np.zeros(0)
             continue
         ending = f"the {rounds} rounds of the method are used up" if last else ""
         ending = tools.deadline.reason if tools.deadline.passed else ending
         return ledger.judged(answer, worst_of(told), proofs, ending)
     raise AssertionError("the last round returns")
+
+
+def _guided(working: Robust, ledger: Ledger) -> None:
+    """Begin where the program's guide ends: with its times, and with what its optimum defines."""
+    program, tools = working.program, ledger.tools
+    if program.guide is None:
+        return
+    guide, shared = program.guide
+    easier = Robust.start(guide)
+    for number in range(1, GUIDED + 1):
+        tools.deadline.check()
+        answer = easier.counterpart.solve(easier.margin)
+        if not answer.solved:
+            return
+        x = np.clip(answer.x, guide.finite.lower, guide.finite.upper)
+        x = x if guide.settle is None else guide.settle(x)
+        working.raw = np.concatenate([x[:shared], np.zeros(program.n - shared)])
+        working.best = working.raw if program.settle is None else program.settle(working.raw)
+        found = separate(guide, x, tools, ALLOWED, number)
+        new = [(family, one.indices[one.violations > ALLOWED]) for family, one in found]
+        if not sum(easier.add(family, indices) for family, indices in new):
+            break
+    for family in program.families:
+        held = [cut.index for cut in easier.cuts if cut.family == family.name and not cut.row]
+        if not family.defines and held:
+            working.add(family, np.array(held))
+    for family, indices in _undefined(working, working.best, False):
+        working.add(family, indices)
+    working.counterpart.calls += easier.counterpart.calls
+
+
+def _undefined(working: Robust, x: Array, feasible: bool) -> list[tuple[ConstraintFamily, Array]]:
+    """Where the bounds that a family defines are exceeded at the relaxed optimum, before they are settled, and between
+    it and the best decision known (Ben-Ameur and Neto 2007); where that is ``feasible``, a better one is kept."""
+    program, raw = working.program, working.raw
+    if feasible and not (working.best.size and program.cost(working.best) <= program.cost(x)):
+        working.best = x
+    best = working.best if working.best.size else x
+    found: list[tuple[ConstraintFamily, Array]] = []
+    for family in program.families:
+        if not family.defines or family.worst is None:
+            continue
+        for share in SHARES:
+            at = share * raw + (1.0 - share) * best
+            indices = family.worst(at).indices
+            over = family.violations(raw, indices).max(axis=1)
+            found.append((family, indices[over > ALLOWED][:CUTS]))
+            if feasible and program.settle is not None:
+                at = program.settle(at)
+                if program.cost(at) < program.cost(working.best):
+                    working.best = at
+    return found
 
 
 def _advanced(
@@ -178,6 +249,7 @@ def _solved(working: Robust, ledger: Ledger) -> Answer | Result:
         return _infeasible(working, ledger, answer.said)
     program = working.program
     x = np.clip(answer.x, program.finite.lower, program.finite.upper)
+    working.raw = x
     x = x if program.settle is None else program.settle(x)
     dual = working.dual(answer, priced=True)
     ledger.improve(dual)
@@ -185,11 +257,17 @@ def _solved(working: Robust, ledger: Ledger) -> Answer | Result:
     budget = 0.4 * ledger.tolerance * max(SMALL_COST * program.cost_scale, program.cost(x))
     if working.slater and price * working.margin > budget:
         working.margin = max(SMALLEST, min(working.margin, budget / price))
-    value, none = program.cost(x), np.zeros(0)
-    solution = FiniteSolution(
-        "optimal", x, value, dual.bound, answer.y, answer.mu, none, program.finite.residual(x), value - dual.bound
-    )
-    return Answer(solution, _rows(working), 0.0, value)
+    none = np.zeros(0)
+    solution = FiniteSolution("optimal", x, np.inf, dual.bound, answer.y, answer.mu, none, np.inf, np.inf)
+    return _at(working, Answer(solution, _rows(working), 0.0, np.inf), x)
+
+
+def _at(working: Robust, answer: Answer, x: Array) -> Answer:
+    """An answer with another decision."""
+    value, bound = working.program.cost(x), answer.solution.lower_bound
+    residual = working.program.finite.residual(x)
+    solution = replace(answer.solution, x=x, value=value, residual=residual, gap=value - bound)
+    return replace(answer, solution=solution, value=value)
 
 
 def _rows(working: Robust) -> Rows:

@@ -134,7 +134,7 @@ def test_a_scenario_result_tells_the_bound_beside_the_worst_violation(tmp_path):
 
 
 def test_fresh_draws_break_the_scenario_decision_no_more_often_than_the_bound(tmp_path):
-    from sparserob_core.control.constraints.samples import sample_disturbances
+    from sparserob_core.control.constraints.scenario import sample_disturbances
 
     outcome = solved(PUSHED, {"name": "scenario", "scenarios": 300}, tmp_path)
     model = outcome.experiment.transcription

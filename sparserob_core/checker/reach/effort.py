@@ -1,0 +1,77 @@
+"""The largest effort that any deviation causes, bounded in balls: ``max_z sum_k |a_k + A_k z|``.
+
+The sum is at most ``sum_k (s_k (a_k + A_k z) + h_k)`` where ``s_k`` is the sign of the entry and ``h_k = 0``, or any
+number of ``[-1, 1]`` and ``h_k`` the larger of ``high (1 - s_k)`` and ``-low (1 + s_k)``, for an entry from ``low`` to
+``high``: an absolute value less a line is convex, so largest at an end. The largest value of the right side is in
+closed form. Both signs of one entry after the other are gone through until that is small enough.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sparserob_core.checker.outcome import Broken, Clock, Unchecked
+from sparserob_core.checker.reach.flow import stacked
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from flint import arb
+
+MOST = 200_000  # parts that are examined
+TOGETHER = 200
+
+
+def at_most(
+    a: list[arb], A: list[list[arb]], support: Callable[[list[arb]], arb], reach: Array, limit: arb, clock: Clock
+) -> int:
+    """Show that the largest effort of ``a (n,)`` and ``A (n, Q)`` is at most the ``limit``; how many parts it took.
+
+    ``support``: the largest ``z'b`` of ``b (Q,)``; ``reach (Q,)``: about how far deviations go, which decides the order
+    only. Raises `Broken` where the effort is certainly larger, `Unchecked` where that was not decided.
+    """
+    from flint import arb
+
+    high = [x + support(row) for x, row in zip(a, A, strict=True)]
+    low = [x - support([-y for y in row]) for x, row in zip(a, A, strict=True)]
+    slopes = np.array([_slope(float(u.mid()), float(v.mid())) for u, v in zip(high, low, strict=True)])
+    heights = [(u * (1 - arb(s))).max(-v * (1 + arb(s))).max(arb(0)) for u, v, s in zip(high, low, slopes, strict=True)]
+    about, table = np.array([float(x.mid()) for x in a]), stacked([[x, *row] for x, row in zip(a, A, strict=True)])
+    rough = np.array([[float(x.mid()) for x in row] for row in A]).reshape(len(a), -1)
+    tall = np.array([float(h.mid()) for h in heights])
+    todo: list[tuple[Array, np.ndarray]] = [(slopes, np.array([bool(h > 0) or not h.is_zero() for h in heights]))]
+    count = 0
+    while todo:
+        clock.check()
+        taken, todo = todo[-TOGETHER:], todo[:-TOGETHER]
+        count += len(taken)
+        if count > MOST:
+            raise Unchecked(f"the largest effort was not bounded by {count} parts of the signs of the control")
+        sums = (stacked([[arb(float(s)) for s in one] for one, _ in taken]) * table).tolist()
+        for (signs, open_), (start, *along) in zip(taken, sums, strict=True):
+            bound = start + support(along) + sum((heights[k] for k in np.flatnonzero(open_)), arb(0))
+            if bound <= limit:
+                continue
+            if not open_.any():
+                if bound > limit:
+                    raise Broken(f"a disturbance causes the effort {float(bound.mid())!r}")
+                raise Unchecked("the largest effort is known too roughly")
+            worst = np.sign(np.array([float(x.mid()) for x in along])) * reach
+            values = about + rough @ worst
+            k = int(np.where(open_, tall + signs * values - np.abs(values), -np.inf).argmax())
+            rest = open_.copy()
+            rest[k] = False
+            for sign in (1.0, -1.0):
+                other = signs.copy()
+                other[k] = sign
+                todo.append((other, rest))
+    return count
+
+
+def _slope(high: float, low: float) -> float:
+    """The slope of the chord of an absolute value, within ``[-1, 1]``."""
+    if low >= 0.0 or high <= 0.0:
+        return 1.0 if low >= 0.0 else -1.0
+    return float(np.clip((high + low) / (high - low), -1.0, 1.0))

@@ -1,0 +1,121 @@
+"""The effort of a control that answers the disturbance, as a family that bounds one variable: the cost `worst`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import final
+
+import numpy as np
+
+from sparserob_core.control.constraints.explanation import TimedExplanation
+from sparserob_core.control.constraints.feedback import not_linear, told
+from sparserob_core.control.feedback.closed_loop import ROUND_OFF, ClosedLoop
+from sparserob_core.control.feedback.effort import Effort, largest_effort
+from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.finite import UncertainRows
+from sparserob_core.sip.program import ConstraintFamily, Enclosure, Explanation, Separation
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class FeedbackEffort:
+    """``sum_k prices_k |u_k| <= c`` for every deviation, ``c`` the variable number ``bound``; ``prices (m K,)`` of the
+    nominal control's entries.
+
+    An index is a sign of every entry, ``s (m K,)``, or with the deviations ``(s, w)``: the constraint is that of
+    ``s``, and where deviations are symmetric that of ``-s`` too, for all signs.
+    """
+
+    name: str
+    loop: ClosedLoop
+    prices: Array
+    bound: int
+    _known: dict[bytes, Effort] = field(default_factory=dict, repr=False)
+
+    def family(self) -> ConstraintFamily:
+        """The constraint as a family."""
+        ones, far = np.ones(self.prices.size), self.loop.spread.radii
+        family = ConstraintFamily(
+            name=self.name,
+            index_set=Box(-ones, ones),
+            rows=not_linear,
+            excess=self.excess,
+            uncertain=self.uncertain,
+            start=ones[None] if self.loop.spread.is_box else np.stack([ones, -ones]),
+            worst=self.worst,
+            enclosure=self.enclosure,
+            cells=(-ones[None], ones[None]),
+            explain=self.explain,
+            source=self,
+            defines=True,
+        )
+        box = Box(np.concatenate([-ones, -far]), np.concatenate([ones, far]))
+        literal = replace(family, index_set=box, formulation="literal", reduced=family, worst=None, excess=None)
+        return replace(family, literal=literal)
+
+    @property
+    def _sides(self) -> Array:
+        return np.array([1.0, -1.0] if self.loop.spread.is_box else [1.0])
+
+    def _control(self, x: Array) -> tuple[Array, Array]:
+        """What every entry of the control costs at no deviation, and what deviations add: ``(m K,), (m K, Q)``."""
+        effects = self.loop.effects(x)
+        return self.prices * self.loop.nominal(x).ravel(), self.prices[:, None] * effects.swapaxes(0, 1).reshape(
+            self.prices.size, -1
+        )
+
+    def excess(self, x: Array, indices: Array) -> Array:
+        """Violations ``(k, r)`` for signs ``(k, m K)`` under the worst disturbances."""
+        a, A = self._control(x)
+        signs = indices[:, None] * self._sides[:, None]
+        return np.asarray(signs @ a + self.loop.spread.support(signs @ A) - x[self.bound])
+
+    def uncertain(self, index: Array) -> UncertainRows:
+        """The rows of one sign of every entry."""
+        from scipy.sparse import csr_array
+
+        loop, weight, count = self.loop, self.prices * index, self._sides.size
+        at, which, value = loop.answers.effect
+        _, m, Q, _ = loop.answers.shape
+        piece, channel = np.divmod(at // Q, m)
+        data = weight.reshape(m, -1)[channel, piece] * value
+        C = csr_array((data, (at % Q, loop.nominal_size + which)), shape=(Q, loop.variables))
+        g = np.zeros((count, loop.variables))
+        g[:, : weight.size] = self._sides[:, None] * weight
+        g[:, self.bound] = -1.0
+        return UncertainRows(
+            csr_array(g), np.zeros(count), np.zeros(count, dtype=int), self._sides, (C,), np.zeros((1, Q))
+        )
+
+    def effort(self, x: Array) -> Effort:
+        """Between what the largest effort lies."""
+        key = x[: self.bound].tobytes()
+        if key not in self._known:
+            self._known.clear()
+            self._known[key] = largest_effort(*self._control(x), self.loop.spread)
+        return self._known[key]
+
+    def settled(self, x: Array) -> Array:
+        """The same decision with the variable at a proven bound of the effort."""
+        answer, (a, A) = x.copy(), self._control(x)
+        size = float(np.abs(a).sum() + (np.abs(A) @ self.loop.spread.radii).sum())
+        answer[self.bound] = self.effort(x).upper + ROUND_OFF * size
+        return answer
+
+    def worst(self, x: Array) -> Separation:
+        """The signs of the largest efforts that were found, worst first."""
+        found = self.effort(x)
+        none = np.zeros(found.values.size, dtype=int)
+        return Separation(found.signs, none, found.values - x[self.bound], found.upper - float(x[self.bound]))
+
+    def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
+        """A proven bound of the violation, for all signs."""
+        over = self.settled(x)[self.bound] - x[self.bound]
+        return Enclosure(np.full(len(lower), over), np.zeros(len(lower), dtype=int))
+
+    def explain(self, index: Array, row: int) -> Explanation:
+        """One constraint for people."""
+        signs = index[: self.prices.size]
+        text = f"{self.name}: the control against {signs.size} signs <= the cost"
+        said = TimedExplanation(text, self.name, text, 0.0, self._sides[row] * signs)
+        return told(said, self.loop, index[self.prices.size :])
