@@ -43,6 +43,11 @@ from sparserob_core.experiment.check.check import check as check
 from sparserob_core.experiment.simulation.simulation import ConstraintShare as ConstraintShare
 from sparserob_core.experiment.simulation.simulation import Simulation as Simulation
 from sparserob_core.experiment.simulation.simulate import simulate as simulate
+from sparserob_core.control.loop.controller import Controller as Controller
+from sparserob_core.control.loop.controller import Step as Step
+from sparserob_core.experiment.loop.controller import controller as controller
+from sparserob_core.experiment.loop.study import ClosedLoops as ClosedLoops
+from sparserob_core.experiment.loop.loop import loop as loop
 from sparserob_core.experiment.margin.margin import Margin as Margin
 from sparserob_core.experiment.margin.margin import margin as margin
 from sparserob_core.experiment.initial_states.initial_states import InitialStates as InitialStates

@@ -74,6 +74,8 @@ class Uncertainty:
         knots = rng.integers(1, KNOTS + 1, size=count)
         for number in range(1, KNOTS + 1):
             here = np.flatnonzero(knots == number)
+            if not here.size:
+                continue
             points = model.bound.sample_extreme(here.size * number, rng).reshape(here.size, number, -1)
             signal[here] = np.einsum("lk,nki->nli", _hats(middles, number), points)
         if model.starts is not None:

@@ -33,6 +33,12 @@ class Measuring:
         assert model.feedback is not None
         return Measuring(model, model.pieces(decision), model.feedback.loop.gains(decision))
 
+    def seen(self, state: Array) -> list[Array]:
+        """The innovations ``(d,)`` so far, when ``state (d,)`` is what the piece that comes next begins in; nothing is
+        changed."""
+        assert self._predicted is not None
+        return [*(one[:, 0] for one in self._innovations), state - self._predicted[:, 0]]
+
     def __call__(self, piece: int, state: Array) -> Array:
         """What acts through the columns of ``B`` on a piece of the grid that begins in ``state (d, n)``: ``(mc,
         n)``."""

@@ -356,7 +356,7 @@ def _state_constraints(
     path = [entry for entry in problem.path if not isinstance(entry, ConvexSet)]
     ends = [terminal for terminal in problem.terminal if not isinstance(terminal, Equality)]
     windows: list[tuple[str, PathConstraint | MixedConstraint]] = [
-        (entry.name or _name("path", i, len(path)), entry) for i, entry in enumerate(path)
+        (name, entry) for name, entry in zip(path_names(problem), path, strict=True)
     ]
     windows += [
         (_name("terminal", i, len(ends)), PathConstraint(terminal, end, end)) for i, terminal in enumerate(ends)
@@ -374,6 +374,12 @@ def _state_constraints(
         elif sides[1].size:
             found.append(FlatConstraint(name, functionals, *sides, entry.start, stop, parameters, reference=moved))
     return tuple(found)
+
+
+def path_names(problem: OptimalControlProblem) -> list[str]:
+    """What the families of the path constraints are called: by their own name, or by their place."""
+    path = [entry for entry in problem.path if not isinstance(entry, ConvexSet)]
+    return [entry.name or _name("path", i, len(path)) for i, entry in enumerate(path)]
 
 
 def _name(kind: str, position: int, count: int) -> str:

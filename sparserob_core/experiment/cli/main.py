@@ -19,6 +19,7 @@ from sparserob_core.experiment.cli.commands.check import check
 from sparserob_core.experiment.cli.commands.compare import benchmark, compare
 from sparserob_core.experiment.cli.commands.figures import figures
 from sparserob_core.experiment.cli.commands.initial_states import initial_states
+from sparserob_core.experiment.cli.commands.loop import loop
 from sparserob_core.experiment.cli.commands.margin import margin
 from sparserob_core.experiment.cli.commands.replay import replay
 from sparserob_core.experiment.cli.commands.run import run
@@ -109,6 +110,7 @@ for command in (
     replay,
     check,
     simulate,
+    loop,
     margin,
     initial_states,
     compare,

@@ -1,0 +1,167 @@
+"""A control that runs: the measured state goes in at every breakpoint, the control of the next piece comes out."""
+
+from __future__ import annotations
+
+import time as clock
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+import numpy.typing as npt
+
+from sparserob_core.control.loop.resolving import Plan, Resolving
+from sparserob_core.control.studies.measuring import Measuring
+from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import Array
+
+SAME_BREAKPOINT = 1e-9  # of the horizon: how far a time may be from the breakpoint that it means
+SEEN = 1e-7  # of the size of a state, a deviation that is rounding
+
+
+@final
+@dataclass(frozen=True)
+class Step:
+    """What one step of a `Controller` was: it began at ``time``, took ``seconds``, and was from a control that was
+    ``resolved`` anew at this step or not; ``covered``: whether the proof covers what was measured so far. ``cost`` and
+    ``lower_bound`` enclose the cost of what is left, where a re-solve has told them (else NaN)."""
+
+    time: float
+    seconds: float
+    resolved: bool
+    covered: bool
+    cost: float = np.nan
+    lower_bound: float = np.nan
+
+
+@final
+class Controller:
+    """The control of a proven plan while the system runs, one `step` at every breakpoint.
+
+    Without a re-solve it applies the plan: a control fixed beforehand is told piece by piece, gains answer what is
+    measured. With one, what is left of the horizon is solved anew from the measured state at every step; the answer is
+    taken where it is proven and costs less than what the last plan has left, which is proven too.
+
+    No constraint is violated as long as the states that it is told are those of a system, a disturbance and an initial
+    state of the problem. For any other state it still gives a control, within the set of controls, and says so:
+    `covered` is then false. Not to be shared by threads.
+    """
+
+    def __init__(self, plan: Plan, resolving: Resolving | None = None) -> None:
+        self._planned, self._resolving = plan, resolving
+        self.reset()
+
+    @property
+    def breakpoints(self) -> Array:
+        """When the pieces of the control begin, and the horizon at the end, ``(K + 1,)``, in the time of the
+        problem."""
+        return np.array(self._planned.model.control.breakpoints)
+
+    @property
+    def covered(self) -> bool:
+        """Whether the proof covers every state that was measured since the last `reset`, or since the last plan that
+        was made of a measured state. Exact where the disturbance moves all states alike; else it may be true a step too
+        long, since states are compared one by one. Parameters are not told from a disturbance: with uncertain ones it
+        is always true."""
+        return self._covered
+
+    @property
+    def steps(self) -> tuple[Step, ...]:
+        """The steps since the last `reset`."""
+        return tuple(self._steps)
+
+    @property
+    def plan(self) -> Plan:
+        """The plan that is applied: the first one, or the last that was solved anew."""
+        return self._plan
+
+    def reset(self) -> None:
+        """Begin anew: the next step is that of time 0."""
+        self._take(self._planned)
+        self._next, self._covered, self._steps = 0, True, list[Step]()
+        self._before: Array | None = None
+        self._reach: tuple[Array, Array] | None = None
+
+    def step(self, time: float, state: npt.ArrayLike) -> Array:
+        """The control ``(m,)`` for the piece that begins at ``time``, a breakpoint, from the ``state (d,)`` measured
+        then. Breakpoints come one after another. Raises `InputError` for a time or a state that is none, and is then as
+        it was before."""
+        began = clock.perf_counter()
+        piece, measured = self._timed(time), self._measured(state)
+        covered = self._covered and self._within(measured)
+        answer = None
+        if self._resolving is not None:
+            answer = self._resolving.answer(self._plan, piece, measured, self._before, self._innovations(measured))
+            if answer.plan is not None and (answer.cheaper or not covered):
+                self._take(answer.plan)
+                covered = True
+            else:
+                answer = answer.declined()
+        u = self._control(piece - self._plan.first, measured)
+        self._reach = self._plan.reach(piece - self._plan.first, measured, u)
+        self._next, self._covered, self._before = piece + 1, covered, u
+        at = float(self._planned.model.control.breakpoints[piece])
+        taken = (False, np.nan, np.nan) if answer is None else (answer.plan is not None, answer.cost, answer.lower)
+        self._steps.append(Step(at, clock.perf_counter() - began, taken[0], covered, *taken[1:]))
+        return u.copy()
+
+    def _take(self, plan: Plan) -> None:
+        self._plan = plan
+        feedback = plan.model.feedback
+        self._measuring = None if feedback is None else Measuring.of(plan.model, plan.decision)
+        self._nominal = plan.model.pieces(plan.decision)
+
+    def _timed(self, time: object) -> int:
+        """The piece that begins at a time, which must be the next one."""
+        points = self._planned.model.control.breakpoints
+        if self._next >= points.size - 1:
+            got = f"a step at {time!r}"
+            raise InputError(path="time", expected=f"reset() first, since the horizon {points[-1]:g} is over", got=got)
+        expected = float(points[self._next])
+        number = isinstance(time, int | float | np.number) and not isinstance(time, bool)
+        if not number or not abs(float(time) - expected) <= SAME_BREAKPOINT * points[-1]:  # type: ignore[arg-type]
+            said = "0, since it begins there" if not self._next else f"{expected!r}, the next breakpoint"
+            raise InputError(path="time", expected=said, got=f"{time!r}")
+        return self._next
+
+    def _measured(self, state: object) -> Array:
+        count = self._planned.model.problem.system.states
+        try:
+            measured = np.array(state, dtype=float)
+        except (TypeError, ValueError):
+            measured = np.zeros(0)
+        if measured.shape != (count,) or not np.isfinite(measured).all():
+            raise InputError(path="state", expected=f"{count} finite numbers, one per state", got=f"{state!r}")
+        return measured
+
+    def _within(self, state: Array) -> bool:
+        """Whether a state is among those that the last one may lead to, or may begin with; coordinate by coordinate."""
+        if self._next == 0:
+            problem = self._planned.model.problem
+            centre, axes = np.asarray(problem.initial_state, dtype=float), np.eye(state.size)
+            deviation, size = state - centre, np.abs(state) + np.abs(centre)
+            if problem.initial_set is None:
+                return bool((np.abs(deviation) <= SEEN * np.maximum(size, size.max())).all())
+            room = SEEN * float(problem.initial_set.reach(axes).max() + size.max())
+            return float(problem.initial_set.violation(deviation)) <= room
+        if self._reach is None:
+            return True
+        lower, upper = self._reach
+        room = SEEN * max(float(np.abs(lower).max()), float(np.abs(upper).max()), np.finfo(float).tiny)
+        return bool((state >= lower - room).all() and (state <= upper + room).all())
+
+    def _innovations(self, state: Array) -> list[Array]:
+        """What the applied plan knows of the disturbance when this state is measured, one vector for each breakpoint
+        since it began."""
+        if self._measuring is None or self._next == self._plan.first:
+            return [np.zeros(state.size)]
+        return self._measuring.seen(state)
+
+    def _control(self, piece: int, state: Array) -> Array:
+        nominal = self._nominal[:, piece]
+        if self._measuring is None:
+            return nominal.copy()
+        grid, control = self._plan.model.response.grid, nominal
+        for number in np.flatnonzero(grid.control_piece == piece).tolist():
+            inputs = self._measuring(number, state[:, None])
+            control = inputs[: nominal.size, 0]
+        return self._plan.drawn_in(control, nominal)

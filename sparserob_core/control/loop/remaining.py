@@ -1,0 +1,102 @@
+"""What is left of a problem from one breakpoint of the control on: the same constraints, a shorter horizon."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
+from sparserob_core.control.response.response import SAME_TIME
+from sparserob_core.control.transcription.record import Transcription
+from sparserob_core.control.transcription.transcribe import path_names, prepare
+from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import Array
+
+
+def refuse_remaining(model: Transcription) -> None:
+    """Raise `InputError` for a problem whose remaining horizon is no problem of the same kind, in one sentence."""
+    problem = model.problem
+    disturbed = problem.disturbance is not None
+    reasons = {
+        "a control in indicators of its pieces (piecewise_constant)": not model.control.is_indicators,
+        "a disturbance that takes any value on each of its pieces, since what is left of another depends on what has"
+        " been": disturbed
+        and (
+            problem.disturbance_class == "l1_ball"
+            or (problem.disturbance_class == "piecewise_constant" and not model.disturbance.is_complete)
+        ),
+        "a control that acts at once, without a delay": problem.system.delay > 0.0,
+    }
+    for wanted, hindered in reasons.items():
+        if hindered:
+            raise InputError(f"solving the remaining horizon needs {wanted}", path="resolve")
+
+
+def remaining(model: Transcription, piece: int, state: Array, before: Array | None) -> Transcription:
+    """The problem that is left where piece ``piece`` of the control begins in ``state (d,)``, after the control
+    ``before (m,)``, transcribed as the ``model`` was; its times begin at 0.
+
+    The parameters may be any of their set, and every piece of the disturbance that is left may be any of its own, also
+    what is left of one that has begun: no less than what can happen.
+    """
+    problem, begin = model.problem, float(model.control.breakpoints[piece])
+    control = _rest(model.control, begin, problem.horizon)
+    disturbance = _rest(model.disturbance.merged(), begin, problem.horizon)
+    horizon = control.horizon
+    left = replace(
+        problem,
+        system=_system(problem, begin, horizon),
+        horizon=horizon,
+        initial_state=state,
+        initial_set=None,
+        initial_control=before if problem.control_step is not None else None,
+        path=_windows(problem, begin, horizon),
+    )
+    policy = None if model.feedback is None else model.feedback.policy
+    return prepare(left, control, disturbance, policy=policy)
+
+
+def _rest(dictionary: Dictionary, begin: float, horizon: float) -> Dictionary:
+    """One indicator for each piece that is left."""
+    slack = SAME_TIME * horizon
+    later = dictionary.breakpoints[dictionary.breakpoints > begin + slack] - begin
+    later[-1] = horizon - begin
+    return Dictionary(np.concatenate([[0.0], later]), np.eye(later.size))
+
+
+def _windows(problem: OptimalControlProblem, begin: float, horizon: float) -> list[PathConstraint | MixedConstraint]:
+    """The windows that are not over, with the names that they had."""
+    found: list[PathConstraint | MixedConstraint] = []
+    for entry, name in zip(problem.path, path_names(problem), strict=True):
+        assert isinstance(entry, PathConstraint | MixedConstraint)
+        stop = problem.horizon if entry.stop is None else entry.stop
+        if stop <= begin + SAME_TIME * problem.horizon:
+            continue
+        start, stop = min(max(0.0, entry.start - begin), horizon), min(stop - begin, horizon)
+        if isinstance(entry, MixedConstraint):
+            found.append(replace(entry, name=name, start=start, stop=stop))
+        else:
+            moved = None if entry.relative_to is None else _moved(np.asarray(entry.relative_to, dtype=float), begin)
+            found.append(replace(entry, name=name, relative_to=moved, start=start, stop=stop))
+    return found
+
+
+def _moved(rows: Array, begin: float) -> Array:
+    """Rows of a time and a point ``(q, 1 + d)``, from ``begin`` on."""
+    shifted = rows - np.eye(1, rows.shape[1])[0] * begin
+    later: Array = shifted[shifted[:, 0] > 0.0]
+    if shifted[0, 0] > 0.0:
+        return later
+    now = [np.interp(0.0, shifted[:, 0], column) for column in shifted[:, 1:].T]
+    return np.vstack([[0.0, *now], later])
+
+
+def _system(problem: OptimalControlProblem, begin: float, horizon: float) -> LinearSystem | SwitchedSystem:
+    system = problem.system
+    if not isinstance(system, SwitchedSystem):
+        return system
+    left = [(until - begin, one) for until, one in system.pieces if until > begin + SAME_TIME * problem.horizon]
+    return SwitchedSystem([*left[:-1], (horizon, left[-1][1])]) if len(left) > 1 else left[-1][1]

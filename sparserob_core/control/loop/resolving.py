@@ -1,0 +1,280 @@
+"""Plans that a controller applies, and the next one: what is left of the horizon, solved anew from a measured state."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import final
+
+import numpy as np
+
+from sparserob_core.control.feedback.innovations import KNOWN
+from sparserob_core.control.loop.remaining import refuse_remaining, remaining
+from sparserob_core.control.loop.tracking import Tracking, trackable
+from sparserob_core.control.problem.units import Units
+from sparserob_core.control.transcription.record import Transcription
+from sparserob_core.control.transcription.transcribe import from_state, in_own_units
+from sparserob_core.errors import SparseRobError
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.events import ignore
+from sparserob_core.sip.evidence import Cut
+from sparserob_core.sip.method import Deadline, OutOfTime, Tools
+from sparserob_core.sip.methods.exchange import Exchange, Violated
+from sparserob_core.sip.methods.own_units import solve_in_own_units
+from sparserob_core.sip.program import SemiInfiniteProgram
+from sparserob_core.sip.proof.branch_and_bound import prove
+from sparserob_core.sip.result import SMALL_COST, Result
+
+PROVEN = ("certified", "verified")
+BETTER = 1e-6  # of the cost of what is left: less than that is no better
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A proven decision ``(n,)`` of a transcribed problem, whose time 0 is the beginning of piece ``first`` of the
+    control that it is a plan for; ``cuts`` are the constraints that mattered."""
+
+    model: Transcription
+    decision: Array
+    first: int = 0
+    cuts: Sequence[Cut] = ()
+
+    def reach(self, piece: int, state: Array, control: Array) -> tuple[Array, Array] | None:
+        """The least and the largest of every state ``(d,)`` to which a piece that begins in ``state (d,)`` may lead
+        under a ``control (m,)``; ``None`` where that is not told from one piece alone."""
+        problem, response = self.model.problem, self.model.response
+        if problem.system.parameters is not None or problem.system.delay > 0.0 or problem.system.switches:
+            return None
+        if problem.disturbance is not None and problem.disturbance_class != "piecewise_constant":
+            return None
+        steps, grid = response.steps(KNOWN), response.grid
+        driven, pushes, middle = steps.B[0] @ np.append(control, np.ones(grid.constants)), list[Array](), state
+        for number in np.flatnonzero(grid.control_piece == piece).tolist():
+            Phi, Gamma = (part[0, int(response.which[number])] for part in (steps.Phi, steps.Gamma))
+            middle = Phi @ middle + Gamma @ driven
+            pushes = [Phi @ push for push in pushes] + [Gamma @ steps.E[0]]
+        lower, upper = middle, middle
+        if problem.disturbance is not None:
+            for push in pushes:
+                upper, lower = upper + problem.disturbance.support(push), lower - problem.disturbance.support(-push)
+        return lower, upper
+
+    def drawn_in(self, control: Array, nominal: Array) -> Array:
+        """A control ``(m,)`` within the set of controls: as it is, but for rounding, where the proof covers what was
+        measured."""
+        bound = self.model.problem.control
+        flat = bound.halfspaces()
+        if bound.is_box:
+            box = bound.bounding_box()
+            return np.clip(control, box.lower, box.upper)
+        if flat is None or float(bound.violation(control)) <= 0.0:
+            return control
+        H, h = flat
+        rise, room = H @ (control - nominal), np.maximum(h - H @ nominal, 0.0)
+        share = np.divide(room, rise, out=np.ones_like(room), where=rise > 0.0).min(initial=1.0)
+        return np.asarray(nominal + min(1.0, float(share)) * (control - nominal))
+
+    def left(self, piece: int, innovations: Sequence[Array]) -> Array:
+        """The nominal control ``(m, K')`` that is left from piece ``piece`` of this plan on, when nothing more happens
+        than what was seen: one innovation ``(d,)`` for each breakpoint so far."""
+        nominal = self.model.pieces(self.decision)[:, piece:]
+        feedback = self.model.feedback
+        if feedback is None:
+            return nominal
+        gains = feedback.loop.gains(self.decision)[piece:, : len(innovations)]
+        return np.asarray(nominal + np.einsum("kjmd,jd->mk", gains, np.array(innovations)))
+
+    def cost_left(self, piece: int, innovations: Sequence[Array]) -> float:
+        """The cost of that under feedback: of the nominal control, or of its peaks over what may still happen."""
+        feedback, problem = self.model.feedback, self.model.problem
+        assert feedback is not None
+        nominal, spread = self.left(piece, innovations), feedback.loop.spread
+        size = np.abs(nominal)
+        if feedback.policy.cost == "peak":
+            effects = feedback.loop.effects(self.decision)[piece:].copy()
+            begin, grid = float(self.model.control.breakpoints[piece]), self.model.response.grid
+            acting = feedback.loop.entries[grid.breakpoints[1:] > begin]  # (L', mw, Q): which deviations act later
+            effects[:, :, np.abs(acting).sum(axis=(0, 1)) == 0.0] = 0.0
+            size = np.maximum(nominal.T + spread.support(effects), -nominal.T + spread.support(-effects)).T
+        weights = problem.cost.l1 * np.asarray(problem.weights)
+        return float(weights @ size @ self.model.control.lengths[piece:])
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """What a re-solve gave: a ``plan``, or none that is proven, its ``cost`` and the ``lower`` bound of it, and whether
+    it is ``cheaper`` than what the last plan has left."""
+
+    plan: Plan | None
+    cost: float = np.nan
+    lower: float = np.nan
+    cheaper: bool = False
+
+    def declined(self) -> Solved:
+        """The same without its plan."""
+        return Solved(None)
+
+
+@final
+class Resolving:
+    """Solves what is left of the horizon by the exchange method, at most for ``seconds`` a step (`None`: no limit).
+
+    A control that is fixed beforehand begins with the constraints that mattered at the last step, and keeps what does
+    not depend on the state for the next loop. Raises `InputError` for a problem of which nothing can be left.
+    """
+
+    def __init__(self, model: Transcription, tools: Tools, tolerance: float, seconds: float | None = None) -> None:
+        refuse_remaining(model)
+        self._model, self._tools, self._seconds = model, tools, seconds
+        self._method = Exchange(tolerance=tolerance)
+        self._kept: dict[int, tuple[Transcription, Transcription, Units]] = {}
+        self._tracking: dict[int, Tracking | None] = {}
+
+    def answer(
+        self, plan: Plan, piece: int, state: Array, before: Array | None, innovations: Sequence[Array]
+    ) -> Solved:
+        """The best of what is left from piece ``piece`` of the whole control on, compared with what ``plan`` has left
+        after what was seen; the state ``(d,)`` is measured, ``before (m,)`` is the last control. Nothing where no
+        answer is proven."""
+        deadline = Deadline(self._seconds)
+        tools = replace(self._tools, deadline=deadline, notify=ignore)
+        try:
+            found = (self._fixed if self._model.feedback is None else self._feedback)(
+                plan, piece, state, before, innovations, tools
+            )
+        except (
+            SparseRobError,
+            OutOfTime,
+        ):  # a state from which nothing is to be had; what the last plan has left is proven
+            found = Solved(None)
+        if deadline.pressed:
+            raise KeyboardInterrupt
+        return found
+
+    def _feedback(
+        self,
+        plan: Plan,
+        piece: int,
+        state: Array,
+        before: Array | None,
+        innovations: Sequence[Array],
+        tools: Tools,
+    ) -> Solved:
+        model = remaining(self._model, piece, state, before)
+        result = solve_in_own_units(self._method, model.program, tools)
+        known = plan.cost_left(piece - plan.first, innovations)
+        return self._judged(model, result, piece, result.decision, result.cost, result.lower_bound, known)
+
+    def _fixed(
+        self,
+        plan: Plan,
+        piece: int,
+        state: Array,
+        before: Array | None,
+        innovations: Sequence[Array],
+        tools: Tools,
+    ) -> Solved:
+        quick = self._tracked(plan, piece, state, innovations)
+        if quick is not None:
+            return quick
+        tools.deadline.check()
+        model, own, units = self._own(piece, state, before)
+        program = own.program
+        gap = float(self._model.control.breakpoints[piece] - self._model.control.breakpoints[plan.first])
+        result = self._method.close(
+            program,
+            tools,
+            lambda x: prove(program, x, deadline=tools.deadline),
+            shifted(plan.cuts, gap, program),
+        )
+        theirs = np.repeat(units.controls, own.control.functions)
+        decision = None if result.decision is None else result.decision * theirs
+        tail = plan.left(piece - plan.first, innovations).ravel() / theirs
+        known = units.cost * float(program.cost(tail))
+        cuts = tuple(replace(cut, index=cut.index * index_units(program, cut)) for cut in result.indices)
+        result = replace(result, indices=cuts)
+        return self._judged(
+            model, result, piece, decision, units.cost * result.cost, units.cost * result.lower_bound, known
+        )
+
+    def _tracked(self, plan: Plan, piece: int, state: Array, innovations: Sequence[Array]) -> Solved | None:
+        """The answer of `Tracking` where it knows such problems and closes the gap."""
+        if self._model.problem.control_step is not None:
+            return None
+        if piece not in self._tracking:
+            own = self._prepared(piece, state)[1]
+            self._tracking[piece] = Tracking(own) if trackable(own) else None
+        tracking = self._tracking[piece]
+        if tracking is None:
+            return None
+        model, own, units = self._prepared(piece, state)
+        found = tracking.solve(state / units.states)
+        scale = SMALL_COST * own.program.cost_scale
+        if found is None or found.cost - found.lower > self._method.tolerance * max(abs(found.cost), scale):
+            return None
+        theirs = np.repeat(units.controls, own.control.functions)
+        known = float(own.program.cost(plan.left(piece - plan.first, innovations).ravel() / theirs))
+        decision, cost = found.decision * theirs, units.cost * found.cost
+        moved = from_state(model, state)
+        return Solved(
+            Plan(moved, decision, piece),
+            cost,
+            units.cost * found.lower,
+            found.cost < known - BETTER * max(abs(known), abs(found.cost)),
+        )
+
+    def _prepared(self, piece: int, state: Array) -> tuple[Transcription, Transcription, Units]:
+        """What is left, from the first state that was asked for, in the user's units and in its own."""
+        if piece not in self._kept:
+            model = remaining(self._model, piece, state, None)
+            self._kept[piece] = (model, *in_own_units(model))
+        return self._kept[piece]
+
+    def _own(self, piece: int, state: Array, before: Array | None) -> tuple[Transcription, Transcription, Units]:
+        """What is left, in the user's units and in its own."""
+        if self._model.problem.control_step is not None:
+            model = remaining(self._model, piece, state, before)
+            return (model, *in_own_units(model))
+        model, own, units = self._prepared(piece, state)
+        return from_state(model, state), from_state(own, state / units.states), units
+
+    def _judged(
+        self,
+        model: Transcription,
+        result: Result,
+        piece: int,
+        decision: Array | None,
+        cost: float,
+        lower: float,
+        known: float,
+    ) -> Solved:
+        if result.status not in PROVEN or decision is None:
+            return Solved(None)
+        cheaper = cost < known - BETTER * max(abs(known), abs(cost))
+        return Solved(Plan(model, decision, piece, result.indices), cost, lower, cheaper)
+
+
+def shifted(cuts: Sequence[Cut], gap: float, program: SemiInfiniteProgram) -> Violated:
+    """Cuts in the user's units as rows of a program in its own that begins ``gap`` later; those of the past, and of
+    constraints that are over, are left out."""
+    families = {family.name: family for family in program.families}
+    found = []
+    for cut in cuts:
+        family = families.get(cut.family)
+        if family is None or cut.formulation != family.formulation or cut.index.size != family.index_set.dimension:
+            continue
+        index = cut.index.copy()
+        index[0] -= gap
+        index = index / index_units(program, cut)
+        box = family.index_set
+        if box.lower[0] <= index[0] <= box.upper[0]:
+            found.append((index[None], np.array([cut.row]), cut.family))
+    return found
+
+
+def index_units(program: SemiInfiniteProgram, cut: Cut) -> Array:
+    """What one of each coordinate of a cut's index is in the user's units."""
+    units = program.family(cut.family).index_units
+    return np.ones(cut.index.size) if units is None else units

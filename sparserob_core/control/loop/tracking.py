@@ -1,0 +1,269 @@
+"""The open-loop program of a known system on equal pieces, solved and proven again for one initial state after another.
+
+Rows, the worst disturbance at a time, and how far it bends, do not depend on the initial state. They are kept by where
+in a piece a time is, so that what is left for a new state is a linear program from the last basis, and a proof in which
+only the nominal state is new.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from sparserob_core.control.constraints.flat import FlatConstraint
+from sparserob_core.control.feedback.innovations import KNOWN
+from sparserob_core.control.transcription.record import Transcription
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.program import TOLERANCE
+from sparserob_core.sip.relaxed.warm import WarmProgram
+
+PARTS, LEVELS = 32, 3  # a cell that is open is cut in so many parts, so many times
+TERMS = 8  # of the Taylor expansion that bounds a curvature
+ROUND_OFF = 2.0**-46  # of the numbers that are added up
+MARGIN = 2e-9  # by which rows are tightened, in their own units
+ROUNDS = 40  # of adding rows
+NUMBERS = 8_000_000  # in the map from controls to states, at most
+FEW = 400  # open cells that are looked at closer, at most
+KEPT, RECENT = 40, 200  # rows at most, before one begins anew with those that had one of so many multipliers
+SAME = 1e-9  # of a piece: an end of a window that is a breakpoint
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """A proven ``decision (n,)`` with the ``cost`` and the ``lower`` bound of it, in the units of the program."""
+
+    decision: Array
+    cost: float
+    lower: float
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Instants:
+    """What all pieces share at some times after they begin: ``flow``, ``driven (q, d, d)``, and what the disturbance
+    adds to the rows until then, ``pushed (q, K + 1, R)``."""
+
+    flow: Array
+    driven: Array
+    pushed: Array
+
+
+def trackable(own: Transcription) -> bool:
+    """Whether a transcription, in its own units, is one that `Tracking` knows."""
+    problem, grid, program, model = own.problem, own.response.grid, own.program, own.functionals.disturbance
+    K = own.control.pieces
+    plain = problem.system.parameters is None and not problem.system.switches and problem.system.delay == 0.0
+    plain = plain and problem.initial_set is None and problem.control_step is None and own.feedback is None
+    linear = program.S is None and program.P is None and program.A is None and problem.cost.is_linear
+    linear = linear and problem.control.is_box and own.control.is_indicators
+    pieces = own.response.uniform and grid.pieces == K
+    if model is not None:
+        pieces = pieces and model.kind == "piecewise_constant" and model.starts is not None and model.starts.size == K
+    if not (plain and linear and pieces) or K * K * problem.system.states * problem.system.controls > NUMBERS:
+        return False
+    flat = all(isinstance(one, FlatConstraint) and one.gains is None and one.reference is None
+               for one in own.constraints)  # fmt: skip
+    box, ends = problem.control.bounding_box(), [t for one in own.constraints for t in (one.start, one.stop)]
+    places = np.array(ends) * K / problem.horizon
+    on = bool((np.abs(places - np.rint(places)) <= SAME).all())
+    return flat and on and bool((box.lower <= 0.0).all() and (box.upper >= 0.0).all())
+
+
+@final
+class Tracking:
+    """`trackable` transcriptions from one initial state ``(d,)`` after another: `solve`."""
+
+    def __init__(self, own: Transcription) -> None:
+        problem, response, steps = own.problem, own.response, own.response.steps(KNOWN)
+        self.own, self.K, self.m = own, own.control.pieces, problem.system.controls
+        self.bound, self.horizon = problem.disturbance, problem.horizon
+        self.length = self.horizon / self.K
+        self.A, self.B, self.E = steps.A[0, 0], steps.B[0][:, : self.m], steps.E[0]
+        self.drift = steps.B[0][:, self.m :].sum(axis=1)
+        flats = [one for one in own.constraints if isinstance(one, FlatConstraint)]
+        d = problem.system.states
+        self.H = np.vstack([np.zeros((0, d)), *(one.H for one in flats)])
+        self.h = np.concatenate([np.zeros(0), *(one.h for one in flats)])
+        sizes = [one.h.size for one in flats]
+        self.start = np.repeat([round(one.start / self.length) for one in flats], sizes).astype(int)
+        self.stop = np.repeat([round(one.stop / self.length) for one in flats], sizes).astype(int)
+        self.kernel = np.ascontiguousarray(response.kernel.swapaxes(0, 1))  # (K, d, d): what a piece of an age gives
+        self.powers = response.flows(response.grid.breakpoints)[0]
+        driven, pushed = self.kernel @ self.B, np.cumsum(self.kernel @ self.drift, axis=0)
+        nodes = np.zeros((self.K + 1, d, self.m, self.K))
+        for k in range(1, self.K + 1):
+            nodes[k, :, :, :k] = driven[k - 1 :: -1].transpose(1, 2, 0)
+        self.nodes = nodes.reshape(self.K + 1, d, -1)
+        self.fixed = np.vstack([np.zeros((1, d)), pushed])
+        box = problem.control.bounding_box()
+        low, high = np.repeat(box.lower, self.K), np.repeat(box.upper, self.K)
+        self.sizes = np.abs(self.nodes) @ np.maximum(-low, high) + np.abs(self.fixed)
+        priced = np.asarray(problem.cost.l1 * np.asarray(problem.weights), dtype=float)
+        weights: Array = np.asarray(np.kron(priced, own.control.lengths), dtype=float)
+        self.limits: tuple[Array, Array, Array] = (weights, low, high)
+        factors = [1.0]
+        self.rates = [self.H @ self.A]
+        for order in range(1, TERMS):
+            factors.append(factors[-1] / order)
+            self.rates.append(self.rates[-1] @ self.A)
+        self.factors = np.array(factors)
+        self.last = np.linalg.norm(self.rates[-1] @ self.A, axis=1)
+        self.growth = float(np.linalg.norm(self.A, 2))
+        self._blocks: dict[tuple[int, int], _Instants] = {}
+        self._offsets: dict[int, tuple[Array, Array]] = {}
+        self._given = self.kernel @ self.E
+        self._first = self._pushed(np.eye(d)[None], np.zeros((1, d, d)))[0]
+        self._bent = self._bending()
+        self._flat = self.nodes.reshape(-1, self.nodes.shape[2])
+        self._absolute = ROUND_OFF * np.abs(self.H).T
+        number = np.arange(self.K + 1)[:, None]
+        self._seen = (number >= self.start) & (number <= self.stop)
+        self._inside = (number[:-1] >= self.start) & (number[:-1] < self.stop)
+        pushed = np.abs(self._first)
+        self._noise = self.sizes @ self._absolute + ROUND_OFF * (np.abs(self.h) + pushed.max(axis=0, initial=0.0))
+        self._recent: list[tuple[int, int, int, int]] = []  # rows that had a multiplier, those of the last states last
+        self._begin()
+
+    def _begin(self) -> None:
+        self._program = WarmProgram(*self.limits)
+        self._places: list[tuple[int, int, int, int]] = []  # row, piece, level and number of an instant
+        self._free, self._right = np.zeros((0, self.H.shape[1])), np.zeros(0)
+
+    def solve(self, state: Array) -> Tracked | None:
+        """The answer from an initial state; ``None`` where none was proven."""
+        if len(self._places) > KEPT:
+            needed = list(dict.fromkeys(self._recent))[-KEPT // 2 :]
+            self._begin()
+            if needed:
+                self._impose(needed)
+        for _ in range(ROUNDS):
+            h = self._right - self._free @ state
+            found = self._program.solve(h - MARGIN)
+            if found is None:
+                return None
+            x, y = found
+            open_ = self._open(x, state)
+            if open_ is None:
+                return None
+            if not open_:
+                self._recent = [*self._recent, *(self._places[i] for i in np.flatnonzero(y > 0.0))][-RECENT:]
+                weights = self.limits[0]
+                return Tracked(x, float(weights @ np.abs(x)), self._program.bound(h, y))
+            fresh = [place for place in open_ if place not in self._places]
+            if not fresh:
+                return None
+            self._impose(fresh)
+        return None
+
+    def _impose(self, places: list[tuple[int, int, int, int]]) -> None:
+        G, F, right = [], [], []
+        for row, piece, level, number in places:
+            c, here, pushed = self.H[row], np.zeros(self.H.shape[1]), self._first[piece, row]
+            if level:
+                parent = min(number // PARTS, PARTS ** (level - 1) - 1)
+                block, at = self._block(level, parent), number - parent * PARTS
+                c, here, pushed = c @ block.flow[at], c @ block.driven[at], block.pushed[at, piece, row]
+            g = (c @ self.nodes[piece]).reshape(self.m, self.K)
+            if level:
+                g[:, piece] += here @ self.B
+            G.append(g.ravel())
+            F.append(c @ self.powers[piece])
+            right.append(self.h[row] - c @ self.fixed[piece] - here @ self.drift - pushed)
+        self._program.add(np.array(G))
+        self._free = np.vstack([self._free, F])
+        self._right = np.concatenate([self._right, right])
+        self._places += places
+
+    def _open(self, x: Array, state: Array) -> list[tuple[int, int, int, int]] | None:
+        """The worst instant of every row in every run of cells in which it is not proven to hold; none where all are
+        proven, ``None`` where that is not told."""
+        nodes = (self._flat @ x).reshape(self.fixed.shape) + self.powers @ state + self.fixed
+        noise = self._noise + np.abs(self.powers) @ np.abs(state) @ self._absolute
+        drives = x.reshape(self.m, self.K).T @ self.B.T + self.drift
+        heights = nodes @ self.H.T + self._first - self.h
+        wrong = (heights + noise > TOLERANCE) & self._seen
+        if wrong.any():
+            return self._peaks(np.where(wrong, heights, -np.inf), 0, np.zeros(self.K + 1, int), np.arange(self.K + 1))
+        rates = nodes[:-1] @ self.A.T + drives
+        bent = (self._curvature(rates, self.length) + self._bent) * (self.length**2 / 8.0)
+        noise = np.maximum(noise[:-1], noise[1:])
+        open_ = (np.maximum(heights[:-1], heights[1:]) + bent + noise > TOLERANCE) & self._inside
+        cells = [(int(k), 0) for k in np.flatnonzero(open_.any(axis=1))]
+        for level in range(1, LEVELS + 1):
+            if not cells or len(cells) > FEW:
+                break
+            found, left = list[tuple[int, int, int, int]](), list[tuple[int, int]]()
+            width = self.length / PARTS**level
+            for k, parent in cells:
+                at = self._block(level, parent)
+                states = at.flow @ nodes[k] + at.driven @ drives[k]  # (PARTS + 1, d)
+                heights = states @ self.H.T + at.pushed[:, k] - self.h
+                wrong = (heights + noise[k] > TOLERANCE) & self._inside[k]
+                first = parent * PARTS
+                if wrong.any():
+                    numbers = np.arange(first, first + PARTS + 1)
+                    worst = np.where(wrong, heights, -np.inf)
+                    found += self._peaks(worst, level, numbers, np.full(numbers.size, k))
+                elif not found:
+                    curved = self._curvature(states[:-1] @ self.A.T + drives[k], width) + self._bent[k]
+                    above = np.maximum(heights[:-1], heights[1:]) + curved * (width**2 / 8.0) + noise[k]
+                    still = ((above > TOLERANCE) & self._inside[k]).any(axis=1)
+                    left += [(k, first + int(one)) for one in np.flatnonzero(still)]
+            if found:
+                return found
+            cells = left
+        return None if cells else []
+
+    def _peaks(self, worst: Array, level: int, at: np.ndarray, pieces: np.ndarray) -> list[tuple[int, int, int, int]]:
+        """Local maxima of violations ``(k, R)`` at instants that follow one another."""
+        padded = np.vstack([np.full(worst.shape[1], -np.inf), worst, np.full(worst.shape[1], -np.inf)])
+        top = (worst > padded[:-2]) & (worst >= padded[2:]) & np.isfinite(worst)
+        return [(int(row), int(pieces[k]), level, int(at[k])) for k, row in np.argwhere(top)]
+
+    def _curvature(self, rates: Array, width: float) -> Array:
+        """Bounds ``(..., R)`` of the second derivative over a cell in whose beginning the states have ``rates (...,
+        d)``."""
+        total, power = np.zeros((*rates.shape[:-1], self.h.size)), 1.0
+        for factor, row in zip(self.factors.tolist(), self.rates, strict=True):
+            total += (factor * power) * np.abs(rates @ row.T)
+            power *= width
+        tail = self.factors[-1] / TERMS * power * np.exp(self.growth * width)
+        return np.asarray(total + tail * np.linalg.norm(rates, axis=-1, keepdims=True) * self.last)
+
+    def _block(self, level: int, parent: int) -> _Instants:
+        """The ``PARTS + 1`` ends of the parts of one cell of the level before."""
+        key = (level, parent)
+        if key not in self._blocks:
+            if level not in self._offsets:
+                self._offsets[level] = self.own.response.flows(np.arange(PARTS + 1) * self.length / PARTS**level)
+            flow, driven = self._offsets[level]
+            if level > 1:
+                before, at = self._block(level - 1, parent // PARTS), parent % PARTS
+                flow, driven = flow @ before.flow[at], flow @ before.driven[at] + driven
+            self._blocks[key] = _Instants(flow, driven, self._pushed(flow, driven))
+        return self._blocks[key]
+
+    def _pushed(self, flow: Array, driven: Array) -> Array:
+        """What the worst disturbance adds to every row on every piece, ``(q, K + 1, R)``."""
+        pushed = np.zeros((flow.shape[0], self.K + 1, self.h.size))
+        if self.bound is not None:
+            q, (K, d, w) = flow.shape[0], self._given.shape
+            past = (self.H @ flow).reshape(-1, d) @ self._given.transpose(1, 0, 2).reshape(d, -1)
+            past = past.reshape(q, self.h.size, K, w).swapaxes(1, 2)
+            pushed[:, 1:] = np.cumsum(self.bound.support(past), axis=1)
+            pushed[:, : self.K] += self.bound.support(self.H @ driven @ self.E)[:, None]
+        return pushed
+
+    def _bending(self) -> Array:
+        """Bounds ``(K, R)`` of the second derivative of what any disturbance adds, over every piece: the sum of those
+        of its entries, each as large as it may be."""
+        if self.bound is None:
+            return np.zeros((self.K, self.h.size))
+        reach = self.bound.reach(np.eye(self.E.shape[1]))
+        rates = (self.A @ self._given).swapaxes(1, 2)  # (K, mw, d)
+        every = np.einsum("kir,i->kr", self._curvature(rates, self.length), reach)
+        past = np.vstack([np.zeros((1, self.h.size)), np.cumsum(every, axis=0)[:-1]])
+        return np.asarray(past + reach @ self._curvature(self.E.T, self.length))

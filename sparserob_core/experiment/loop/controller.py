@@ -1,0 +1,96 @@
+"""The controller of a config, of a finished run, or of an outcome."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sparserob_core.control.loop.controller import Controller
+from sparserob_core.control.loop.resolving import PROVEN, Plan, Resolving
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.assemble import ControlExperiment, Experiment, assemble, build, counting, tools_of
+from sparserob_core.experiment.config.load import load_config
+from sparserob_core.experiment.directory.finished import read_finished
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.evidence import Cut
+from sparserob_core.sip.method import GAP_TOLERANCE, Deadline, as_seconds, require_suited
+from sparserob_core.sip.methods.own_units import solve_in_own_units
+
+if TYPE_CHECKING:
+    from sparserob_core.experiment.run.run import Outcome
+
+
+def controller(
+    config: str | Path | Mapping[str, Any] | Outcome,
+    resolve: bool = False,
+    *,
+    seconds: float | None = None,
+    plugins: Iterable[str | Path] = (),
+) -> Controller:
+    """The `Controller` that applies the proven control of a config (a file or a mapping, which is solved first, without
+    files), of a run's directory, or of what ``sr.run`` returned.
+
+    ``resolve``: what is left of the horizon is solved anew at every step, for about ``seconds`` a step at most (no
+    limit unless given), and the last proven plan goes on where that does not give a better one. ``plugins``: files that
+    offer what a run was made with. Raises `InputError` where there is no proven control, or where nothing can be solved
+    anew: with a delay, or a dictionary whose functions are no indicators.
+    """
+    if not isinstance(resolve, bool | np.bool_):
+        raise InputError(path="resolve", expected="true or false", got=f"{resolve!r}")
+    limit = as_seconds(seconds)
+    if limit is not None and not resolve:
+        raise InputError("seconds: is the time of a re-solve; expected resolve=True beside it")
+    plan, experiment = _planned(config, plugins)
+    return Controller(plan, resolving(experiment, limit) if resolve else None)
+
+
+def resolving(experiment: ControlExperiment, seconds: float | None) -> Resolving:
+    """What solves the remaining horizons of an experiment, with its solver and tolerance."""
+    counts, letters = counting(experiment.loaded)
+    if counts or letters is not None:
+        raise InputError(
+            "resolve: a re-solve minimises the cost of the problem; expected a method that does too, got"
+            f" {experiment.loaded.config.method.name}"
+        )
+    tolerance = experiment.gap_tolerance or GAP_TOLERANCE
+    return Resolving(experiment.transcription, tools_of(experiment.loaded), tolerance, seconds)
+
+
+def _planned(config: object, plugins: Iterable[str | Path]) -> tuple[Plan, ControlExperiment]:
+    experiment = getattr(config, "experiment", None)
+    if isinstance(experiment, Experiment):
+        result = config.result  # type: ignore[attr-defined]
+        return _plan(experiment, result.status, result.message, result.decision, result.indices)
+    if isinstance(config, str | Path) and Path(config).is_dir():
+        finished = read_finished(Path(config), plugins)
+        status, message = str(finished.summary["status"]), str(finished.summary["message"])
+        return _plan(finished.experiment, status, message, finished.decision)
+    if not isinstance(config, str | Path | Mapping):
+        raise InputError(
+            f"config: expected a config, the directory of a run or what sr.run returned, got {type(config).__name__}"
+        )
+    loaded = load_config(config)
+    deadline = Deadline(loaded.config.limits.seconds)
+    experiment = assemble(loaded, deadline)
+    if not isinstance(experiment, ControlExperiment):
+        return _plan(experiment, "", "", None)
+    method = build(loaded, "method", loaded.config.method)
+    try:
+        require_suited(method, experiment.program, loaded.config.method.name)
+    except InputError as error:
+        raise loaded.located((), error) from error
+    result = solve_in_own_units(method, experiment.program, tools_of(loaded))
+    return _plan(experiment, result.status, result.message, result.decision, result.indices)
+
+
+def _plan(
+    experiment: Experiment, status: str, message: str, decision: Array | None, cuts: Iterable[Cut] = ()
+) -> tuple[Plan, ControlExperiment]:
+    if not isinstance(experiment, ControlExperiment):
+        raise InputError("expected a control problem, got another semi-infinite program: there is nothing to control")
+    if status not in PROVEN or decision is None:
+        raise InputError(f"there is no proven control to apply; the status is '{status}': {message}")
+    return Plan(experiment.transcription, np.asarray(decision, dtype=float).ravel(), 0, tuple(cuts)), experiment

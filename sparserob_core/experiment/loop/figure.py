@@ -1,0 +1,74 @@
+"""The figure of a study in closed loop: states inside the tube of the plan, and the control that was applied."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sparserob_core.experiment.figures import style as look
+from sparserob_core.experiment.figures.adversary_figure import caption, draw_tube, finish_panel
+from sparserob_core.experiment.figures.drawing import active_times, figure_data
+from sparserob_core.experiment.figures.figure_data import FigureData
+from sparserob_core.experiment.figures.style import panels, style, write_figure
+from sparserob_core.experiment.simulation.simulation import ADVERSARY
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from sparserob_core.experiment.directory.finished import FinishedRun
+    from sparserob_core.experiment.loop.study import ClosedLoops
+
+PLAN = (0, (3, 1))
+COLOURS = {
+    ADVERSARY: look.INK,
+    "iid": look.BLUE,
+    "vertices": look.GREEN,
+    "slow": look.PURPLE,
+    "neighbours": look.ORANGE,
+}
+
+
+def write_loops(file: Path, loops: ClosedLoops, finished: FinishedRun) -> None:
+    """Draw loops over the tube of their plan into a file (.png, .pdf, .svg); raises `InputError` when it cannot be
+    written."""
+    data = figure_data(finished.experiment, finished.decision, active_times(finished.solution), (), None)
+    with style():
+        write_figure(file, draw_loops(loops, data))
+
+
+def draw_loops(loops: ClosedLoops, data: FigureData) -> Figure:
+    """Every state of the first loops of every law, below the controls that were applied, and the plan's."""
+    states, channels = len(data.state), len(data.control)
+    figure, axes = panels(states + channels, 1.7, extra=0.35)
+    for component, ax in enumerate(axes[:states]):
+        draw_tube(ax, data, component)
+        named = set[str]()
+        for law, path in loops.paths:
+            label = None if law in named else f"{law}"
+            named.add(law)
+            ax.plot(loops.shown, path[component], color=COLOURS[law], linewidth=0.7, alpha=0.7, zorder=3, label=label)
+        finish_panel(ax, data, component, tuple(path[component] for _, path in loops.paths))
+    for channel, ax in enumerate(axes[states:]):
+        ax.axhline(0.0, color=look.GREY, linewidth=0.6, zorder=1)
+        for law, control in loops.controls:
+            ax.stairs(control[channel], data.breakpoints, baseline=None, color=COLOURS[law], linewidth=0.7, alpha=0.7)
+        ax.stairs(
+            data.control[channel],
+            data.breakpoints,
+            baseline=None,
+            color=look.INK,
+            linewidth=1.4,
+            linestyle=PLAN,
+            label="the plan",
+        )
+        for bound in (data.control_lower[channel], data.control_upper[channel]):
+            if np.isfinite(bound):
+                ax.axhline(bound, color=look.GREY, linewidth=0.6, linestyle=(0, (4, 2)))
+        ax.set_ylabel(data.control_label(channel))
+        ax.margins(y=0.12)
+    time = loops.summary()["milliseconds"]
+    how = "solved anew at every step" if loops.resolve else "the plan applied"
+    caption(figure, axes, data, f"closed loop, {how}: {loops.steps} steps of {time['median']:.3g} ms (median)")
+    return figure

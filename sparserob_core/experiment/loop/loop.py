@@ -1,0 +1,215 @@
+"""Close the loop around the exact system: a controller, disturbances of every law, and what they make of each other."""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from sparserob_core.arguments import whole
+from sparserob_core.control.constraints.state import StateConstraint
+from sparserob_core.control.loop.controller import Controller
+from sparserob_core.control.response.response import Response
+from sparserob_core.control.studies.laws import LawName, Uncertainty
+from sparserob_core.control.studies.simulate import fine_times, finer, walk
+from sparserob_core.control.transcription.own_units import row_units
+from sparserob_core.control.transcription.record import Transcription
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.directory.adversary import adversaries
+from sparserob_core.experiment.directory.artefacts import RunDirectory
+from sparserob_core.experiment.directory.finished import FinishedRun, read_finished
+from sparserob_core.experiment.loop.controller import controller
+from sparserob_core.experiment.loop.study import ClosedLoops
+from sparserob_core.experiment.run.events import StudyProgress
+from sparserob_core.experiment.simulation.simulation import ADVERSARY, LAWS
+from sparserob_core.experiment.simulation.violations import ViolationCount
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.events import Notify, ignore
+from sparserob_core.sip.program import TOLERANCE
+
+if TYPE_CHECKING:
+    from sparserob_core.experiment.run.run import Outcome
+
+LOOPS, RESOLVED_LOOPS = 10, 1  # of every law, unless told
+SHOWN, DRAWN = 400, 6  # times, and loops of every law, that are drawn
+CONTROL = "control"
+ROUNDING = 1e-12  # of the size of the set of controls
+
+Drawn = tuple[str, Array | None, Array, Array | None]  # law, disturbance (1, mw, M), parameter (1, nu), state (1, d)
+
+
+def loop(
+    run: str | Path | Outcome,
+    resolve: bool = False,
+    trajectories: int | None = None,
+    seed: int = 0,
+    *,
+    seconds: float | None = None,
+    out: str | Path | None = None,
+    plugins: Iterable[str | Path] = (),
+    notify: Notify = ignore,
+) -> ClosedLoops:
+    """Run the controller of a finished run in closed loop: what ``sparserob loop RUN`` does.
+
+    Every constraint's worst case is replayed once, and every law of `simulate` drives ``trajectories`` loops (10, or 1
+    where the remaining horizon is solved anew at every step: ``resolve``, ``seconds`` as for `controller`). The state
+    moves exactly, and is looked at inside the pieces too. The result is written to ``loop.json`` in the run's
+    directory, and drawn into the file ``out`` when given. Raises `InputError` for a directory that is no finished run
+    with a proven control, or another argument at fault, before anything is written.
+    """
+    from sparserob_core.experiment.figures.style import missing_matplotlib, require_writable
+    from sparserob_core.experiment.loop.figure import write_loops
+
+    count = (RESOLVED_LOOPS if resolve else LOOPS) if trajectories is None else whole("trajectories", trajectories, 1)
+    whole("seed", seed, 0)
+    if out is not None:
+        require_writable(Path(out))
+    directory = getattr(run, "directory", run)
+    if not isinstance(directory, str | Path):
+        raise InputError(f"run: expected the directory of a run or what sr.run returned, got {type(run).__name__}")
+    began = clock.perf_counter()
+    finished = read_finished(Path(directory), plugins, getattr(run, "experiment", None))
+    acting = controller(directory if directory is run else cast(Any, run), resolve, seconds=seconds, plugins=plugins)
+    found = replace(_closed(finished, acting, resolve, count, seed, notify), seconds=clock.perf_counter() - began)
+    RunDirectory(finished.directory).write_json("loop.json", found.summary())
+    if out is not None and (missing := missing_matplotlib()):
+        return replace(found, undrawn=missing)
+    if out is not None:
+        write_loops(Path(out), found, finished)
+    return found
+
+
+def _closed(
+    finished: FinishedRun, acting: Controller, resolve: bool, count: int, seed: int, notify: Notify
+) -> ClosedLoops:
+    model = finished.experiment.transcription
+    worst = adversaries(finished.experiment, finished.decision)
+    breaks = worst.get("breakpoints", model.response.grid.breakpoints)
+    grid = model.response.grid.refined(breaks)
+    ends = [moment for one in model.constraints for moment in (one.start, one.stop)]
+    times = fine_times(
+        Response(model.response.system, grid, model.response.initial_state),
+        model.parameters,
+        np.concatenate([ends, worst.get("times", np.zeros(0))]),
+    )
+    shown = np.unique(np.linspace(0, times.size - 1, min(times.size, SHOWN)).round().astype(int))
+    drawn = [*_replayed(model, worst), *_sampled(model, worst, count, np.random.default_rng(seed))]
+    spent, paid, kept, laws = list[float](), list[float](), list[tuple[str, Array, Array]](), dict[str, int]()
+    found = {one.name: -np.inf for one in model.constraints}
+    limits = {one.name: TOLERANCE * float(row_units(one, model.problem.control).min()) for one in model.constraints}
+    resolved, uncovered, outside = 0, 0, -np.inf
+    for number, (law, disturbance, parameter, begun) in enumerate(drawn):
+        on = grid if law == ADVERSARY else model.response.grid
+        fine = Response(model.response.system, finer(on, times), model.response.initial_state)
+        closing = _Closing(model, acting, on.control_piece if law == ADVERSARY else np.arange(on.pieces))
+        states = np.stack(list(walk(fine, closing, parameter, disturbance, begun)))
+        laws[law] = laws.get(law, 0) + 1
+        for name, largest in _violations(model, finished, states, times, closing.applied).items():
+            found[name] = max(found[name], largest)
+        outside = max(outside, float(model.problem.control.violation(closing.applied.T).max()))
+        spent += [1e3 * one.seconds for one in acting.steps]
+        resolved += sum(one.resolved for one in acting.steps)
+        uncovered += sum(not one.covered for one in acting.steps)
+        paid.append(_paid(model, closing.applied))
+        if laws[law] <= DRAWN:
+            kept.append((law, states[shown, :, 0].T, closing.applied))
+        notify(StudyProgress(text=f"{number + 1} of {len(drawn)} loops", done=number + 1, total=len(drawn)))
+    size = float(model.problem.control.reach(np.eye(model.problem.system.controls)).max())
+    return ClosedLoops(
+        title=finished.experiment.title,
+        directory=finished.directory,
+        status=str(finished.summary["status"]),
+        resolve=resolve,
+        seed=seed,
+        laws=laws,
+        constraints={**{name: (found[name], limits[name]) for name in found}, CONTROL: (outside, TOLERANCE * size)},
+        milliseconds=np.array(spent),
+        resolved=resolved,
+        uncovered=uncovered,
+        cost=float(finished.summary["cost"]),
+        planned=_paid(model, model.pieces(finished.decision)),
+        costs=np.array(paid),
+        seconds=0.0,
+        shown=times[shown],
+        paths=[(law, path) for law, path, _ in kept],
+        controls=[(law, control) for law, _, control in kept],
+    )
+
+
+class _Closing:
+    """What drives a system: a controller, asked at the breakpoints of the control in the order in which they come.
+    ``which``: the pieces of the model's grid that are walked through."""
+
+    def __init__(self, model: Transcription, acting: Controller, which: np.ndarray) -> None:
+        self.model, self.acting, self.which = model, acting, which
+        self.applied = np.zeros((model.problem.system.controls, model.control.pieces))
+        self._asked = 0
+        acting.reset()
+
+    def __call__(self, number: int, state: Array) -> Array:
+        """The inputs ``(m + constants, 1)`` on a piece that begins in ``state (d, 1)``."""
+        piece, points = int(self.which[number]), self.model.control.breakpoints
+        grid = self.model.response.grid
+        middle = (grid.breakpoints[piece] + grid.breakpoints[piece + 1]) / 2
+        if self._asked < points.size - 1 and middle > points[self._asked]:
+            self.applied[:, self._asked] = self.acting.step(float(points[self._asked]), state[:, 0])
+            self._asked += 1
+        return np.asarray(grid.inputs(self.applied)[:, piece, None])
+
+
+def _replayed(model: Transcription, worst: Mapping[str, Array]) -> Iterator[Drawn]:
+    """The worst case of every constraint, under the plan."""
+    for row in range(worst["names"].size if worst else 0):
+        disturbance = worst["disturbances"][row : row + 1] if worst["disturbances"].shape[1] else None
+        yield ADVERSARY, disturbance, worst["parameters"][row : row + 1], worst["initial_states"][row : row + 1]
+
+
+def _sampled(model: Transcription, worst: Mapping[str, Array], count: int, rng: np.random.Generator) -> Iterator[Drawn]:
+    """``count`` loops of every law; one loop where nothing is uncertain."""
+    functionals, parameters = model.functionals, model.parameters
+    if not functionals.disturbed and parameters.set is None:
+        yield "iid", None, np.zeros((1, 0)), None
+        return
+    known = tuple(worst[name] for name in ("times", "directions", "parameters")) if worst else (np.zeros(0),) * 3
+    uncertainty = Uncertainty(functionals, parameters, model.constraints, (known[0], known[1], known[2]))
+    for law in (law for law in LAWS if law != ADVERSARY and (worst or law != "neighbours")):
+        disturbances, drawn, begun = uncertainty.draw(cast(LawName, law), count, rng)
+        for row in range(count):
+            one = slice(row, row + 1)
+            signal = None if disturbances is None else disturbances[one]
+            yield law, signal, drawn[one], None if begun is None else begun[one]
+
+
+def _violations(
+    model: Transcription, finished: FinishedRun, states: Array, times: Array, applied: Array
+) -> dict[str, float]:
+    """The largest violation of every constraint along states ``(T, d, 1)``, with the control ``(m, K)`` that was
+    applied."""
+    theta = applied.ravel() if model.control.is_indicators else finished.theta.ravel()
+    counts: Sequence[ViolationCount] = [_count(one, model, times, theta) for one in model.constraints]
+    for position, state in enumerate(states):
+        for one in counts:
+            one.add(position, state)
+    for one in counts:
+        one.close()
+    return {one.constraint.name: one.largest for one in counts}
+
+
+def _count(one: StateConstraint, model: Transcription, times: Array, theta: Array) -> ViolationCount:
+    counted = ViolationCount(one, times, row_units(one, model.problem.control), theta)
+    counted.begin(1)
+    return counted
+
+
+def _paid(model: Transcription, control: Array) -> float:
+    """The first term of the cost of a control ``(m, K)``."""
+    problem, lengths = model.problem, model.control.lengths
+    weights, blocks = np.asarray(problem.weights), problem.cost.blocks
+    if blocks:
+        sizes = sum(weights[block[0]] * np.linalg.norm(control[list(block)], axis=0) for block in blocks)
+        return float(problem.cost.l1 * (sizes @ lengths))
+    return float(problem.cost.l1 * (weights @ np.abs(control) @ lengths))

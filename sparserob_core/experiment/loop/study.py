@@ -1,0 +1,117 @@
+"""What a study in closed loop found, and the words that go with it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from sparserob_core.sip.convex_set import Array
+
+
+@final
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ClosedLoops:
+    """Loops of a `Controller` around the exact system, ``loops`` for each law: ``steps`` in all, of which ``resolved``
+    took a control that was solved anew, and ``uncovered`` had a state that the proof does not cover.
+
+    ``constraints``: the largest violation of each (negative: a margin), with its ``tolerance``, over the breakpoints
+    and times inside every piece; the set of controls is ``control``. ``milliseconds (steps,)`` of every step.
+    ``cost`` is that of the run, ``planned`` the first term of it for the plan's own control (under feedback the nominal
+    one), ``costs (loops,)`` the same term for the control that was applied. ``paths`` and ``controls`` are the first
+    loops of every law, for drawing.
+    """
+
+    title: str
+    directory: Path
+    status: str
+    resolve: bool
+    seed: int
+    laws: Mapping[str, int]
+    constraints: Mapping[str, tuple[float, float]]
+    milliseconds: Array = field(repr=False)
+    resolved: int
+    uncovered: int
+    cost: float
+    planned: float
+    costs: Array = field(repr=False)
+    seconds: float
+    shown: Array = field(repr=False)
+    paths: Sequence[tuple[str, Array]] = field(repr=False)
+    controls: Sequence[tuple[str, Array]] = field(repr=False)
+    undrawn: str = ""
+    """Why there is no figure, where one was asked for."""
+
+    @property
+    def steps(self) -> int:
+        """How many steps there were."""
+        return int(self.milliseconds.size)
+
+    @property
+    def violated(self) -> tuple[str, ...]:
+        """The constraints that a loop violates."""
+        return tuple(name for name, (largest, tolerance) in self.constraints.items() if largest > tolerance)
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether a loop does what is proven impossible."""
+        return bool(self.violated) or self.uncovered > 0
+
+    def summary(self) -> dict[str, Any]:
+        """What ``loop.json`` holds."""
+        median, late = np.quantile(self.milliseconds, [0.5, 0.99]).tolist()
+        return {
+            "title": self.title,
+            "status": self.status,
+            "resolve": self.resolve,
+            "seed": self.seed,
+            "loops": dict(self.laws),
+            "steps": self.steps,
+            "resolved": self.resolved,
+            "uncovered": self.uncovered,
+            "milliseconds": {"median": median, "99%": late, "largest": float(self.milliseconds.max())},
+            "cost": {
+                "run": self.cost,
+                "plan": self.planned,
+                "mean": float(self.costs.mean()),
+                "least": float(self.costs.min()),
+                "largest": float(self.costs.max()),
+            },
+            "constraints": [
+                {"name": name, "largest": largest, "tolerance": tolerance, "violated": largest > tolerance}
+                for name, (largest, tolerance) in self.constraints.items()
+            ],
+            "contradicts": self.contradicts,
+            "remarks": list(self.remarks()),
+            "seconds": self.seconds,
+        }
+
+    def table(self) -> tuple[tuple[str, ...], list[tuple[str, str]]]:
+        """Columns and rows for people."""
+        summary = self.summary()
+        time, cost = summary["milliseconds"], summary["cost"]
+        rows = [
+            ("loops", f"{sum(self.laws.values())} ({', '.join(f'{n} {law}' for law, n in self.laws.items())})"),
+            ("steps", f"{self.steps}" + (f", {self.resolved} of them solved anew and better" if self.resolve else "")),
+            ("a step takes", f"{time['median']:.3g} ms (median), {time['99%']:.3g} ms (99 %)"),
+            ("cost of the run", f"{cost['run']:.7g}"),
+            ("cost of its control", f"{cost['plan']:.7g}" + " when nothing happens"),
+            ("cost of the loops", f"{cost['mean']:.7g} on average, {cost['least']:.7g} to {cost['largest']:.7g}"),
+            *((f"largest violation of {name}", f"{found:.3e}") for name, (found, _) in self.constraints.items()),
+        ]
+        return (), rows
+
+    def remarks(self) -> Iterator[str]:
+        """What is to be said beside the numbers."""
+        if self.violated:
+            yield f"a loop contradicts the proof: it violates {', '.join(self.violated)}; one of the two is wrong"
+        elif self.uncovered:
+            yield f"{self.uncovered} states were outside what the proof covers, which no disturbance should reach"
+        else:
+            yield "no loop violates a constraint; the run proves that none can, which no number of loops does"
+        yield "the cost of a loop is that of the control that was applied, without terms of the state or of squares"
+        if self.undrawn:
+            yield self.undrawn

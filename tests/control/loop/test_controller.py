@@ -1,0 +1,280 @@
+"""Guards control/loop/controller, resolving and remaining: no loop that begins in the proven set violates a
+constraint, whatever drives it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import sparserob_core as sr
+from sparserob_core.control.loop.remaining import remaining
+from sparserob_core.control.studies.adversary import find_adversary
+
+BASE = {
+    "problem": {
+        "name": "linear",
+        "system": {"A": [[0, 1], [-2, -0.5]], "B": [[0], [1]]},
+        "horizon": 3.0,
+        "initial_state": [-1, 1],
+        "control": {"box": 1.0},
+        "disturbance": {"box": [0.06, 0.06]},
+        "path": [{"box": [0.7, None], "from": 0.5}],
+        "terminal": [{"box": [0.3, 0.6]}],
+    },
+    "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 12}},
+}
+GAINS = {**BASE, "policy": {"name": "affine", "cost": "nominal"}}
+PEAK = {**BASE, "policy": {"name": "affine", "cost": "peak"}}
+EXACT = 1e-9
+
+
+@pytest.fixture(scope="module")
+def plans(tmp_path_factory) -> dict[str, sr.Outcome]:
+    found = {}
+    for name, config in (("open loop", BASE), ("nominal", GAINS), ("peak", PEAK)):
+        found[name] = sr.run(config, out=tmp_path_factory.mktemp("runs") / "run", quiet=True, figures=False)
+        assert found[name].status == "certified"
+    return found
+
+
+class Plant:
+    """The exact system, piece by piece of the control, without any of the code that made the plan: a matrix
+    exponential of the system with its inputs as states (Van Loan 1978), looked at within the pieces too."""
+
+    def __init__(self, outcome: sr.Outcome) -> None:
+        problem = outcome.problem
+        self.problem, self.bounds = problem, outcome.experiment.control.breakpoints
+        system = problem.system
+        self.A, self.B, self.E = (np.asarray(one, dtype=float) for one in (system.A, system.B, system.E))
+
+    def moved(self, state, u, w, length):
+        """The states at ten times within a piece and at its end."""
+        from scipy.linalg import expm
+
+        d = state.size
+        block = np.zeros((d + 1, d + 1))
+        block[:d, :d], block[:d, d] = self.A, self.B @ u + self.E @ w
+        step = expm(block * length / 10)
+        states, z = [], np.append(state, 1.0)
+        for _ in range(10):
+            z = step @ z
+            states.append(z[:d])
+        return states
+
+    def violation(self, time, state):
+        """How far a state is outside the sets of its time."""
+        found = [-np.inf]
+        found += [float(p.set.violation(state)) for p in self.problem.path if p.start - 1e-9 <= time <= p.stop + 1e-9]
+        at_end = abs(time - self.problem.horizon) < 1e-9
+        found += [float(one.violation(state)) for one in self.problem.terminal if at_end]
+        return max(found)
+
+    def loop(self, controller, disturb):
+        """The largest violation, of the states and of the control, and the control that was applied."""
+        controller.reset()
+        state, worst, applied = np.array(self.problem.initial_state, dtype=float), -np.inf, []
+        for k, (begin, end) in enumerate(zip(self.bounds[:-1], self.bounds[1:], strict=True)):
+            u = controller.step(begin, state)
+            applied.append(u)
+            worst = max(worst, float(self.problem.control.violation(u)))
+            for part, reached in enumerate(self.moved(state, u, disturb(k, state, controller), end - begin)):
+                worst = max(worst, self.violation(begin + (end - begin) * (part + 1) / 10, reached))
+            state = reached
+        assert controller.covered
+        return worst, np.array(applied).T
+
+
+def adaptive(plan, k):
+    """The first piece of the worst disturbance of the plan that is applied now: an adversary that learns of every
+    plan."""
+    model = plan.model
+    found = [find_adversary(one, plan.decision, model.feedback) for one in model.constraints]
+    worst = max(found, key=lambda one: one.violation)
+    return worst.disturbance[:, k - plan.first]
+
+
+def drives(outcome, rng):
+    """Disturbances of the four laws, of the adversary, and of one that learns."""
+    bound, pieces = outcome.problem.disturbance, outcome.experiment.control.pieces
+    iid, vertices = bound.sample(pieces, rng), bound.sample_extreme(pieces, rng)
+    slow = np.linspace(*bound.sample_extreme(2, rng), pieces)
+    model = outcome.experiment.transcription
+    yield lambda k, x, c: iid[k]
+    yield lambda k, x, c: vertices[k]
+    yield lambda k, x, c: slow[k]
+    for constraint in model.constraints:
+        w = find_adversary(constraint, outcome.result.decision, model.feedback).disturbance
+        near = w.copy()
+        near[:, rng.integers(pieces)] *= -1.0
+        yield lambda k, x, c, w=w: w[:, k]
+        yield lambda k, x, c, w=near: w[:, k]
+    yield lambda k, x, c: adaptive(c.plan, k)
+
+
+@pytest.mark.parametrize("name", ["open loop", "nominal", "peak"])
+@pytest.mark.parametrize("resolve", [False, True])
+def test_no_loop_violates_a_constraint(plans, name, resolve) -> None:
+    plant, controller = Plant(plans[name]), sr.controller(plans[name], resolve)
+    every = list(drives(plans[name], np.random.default_rng(0)))
+    found = [plant.loop(controller, drive) for drive in (every[1::6] if resolve else every)]
+    assert max(worst for worst, _ in found) <= EXACT
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["open loop", "nominal", "peak"])
+def test_no_loop_of_ten_thousand_steps_violates_a_constraint(plans, name) -> None:
+    plant, controller, rng, steps = Plant(plans[name]), sr.controller(plans[name]), np.random.default_rng(1), 0
+    while steps < 10_000:
+        for drive in drives(plans[name], rng):
+            worst, _ = plant.loop(controller, drive)
+            steps += 12
+            assert worst <= EXACT
+
+
+@pytest.mark.slow
+def test_no_loop_of_many_steps_that_are_solved_anew_violates_a_constraint(plans) -> None:
+    for name, outcome in plans.items():
+        plant, controller, rng, steps = Plant(outcome), sr.controller(outcome, True), np.random.default_rng(2), 0
+        while steps < 400:
+            for drive in drives(outcome, rng):
+                worst, _ = plant.loop(controller, drive)
+                steps += 12
+                assert worst <= EXACT, name
+
+
+def test_an_open_loop_controller_tells_the_planned_control_whatever_it_measures(plans) -> None:
+    outcome = plans["open loop"]
+    rng = np.random.default_rng(3)
+    _, applied = Plant(outcome).loop(sr.controller(outcome), lambda k, x, c: 0.06 * rng.uniform(-1, 1, 2))
+    assert np.array_equal(applied, outcome.control)
+
+
+@pytest.mark.parametrize("name", ["nominal", "peak"])
+def test_without_a_disturbance_gains_add_nothing(plans, name) -> None:
+    outcome = plans[name]
+    _, applied = Plant(outcome).loop(sr.controller(outcome), lambda k, x, c: np.zeros(2))
+    assert applied == pytest.approx(outcome.control, abs=1e-9)
+
+
+@pytest.mark.parametrize("name", ["nominal", "peak"])
+def test_the_control_is_the_gains_times_the_innovations(plans, name) -> None:
+    outcome = plans[name]
+    stored, plant = np.load(outcome.directory / "solution.npz"), Plant(outcome)
+    w, rng = [], np.random.default_rng(4)
+
+    def disturb(k, state, controller):
+        w.append(0.06 * rng.uniform(-1, 1, 2))
+        return w[-1]
+
+    _, applied = plant.loop(sr.controller(outcome), disturb)
+    lengths, zero = np.diff(plant.bounds), np.zeros(1)
+    innovations = [np.zeros(2)] + [
+        plant.moved(np.zeros(2), zero, one, length)[-1] for one, length in zip(w[:-1], lengths, strict=False)
+    ]
+    expected = stored["control"] + np.einsum("kjmd,jd->mk", stored["gains"], np.array(innovations))
+    assert applied == pytest.approx(expected, abs=1e-8)
+
+
+@pytest.mark.parametrize("name", ["open loop", "nominal", "peak"])
+def test_a_resolved_plan_is_taken_only_where_it_costs_less_than_what_is_left(plans, name) -> None:
+    outcome = plans[name]
+    plant, controller = Plant(outcome), sr.controller(outcome, True)
+    _, applied = plant.loop(controller, lambda k, x, c: np.zeros(2))
+    paid = float(np.abs(applied[0]) @ np.diff(plant.bounds))
+    assert paid <= outcome.result.cost * (1.0 + 1e-6)
+    if name == "open loop":  # a disturbance that did not come leaves room
+        assert paid < 0.99 * outcome.result.cost
+    resolved = [one for one in controller.steps if one.resolved]
+    assert resolved or name == "nominal"  # what nothing disturbs is as good as it was
+    assert all(one.lower_bound <= one.cost + 1e-9 for one in resolved)
+
+
+def test_the_cost_that_a_policy_has_left_is_the_cost_of_its_program(plans) -> None:
+    for name in ("nominal", "peak"):
+        plan = sr.controller(plans[name]).plan
+        assert plan.cost_left(0, [np.zeros(2)]) == pytest.approx(plans[name].result.cost, rel=1e-7)
+
+
+def test_what_is_left_at_the_beginning_is_the_problem_itself(plans) -> None:
+    for outcome in plans.values():
+        model = outcome.experiment.transcription
+        whole = remaining(model, 0, np.array([-1.0, 1.0]), None)
+        assert whole.program.cost(outcome.result.decision) == pytest.approx(outcome.result.cost)
+        assert [one.name for one in whole.constraints] == [one.name for one in model.constraints]
+        late = remaining(model, 6, np.zeros(2), None)
+        assert late.problem.horizon == pytest.approx(1.5)
+        assert late.problem.path[0].start == 0.0
+        assert [one.name for one in late.constraints] == [one.name for one in model.constraints]
+
+
+def test_a_state_that_no_disturbance_leads_to_is_told_and_solved_anew(plans) -> None:
+    for resolve in (False, True):
+        controller = sr.controller(plans["nominal"], resolve)
+        controller.step(0.0, [-1, 1])
+        u = controller.step(0.25, [-0.6, 0.9])
+        assert controller.covered is resolve  # a control is proven from there, so that the proof covers it again
+        assert abs(u[0]) <= 1.0
+        controller.reset()
+        assert controller.covered
+        u = controller.step(0.0, [40.0, 0.0])  # from where nothing is feasible
+        assert not controller.covered
+        assert abs(u[0]) <= 1.0
+
+
+def test_without_time_the_plan_goes_on(plans) -> None:
+    controller = sr.controller(plans["nominal"], True, seconds=1e-9)
+    worst, applied = Plant(plans["nominal"]).loop(controller, lambda k, x, c: np.zeros(2))
+    assert worst <= EXACT
+    assert not any(one.resolved for one in controller.steps)
+    assert applied == pytest.approx(plans["nominal"].control, abs=1e-9)
+
+
+def test_a_step_that_is_refused_changes_nothing(plans) -> None:
+    controller = sr.controller(plans["nominal"])
+    with pytest.raises(sr.InputError, match=r"^time: expected 0, since it begins there, got 0.25$"):
+        controller.step(0.25, [-1, 1])
+    first = controller.step(0.0, [-1, 1])
+    with pytest.raises(sr.InputError, match=r"^time: expected 0.25, the next breakpoint, got 0.0$"):
+        controller.step(0.0, [-1, 1])
+    for state in ([-0.7], [[1, 2]], [np.nan, 0], "here", None):
+        with pytest.raises(sr.InputError, match=r"^state: expected 2 finite numbers, one per state"):
+            controller.step(0.25, state)
+    for time in (None, "0.25", True, np.nan):
+        with pytest.raises(sr.InputError, match=r"^time: expected 0.25"):
+            controller.step(time, [-1, 1])
+    controller.step(0.25 + 1e-10, [-0.75, 1.2])
+    assert len(controller.steps) == 2
+    controller.reset()
+    assert np.array_equal(controller.step(0.0, [-1, 1]), first)
+
+
+def test_after_the_horizon_it_asks_for_a_reset(plans) -> None:
+    controller = sr.controller(plans["open loop"])
+    for time in controller.breakpoints[:-1]:
+        controller.step(time, [0, 0])
+    with pytest.raises(sr.InputError, match=r"reset\(\) first, since the horizon 3 is over"):
+        controller.step(3.0, [0, 0])
+
+
+def test_what_cannot_be_solved_anew_is_refused_in_one_sentence() -> None:
+    haar = {**BASE, "dictionaries": {"control": {"name": "haar", "pieces": 8}}}
+    delayed = {**BASE, "problem": {**BASE["problem"], "system": {**BASE["problem"]["system"], "delay": 0.1}}}
+    for config, said in ((haar, "indicators"), (delayed, "without a delay")):
+        with pytest.raises(sr.InputError, match=f"^resolve: .*{said}"):
+            sr.controller(config, True)
+        controller = sr.controller(config)
+        plan = controller.plan
+        controller.step(0.0, [-1, 1])
+        assert plan.first == 0
+
+
+def test_a_controller_needs_a_proven_control() -> None:
+    hopeless = {**BASE, "problem": {**BASE["problem"], "disturbance": {"box": [5, 5]}}}
+    with pytest.raises(sr.InputError, match=r"no proven control to apply; the status is 'infeasible'"):
+        sr.controller(hopeless)
+    with pytest.raises(sr.InputError, match=r"^config: expected a config"):
+        sr.controller(3)
+    with pytest.raises(sr.InputError, match=r"^resolve: expected true or false"):
+        sr.controller(BASE, "yes")
+    with pytest.raises(sr.InputError, match=r"^seconds"):
+        sr.controller(BASE, seconds=1.0)

@@ -1,0 +1,129 @@
+"""Guards control/loop/tracking and sip/relaxed/warm: the quick way from one initial state to the next proves what
+the long way proves, and claims no more."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import sparserob_core as sr
+from sparserob_core.control.loop.tracking import Tracking, trackable
+from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.transcription.transcribe import from_state, in_own_units, prepare
+from sparserob_core.sip.program import TOLERANCE
+from sparserob_core.sip.proof.branch_and_bound import prove
+from sparserob_core.sip.relaxed.warm import WarmProgram
+
+
+def spring(pieces=40, disturbance=None, **more) -> object:
+    problem = sr.OptimalControlProblem(
+        system=sr.LinearSystem([[0, 1], [-2, -0.5]], [[0], [1]], **more.pop("matrices", {})),
+        horizon=4.0,
+        initial_state=[-1, 1],
+        control=sr.Box([-1], [1]),
+        disturbance=disturbance or sr.Box([-0.05, -0.03], [0.05, 0.06]),
+        path=[sr.PathConstraint(sr.Box([-0.7, -np.inf], [0.7, np.inf]), 0.5)],
+        terminal=[sr.Box([-0.3, -0.4], [0.3, 0.4])],
+        **more,
+    )
+    indicators = Dictionary(np.linspace(0.0, 4.0, pieces + 1), np.eye(pieces))
+    return in_own_units(prepare(problem, indicators, indicators))
+
+
+VARIANTS = {
+    "a box": {},
+    "an ellipsoid": {"disturbance": sr.Ellipsoid([0.0, 0.0], [[0.003, 0.001], [0.001, 0.002]])},
+    "a drift": {"matrices": {"c": [0.05, -0.1]}},
+    "weights": {"weights": [3.0]},
+}
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_it_proves_and_finds_what_the_exchange_does(name) -> None:
+    own, units = spring(**VARIANTS[name])
+    assert trackable(own)
+    tracking, rng = Tracking(own), np.random.default_rng(0)
+    for _ in range(6):
+        state = (np.array([-1, 1]) + 0.05 * rng.standard_normal(2)) / units.states
+        found, program = tracking.solve(state), from_state(own, state).program
+        assert found is not None
+        assert all(proof.verdict == "proven" for proof in prove(program, found.decision))
+        known = sr.solve(program, "exchange", "piqp", regulariser=None)
+        assert known.status == "certified"
+        assert found.cost == pytest.approx(program.cost(found.decision), rel=1e-12)
+        assert found.lower <= known.upper_bound + 1e-12
+        assert known.lower_bound <= found.cost + 1e-12
+        assert found.cost - found.lower <= 1e-7 * found.cost
+
+
+def test_what_it_leaves_open_is_violated_or_not_told() -> None:
+    own, units = spring()
+    tracking, rng = Tracking(own), np.random.default_rng(1)
+    state = np.array([-1, 1]) / units.states
+    low, high = own.program.finite.lower, own.program.finite.upper
+    best = tracking.solve(state).decision
+    for share in (0.0, 1e-9, 1e-7, 1e-4, 0.1):
+        x = np.clip(best + share * rng.uniform(-1, 1, best.size), low, high)
+        verdicts = [proof.verdict for proof in prove(from_state(own, state).program, x)]
+        open_ = tracking._open(x, state)
+        if open_ == []:
+            assert "refuted" not in verdicts
+        if verdicts == ["proven", "proven"]:
+            assert not open_
+
+
+def test_its_bounds_lie_above_the_worst_case_between_the_instants() -> None:
+    own, units = spring(pieces=8)
+    tracking, rng = Tracking(own), np.random.default_rng(2)
+    state = np.array([-1, 1]) / units.states
+    x = rng.uniform(-1, 1, 8)
+    moved = from_state(own, state)
+    nodes = (tracking.nodes @ x).reshape(9, 2) + tracking.powers @ state + tracking.fixed
+    drives = x.reshape(1, 8).T @ tracking.B.T + tracking.drift
+    heights = nodes @ tracking.H.T + tracking._first
+    bent = tracking._curvature(nodes[:-1] @ tracking.A.T + drives, tracking.length) + tracking._bent
+    above = np.maximum(heights[:-1], heights[1:]) + bent * tracking.length**2 / 8
+    for piece in range(8):
+        times = (piece + np.linspace(0, 1, 41)) * tracking.length
+        for row, c in enumerate(tracking.H):
+            values = moved.functionals.values(x, times, np.tile(c, (41, 1)), np.zeros((41, 0)))
+            assert values.max() <= above[piece, row] + TOLERANCE
+            assert values[0] == pytest.approx(heights[piece, row], abs=1e-12)
+
+
+def test_from_where_nothing_is_feasible_it_says_nothing() -> None:
+    own, units = spring()
+    tracking = Tracking(own)
+    assert tracking.solve(np.array([-9.0, 1.0]) / units.states) is None
+    assert tracking.solve(np.array([-1.0, 1.0]) / units.states) is not None
+
+
+def test_many_states_do_not_let_it_grow() -> None:
+    own, units = spring(pieces=12)
+    tracking, rng = Tracking(own), np.random.default_rng(3)
+    for _ in range(60):
+        assert tracking.solve((np.array([-1, 1]) + 0.1 * rng.uniform(-1, 1, 2)) / units.states) is not None
+    assert len(tracking._places) < 100
+
+
+def test_what_it_does_not_know_it_leaves_to_the_exchange() -> None:
+    assert not trackable(spring(control_step=sr.Box([-0.2], [0.2]))[0])
+    assert not trackable(spring(initial_set=sr.Box([-0.1, -0.1], [0.1, 0.1]))[0])
+
+
+def test_the_bound_of_a_linear_program_is_its_optimum() -> None:
+    from scipy.optimize import linprog
+
+    rng = np.random.default_rng(4)
+    n = 12
+    weights, low, high = rng.uniform(0.5, 2, n), -rng.uniform(0.5, 2, n), rng.uniform(0.5, 2, n)
+    warm, G = WarmProgram(weights, low, high), rng.standard_normal((5, n))
+    warm.add(G)
+    for _ in range(5):
+        h = -rng.uniform(0.0, 1.0, 5)
+        x, y = warm.solve(h)
+        plain = linprog(np.tile(weights, 2), np.hstack([G, -G]), h, bounds=[(0, u) for u in (*high, *-low)])
+        assert weights @ np.abs(x) == pytest.approx(plain.fun, abs=1e-9)
+        assert warm.bound(h, y) == pytest.approx(plain.fun, abs=1e-9)
+        assert warm.bound(h, y) <= plain.fun
+        assert warm.bound(h, rng.uniform(0, 1, 5)) <= plain.fun
