@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from pathlib import Path
 
@@ -26,6 +27,10 @@ __all__ = ["command", "config", "process"]
 # the same examples in every run; HYPOTHESIS_PROFILE=default searches for new ones
 settings.register_profile("repeatable", derandomize=True)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable"))
+
+gc.set_threshold(
+    50_000, 20, 20
+)  # what thousands of tests and modules hold need not be searched for cycles all the time
 
 
 @pytest.fixture(scope="session")

@@ -72,7 +72,7 @@ def certified(outcome: Any) -> float:
 
 
 @pytest.mark.parametrize(("cost", "value"), [(EVERYTHING, 0.983009), (TRACKING, 1.234490)])
-@pytest.mark.parametrize("solver", ["piqp", "proxqp", "clarabel"])
+@pytest.mark.parametrize("solver", ["piqp", "clarabel", pytest.param("proxqp", marks=pytest.mark.slow)])
 def test_known_costs_are_reached_with_every_solver(cost, value, solver, tmp_path):
     outcome = run({**SPRING, "cost": cost}, 50, tmp_path / "run", solver={"name": solver})
     assert certified(outcome) == pytest.approx(value, rel=1e-6)

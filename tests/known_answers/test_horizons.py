@@ -92,12 +92,14 @@ def test_the_spring_can_be_at_rest_at_some_horizons_only(tmp_path: Path) -> None
     [
         ({}, 1.5),
         ({"disturbance": {"box": 0.1}}, 1.5 / 0.9),
-        ({"disturbance": {"box": 0.1}, "disturbance_class": "measurable"}, 1.5 / 0.9),
+        pytest.param(
+            {"disturbance": {"box": 0.1}, "disturbance_class": "measurable"}, 1.5 / 0.9, marks=pytest.mark.slow
+        ),
         ({"initial_state": {"centre": 2, "box": 0.1}}, 1.6),
         ({"system": {"A": [[0]], "B": [[1]], "c": [0.25]}}, 1.5 / 0.75),
         ({"terminal": [{"equals": [0]}]}, 2.0),
-        ({"terminal": [{"norm": {"p": 2, "radius": 0.5}}]}, 1.5),
-        ({"control": {"box": {"lower": -3, "upper": 0.5}}}, 0.5),
+        pytest.param({"terminal": [{"norm": {"p": 2, "radius": 0.5}}]}, 1.5, marks=pytest.mark.slow),
+        pytest.param({"control": {"box": {"lower": -3, "upper": 0.5}}}, 0.5, marks=pytest.mark.slow),
     ],
     ids=("known", "disturbed", "measurable", "begun", "drift", "equality", "norm", "asymmetric"),
 )

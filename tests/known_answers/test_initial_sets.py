@@ -67,7 +67,9 @@ def test_the_farthest_initial_state_decides_at_an_uncertain_rate(tmp_path: Path)
     ("deviations", "end"),
     [
         ({"polytope": {"H": [[1, 1], [-1, 0.2], [0, -1]], "h": [0.03, 0.02, 0.01]}}, {"box": 0.35}),
-        ({"ellipsoid": {"shape": [[0.0009, 0.0003], [0.0003, 0.0025]]}}, {"box": 0.35}),
+        pytest.param(
+            {"ellipsoid": {"shape": [[0.0009, 0.0003], [0.0003, 0.0025]]}}, {"box": 0.35}, marks=pytest.mark.slow
+        ),
         pytest.param({"norm": {"p": 1, "radius": 0.05}}, {"norm": {"p": 2, "radius": 0.4}}, marks=pytest.mark.slow),
     ],
     ids=("polytope", "ellipsoid", "norm"),

@@ -11,7 +11,7 @@ from scipy.special import roots_jacobi
 
 import sparserob_core as sr
 
-SOLVERS = ["piqp", "proxqp", "clarabel"]
+SOLVERS = ["piqp", *(pytest.param(name, marks=pytest.mark.slow) for name in ("proxqp", "clarabel"))]
 
 
 def family(name, lower, upper, rows):
@@ -84,7 +84,7 @@ FUNCTIONS = {
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-@pytest.mark.parametrize("n", [2, 3, 4, 5, 6])
+@pytest.mark.parametrize("n", [2, 5, *(pytest.param(n, marks=pytest.mark.slow) for n in (3, 4, 6))])
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_one_sided_polynomial_approximation_has_the_value_of_its_quadrature(name, n, solver):
     f, sign = FUNCTIONS[name]
@@ -154,7 +154,7 @@ def powers(degree):
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-@pytest.mark.parametrize("n", range(2, 9))
+@pytest.mark.parametrize("n", [2, 3, 8, *(pytest.param(n, marks=pytest.mark.slow) for n in (4, 5, 6, 7))])
 def test_the_monic_polynomial_of_least_deviation_is_the_one_of_chebyshev(n, solver):
     assert_solved(best_approximation(lambda t: t**n, powers(n)), solver, 2.0 ** (1 - n))
 

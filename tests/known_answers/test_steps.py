@@ -120,7 +120,13 @@ def test_the_cost_is_that_of_an_independent_linear_program(step, before, tmp_pat
 
 
 @pytest.mark.parametrize("step", [{"norm": {"p": 2, "radius": 0.3}}, {"box": [0.2, 0.3]}])
-@pytest.mark.parametrize("control", [{"name": "piecewise_constant", "pieces": 16}, {"name": "haar", "pieces": 16}])
+@pytest.mark.parametrize(
+    "control",
+    [
+        {"name": "piecewise_constant", "pieces": 16},
+        pytest.param({"name": "haar", "pieces": 16}, marks=pytest.mark.slow),
+    ],
+)
 def test_two_inputs_with_an_uncertain_system_are_certified_and_checked(step, control, tmp_path):
     outcome = run({**MASSES, "control_step": step}, 16, tmp_path / "run", dictionaries={"control": control})
     assert outcome.result.status == "certified", outcome.result.message

@@ -16,6 +16,7 @@ import sparserob_core as sr
 from sparserob_core.sip.methods.own_units import UsersUnits
 
 FILES = Path(__file__).parent / "units"
+HEAVY = {"32_weights_1e-7", "f124", "hcw_seconds"}
 INFEASIBLE = ("01", "11", "15", "16", "18", "21", "22", "23", "25", "27")
 COSTS = {
     "14_units_1e5_terminal_only": 1.569187687,
@@ -44,7 +45,13 @@ def test_what_is_outside_in_its_own_unit_is_infeasible(name, tmp_path):
     assert result.status == "infeasible", result.message
 
 
-@pytest.mark.parametrize("name", sorted(path.stem for path in FILES.glob("*.yaml") if path.stem[:2] not in INFEASIBLE))
+def feasible() -> list[object]:
+    """The files of feasible problems, a heavy one only where the second stage is run."""
+    names = sorted(path.stem for path in FILES.glob("*.yaml") if path.stem[:2] not in INFEASIBLE)
+    return [pytest.param(name, marks=pytest.mark.slow if name in HEAVY else ()) for name in names]
+
+
+@pytest.mark.parametrize("name", feasible())
 def test_what_is_feasible_in_its_own_unit_is_certified(name, tmp_path):
     result = run(name, tmp_path / "run")
     if name.startswith("32"):  # the weights of two controls differ by 1e7 and more

@@ -53,6 +53,9 @@ EXPECTED: dict[str, tuple[str, float | None, float]] = {
 UNCHECKED = {("experiment1_scenario", "lower bound")}  # its constraints are samples
 ELSEWHERE = {"experiment1_paper"}  # what is found by it is tested in known_answers/test_paper.py
 SLOW = {  # every status, formulation and kind of uncertainty has a lighter config
+    "breakpoints",
+    "experiment1_literal",
+    "rendezvous",
     "cart_pendulum",
     "ellipsoidal",
     "experiment2_literal",
@@ -113,7 +116,7 @@ COARSE = {"dictionaries.control.pieces": 20, "dictionaries.disturbance.pieces": 
     ("name", "size"),
     [
         pytest.param("experiment1_reduced", COARSE, id="coarse reduced"),
-        pytest.param("experiment1_literal", COARSE, id="coarse literal"),
+        pytest.param("experiment1_literal", COARSE, marks=pytest.mark.slow, id="coarse literal"),
         *(pytest.param(name, {}, marks=pytest.mark.slow, id=name) for name in SEARCHES),
     ],
 )

@@ -72,8 +72,22 @@ def reached(model, one, u):
     return state
 
 
-@pytest.mark.parametrize("parameters", PARAMETERS)
-@pytest.mark.parametrize("name", CASES)
+HEAVY = [
+    (name, parameters)
+    for name in CASES
+    for parameters in PARAMETERS
+    if name.startswith("measurable") and parameters != "known" and (name, parameters) != ("measurable, box", "box")
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    [
+        pytest.param(name, parameters, marks=pytest.mark.slow if (name, parameters) in HEAVY else ())
+        for name in CASES
+        for parameters in PARAMETERS
+    ],
+)
 def test_the_adversary_attains_the_worst_of_its_family(name, parameters):
     model = transcribed(*CASES[name], PARAMETERS[parameters])
     program, u = model.program, np.random.default_rng(1).uniform(-1, 1, size=8)

@@ -88,7 +88,7 @@ def wait_for(condition: Callable[[], bool]) -> None:
 WORDS = {signal.SIGINT: "interrupted from the keyboard", signal.SIGTERM: "interrupted by SIGTERM"}
 
 
-@pytest.mark.parametrize("number", WORDS)
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM])
 def test_an_interrupted_run_without_a_decision_leaves_its_rounds(config: Path, tmp_path: Path, number: int) -> None:
     out = tmp_path / "out"
     with started("run", config, "method.wait=0.2", "method.rounds=500", "--out", out, cwd=tmp_path) as process:
@@ -105,7 +105,7 @@ def test_an_interrupted_run_without_a_decision_leaves_its_rounds(config: Path, t
     assert sorted(path.name for path in out.iterdir()) == ["config.yaml", "result.json", "trace.npz"]
 
 
-@pytest.mark.parametrize("number", WORDS)
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_an_interrupted_run_keeps_its_last_control_and_claims_nothing_of_it(
     config: Path, tmp_path: Path, number: int
 ) -> None:

@@ -87,7 +87,7 @@ def test_the_progress_of_a_proof_that_does_not_advance_says_what_hinders_it(monk
     assert "slow" in stuck[-1].hindrance
 
 
-@pytest.mark.parametrize("method", ["exchange", "nominal"])
+@pytest.mark.parametrize("method", ["exchange", pytest.param("nominal", marks=pytest.mark.slow)])
 def test_a_limit_returns_the_decision_with_what_was_proven_of_it(method):
     family = slow_family(0.02)
     program = sr.SemiInfiniteProgram(n=1, q=[1.0], lower=-5.0, upper=5.0, families=[replace(family, nominal=family)])

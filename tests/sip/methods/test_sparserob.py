@@ -43,7 +43,14 @@ def test_a_general_program_is_solved_to_the_accuracy_of_the_search():
     assert result.status == "undecided"
 
 
-@pytest.mark.parametrize("name", ["random_search", "simulated_annealing", "sequool", "gradient_ascent"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "simulated_annealing",
+        "sequool",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("random_search", "gradient_ascent")),
+    ],
+)
 def test_the_lower_bound_never_exceeds_the_exact_value(name, exact, tmp_path):
     result = experiment1(
         tmp_path / "run", {"indices": 4, "sc1": {"name": "iterations", "count": 3}}, {"name": name, "budget": 60}
