@@ -475,3 +475,62 @@ def test_the_margin_of_a_policy_says_above_which_factor_no_causal_policy_exists(
     found = sr.margin(given, tolerance=1e-4)
     assert found.lower <= found.causal_upper
     assert found.causal_upper * 0.2 <= cap * (1.0 + 1e-6)
+
+
+@pytest.fixture(scope="module")
+def refuted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that ends after one round, with a witness."""
+    given = springs(0.2, 0.5) | {"initial_state": {"centre": [-1, 1], "box": [0.01, 0.01]}}
+    method = {"name": "exchange", "rounds": 1}
+    outcome = run(given, 10, tmp_path_factory.mktemp("refuted") / "run", method=method)
+    assert outcome.result.status == "refuted"
+    return outcome.directory
+
+
+def test_the_checker_drives_the_closed_loop_by_the_witness(refuted: Path) -> None:
+    found = {claim.name: claim for claim in check(refuted).claims}
+    assert found["violation"].verdict == "holds" and found["result.json"].verdict == "holds"
+    assert check(refuted).status == "verified"
+
+
+def test_a_forged_witness_of_a_closed_loop_is_refused(refuted: Path, tmp_path: Path) -> None:
+    certificate = json.loads((refuted / "certificate.json").read_text())
+    witness = certificate["witness"]
+
+    def verdict(**changed: Any) -> str:
+        copy = tmp_path / "copy"
+        shutil.rmtree(copy, ignore_errors=True)
+        shutil.copytree(refuted, copy)
+        (copy / "certificate.json").write_text(json.dumps({**certificate, "witness": {**witness, **changed}}))
+        return {claim.name: claim.verdict for claim in check(copy).claims}["violation"]
+
+    signal = np.array(witness["disturbance"])
+    assert verdict() == "holds"
+    assert verdict(disturbance=(1.01 * signal).tolist()) == "fails"  # not in its set
+    assert verdict(disturbance=(-signal).tolist()) == "fails"  # drives the state elsewhere
+    assert verdict(disturbance=signal[:, 1:].tolist()) == "fails"
+    assert verdict(deviation=[0.02, 0.0]) == "fails"
+    assert verdict(violation=2.0 * witness["violation"]) == "fails"
+    assert verdict(time=0.1) == "fails"  # before the window
+    assert verdict(direction=[1.0, 0.0, 0.0]) == "fails"
+    assert verdict(constraint="control") == "fails"
+    assert verdict(disturbance=None) == "not checked"
+
+
+def test_the_witness_is_where_the_simulated_loop_goes(refuted: Path) -> None:
+    """The signal that the certificate holds, through the controller that measures."""
+    simulated = sr.simulate(str(refuted), law="adversary")
+    witness = json.loads((refuted / "certificate.json").read_text())["witness"]
+    largest = {one.name: one.largest for one in simulated.constraints}
+    assert largest[witness["constraint"]] == pytest.approx(witness["violation"], rel=1e-9)
+
+
+def test_minimum_attention_answers_what_it_measures_and_its_rate_has_a_name_of_its_own(tmp_path: Path) -> None:
+    outcome = sr.run("configs/experiment3_feedback.yaml", out=tmp_path / "run", quiet=True, figures=False)
+    assert {"control", "rate", "equals"} <= set(outcome.summary["tolerances"])
+    found = check(outcome.directory)
+    assert found.status == "verified"
+    loop = outcome.result.model.feedback.loop
+    assert (
+        np.abs(loop.states(outcome.result.decision, np.array([5.0]))[0, 2]).max() < 1e-12
+    )  # u(5) = 0 whatever happens

@@ -441,10 +441,10 @@ def largest_cost(case: Case) -> float:
 def _witness(case: Case) -> str:
     """The state that the witness leads to, and by how much it leaves the constraint."""
     data = case.certificate.get("witness")
-    if case.policy is not None:
-        raise Unchecked("the checker does not drive a closed loop by a witness")
     if not isinstance(data, Mapping):
         raise Unchecked("the certificate holds no witness")
+    if case.policy is not None:
+        return _exceeded(*feedback_of(case).driven(data), data)
     window, time = case.window(str(data.get("constraint"))), number(data, "time")
     direction, parameter = (numbers(data.get(key), key) for key in ("direction", "parameter"))
     _sized(direction, window.shape.dimension, window.name)
@@ -458,9 +458,13 @@ def _witness(case: Case) -> str:
     if window.is_mixed:
         state = state + case.pieces[_piece(case, window, data, time)].entries()
     over = sum((balls([c])[0] * x for c, x in zip(direction, state, strict=True)), -height)
-    slack = case.units(window).slack(direction, height)
+    return _exceeded(over, case.units(window).slack(direction, height), data)
+
+
+def _exceeded(over: arb, slack: float, data: Mapping[str, Any]) -> str:
+    """A constraint is exceeded by ``over``, up to ``slack`` of which is none, as the witness says."""
     if not over > slack:
         raise Broken(f"it leads to a violation of {float(over.mid()):.3g}, up to {slack:.3g} is none")
     if abs(float(over.mid()) - number(data, "violation")) > 1e-6 * abs(float(over.mid())) + slack:
         raise Broken(f"a violation of {data.get('violation')!r} is written, {float(over.mid())!r} is derived")
-    return f"{window.name} is exceeded by {float(over.lower()):.6g} at t = {time:.6g}"
+    return f"{data.get('constraint')} is exceeded by {float(over.lower()):.6g} at t = {number(data, 'time'):.6g}"

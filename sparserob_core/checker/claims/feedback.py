@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, final
 
@@ -12,6 +13,7 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import balls, below
 from sparserob_core.checker.claims.case import Case, number, numbers
 from sparserob_core.checker.claims.constraints import covered, cut, normals_of
+from sparserob_core.checker.claims.units import RowUnits
 from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import EQUALITY, RESOLVED, TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.reach.closed_loop import ClosedLoop
@@ -20,14 +22,14 @@ from sparserob_core.checker.reach.effort import at_most
 from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.system import LinearSystem
-from sparserob_core.control.sets.sets import Ellipsoid, NormBall
+from sparserob_core.control.sets.sets import Box, Ellipsoid, NormBall
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
 MOST_CELLS = 40_000  # cells of time examined for each constraint
-PEAK, CONTROL, EQUALS, WORST, EFFORT = "peak", "control", "equals", "worst", "effort"
+PEAK, CONTROL, RATE, EQUALS, WORST, EFFORT = "peak", "control", "rate", "equals", "worst", "effort"
 FIGURES, SMALL_COST = 1e-11, 1e-6  # of an effort, and of the largest possible one: how closely it is known
 
 
@@ -228,10 +230,10 @@ class FeedbackClaims:
     def equalities(self) -> str:
         """Show that the fixed states are met for every disturbance and initial state; a sentence with the figures."""
         case, worst = self.case, 0.0
-        state, rest = self._last(self.loop), self._last(self.loop_at_rest)
+        state = self._last(self.loop)
         for row, value in case.equalities:
             missed = self._missed(state, row, value)
-            sums = self._added(rest, row) + self._added(state, row)
+            sums = self._added(row)
             most = EQUALITY * max(sums, abs(value))
             if not missed <= most:
                 raise Broken(
@@ -255,10 +257,22 @@ class FeedbackClaims:
         found: list[list[arb]] = loop.nodes[-1].tolist()
         return found
 
-    def _added(self, state: list[list[arb]], row: int) -> float:
-        """The size of the numbers that are added up in a state."""
-        first, *answers = (float(abs(x).upper()) for x in state[row])
-        return first + float(np.array(answers) @ self.loop.radii)
+    def _added(self, row: int) -> float:
+        """The size of the numbers that are added up in a state at the end: of what the system does without control,
+        with it, and of what the control can add."""
+        total = float(self._reaches[row])
+        for loop in (self.loop_at_rest, self.loop):
+            first, *answers = (float(abs(x).upper()) for x in self._last(loop)[row])
+            total += first + float(np.array(answers) @ self.loop.radii)
+        return total
+
+    @cached_property
+    def _reaches(self) -> Array:
+        """What initial state and control add up to in every state at the end, ``(d,)``."""
+        case, d = self.case, self.case.problem.system.states
+        everything, end = Box(np.full(d, -np.inf), np.full(d, np.inf)), case.problem.horizon
+        scene = replace(case.scene, disturbance=None, initial_set=None)
+        return RowUnits(case.problem, scene, everything, end, end).sums
 
     def _entry(self, window: Window) -> Mapping[str, Any]:
         """What the certificate says of the proof of a constraint."""
@@ -278,7 +292,7 @@ class FeedbackClaims:
         known: `said` holds the names ``constraint``, ``time`` and ``violation``."""
         case, loop, name, time = self.case, self.loop, str(said.get("constraint")), number(said, "time")
         number(said, "violation")
-        if name == CONTROL:
+        if name == self.of_control:
             k = int(np.clip(bisect_right(loop.breakpoints, time) - 1, 0, case.control.pieces - 1))
             sides = known(case.problem.control).facets
             if sides is None:
@@ -292,7 +306,7 @@ class FeedbackClaims:
         if name == EQUALS and case.equalities:
             state = self._last(loop)
             return [float(self._missed(state, row, value).mid()) for row, value in case.equalities], TOLERANCE * max(
-                self._added(self._last(self.loop_at_rest), row) for row, _ in case.equalities
+                self._added(row) for row, _ in case.equalities
             )
         window = case.window(name)
         if not window.start <= time <= window.stop:
@@ -304,6 +318,35 @@ class FeedbackClaims:
         found = loop.heights(loop.state(piece, time), np.array([c for c, _ in flat]))
         slack = TOLERANCE * float(case.units(window).rows.max(initial=0.0))
         return [float((height - b).mid()) for height, (_, b) in zip(found, flat, strict=True)], slack
+
+    def driven(self, data: Mapping[str, Any]) -> tuple[arb, float]:
+        """By how much a witness exceeds the constraint that it names, under the disturbance and from the initial state
+        that it names, and how much of that counts as none."""
+        case, loop, name, time = self.case, self.loop, str(data.get("constraint")), number(data, "time")
+        if case.problem.disturbance is not None and data.get("disturbance") is None:
+            raise Unchecked("the certificate holds no disturbance of the witness")
+        direction = numbers(data.get("direction"), "direction")
+        z = [x for block in _deviations(case, loop, data, name) for x in block]
+        of_control = name == self.of_control
+        if direction.shape != (loop.gains.shape[2:][not of_control],):
+            raise Broken(f"{name}: {direction.size} numbers in the direction")
+        if of_control:
+            k = int(np.clip(bisect_right(loop.breakpoints, time) - 1, 0, case.control.pieces - 1))
+            table, limit = loop.effects[k], known(case.problem.control).limit(direction)
+            values = [v + _along(row, z) for v, row in zip(balls(loop.nominal[:, k]), table, strict=True)]
+            return _dot(direction, values) - limit, TOLERANCE * max(known(case.problem.control).units(), default=1.0)
+        window = case.window(name)
+        if not window.start <= time <= window.stop:
+            raise Broken(f"t = {time!r} is not within {window.start:g} to {window.stop:g}")
+        piece = min(max(bisect_right(case.grid, time) - 1, 0), len(case.grid) - 2)
+        state, limit = loop.state(piece, time).tolist(), window.limit(direction, time)
+        values = [row[0] + _along(row[1:], z) for row in state]
+        return _dot(direction, values) - limit, case.units(window).slack(direction, limit)
+
+    @cached_property
+    def of_control(self) -> str:
+        """What the control's own set is called: ``rate`` where a path constraint is called ``control``."""
+        return RATE if any(window.name == CONTROL for window in self.case.windows) else CONTROL
 
     def multiplied(self, entries: Sequence[Any], priced: bool) -> arb:
         """The bound that multipliers of constraints at single disturbances prove, for every policy of the kind.
@@ -499,7 +542,7 @@ class _Row:
         if numbers(entry.get("parameter", []), f"{name}: parameter").size:
             raise Broken(f"{name}: a parameter is given of a known system")
         z = _deviations(case, loop, entry, name)
-        if name in (CONTROL, PEAK):
+        if name in (feedback_of(case).of_control, PEAK):
             return _Row._of_control(case, loop, (name, direction, time, y), z, cost == PEAK)
         if name == EFFORT and cost == WORST:
             return _Row._of_effort(case, loop, direction, y, z)
@@ -530,7 +573,7 @@ class _Row:
         piece = int(np.clip(bisect_right(loop.breakpoints, time) - 1, 0, K - 1))
         nominal[piece] = balls(direction)
         seen = [part if j <= piece else [arb(0)] * d for j, part in enumerate(_seen(loop, z, d))]
-        if name == CONTROL:
+        if name != PEAK:
             return _Row(y, -known(case.problem.control).limit(direction), nominal, seen, None)
         channel = int(np.abs(direction).argmax())
         if not peaks or sorted(np.abs(direction).tolist()) != [0.0] * (m - 1) + [1.0]:
@@ -622,6 +665,12 @@ def _dot(c: Array, x: list[arb]) -> arb:
     from flint import arb
 
     return sum((arb(float(a)) * v for a, v in zip(c, x, strict=True) if a), arb(0))
+
+
+def _along(row: list[arb], z: list[arb]) -> arb:
+    from flint import arb
+
+    return sum((a * b for a, b in zip(row, z, strict=True)), arb(0))
 
 
 def _axis(shape: ConvexSet, channel: int, sign: float) -> arb:

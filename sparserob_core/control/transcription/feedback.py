@@ -27,7 +27,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.program import ConstraintFamily, OwnUnits, SemiInfiniteProgram
 
-CONTROL, PEAK, EFFORT = "control", "peak", "effort"  # names of the families that are about the control
+CONTROL, RATE, PEAK, EFFORT = "control", "rate", "peak", "effort"  # names of the families that are about the control
 EQUALS = "equals"  # that of the terminal equalities
 FINER = 2.0**-11  # of the numbers that are added up, the unit of an equality: it is met to `EQUALITY` of them
 
@@ -87,11 +87,17 @@ def _fixed(
     return (np.vstack([H, -H]), np.append(h, -h)), (np.vstack([scaled, -scaled]), np.append(both, -both))
 
 
+def of_control(problem: OptimalControlProblem) -> str:
+    """What the control's own set is called: ``rate`` where a path constraint is called ``control``."""
+    return RATE if any(getattr(entry, "name", "") == CONTROL for entry in problem.path) else CONTROL
+
+
 def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary) -> None:
     """Raise `InputError` for what a policy is not built for, in one sentence."""
     disturbed = problem.disturbance is not None
     paths = [entry for entry in problem.path if isinstance(entry, PathConstraint)]
-    named = [entry.name for entry in paths if entry.name in (CONTROL, PEAK, EFFORT, EQUALS)]
+    own = CONTROL if problem.control.halfspaces() is None else of_control(problem)
+    named = [entry.name for entry in paths if entry.name in (own, PEAK, EFFORT, EQUALS)]
     plain = problem.disturbance_class == "piecewise_constant"
     reasons = {
         "control in indicators of its pieces (piecewise_constant)": not control.is_indicators,
@@ -143,7 +149,11 @@ def _program(
         families.append(equal.family())
         settled.append(equal.met)
     flat = problem.control.halfspaces()
-    within = FeedbackCurvedControl(loop, problem.control) if flat is None else FeedbackControl(CONTROL, loop, *flat)
+    within = (
+        FeedbackCurvedControl(loop, problem.control)
+        if flat is None
+        else FeedbackControl(of_control(problem), loop, *flat)
+    )
     families.append(within.family())
     axes = np.eye(problem.system.controls)
     low, high = -problem.control.support(-axes), problem.control.support(axes)

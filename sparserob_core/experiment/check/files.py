@@ -309,7 +309,7 @@ def _attained(case: Case, said: Mapping[str, Any]) -> list[str]:
 
 def _begins(case: Case, said: Mapping[str, Any], witness: Mapping[str, Any]) -> bool:
     """Whether the worst initial state that is told is the one that the witness begins at."""
-    if case.problem.initial_set is None:
+    if case.problem.initial_set is None or (case.policy is not None and "initial_state" not in said):
         return "initial_state" not in said
     deviation = witness.get("deviation")
     if not isinstance(deviation, list) or not all(isinstance(one, int | float) for one in deviation):

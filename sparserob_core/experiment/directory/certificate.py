@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 
 from sparserob_core.control.constraints.explanation import TimedExplanation
+from sparserob_core.control.constraints.feedback import told
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.control.studies.answer import ControlResult
 from sparserob_core.control.studies.causal import CausalBound
+from sparserob_core.control.transcription.feedback import of_control
 from sparserob_core.control.transcription.steps import Steps
 from sparserob_core.control.transcription.transcribe import slanted
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment
@@ -49,7 +51,7 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
         return None
     if result.decision is None and result.status != "infeasible":
         return None  # it was stopped before there was anything to claim
-    problem, program = experiment.problem, experiment.program
+    program = experiment.program
     theta = (
         None
         if result.decision is None
@@ -71,7 +73,7 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
         **_fewest(experiment, result.activity),
         **({} if causal is None else {"causal": causal_data(causal)}),
         "proof": _proofs(experiment, result.proofs),
-        "witness": _witness(problem, program, result) if result.status == "refuted" else None,
+        "witness": _witness(experiment, result) if result.status == "refuted" else None,
     }
 
 
@@ -262,13 +264,14 @@ def _joined(lower: Array, upper: Array, first: Array, last: Array) -> tuple[Arra
     return lower[begins, None], upper[np.append(begins[1:], True), None]
 
 
-def _witness(problem: OptimalControlProblem, program: SemiInfiniteProgram, result: Result) -> dict[str, Any] | None:
-    worst = result.worst
+def _witness(experiment: ControlExperiment, result: Result) -> dict[str, Any] | None:
+    worst, problem = result.worst, experiment.problem
     if worst is None:
         return None
-    said = _explained(program, worst.constraint, worst.formulation, worst.index, worst.row)
+    said = _explained(experiment.program, worst.constraint, worst.formulation, worst.index, worst.row)
     if said is None:
         return None
+    said = _driven(experiment, said, np.asarray(result.decision))
     signal: Sequence[Any] | Array | None = said.disturbance
     if signal is not None and problem.disturbance is not None:
         middle = problem.disturbance.interior_point()
@@ -282,3 +285,15 @@ def _witness(problem: OptimalControlProblem, program: SemiInfiniteProgram, resul
         **_deviation(problem, said),
         "violation": worst.violation,
     }
+
+
+def _driven(experiment: ControlExperiment, said: TimedExplanation, decision: Array) -> TimedExplanation:
+    """The same constraint at the deviations that drive a closed loop to it most, where there is one."""
+    feedback = experiment.transcription.feedback
+    if feedback is None or experiment.problem.disturbance_class != "piecewise_constant":
+        return said
+    loop, time = feedback.loop, said.time
+    if said.constraint != of_control(experiment.problem):
+        return told(said, loop, loop.worst(decision, time, said.direction))
+    piece = int(np.searchsorted(experiment.control.breakpoints[1:-1], time, side="right"))
+    return told(said, loop, loop.spread.worst(said.direction @ loop.effects(decision)[piece]))
