@@ -52,7 +52,7 @@ SCALAR: dict[str, Any] = {
 
 def run(problem: dict[str, Any], pieces: int, out: Path, cost: str = "worst", **more: Any) -> sr.Outcome:
     dictionaries = {"control": {"name": "piecewise_constant", "pieces": pieces}}
-    policy = {"name": "affine", "cost": cost, "causal_signals": 0}
+    policy = more.pop("policy", {"name": "affine", "cost": cost, "causal_signals": 0})
     config = {"problem": problem, "dictionaries": dictionaries, "policy": policy, "observers": [], **more}
     return sr.run(config, out=out, quiet=True, figures=False)
 
@@ -254,6 +254,23 @@ def test_forged_costs_and_multipliers_of_an_effort_are_refused(tmp_path: Path) -
         lambda e: {**e, "disturbance": [[1.5 * v for v in row] for row in e["disturbance"]]},
     ):
         assert verdicts(multipliers(change))["lower bound"] == "fails"
+
+
+def test_affine_answers_are_the_best_of_all_causal_ones_for_the_worst_effort_of_a_spring(tmp_path: Path) -> None:
+    """The bound over trees of signals meets the bound over affine policies; forged shares are refused."""
+    spring = {**SCALAR, **PLANE, "horizon": 5.0, "disturbance": {"box": [0.2, 0.2]}, "terminal": [{"box": [0.3, 0.3]}]}
+    spring["path"] = [{"box": [0.7, None], "from": 0.5}]
+    outcome = run(spring, 10, tmp_path / "run", policy={"name": "affine", "cost": "worst"})
+    lower = outcome.summary["causal_lower_bound"]
+    assert outcome.status == "certified" and outcome.result.cost == pytest.approx(1.95941876, rel=1e-7)
+    assert outcome.result.lower_bound * (1.0 - 1e-6) <= lower <= outcome.result.cost
+    assert check(outcome.directory).status == "verified"
+    file = outcome.directory / "certificate.json"
+    certificate = json.loads(file.read_text())
+    shares = certificate["causal"]["shares"]
+    for wrong in ([2.0 * v for v in shares], shares[:-1], [-v for v in shares], [0.0 for _ in shares], None, "1"):
+        file.write_text(json.dumps({**certificate, "causal": {**certificate["causal"], "shares": wrong}}))
+        assert {one.name: one.verdict for one in check(outcome.directory).claims}["causal"] == "fails"
 
 
 def test_the_norm_of_all_channels_together_is_refused(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from flint import arb
 
 MOST = 100_000  # multipliers
-PEAK = "peak"
+PEAK, WORST = "peak", "worst"
 Rows: TypeAlias = "dict[tuple[str, float, bytes], tuple[Row, list[list[arb]]]]"
 SHARE = 1.0 - 2.0**-40  # of a price, that is shared: so that rounding does not share more than there is
 
@@ -55,9 +55,29 @@ def causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> arb:
             if any(not x.is_zero() for x in row.slope[k]):
                 group = groups[k].setdefault(_until(signal, seen[k]), [arb(0)] * m)
                 group[:] = [a + weight * x for a, x in zip(group, row.slope[k], strict=True)]
+    assert case.policy is not None
+    shared = _shares(data, len(signals)) if priced and case.policy.cost == WORST else None
     for k in range(K):
-        total = total + _of_piece(case, k, groups[k], _until(rest, seen[k]), priced)
+        prices: dict[bytes, arb] = {_until(rest, seen[k]): arb(1)} if shared is None else {}
+        for signal, share in zip(signals, shared or (), strict=False):
+            key = _until(signal, seen[k])
+            prices[key] = prices.get(key, arb(0)) + share
+            groups[k].setdefault(key, [arb(0)] * m)
+        total = total + _of_piece(case, k, groups[k], prices, priced)
     return total
+
+
+def _shares(data: Mapping[str, Any], count: int) -> list[arb]:
+    """How much the effort under every signal counts: a mean of these is at most the largest."""
+    from flint import arb
+
+    found = numbers(data.get("shares", []), "causal: shares")
+    if found.shape != (count,) or not (found >= 0.0).all():
+        raise Broken(f"causal: expected shares of {count} signals, not below 0")
+    balls = [arb(float(share)) for share in found]
+    if not sum(balls, arb(0)) <= 1:
+        raise Broken(f"causal: the shares of the signals add up to {found.sum()!r}, expected at most 1")
+    return balls
 
 
 def _refuse(case: Case) -> None:
@@ -119,9 +139,9 @@ def _signals(case: Case, data: Mapping[str, Any]) -> list[Array]:
     return found
 
 
-def _of_piece(case: Case, k: int, groups: dict[bytes, list[arb]], nominal: bytes, priced: bool) -> arb:
+def _of_piece(case: Case, k: int, groups: dict[bytes, list[arb]], counts: dict[bytes, arb], priced: bool) -> arb:
     """The least that the controls on one piece can cost and give to the weighted sum, those of every group of signals
-    together; the price of a peak is shared among the groups."""
+    together; ``counts``: how much of the price a group pays; that of a peak is shared among all."""
     from flint import arb
 
     assert case.policy is not None
@@ -129,8 +149,7 @@ def _of_piece(case: Case, k: int, groups: dict[bytes, list[arb]], nominal: bytes
     length = arb(float(times[k + 1])) - arb(float(times[k]))
     prices = [w * length if priced else arb(0) for w in case.price.weights]
     total, zero = arb(0), [arb(0)] * m
-    shares = dict.fromkeys(groups, zero)
-    shares[nominal] = prices
+    shares = dict.fromkeys(groups, zero) | {key: [part * price for price in prices] for key, part in counts.items()}
     if priced and case.policy.cost == PEAK:
         shares = _shared(case, prices, groups)
     for key, slope in groups.items():

@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import final
+from typing import Literal, final
 
 import numpy as np
 
@@ -78,7 +78,7 @@ class Sampled:
 class Grown:
     """A solved tree: the controls ``u (S, m, K)`` under every signal, the ``value`` of its program, and of the rows
     with a multiplier the signal, the row, the block from which on the worst for that row replaces the signal, and the
-    multiplier; ``x``: the columns."""
+    multiplier; ``x``: the columns; ``shares``: with the cost ``worst`` what every signal's effort counts."""
 
     value: float
     x: Array
@@ -87,6 +87,7 @@ class Grown:
     rows: np.ndarray
     blocks: np.ndarray
     multipliers: Array
+    shares: Array
 
 
 @final
@@ -95,9 +96,10 @@ class Tree:
     """The program of a tree of signals, which grows. Deviations ``z (Q,)`` come in blocks of ``width``,
     ``worst (R, Q)`` are those that are the worst for every row; ``seen (K,)``: how many blocks began before every piece
     of the control; ``prices (m, K)``: what an absolute value costs. The first signal must be the nominal one; with
-    ``peaks`` the largest absolute value over all signals is charged, not that one's. With a ``highest`` factor its
-    program is that of the largest factor of all deviations, without prices. ``seconds`` tells how many a solution may
-    take; ``work`` counts what was done, the same on every machine.
+    the cost ``nominal`` its absolute values are charged, with ``peak`` the largest over all signals, with ``worst``
+    those of the signal that costs most. With a ``highest`` factor its program is that of the largest factor of all
+    deviations, without prices. ``seconds`` tells how many a solution may take; ``work`` counts what was done, the same
+    on every machine.
     """
 
     sampled: Sampled
@@ -106,7 +108,7 @@ class Tree:
     prices: Array
     seen: np.ndarray
     width: int
-    peaks: bool
+    cost: Literal["nominal", "peak", "worst"]
     highest: float | None = None
     seconds: Callable[[], float] = lambda: np.inf
     work: float = 0.0
@@ -116,6 +118,8 @@ class Tree:
     _imposed: set[tuple[int, int, bytes]] = field(default_factory=set)
     _order: list[tuple[int, int, int]] = field(default_factory=list)
     _numbers: list[int] = field(default_factory=list)
+    _own: dict[tuple[int, bytes], np.ndarray] = field(default_factory=dict)
+    _efforts: list[int] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         m, K = self.prices.shape
@@ -127,11 +131,14 @@ class Tree:
         self._linear.variables(np.zeros(1), np.array([high]), np.array([price]))
         self._sizes = np.zeros((m, 0), dtype=int)
         if self.priced:
-            prices = self.prices.ravel()
-            sizes = self._linear.variables(np.zeros(m * K), np.repeat(self._far, K), prices)
-            self._sizes = sizes.reshape(m, K)
-            row = np.zeros(sizes.size, dtype=int)
-            self._budget = int(self._linear.rows([(row, sizes, prices)], np.array([-np.inf]), np.array([np.inf]))[0])
+            self._charges, far = self.prices.ravel(), np.repeat(self._far, K)
+            if self.cost == "worst":
+                self._charges, far = np.ones(1), np.array([2.0 * self._charges @ far])
+            self._charged = self._linear.variables(np.zeros(far.size), far, self._charges)
+            if self.cost != "worst":
+                self._sizes = self._charged.reshape(m, K)
+            entries = [(np.zeros(far.size, dtype=int), self._charged, self._charges)]
+            self._budget = int(self._linear.rows(entries, np.array([-np.inf]), np.array([np.inf]))[0])
 
     @property
     def priced(self) -> bool:
@@ -168,11 +175,19 @@ class Tree:
             if fresh and flat is not None:
                 row, channel = np.nonzero(flat[0])
                 self._rows([(row, columns[channel, k], flat[0][row, channel])], flat[1])
-            if fresh and self.priced and (nominal or self.peaks):
+            if fresh and self.priced and (nominal or self.cost != "nominal"):
                 which = np.arange(m)
+                if self.cost == "worst":
+                    self._own[key] = self._linear.variables(np.zeros(m), self._far, np.zeros(m))
+                sizes = self._own[key] if self.cost == "worst" else self._sizes[:, k]
                 for sign in (1.0, -1.0):
-                    entries = [(which, columns[:, k], np.full(m, sign)), (which, self._sizes[:, k], np.full(m, -1.0))]
-                    self._rows(entries, np.zeros(m))
+                    self._rows([(which, columns[:, k], np.full(m, sign)), (which, sizes, -np.ones(m))], np.zeros(m))
+        if self.priced and self.cost == "worst":
+            own = [self._own[k, self._until(z, int(self.seen[k]))] for k in range(K)]
+            column = np.concatenate([*own, self._charged])
+            self._efforts.append(
+                self._rows([(np.zeros(column.size, dtype=int), column, np.append(self.prices.T, -1.0))], np.zeros(1))
+            )
         self.signals.append(z)
         self._columns.append(columns)
         return True
@@ -217,7 +232,7 @@ class Tree:
     @property
     def _limited(self) -> bool:
         """Whether controls are limited by variables."""
-        return self.peaks and self.priced
+        return self.cost == "peak" and self.priced
 
     @cached_property
     def _by_size(self) -> Array:
@@ -255,10 +270,10 @@ class Tree:
     def relaxed(self, budget: float = np.inf, central: bool = False) -> Grown | None:
         """The least relaxation, in the rows' units, that a cost within a ``budget`` needs (below 0: how far within all
         rows it can stay); the ``value`` is that. ``central``: in the middle of all controls that need no more."""
-        highs, sizes = self._linear.highs, self._sizes.ravel()
+        highs = self._linear.highs
         highs.changeColBounds(0, -ROOM, np.inf)
         highs.changeColCost(0, 1.0)
-        for column in sizes.tolist():
+        for column in self._charged.tolist():
             highs.changeColCost(column, 0.0)
         highs.changeRowBounds(self._budget, -np.inf, budget)
         if central:
@@ -273,7 +288,7 @@ class Tree:
                 highs.clearSolver()
             highs.changeColBounds(0, 0.0, 0.0)
             highs.changeColCost(0, 0.0)
-            for column, price in zip(sizes.tolist(), self.prices.ravel().tolist(), strict=True):
+            for column, price in zip(self._charged.tolist(), self._charges.tolist(), strict=True):
                 highs.changeColCost(column, price)
             highs.changeRowBounds(self._budget, -np.inf, np.inf)
 
@@ -288,8 +303,9 @@ class Tree:
             u, mine = x[np.array(self._columns)], np.array([y[at] for at in self._numbers])
             kept = np.flatnonzero(mine > 0.0)
             signals, rows, blocks = np.array(self._order, dtype=int).reshape(-1, 3)[kept].T
-            value = float(x[0]) if relaxed or not self.priced else float((self.prices * x[self._sizes]).sum())
-            found = Grown(value, x, u, signals, rows, blocks, mine[kept] / self.units[rows])
+            value = float(x[0]) if relaxed or not self.priced else float(self._charges @ x[self._charged])
+            shares = np.maximum([y[at] for at in self._efforts], 0.0)
+            found = Grown(value, x, u, signals, rows, blocks, mine[kept] / self.units[rows], shares)
             if not self._separate(found):
                 break
         return found

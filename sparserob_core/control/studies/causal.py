@@ -19,6 +19,7 @@ from sparserob_core.sip.result import Result
 
 Ended: TypeAlias = Literal["settled", "signals", "work", "seconds"]
 
+SHARED = 1.0 - 2.0**-40  # what shares add up to at most: with rounding no more than 1
 INWARDS = 1.0 - 1e-13  # points that must be in a curved set are drawn inwards by rounding
 AT_ONCE = 8  # signals that a round adds
 TOWARDS = 0.9  # of the way from the bound to the policy's cost: the budget at which the tree is asked for room
@@ -47,12 +48,14 @@ class Weighed:
 class CausalBound:
     """What no causal policy can do: cost less than ``lower``; infinite: exist at all; ``-inf`` where nothing was
     proven. ``signals``: values ``(mw, blocks)`` of the disturbance, ``rows``: constraints under them whose multipliers
-    prove it. ``ended``: why no more was sought."""
+    prove it. ``ended``: why no more was sought. ``shares``: with the cost ``worst`` what the effort under every signal
+    counts, no more than 1 together."""
 
     lower: float
     signals: tuple[Array, ...] = ()
     rows: tuple[Weighed, ...] = ()
     ended: Ended = "settled"
+    shares: tuple[float, ...] = ()
 
 
 @final
@@ -132,8 +135,7 @@ class CausalSearch:
         seen = np.searchsorted(self.starts, self.model.control.breakpoints[:-1])
         width = loop.spread.size // max(1, self.starts.size)
         worst = extreme(loop, self.sampled.N)
-        peaks = feedback.policy.cost == "peak"
-        tree = Tree(self.sampled, worst, problem.control, prices, seen, width, peaks, highest)
+        tree = Tree(self.sampled, worst, problem.control, prices, seen, width, feedback.policy.cost, highest)
         tree.add(np.zeros(loop.spread.size))
         tree.seconds = lambda: limits.seconds
         for _, _, deviation in self._active:
@@ -235,7 +237,16 @@ class CausalSearch:
                 signals.append(_values(z * scale, disturbance, tree.blocks))
             one, s = self.constraints[self.sampled.constraint[row]], self.sampled
             rows.append(Weighed(number, one.name, float(s.time[row]), one.H[s.side[row]], float(y)))
-        return CausalBound(lower, tuple(signals), tuple(rows), ended)
+        held = dict[int, float]()
+        for signal in np.flatnonzero(found.shares).tolist() if np.isfinite(lower) else ():
+            z = tree.signals[signal]
+            number = numbers.setdefault(z.tobytes(), len(numbers))
+            if number == len(signals):
+                signals.append(_values(z * scale, disturbance, tree.blocks))
+            held[number] = held.get(number, 0.0) + float(found.shares[signal])
+        whole = max(1.0, sum(held.values())) / SHARED
+        shares = tuple(held.get(number, 0.0) / whole for number in range(len(signals)) if held)
+        return CausalBound(lower, tuple(signals), tuple(rows), ended, shares)
 
 
 def _values(z: Array, disturbance: ConvexSet | None, blocks: int) -> Array:

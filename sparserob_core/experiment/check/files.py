@@ -84,7 +84,7 @@ def _unread(case: Case) -> set[str]:
     of_activity = fewest.get("multipliers") if isinstance(fewest, Mapping) else None
     left |= _besides("fewest_active", fewest, {"lower", "upper", "multipliers", "decision", "proof"})
     causal = data.get("causal") if case.policy is not None else None
-    left |= _besides("causal", causal, {"lower_bound", "signals", "multipliers"})
+    left |= _besides("causal", causal, {"lower_bound", "signals", "multipliers", "shares"})
     rows = causal.get("multipliers") if isinstance(causal, Mapping) else None
     for entry in rows if isinstance(rows, list) else []:
         left |= _besides("causal.multipliers", entry, (MULTIPLIER - {"parameter"}) | {"signal"})

@@ -79,10 +79,12 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
 
 def causal_data(bound: CausalBound) -> dict[str, Any]:
     """A bound against every causal policy: ``lower_bound``, ``null`` where none exists, the ``signals`` of the
-    disturbance, ``(mw, blocks)`` each, and the ``multipliers`` of constraints under one of them."""
+    disturbance, ``(mw, blocks)`` each, and the ``multipliers`` of constraints under one of them; with the cost
+    ``worst`` the ``shares`` with which the effort under every signal counts."""
     return {
         "lower_bound": bound.lower if np.isfinite(bound.lower) else None,
         "signals": list(bound.signals),
+        **({"shares": list(bound.shares)} if bound.shares else {}),
         "multipliers": [
             {
                 "signal": row.signal,
