@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -23,7 +22,9 @@ from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.events import RoundFinished
 
-TIMES = 400
+TIMES = 400  # drawn at most
+SMOOTH = 200  # drawn at least, about
+NOTHING = 1e-9  # of the largest multiplier: the rounding of a solver
 
 
 def draw_experiment(
@@ -64,7 +65,8 @@ def active_times(solution: Mapping[str, Array]) -> Array:
     """The times of the imposed constraints that carry a multiplier, from ``solution.npz``; none where it has none."""
     if not {"times", "multipliers"} <= set(solution):
         return np.empty(0)
-    return np.unique(solution["times"][solution["multipliers"] > 0])
+    multipliers = solution["multipliers"]
+    return np.unique(solution["times"][multipliers > NOTHING * multipliers.max(initial=0.0)])
 
 
 def _data(
@@ -77,9 +79,8 @@ def _data(
     problem, model, program = experiment.problem, experiment.transcription, experiment.program
     control, dictionary = model.pieces(theta), model.control
     axes = np.eye(problem.system.controls)
-    shown = _shown(model.response.grid.breakpoints.size)
     tolerance = experiment.loaded.config.method.options.get("tolerance")
-    decision, times = np.ravel(theta), model.response.grid.breakpoints[shown]
+    decision, times = np.ravel(theta), _times(model.response.grid.breakpoints)
     around = tube(model, decision, times)
     answered = {} if model.feedback is None else _answered(model, decision, times)
     longest = 0.0 if program.activity is None else float(program.activity.sum())
@@ -123,8 +124,13 @@ def _answered(model: Transcription, decision: Array, times: Array) -> dict[str, 
     }
 
 
-def _shown(count: int) -> np.ndarray[Any, np.dtype[np.intp]]:
-    return np.unique(np.linspace(0, count - 1, min(count, TIMES + 1)).round().astype(int))
+def _times(points: Array) -> Array:
+    """Breakpoints and times between them that show how a state moves; of very many breakpoints some."""
+    if points.size > TIMES + 1:
+        return points[np.unique(np.linspace(0, points.size - 1, TIMES + 1).round().astype(int))]
+    each = max(1, SMOOTH // (points.size - 1))
+    between = points[:-1, None] + np.diff(points)[:, None] * (np.arange(each) / each)
+    return np.append(between.ravel(), points[-1])
 
 
 def _walls(problem: OptimalControlProblem) -> Iterator[Wall]:
