@@ -38,6 +38,7 @@ from sparserob_core.experiment.terminal.printing import printable
 
 DEBUG = "SPARSEROB_DEBUG"
 RARELY = (50_000, 20, 20)  # allocations between two searches for cycles: at first nearly all are of modules, which stay
+QUESTIONS = frozenset({"-h", "--help", "--version"})  # that need no numbers
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -45,15 +46,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     Ctrl-C and SIGTERM end it with what is known by then, and the status 130; a second one ends it at once.
     """
+    given = sys.argv[1:] if arguments is None else arguments
     gc.set_threshold(*RARELY)
     listen()
     open_streams()
-    sys.exit(_status(arguments))
+    if given and QUESTIONS.isdisjoint(given):
+        spare_imports()
+    sys.exit(_status(given))
 
 
-def _status(arguments: Sequence[str] | None) -> int:
+def _status(arguments: Sequence[str]) -> int:
     try:
-        status = int(commands.main(args=arguments, prog_name="sparserob", standalone_mode=False) or 0)
+        status = int(commands.main(args=list(arguments), prog_name="sparserob", standalone_mode=False) or 0)
         sys.stdout.flush()
         return status
     except click.Abort as error:
@@ -89,7 +93,6 @@ class Commands(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         """The command's exit status."""
-        spare_imports()
         try:
             return super().invoke(ctx)
         except BrokenPipeError:

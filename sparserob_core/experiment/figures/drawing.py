@@ -127,7 +127,7 @@ def _answered(model: Transcription, decision: Array, times: Array) -> dict[str, 
 def _times(points: Array) -> Array:
     """Breakpoints and times between them that show how a state moves; of very many breakpoints some."""
     if points.size > TIMES + 1:
-        return points[np.unique(np.linspace(0, points.size - 1, TIMES + 1).round().astype(int))]
+        return np.asarray(points[np.unique(np.linspace(0, points.size - 1, TIMES + 1).round().astype(int))])
     each = max(1, SMOOTH // (points.size - 1))
     between = points[:-1, None] + np.diff(points)[:, None] * (np.arange(each) / each)
     return np.append(between.ravel(), points[-1])
