@@ -242,7 +242,7 @@ problem:
   control: {box: 2.0}
   disturbance: {box: 0.01}
   path: [{box: 5.0}]
-dictionaries: {control: {pieces: 1000}}
+dictionaries: {control: {pieces: 50000}}
 limits: {seconds: 0.02}
 observers: []
 """
