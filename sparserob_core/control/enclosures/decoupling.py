@@ -27,6 +27,7 @@ LongArray: TypeAlias = npt.NDArray[np.longdouble]
 WELL_CONDITIONED = 1e3
 SEPARATED = (1e-6, 1e-4, 1e-2, 0.1, 0.5)  # of the largest eigenvalue: closer ones are tried in one group
 SWEEPS = 16  # of balancing
+FAR = 6.0  # bits by which two ways to balance may differ before the one that is not step by step is taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,65 +154,78 @@ def _candidates(A: Array) -> Iterator[tuple[Array, np.ndarray, np.ndarray]]:
     modal = np.stack(columns, axis=1)
     if modal.shape[0] == modal.shape[1] and np.linalg.cond(modal) < WELL_CONDITIONED:
         yield modal, np.array(starts), np.array(starts)
+    from scipy.linalg import schur
+
+    form, basis = schur(A, output="real")
+    values = _eigenvalues(form)
     for closeness in SEPARATED:
         clusters = _clusters(values, closeness * np.abs(values).max())
         if len(clusters) == 1:
             break
-        found = _grouped(A, values, clusters)
+        found = _grouped(form, basis, clusters)
         if found is not None and np.linalg.cond(found[0]) < WELL_CONDITIONED:
             yield found
-    found = _grouped(A, values, [values])
+    found = _grouped(form, basis, [np.ones(values.size, dtype=bool)])
     if found is not None:
         yield found
 
 
+def _eigenvalues(form: Array) -> np.ndarray:
+    """The eigenvalues of a quasi-triangular matrix, in the order of its diagonal."""
+    below = np.append(np.diag(form, -1), 0.0)
+    turning = np.sqrt(np.abs(below * np.append(np.diag(form, 1), 0.0))) * (below != 0)
+    return np.asarray(np.diag(form) + 1j * (turning - np.append(0.0, turning[:-1])))
+
+
 def _clusters(values: np.ndarray, distance: float) -> list[np.ndarray]:
-    """Eigenvalues that are within ``distance`` of each other, in chains, conjugates always together."""
+    """Which eigenvalues are within ``distance`` of each other, in chains, conjugates always together; the order is that
+    of their numbers."""
     upper = np.where(values.imag < 0, values.conj(), values)
     linked = np.abs(upper[:, None] - upper) <= distance
-    for _ in range(values.size):
+    for _ in range(values.size.bit_length()):
         linked = linked @ linked
     labels = linked.argmax(axis=1)
-    return [values[labels == label] for label in np.unique(labels)]
+    return [labels == label for label in np.unique(labels)]
 
 
-def _grouped(A: Array, values: np.ndarray, clusters: list[np.ndarray]) -> tuple[Array, np.ndarray, np.ndarray] | None:
-    """Orthonormal bases of the invariant subspaces of the clusters, side by side, from one Schur form each."""
-    from scipy.linalg import schur
+def _grouped(form: Array, basis: Array, clusters: list[np.ndarray]) -> tuple[Array, np.ndarray, np.ndarray] | None:
+    """Orthonormal bases of the invariant subspaces of the clusters, side by side, each by bringing its eigenvalues to
+    the front of one Schur form (Bai and Demmel 1993)."""
+    from scipy.linalg.lapack import dtrsen
 
     bases, starts, groups, done = [], [], [], 0
-    others = len(clusters) > 1
     for cluster in clusters:
-
-        def chosen(real: float, imaginary: float = 0.0, cluster: np.ndarray = cluster) -> bool:
-            value = complex(real, imaginary)
-            return bool(np.abs(cluster - value).min() <= np.abs(np.setdiff1d(values, cluster) - value).min())
-
-        form, basis = schur(A, output="real", sort=chosen)[:2] if others else schur(A, output="real")
-        count = cluster.size
-        if others and count < A.shape[0] and abs(form[count, count - 1]) > 0:
-            return None
-        basis = basis[:, :count].copy()
+        moved, turned, count = form, basis, int(cluster.sum())
+        if len(clusters) > 1:
+            moved, turned, *_, error = dtrsen(cluster.astype(np.int32), form, basis, job="N", lwork=form.shape[0])
+            if error or (count < form.shape[0] and abs(moved[count, count - 1]) > 0):
+                return None
+        columns = turned[:, :count].copy()
         places, at = [], 0
         while at < count:
             places.append(done + at)
-            pair = at + 1 < count and form[at + 1, at] != 0
+            pair = at + 1 < count and moved[at + 1, at] != 0
             if pair:  # a rotation: equal off-diagonal entries make it normal
-                basis[:, at + 1] *= np.sqrt(abs(form[at + 1, at] / form[at, at + 1]))
+                columns[:, at + 1] *= np.sqrt(abs(moved[at + 1, at] / moved[at, at + 1]))
             at += 2 if pair else 1
-        bases.append(basis)
+        bases.append(columns)
         starts += places
         groups.append(done)
         done += count
-    if done != A.shape[0]:
-        return None
     return np.hstack(bases), np.array(starts), np.array(groups)
 
 
 def _balance(A: Array) -> Array:
     """Powers of two ``s (d,)`` such that rows and columns of ``A s_j / s_i`` are equally large (Osborne 1960)."""
-    size = np.abs(A - np.diag(np.diag(A)))
-    scale = np.ones(A.shape[0])
+    scale, start = _swept(A, np.ones(A.shape[0])), _near_one(A)
+    # where many states are in a row, each next to its like, the sweeps stop early
+    return scale if np.ptp(np.log2(scale / start)) <= FAR else _swept(A, start)
+
+
+def _swept(A: Array, scale: Array) -> Array:
+    """The powers of two after some sweeps from ``scale (d,)``."""
+    size = np.abs(A - np.diag(np.diag(A))) * scale / scale[:, None]
+    scale = scale.copy()
     for _ in range(SWEEPS):
         moved = False
         for i in range(A.shape[0]):
@@ -226,6 +240,19 @@ def _balance(A: Array) -> Array:
         if not moved:
             break
     return scale
+
+
+def _near_one(A: Array) -> Array:
+    """Powers of two ``s (d,)`` for which the logarithms of the entries ``A_ij s_j / s_i`` have the least squares
+    (Curtis and Reid 1972)."""
+    i, j = np.nonzero(A - np.diag(np.diag(A)))
+    logs, d = np.log2(np.abs(A[i, j])), A.shape[0]
+    graph, sums = np.zeros((d, d)), np.zeros(d)
+    for sign, here, there in ((1.0, i, j), (-1.0, j, i)):
+        np.add.at(graph, (here, here), 1.0)
+        np.add.at(graph, (here, there), -1.0)
+        np.add.at(sums, here, sign * logs)
+    return np.asarray(np.exp2(np.round(np.linalg.lstsq(graph, sums, rcond=None)[0])))
 
 
 def decoupled_transitions(decoupling: Decoupling, D: Array, durations: Array) -> tuple[Array, Array]:

@@ -143,7 +143,7 @@ class DisturbanceSupport:
         young = self._weights(start @ driven)[..., None, :]
         moved = np.einsum("rd,qde->qre", start, flow)
         kernel = backward.kernel[:, : int(pieces.max(initial=0))]
-        old = np.moveaxis(self._weights(np.einsum("qre,eaf->qraf", moved, kernel)), -2, -3)
+        old = np.moveaxis(self._weights(np.tensordot(moved, kernel, axes=1)), -2, -3)
         parts = np.concatenate([of_blocks(combined(young)), of_blocks(combined(old))], axis=2)
         return np.asarray(np.cumsum(parts, axis=2)[which, :, pieces])
 

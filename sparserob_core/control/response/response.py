@@ -23,7 +23,9 @@ from sparserob_core.sip.convex_set import Array
 
 LONG = 1000  # pieces from which the states are computed in blocks
 TINY = float(np.finfo(float).tiny)
+KERNEL = 1_000_000  # numbers of what all ages give in all directions, up to which they are remembered
 FEW = 128  # indices for which a table beats the loop over the pieces
+INSIDE_KEPT = 4  # sets of durations within pieces whose transitions are remembered
 STEPS_KEPT = 16  # sets of parameters whose transitions are remembered
 SAME_DURATION = 1e-15  # of the horizon: durations that differ by less are computed once
 SAME_TIME = 1e-12  # times closer than this share of the horizon are one
@@ -174,13 +176,15 @@ def _joined(points: Array, others: Array) -> Array:
 class Steps:
     """Matrices at ``v`` parameters, ``A (v, J, d, d)`` of every mode and ``B``, ``E`` of all modes side by side, and
     their transitions over whole pieces of ``q`` distinct modes and lengths: ``Phi = e^{A h}`` and
-    ``Gamma = int_0^h e^{A s} ds``, ``(v, q, d, d)`` each."""
+    ``Gamma = int_0^h e^{A s} ds``, ``(v, q, d, d)`` each; ``inside``: those over parts of pieces, as far as they are
+    remembered."""
 
     A: Array
     B: Array
     E: Array
     Phi: Array
     Gamma: Array
+    inside: dict[bytes, tuple[Array, Array]] = field(default_factory=dict, repr=False)
 
     @cached_property
     def side_by_side(self) -> Array:
@@ -284,11 +288,14 @@ class Propagator:
         Phi, Gamma = self._partial(steps, np.zeros_like(pieces), within, pieces)
         rows = np.einsum("kd,kde->ke", directions, Phi)
         gains = np.zeros((times.size, self.grid.pieces, directions.shape[1]))
-        by_age = np.einsum("kd,dle->kle", rows, self.kernel[:, : pieces.max()])
+        by_age = self._aged(rows, int(pieces.max()))
         for number, piece in enumerate(pieces.tolist()):
             gains[number, :piece] = by_age[number, :piece][::-1]
         gains[np.arange(times.size), pieces] = np.einsum("kd,kde->ke", directions, Gamma)
-        free = np.einsum("kd,kde->ke", rows, self._powers[pieces])
+        free = rows.copy()
+        for place, leap in enumerate(self._leaps[: int(pieces.max()).bit_length()]):
+            far = np.flatnonzero(pieces >> place & 1)
+            free[far] = free[far] @ leap
         return free, gains, np.repeat(steps.B, times.size, axis=0), np.repeat(steps.E, times.size, axis=0)
 
     def _partial(self, steps: Steps, which: np.ndarray, within: Array, pieces: np.ndarray) -> tuple[Array, Array]:
@@ -296,7 +303,10 @@ class Propagator:
         shares = np.round(within / horizon, 15)
         if steps.A.shape[:2] == (1, 1):
             distinct, inverse = np.unique(shares, return_inverse=True)
-            Phi, Gamma = self._transitions(steps.A[:, 0], distinct * horizon)
+            key = distinct.tobytes()
+            if key not in steps.inside:  # mostly nothing or a whole piece, again and again
+                remember(steps.inside, key, self._transitions(steps.A[:, 0], distinct * horizon), INSIDE_KEPT)
+            Phi, Gamma = steps.inside[key]
         else:
             modes = np.zeros_like(which) if self.grid.mode is None else self.grid.mode[pieces]
             cases, inverse = np.unique(np.stack([which, modes, shares]), axis=1, return_inverse=True)
@@ -324,9 +334,24 @@ class Propagator:
         return (self.propagate or transitions)(A, durations)
 
     @cached_property
-    def _powers(self) -> Array:
-        """``e^{A tau}`` at the breakpoints, ``(L + 1, d, d)``; for a known system."""
-        return self.flows(self.grid.breakpoints)[0]
+    def _leaps(self) -> Array:
+        """The transitions over 1, 2, 4, ... pieces, ``(q, d, d)``; for a known system and equal pieces."""
+        return self.flows(2.0 ** np.arange(self.grid.pieces.bit_length()) * self._lengths[0])[0]
+
+    def _aged(self, rows: Array, count: int) -> Array:
+        """What a piece of age ``0, ..., count - 1`` still gives to ``rows (k, d)``, ``(k, count, d)``: all ages of a
+        row at once, twice as many each time, where the `kernel` would be large."""
+        if self.grid.pieces * rows.shape[1] ** 2 <= KERNEL:
+            return np.asarray(np.einsum("kd,dle->kle", rows, self.kernel[:, :count]))
+        powers, done = np.empty((rows.shape[0], count, rows.shape[1])), min(1, count)
+        powers[:, :done] = rows[:, None]
+        for leap in self._leaps:
+            if done >= count:
+                break
+            more = min(done, count - done)
+            powers[:, done : done + more] = powers[:, :more] @ leap
+            done += more
+        return np.asarray(powers @ self.steps(np.zeros((1, 0))).Gamma[0, 0])
 
     @cached_property
     def kernel(self) -> Array:
@@ -336,8 +361,8 @@ class Propagator:
         steps = self.steps(np.zeros((1, 0)))
         powers = np.empty((self.grid.pieces, *steps.A.shape[2:]))
         powers[0] = steps.Gamma[0, 0]
-        doublings = 2 ** np.arange((self.grid.pieces - 1).bit_length())  # e^{A (done + i) h} = e^{A done h} e^{A i h}
-        for done, leap in zip(doublings.tolist(), self.flows(doublings * self._lengths[0])[0], strict=True):
+        for place, leap in enumerate(self._leaps[: (self.grid.pieces - 1).bit_length()]):
+            done = 2**place  # e^{A (done + i) h} = e^{A done h} e^{A i h}
             count = min(done, powers.shape[0] - done)
             powers[done : done + count] = leap @ powers[:count]
         return np.ascontiguousarray(powers.swapaxes(0, 1))

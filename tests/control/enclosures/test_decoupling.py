@@ -116,3 +116,13 @@ def test_a_stable_system_stays_bounded_however_long_it_runs():
     basis, D, _ = made(np.array(MATRICES["a defective fast mode"]))
     comparison = ComparisonSystem(comparison_matrix(D, basis.starts), block_sizes(D, basis.starts))
     assert comparison.over(np.array([1e3])).peak.max() <= 20.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_long_chain_of_masses_comes_apart_in_whatever_units_its_states_are(seed):
+    """Sizes along a chain grow and fall without any state that differs much from its neighbours."""
+    count = 30
+    stiffness = 2.0 * np.eye(count) - np.eye(count, k=1) - np.eye(count, k=-1)
+    chain = np.block([[np.zeros((count, count)), np.eye(count)], [-stiffness, -0.1 * stiffness - 0.05 * np.eye(count)]])
+    units = 2.0 ** np.random.default_rng(seed).integers(-30, 30, 2 * count)
+    assert decoupled(chain * units / units[:, None]).groups.size == count

@@ -190,6 +190,20 @@ def test_functionals_asked_for_one_by_one_are_those_asked_for_all_at_once(states
             assert np.allclose(alone[0], among[one], rtol=1e-11, atol=1e-12)
 
 
+@pytest.mark.parametrize("states", [1, 4])
+def test_what_pieces_of_every_age_give_is_the_same_with_and_without_the_kernel(states):
+    rng, breaks = np.random.default_rng(states), np.linspace(0, 2, 54)
+    times, directions = rng.uniform(0, 2, 20), rng.normal(size=(20, states))
+    times[:3] = 0.0, breaks[32], 2.0
+    system, found = random_system(rng, states), []
+    for most in (0, 10**9):
+        with patch("sparserob_core.control.response.response.KERNEL", most):
+            response = Response(system, merge_grids(breaks, breaks), np.zeros(states))
+            found.append(response.adjoint(times, directions, np.zeros((20, 0))))
+    for one, other in zip(*found, strict=True):
+        assert np.allclose(one, other, rtol=1e-12, atol=1e-13)
+
+
 @pytest.mark.parametrize("pieces", [7, 999, 3001])
 def test_many_pieces_add_up_to_the_horizon(pieces):
     """An integrator driven by 1 ends at the horizon; the rounded length of a piece may not accumulate."""
