@@ -20,7 +20,7 @@ STORIES: dict[str, tuple[str, ...]] = {
     "two_modes": ("states",),
     "tracking_corridor": ("states",),
     "motor_voltage": ("states",),
-    "experiment1_feedback": ("states", "gains"),
+    "experiment1_feedback": ("states", "gains", "effort", "answers"),
     "singular": ("control",),
 }
 """The configs of the page, and which of their figures it shows."""

@@ -6,13 +6,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from sparserob_core.control.feedback.closed_loop import ClosedLoop
 from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
 from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.sets.sets import Equality
+from sparserob_core.control.studies.adversary import find_adversary
 from sparserob_core.control.studies.answer import tube
+from sparserob_core.control.studies.measuring import Measuring
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, counting
@@ -25,6 +29,8 @@ from sparserob_core.sip.events import RoundFinished
 TIMES = 400  # drawn at most
 SMOOTH = 200  # drawn at least, about
 NOTHING = 1e-9  # of the largest multiplier: the rounding of a solver
+DRAWS = 2000  # of which the quantiles of the control are drawn
+QUANTILES = (0.05, 0.5, 0.95)
 
 
 def draw_experiment(
@@ -44,7 +50,7 @@ def draw_experiment(
     from sparserob_core.experiment.figures.adversary_figure import write_adversary
     from sparserob_core.experiment.figures.run_figures import write_figures
 
-    data = figure_data(experiment, theta, active_times, history, cost)
+    data = figure_data(experiment, theta, active_times, history, cost, draws=DRAWS)
     files = write_figures(directory / "figures", data)
     if worst:
         files += write_adversary(directory / "figures" / "adversary", worst, data)
@@ -52,13 +58,18 @@ def draw_experiment(
 
 
 def figure_data(
-    experiment: Experiment, theta: Array, active_times: Array, history: Sequence[RoundFinished], cost: float | None
+    experiment: Experiment,
+    theta: Array,
+    active_times: Array,
+    history: Sequence[RoundFinished],
+    cost: float | None,
+    draws: int = 0,
 ) -> FigureData:
-    """What figures of a decision (``theta (m, N)``, or whole) show; raises `InputError` when the program is no
-    control problem."""
+    """What figures of a decision (``theta (m, N)``, or whole) show; under feedback also what so many random
+    disturbances and the worst one make of the control. Raises `InputError` when the program is no control problem."""
     if not isinstance(experiment, ControlExperiment):
         raise InputError("figures: they are for control problems; this is a semi-infinite program of another kind")
-    return _data(experiment, theta, active_times, history, cost)
+    return _data(experiment, theta, active_times, history, cost, draws)
 
 
 def active_times(solution: Mapping[str, Array]) -> Array:
@@ -75,6 +86,7 @@ def _data(
     active_times: Array,
     history: Sequence[RoundFinished],
     cost: float | None,
+    draws: int,
 ) -> FigureData:
     problem, model, program = experiment.problem, experiment.transcription, experiment.program
     control, dictionary = model.pieces(theta), model.control
@@ -82,7 +94,7 @@ def _data(
     tolerance = experiment.loaded.config.method.options.get("tolerance")
     decision, times = np.ravel(theta), _times(model.response.grid.breakpoints)
     around = tube(model, decision, times)
-    answered = {} if model.feedback is None else _answered(model, decision, times)
+    answered = {} if model.feedback is None else _answered(model, decision, times, draws)
     longest = 0.0 if program.activity is None else float(program.activity.sum())
     counts = counting(experiment.loaded)[0] and longest > 0.0
     return FigureData(
@@ -109,9 +121,10 @@ def _data(
     )
 
 
-def _answered(model: Transcription, decision: Array, times: Array) -> dict[str, Array]:
+def _answered(model: Transcription, decision: Array, times: Array, draws: int) -> dict[str, Any]:
     """What feedback adds to the figures: the tube that the nominal control alone has, how far the disturbance moves the
-    control, and the gains."""
+    control, and the gains; with ``draws`` the effort under so many of them, and what moves the control in the worst
+    case."""
     assert model.feedback is not None
     loop, alone = model.feedback.loop, tube(replace(model, feedback=None), model.nominal(decision), times)
     nominal, effects = loop.nominal(decision), loop.effects(decision)
@@ -121,6 +134,8 @@ def _answered(model: Transcription, decision: Array, times: Array) -> dict[str, 
         "control_least": nominal - loop.spread.support(-effects).T,
         "control_most": nominal + loop.spread.support(effects).T,
         "gains": loop.gains(decision),
+        **(_drawn(loop, nominal, effects, draws) if draws else {}),
+        **(_moved(model, decision) if draws else {}),
     }
 
 
@@ -131,6 +146,34 @@ def _times(points: Array) -> Array:
     each = max(1, SMOOTH // (points.size - 1))
     between = points[:-1, None] + np.diff(points)[:, None] * (np.arange(each) / each)
     return np.append(between.ravel(), points[-1])
+
+
+def _drawn(loop: ClosedLoop, nominal: Array, effects: Array, draws: int) -> dict[str, Any]:
+    """Quantiles of ``|u|`` over uniform draws from the sets of the deviations; always the same ones."""
+    rng = np.random.default_rng(0)
+    parts = [
+        convex.sample(draws * count, rng).reshape(draws, -1) - np.tile(middle, count)
+        for _, count, convex, middle in loop.spread.parts
+    ]
+    z = np.concatenate([np.zeros((draws, 0)), *parts], axis=1)
+    found = [np.quantile(np.abs(v + z @ F.T), QUANTILES, axis=0) for v, F in zip(nominal.T, effects, strict=True)]
+    return {"effort": np.stack(found, axis=2), "draws": draws}
+
+
+def _moved(model: Transcription, decision: Array) -> dict[str, Any]:
+    """What every innovation adds to the control on every piece, in the worst case of the constraint that comes nearest
+    to being violated; nothing where that is not a disturbance of the run's pieces."""
+    found = [find_adversary(constraint, decision, model.feedback) for constraint in model.constraints]
+    worst = max((one for one in found if one is not None), key=lambda one: one.violation, default=None)
+    grid = model.response.grid.breakpoints
+    if worst is None or worst.disturbance is None or not np.array_equal(worst.breakpoints, grid):
+        return {}
+    measuring = Measuring.of(model, decision)
+    _, innovations = measuring.follow(worst.disturbance, worst.initial_state)
+    return {
+        "answers": np.einsum("kjid,jd->kji", measuring.gains, innovations),
+        "worst_case": f"the worst case of {printable(worst.name)} at t = {worst.time:.4g}",
+    }
 
 
 def _walls(problem: OptimalControlProblem) -> Iterator[Wall]:

@@ -61,7 +61,9 @@ class FigureData:
 
     Under feedback the control is the nominal one, ``control_least``, ``control_most (m, K)`` are how far the
     disturbance moves it, ``gains (K, K, m, d)`` answer what is measured, and ``alone_lower``, ``alone_upper (d, T)``
-    is the tube that the nominal control alone has.
+    is the tube that the nominal control alone has. ``effort (3, m, K)`` are quantiles of ``|u|`` over ``draws``
+    admissible disturbances (5 %, 50 %, 95 %), and ``answers (K, K, m)`` what the control on every piece adds for the
+    innovation of every breakpoint in the ``worst_case`` that is named; each where it was asked for.
     """
 
     title: str
@@ -86,6 +88,10 @@ class FigureData:
     control_least: Array | None = None
     control_most: Array | None = None
     gains: Array | None = None
+    effort: Array | None = None
+    draws: int = 0
+    answers: Array | None = None
+    worst_case: str = ""
     counts: bool = False
     names: Names = UNNAMED
 
@@ -105,6 +111,13 @@ class FigureData:
     def state_label(self, component: int) -> str:
         """The axis label of one state component."""
         return label(self.names.states, self.names.state_units, "x", component, self.state.shape[0])
+
+    def gain_label(self, channel: int, component: int) -> str:
+        """The label of a gain: of which control on which state, and its unit where both are known."""
+        u, x = self.names.control_units, self.names.state_units
+        unit = f" [{plain(u[channel])} per {plain(x[component])}]" if u and x and u[channel] and x[component] else ""
+        plainly = label(self.names.states, (), "x", component, self.state.shape[0])
+        return f"gain on {plainly}{unit}"
 
     def time_label(self) -> str:
         """The label of the time axis."""

@@ -1,4 +1,4 @@
-"""The three figures of a run: the control, the worst-case tube of every state, and the two bounds that meet."""
+"""The figures of a run: the control, the worst-case tube of every state, gains and effort, and the bounds that meet."""
 
 from __future__ import annotations
 
@@ -19,10 +19,13 @@ if TYPE_CHECKING:
 
     from sparserob_core.sip.convex_set import Array
 
+MOST_GAINS = 16  # pictures of gains in one figure
+IDLE = 1e-7  # of the control's bound: less than that is no action but rounding
+
 
 def write_figures(directory: Path, data: FigureData) -> list[Path]:
-    """Draw ``control``, ``states`` and, when there is a history, ``convergence`` into ``directory``, each as PDF and
-    PNG.
+    """Draw ``control``, ``states``, under feedback ``gains``, ``effort`` and ``answers``, and when there is a history
+    ``convergence`` into ``directory``, each as PDF and PNG.
 
     Returns the files. Raises `InputError` when matplotlib is missing.
     """
@@ -32,6 +35,8 @@ def write_figures(directory: Path, data: FigureData) -> list[Path]:
         files += write_figure(directory / "states", draw_states(data))
         if data.gains is not None:
             files += write_figure(directory / "gains", draw_gains(data))
+            files += write_figure(directory / "effort", draw_effort(data)) if data.effort is not None else []
+            files += write_figure(directory / "answers", draw_answers(data)) if data.answers is not None else []
         if data.history:
             files += write_figure(directory / "convergence", draw_convergence(data))
     return files
@@ -109,21 +114,92 @@ def draw_states(data: FigureData) -> Figure:
 
 
 def draw_gains(data: FigureData) -> Figure:
-    """Every gain as a picture: rows are the pieces of the control, columns the times at which an innovation is seen."""
+    """Every gain as a picture: rows are the pieces of the control, columns the times at which an innovation is seen; of
+    many gains the control channels with the most of them."""
     assert data.gains is not None
     K, _, m, d = data.gains.shape
-    figure, axes = panels(m * d, 2.6, extra=0.3)
-    for number, ax in enumerate(axes):
+    sizes = np.abs(data.gains).max(axis=(0, 1))
+    shown = sorted(np.argsort(-sizes.ravel(), kind="stable")[:MOST_GAINS].tolist())
+    across = 1 if len(shown) < 3 else d if d <= 4 and len(shown) == m * d else 4
+    figure, axes = _grid(len(shown), across)
+    seen = np.tril(np.ones((K, K))) > 0
+    for place, (number, ax) in enumerate(zip(shown, axes, strict=True)):
         channel, state = divmod(number, d)
-        table = np.where(np.tril(np.ones((K, K))) > 0, data.gains[:, :, channel, state], np.nan)
+        table = np.where(seen, data.gains[:, :, channel, state], np.nan)
+        most = float(sizes[channel, state]) or 1.0
+        mesh = ax.pcolormesh(
+            data.breakpoints, data.breakpoints, table, cmap="PuOr", vmin=-most, vmax=most, rasterized=True
+        )
+        if place % across == 0 or len(shown) < m * d:
+            ax.set_ylabel(f"{data.control_label(channel)} answers at")
+        figure.colorbar(mesh, ax=ax, pad=0.01).set_label(data.gain_label(channel, state))
+        ax.set_xlabel(f"innovation seen at {data.time_label()}" if place >= len(shown) - across else "")
+    left = f"  ·  the largest {len(shown)} of {m * d}" if len(shown) < m * d else ""
+    axes[0].set_title(f"{data.title}: gains{left}")
+    return figure
+
+
+def draw_answers(data: FigureData) -> Figure:
+    """Which innovation moves the control on each piece, and by how much, in the worst case that is named."""
+    assert data.answers is not None
+    K, _, m = data.answers.shape
+    figure, axes = panels(m, 2.6, extra=0.3)
+    seen = np.tril(np.ones((K, K))) > 0
+    for channel, ax in enumerate(axes):
+        table = np.where(seen, data.answers[:, :, channel], np.nan)
         most = float(np.nanmax(np.abs(table))) or 1.0
-        ends = data.breakpoints
-        mesh = ax.pcolormesh(ends, ends, table, cmap="PuOr", vmin=-most, vmax=most, rasterized=True)
+        mesh = ax.pcolormesh(
+            data.breakpoints, data.breakpoints, table, cmap="PuOr", vmin=-most, vmax=most, rasterized=True
+        )
         ax.set_ylabel(f"{data.control_label(channel)} answers at")
-        figure.colorbar(mesh, ax=ax, pad=0.01).set_label(f"gain on {data.state_label(state)}")
-    axes[0].set_title(data.title)
+        figure.colorbar(mesh, ax=ax, pad=0.01).set_label(f"adds to {data.control_label(channel)}")
+    _title(axes[0], data.title, f"what every innovation adds to the control, in {data.worst_case}")
     axes[-1].set_xlabel(f"innovation seen at {data.time_label()}")
     return figure
+
+
+def draw_effort(data: FigureData) -> Figure:
+    """How large the control is: quantiles over random disturbances, the nominal control, and the most that any
+    disturbance causes; the ground is white where the control is off whatever happens."""
+    assert data.effort is not None and data.control_least is not None and data.control_most is not None
+    figure, axes = panels(len(data.control), 1.9, extra=0.5)
+    ends, lengths = data.breakpoints, np.diff(data.breakpoints)
+    most = np.maximum(np.abs(data.control_least), np.abs(data.control_most))
+    bound = np.maximum(np.abs(data.control_lower), np.abs(data.control_upper))
+    acts = most > IDLE * np.where(np.isfinite(bound), bound, most.max(axis=1))[:, None]
+    for channel, ax in enumerate(axes):
+        low, middle, high = data.effort[:, channel]
+        top = max(float(most[channel].max()), 1e-9) * 1.12
+        ax.stairs(
+            np.where(acts[channel], top, 0.0), ends, fill=True, color=look.MIST, linewidth=0, zorder=0, label="may act"
+        )
+        ax.stairs(high, ends, baseline=low, fill=True, color=look.SKY, alpha=0.6, linewidth=0, zorder=2,
+                  label="90 % of the draws")  # fmt: skip
+        ax.stairs(middle, ends, baseline=None, color=look.SKY, linewidth=1.2, zorder=3, label="median")
+        ax.stairs(most[channel], ends, baseline=None, color=look.VERMILLION, linewidth=1.2, zorder=4,
+                  label="most, under any disturbance")  # fmt: skip
+        ax.stairs(np.abs(data.control[channel]), ends, baseline=None, color=look.BLUE, linewidth=1.5, zorder=3,
+                  label="nominal")  # fmt: skip
+        ax.set_ylim(0.0, top)
+        ax.set_ylabel(f"size of {data.control_label(channel)}")
+    draw_time_axis(axes[-1], data)
+    off = float((~acts.any(axis=0) * lengths).sum() / lengths.sum())
+    _title(axes[0], data.title, f"off whatever happens for {100 * off:.1f} % of the time  ·  {data.draws} random draws")
+    draw_legend(figure, axes)
+    return figure
+
+
+def _grid(count: int, across: int) -> tuple[Figure, list[Axes]]:
+    """A figure of ``count`` pictures, so many beside one another."""
+    from matplotlib.figure import Figure
+
+    down = -(-count // across)
+    width = look.WIDTH if across == 1 else 3.4 * across
+    figure = Figure(figsize=(width, 2.6 * down + 1.0), layout="constrained")
+    axes = figure.subplots(down, across, squeeze=False).ravel()
+    for ax in axes[count:]:
+        ax.set_visible(False)
+    return figure, list(axes[:count])
 
 
 def draw_convergence(data: FigureData) -> Figure:
