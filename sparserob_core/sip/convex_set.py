@@ -77,6 +77,11 @@ class ConvexSet(ABC):
         """Whether the set is its own `bounding_box`."""
         return False
 
+    @property
+    def is_symmetric(self) -> bool:
+        """Whether the set is known to be symmetric about its `middle`."""
+        return self.is_box
+
     @shaped
     def halfspaces(self) -> tuple[Float[Array, "r d"], Float[Array, " r"]] | None:
         """``(H (r, d), h (r,))`` with the set ``= {x : H x <= h}``, or ``None`` for a curved set."""

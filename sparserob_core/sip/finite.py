@@ -260,10 +260,12 @@ class FiniteSolution:
 class Spread:
     """The set of deviations ``w (Q,)`` from the middle ``(Q,)``: a product of ``sets``, each so many times, in order.
 
-    A deviation is what a point of its set has beyond the set's ``middle``; 0 is one.
+    A deviation is what a point of its set has beyond the set's ``middle``; 0 is one. ``missed``: of its size, by how
+    much what is written down of a deviation may miss it.
     """
 
     sets: tuple[tuple[int, ConvexSet], ...]
+    missed: float = 0.0
 
     @cached_property
     def parts(self) -> tuple[tuple[slice, int, ConvexSet, Array], ...]:
@@ -323,6 +325,11 @@ class Spread:
     def is_box(self) -> bool:
         """Whether every set is a box: the deviations are then those of at most `radii`, entry by entry."""
         return all(convex.is_box for _, convex in self.sets)
+
+    @cached_property
+    def is_symmetric(self) -> bool:
+        """Whether with every deviation its opposite is one."""
+        return all(convex.is_symmetric for _, convex in self.sets)
 
     def support(self, a: Array) -> Array:
         """``max_w w'a (...,)`` of ``a (..., Q)``."""

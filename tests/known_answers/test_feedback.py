@@ -322,7 +322,7 @@ def policies(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"disturbance_class": "measurable"}, "piecewise_constant"),
+        ({"disturbance_class": "l1_ball"}, "piecewise_constant or measurable"),
         ({"control_step": {"box": 0.3}}, "control_step"),
     ],
 )

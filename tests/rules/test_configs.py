@@ -40,6 +40,7 @@ EXPECTED: dict[str, tuple[str, float | None, float]] = {
     "experiment3_reduced": ("certified", None, 0.0),
     "experiment3_repaired": ("certified", 1.11230, 2e-5),
     "haar": ("certified", 0.537592, 5e-6),
+    "measurable_feedback": ("certified", 1.11265558, 1e-7),
     "initial_set": ("certified", 0.502958, 1e-6),
     "motor_voltage": ("certified", 0.799768, 1e-6),
     "parameters_and_disturbance": ("certified", None, 0.0),

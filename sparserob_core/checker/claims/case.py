@@ -87,12 +87,20 @@ class Case:
             raise Broken(f"the problem has no constraint {name!r}")
         return found[0]
 
+    @property
+    def measurable(self) -> bool:
+        """Whether a policy answers measurable disturbances."""
+        kind = self.problem.disturbance_class
+        return self.policy is not None and self.problem.disturbance is not None and kind == "measurable"
+
     @cached_property
     def changes(self) -> list[float] | None:
         """Where the disturbance may jump; ``None`` when there is none. Other classes than piecewise constant ones are
-        not checked."""
+        not checked; of measurable ones that a policy answers, where those jump by which rows are measured."""
         if self.problem.disturbance is None:
             return None
+        if self.measurable:
+            return self.grid[:-1]
         jumps = np.flatnonzero(self.disturbance.changes) + 1
         if self.problem.disturbance_class != "piecewise_constant":
             raise Unchecked(

@@ -104,11 +104,13 @@ class Duality:
                     constant = constant + known(self.problem.disturbance).support(weights)
         return Row(constant, slope)
 
-    def pushed(self, direction: Array, time: float) -> list[list[arb]]:
-        """What every block of the disturbance gives to ``c'x(t)`` of a known system, ``(mw,)`` each."""
-        if not self.changes:
+    def pushed(self, direction: Array, time: float, jumps: list[float] | None = None) -> list[list[arb]]:
+        """What every block of the disturbance gives to ``c'x(t)`` of a known system, ``(mw,)`` each; the blocks begin
+        at ``jumps``, or where those of the problem do."""
+        jumps = self.changes if jumps is None else jumps
+        if not jumps:
             return []
-        every, jumps = flows(self.problem.system, ()), self.changes
+        every = flows(self.problem.system, ())
         parts = every[0].parts
         first, mw = direction.size + parts["B"][0].ncols(), parts["E"][0].ncols()
         lags = self._lags(every, direction, time, {0.0, *(s for s in jumps if s < time)})

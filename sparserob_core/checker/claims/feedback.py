@@ -20,6 +20,7 @@ from sparserob_core.checker.reach.closed_loop import ClosedLoop
 from sparserob_core.checker.reach.directions import Directions
 from sparserob_core.checker.reach.effort import at_most
 from sparserob_core.checker.reach.flow import stacked
+from sparserob_core.checker.reach.measurable import MeasurableLoop
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, Ellipsoid, NormBall
@@ -63,18 +64,20 @@ class FeedbackClaims:
         """The system under the nominal control and the gains."""
         return self._loop(self.case.theta, self.gains)
 
-    def _loop(self, nominal: Array, gains: Array) -> ClosedLoop:
+    def _loop(self, nominal: Array, gains: Array, changes: list[float] | None = None) -> ClosedLoop:
+        """The loop; where ``changes`` are given, under disturbances that jump there only."""
         case = self.case
         if not isinstance(case.problem.system, LinearSystem) or case.problem.system.parameter_count:
             raise Unchecked("the checker knows feedback of known systems only")
-        return ClosedLoop(
+        held = (changes or []) if case.measurable else (case.changes or [])
+        return (MeasurableLoop if case.measurable and changes is None else ClosedLoop)(
             case.problem.system,
             [float(v) for v in np.asarray(case.problem.initial_state)],
             nominal,
             gains,
-            case.grid,
+            sorted({*case.grid, *held}),
             [float(t) for t in case.control.breakpoints],
-            case.changes or [],
+            held,
             case.problem.disturbance,
             case.problem.initial_set,
         )
@@ -315,7 +318,7 @@ class FeedbackClaims:
         if flat is None:
             raise Unchecked("the worst direction of a curved set is not told")
         piece = min(max(bisect_right(case.grid, time) - 1, 0), len(case.grid) - 2)
-        found = loop.heights(loop.state(piece, time), np.array([c for c, _ in flat]))
+        found = loop.highest(piece, time, np.array([c for c, _ in flat]))
         slack = TOLERANCE * float(case.units(window).rows.max(initial=0.0))
         return [float((height - b).mid()) for height, (_, b) in zip(found, flat, strict=True)], slack
 
@@ -361,7 +364,7 @@ class FeedbackClaims:
         assert case.policy is not None
         K, m = case.control.pieces, case.problem.system.controls
         loop = self.loop_at_rest
-        rows = [_Row.of(case, loop, entry, case.policy.cost) for entry in entries]
+        rows = [_Row.of(case, self._told(entry), entry, case.policy.cost) for entry in entries]
         total = sum((row.multiplier * row.constant for row in rows), arb(0))
         slope = [[sum((r.multiplier * r.nominal[k][i] for r in rows if not r.nominal[k][i].is_zero()), arb(0))
                   for i in range(m)] for k in range(K)]  # fmt: skip
@@ -450,7 +453,9 @@ class FeedbackClaims:
                     for s in range(d)
                 ]
             D = stacked(table)
-            if D.ncols() <= D.nrows():
+            if self.case.measurable and members != (0,):
+                inverse = self._independent(D)
+            elif D.ncols() <= D.nrows():
                 inverse = (D.transpose() * D).inv() * D.transpose()
             else:
                 inverse = D.transpose() * (D * D.transpose()).inv()
@@ -467,9 +472,60 @@ class FeedbackClaims:
 
     @cached_property
     def loop_at_rest(self) -> ClosedLoop:
-        """The same system without any control."""
+        """The same system without any control; of measurable disturbances under some of them, that jump often enough to
+        push the state wherever any do."""
+        case = self.case
+        if not case.measurable:
+            return self._resting(None)
+        parts = np.arange(case.problem.system.states) / case.problem.system.states
+        ends = zip(case.grid[:-1], case.grid[1:], strict=True)
+        return self._resting([float(t) for a, b in ends for t in a + parts * (b - a)])
+
+    def _resting(self, changes: list[float] | None) -> ClosedLoop:
         K, m, d = self.case.control.pieces, self.case.problem.system.controls, self.case.problem.system.states
-        return self._loop(np.zeros((m, K)), np.zeros((K, K, m, d)))
+        return self._loop(np.zeros((m, K)), np.zeros((K, K, m, d)), changes)
+
+    def _told(self, entry: object) -> ClosedLoop:
+        """The system at rest under disturbances that jump where the one does that an entry names."""
+        if not self.case.measurable:
+            return self.loop_at_rest
+        if not isinstance(entry, Mapping):
+            raise Broken("multipliers: expected a constraint, a time, a direction, a disturbance and a number each")
+        name = str(entry.get("constraint"))
+        changes = numbers(entry.get("changes"), f"{name}: changes")
+        if changes.ndim != 1 or not changes.size or changes[0] != 0.0 or not (np.diff(changes) > 0.0).all():
+            raise Broken(f"{name}: the disturbance must change at increasing times from 0 on")
+        if changes[-1] >= self.case.grid[-1]:
+            raise Broken(f"{name}: the disturbance changes at {float(changes[-1]):.6g}, after the end")
+        return self._resting([float(t) for t in changes])
+
+    def _independent(self, D: arb_mat) -> arb_mat:
+        """A right inverse; where the disturbance cannot push the state everywhere, a left inverse of as many columns as
+        it has directions to push it in, and 0 for the others: all that it does is a combination of these. How many
+        directions there are is found without rounding."""
+        from flint import fmpq, fmpq_mat
+        from scipy.linalg import qr
+
+        A, E = ([[fmpq(*float(x.mid()).as_integer_ratio()) for x in row] for row in part.tolist()]
+                for part in (self.loop_at_rest.parts["A"], self.loop_at_rest.parts["E"]))  # fmt: skip
+        if any(not x.is_exact() for part in ("A", "E") for x in self.loop_at_rest.parts[part].entries()):
+            raise Unchecked("the numbers of the system are not exact")
+        pushed = [fmpq_mat(E)]
+        for _ in range(len(A) - 1):
+            pushed.append(fmpq_mat(A) * pushed[-1])
+        rank = fmpq_mat([column for part in pushed for column in part.transpose().tolist()]).rank()
+        if rank == len(A):
+            return D.transpose() * (D * D.transpose()).inv()
+        columns = np.array([[float(x.mid()) for x in row] for row in D.tolist()])
+        sizes = np.linalg.norm(columns, axis=0)
+        order = qr(columns / np.where(sizes > 0.0, sizes, 1.0), mode="economic", pivoting=True)[2][:rank]
+        chosen = stacked([[row[j] for j in order] for row in D.tolist()])
+        try:
+            inverse = ((chosen.transpose() * chosen).inv() * chosen.transpose()).tolist()
+        except ZeroDivisionError:
+            raise Unchecked("the checker cannot tell in which directions the disturbance pushes the state") from None
+        rows = dict(zip(order.tolist(), inverse, strict=True))
+        return stacked([rows.get(j, [0 * x for x in inverse[0]]) for j in range(D.ncols())])
 
     @cached_property
     def _inverses(self) -> dict[tuple[int, ...], tuple[arb_mat, list[int]]]:
@@ -495,7 +551,7 @@ class _Sides:
 
     def _heights(self, piece: int, time: float) -> Array:
         if (piece, time) not in self._known:
-            found = self.loop.heights(self.loop.state(piece, time), self.rows)
+            found = self.loop.highest(piece, time, self.rows)
             self._known[piece, time] = np.array([float(x.upper()) for x in found])
             over = (np.array([float(x.lower()) for x in found]) - self.limits) / self.unit
             if (over > TOLERANCE).any():
@@ -611,7 +667,7 @@ def _given(case: Case, loop: ClosedLoop, direction: Array, time: float, z: list[
     control answers them."""
     from flint import arb
 
-    weights = case.duality.pushed(direction, time)
+    weights = case.duality.pushed(direction, time, loop.changes)
     weights += [] if case.problem.initial_set is None else [case.duality.carried(direction, time)]
     return sum(
         (

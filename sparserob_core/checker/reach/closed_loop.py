@@ -14,7 +14,7 @@ from bisect import bisect_right
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import accumulate
-from typing import TYPE_CHECKING, final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -42,7 +42,6 @@ def middle(shape: ConvexSet) -> Array:
     return found
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class ClosedLoop:
     """A known system from ``initial_state`` under the nominal control ``(m, K)`` and ``gains (K, K, m, d)``; ``grid``:
@@ -176,7 +175,7 @@ class ClosedLoop:
         """What drives the nominal state and every response on each piece of the grid, ``(d, 1 + Q)``."""
         from flint import arb
 
-        m, E, mw, found = self.gains.shape[2], self.parts["E"], self.width, []
+        m, E, found = self.gains.shape[2], self.parts["E"], []
         B, drift = stacked([row[:m] for row in self.parts["B"].tolist()]), self.drift
         onto = [E * stacked([[arb(float(v))] for v in self.middle])] if self.blocks else []
         by_control = {}
@@ -191,11 +190,20 @@ class ClosedLoop:
             if self.blocks:
                 for i in range(len(rows)):
                     rows[i][0] = rows[i][0] + onto[0][i, 0]
-                    for b in range(mw):
-                        at = 1 + block * mw + b
-                        rows[i][at] = rows[i][at] + E[i, b]
+                self._entered(rows, block)
             found.append(stacked(rows))
         return found
+
+    def _entered(self, rows: list[list[arb]], block: int) -> None:
+        """Add what a block of the disturbance drives to what drives the state, row by row."""
+        E = self.parts["E"]
+        for i, row in enumerate(rows):
+            for b in range(self.width):
+                row[1 + block * self.width + b] = row[1 + block * self.width + b] + E[i, b]
+
+    def _ended(self, piece: int, state: arb_mat) -> arb_mat:
+        """The state and the responses when a piece of the grid is over, from what they are by then."""
+        return state
 
     @cached_property
     def nodes(self) -> list[arb_mat]:
@@ -207,11 +215,11 @@ class ClosedLoop:
             answers = [[] for _ in begin]
         else:
             begin = [v + arb(float(m)) for v, m in zip(begin, self.sets[-1][1], strict=True)]
-        zero = [arb(0)] * (self.blocks * self.width)
+        zero = [arb(0)] * self.starts[self.blocks]
         found = [stacked([[v, *zero, *row] for v, row in zip(begin, answers, strict=True)])]
         for piece, drive in enumerate(self.drives):
             Phi, Gamma = self._held(self.grid[piece], self.grid[piece + 1])
-            found.append(Phi * found[-1] + Gamma * drive)
+            found.append(self._ended(piece, Phi * found[-1] + Gamma * drive))
         return found
 
     def state(self, piece: int, time: float) -> arb_mat:
@@ -244,8 +252,12 @@ class ClosedLoop:
 
     def heights(self, state: arb_mat, rows: Array | arb_mat) -> list[arb]:
         """``max c'x`` over all deviations for every row ``c`` of ``rows (r, d)``, at a time with this `state`."""
-        along = (_matrix(rows) * state).tolist()
+        along = (exactly(rows) * state).tolist()
         return [row[0] + self.support(row[1:]) for row in along]
+
+    def highest(self, piece: int, time: float, rows: Array) -> list[arb]:
+        """`heights` at a time in a piece of the grid."""
+        return self.heights(self.state(piece, time), rows)
 
     def bent(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:
         """By how much ``max c'x(t)`` may lie above its chord on ``[start, stop]``, a part of a piece of the grid, at
@@ -255,7 +267,7 @@ class ClosedLoop:
 
         A, h = self.parts["A"], arb(stop) - arb(start)
         rate = A * self.state(piece, start) + self.drives[piece]
-        row, factor = _matrix(rows) * A, arb(1)
+        row, factor = exactly(rows) * A, arb(1)
         total = np.zeros((row.nrows(), 1 + self.starts[-1]))
         for order in range(TERMS):
             found = Enclosed.of(row * rate)
@@ -270,7 +282,8 @@ class ClosedLoop:
         return np.asarray(float((h * h / 8).upper()) * summed * OUTWARD)
 
 
-def _matrix(rows: Array | arb_mat) -> arb_mat:
+def exactly(rows: Array | arb_mat) -> arb_mat:
+    """Rows of floats as balls."""
     from flint import arb
 
     return stacked([[arb(float(v)) for v in row] for row in rows]) if isinstance(rows, np.ndarray) else rows

@@ -299,21 +299,34 @@ class FeedbackControl:
                  for i, v in enumerate(direction) if v]  # fmt: skip
         right = "its peak" if self.bound is not None else f"{self.h[row]:.6g}"
         text = f"{self.name}: {' + '.join(terms)} <= {right}"
-        return told(TimedExplanation(text, self.name, text, time, direction), self.loop, index[1:])
+        said = TimedExplanation(text, self.name, text, time, direction)
+        return told(said, self.loop, index[1:], controls=True)
 
 
-def told(said: TimedExplanation, loop: ClosedLoop, w: Array) -> TimedExplanation:
-    """What is said of a constraint, of every disturbance, or at deviations ``w (Q,)``."""
+def told(said: TimedExplanation, loop: ClosedLoop, w: Array, controls: bool = False) -> TimedExplanation:
+    """What is said of a constraint, on the state or on the ``controls``, of every disturbance, or at deviations
+    ``w (Q,)``."""
     problem = loop.functionals
     every = ("disturbance", problem.disturbance), ("initial state", problem.initial)
     text = f"{said.statement} for every {' and '.join(name for name, one in every if one is not None) or 'disturbance'}"
-    if not w.size:
+    if not w.size and loop.spread.size:
         return replace(said, text=text, disturbance=None, begun=None, deviation=None, quantity="")
     point, width = loop.spread.middle + w, loop.steps.E.shape[2]
-    own = point[: point.size - int(loop.begins.sum())]
-    signal = None if problem.disturbance is None else own.reshape(-1, width).T
+    signal = changes = None
+    if loop.measurable is not None:
+        breakpoints, signal = loop.signal(w, said.time, None if controls else said.direction)
+        changes = breakpoints[:-1]
+    elif problem.disturbance is not None:
+        signal = point[: point.size - int(loop.begins.sum())].reshape(-1, width).T
     if problem.initial is None:
-        return replace(said, text=text, disturbance=signal, quantity="")
+        return replace(said, text=text, disturbance=signal, changes=changes, quantity="")
     deviation = loop.begins @ point
-    begun = problem.response.initial_state + deviation
-    return replace(said, text=text, disturbance=signal, begun=begun, deviation=deviation, quantity="")
+    return replace(
+        said,
+        text=text,
+        disturbance=signal,
+        changes=changes,
+        begun=problem.response.initial_state + deviation,
+        deviation=deviation,
+        quantity="",
+    )

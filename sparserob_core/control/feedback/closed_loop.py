@@ -14,7 +14,9 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from sparserob_core.control.feedback.innovations import KNOWN, Answers
+from sparserob_core.control.feedback.measurable import MeasurablePieces
 from sparserob_core.control.response.functional import WorstCase
+from sparserob_core.control.response.measurable import MISSED
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.finite import Spread, UncertainRows
 
@@ -31,14 +33,16 @@ class ClosedLoop:
     """The functionals of one system whose control answers what it sees.
 
     The decision ``x (n,)`` begins with the nominal control ``v (m, K)``, raveled; the variables of ``answers`` follow,
-    and then whatever else the program has. ``spread``: the deviations of the disturbance, block after block, and of the
-    initial state where there is a set of them.
+    and then whatever else the program has. ``spread``: the deviations of the disturbance, block after block (of
+    ``measurable`` ones what they make of the state at the end of every piece of the grid), and of the initial state
+    where there is a set of them.
     """
 
     functionals: WorstCase
     answers: Answers
     spread: Spread
     variables: int
+    measurable: MeasurablePieces | None = None
     _paths: dict[bytes, tuple[Array, Array]] = field(default_factory=dict, repr=False)
 
     @property
@@ -68,7 +72,7 @@ class ClosedLoop:
         """Which entries of the deviations act on every piece of the grid, and how: ``(L, mw, Q)``."""
         model, grid = self.functionals.disturbance, self.functionals.response.grid
         table = np.zeros((grid.pieces, self.steps.E.shape[2], self.spread.size))
-        if model is not None:
+        if model is not None and self.measurable is None:
             assert model.starts is not None
             block = np.searchsorted(model.starts, np.arange(grid.pieces), side="right") - 1
             width = model.channels
@@ -92,6 +96,8 @@ class ClosedLoop:
     @cached_property
     def middles(self) -> Array:
         """The middle of the disturbance on every piece of the grid, ``(L, mw)``."""
+        if self.measurable is not None:
+            return np.tile(self.measurable.middle, (self.functionals.response.grid.pieces, 1))
         return np.asarray(self.entries @ self.spread.middle)
 
     def drives(self, x: Array) -> Array:
@@ -104,7 +110,8 @@ class ClosedLoop:
 
     def path(self, x: Array) -> tuple[Array, Array]:
         """The nominal state and every response at the breakpoints of the grid, ``(L + 1, d, 1 + Q)``, and what drives
-        them; those of the last few decisions are remembered."""
+        them; those of the last few decisions are remembered. What measurable disturbances have done is told when a
+        piece is over."""
         key = x.tobytes()
         if key not in self._paths:
             response, drives = self.functionals.response, self.drives(x)
@@ -114,6 +121,9 @@ class ClosedLoop:
                 nodes[piece + 1] = (
                     self.steps.Phi[0, length] @ nodes[piece] + self.steps.Gamma[0, length] @ drives[piece]
                 )
+                if self.measurable is not None:
+                    place, outward = self.measurable.at(piece)
+                    nodes[piece + 1, :, 1:][:, place] += outward
             while len(self._paths) > 1:
                 self._paths.pop(next(iter(self._paths)))
             self._paths[key] = (nodes, drives)
@@ -134,7 +144,8 @@ class ClosedLoop:
 
     def values(self, x: Array, times: Array, H: Array) -> Array:
         """``max_w H x(t)`` at ``times (k,)`` for ``H (r, d)``: ``(k, r)``."""
-        return self.height(H @ self.states(x, times))
+        found = self.height(H @ self.states(x, times))
+        return found if self.measurable is None else found + self.measurable.within(times, H)
 
     def bounds(self, x: Array, lower: Array, upper: Array, H: Array) -> Array:
         """Upper bounds ``(k, r)`` of ``max_w H x(t)`` over cells of time ``[lower, upper] (k,)``, each within one piece
@@ -169,17 +180,25 @@ class ClosedLoop:
         radii = np.concatenate([[1.0], self.spread.radii])
         size = np.abs(H) @ np.maximum(np.abs(ends[0]), np.abs(ends[1]))
         late = (h[..., 0] ** 2 / 8.0) * (bent @ radii)
-        found = np.maximum(self.height(along[0]), self.height(along[1])) + late + ROUND_OFF * (size @ radii)
-        return np.where(np.isnan(found), np.inf, found), late
+        found, lost = [self.height(one) for one in along], ROUND_OFF * (size @ radii)
+        if self.measurable is not None:
+            inside = (self.measurable.within(end, H, pieces) for end in (lower, upper))
+            found = [value + more for value, more in zip(found, inside, strict=True)]
+            lost += self.measurable.allowance(lower, upper, H, pieces) + MISSED * (size @ radii)
+        most = np.maximum(*found) + late + lost
+        return np.where(np.isnan(most), np.inf, most), late
 
     def worst(self, x: Array, time: float, direction: Array) -> Array:
         """A deviation ``(Q,)`` that attains the worst case of ``c'x(t)``."""
         along = direction @ self.states(x, np.array([time]))[0]
         return self.spread.worst(along[1:])
 
-    def signal(self, deviation: Array) -> Array:
-        """The disturbance ``(mw, L)`` on the pieces of the grid of a deviation ``(Q,)``."""
-        return np.asarray((self.entries @ (self.spread.middle + deviation)).T)
+    def signal(self, deviation: Array, time: float, direction: Array | None) -> tuple[Array, Array]:
+        """Breakpoints and the disturbance ``(mw, L)`` between them that has a deviation ``(Q,)``: on the pieces of the
+        grid, or measurable and the worst for ``direction'x(time)`` on the piece that holds ``time``."""
+        if self.measurable is not None:
+            return self.measurable.signal(deviation, time, direction)
+        return self.functionals.response.grid.breakpoints, (self.entries @ (self.spread.middle + deviation)).T
 
     def begun(self, deviation: Array) -> Array:
         """The initial state ``(d,)`` of a deviation ``(Q,)``."""
@@ -212,6 +231,9 @@ class ClosedLoop:
         g = np.zeros((count, self.variables))
         g[:, : self.nominal_size] = on_control
         d = np.einsum("pli,liq->pq", on_noise[firsts], self.entries) + free[firsts] @ self.begins
+        if self.measurable is not None:
+            d[:, : self.measurable.size] = self.measurable.weights(time, H[firsts])
+            offset = offset + self.measurable.within(np.array([time]), H)[0]
         return UncertainRows(csr_array(g), h - offset, part, factor, tuple(parts), d)
 
     def control_rows(self, piece: int, H: Array, h: Array, extra: Array | None = None) -> UncertainRows:
@@ -258,7 +280,7 @@ def shared(H: Array, spread: Spread) -> tuple[np.ndarray, Array]:
         for p, first in enumerate(firsts):
             at = int(np.abs(H[first]).argmax())
             share = H[row, at] / H[first, at]
-            if np.array_equal(H[row], share * H[first]) and (share > 0.0 or spread.is_box):
+            if np.array_equal(H[row], share * H[first]) and (share > 0.0 or spread.is_symmetric):
                 part[row], factor[row] = p, share
                 break
         else:

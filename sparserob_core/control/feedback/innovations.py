@@ -18,6 +18,7 @@ from sparserob_core.control.response.response import SAME_TIME, Response
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
+    from sparserob_core.control.feedback.measurable import MeasurablePieces
     from sparserob_core.control.problem.dictionary import Dictionary
     from sparserob_core.control.response.disturbance import DisturbanceModel
 
@@ -26,7 +27,11 @@ KNOWN = np.zeros((1, 0))
 
 
 def innovations_seen(
-    response: Response, control: Dictionary, model: DisturbanceModel | None, begins: bool = False
+    response: Response,
+    control: Dictionary,
+    model: DisturbanceModel | None,
+    begins: bool = False,
+    pieces: MeasurablePieces | None = None,
 ) -> Array:
     """``D (K, d, Q)``: what every innovation is of the deviations, block after block, and then, where a set of initial
     states ``begins``, of those of the initial state, of which ``e_0`` is all; ``e_0`` is 0 from one initial state."""
@@ -37,6 +42,8 @@ def innovations_seen(
     if model is None:
         return begun
     grid, E = response.grid, response.steps(KNOWN).E[0]
+    if pieces is not None:
+        return np.concatenate([_measurable(response, control, pieces), begun], axis=2)
     assert model.starts is not None
     block = np.searchsorted(model.starts, np.arange(grid.pieces), side="right") - 1
     ends = control.breakpoints[grid.control_piece + 1]
@@ -47,6 +54,19 @@ def innovations_seen(
         if grid.control_piece[piece] + 1 < K:  # what happens on the last piece is seen when all is over
             D[grid.control_piece[piece] + 1, :, block[piece]] += moved[piece]
     return np.concatenate([D.reshape(K, d, -1), begun], axis=2)
+
+
+def _measurable(response: Response, control: Dictionary, pieces: MeasurablePieces) -> Array:
+    """The same of what measurable disturbances make of the state at the end of every piece."""
+    grid, K = response.grid, control.pieces
+    ends = control.breakpoints[grid.control_piece + 1]
+    flows = response.flows(ends - grid.breakpoints[1:])[0]
+    D = np.zeros((K, response.initial_state.size, pieces.size))
+    for piece in range(grid.pieces):
+        if grid.control_piece[piece] + 1 < K:
+            place, outward = pieces.at(piece)
+            D[grid.control_piece[piece] + 1, :, place] = flows[piece] @ outward * pieces.seen(piece)
+    return D
 
 
 @final

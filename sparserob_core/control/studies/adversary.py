@@ -77,8 +77,10 @@ def _of_loop(constraint: StateConstraint, decision: Array, loop: ClosedLoop) -> 
     row, time = int(worst.rows[0]), float(worst.indices[0, 0])
     _, directions, _, bounds = constraint.functionals_at(worst.indices[:1])
     response, direction = constraint.functionals.response, directions[row]
-    disturbed = constraint.functionals.disturbance is not None
     deviation = loop.worst(decision, time, direction)
+    breakpoints, disturbance = response.grid.breakpoints, None
+    if constraint.functionals.disturbance is not None:
+        breakpoints, disturbance = loop.signal(deviation, time, direction)
     return Adversary(
         name=constraint.name,
         row=row,
@@ -88,8 +90,8 @@ def _of_loop(constraint: StateConstraint, decision: Array, loop: ClosedLoop) -> 
         parameter=np.zeros(0),
         initial_state=loop.begun(deviation),
         violation=float(worst.violations[0]),
-        breakpoints=response.grid.breakpoints,
-        disturbance=loop.signal(deviation) if disturbed else None,
+        breakpoints=breakpoints,
+        disturbance=disturbance,
     )
 
 

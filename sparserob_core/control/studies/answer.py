@@ -139,9 +139,9 @@ def tube(model: Transcription, theta: Array, times: Array) -> Tube:
     """The tube at a decision ``theta (m N,)``, or the whole one under feedback, and at ``times (T,)``."""
     if model.feedback is not None:
         loop = model.feedback.loop
-        states = loop.states(theta, times)
-        above, below = (loop.spread.support(sign * states[:, :, 1:]) for sign in (1.0, -1.0))
-        return Tube(times, states[:, :, 0].T, (states[:, :, 0] - below).T, (states[:, :, 0] + above).T)
+        nominal, axes = loop.states(theta, times)[:, :, 0], np.eye(model.problem.system.states)
+        upper, lower = loop.values(theta, times, axes), -loop.values(theta, times, -axes)
+        return Tube(times, nominal.T, lower.T, upper.T)
     functionals, known = model.functionals, model.functionals.central()
     bound = model.problem.system.parameters
     centre = np.zeros(0) if bound is None else nominal_point(bound)

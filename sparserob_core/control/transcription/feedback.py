@@ -15,16 +15,20 @@ from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.feedback.closed_loop import ClosedLoop, deviations_of
 from sparserob_core.control.feedback.innovations import Answers, answers, innovations_seen
+from sparserob_core.control.feedback.measurable import MeasurablePieces, measurable_pieces
+from sparserob_core.control.feedback.zonoid import has_corners
 from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
 from sparserob_core.control.problem.units import Units, power_of_two
+from sparserob_core.control.response.measurable import MISSED
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.transcription.own_units import reaches
 from sparserob_core.control.transcription.record import Feedback, Transcription
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.finite import Spread
 from sparserob_core.sip.program import ConstraintFamily, OwnUnits, SemiInfiniteProgram
 
 CONTROL, RATE, PEAK, EFFORT = "control", "rate", "peak", "effort"  # names of the families that are about the control
@@ -37,33 +41,34 @@ def with_feedback(
 ) -> Transcription:
     """The program of a problem under a policy, from its transcription ``model`` without feedback and without terminal
     equalities, and the same in its ``own`` ``units``."""
+    pieces = measurable_pieces(own.functionals)
+    spread = _spread(own, pieces)
+    begins = own.problem.initial_set is not None
     blocks = 0 if own.functionals.disturbance is None else own.functionals.disturbance.block_count
     deviations = np.tile(units.disturbances[: own.problem.system.disturbances], blocks)
-    begins = own.problem.initial_set is not None
+    deviations = deviations if pieces is None else np.ones(pieces.size)
     deviations = np.concatenate([deviations, units.states]) if begins else deviations
-    seen = innovations_seen(own.response, own.control, own.functionals.disturbance, begins)
-    spread = deviations_of(own.problem.disturbance, blocks, own.problem.initial_set)
+    seen = innovations_seen(own.response, own.control, own.functionals.disturbance, begins, pieces)
     seen = seen * (spread.chords > 0.0)  # what cannot deviate is not answered
     memory = None if policy.memory is None else policy.memory / units.time
     scaled = answers(seen, own.control.breakpoints, own.problem.system.controls, memory)
     known = _in_users(scaled, units, deviations)
 
+    acting = None if pieces is None else pieces.in_units_of(model.functionals, units.states, units.disturbances)
     fixed = _fixed(problem, own, units)
-    mine, theirs = (
-        _program(one, policy, each, blocks, ends)
-        for one, each, ends in zip((model, own), (known, scaled), fixed, strict=True)
-    )
+    mine = _program(model, policy, known, acting, fixed[0])
+    theirs = _program(own, policy, scaled, pieces, fixed[1])
     told = [
         _told_by(family, other, units, deviations, own)
         for family, other in zip(theirs[0].families, mine[0].families, strict=True)
     ]
     scaled_program = replace(theirs[0], families=told, cost_unit=units.cost)
-    pieces = own.control.pieces
+    repeated = own.control.pieces
     decision = np.concatenate(
         [
-            np.repeat(units.controls, pieces),
+            np.repeat(units.controls, repeated),
             units.controls[scaled.channel] / deviations[scaled.entry],
-            np.full(1, units.cost) if policy.cost == "worst" else np.repeat(units.controls, pieces),
+            np.full(1, units.cost) if policy.cost == "worst" else np.repeat(units.controls, repeated),
         ]
     )[: scaled_program.n]
     program = mine[0].mirrored(lambda _: OwnUnits(scaled_program, decision, decision, np.zeros(0), units.cost))
@@ -92,21 +97,35 @@ def of_control(problem: OptimalControlProblem) -> str:
     return RATE if any(getattr(entry, "name", "") == CONTROL for entry in problem.path) else CONTROL
 
 
-def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary) -> None:
+def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary, cost: str) -> None:
     """Raise `InputError` for what a policy is not built for, in one sentence."""
     disturbed = problem.disturbance is not None
     paths = [entry for entry in problem.path if isinstance(entry, PathConstraint)]
+    sets = [entry.set for entry in paths] + [end for end in problem.terminal if not isinstance(end, Equality)]
+    curved = [one.kind for one in (*sets, problem.control) if one.halfspaces() is None]
     own = CONTROL if problem.control.halfspaces() is None else of_control(problem)
     named = [entry.name for entry in paths if entry.name in (own, PEAK, EFFORT, EQUALS)]
-    plain = problem.disturbance_class == "piecewise_constant"
+    kind, bound = problem.disturbance_class, problem.disturbance
+    measurable = bound is not None and kind == "measurable"
+    ends = any(isinstance(end, Equality) for end in problem.terminal)
     reasons = {
         "control in indicators of its pieces (piecewise_constant)": not control.is_indicators,
         "system without uncertain parameters: else what is measured is not the disturbance alone": bool(
             problem.system.parameter_count
         ),
-        f"disturbance of the class piecewise_constant, not {problem.disturbance_class}": disturbed and not plain,
-        "disturbance that takes any value on each of its pieces": disturbed and not disturbance.is_complete,
+        f"disturbance of the class piecewise_constant or measurable, not {kind}": disturbed
+        and kind not in ("piecewise_constant", "measurable"),
+        f"measurable disturbance in a set with known corners, which the {bound.kind if bound else ''} has not": bool(
+            measurable and bound is not None and not has_corners(bound)
+        ),
+        f"set with flat sides for states and controls under measurable disturbances, which the "
+        f"{' and the '.join(curved)} has not": measurable and bool(curved),
+        "cost other than worst under measurable disturbances": measurable and cost == "worst",
+        "disturbance that takes any value on each of its pieces": disturbed
+        and not measurable
+        and not disturbance.is_complete,
         f"path constraint of another name than {' or '.join(map(str, named))}, which is taken": bool(named),
+        "terminal set with an interior under measurable disturbances: they reach a fixed state": measurable and ends,
         "control that acts at once, without a delay": problem.system.delay > 0.0,
         "single linear system, without pieces": bool(problem.system.switches),
         "path constraint on the state alone, without mixed": any(
@@ -132,13 +151,17 @@ def _in_users(own: Answers, units: Units, deviations: Array) -> Answers:
 
 
 def _program(
-    model: Transcription, policy: AffinePolicy, known: Answers, blocks: int, fixed: tuple[Array, Array]
+    model: Transcription,
+    policy: AffinePolicy,
+    known: Answers,
+    acting: MeasurablePieces | None,
+    fixed: tuple[Array, Array],
 ) -> tuple[SemiInfiniteProgram, ClosedLoop]:
     """The program of one transcription, in its units; ``fixed``: the rows of its terminal equalities."""
     functionals, problem, pieces = model.functionals, model.problem, model.control.pieces
     nominal, first = functionals.variables, functionals.variables + known.variables
     size = first + {"nominal": 0, "peak": nominal, "worst": 1}[policy.cost]
-    loop = ClosedLoop(functionals, known, deviations_of(problem.disturbance, blocks, problem.initial_set), size)
+    loop = ClosedLoop(functionals, known, _spread(model, acting), size, acting)
     families = [of_state(constraint, loop).family() for constraint in model.constraints]
     settled: list[Callable[[Array], Array]] = []
     if fixed[1].size:
@@ -174,7 +197,7 @@ def _program(
         effort = FeedbackEffort(EFFORT, loop, cost, first)
         families.append(effort.family())
         settled.append(effort.settled)
-        guide = (_program(model, policy.model_copy(update={"cost": "peak"}), known, blocks, fixed)[0], first)
+        guide = (_program(model, policy.model_copy(update={"cost": "peak"}), known, acting, fixed)[0], first)
         weights[first:] = 1.0
         lower = np.append(lower, 0.0)
         largest = float(cost @ np.maximum(np.abs(low), np.abs(high)))
@@ -195,6 +218,16 @@ def _program(
         largest=largest,
     )
     return program, loop
+
+
+def _spread(model: Transcription, acting: MeasurablePieces | None) -> Spread:
+    """The deviations of a problem's disturbance and of its initial state."""
+    problem, disturbance = model.problem, model.functionals.disturbance
+    if acting is not None:
+        return Spread((*acting.sets, *deviations_of(None, 0, problem.initial_set).sets), MISSED)
+    return deviations_of(
+        problem.disturbance, 0 if disturbance is None else disturbance.block_count, problem.initial_set
+    )
 
 
 def _told_by(

@@ -93,7 +93,7 @@ def prepare(
             )
     refuse_without_steps(problem, control)
     if isinstance(policy, AffinePolicy):
-        refuse(problem, control, disturbance)
+        refuse(problem, control, disturbance, policy.cost)
         if formulation != "reduced":
             raise InputError(f"formulation: expected reduced with policy: affine, got {formulation!r}")
         ends = [end for end in problem.terminal if not isinstance(end, Equality)]

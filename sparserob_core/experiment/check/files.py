@@ -101,6 +101,7 @@ def _unread(case: Case) -> set[str]:
             mixed = isinstance(entry, Mapping) and str(entry.get("constraint")) in pieced
             more = ({"piece"} if mixed else set()) | (set() if case.policy is None else {"disturbance"})
             more |= BEGUN if case.policy is not None and case.problem.initial_set is not None else set()
+            more |= {"changes"} if case.measurable else set()
             left |= _besides("multipliers.constraints", entry, MULTIPLIER | more)
             left |= {"multipliers.constraints.parameter"} if _of_a_curved_set_of_controls(case, entry) else set()
     if "proof" in read and isinstance(proof, Mapping):

@@ -73,8 +73,15 @@ def controlled(model: Transcription, decision: Array, which: np.ndarray) -> Arra
     ``(m, pieces)``, or under feedback what answers the states."""
     if model.feedback is None:
         return model.functionals.on_grid(model.nominal(decision))[:, which]
-    measuring = Measuring.of(model, decision)
-    return lambda piece, state: measuring(int(which[piece]), state)
+    measuring, latest = Measuring.of(model, decision), (-1, np.zeros(0))
+
+    def acting(piece: int, state: Array) -> Array:
+        nonlocal latest
+        if int(which[piece]) != latest[0] or piece == 0:
+            latest = (int(which[piece]), measuring(int(which[piece]), state))
+        return latest[1]
+
+    return acting
 
 
 def attained(arrays: Mapping[str, Array], times: Array, states: Array) -> Array:

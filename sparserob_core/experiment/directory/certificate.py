@@ -44,8 +44,9 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
     least and its proof where that is another one. Where the cost is the time that the control acts, ``J`` is beside it,
     and ``tree`` holds the parts of the controls, each with multipliers of its own. ``witness``: what refutes the
     decision. Under feedback ``decision`` is the nominal control, ``gains (K, K, m, d)`` are what answers the
-    innovations, every constraint with a multiplier is one at a ``disturbance``, and at a ``deviation`` of the
-    initial state from its centre where there is a set of them, and ``causal`` is the bound against every causal policy.
+    innovations, every constraint with a multiplier is one at a ``disturbance`` (a measurable one jumps at its
+    ``changes``), and at a ``deviation`` of the initial state from its centre where there is a set of them, and
+    ``causal`` is the bound against every causal policy.
     """
     if not isinstance(experiment, ControlExperiment) or result.status == "failed":
         return None
@@ -168,6 +169,7 @@ def _multipliers(experiment: ControlExperiment, dual: Dual) -> dict[str, Any] | 
                 "multiplier": cut.multiplier,
                 **({} if program.spread is None else {"disturbance": _admissible(problem, said)}),
                 **({} if program.spread is None else _deviation(problem, said)),
+                **({} if said.changes is None else {"changes": said.changes}),
             }
             for cut, said in explained
         ]

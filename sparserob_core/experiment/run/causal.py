@@ -27,7 +27,7 @@ def with_causal(result: ControlResult, tools: Tools) -> ControlResult:
     if model.feedback is None or result.status == "failed" or result.stopped or tools.deadline.passed:
         return result
     policy = model.feedback.policy
-    if not policy.causal_signals or model.problem.initial_set is not None:
+    if not policy.causal_signals or model.problem.initial_set is not None or model.feedback.loop.measurable is not None:
         return result
     try:
         search = CausalSearch(model, result.decision, active(model, result))

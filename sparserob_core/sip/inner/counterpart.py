@@ -163,12 +163,12 @@ class Counterpart:
         entries: list[tuple[np.ndarray, np.ndarray, Array]] = []
         limits: list[float] = []
         first = self._linear.count
+        said = [block.coefficients(x) for block, (_, _, parts) in zip(self.blocks, self._imposed, strict=True) if parts]
+        found = self.spread.worst(np.concatenate([*said, np.zeros((0, self.spread.size))]))
+        many = 0
         for block, (_, _, parts) in zip(self.blocks, self._imposed, strict=True):
-            if not parts:
-                continue
-            for part, C, d, worst in zip(
-                parts, block.C, block.d, self.spread.worst(block.coefficients(x)), strict=True
-            ):
+            for part, C, d in zip(parts, block.C, block.d, strict=False):  # none of an equality
+                worst, many = found[many], many + 1
                 for place, name, known, at in part.points:
                     point = worst[place]
                     if any(np.abs(point - other).max() <= SAME for other in known):

@@ -85,7 +85,7 @@ class Robust:
             for cut, y, w in zip(self.cuts, answer.y, answer.deviations, strict=True)
             if y > 0.0
         )
-        return Dual(bound - ROUNDING * size, cuts, answer.mu)
+        return Dual(bound - (ROUNDING + self.counterpart.spread.missed) * size, cuts, answer.mu)
 
 
 def robust_exchange(

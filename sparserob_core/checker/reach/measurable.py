@@ -1,0 +1,343 @@
+"""A closed loop under measurable disturbances: what they make of the state by the end of every piece, and within one.
+
+On a piece of the grid a disturbance ``w = m + z`` pushes the state by ``e = int e^{A r} E z dr``, ``r`` the time that
+is left of the piece; the control of later pieces answers ``e``, and nothing else of the disturbance. So the worst of
+``a'e`` is the integral of the support function of ``E'e^{A'r} a``. It is enclosed: on cells the corner of the set that
+is best there stands for all, and where another one could be better, by how much is bounded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import accumulate
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.arithmetic.series import norm
+from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.checker.reach.closed_loop import ClosedLoop, exactly, middle
+from sparserob_core.checker.reach.flow import held, stacked
+from sparserob_core.checker.sets.flat import Boxed, Cornered
+from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
+from sparserob_core.sip.convex_set import Array, ConvexSet
+
+if TYPE_CHECKING:
+    from flint import arb, arb_mat
+
+ORDER = 13  # of the polynomials
+PARTS, MOST_PARTS = 4, 2048  # of a piece, at least and at most
+SETTLED = 2.0**-49  # of the heights: what another corner may add on a cell
+ROUNDS = 60  # in which cells are cut
+SECANTS = 12  # steps to where two corners are equally good
+APART = 2.0**-45  # how far the place of a time among the parts may be off
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Side:
+    """One of the sets that add up to that of the deviations: ``corners (v, mw)``, off by at most ``rad (v, mw)``."""
+
+    corners: Array
+    rad: Array
+
+    @staticmethod
+    def of(shape: ConvexSet) -> list[Side]:
+        """Those of a set, counted from its middle: of a box one for every channel."""
+        from flint import arb, fmpq
+
+        about, seen = [arb(float(m)) for m in middle(shape)], known(shape)
+        if isinstance(seen, Boxed):
+            found = []
+            for i, m in enumerate(about):
+                axis = balls(np.eye(seen.dimension)[i])
+                ends = [seen.support(axis) - m, -seen.support([-x for x in axis]) - m]
+                found.append([[end if j == i else arb(0) for j in range(seen.dimension)] for end in ends])
+        elif isinstance(seen, Cornered):
+            exact = [[arb(fmpq(x.numerator, x.denominator)) for x in corner] for corner in seen.corners]
+            found = [[[x - m for x, m in zip(corner, about, strict=True)] for corner in exact]]
+        else:
+            raise Unchecked("the checker knows measurable disturbances in boxes and polytopes only")
+        return [Side(one.mid, one.rad) for one in (Enclosed.of(stacked(rows)) for rows in found)]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Kernel:
+    """``e^{A r} E`` for ``r`` from 0 to a length, on equal parts, as polynomials of ``u`` from -1 to 1 across each:
+    coefficients ``(S, p + 1, d, mw)``, all together off by at most ``off (S, d, mw)``; ``half`` of a part's length."""
+
+    coefficients: Array
+    off: Array
+    half: float
+
+    @staticmethod
+    def of(A: arb_mat, E: arb_mat, length: arb) -> Kernel:
+        """The kernel of a piece."""
+        from flint import arb, arb_mat
+
+        d, mw = A.nrows(), E.ncols()
+        speed = float((norm(A) * length).upper())
+        if not speed < MOST_PARTS:
+            raise Unchecked("the system is too fast for its pieces to be integrated")
+        count = max(PARTS, int(np.ceil(speed)))
+        half = length / (2 * count)
+        unit = arb_mat([[int(i == j) for j in range(d)] for i in range(d)])
+        step, term = held(A, unit, 2 * half)[0], held(A, unit, half)[0]
+        terms, factor = [E], arb(1)
+        for order in range(ORDER):
+            terms.append(A * terms[-1] * (half / (order + 1)))
+            factor = factor * norm(A) * half / (order + 1)
+        rest = factor * norm(A) * half / (ORDER + 1) * (norm(A) * half).exp() * norm(E)
+        matrices, lost = [], []
+        for _ in range(count):
+            matrices += [term * one for one in terms]
+            lost.append(float((rest * norm(term)).upper()))
+            term = step * term
+        found = Enclosed.all(matrices, (count, ORDER + 1, d, mw))
+        off = (found.rad.sum(axis=1) + np.array(lost)[:, None, None]) * OUTWARD
+        return Kernel(found.mid, off, float(half.mid()))
+
+    @property
+    def count(self) -> int:
+        """How many parts there are."""
+        return int(self.coefficients.shape[0])
+
+    def most(self, a: Enclosed, sides: list[Side], share: float = 1.0) -> Enclosed:
+        """The integral of the support function of ``K(r)'a`` for ``a (N, d)``, over the first ``share`` of the length:
+        between bounds, as a middle and a radius ``(N,)``."""
+        size, count = np.abs(a.mid), self.count
+        plain = np.einsum("nd,spdw->nspw", a.mid, self.coefficients)
+        large = np.einsum("nd,spdw->nsw", size, np.abs(self.coefficients))
+        off = rounding(size.shape[1] + 1) * large + np.einsum("nd,sdw->nsw", size + a.rad, self.off)
+        off = (off + np.einsum("nd,spdw->nsw", a.rad, np.abs(self.coefficients))) * OUTWARD
+        place = share * count
+        last = min(int(place), count - 1)
+        ends = np.where(np.arange(count) < last, 1.0, 2.0 * min(place - last, 1.0) - 1.0)[: last + 1]
+        low, high, lost = np.zeros(len(size)), np.zeros(len(size)), np.zeros(len(size))
+        for side in sides:
+            C = np.abs(side.corners)
+            P = np.einsum("nspw,vw->nspv", plain[:, : last + 1], side.corners)
+            sums = np.abs(P).sum(axis=2)
+            e = (off[:, : last + 1] + rounding(C.shape[1] + 2 * ORDER + 8) * large[:, : last + 1]) @ (C + side.rad).T
+            e = (e + large[:, : last + 1] @ side.rad.T) * OUTWARD
+            value, more, less = _swept(P.reshape(-1, *P.shape[2:]), e.reshape(-1, e.shape[2]), np.tile(ends, len(size)))
+            value, more, less = (one.reshape(len(size), -1).sum(axis=1) for one in (value, more, less))
+            low, high = low + value - less, high + value + more
+            tops = sums.max(axis=2)
+            lost += rounding(4 * count + 8) * 2.0 * tops.sum(axis=1)
+            if share < 1.0:
+                lost += APART * count * tops.max(axis=1)
+        low, high = low * self.half, high * self.half
+        rad = (high - low) / 2.0 + (lost * self.half + rounding(4) * (np.abs(low) + np.abs(high)))
+        return Enclosed((low + high) / 2.0, rad * OUTWARD)
+
+    def steepest(self, a: Array, sides: list[Side]) -> Array:
+        """How fast the support function of ``K(r)'a`` changes with ``r`` at most, ``a (N, d)`` exact: ``(N,)``."""
+        radii = sum(((np.abs(side.corners) + side.rad).max(axis=0) for side in sides), np.zeros(self.off.shape[2]))
+        large = np.einsum("nd,spdw->npsw", np.abs(a), np.abs(self.coefficients))
+        plain = np.abs(np.einsum("nd,spdw->npsw", a, self.coefficients)) + rounding(a.shape[1]) * large
+        slopes = (np.arange(ORDER + 1)[:, None, None] * plain).sum(axis=1) / self.half
+        return np.asarray((slopes @ radii).max(axis=1) * OUTWARD)
+
+
+def _swept(P: Array, e: Array, ends: Array) -> tuple[Array, Array, Array]:
+    """The integral over ``u`` from -1 to ``ends (M,)`` of the largest of polynomials ``P (M, p + 1, v)``, which are off
+    by at most ``e (M, v)``: values, and by how much more and less it may be, ``(M,)``."""
+    orders = np.arange(P.shape[1])
+    here, start, stop = np.arange(len(P)), -np.ones(len(P)), ends.copy()
+    value, more, less = np.zeros(len(P)), np.zeros(len(P)), np.zeros(len(P))
+    allowed = SETTLED * np.abs(P).sum(axis=1).max(axis=1)
+    weights = 1.0 / (orders + 1.0)
+    for turn in range(ROUNDS + 1):
+        Q = P[here]
+        left, right = _valued(Q, start), _valued(Q, stop)
+        best, rows, width = (left + right).argmax(axis=1), np.arange(here.size), stop - start
+        G = Q[rows, :, best][:, :, None] - Q
+        g = [one[rows, best][:, None] - one for one in (left, right)]
+        below = np.maximum(0.0, -np.minimum(*g))
+        bend = (np.abs(G) * (orders * (orders - 1))[:, None]).sum(axis=1)
+        near = (np.sqrt(np.maximum(g[0], 0.0)) + np.sqrt(np.maximum(g[1], 0.0))) ** 2
+        dips = np.where(near >= bend * (width**2 / 2.0)[:, None], 0.0, bend * (width**2 / 8.0)[:, None])
+        wrong = (below + dips) * (1.0 + 1e-13)
+        wrong[rows, best] = 0.0
+        wrong = wrong.max(axis=1)
+        settled = (wrong * width <= allowed[here]) | (turn == ROUNDS)
+        done, at = rows[settled], here[settled]
+        chosen = Q[done, :, best[done]] * weights
+        area = _valued(chosen, stop[done]) * stop[done] - _valued(chosen, start[done]) * start[done]
+        own, others = e[at, best[done]], e[at].max(axis=1)
+        np.add.at(value, at, area)
+        np.add.at(more, at, (wrong[done] + own + 2.0 * others) * width[done])
+        np.add.at(less, at, own * width[done])
+        if settled.all():
+            break
+        rest = rows[~settled]
+        a, b = left[rest].argmax(axis=1), right[rest].argmax(axis=1)
+        cut = _equal(Q[rest, :, a] - Q[rest, :, b], start[rest], stop[rest])
+        here = np.tile(here[rest], 2)
+        start, stop = np.concatenate([start[rest], cut]), np.concatenate([cut, stop[rest]])
+    return value, more * OUTWARD, less * OUTWARD
+
+
+def _valued(P: Array, u: Array) -> Array:
+    """Polynomials ``(M, p + 1, ...)`` at ``u (M,)``."""
+    powers = u[:, None] ** np.arange(P.shape[1])
+    return np.asarray(np.einsum("mp,mp...->m...", powers, P))
+
+
+def _equal(P: Array, start: Array, stop: Array) -> Array:
+    """Near a root of polynomials ``(M, p + 1)`` whose signs differ at the ends, by secants of which the older end
+    counts half (Illinois); the middle elsewhere. Wherever it is, what is claimed holds."""
+    a, b, fa, fb = start, stop, _valued(P, start), _valued(P, stop)
+    middle_of = (a + b) / 2.0
+    crossing, cut = fa * fb < 0.0, middle_of
+    for _ in range(SECANTS):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            cut = np.where(crossing, b - fb * (b - a) / (fb - fa), middle_of)
+        cut = np.where(np.isfinite(cut), cut, middle_of)
+        f = _valued(P, cut)
+        turned = f * fb < 0.0
+        a, fa = np.where(turned, b, a), np.where(turned, fb, fa / 2.0)
+        b, fb = cut, f
+    least = 1e-9 * (stop - start)
+    return np.asarray(np.where(crossing & (cut > start + least) & (cut < stop - least), cut, middle_of))
+
+
+@dataclass(frozen=True, eq=False)
+class MeasurableLoop(ClosedLoop):
+    """`ClosedLoop` under measurable disturbances. Its deviations are what they make of the state by the end of every
+    piece of the grid, ``(d,)`` each, and that of the initial state."""
+
+    _kernels: dict[tuple[float, bool], Kernel] = field(default_factory=dict, repr=False)
+
+    @property
+    def blocks(self) -> int:
+        return len(self.grid) - 1
+
+    @cached_property
+    def sets(self) -> list[tuple[ConvexSet, Array]]:
+        """That of the initial state only."""
+        return [] if self.initial is None else [(self.initial, middle(self.initial))]
+
+    @cached_property
+    def starts(self) -> list[int]:
+        d = self.parts["A"].nrows()
+        return [0, *accumulate([d] * (self.blocks + (self.initial is not None)))]
+
+    @cached_property
+    def sides(self) -> list[Side]:
+        """The sets of the deviations, which add up."""
+        assert self.shape is not None
+        return Side.of(self.shape)
+
+    def kernel(self, piece: int) -> Kernel:
+        """That of a piece."""
+        from flint import arb
+
+        start, stop = self.grid[piece], self.grid[piece + 1]
+        exact = self._exact(start, stop, stop - start)
+        key = (stop - start, True) if exact else (float(piece), False)
+        if key not in self._kernels:
+            self._kernels[key] = Kernel.of(self.parts["A"], self.parts["E"], arb(stop) - arb(start))
+        return self._kernels[key]
+
+    @cached_property
+    def seen(self) -> list[dict[int, arb_mat]]:
+        K = len(self.breakpoints) - 1
+        found: list[dict[int, arb_mat]] = [{} for _ in range(K)]
+        if self.initial is not None:
+            found[0][self.blocks] = self._identity
+        for piece in range(self.blocks):
+            k, _ = self._places(piece)
+            if k + 1 < K:
+                found[k + 1][piece] = self._held(self.grid[piece + 1], self.breakpoints[k + 1])[0]
+        return found
+
+    def _entered(self, rows: list[list[arb]], block: int) -> None:
+        """Nothing: what happens within a piece counts at its end."""
+
+    def _ended(self, piece: int, state: arb_mat) -> arb_mat:
+        rows, unit = state.tolist(), self._identity
+        for i, row in enumerate(rows):
+            for j in range(len(rows)):
+                row[1 + self.starts[piece] + j] = row[1 + self.starts[piece] + j] + unit[i, j]
+        return stacked(rows)
+
+    def state(self, piece: int, time: float) -> arb_mat:
+        """The nominal state and every response at a time in a piece of the grid, before what happens in it counts."""
+        if time == self.grid[piece]:
+            return self.nodes[piece]
+        Phi, Gamma = self._held(self.grid[piece], time)
+        return Phi * self.nodes[piece] + Gamma * self.drives[piece]
+
+    @cached_property
+    def radii(self) -> Array:
+        d = self.parts["A"].nrows()
+        axes = np.vstack([np.eye(d), -np.eye(d)])
+        exact = Enclosed(axes, np.zeros_like(axes))
+        alike: dict[int, Array] = {}
+        found = []
+        for piece in range(self.blocks):
+            kernel = self.kernel(piece)
+            if id(kernel) not in alike:
+                ends = kernel.most(exact, self.sides)
+                alike[id(kernel)] = (ends.mid + ends.rad).reshape(2, d).max(axis=0)
+            found.append(alike[id(kernel)])
+        found += [np.array(known(shape).radius) + np.abs(about) for shape, about in self.sets]
+        return np.nextafter(np.concatenate(found) * OUTWARD, np.inf)
+
+    def support(self, a: list[arb]) -> arb:
+        return self.supports([a])[0]
+
+    def supports(self, every: list[list[arb]]) -> list[arb]:
+        """`support` of several, ``(n, Q)``."""
+        from flint import arb
+
+        d, blocks = self.parts["A"].nrows(), self.blocks
+        table = Enclosed.of(stacked(every))
+        mid, rad = (part[:, : blocks * d].reshape(len(every), blocks, d) for part in (table.mid, table.rad))
+        rad = np.where(rad > 1e-290, rad, 0.0)  # of exact zeros
+        alike: dict[int, tuple[Kernel, list[int]]] = {}
+        for piece in range(blocks):
+            kernel = self.kernel(piece)
+            alike.setdefault(id(kernel), (kernel, []))[1].append(piece)
+        total = [arb(0)] * len(every)
+        for kernel, pieces in alike.values():
+            parts = Enclosed(mid[:, pieces].reshape(-1, d), rad[:, pieces].reshape(-1, d))
+            used = np.flatnonzero((np.abs(parts.mid) + parts.rad).any(axis=1))
+            if not used.size:
+                continue
+            found = kernel.most(Enclosed(parts.mid[used], parts.rad[used]), self.sides)
+            for place, m, r in zip((used // len(pieces)).tolist(), found.mid.tolist(), found.rad.tolist(), strict=True):
+                total[place] = total[place] + arb(m, r)
+        for shape, about in self.sets:
+            for n, a in enumerate(every):
+                block = a[blocks * d :]
+                if any(not x.is_zero() for x in block):
+                    off = sum((x * arb(float(m)) for x, m in zip(block, about, strict=True)), arb(0))
+                    total[n] = total[n] + known(shape).support(block) - off
+        return total
+
+    def heights(self, state: arb_mat, rows: Array | arb_mat) -> list[arb]:
+        along = (exactly(rows) * state).tolist()
+        return [row[0] + more for row, more in zip(along, self.supports([row[1:] for row in along]), strict=True)]
+
+    def highest(self, piece: int, time: float, rows: Array) -> list[arb]:
+        from flint import arb
+
+        found = super().highest(piece, time, rows)
+        if time == self.grid[piece]:
+            return found
+        share = float(((arb(time) - arb(self.grid[piece])) / (arb(self.grid[piece + 1]) - arb(self.grid[piece]))).mid())
+        added = self.kernel(piece).most(Enclosed(rows, np.zeros_like(rows)), self.sides, min(share, 1.0))
+        return [one + arb(m, r) for one, m, r in zip(found, added.mid.tolist(), added.rad.tolist(), strict=True)]
+
+    def bent(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:
+        """As of `ClosedLoop`; what the piece itself adds is the integral of a Lipschitz function."""
+        assert isinstance(rows, np.ndarray)
+        steep = self.kernel(piece).steepest(rows, self.sides)
+        return np.asarray(super().bent(piece, start, stop, rows) + (stop - start) ** 2 / 8.0 * steep * OUTWARD)

@@ -1,0 +1,195 @@
+"""Measurable disturbances under feedback: what they have done to the state when a piece is over, and until then.
+
+The control sees the state at breakpoints. So of a disturbance on a piece of the grid only one vector counts once the
+piece is over, what it has made of the state by then: a point of a `Zonoid`. On the piece that holds ``t`` nothing has
+been answered yet, and what it adds to ``c'x(t)`` is the support function of a set that no decision enters.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import accumulate
+from typing import final
+
+import numpy as np
+
+from sparserob_core.control.feedback.zonoid import Arc, Zonoid, corners
+from sparserob_core.control.response.functional import WorstCase
+from sparserob_core.control.response.measurable import MISSED
+from sparserob_core.sip.convex_set import Array, ConvexSet
+
+KNOWN = np.zeros((1, 0))
+TERMS = 8  # of the expansion that bounds a slope
+SEEN = 1e-7  # of the largest extent of a piece's set, one along which it is answered
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class MeasurablePieces:
+    """What measurable disturbances do on every piece of a grid: a point of each of ``zonoids``, whose coordinates are
+    those of the problem's own units; ``states (d,)`` and ``disturbances (mw,)`` are these in the units of
+    ``functionals``."""
+
+    functionals: WorstCase
+    zonoids: tuple[Zonoid, ...]
+    states: Array
+    disturbances: Array
+
+    def in_units_of(self, functionals: WorstCase, states: Array, disturbances: Array) -> MeasurablePieces:
+        """The same of the same problem in other units."""
+        return replace(self, functionals=functionals, states=states, disturbances=disturbances[: self.middle.size])
+
+    @cached_property
+    def sets(self) -> tuple[tuple[int, ConvexSet], ...]:
+        """The sets of the deviations, one block for every piece, as in `Spread`."""
+        sets: list[tuple[int, ConvexSet]] = []
+        for one in self.zonoids:
+            if sets and sets[-1][1] is one:
+                sets[-1] = (sets[-1][0] + 1, one)
+            elif one.dimension:
+                sets.append((1, one))
+        return tuple(sets)
+
+    @property
+    def size(self) -> int:
+        """How many entries a deviation has."""
+        return sum(one.dimension for one in self.zonoids)
+
+    @cached_property
+    def _starts(self) -> list[int]:
+        return list(accumulate((one.dimension for one in self.zonoids), initial=0))
+
+    def at(self, piece: int) -> tuple[slice, Array]:
+        """The entries of a piece, and what they are of the state at its end, ``(d, r)``."""
+        outward = self.states[:, None] * self.zonoids[piece].outward
+        return slice(self._starts[piece], self._starts[piece + 1]), outward
+
+    def seen(self, piece: int) -> np.ndarray:
+        """Along which of a piece's coordinates it is answered, ``(r,)``: not where nearly nothing happens."""
+        sizes = np.linalg.norm(self.zonoids[piece].outward, axis=0)
+        large: np.ndarray = sizes > SEEN * sizes.max(initial=0.0)
+        return large
+
+    @cached_property
+    def middle(self) -> Array:
+        """The middle of the disturbance's set, ``(mw,)``."""
+        model = self.functionals.disturbance
+        assert model is not None
+        middle: Array = model.bound.middle()
+        return middle
+
+    @cached_property
+    def _matrices(self) -> tuple[Array, Array]:
+        steps = self.functionals.response.steps(KNOWN)
+        return steps.A[0, 0], steps.E[0]
+
+    @cached_property
+    def _radii(self) -> Array:
+        """How far each channel deviates, ``(mw,)``."""
+        model = self.functionals.disturbance
+        assert model is not None
+        axes = np.eye(self.middle.size)
+        ends = (model.bound.support(axes) - self.middle, model.bound.support(-axes) + self.middle)
+        far: Array = np.maximum(*ends)
+        return far
+
+    def within(self, times: Array, H: Array, pieces: np.ndarray | None = None) -> Array:
+        """What the piece of the grid that holds each of ``times (k,)``, or these, has added to ``H x(t)`` by then at
+        most, beyond the middle: ``(k, r)``."""
+        response, k, r = self.functionals.response, times.size, H.shape[0]
+        pieces = response.grid.locate(times) if pieces is None else pieces
+        distinct, which = np.unique(np.clip(times - response.grid.breakpoints[pieces], 0.0, None), return_inverse=True)
+        count = distinct.size
+        none = np.zeros((count * r, 0))
+        found = self.functionals.measurable(np.repeat(distinct, r), np.tile(H, (count, 1)), none).reshape(count, r)
+        _, E = self._matrices
+        found = found - (H @ response.flows(distinct)[1] @ (E @ self.middle))
+        return np.asarray(found[which.reshape(k)])
+
+    def allowance(self, lower: Array, upper: Array, H: Array, pieces: np.ndarray) -> Array:
+        """By how much `within` may lie above its chord on cells ``[lower, upper] (k,)`` of these pieces, ``(k, r)``:
+        the integrand is Lipschitz; with what its quadrature may miss."""
+        response, (A, E) = self.functionals.response, self._matrices
+        within = np.clip(lower - response.grid.breakpoints[pieces], 0.0, None)
+        h = (upper - lower)[:, None]
+        row = H @ response.flows(within)[0] @ A
+        slope, factor = np.zeros(row.shape[:2]), np.ones_like(h)
+        for order in range(TERMS):
+            slope += factor * (np.abs(row @ E) @ self._radii)
+            row, factor = row @ A, factor * h / (order + 1)
+        far = float(np.linalg.norm(np.abs(E) @ self._radii))
+        with np.errstate(over="ignore", invalid="ignore"):
+            slope += factor * np.exp(np.linalg.norm(A, 2) * h) * np.linalg.norm(row, axis=2) * far
+        return np.asarray(h**2 / 8.0 * slope + MISSED * np.abs(self.within(upper, H, pieces)))
+
+    def weights(self, time: float, H: Array) -> Array:
+        """What a deviation gives to ``H x(time)`` without any control, ``(r, Q)``."""
+        response, found = self.functionals.response, np.zeros((H.shape[0], self.size))
+        over = self._over(time)
+        flows = response.flows(time - response.grid.breakpoints[1 : over + 1])[0]
+        for piece in range(over):
+            place, outward = self.at(piece)
+            found[:, place] = H @ flows[piece] @ outward
+        return found
+
+    def _over(self, time: float) -> int:
+        """How many pieces are over before a time; the one that ends then is not."""
+        return int(self.functionals.response.grid.locate(np.array([time]))[0])
+
+    def signal(self, deviation: Array, time: float, direction: Array | None) -> tuple[Array, Array]:
+        """Breakpoints ``(L + 1,)``, those of the grid among them, and a disturbance ``(mw, L)`` between them that has
+        the ``deviation (Q,)``; on the piece that holds ``time`` the worst for ``direction'x(time)``, afterwards the
+        middle."""
+        grid, over = self.functionals.response.grid, self._over(time)
+        made, ends, values = self._arcs(deviation), [], []
+        for piece, (start, stop) in enumerate(zip(grid.breakpoints[:-1], grid.breakpoints[1:], strict=True)):
+            if direction is not None and piece == over and time > start:
+                one = self._last(time - start).best(direction)
+                ends += [start + one.ends[:-1] * (time - start), [min(time, stop)]]
+                values.append(one.values)
+                if time < stop:
+                    ends.append([stop])
+                    values.append(np.zeros((1, self.middle.size)))
+                continue
+            one = made[piece]
+            ends += [start + one.ends[:-1] * (stop - start), [stop]]
+            values.append(one.values * self.disturbances)
+        points = np.concatenate([[grid.breakpoints[0]], *ends])
+        kept = np.diff(points) > 0.0
+        return np.concatenate([points[:1], points[1:][kept]]), (self.middle + np.vstack(values)[kept]).T
+
+    def _arcs(self, deviation: Array) -> list[Arc]:
+        """The signals on all pieces that have a deviation ``(Q,)``."""
+        found = [Arc(np.ones(1), np.zeros((1, self.middle.size)))] * len(self.zonoids)
+        alike: dict[int, list[int]] = {}
+        for piece, one in enumerate(self.zonoids):
+            if deviation[self.at(piece)[0]].any():
+                alike.setdefault(id(one), []).append(piece)
+        for pieces in alike.values():
+            points = np.stack([deviation[self.at(piece)[0]] for piece in pieces])
+            for piece, made in zip(pieces, self.zonoids[pieces[0]].signals(points), strict=True):
+                found[piece] = made
+        return found
+
+    def _last(self, length: float) -> Zonoid:
+        """What happens for a while before now, in the coordinates of the state."""
+        model, (A, E) = self.functionals.disturbance, self._matrices
+        assert model is not None
+        identity = np.eye(A.shape[0])
+        return Zonoid(A, E, length, tuple(corners(model.bound)), identity, identity)
+
+
+def measurable_pieces(functionals: WorstCase) -> MeasurablePieces | None:
+    """What measurable disturbances do on the pieces of a grid, in the units of ``functionals``; ``None`` where there is
+    none."""
+    model, response = functionals.disturbance, functionals.response
+    if model is None or model.kind != "measurable":
+        return None
+    steps, lengths = response.steps(KNOWN), response.grid.lengths
+    made: dict[int, Zonoid] = {}
+    for piece, which in enumerate(response.which.tolist()):
+        if which not in made:
+            made[which] = Zonoid.of(steps.A[0, 0], steps.E[0], float(lengths[piece]), model.bound)
+    zonoids = tuple(made[which] for which in response.which.tolist())
+    return MeasurablePieces(functionals, zonoids, np.ones(steps.A.shape[2]), np.ones(steps.E.shape[2]))

@@ -1,0 +1,360 @@
+"""What measurable disturbances of one piece make of the state at its end: a set of vectors, the integral of a set.
+
+``Z = {int_0^l K(r) (w(r) - m) dr : w(r) in W}`` is convex (Lyapunov 1940, Aumann 1965) and closed; its support function
+is ``int_0^l max_v (v - m)'K(r)'a dr`` over the corners ``v`` of ``W``. Which corner is best changes at finitely many
+times, the roots of exponential polynomials: they are looked for between samples that are certain to be apart, and the
+integral in between is that of a polynomial.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+
+from sparserob_core.control.enclosures.matrix_exponential import exponential
+from sparserob_core.sip.convex_set import Array, ConvexSet
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+DEGREE = 18  # at most, of the polynomials that stand for the kernel on a part of a piece
+REST = 2.0**-56  # of the kernel: what a polynomial may leave out
+PARTS, MOST_PARTS = 4, 4096  # of a piece at least, and at most
+FAST = 1.0  # what a part may be of the time in which the system changes by e
+HALVINGS = 24  # of a part on which it is not certain which corner is best
+NEWTON = 3  # steps to a root
+FLAT = 2.0**-44  # of the largest height: a difference of heights that is rounding
+HELD = 2_000_000  # numbers that are held at once
+NEGLIGIBLE = 1e-13  # of the largest extent, one that is rounding
+PIVOTS = 200  # points asked for at most on the way to one point's parts
+RELATIVE = 2e-14  # by which a gauge may be too large
+SPIKE, TILT = 1e-12, 1e-14  # as in `ConvexSet`
+EDGE = 1e-9  # of a cell, a root that is so near to an end is no progress
+
+
+def has_corners(bound: ConvexSet) -> bool:
+    """Whether a set has `corners` that are known."""
+    return bound.is_box or getattr(bound, "vertices", None) is not None
+
+
+def corners(bound: ConvexSet) -> list[Array]:
+    """Corners ``(v, mw)`` of sets that add up to a set less its middle: of a box one set for every channel."""
+    if bound.is_box:
+        box = bound.bounding_box()
+        radii = (box.upper - box.lower) / 2
+        return [np.outer([1.0, -1.0], row) for row in np.diag(radii)[radii > 0.0]]
+    found = getattr(bound, "vertices", None)
+    assert found is not None
+    return [np.asarray(found) - bound.middle()]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Arc:
+    """A signal on a piece: ``values (n, mw)``, deviations from the middle, that follow one another, each until its
+    share ``ends (n,)`` of the piece."""
+
+    ends: Array
+    values: Array
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Zonoid(ConvexSet):
+    """``Z`` of a piece of a length in coordinates ``into (r, d)`` of the state: ``K(r) = into e^{A r} E``, with the
+    `corners` of ``W`` in ``parts``. ``outward (d, r)`` brings the coordinates back; the set is about round in them.
+
+    Times count backwards, from the end of the piece.
+    """
+
+    A: Array
+    E: Array
+    length: float
+    parts: tuple[Array, ...]
+    into: Array
+    outward: Array
+
+    @staticmethod
+    def of(A: Array, E: Array, length: float, bound: ConvexSet) -> Zonoid:
+        """The set of one piece, in the coordinates in which the ellipsoid of its second moments is a ball."""
+        parts = tuple(corners(bound))
+        nodes, weights = np.polynomial.legendre.leggauss(32)
+        count = _parts(A, length)
+        times = (np.arange(count)[:, None] + (nodes + 1.0) / 2.0).ravel() * (length / count)
+        share = np.tile(weights, count) * (length / count / 2.0)
+        reach = np.zeros(E.shape[1]) if not parts else np.max([np.abs(part).max(axis=0) for part in parts], axis=0)
+        pushes = exponential(A * times[:, None, None]) @ (E * reach)
+        moments = (pushes * np.sqrt(share)[:, None, None]).transpose(1, 0, 2).reshape(A.shape[0], -1)
+        U, sizes, _ = np.linalg.svd(moments, full_matrices=False)
+        kept = sizes > NEGLIGIBLE * sizes.max(initial=0.0)
+        U, sizes = U[:, kept], sizes[kept]
+        return Zonoid(A, E, length, parts, (U / sizes).T, U * sizes)
+
+    @property
+    def dimension(self) -> int:
+        return int(self.into.shape[0])
+
+    def middle(self) -> Array:
+        """The middle of ``W`` throughout: 0."""
+        return np.zeros(self.dimension)
+
+    def interior_point(self) -> Array:
+        return np.zeros(self.dimension)
+
+    @property
+    def is_symmetric(self) -> bool:
+        return all(part.shape[0] == 2 and not part.sum(axis=0).any() for part in self.parts)
+
+    @property
+    def kind(self) -> str:
+        return "set of what a measurable disturbance does on a piece"
+
+    @cached_property
+    def count(self) -> int:
+        """How many parts the piece is cut into, of equal length."""
+        return _parts(self.A, self.length)
+
+    @cached_property
+    def degree(self) -> int:
+        """Of the polynomials."""
+        term, reach = 1.0, float(np.linalg.norm(self.A, 2)) * self.length / self.count / 2.0
+        for order in range(1, DEGREE):
+            term *= reach / order
+            if term <= REST:
+                return order
+        return DEGREE
+
+    @cached_property
+    def coefficients(self) -> Array:
+        """``K`` on every part as a polynomial of ``u`` from -1 to 1 across it, ``(S, p + 1, r, mw)``."""
+        half = self.length / self.count / 2.0
+        middles = (np.arange(self.count) + 0.5) * (2.0 * half)
+        flows = exponential(self.A * middles[:, None, None])
+        found, term = [], self.E
+        for order in range(self.degree + 1):
+            found.append(self.into @ flows @ term)
+            term = self.A @ term * (half / (order + 1))
+        return np.stack(found, axis=1)
+
+    @cached_property
+    def integrals(self) -> Array:
+        """The integral of the `coefficients` over time from the middle of a part, ``(S, p + 2, r, mw)``."""
+        half = self.length / self.count / 2.0
+        orders = np.arange(1, self.degree + 2)[:, None, None]
+        return np.concatenate([np.zeros_like(self.coefficients[:, :1]), half * self.coefficients / orders], axis=1)
+
+    @cached_property
+    def across(self) -> Array:
+        """The integral over every part, ``(S, r, mw)``."""
+        signs = (-1.0) ** np.arange(self.degree + 2)
+        return np.asarray((self.integrals * (1.0 - signs)[:, None, None]).sum(axis=1))
+
+    @cached_property
+    def nodes(self) -> Array:
+        """``K`` at the ends of the parts, ``(S + 1, r, mw)``."""
+        signs = (-1.0) ** np.arange(self.degree + 1)
+        first = (self.coefficients[0] * signs[:, None, None]).sum(axis=0)
+        return np.concatenate([first[None], self.coefficients.sum(axis=1)])
+
+    @cached_property
+    def bend(self) -> Array:
+        """Bounds of the second derivatives of ``K`` by ``u`` on every part, ``(S, r, mw)``."""
+        orders = np.arange(self.degree + 1)
+        return np.asarray((np.abs(self.coefficients) * (orders * (orders - 1))[:, None, None]).sum(axis=1))
+
+    def support(self, directions: Array) -> Array:
+        flat = np.asarray(directions, dtype=float).reshape(-1, self.dimension)
+        found = np.zeros(flat.shape[0])
+        for part in self.parts:
+            for here in self._chunks(flat.shape[0], part):
+                found[here] += self._swept(part, flat[here]).values()
+        return found.reshape(np.shape(directions)[:-1])
+
+    def support_point(self, directions: Array) -> Array:
+        flat = np.asarray(directions, dtype=float).reshape(-1, self.dimension)
+        found = np.zeros(flat.shape)
+        for part in self.parts:
+            for here in self._chunks(flat.shape[0], part):
+                found[here] += self._swept(part, flat[here]).points()
+        found[~flat.any(axis=1)] = 0.0
+        return found.reshape(np.shape(directions))
+
+    def signals(self, points: Array) -> list[Arc]:
+        """A signal that leads to each of the points ``(k, r)`` of the set: a mean of at most ``r`` that attain support
+        functions and of the middle (Caratheodory)."""
+        every, shares = self._made_of(points)
+        return [
+            _mean([self.best(a) for a in directions[share > 0.0]], share[share > 0.0], self.E.shape[1])
+            for directions, share in zip(every, shares, strict=True)
+        ]
+
+    def best(self, direction: Array) -> Arc:
+        """The signal that attains the support function of a direction ``(r,)``."""
+        made = [self._swept(part, direction[None]).arc() for part in self.parts]
+        return _mean(made, np.ones(len(made)), self.E.shape[1])
+
+    def _chunks(self, size: int, part: Array) -> Iterator[slice]:
+        step = max(1, HELD // ((self.count + 1) * max(self.E.shape[1], part.shape[0])))
+        return (slice(first, first + step) for first in range(0, size, step))
+
+    def _swept(self, part: Array, directions: Array) -> _Sweep:
+        return _Sweep(self, part, directions)
+
+    def _made_of(self, points: Array) -> tuple[Array, Array]:
+        """Directions ``(k, r, r)`` and shares ``(k, r)``, at most 1 together, such that the support points of the
+        directions in these shares are ``points (k, r)`` of the set, up to rounding: the gauge of a point as a linear
+        program whose columns are generated, as in `ConvexSet`."""
+        k, r = points.shape
+        turned = np.where(points < 0.0, -1.0, 1.0)
+        lengths = np.linalg.norm(points, axis=1)
+        tilted = points / np.where(lengths > 0.0, lengths, 1.0)[:, None] + TILT * turned * (1.0 + np.arange(r) / 7.0)
+        columns = SPIKE * turned[:, :, None] * np.eye(r)
+        chosen, made = np.zeros((k, r, r)), np.zeros((k, r), dtype=bool)
+        open_ = np.flatnonzero(lengths > 0.0)
+        for _ in range(PIVOTS):
+            directions = np.linalg.solve(columns[open_], np.ones((open_.size, r, 1)))[..., 0]
+            entering = self.support_point(np.asarray(directions, dtype=float))
+            better = (directions * entering).sum(axis=1) > 1.0 + RELATIVE
+            open_, directions, entering = open_[better], directions[better], entering[better]
+            if not open_.size:
+                break
+            sides = np.stack([tilted[open_], entering], axis=2)
+            share, slope = np.moveaxis(np.linalg.solve(np.swapaxes(columns[open_], 1, 2), sides), 2, 0)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                leaving = np.where(slope > 0.0, np.maximum(share, 0.0) / slope, np.inf).argmin(axis=1)
+            columns[open_, leaving], chosen[open_, leaving] = entering, directions
+            made[open_, leaving] = True
+        shares = np.linalg.solve(np.swapaxes(columns, 1, 2), (tilted * lengths[:, None])[..., None])[..., 0]
+        shares = np.where(made, np.maximum(shares, 0.0), 0.0)
+        return chosen, shares / np.maximum(1.0, shares.sum(axis=1, keepdims=True))
+
+
+@final
+class _Sweep:
+    """Which corner of ``part (v, mw)`` is best along a piece for ``directions (N, r)``: one on every part of the piece
+    that is `clean`, cells ``[low, high]`` of the others with the best corner of each."""
+
+    def __init__(self, zonoid: Zonoid, part: Array, directions: Array) -> None:
+        self.zonoid, self.part, self.directions = zonoid, part, directions
+        heights = np.tensordot(directions, zonoid.nodes, axes=(1, 1)) @ part.T  # (N, S + 1, v)
+        self.best = heights[:, :-1].argmax(axis=2)
+        bent = np.tensordot(np.abs(directions), zonoid.bend, axes=(1, 1))  # (N, S, mw)
+        bent = bent @ np.abs(part[:, None] - part).transpose(2, 0, 1).reshape(part.shape[1], -1)
+        bent = np.take_along_axis(
+            bent.reshape(*self.best.shape, part.shape[0], -1), self.best[:, :, None, None], axis=2
+        )[:, :, 0]
+        highest = self.best[..., None]
+        left, right = (np.take_along_axis(one, highest, axis=2) - one for one in (heights[:, :-1], heights[:, 1:]))
+        self.clean: np.ndarray = np.all(_apart(left, right, 2.0 * bent, 0.0), axis=2)
+        self._split()
+
+    def _split(self) -> None:
+        zonoid, part = self.zonoid, self.part
+        n, s = np.nonzero(~self.clean)
+        P = np.einsum("nr,nprw,vw->npv", self.directions[n], zonoid.coefficients[s], part, optimize=True)
+        scale = np.abs(P).sum(axis=1).max(axis=1, initial=0.0)
+        low, high = -np.ones(n.size), np.ones(n.size)
+        orders = np.arange(P.shape[1])
+        here = np.arange(n.size)  # the polynomial of every open cell
+        done: list[tuple[np.ndarray, Array, Array, np.ndarray]] = []
+        for halving in range(HALVINGS + 1):
+            left, right = _at(P[here], low), _at(P[here], high)
+            best = (left + right).argmax(axis=1)
+            over = P[here] - np.take_along_axis(P[here], best[:, None, None], axis=2)
+            bent = (np.abs(over) * (orders * (orders - 1))[:, None]).sum(axis=1)
+            g, h = (np.take_along_axis(one, best[:, None], axis=1) - one for one in (left, right))
+            wide = ((high - low) ** 2 / 2.0)[:, None]
+            ready = np.all(_apart(g, h, wide * bent, FLAT * scale[here][:, None]), axis=1) | (halving == HALVINGS)
+            done.append((here[ready], low[ready], high[ready], best[ready]))
+            here, low, high, left, right = here[~ready], low[~ready], high[~ready], left[~ready], right[~ready]
+            if not here.size:
+                break
+            a, b = left.argmax(axis=1), right.argmax(axis=1)
+            rows = np.arange(here.size)
+            cut = _root(P[here][rows, :, a] - P[here][rows, :, b], low, high)
+            here, low, high = np.tile(here, 2), np.concatenate([low, cut]), np.concatenate([cut, high])
+        place, low, high, best = (np.concatenate(one) for one in zip(*done, strict=True))
+        self.cells = (n[place], s[place], low, high, best)
+
+    def values(self) -> Array:
+        """The integrals of the best, ``(N,)``."""
+        return np.asarray((self.directions * self.points()).sum(axis=1))
+
+    def points(self) -> Array:
+        """What the best corners lead to, ``(N, r)``."""
+        zonoid, (n, s, low, high, best) = self.zonoid, self.cells
+        found = np.tensordot(self.part[self.best] * self.clean[..., None], zonoid.across, axes=([1, 2], [0, 2]))
+        if n.size:
+            orders = np.arange(zonoid.integrals.shape[1])
+            moved = high[:, None] ** orders - low[:, None] ** orders
+            more = np.einsum("np,nprw,nw->nr", moved, zonoid.integrals[s], self.part[best], optimize=True)
+            np.add.at(found, n, more)
+        return np.asarray(found)
+
+    def arc(self) -> Arc:
+        """The signal of the first direction."""
+        _, s, low, high, best = self.cells
+        count = self.zonoid.count
+        clean = np.flatnonzero(self.clean[0])
+        stop = np.concatenate([clean + 1.0, s + (high + 1.0) / 2.0])  # backwards in time
+        start = np.concatenate([clean + 0.0, s + (low + 1.0) / 2.0])
+        which = np.concatenate([self.best[0, clean], best])
+        order = np.argsort(-stop)
+        return Arc(1.0 - start[order] / count, self.part[which[order]])
+
+
+def _parts(A: Array, length: float) -> int:
+    speed = min(float(np.linalg.norm(A, 2)), MOST_PARTS / max(length, 1e-300))
+    return int(np.clip(np.ceil(speed * length / FAST), PARTS, MOST_PARTS))
+
+
+def _apart(left: Array, right: Array, bent: Array, spare: Array | float) -> np.ndarray:
+    """Whether a function with these values at the ends of a cell is not negative on it, where its second derivative
+    times half the square of the cell's length is at most ``bent``: the chord less a parabola, by Cauchy's
+    inequality."""
+    near = np.sqrt(np.maximum(left, 0.0)) + np.sqrt(np.maximum(right, 0.0))
+    return (left >= -spare) & (right >= -spare) & (near**2 >= bent - spare)
+
+
+def _at(P: Array, u: Array) -> Array:
+    """Polynomials ``(M, p + 1, ...)`` at ``u (M,)``."""
+    u = u.reshape(-1, *([1] * (P.ndim - 2)))
+    value = P[:, -1]
+    for order in range(P.shape[1] - 2, -1, -1):
+        value = value * u + P[:, order]
+    return value
+
+
+def _root(P: Array, low: Array, high: Array) -> Array:
+    """A root of polynomials ``(M, p + 1)`` between ``low`` and ``high (M,)`` where the signs there differ, their middle
+    elsewhere."""
+    first, last = _at(P, low), _at(P, high)
+    middle = (low + high) / 2.0
+    crossing = first * last < 0.0
+    slope = P[:, 1:] * np.arange(1, P.shape[1])
+    a, b = low.copy(), high.copy()
+    u = np.where(crossing, low - first * (high - low) / np.where(crossing, last - first, 1.0), middle)
+    for _ in range(NEWTON):
+        value = _at(P, u)
+        same = value * first > 0.0
+        a, b = np.where(same, u, a), np.where(same, b, u)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            step = u - value / _at(slope, u)
+        u = np.where((step > a) & (step < b), step, (a + b) / 2.0)
+    least = EDGE * (high - low)
+    inside = crossing & (u > low + least) & (u < high - least)
+    return np.asarray(np.where(inside, u, middle))
+
+
+def _mean(signals: Sequence[Arc], shares: Array, channels: int) -> Arc:
+    """The sum of signals in these shares, constants that are equal joined."""
+    ends = np.unique(np.concatenate([[1.0], *(one.ends for one in signals)]))
+    total = np.zeros((ends.size, channels))
+    for one, share in zip(signals, shares, strict=True):
+        total += share * one.values[np.minimum(np.searchsorted(one.ends, ends), one.ends.size - 1)]
+    kept = np.append((np.diff(total, axis=0) != 0.0).any(axis=1), True)
+    return Arc(ends[kept], total[kept])

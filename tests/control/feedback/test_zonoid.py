@@ -1,0 +1,92 @@
+"""Guards what measurable disturbances of a piece do to the state: support functions against closed forms and
+quadrature, signals that lead where they should."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from sparserob_core.control.feedback.zonoid import Zonoid
+from sparserob_core.control.sets.sets import Box, Polytope
+from sparserob_core.sip.convex_set import Array, ConvexSet
+
+DOUBLE = np.array([[0.0, 1.0], [0.0, 0.0]])
+SPRING = np.array([[0.0, 1.0], [-2.0, -0.5]])
+FORCE = np.array([[0.0], [1.0]])
+TRIANGLE = Polytope([[-1.0, 0.0], [0.0, -1.0], [1.0, 1.0]], [0.1, 0.1, 0.3])
+
+CASES: dict[str, tuple[Array, Array, float, ConvexSet]] = {
+    "force on a double integrator": (DOUBLE, FORCE, 0.5, Box([-0.1], [0.3])),
+    "two channels of a spring": (SPRING, np.eye(2), 0.25, Box([-0.2, -0.3], [0.2, 0.3])),
+    "a triangle": (SPRING, np.eye(2), 2.5, TRIANGLE),
+    "many oscillations within a piece": (np.array([[0.0, 8.0], [-8.0, -0.5]]), np.eye(2), 2.5, TRIANGLE),
+    "four integrators": (np.diag([1.0, 1.0, 1.0], 1), np.eye(4)[:, 3:], 0.3, Box([-0.2], [0.2])),
+    "one direction of two": (-np.eye(2), np.ones((2, 1)), 1.0, Box([-0.2], [0.2])),
+}
+
+
+def effect(A: Array, E: Array, length: float, ends: Array, values: Array) -> Array:
+    """The state after a piece from 0, under a signal that is constant until each share of the piece."""
+    state, before, d = np.zeros(A.shape[0]), 0.0, A.shape[0]
+    for end, value in zip(ends, values, strict=True):
+        flow = expm(np.block([[A, (E @ value)[:, None]], [np.zeros((1, d + 1))]]) * (end - before) * length)
+        state, before = flow[:d, :d] @ state + flow[:d, d], end
+    return state
+
+
+def test_the_support_of_a_force_on_a_double_integrator_is_in_closed_form() -> None:
+    """``int_0^l |a_1 r + a_2| dr`` with a root at ``-a_2 / a_1`` where that is within the piece."""
+    length, found = 0.8, Zonoid.of(DOUBLE, FORCE, 0.8, Box([-1.0], [1.0]))
+    rng = np.random.default_rng(0)
+    for a in rng.normal(size=(50, 2)):
+        root = float(np.clip(-a[1] / a[0], 0.0, length))
+        parts = [a[0] * (v**2 - u**2) / 2 + a[1] * (v - u) for u, v in ((0.0, root), (root, length))]
+        assert found.support(a @ found.outward) == pytest.approx(np.abs(parts).sum(), rel=1e-13)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_support_function_is_the_integral_of_that_of_the_disturbance(name: str) -> None:
+    A, E, length, bound = CASES[name]
+    found, count = Zonoid.of(A, E, length, bound), 20_000
+    step, K = expm(A * length / count), [expm(A * length / count / 2) @ E]
+    for _ in range(count - 1):
+        K.append(step @ K[-1])
+    rows = np.einsum("rd,ndw->nrw", found.into, np.array(K))
+    for a in np.random.default_rng(1).normal(size=(5, found.dimension)):
+        along = np.einsum("nrw,r->nw", rows, a)
+        middles = (bound.support(along) - along @ bound.middle()).sum() * length / count
+        assert found.support(a) == pytest.approx(middles, rel=1e-7)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_signal_of_a_direction_attains_the_support_function_and_no_sampled_signal_exceeds_it(name: str) -> None:
+    A, E, length, bound = CASES[name]
+    found, rng = Zonoid.of(A, E, length, bound), np.random.default_rng(2)
+    for a in rng.normal(size=(3, found.dimension)):
+        best = found.best(a)
+        assert (bound.violation(best.values + bound.middle()) <= 1e-12).all()
+        point = found.into @ effect(A, E, length, best.ends, best.values)
+        assert a @ point == pytest.approx(float(found.support(a)), rel=1e-11)
+        np.testing.assert_allclose(point, found.support_point(a), rtol=1e-9, atol=1e-11)
+        other = bound.sample_extreme(7, rng) - bound.middle()
+        pushed = found.into @ effect(A, E, length, np.arange(1, 8) / 7, other)
+        assert a @ pushed <= float(found.support(a)) * (1 + 1e-12)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_every_point_of_the_set_has_an_admissible_signal(name: str) -> None:
+    A, E, length, bound = CASES[name]
+    found, rng = Zonoid.of(A, E, length, bound), np.random.default_rng(3)
+    extreme = found.support_point(rng.normal(size=(6, found.dimension)))
+    points = np.vstack([rng.dirichlet(np.ones(6), 3) @ extreme, np.zeros((1, found.dimension)), extreme[:1]])
+    for point, made in zip(points, found.signals(points), strict=True):
+        assert (bound.violation(made.values + bound.middle()) <= 1e-12).all()
+        reached = found.into @ effect(A, E, length, made.ends, made.values)
+        np.testing.assert_allclose(reached, point, atol=1e-11 * np.abs(extreme).max())
+
+
+def test_a_direction_that_nothing_pushes_is_no_coordinate() -> None:
+    found = Zonoid.of(-np.eye(2), np.ones((2, 1)), 1.0, Box([-0.2], [0.2]))
+    assert found.dimension == 1
+    assert Zonoid.of(SPRING, np.eye(2), 1.0, Box([0.5, 0.0], [0.5, 0.0])).dimension == 0
