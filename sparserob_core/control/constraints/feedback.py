@@ -19,6 +19,9 @@ from sparserob_core.sip.program import ConstraintFamily, Enclosure, Explanation,
 
 KEPT = 12  # separated times for each row and round
 ZOOMED, ZOOMS, CLOSER = 9, 14, 4.0  # samples around a maximum, and how often they are drawn so many times closer
+NEAR, FEW = 1e-3, 4  # maxima that are so near to their limit are refined, and so many in any case
+HALVINGS, HALVED = 14, 200  # how often samples are drawn closer, and how many intervals at a time
+HIDDEN, SHARE = 2e-10, 0.2  # a violation that samples may miss; the share of the largest that they may
 BEGUN = 20  # times of a window that a method begins with
 STATES = 60_000_000  # numbers in the states that are sampled at once
 IDLE = 1e-14  # of the largest coefficient, one that is rounding
@@ -143,11 +146,7 @@ class FeedbackConstraint:
 
     def worst(self, x: Array) -> Separation:
         """The largest local maxima of the violation over the window, refined between the samples."""
-        times = self.flat.times
-        step = max(1, STATES // ((1 + self.loop.spread.size) * self.flat.H.shape[1]))
-        values = np.concatenate(
-            [self.excess(x, times[first : first + step, None]) for first in range(0, times.size, step)]
-        )
+        times, values = self._sampled(x)
         positions = local_maxima(values.T[None], (1,), KEPT)
         rows, at = positions[:, 1], positions[:, 2]
         best, found = times[at].copy(), values[at, rows].copy()
@@ -155,6 +154,7 @@ class FeedbackConstraint:
             times[np.minimum(at + 1, times.size - 1)] - times[at], times[at] - times[np.maximum(at - 1, 0)]
         )
         likely = np.argsort(-found, kind="stable")[: 4 * KEPT]
+        likely = likely[(found[likely] > -NEAR * np.abs(self.flat.h[rows[likely]])) | (np.arange(likely.size) < FEW)]
         best, found, rows, width = best[likely], found[likely], rows[likely], width[likely]
         offsets = np.linspace(-1.0, 1.0, ZOOMED)
         for _ in range(ZOOMS if width.any() else 0):
@@ -168,6 +168,31 @@ class FeedbackConstraint:
             width = width / CLOSER
         order = np.argsort(-found, kind="stable")
         return Separation(best[order][:, None], rows[order], found[order])
+
+    def _sampled(self, x: Array) -> tuple[Array, Array]:
+        """Times ``(k,)`` in order and the violations there ``(k, r)``: halfway between two of them again and again,
+        where a larger violation can be."""
+        times = self.flat.times
+        step = max(1, STATES // ((1 + self.loop.spread.size) * self.flat.H.shape[1]))
+        values = np.concatenate(
+            [self.excess(x, times[first : first + step, None]) for first in range(0, times.size, step)]
+        )
+        cells = np.arange(times.size - 1)
+        for _ in range(HALVINGS):
+            lower, upper = times[cells], times[cells + 1]
+            bounds = (self.loop.bounds(x, lower, upper, self.flat.H) - self.flat.h).max(axis=1)
+            ends = np.maximum(values[cells], values[cells + 1]).max(axis=1)
+            hidden = (bounds > HIDDEN) & (bounds - ends > SHARE * np.maximum(bounds, ends.max(initial=0.0)))
+            if not hidden.any():
+                break
+            split = cells[hidden][np.argsort(-bounds[hidden], kind="stable")[:HALVED]]
+            split.sort()
+            between = (times[split] + times[split + 1]) / 2
+            times = np.insert(times, split + 1, between)
+            values = np.insert(values, split + 1, self.excess(x, between[:, None]), axis=0)
+            left = split + np.arange(split.size)
+            cells = np.sort(np.concatenate([left, left + 1]))
+        return times, values
 
     @property
     def cells(self) -> tuple[Array, Array]:
