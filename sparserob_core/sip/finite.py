@@ -222,6 +222,7 @@ class Directions:
 
 
 CLOSED_FORM, DUAL_NEWTON, HIGHS, SOLVER, NOBODY = "closed_form", "dual_newton", "highs", "solver", "nobody"
+INTERIOR = "interior_point"
 
 
 @dataclass(frozen=True, eq=False)
@@ -389,10 +390,16 @@ class UncertainRows:
             rhs += [self.h[[row]], -factor * self.d[p]]
         return csr_array(vstack(tables)), np.concatenate(rhs)
 
+    @cached_property
+    def stacked(self) -> csr_array:
+        """The ``C_p``, one below the other, ``(p Q, n)``."""
+        from scipy.sparse import csr_array, vstack
+
+        return csr_array(vstack(self.C)) if self.C else csr_array((0, self.g.shape[1]))
+
     def coefficients(self, x: Array) -> Array:
         """``C_p x + d_p``, ``(p, Q)``."""
-        moved = [np.asarray(C @ x) for C in self.C]
-        return self.d + (np.stack(moved) if moved else 0.0)
+        return np.asarray(self.d + (self.stacked @ x).reshape(self.d.shape))
 
     def excess(self, x: Array, spread: Spread) -> Array:
         """By how much the rows are violated at the worst deviation, ``(r,)``; negative: a margin."""

@@ -76,6 +76,7 @@ WHO = {
     "closed_form": "in closed form, no row being active",
     "dual_newton": "by the dual Newton method",
     "highs": "by HiGHS",
+    "interior_point": "by the interior point method for feedback",
     "nobody": "not solved",
 }
 

@@ -373,15 +373,14 @@ def robust_bound(
         used = np.flatnonzero(mine)
         if not used.size:
             continue
-        slope = slope + block.g.T @ mine
-        noise = noise + abs(block.g).T @ mine
-        for p in np.unique(block.part[used]):
-            rows = used[block.part[used] == p]
-            weight = (mine[rows] * block.factor[rows]) @ w[rows]
-            slope = slope + block.C[p].T @ weight
-            constant += float(weight @ block.d[p])
-            noise = noise + abs(block.C[p]).T @ np.abs(weight)
-            size += float(np.abs(weight) @ np.abs(block.d[p]))
+        slope = slope + mine @ block.g
+        noise = noise + np.abs(mine) @ abs(block.g)
+        weight = np.zeros(block.d.shape)
+        np.add.at(weight, block.part[used], (mine[used] * block.factor[used])[:, None] * w[used])
+        slope = slope + weight.ravel() @ block.stacked
+        noise = noise + np.abs(weight).ravel() @ abs(block.stacked)
+        constant += float(weight.ravel() @ block.d.ravel())
+        size += float(np.abs(weight).ravel() @ np.abs(block.d).ravel())
         constant -= float(mine @ block.h)
         size += float(mine @ np.abs(block.h))
     weights = program.weights if priced else np.zeros(program.n)

@@ -1,12 +1,14 @@
 """Exchange for rows that must hold for every deviation: times are exchanged, deviations are all in the relaxed program.
 
-A round solves the robust counterpart at the imposed indices (`inner.counterpart`), separates every family in closed
-form and imposes what is violated. The lower bound is that of cuts: every row with a multiplier, at the deviation that
-its multipliers say (weak duality over the bounds of the program). It ends as the other exchange does: by proof.
+A round solves the robust counterpart at the imposed indices (`inner.counterpart`, or `inner.central` where that is
+quicker), separates every family in closed form and imposes what is violated. The lower bound is that of cuts: every row
+with a multiplier, at the deviation that its multipliers say (weak duality over the bounds of the program). It ends as
+the other exchange does: by proof.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
@@ -15,7 +17,8 @@ import numpy as np
 
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Cut, Dual, InfeasibleSubsystem, Proof
-from sparserob_core.sip.finite import HIGHS, FiniteSolution
+from sparserob_core.sip.finite import HIGHS, INTERIOR, FiniteSolution
+from sparserob_core.sip.inner.central.interior import Interior
 from sparserob_core.sip.inner.counterpart import Counterpart, RobustAnswer, robust_bound
 from sparserob_core.sip.methods.ledger import Answer, Ledger, Prover
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram, WorstConstraint
@@ -35,6 +38,8 @@ CUTS, GUIDED = 4, 30  # of them at each; rounds of a guide
 THINNER = 0.1  # share of a margin that leaves nothing feasible, which is tried next
 ROOM = 1e3  # units of the rows that they may have to spare
 SLACKENED = 200  # rounds of `least_slack` at most
+COARSE, SHARPER = 10.0, 0.1  # share of the cost to which the first round is solved, and how much closer the next ones
+FINEST = 0.1  # share of the tolerance to which the last rounds are solved
 FARKAS = 1e-9  # a weighted sum of rows is violated by more than that: nothing is feasible
 
 
@@ -43,23 +48,56 @@ class Robust:
     """The imposed indices of every family, and the counterpart at them."""
 
     program: SemiInfiniteProgram
-    counterpart: Counterpart
+    counterpart: Counterpart | Interior
     cuts: list[Cut] = field(default_factory=list)
     known: set[tuple[str, bytes]] = field(default_factory=set)
     margin: float = FIRST
     slater: bool = True
     raw: Array = field(default_factory=lambda: np.zeros(0))
     best: Array = field(default_factory=lambda: np.zeros(0))
+    accuracy: float = COARSE
+    price: float = 0.0
+    calls: Counter[str] = field(default_factory=Counter)
 
     @staticmethod
     def start(program: SemiInfiniteProgram) -> Robust:
         """What every family begins with."""
         assert program.spread is not None
-        working = Robust(program, Counterpart(program.finite, program.spread))
+        central = Interior(program.finite, program.spread)
+        working = Robust(program, central)
         for family in program.families:
             assert family.start is not None
             working.add(family, family.start)
+        if program.guide is not None or not central.fits():
+            working.by_simplex()
         return working
+
+    def by_simplex(self) -> None:
+        """From now on by the simplex method, which takes all there is."""
+        if isinstance(self.counterpart, Counterpart):
+            return
+        known = self.counterpart.blocks
+        self.counterpart = Counterpart(self.program.finite, self.counterpart.spread)
+        for block in known:
+            self.counterpart.add(block)
+
+    def solve(self, size: float) -> RobustAnswer:
+        """The optimum with the rows tightened, as accurate as this round asks for; ``size``: of the cost."""
+        if isinstance(self.counterpart, Interior):
+            answer = self.counterpart.solve(self.margin, self.accuracy * size)
+            self.calls[INTERIOR] += 1
+        else:
+            answer = self.counterpart.solve(self.margin)
+            self.calls[HIGHS] += 1
+        return answer
+
+    def sharper(self, violation: float, size: float, added: bool, tolerance: float) -> bool:
+        """Whether the next round is to be more accurate, because what was added changes little, and can be."""
+        if not isinstance(self.counterpart, Interior) or self.accuracy <= FINEST * tolerance:
+            return False
+        if not added or self.price * violation < self.accuracy * size:
+            self.accuracy = max(FINEST * tolerance, SHARPER * self.accuracy)
+        return True
 
     def add(self, family: ConstraintFamily, indices: Array) -> int:
         """Impose all rows of a family at indices ``(k, d)``; how many indices were new."""
@@ -86,6 +124,14 @@ class Robust:
             if y > 0.0
         )
         return Dual(bound - (ROUNDING + self.counterpart.spread.missed) * size, cuts, answer.mu)
+
+    def refuted(self, answer: RobustAnswer) -> Dual | None:
+        """What the multipliers of an answer prove of all decisions alike: that there is none; or nothing."""
+        total = float(answer.y.sum() + np.abs(answer.mu).sum())
+        if not 0.0 < total < np.inf:
+            return None
+        dual = self.dual(replace(answer, y=answer.y / total, mu=answer.mu / total), priced=False)
+        return dual if dual.bound > FARKAS else None
 
 
 def robust_exchange(
@@ -135,7 +181,7 @@ def _exchange(working: Robust, ledger: Ledger, prover: Prover, rounds: int) -> R
         ledger.tell(number, answer, told, program.cost(x) if feasible else np.inf, kept=len(working.cuts))
 
         # Exchange: impose them, or sharpen what stands for the imposed ones, or choose another margin.
-        if not last and _advanced(working, ledger, x, violated, feasible):
+        if not last and _advanced(working, ledger, x, violated, feasible, worst_of(told).violation):
             continue
 
         # Prove: over the whole continuum; a witness that the proof meets is one more index to impose.
@@ -156,9 +202,10 @@ def _guided(working: Robust, ledger: Ledger) -> None:
         return
     guide, shared = program.guide
     easier = Robust.start(guide)
+    easier.by_simplex()
     for number in range(1, GUIDED + 1):
         tools.deadline.check()
-        answer = easier.counterpart.solve(easier.margin)
+        answer = easier.solve(program.cost_scale)
         if not answer.solved:
             return
         x = np.clip(answer.x, guide.finite.lower, guide.finite.upper)
@@ -175,7 +222,7 @@ def _guided(working: Robust, ledger: Ledger) -> None:
             working.add(family, np.array(held))
     for family, indices in _undefined(working, working.best, False):
         working.add(family, indices)
-    working.counterpart.calls += easier.counterpart.calls
+    working.calls += easier.calls
 
 
 def _undefined(working: Robust, x: Array, feasible: bool) -> list[tuple[ConstraintFamily, Array]]:
@@ -202,11 +249,19 @@ def _undefined(working: Robust, x: Array, feasible: bool) -> list[tuple[Constrai
 
 
 def _advanced(
-    working: Robust, ledger: Ledger, x: Array, violated: list[tuple[ConstraintFamily, Array]], feasible: bool
+    working: Robust,
+    ledger: Ledger,
+    x: Array,
+    violated: list[tuple[ConstraintFamily, Array]],
+    feasible: bool,
+    worst: float,
 ) -> bool:
     """Whether the next round has something new to solve."""
     added = sum(working.add(family, indices) for family, indices in violated)
-    if (not feasible or added or ledger.open(x)) and (working.counterpart.sharpen(x) or added):
+    wanted = not feasible or added or ledger.open(x)
+    if wanted and working.sharper(worst, _size(ledger.program, x), bool(added), ledger.tolerance):
+        return True
+    if wanted and (working.counterpart.sharpen(x) or added):
         return True
     if not feasible and working.slater and working.margin < LARGEST:
         working.margin = min(LARGEST, 4.0 * working.margin)  # imposed and violated: by the solver's accuracy
@@ -235,26 +290,32 @@ def _learned(working: Robust, x: Array, proofs: Sequence[Proof]) -> bool:
 def _solved(working: Robust, ledger: Ledger) -> Answer | Result:
     """The optimum of the counterpart with the rows tightened; where that leaves nothing, less and less so, and in the
     end the proof that nothing is feasible."""
+    program, best = working.program, ledger.best
+    size = program.cost_scale if best is None else _size(program, best.solution.x)
     while True:
-        answer = working.counterpart.solve(working.margin)
-        calls = working.counterpart.calls
-        ledger.relaxed.solves = ledger.relaxed.counted.calls = ledger.relaxed.solved_by[HIGHS] = calls
+        answer = working.solve(size)
+        _count(working, ledger)
         if answer.solved:
             break
+        if isinstance(working.counterpart, Interior):
+            refuted = working.refuted(answer)
+            if refuted is not None:
+                return _refuted(working, ledger, answer, refuted)
+            working.by_simplex()
+            continue
         if working.margin > 0.0:
             working.margin = THINNER * working.margin if working.margin > SMALLEST * THINNER else 0.0
             working.slater = working.margin > 0.0
             if working.margin > 0.0:
                 continue
         return _infeasible(working, ledger, answer.said)
-    program = working.program
     x = np.clip(answer.x, program.finite.lower, program.finite.upper)
     working.raw = x
     x = x if program.settle is None else program.settle(x)
     dual = working.dual(answer, priced=True)
     ledger.improve(dual)
-    price = float(answer.y.sum())
-    budget = 0.4 * ledger.tolerance * max(SMALL_COST * program.cost_scale, program.cost(x))
+    price = working.price = float(answer.y.sum())
+    budget = 0.4 * ledger.tolerance * _size(program, x)
     if working.slater and price * working.margin > budget:
         working.margin = max(SMALLEST, min(working.margin, budget / price))
     none = np.zeros(0)
@@ -284,21 +345,36 @@ def _infeasible(working: Robust, ledger: Ledger, said: str) -> Result:
     elastic = relaxing.solve()
     while elastic.solved and relaxing.sharpen(elastic.x):
         elastic = relaxing.solve()
-    calls = working.counterpart.calls + relaxing.calls
-    ledger.relaxed.solves = ledger.relaxed.counted.calls = ledger.relaxed.solved_by[HIGHS] = calls
-    dual = working.dual(elastic, priced=False) if elastic.solved else None
-    if dual is None or not dual.bound > FARKAS:
+    working.calls[HIGHS] += relaxing.calls
+    _count(working, ledger)
+    dual = working.refuted(elastic) if elastic.solved else None
+    if dual is None:
         found = FiniteSolution("failed", np.zeros(program.n), np.nan, -np.inf, none, none, none, np.inf, np.inf, said)
         return ledger.result(
             "failed", f"the relaxed program was not solved: {said}", Answer(found, _rows(working), 0.0, np.nan)
         )
+    return _refuted(working, ledger, elastic, dual)
+
+
+def _refuted(working: Robust, ledger: Ledger, answer: RobustAnswer, dual: Dual) -> Result:
+    """Nothing is feasible, as these multipliers prove."""
+    program, none = working.program, np.zeros(0)
     solution = FiniteSolution(
-        "infeasible", elastic.x, np.inf, np.inf, elastic.y, elastic.mu, none, np.inf, 0.0, said, (), dual.bound
+        "infeasible", answer.x, np.inf, np.inf, answer.y, answer.mu, none, np.inf, 0.0, answer.said, (), dual.bound
     )
     ledger.dual = dual
     told, worst = _reason(program, dual)
-    answer = Answer(solution, _rows(working), 0.0, np.inf)
-    return replace(ledger.result("infeasible", told.sentence(), answer, worst), infeasible=told)
+    found = Answer(solution, _rows(working), 0.0, np.inf)
+    return replace(ledger.result("infeasible", told.sentence(), found, worst), infeasible=told)
+
+
+def _count(working: Robust, ledger: Ledger) -> None:
+    ledger.relaxed.solves = ledger.relaxed.counted.calls = working.calls.total()
+    ledger.relaxed.solved_by.update(working.calls - ledger.relaxed.solved_by)
+
+
+def _size(program: SemiInfiniteProgram, x: Array) -> float:
+    return max(SMALL_COST * program.cost_scale, program.cost(x))
 
 
 def _reason(program: SemiInfiniteProgram, dual: Dual) -> tuple[InfeasibleSubsystem, WorstConstraint | None]:

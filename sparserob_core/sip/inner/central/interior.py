@@ -1,0 +1,350 @@
+"""An interior point method for uncertain rows: Mehrotra's (1992), with a Newton system eliminated block by block.
+
+minimise ``c'z`` subject to ``g z + scale_r sum_j radius_j t_j + s = h``, ``s >= 0``, ``|a_j| <= t_j`` and
+``a = C f + offset``. A block of answering variables ``f`` is eliminated by one Cholesky factorisation of its own size;
+what is left of it are the parts, sums of absolute values, and then the joint variables ``z``. So a step costs as much
+as the blocks do, however many of them there are. A solution is in the middle of all that are as good: a new row moves
+it little.
+
+New rows come to a decision that violates them. All products of slacks and multipliers are then made so large that
+slacks of the size of the violation are in the middle, and the next solve begins there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.finite import FiniteProgram, Spread, UncertainRows
+from sparserob_core.sip.inner.central.layout import Block, Layout
+from sparserob_core.sip.inner.counterpart import RobustAnswer
+
+if TYPE_CHECKING:
+    pass
+
+STEPS = 80  # Newton steps of one solve at most
+CORRECTIONS = 2  # of a step at most (Gondzio 1996)
+SHARE = 0.995  # of the way to the boundary
+GREATER = 1e-14  # by which a diagonal is enlarged, relative to itself
+PROXIMAL = 1e-9  # weight of the distance from the last iterate: directions that change nothing have no length
+FIRST = 0.1  # products that the method begins with, in units of the largest cost
+AROUND, ROOM = 5.0, 1.0  # slacks that it begins with: times the largest violation, at least
+SLACK = 0.1  # share of a violation that new rows have as slack in the middle
+SPENT = 0.1  # share of the accuracy that residuals may take
+MET = 1e-10  # residual of rows that is none
+NOTHING = 1e-11  # share of the largest multiplier below which one is 0
+ENDLESS = 1e9  # multipliers of rows that nothing meets
+TINY = 1e-300
+
+Direction = tuple[Array, Array, Array, Array, Array, Array, Array, Array]
+
+
+@final
+@dataclass(eq=False)
+class Interior:
+    """Uncertain rows over one program and one box of deviations, to which rows are added; every solve begins where the
+    last one ended."""
+
+    program: FiniteProgram
+    spread: Spread
+    steps: int = 0
+    blocks: list[UncertainRows] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._layout = Layout(self.program, self.spread)
+        self._begun, self._stale = False, True
+
+    def add(self, block: UncertainRows) -> None:
+        """Impose rows from now on."""
+        if self.spread.is_box and not block.exact:
+            self._layout.add(block)
+        self.blocks.append(block)
+        self._stale = True
+
+    def fits(self) -> bool:
+        """Whether all rows are of the kind that this knows, and so many variables that it is worth it."""
+        plain = self.spread.is_box and not any(block.exact for block in self.blocks)
+        return plain and self._layout.fits()
+
+    def sharpen(self, x: Array) -> bool:
+        """Nothing stands for the rows but they themselves."""
+        return False
+
+    def solve(self, margin: float, accuracy: float) -> RobustAnswer:
+        """The optimum with every row tightened by ``margin``, to about ``accuracy`` in the cost."""
+        if self._stale:
+            self._extend(margin)
+        first = self._limits.size
+        self._h[first:] = self._layout.h - self._layout.rest - margin
+        self._floor = 0.1 * accuracy / (self._y.size + 2 * self._plus.size)
+        with np.errstate(all="ignore"):
+            for _ in range(STEPS):
+                gap, lost, missed = self._residuals()
+                close = gap + lost <= accuracy or gap <= SPENT * accuracy
+                if close and missed <= max(MET, SPENT * accuracy):
+                    return self._answer(True, "interior point method: optimal")
+                if not self._y.max() < ENDLESS or not self._step():
+                    return self._answer(False, "the interior point method came to a halt")
+                self.steps += 1
+        return self._answer(False, f"the interior point method took {STEPS} steps")
+
+    def _begin(self) -> None:
+        """Joint variables, absolute values of those that cost, and the rows that bound them."""
+        from scipy.sparse import coo_array, csr_array
+
+        program, joint = self.program, self._layout.joint
+        n, low, high = joint.size, program.lower[joint], program.upper[joint]
+        weights = program.weights[joint]
+        split = np.flatnonzero((weights > 0.0) & (low < 0.0) & (high > 0.0))
+        k = np.arange(split.size)
+        self._n, self._size = n, n + split.size
+        signs = np.where(low >= 0.0, 1.0, np.where(high <= 0.0, -1.0, 0.0))
+        self._c = np.concatenate([program.q[joint] + signs * weights, weights[split]])
+        up, down = np.flatnonzero(np.isfinite(high)), np.flatnonzero(np.isfinite(low))
+        count = up.size + down.size
+        row = np.concatenate([np.arange(count), count + k, count + split.size + k])
+        column = np.concatenate([up, down, split, split])
+        value = np.concatenate([np.ones(up.size), -np.ones(down.size), np.ones(split.size), -np.ones(split.size)])
+        row = np.concatenate([row, count + k, count + split.size + k])
+        column, value = np.concatenate([column, n + k, n + k]), np.concatenate([value, -np.ones(2 * split.size)])
+        self._plain = csr_array(coo_array((value, (row, column)), shape=(count + 2 * split.size, self._size)))
+        self._limits = np.concatenate([high[up], -low[down], np.zeros(2 * split.size)])
+        self._z, self._f = np.zeros(self._size), np.zeros(self._layout.answering.size)
+        self._z[:n], self._z[n:] = np.clip(0.0, low, high), ROOM
+        far = np.maximum(np.abs(program.lower), np.abs(program.upper))
+        far = np.where(np.isfinite(far), far, ROOM)
+        self._reach = np.concatenate([far[joint], np.full(split.size, ROOM)]), far[self._layout.answering]
+        self._mu = FIRST * max(float(np.abs(self._c).max(initial=0.0)), TINY)
+        self._s = np.maximum(self._limits - self._plain @ self._z, ROOM)
+        self._y = self._mu / self._s
+        self._plus = self._minus = self._alpha = self._beta = np.zeros(0)
+        self._begun = True
+
+    def _extend(self, margin: float) -> None:
+        """Places, slacks and multipliers of what is new."""
+        from scipy.sparse import csr_array, hstack, vstack
+
+        kept, L = self._layout.arrange(), self._layout
+        if not (self._begun and kept):
+            self._begin()
+        first = self._limits.size
+        self._g = csr_array(hstack([L.g, csr_array((L.g.shape[0], self._size - self._n))]))
+        self._G = csr_array(vstack([self._plain, self._g]))
+        self._h = np.concatenate([self._limits, L.h - L.rest - margin])
+        self._Phi = csr_array((L.scale, (np.arange(L.of.size), L.of)), shape=(L.of.size, L.parts))
+        had = self._s.size - first
+        a = L.C @ self._f + L.offset
+        worst = np.bincount(L.part, L.radius * np.abs(a), L.parts)
+        free = self._h[first:] - self._g @ self._z - L.scale * worst[L.of]
+        many = np.bincount(L.part, minlength=L.parts) + 2.0  # a slack is as large as that of each absolute value
+        violation = max(0.0, -float(free[had:].min(initial=0.0)))
+        if had:
+            aim = SLACK * violation * float(self._y[first:].max()) / float(many.max())
+            self._mu = max(self._mu, aim)
+            self._s = np.maximum(self._s, self._mu / self._y)
+            self._y = np.maximum(self._y, self._mu / self._s)
+        else:
+            violation = max(ROOM, AROUND * violation)
+        self._appear(had, a, free, np.maximum(free, violation) / many[L.of])
+        self._stale = False
+
+    def _appear(self, had: int, a: Array, free: Array, room: Array) -> None:
+        """Slacks and multipliers of new rows, and those of all absolute values; ``room (r,)``: what a row of this
+        freedom ``free`` has as slack in the middle."""
+        L, first = self._layout, self._limits.size
+        y = np.concatenate([self._y[first:], self._mu / room[had:]])
+        eta = np.bincount(L.of, L.scale * y, L.parts)
+        most = np.full(L.parts, np.inf)
+        np.minimum.at(most, L.of, room / np.maximum(L.scale, TINY))
+        t = np.abs(a) + np.minimum(self._mu / np.maximum(eta, TINY), most)[L.part] / L.radius
+        old = self._plus.size
+        t[:old] = np.maximum(t[:old], (self._plus + self._minus) / 2)
+        used = np.bincount(L.part, L.radius * (t - np.abs(a)), L.parts)
+        left = np.maximum(free - L.scale * used[L.of], room)[had:]
+        self._s = np.concatenate([self._s, left])
+        self._y = np.concatenate([self._y, self._mu / left])
+        self._plus, self._minus = t - a, t + a
+        self._alpha, self._beta = self._mu / self._plus, self._mu / self._minus
+
+    def _residuals(self) -> tuple[float, float, float]:
+        """The gap, what the residuals of the dual take from a bound, and the largest of the primal."""
+        L, first = self._layout, self._limits.size
+        tau = np.bincount(L.part, L.radius * (self._plus + self._minus) / 2, L.parts)
+        eta = np.bincount(L.of, L.scale * self._y[first:], L.parts)
+        self._rz = self._c + self._G.T @ self._y
+        self._rf = L.C.T @ (self._alpha - self._beta)
+        self._rt = L.radius * eta[L.part] - self._alpha - self._beta
+        self._rp = self._G @ self._z + self._s - self._h
+        self._rp[first:] += L.scale * tau[L.of]
+        gap = float(self._y @ self._s + self._alpha @ self._plus + self._beta @ self._minus)
+        self._mu = gap / (self._y.size + 2 * self._plus.size)
+        lost = float(np.abs(self._rz) @ self._reach[0] + np.abs(self._rf) @ self._reach[1])
+        return gap, lost, float(np.abs(self._rp).max())
+
+    def _step(self) -> bool:
+        """One step towards the optimum; whether one was possible."""
+        try:
+            self._factorise()
+        except np.linalg.LinAlgError:
+            return False
+        values, prices = (self._s, self._plus, self._minus), (self._y, self._alpha, self._beta)
+        products = [value * price for value, price in zip(values, prices, strict=True)]
+        predicted = self._direction(*(-one for one in products))
+        changes = list(zip(values, prices, *_moves(predicted), strict=True))
+        primal, dual = self._lengths(predicted, 1.0)
+        after = sum(float((s + primal * ds) @ (y + dual * dy)) for s, y, ds, dy in changes)
+        share = after / sum(float(one.sum()) for one in products)
+        aim = max(self._mu * min(1.0, max(share, 0.0)) ** 3, self._floor)
+        terms = [aim - s * y - ds * dy for s, y, ds, dy in changes]
+        move = self._direction(*terms)
+        primal, dual = self._lengths(move, SHARE)
+        for _ in range(CORRECTIONS):  # products that a longer step would make far from the middle are brought back
+            if min(primal, dual) > 0.9:
+                break
+            further = min(1.0, 1.08 * primal + 0.08), min(1.0, 1.08 * dual + 0.08)
+            changes = list(zip(values, prices, *_moves(move), strict=True))
+            terms = [term + _back(*one, *further, aim) for term, one in zip(terms, changes, strict=True)]
+            other = self._direction(*terms)
+            lengths = self._lengths(other, SHARE)
+            if not sum(lengths) > primal + dual + 0.01:
+                break
+            move, (primal, dual) = other, lengths
+        if not max(primal, dual) > 1e-8 or not np.isfinite(move[1]).all():
+            return False
+        dz, df, ds, dy, dplus, dminus, dalpha, dbeta = move
+        self._z, self._f, self._s = self._z + primal * dz, self._f + primal * df, self._s + primal * ds
+        self._plus, self._minus = self._plus + primal * dplus, self._minus + primal * dminus
+        self._y, self._alpha, self._beta = self._y + dual * dy, self._alpha + dual * dalpha, self._beta + dual * dbeta
+        return True
+
+    def _lengths(self, move: Direction, share: float) -> tuple[float, float]:
+        """How far slacks and multipliers can go."""
+        slacks, prices = _moves(move)
+
+        def most(values: tuple[Array, Array, Array], changes: tuple[Array, Array, Array]) -> float:
+            least = min(float((d / v).min(initial=0.0)) for v, d in zip(values, changes, strict=True))
+            return min(1.0, share / -least) if least < 0.0 else 1.0
+
+        return (
+            most((self._s, self._plus, self._minus), slacks),
+            most((self._y, self._alpha, self._beta), prices),
+        )
+
+    def _factorise(self) -> None:
+        """Blocks, then what they leave of the rows, then the joint variables."""
+        from scipy.linalg import lapack
+        from scipy.sparse import diags_array
+
+        L, first = self._layout, self._limits.size
+        e, b = self._alpha / self._plus, self._beta / self._minus
+        both = e + b
+        self._both = both + PROXIMAL
+        self._lean = (e - b) / self._both
+        self._weight = (4.0 * e * b + PROXIMAL * both) / self._both
+        lean = self._lean * L.radius
+        S = np.diag(np.bincount(L.part, L.radius**2 / self._both, L.parts))
+        self._factors: list[tuple[Block, Array, Array, np.ndarray]] = []
+        for group in L.groups:
+            total = np.zeros((group.parts.size, group.parts.size))
+            for block in group.blocks:
+                factor, X = self._eliminated(block, group.parts.size, lean)
+                total += X.T @ X
+                self._factors.append((block, factor, X, group.parts))
+            S[np.ix_(group.parts, group.parts)] += total
+        self._D = self._y / self._s
+        W = (L.scale[:, None] * S[np.ix_(L.of, L.of)]) * L.scale
+        W.reshape(-1)[:: L.of.size + 1] += 1.0 / self._D[first:]
+        self._W = _cholesky(W)
+        self._Y, _ = lapack.dtrtrs(self._W, self._g.toarray(), lower=1)
+        table = (self._plain.T @ diags_array(self._D[:first]) @ self._plain).toarray()
+        self._K = _cholesky(table + self._Y.T @ self._Y)
+
+    def _eliminated(self, block: Block, parts: int, lean: Array) -> tuple[Array, Array]:
+        """The Cholesky factor of one block, and what it makes of the coupling to the parts."""
+        from scipy.linalg import lapack
+
+        n, A = block.last - block.first, block.A
+        scaled = A * np.sqrt(self._weight[block.at])[:, None]
+        M = scaled.T @ scaled
+        M.reshape(-1)[:: n + 1] += PROXIMAL + np.bincount(block.of, block.value**2 * self._weight[block.single], n)
+        factor = _cholesky(M)
+        B = np.zeros((n, parts), order="F")
+        if block.once:
+            B[:, block.mixed] = (A * lean[block.at][:, None]).T
+        else:
+            np.add.at(B.T, block.mixed, A * lean[block.at][:, None])
+        np.add.at(B, (block.of, block.columns), block.value * lean[block.single])
+        X, _ = lapack.dtrtrs(factor, B, lower=1, overwrite_b=1)
+        return factor, X
+
+    def _direction(self, rows: Array, over: Array, under: Array) -> Direction:
+        """The Newton direction for these changes of the products of slacks and multipliers: of ``z``, ``f``, and the
+        slacks and multipliers of rows and of both sides of absolute values."""
+        from scipy.linalg import lapack
+
+        L, D, first = self._layout, self._D, self._limits.size
+        k, kp, km = rows / self._s, over / self._plus, under / self._minus
+        pull = -self._rt + kp + km
+        rhs = -self._rf - L.C.T @ (kp - km - self._lean * pull)
+        kappa = np.bincount(L.part, L.radius * pull / self._both, L.parts)
+        reduced = []
+        for block, factor, X, parts in self._factors:
+            one, _ = lapack.dtrtrs(factor, rhs[block.first : block.last], lower=1)
+            reduced.append(one)
+            kappa[parts] += X.T @ one
+        lifted, _ = lapack.dtrtrs(self._W, self._rp[first:] + L.scale * kappa[L.of] + k[first:] / D[first:], lower=1)
+        right = self._rz + self._plain.T @ (D[:first] * self._rp[:first] + k[:first]) + self._Y.T @ lifted
+        dz, _ = lapack.dpotrs(self._K, -right, lower=1)
+        dy = np.empty(k.size)
+        dy[:first] = D[:first] * (self._plain @ dz + self._rp[:first]) + k[:first]
+        dy[first:], _ = lapack.dtrtrs(self._W, self._Y @ dz + lifted, lower=1, trans=1)
+        deta = self._Phi.T @ dy[first:]
+        df = np.empty(self._f.size)
+        for (block, factor, X, parts), one in zip(self._factors, reduced, strict=True):
+            df[block.first : block.last], _ = lapack.dtrtrs(factor, one - X @ deta[parts], lower=1, trans=1)
+        da = L.C @ df
+        dt = (pull - L.radius * deta[L.part]) / self._both + self._lean * da
+        dplus, dminus = dt - da, dt + da
+        dalpha, dbeta = kp - self._alpha / self._plus * dplus, km - self._beta / self._minus * dminus
+        return dz, df, (k - dy) / D, dy, dplus, dminus, dalpha, dbeta
+
+    def _answer(self, solved: bool, said: str) -> RobustAnswer:
+        L = self._layout
+        x = np.zeros(self.program.n)
+        x[L.joint], x[L.answering] = self._z[: self._n], self._f
+        y = self._y[self._limits.size :]
+        y = np.where(y > NOTHING * y.max(), y, 0.0)
+        leaning = L.radius * (self._alpha - self._beta) / np.maximum(self._alpha + self._beta, TINY)
+        table = L.at_rest.copy()
+        table[L.part, L.entry] = np.clip(leaning, -L.radius, L.radius)
+        signs = np.concatenate([np.sign(block.factor) for block in self.blocks])
+        return RobustAnswer(solved, said, x, y, signs[:, None] * table[L.of], np.zeros(0))
+
+
+def _moves(move: Direction) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
+    """The changes of the slacks, and of their multipliers."""
+    _, _, ds, dy, dplus, dminus, dalpha, dbeta = move
+    return (ds, dplus, dminus), (dy, dalpha, dbeta)
+
+
+def _back(value: Array, price: Array, dvalue: Array, dprice: Array, primal: float, dual: float, aim: float) -> Array:
+    """What brings products that a longer step would make far from ``aim`` back to its neighbourhood."""
+    product = (value + primal * dvalue) * (price + dual * dprice)
+    return np.clip(np.clip(product, 0.1 * aim, 10.0 * aim) - product, -10.0 * aim, 10.0 * aim)
+
+
+def _cholesky(M: Array) -> Array:
+    """The lower factor of a positive definite matrix, whose diagonal is enlarged until it is one."""
+    from scipy.linalg import lapack
+
+    diagonal, grown = M.reshape(-1)[:: M.shape[0] + 1], GREATER
+    while grown < 1e-6:
+        diagonal *= 1.0 + grown
+        factor, info = lapack.dpotrf(M, lower=1, clean=1)
+        if not info:
+            return np.asarray(factor)
+        grown *= 100.0
+    raise np.linalg.LinAlgError

@@ -1,0 +1,206 @@
+"""Uncertain rows taken apart: absolute values of blocks of variables, which few rows join.
+
+A variable that answers the deviations enters few of their entries. Variables and entries that hang together are one
+*block*. An absolute value ``|a_j|`` is of one entry and hence of one block; rows add absolute values up, together with
+variables that answer nothing (*joint* variables).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.finite import FiniteProgram, Spread, UncertainRows
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+ALIKE = 1.2  # times the parts of a block that its group may have
+WORTH = 3500  # answering variables from which the simplex method takes longer
+LARGEST = 600  # variables of one block at most: beyond, a factorisation of it is no gain
+
+
+@final
+@dataclass(eq=False)
+class Block:
+    """The answering variables ``first`` to ``last``; the absolute values in which one of them is (``single``, by
+    number) and those in which several are: numbers ``at (k,)`` and coefficients ``A (k, n)``. Of the single ones the
+    variable ``of``, counted from ``first``, and its ``value``. Where the parts of both kinds are among those of the
+    group: ``columns`` and ``mixed``; ``once``: no two of ``mixed`` are the same."""
+
+    first: int
+    last: int
+    single: np.ndarray
+    at: np.ndarray
+    A: Array
+    of: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
+    value: Array = field(default_factory=lambda: np.zeros(0))
+    columns: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
+    mixed: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
+    once: bool = True
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Blocks with about the same ``parts (p,)``."""
+
+    blocks: tuple[Block, ...]
+    parts: np.ndarray
+
+
+@final
+class Layout:
+    """The rows that were added, taken apart.
+
+    Absolute values ``j``: ``entry``, ``part``, ``radius`` and ``offset (J,)``, and ``a = C f + offset`` of the
+    answering variables ``f``, whose numbers are ``answering``. Rows: coefficients ``g (r, z)`` of the joint variables,
+    whose numbers are ``joint``; ``of (r,)`` their part, ``scale (r,)`` its weight, ``h (r,)`` their limits and
+    ``rest (r,)`` the worst case of entries that no variable enters, with ``at_rest (p, Q)`` these entries of it.
+    """
+
+    def __init__(self, program: FiniteProgram, spread: Spread) -> None:
+        self.program, self.spread = program, spread
+        self.parts = 0
+        self.taken = 0  # absolute values that stand in `blocks`
+        self._known: dict[tuple[bytes, bytes, bytes, bytes], int] = {}
+        self._rests: list[float] = []
+        self._still: list[Array] = []
+        self._values: list[tuple[np.ndarray, np.ndarray, np.ndarray, Array]] = []
+        self._entries: list[tuple[np.ndarray, np.ndarray, Array]] = []
+        self._rows: list[tuple[csr_array, np.ndarray, Array, Array]] = []
+        self.count = 0
+        self.label: np.ndarray | None = None
+        self.blocks: list[Block] = []
+
+    def add(self, block: UncertainRows) -> None:
+        """Take rows apart."""
+        names = np.array([self._part(C, d) for C, d in zip(block.C, block.d, strict=True)], dtype=int)
+        self._rows.append((block.g, names[block.part], np.abs(block.factor), block.h))
+
+    def _part(self, C: csr_array, d: Array) -> int:
+        key = (C.indptr.tobytes(), C.indices.tobytes(), C.data.tobytes(), d.tobytes())
+        if key in self._known:
+            return self._known[key]
+        radii, counts = self.spread.radii, np.diff(C.indptr)
+        self._rests.append(float(radii[counts == 0] @ np.abs(d[counts == 0])))
+        self._still.append(np.where(counts == 0, np.sign(d) * radii, 0.0))
+        entries = np.flatnonzero((counts > 0) & (radii > 0.0))
+        number = np.full(self.spread.size, -1)
+        number[entries] = self.count + np.arange(entries.size)
+        row = np.repeat(number, counts)
+        self._values.append((entries, np.full(entries.size, self.parts), d[entries], radii[entries]))
+        self._entries.append((row[row >= 0], C.indices[row >= 0], C.data[row >= 0]))
+        self.count += entries.size
+        self._known[key] = self.parts
+        self.parts += 1
+        return self.parts - 1
+
+    def arrange(self) -> bool:
+        """Bring what was added to its place; whether all that was there has kept its own."""
+        from scipy.sparse import csr_array, vstack
+
+        self.entry, self.part, self.offset, self.radius = (
+            np.concatenate(one) for one in zip(*self._values, strict=True)
+        )
+        row, variable, value = (np.concatenate(one) for one in zip(*self._entries, strict=True))
+        kept = self.label is not None and self._hang_together(row, variable)
+        if not kept:
+            self._partition(row, variable)
+        self.C = csr_array((value, (row, self._place[variable])), shape=(self.count, self.answering.size))
+        self._blocks()
+        self.of, self.scale, self.h = (
+            np.concatenate(one) for one in ([rows[i] for rows in self._rows] for i in (1, 2, 3))
+        )
+        self.g = csr_array(vstack([rows[0] for rows in self._rows]).tocsc()[:, self.joint])
+        self.rest = self.scale * np.array(self._rests)[self.of]
+        self.at_rest = np.array(self._still)
+        return kept
+
+    def _hang_together(self, row: np.ndarray, variable: np.ndarray) -> bool:
+        assert self.label is not None
+        new = row >= self.taken
+        Q = self.spread.size
+        return bool((self.label[Q + variable[new]] == self.label[self.entry[row[new]]]).all()) and bool(
+            (self._place[variable[new]] >= 0).all()
+        )
+
+    def _partition(self, row: np.ndarray, variable: np.ndarray) -> None:
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        Q, n = self.spread.size, self.program.n
+        graph = coo_array((np.ones(row.size), (self.entry[row], Q + variable)), shape=(Q + n, Q + n))
+        _, self.label = connected_components(graph, directed=False)
+        answers = np.zeros(n, dtype=bool)
+        answers[variable] = True
+        self.joint, mine = np.flatnonzero(~answers), np.flatnonzero(answers)
+        self.answering = mine[np.argsort(self.label[Q + mine], kind="stable")]
+        self._place = np.full(n, -1)
+        self._place[self.answering] = np.arange(self.answering.size)
+        _, starts, self._of = np.unique(self.label[Q + self.answering], return_index=True, return_inverse=True)
+        self.starts = np.concatenate([starts, [self.answering.size]])
+        self.taken, self.blocks = 0, []
+
+    def _blocks(self) -> None:
+        """Of every block the absolute values, those that are new behind the others."""
+        fresh = np.arange(self.taken, self.count)
+        fresh = fresh[np.diff(self.C.indptr)[self.taken :] > 0]
+        one = np.diff(self.C.indptr)[fresh] == 1
+        number = self._of[self.C.indices[self.C.indptr[fresh]]]
+        order = np.argsort(number, kind="stable")
+        cuts = np.searchsorted(number[order], np.arange(self.starts.size))
+        for b in range(self.starts.size - 1):
+            first, last = int(self.starts[b]), int(self.starts[b + 1])
+            mine = order[cuts[b] : cuts[b + 1]]
+            single, at = fresh[mine[one[mine]]], fresh[mine[~one[mine]]]
+            A = np.zeros((at.size, last - first))
+            for i, j in enumerate(at.tolist()):
+                place = slice(self.C.indptr[j], self.C.indptr[j + 1])
+                A[i, self.C.indices[place] - first] = self.C.data[place]
+            if b == len(self.blocks):
+                self.blocks.append(Block(first, last, single, at, A))
+            else:
+                old = self.blocks[b]
+                old.single, old.at = np.concatenate([old.single, single]), np.concatenate([old.at, at])
+                old.A = np.vstack([old.A, A])
+        self.taken = self.count
+        self._group()
+
+    def _group(self) -> None:
+        """Put blocks together, one after the other, as long as they have most parts in common."""
+        self.groups: list[Group] = []
+        open_, union = list[Block](), np.zeros(0, dtype=int)
+        for block in self.blocks:
+            mine = np.unique(self.part[np.concatenate([block.single, block.at])])
+            both = np.union1d(union, mine)
+            if open_ and both.size > ALIKE * min(union.size, mine.size) + 4:
+                self._close(open_, union)
+                open_, both = [], mine
+            open_, union = [*open_, block], both
+        self._close(open_, union)
+
+    def _close(self, blocks: list[Block], parts: np.ndarray) -> None:
+        for block in blocks:
+            places = self.C.indptr[block.single]
+            block.of, block.value = self.C.indices[places] - block.first, self.C.data[places]
+            block.columns = np.searchsorted(parts, self.part[block.single])
+            block.mixed = np.searchsorted(parts, self.part[block.at])
+            block.once = bool(np.unique(block.mixed).size == block.mixed.size)
+        self.groups.append(Group(tuple(blocks), parts))
+
+    def fits(self) -> bool:
+        """Whether there are many variables, in small blocks, and nothing beside them that is not known here."""
+        program = self.program
+        if not self.count or program.n < WORTH or program.b.size or program.P is not None or program.S is not None:
+            return False
+        if program.G.shape[0] or not (program.lower < program.upper).all():
+            return False
+        self.arrange()
+        mine = self.answering
+        plain = not program.weights[mine].any() and not program.q[mine].any()
+        plain = plain and not any(rows[0].tocsc()[:, mine].nnz for rows in self._rows)
+        return plain and mine.size >= WORTH and int(np.diff(self.starts).max()) <= LARGEST
