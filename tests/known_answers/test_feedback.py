@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import re
 import shutil
 import time
 from pathlib import Path
@@ -19,6 +20,7 @@ from scipy.sparse import coo_array
 import sparserob_core as sr
 from sparserob_core.control.studies.answer import ControlResult
 from sparserob_core.experiment.check.check import check
+from tests.support.places import CONFIGS, ROOT
 
 SPRING: dict[str, Any] = {
     "name": "linear",
@@ -526,7 +528,7 @@ def test_the_witness_is_where_the_simulated_loop_goes(refuted: Path) -> None:
 
 
 def test_minimum_attention_answers_what_it_measures_and_its_rate_has_a_name_of_its_own(tmp_path: Path) -> None:
-    outcome = sr.run("configs/experiment3_feedback.yaml", out=tmp_path / "run", quiet=True, figures=False)
+    outcome = sr.run(CONFIGS / "experiment3_feedback.yaml", out=tmp_path / "run", quiet=True, figures=False)
     assert {"control", "rate", "equals"} <= set(outcome.summary["tolerances"])
     found = check(outcome.directory)
     assert found.status == "verified"
@@ -534,3 +536,17 @@ def test_minimum_attention_answers_what_it_measures_and_its_rate_has_a_name_of_i
     assert (
         np.abs(loop.states(outcome.result.decision, np.array([5.0]))[0, 2]).max() < 1e-12
     )  # u(5) = 0 whatever happens
+
+
+@pytest.mark.slow
+def test_the_page_on_feedback_says_what_the_runs_say(tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "feedback.md").read_text()
+    row = r"^\| `(\w+_feedback)` \| (\w+)" + 4 * r" \| ([\d.]+)"
+    rows = re.findall(row, page, re.MULTILINE)
+    assert {name for name, *_ in rows} == {path.stem for path in CONFIGS.glob("*_feedback.yaml")}
+    for name, cost, *said, apart in rows:
+        summary = sr.run(CONFIGS / f"{name}.yaml", out=tmp_path / name, quiet=True, figures=False).summary
+        found = [summary[key] for key in ("cost", "lower_bound", "causal_lower_bound")]
+        assert found[:2] == pytest.approx([float(one) for one in said[:2]], abs=1e-6)
+        assert found[2] >= float(said[2]) - 1e-3 and cost in ("nominal", "peak", "worst")
+        assert 100 * (found[0] - found[2]) / found[0] == pytest.approx(float(apart), abs=0.6)
