@@ -15,7 +15,7 @@ from figures_controls import draw_attention, draw_controls
 from figures_states import draw_ends, draw_states
 from numbers_of import numbers_of
 from page import page
-from studies import WEIGHTS, largest_disturbance, run_all, tell
+from studies import WEIGHTS, answered_disturbance, largest_disturbance, run_all, tell
 
 import sparserob_core as sr
 
@@ -46,13 +46,15 @@ def build(docs: Path = DOCS, numbers: Path = NUMBERS) -> None:
         outcomes = run_all(Path(directory))
         tell("        the largest disturbance that experiment 1 withstands, by bisection")
         bracket = largest_disturbance(Path(directory))
+        tell("        the same with feedback, and what no causal control withstands")
+        answered = answered_disturbance()
         tell("        10 000 trajectories of every control")
         clouds = {
             name: cloud_of(outcome)
             for name, outcome in outcomes.items()
             if outcome.control is not None and "epsilon" not in name
         }
-        found = numbers_of(outcomes, clouds, bracket)
+        found = numbers_of(outcomes, clouds, bracket, answered)
     tell("        figures")
     draw(docs / "figures" / "paper", outcomes, clouds)
     numbers.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")

@@ -17,7 +17,10 @@ SMALLEST_ERROR = 1e-12
 
 
 def numbers_of(
-    outcomes: Mapping[str, sr.Outcome], clouds: Mapping[str, Cloud], bracket: tuple[float, float]
+    outcomes: Mapping[str, sr.Outcome],
+    clouds: Mapping[str, Cloud],
+    bracket: tuple[float, float],
+    answered: Mapping[str, float],
 ) -> dict[str, Any]:
     """What the page says, and nothing that differs from one run to the next (times, versions)."""
     return {
@@ -32,6 +35,7 @@ def numbers_of(
         },
         "epsilon": _sweep(outcomes),
         "bracket": list(bracket),
+        "answered": dict(answered),
         "deviation": [
             float(value) for value in (clouds["nominal1"].upper[:, -1] - clouds["nominal1"].lower[:, -1]) / 2
         ],
