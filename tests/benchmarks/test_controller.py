@@ -54,16 +54,23 @@ def test_a_warm_re_solve_of_250_pieces_is_ten_times_faster_than_the_exchange(tmp
     assert 10.0 * median <= told(capsys, "the same by the exchange, from the rows of the plan", slow)
 
 
-def test_a_policy_is_applied_in_less_than_a_hundredth_of_a_re_solve(tmp_path, capsys) -> None:
+def test_a_policy_is_applied_or_retuned_in_a_fraction_of_a_re_solve(tmp_path, capsys) -> None:
     overrides = {"dictionaries.control.pieces": 40, "policy.cost": "nominal"}
     outcome = sr.run(CONFIGS / "experiment1_feedback.yaml", overrides, tmp_path / "run", quiet=True, figures=False)
     medians = []
-    for resolve in (False, True):
-        controller = sr.controller(outcome, resolve)
-        state = np.array([-1.0, 1.0])
-        for begin in controller.breakpoints[:4]:  # a re-solve takes seconds
-            controller.step(begin, state)
-            state = outcome.tube([float(begin) + 0.125]).nominal[:, 0]
-        what = "feedback, 40 pieces, " + ("solved anew" if resolve else "applied")
-        medians.append(told(capsys, what, [one.seconds for one in controller.steps]))
-    assert 100.0 * medians[0] <= medians[1]
+    for what, resolve, seconds, steps in (
+        ("applied", False, None, 40),
+        ("the nominal control chosen anew", True, 0.02, 40),
+        ("the whole program solved anew", True, None, 4),  # which takes seconds
+    ):
+        controller, spent = sr.controller(outcome, resolve, seconds=seconds), list[float]()
+        for _ in range(1 if steps < 40 else 5):
+            controller.reset()
+            state, rng = np.array([-1.0, 1.0]), np.random.default_rng(0)
+            for begin in controller.breakpoints[:steps]:
+                controller.step(begin, state)
+                state = outcome.tube([float(begin) + 0.125]).nominal[:, 0] + 0.01 * rng.uniform(-1, 1, 2)
+            spent += [one.seconds for one in controller.steps]
+        medians.append(told(capsys, f"feedback, 40 pieces, {what}", spent))
+    assert 100.0 * medians[0] <= medians[2]
+    assert 20.0 * medians[1] <= medians[2]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time as clock
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
@@ -92,7 +92,7 @@ class Controller:
         if self._resolving is not None:
             answer = self._resolving.answer(self._plan, piece, measured, self._before, self._innovations(measured))
             if answer.plan is not None and (answer.cheaper or not covered):
-                self._take(answer.plan)
+                self._go_on(answer.plan)
                 covered = True
             else:
                 answer = answer.declined()
@@ -109,6 +109,14 @@ class Controller:
         feedback = plan.model.feedback
         self._measuring = None if feedback is None else Measuring.of(plan.model, plan.decision)
         self._nominal = plan.model.pieces(plan.decision)
+
+    def _go_on(self, plan: Plan) -> None:
+        """Apply a new plan from now on; one with the same gains goes on answering what was seen so far."""
+        if self._measuring is None or plan.model is not self._plan.model:
+            self._take(plan)
+            return
+        self._plan, self._nominal = plan, plan.model.pieces(plan.decision)
+        self._measuring = replace(self._measuring, nominal=self._nominal)
 
     def _timed(self, time: object) -> int:
         """The piece that begins at a time, which must be the next one."""
@@ -152,8 +160,11 @@ class Controller:
     def _innovations(self, state: Array) -> list[Array]:
         """What the applied plan knows of the disturbance when this state is measured, one vector for each breakpoint
         since it began."""
-        if self._measuring is None or self._next == self._plan.first:
+        feedback = self._plan.model.feedback
+        if self._measuring is None or feedback is None:
             return [np.zeros(state.size)]
+        if self._next == self._plan.first:
+            return [state - feedback.loop.start if feedback.loop.begins.any() else np.zeros(state.size)]
         return self._measuring.seen(state)
 
     def _control(self, piece: int, state: Array) -> Array:

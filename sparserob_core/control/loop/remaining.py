@@ -35,16 +35,19 @@ def refuse_remaining(model: Transcription) -> None:
             raise InputError(f"solving the remaining horizon needs {wanted}", path="resolve")
 
 
-def remaining(model: Transcription, piece: int, state: Array, before: Array | None) -> Transcription:
+def remaining(
+    model: Transcription, piece: int, state: Array, before: Array | None, alone: bool = False
+) -> Transcription:
     """The problem that is left where piece ``piece`` of the control begins in ``state (d,)``, after the control
     ``before (m,)``, transcribed as the ``model`` was; its times begin at 0.
 
     The parameters may be any of their set, and every piece of the disturbance that is left may be any of its own, also
-    what is left of one that has begun: no less than what can happen.
+    what is left of one that has begun: no less than what can happen. ``alone``: the nominal control and state alone,
+    as if nothing disturbed them and nothing were answered.
     """
     problem, begin = model.problem, float(model.control.breakpoints[piece])
     control = _rest(model.control, begin, problem.horizon)
-    disturbance = _rest(model.disturbance.merged(), begin, problem.horizon)
+    disturbance = control if alone else _rest(model.disturbance.merged(), begin, problem.horizon)
     horizon = control.horizon
     left = replace(
         problem,
@@ -55,7 +58,8 @@ def remaining(model: Transcription, piece: int, state: Array, before: Array | No
         initial_control=before if problem.control_step is not None else None,
         path=_windows(problem, begin, horizon),
     )
-    policy = None if model.feedback is None else model.feedback.policy
+    left = replace(left, disturbance=None) if alone else left
+    policy = None if alone or model.feedback is None else model.feedback.policy
     return prepare(left, control, disturbance, policy=policy)
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import time as clock
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -10,6 +12,7 @@ import numpy as np
 
 from sparserob_core.control.feedback.innovations import KNOWN
 from sparserob_core.control.loop.remaining import refuse_remaining, remaining
+from sparserob_core.control.loop.retuning import Retuning, retuned
 from sparserob_core.control.loop.tracking import Tracking, trackable
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.transcription.record import Transcription
@@ -26,6 +29,7 @@ from sparserob_core.sip.proof.branch_and_bound import prove
 from sparserob_core.sip.result import SMALL_COST, Result
 
 PROVEN = ("certified", "verified")
+WHOLE = 10.0  # times what it takes to write a whole program down: a solution takes more
 BETTER = 1e-6  # of the cost of what is left: less than that is no better
 
 
@@ -122,7 +126,9 @@ class Resolving:
     """Solves what is left of the horizon by the exchange method, at most for ``seconds`` a step (`None`: no limit).
 
     A control that is fixed beforehand begins with the constraints that mattered at the last step, and keeps what does
-    not depend on the state for the next loop. Raises `InputError` for a problem of which nothing can be left.
+    not depend on the state for the next loop. Under feedback the nominal control is chosen anew for the same gains,
+    which has no lower bound of its own, and then, where that is expected to end in time, the whole program. Raises
+    `InputError` for a problem of which nothing can be left.
     """
 
     def __init__(self, model: Transcription, tools: Tools, tolerance: float, seconds: float | None = None) -> None:
@@ -131,6 +137,12 @@ class Resolving:
         self._method = Exchange(tolerance=tolerance)
         self._kept: dict[int, tuple[Transcription, Transcription, Units]] = {}
         self._tracking: dict[int, Tracking | None] = {}
+        self._retuning: list[Retuning] = []
+        self._took, self._pieces = 0.0, model.control.pieces  # a whole program, and the pieces that it had
+        if model.feedback is not None and seconds is not None:
+            began = clock.perf_counter()
+            remaining(model, 0, np.asarray(model.problem.initial_state, dtype=float), None)
+            self._took = WHOLE * (clock.perf_counter() - began)
 
     def answer(
         self, plan: Plan, piece: int, state: Array, before: Array | None, innovations: Sequence[Array]
@@ -162,10 +174,38 @@ class Resolving:
         innovations: Sequence[Array],
         tools: Tools,
     ) -> Solved:
-        model = remaining(self._model, piece, state, before)
-        result = solve_in_own_units(self._method, model.program, tools)
-        known = plan.cost_left(piece - plan.first, innovations)
-        return self._judged(model, result, piece, result.decision, result.cost, result.lower_bound, known)
+        tools.deadline.check()
+        tuned, pieces = self._tuned(plan, piece, state, innovations), self._model.control.pieces - piece
+        needed = self._took * (pieces / self._pieces) ** 2
+        if tuned.plan is not None and self._seconds is not None and needed > self._seconds:
+            return tuned
+        began, whole = clock.perf_counter(), Solved(None)
+        with suppress(SparseRobError, OutOfTime):
+            model = remaining(self._model, piece, state, before)
+            result = solve_in_own_units(self._method, model.program, tools)
+            known = plan.cost_left(piece - plan.first, innovations)
+            whole = self._judged(model, result, piece, result.decision, result.cost, result.lower_bound, known)
+        self._took, self._pieces = clock.perf_counter() - began, pieces
+        if whole.plan is None:
+            self._took *= 2.0  # it needs more than it had
+        if tuned.plan is None or (whole.plan is not None and whole.cost <= tuned.cost):
+            return whole
+        return replace(tuned, lower=whole.lower)
+
+    def _tuned(self, plan: Plan, piece: int, state: Array, innovations: Sequence[Array]) -> Solved:
+        """The same gains with the best nominal control for them, where `Retuning` knows such problems."""
+        retuning = next((one for one in self._retuning if one.model is plan.model), None)
+        if retuning is None:
+            retuning = Retuning(plan.model, plan.decision)
+            self._retuning = [*self._retuning[:1], retuning]  # that of the plan that loops begin with, and the last
+        begun = piece - plan.first
+        found = retuning.solve(begun, state)
+        if found is None:
+            return Solved(None)
+        decision = retuned(plan.model, plan.decision, begun, plan.left(begun, innovations), found.decision)
+        tuned = replace(plan, decision=decision)
+        cost, known = (one.cost_left(begun, innovations) for one in (tuned, plan))
+        return Solved(tuned, cost, cheaper=cost < known - BETTER * max(abs(known), abs(cost)))
 
     def _fixed(
         self,

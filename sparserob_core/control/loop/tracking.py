@@ -7,8 +7,9 @@ only the nominal state is new.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import final
+from typing import Protocol, final
 
 import numpy as np
 
@@ -72,11 +73,28 @@ def trackable(own: Transcription) -> bool:
     return flat and on and bool((box.lower <= 0.0).all() and (box.upper >= 0.0).all())
 
 
+class Answering(Protocol):
+    """What future disturbances add to rows ``H x <= h (R,)`` under gains, at times that are counted as those of the
+    nominal problem: from the beginning of each of its ``K`` pieces."""
+
+    def room(self) -> tuple[Array, Array]:
+        """By how much the control may come below and above the nominal one on every piece, ``(m, K)`` each."""
+
+    def added(self, flow: Array, driven: Array, piece: int) -> Array:
+        """The largest that is added ``(q, R)`` at instants of a piece, with these flows ``(q, d, d)`` from its
+        beginning; the last piece is followed by a time alone."""
+
+    def bending(self, curvature: Callable[[Array], Array]) -> tuple[Array, Array]:
+        """Bounds ``(K, R)`` of the second derivative of that over every piece, and the numbers ``(K + 1, R)`` of which
+        it is made; ``curvature`` bounds those of the rows of a state from its rates ``(..., d)``."""
+
+
 @final
 class Tracking:
-    """`trackable` transcriptions from one initial state ``(d,)`` after another: `solve`."""
+    """`trackable` transcriptions from one initial state ``(d,)`` after another: `solve`. ``answering``: with gains that
+    stay as they are, ``own`` is then what is left when nothing happens."""
 
-    def __init__(self, own: Transcription) -> None:
+    def __init__(self, own: Transcription, answering: Callable[[Array], Answering] | None = None) -> None:
         problem, response, steps = own.problem, own.response, own.response.steps(KNOWN)
         self.own, self.K, self.m = own, own.control.pieces, problem.system.controls
         self.bound, self.horizon = problem.disturbance, problem.horizon
@@ -99,7 +117,12 @@ class Tracking:
         self.nodes = nodes.reshape(self.K + 1, d, -1)
         self.fixed = np.vstack([np.zeros((1, d)), pushed])
         box = problem.control.bounding_box()
+        self._answering = None if answering is None else answering(self.H)
         low, high = np.repeat(box.lower, self.K), np.repeat(box.upper, self.K)
+        if self._answering is not None:
+            below, above = self._answering.room()
+            low, high = low + below.ravel(), high - above.ravel()
+        self.limited = bool((low <= 0.0).all() and (high >= 0.0).all())
         self.sizes = np.abs(self.nodes) @ np.maximum(-low, high) + np.abs(self.fixed)
         priced = np.asarray(problem.cost.l1 * np.asarray(problem.weights), dtype=float)
         weights: Array = np.asarray(np.kron(priced, own.control.lengths), dtype=float)
@@ -115,8 +138,13 @@ class Tracking:
         self._blocks: dict[tuple[int, int], _Instants] = {}
         self._offsets: dict[int, tuple[Array, Array]] = {}
         self._given = self.kernel @ self.E
-        self._first = self._pushed(np.eye(d)[None], np.zeros((1, d, d)))[0]
-        self._bent = self._bending()
+        self._added: dict[tuple[int, int, int], Array] = {}
+        self._first, still = self._pushed(np.eye(d)[None], np.zeros((1, d, d)))[0], np.zeros((1, d, d))
+        self._bent, made = self._bending(), np.zeros_like(self._first)
+        if self._answering is not None:
+            ends = [self._answering.added(np.eye(d)[None], still, k) for k in range(self.K + 1)]
+            self._first = np.concatenate(ends)
+            self._bent, made = self._answering.bending(lambda rates: self._curvature(rates, self.length))
         self._flat = self.nodes.reshape(-1, self.nodes.shape[2])
         self._absolute = ROUND_OFF * np.abs(self.H).T
         number = np.arange(self.K + 1)[:, None]
@@ -124,6 +152,7 @@ class Tracking:
         self._inside = (number[:-1] >= self.start) & (number[:-1] < self.stop)
         pushed = np.abs(self._first)
         self._noise = self.sizes @ self._absolute + ROUND_OFF * (np.abs(self.h) + pushed.max(axis=0, initial=0.0))
+        self._noise = self._noise + ROUND_OFF * made
         self._recent: list[tuple[int, int, int, int]] = []  # rows that had a multiplier, those of the last states last
         self._begin()
 
@@ -165,7 +194,7 @@ class Tracking:
             if level:
                 parent = min(number // PARTS, PARTS ** (level - 1) - 1)
                 block, at = self._block(level, parent), number - parent * PARTS
-                c, here, pushed = c @ block.flow[at], c @ block.driven[at], block.pushed[at, piece, row]
+                c, here, pushed = c @ block.flow[at], c @ block.driven[at], self._at(level, parent, piece)[at, row]
             g = (c @ self.nodes[piece]).reshape(self.m, self.K)
             if level:
                 g[:, piece] += here @ self.B
@@ -200,7 +229,7 @@ class Tracking:
             for k, parent in cells:
                 at = self._block(level, parent)
                 states = at.flow @ nodes[k] + at.driven @ drives[k]  # (PARTS + 1, d)
-                heights = states @ self.H.T + at.pushed[:, k] - self.h
+                heights = states @ self.H.T + self._at(level, parent, k) - self.h
                 wrong = (heights + noise[k] > TOLERANCE) & self._inside[k]
                 first = parent * PARTS
                 if wrong.any():
@@ -245,6 +274,16 @@ class Tracking:
                 flow, driven = flow @ before.flow[at], flow @ before.driven[at] + driven
             self._blocks[key] = _Instants(flow, driven, self._pushed(flow, driven))
         return self._blocks[key]
+
+    def _at(self, level: int, parent: int, piece: int) -> Array:
+        """What the worst disturbance adds to every row at the instants of a block on one piece, ``(q, R)``."""
+        block = self._block(level, parent)
+        if self._answering is None:
+            return np.asarray(block.pushed[:, piece])
+        key = (level, parent, piece)
+        if key not in self._added:
+            self._added[key] = self._answering.added(block.flow, block.driven, piece)
+        return self._added[key]
 
     def _pushed(self, flow: Array, driven: Array) -> Array:
         """What the worst disturbance adds to every row on every piece, ``(q, K + 1, R)``."""

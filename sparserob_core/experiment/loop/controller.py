@@ -34,9 +34,10 @@ def controller(
     files), of a run's directory, or of what ``sr.run`` returned.
 
     ``resolve``: what is left of the horizon is solved anew at every step, for about ``seconds`` a step at most (no
-    limit unless given), and the last proven plan goes on where that does not give a better one. ``plugins``: files that
-    offer what a run was made with. Raises `InputError` where there is no proven control, or where nothing can be solved
-    anew: with a delay, or a dictionary whose functions are no indicators.
+    limit unless given), and the last proven plan goes on where that does not give a better one. Under feedback, where
+    that is too little for a whole program, its nominal control alone is solved anew, for the same gains. ``plugins``:
+    files that offer what a run was made with. Raises `InputError` where there is no proven control, or where nothing
+    can be solved anew: with a delay, or a dictionary whose functions are no indicators.
     """
     if not isinstance(resolve, bool | np.bool_):
         raise InputError(path="resolve", expected="true or false", got=f"{resolve!r}")
