@@ -22,6 +22,7 @@ from sparserob_core.control.studies.answer import ControlResult
 from sparserob_core.experiment.check.check import check
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import Spread
+from sparserob_core.sip.inner.counterpart import Growing
 
 RATE, T = 0.4, 3.0
 DOUBLE: dict[str, Any] = {
@@ -215,10 +216,25 @@ def test_draws_and_the_adversary_never_cost_more_than_the_largest_effort(tmp_pat
     assert effort_at(outcome, draws).max() <= outcome.result.cost
 
 
-def test_a_time_limit_leaves_an_honest_gap(tmp_path: Path) -> None:
-    outcome = run(DOUBLE, 20, tmp_path / "run", method={"name": "exchange", "rounds": 3})
-    assert outcome.status == "verified"
-    assert outcome.result.lower_bound < outcome.result.cost < np.inf
+@pytest.mark.parametrize("pressed", [False, True])
+def test_a_search_that_is_ended_leaves_an_honest_gap(
+    pressed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After three rounds, or by a key within the sixth program; the cost is then that of `peak`, where it begins."""
+    calls, solve = [0], Growing.solve
+
+    def interrupted(self: Growing, seconds: float = np.inf) -> Any:
+        calls[0] += 1
+        if pressed and calls[0] == 6:
+            raise KeyboardInterrupt
+        return solve(self, seconds)
+
+    monkeypatch.setattr(Growing, "solve", interrupted)
+    problem, method = {**DOUBLE, "disturbance": {"box": 0.1}}, {"name": "exchange", "rounds": 3}
+    outcome = run(problem, 20, tmp_path / "run", **({} if pressed else {"method": method}))
+    assert outcome.status == "verified", outcome.result.message
+    assert outcome.result.cost == pytest.approx(1.73666667, rel=1e-6)
+    assert 0.1 < outcome.result.lower_bound < outcome.result.cost
     found = check(outcome.directory)
     assert found.status == "verified", [claim for claim in found.claims if claim.verdict != "holds"]
 

@@ -185,16 +185,16 @@ class Counterpart:
             self._linear.rows(entries, np.full(len(limits), -np.inf), np.array(limits))
         return bool(limits)
 
-    def solve(self, margin: float = 0.0) -> RobustAnswer:
+    def solve(self, margin: float = 0.0, seconds: float = np.inf) -> RobustAnswer:
         """The optimum with every row tightened by ``margin``; where it is elastic, how far the rows must be relaxed so
-        that they can be met."""
+        that they can be met. It is not solved where ``seconds`` do not suffice."""
         self.calls += 1
         if margin != self._margin:
             self._margin = margin
             for where, limits, parts in self._imposed:
                 if parts:
                     self._linear.limit(where, limits - margin)
-        solved, said, columns, rows = self._linear.solve()
+        solved, said, columns, rows = self._linear.solve(seconds)
         if not solved:
             none = np.zeros(0)
             return RobustAnswer(False, said, none, none, np.zeros((0, 0)), none)

@@ -161,10 +161,6 @@ class Ledger:
         yield "its bounds or rows", finite.residual(x), TOLERANCE if strictly else CRUDE
         yield "its bounds", _beyond(self.program, x) if strictly else 0.0, TOLERANCE
 
-    def prefer(self, answer: Answer, found: Found) -> None:
-        """Take another answer for the best one, at which this was ``found``."""
-        self.best, self._found = answer, found
-
     def stopped(self, error: KeyboardInterrupt, prover: Prover) -> Result:
         """The result where time is over or a key was pressed: the best decision so far, with what one look at it
         proves (a proof whose deadline has passed looks at every family once)."""

@@ -34,6 +34,7 @@ ALLOWED = TOLERANCE / 2  # a violation that the search may leave to the proof
 ROUNDING = 2.0**-46  # of the numbers of which a bound is made
 FIRST, LARGEST, SMALLEST = 1e-8, 1e-6, 2e-9  # margins by which rows are tightened, in their own units
 SHARES = (0.1, 0.5, 1.0)  # of the way from the best decision known to the relaxed optimum, where rows are sought
+ENDED = 0.05  # seconds after the end of the time, when it is over for certain
 CUTS, GUIDED = 4, 30  # of them at each; rounds of a guide
 THINNER = 0.1  # share of a margin that leaves nothing feasible, which is tried next
 ROOM = 1e3  # units of the rows that they may have to spare
@@ -58,6 +59,7 @@ class Robust:
     accuracy: float = COARSE
     price: float = 0.0
     calls: Counter[str] = field(default_factory=Counter)
+    shown: tuple[Array, Sequence[Proof]] | None = None
 
     @staticmethod
     def start(program: SemiInfiniteProgram) -> Robust:
@@ -81,13 +83,14 @@ class Robust:
         for block in known:
             self.counterpart.add(block)
 
-    def solve(self, size: float) -> RobustAnswer:
-        """The optimum with the rows tightened, as accurate as this round asks for; ``size``: of the cost."""
+    def solve(self, size: float, seconds: float = np.inf) -> RobustAnswer:
+        """The optimum with the rows tightened, as accurate as this round asks for; ``size``: of the cost. Not solved
+        where ``seconds`` do not suffice."""
         if isinstance(self.counterpart, Interior):
             answer = self.counterpart.solve(self.margin, self.accuracy * size)
             self.calls[INTERIOR] += 1
         else:
-            answer = self.counterpart.solve(self.margin)
+            answer = self.counterpart.solve(self.margin, seconds)
             self.calls[HIGHS] += 1
         return answer
 
@@ -145,10 +148,11 @@ def robust_exchange(
         with tools.deadline.enforced():
             return _exchange(working, ledger, prover, rounds)
     except KeyboardInterrupt as error:
-        best = working.best
-        if ledger.best is not None and best.size and program.cost(best) < program.cost(ledger.best.solution.x):
-            met = [(one, one.worst(best)) for one in program.families if not one.defines and one.worst is not None]
-            ledger.prefer(_at(working, ledger.best, best), met)
+        if working.shown is not None and ledger.best is not None:
+            x, proofs = working.shown
+            met = [(one, one.worst(x)) for one in program.families if not one.defines and one.worst is not None]
+            answer = _at(working, ledger.best, x)
+            return ledger.judged(answer, worst_of(met), proofs, tools.deadline.interrupt(error))
         return ledger.stopped(error, prover)
 
 
@@ -178,6 +182,8 @@ def _exchange(working: Robust, ledger: Ledger, prover: Prover, rounds: int) -> R
             continue
         if program.guide is not None and (not feasible or ledger.open(x)):
             violated += _undefined(working, x, feasible)
+            if number & (number - 1) == 0:  # 1, 2, 4, 8, ...
+                _show(working, prover)
         ledger.tell(number, answer, told, program.cost(x) if feasible else np.inf, kept=len(working.cuts))
 
         # Exchange: impose them, or sharpen what stands for the imposed ones, or choose another margin.
@@ -195,6 +201,15 @@ def _exchange(working: Robust, ledger: Ledger, prover: Prover, rounds: int) -> R
     raise AssertionError("the last round returns")
 
 
+def _show(working: Robust, prover: Prover) -> None:
+    """Prove the best decision known, to have one to return where time ends the search."""
+    best = working.best
+    if best.size and not (working.shown is not None and working.shown[0] is best):
+        proofs = prover(best)
+        if all(one.verdict == "proven" for one in proofs):
+            working.shown = best, proofs
+
+
 def _guided(working: Robust, ledger: Ledger) -> None:
     """Begin where the program's guide ends: with its times, and with what its optimum defines."""
     program, tools = working.program, ledger.tools
@@ -205,7 +220,7 @@ def _guided(working: Robust, ledger: Ledger) -> None:
     easier.by_simplex()
     for number in range(1, GUIDED + 1):
         tools.deadline.check()
-        answer = easier.solve(program.cost_scale)
+        answer = easier.solve(program.cost_scale, _left(tools))
         if not answer.solved:
             return
         x = np.clip(answer.x, guide.finite.lower, guide.finite.upper)
@@ -293,10 +308,11 @@ def _solved(working: Robust, ledger: Ledger) -> Answer | Result:
     program, best = working.program, ledger.best
     size = program.cost_scale if best is None else _size(program, best.solution.x)
     while True:
-        answer = working.solve(size)
+        answer = working.solve(size, _left(ledger.tools))
         _count(working, ledger)
         if answer.solved:
             break
+        ledger.tools.deadline.check()
         if isinstance(working.counterpart, Interior):
             refuted = working.refuted(answer)
             if refuted is not None:
@@ -321,6 +337,11 @@ def _solved(working: Robust, ledger: Ledger) -> Answer | Result:
     none = np.zeros(0)
     solution = FiniteSolution("optimal", x, np.inf, dual.bound, answer.y, answer.mu, none, np.inf, np.inf)
     return _at(working, Answer(solution, _rows(working), 0.0, np.inf), x)
+
+
+def _left(tools: Tools) -> float:
+    """The seconds that a solution may take."""
+    return np.inf if tools.deadline.left is None else tools.deadline.left + ENDED
 
 
 def _at(working: Robust, answer: Answer, x: Array) -> Answer:
