@@ -264,3 +264,21 @@ def test_what_is_not_built_is_refused_in_one_sentence(changed: dict[str, Any], s
         cost = changed.pop("cost", "nominal")
         run({**SPRING, **changed}, tmp_path / "run", cost)
     assert not (tmp_path / "run").exists()
+
+
+def test_no_causal_policy_costs_less_than_signals_that_are_held_prove(certified: Path) -> None:
+    said = json.loads((certified / "result.json").read_text())
+    assert 0.9 * said["cost"] < said["causal_lower_bound"] <= said["cost"]
+    assert {claim.name: claim.verdict for claim in check(certified).claims}["causal"] == "holds"
+
+
+@pytest.mark.slow
+def test_the_margin_is_bracketed_and_lies_below_what_any_causal_policy_withstands(tmp_path: Path) -> None:
+    config = {
+        "problem": SPRING,
+        "dictionaries": {"control": {"name": "piecewise_constant", "pieces": PIECES}},
+        "policy": {"name": "affine"},
+    }
+    found = sr.margin(config, tolerance=0.02, out=tmp_path / "margin")
+    assert 1.0 < found.lower <= found.upper <= 1.05 * found.lower
+    assert not np.isfinite(found.causal_upper) or found.causal_upper >= found.lower

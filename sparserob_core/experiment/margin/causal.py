@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sparserob_core.control.studies.causal import CausalSearch, Limits
+from sparserob_core.control.studies.causal import Limits
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.experiment.margin.scaling import Scaling
-from sparserob_core.experiment.run.causal import active, proven
+from sparserob_core.experiment.run.causal import active, proven, searched
 from sparserob_core.sip.events import Notify
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.result import Result
@@ -42,7 +42,7 @@ def causal_upper(
     refused = [one for factor, one in results.items() if one.status == "infeasible" and factor > 0.0]
     rests = [] if result is None else active(model, result)
     rests += [at for one in refused for at in active(model, one)]
-    search = CausalSearch(model, None if result is None else result.decision, rests)
+    search = searched(model, None if result is None else result.decision, rests)
     limits = Limits.of(policy, list(results.values()), model.program.n, lambda: tools.deadline.passed)
     found = search.largest_factor(scaling.highest / base, limits)
     if found is None:

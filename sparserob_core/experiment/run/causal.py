@@ -7,10 +7,12 @@ from dataclasses import replace
 import numpy as np
 
 from sparserob_core.control.constraints.explanation import TimedExplanation
+from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.studies.answer import ControlResult
 from sparserob_core.control.studies.causal import CausalBound, CausalSearch, Limits
 from sparserob_core.control.transcription.record import Transcription
+from sparserob_core.control.transcription.transcribe import prepare
 from sparserob_core.experiment.directory.artefacts import finite
 from sparserob_core.experiment.directory.certificate import causal_data
 from sparserob_core.sip.convex_set import Array
@@ -27,10 +29,10 @@ def with_causal(result: ControlResult, tools: Tools) -> ControlResult:
     if model.feedback is None or result.status == "failed" or result.stopped or tools.deadline.passed:
         return result
     policy = model.feedback.policy
-    if not policy.causal_signals or model.problem.initial_set is not None or model.feedback.loop.measurable is not None:
+    if not policy.causal_signals or model.problem.initial_set is not None:
         return result
     try:
-        search = CausalSearch(model, result.decision, active(model, result))
+        search = searched(model, result.decision, active(model, result))
         limits = Limits.of(policy, [result], model.program.n, lambda: tools.deadline.passed)
         cost = result.cost if result.status in ("certified", "verified") else np.inf
         found = search.least_cost(cost, limits)
@@ -59,9 +61,23 @@ def active(model: Transcription, result: Result) -> list[tuple[str, float, Array
         family = model.program.formulated(cut.family, cut.formulation)
         said = None if family is None else family.explanation(cut.index, cut.row)
         if isinstance(said, TimedExplanation):
-            signal = said.disturbance
+            signal = None if model.feedback.loop.measurable is not None else said.disturbance
             found.append((cut.family, said.time, None if signal is None else np.asarray(signal).T.ravel() - rest))
     return found
+
+
+def searched(
+    model: Transcription, decision: Array | None, rests: list[tuple[str, float, Array | None]]
+) -> CausalSearch:
+    """The search for a bound, beside a policy's ``decision`` and what its own bound ``rests`` on. Of measurable
+    disturbances those are looked at that are constant on the pieces of the grid: what no policy can do against these,
+    none can do against all."""
+    assert model.feedback is not None
+    if model.feedback.loop.measurable is None:
+        return CausalSearch(model, decision, rests)
+    pieces = Dictionary.indicators(model.response.grid.breakpoints)
+    problem = replace(model.problem, disturbance_class="piecewise_constant")
+    return CausalSearch(prepare(problem, model.control, pieces, policy=model.feedback.policy), None, rests)
 
 
 def proven(model: Transcription, problem: OptimalControlProblem, stated: CausalBound) -> float | None:
