@@ -33,11 +33,13 @@ SEARCH = [
     "maximiser={name: simulated_annealing, budget: 1500}",
     "method.sc2=null",
 ]
+FEEDBACK = ["watch", "configs/experiment1_feedback.yaml"]
 INFEASIBLE = ["watch", "configs/experiment2_repaired.yaml", "problem.path.0.from=1.0"]
 STUDY = ["sweep", "configs/double_integrator.yaml", "problem.horizon=3:6:7", "problem.control.box=0.6:1.6:6"]
 RUNS: dict[str, tuple[list[str], dict[str, str]]] = {
     "exchange": (EXCHANGE, {"Overview": "exchange", "Exchange": "exchange_tab"}),
     "search": (SEARCH, {"Overview": "search", "Search": "search_tab", "Landscape as a surface": "surface"}),
+    "feedback": (FEEDBACK, {"Feedback": "feedback"}),
     "infeasible": (INFEASIBLE, {"Overview": "infeasible"}),
     "study": (STUDY, {"Study": "study"}),
 }

@@ -52,6 +52,47 @@ def exchanged(tmp_path_factory: pytest.TempPathFactory) -> sr.Outcome:
     return recorded(tmp_path_factory.mktemp("exchange") / "run", "experiment1_repaired.yaml", QUICK)
 
 
+@pytest.fixture(scope="module")
+def answered(tmp_path_factory: pytest.TempPathFactory) -> sr.Outcome:
+    """A recorded run whose control answers what it measures."""
+    small = {"dictionaries.control.pieces": 10, "problem.disturbance.box": [0.15, 0.15]}
+    return recorded(tmp_path_factory.mktemp("answered") / "run", "experiment1_feedback.yaml", small)
+
+
+FEEDBACK = {"/feedback/gains/u1_x1", "/feedback/gains/u1_x2", "/feedback/answers/u1", "/feedback/frames/frame"}
+
+
+def test_gains_answers_and_effort_of_a_policy_are_in_the_recording(answered: sr.Outcome) -> None:
+    found = read(answered.directory / "recording.rrd")
+    assert set(found) >= FEEDBACK
+    control = scalars(found["/signals/control"], "t")[1][:, 0]
+    least, most = scalars(found["/signals/control/range1"], "t")[1].T
+    assert (least <= control + 1e-12).all() and (control <= most + 1e-12).all()
+    low, middle, high, largest = scalars(found["/signals/effort/u1"], "t")[1].T
+    assert (low <= middle).all() and (middle <= high).all() and (high <= largest + 1e-12).all()
+    assert largest == pytest.approx(np.maximum(np.abs(least), np.abs(most)))
+
+
+def test_a_policy_that_is_shown_again_has_the_same_pictures(answered: sr.Outcome, tmp_path: Path) -> None:
+    again = tmp_path / "again.rrd"
+    assert command("replay", str(answered.directory), "--save", str(again)) == 0
+    first, second = read(answered.directory / "recording.rrd"), read(again)
+    assert set(second) >= FEEDBACK
+    one, other = (scalars(part["/signals/effort/u1"], "t")[1] for part in (first, second))
+    np.testing.assert_array_equal(one, other)
+
+
+def test_a_gain_is_drawn_where_it_is_seen_and_answered() -> None:
+    from sparserob_rerun.physics.feedback import PIXELS, spread_out
+
+    table = np.arange(9.0).reshape(3, 3)
+    shown = spread_out(table, np.array([0.0, 1.0, 2.0, 4.0]))
+    assert shown.shape == (PIXELS, PIXELS)
+    assert shown[0, 0] == 6.0 and shown[0, -1] == 8.0 and shown[-1, 0] == 0.0  # the last piece is at the top
+    assert np.isnan(shown[-1, -1])  # not measured yet
+    assert (shown == 8.0).sum() == (PIXELS // 2) ** 2  # the last piece takes half of the time
+
+
 def test_every_evaluation_is_in_the_recording_with_the_value_that_the_trace_has(searched: sr.Outcome) -> None:
     trace = searched.result.trace
     assert trace is not None and trace.value.size > 60

@@ -63,8 +63,13 @@ class Physics:
 
     def signals(self, decision: Floats) -> None:
         """The final control and states as series on a timeline of their own, ``t``: the time of the system in
-        seconds."""
-        rr, data = self.rr, self.view.picture(decision, np.empty(0))
+        seconds; under feedback what it answers, too."""
+        from sparserob_rerun.physics.feedback import DRAWS, draw_feedback, send_effort
+
+        rr, data = self.rr, self.view.picture(decision, np.empty(0), draws=DRAWS)
+        if data.gains is not None:
+            draw_feedback(rr, self.stream, data)
+            send_effort(rr, self.stream, data)
         at = [rr.TimeColumn("t", duration=data.breakpoints[:-1])]
         channels, states = len(data.control), len(data.state)
         names = [data.names.control(channel) for channel in range(channels)]

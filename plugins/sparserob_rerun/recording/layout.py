@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, final
 from sparserob_rerun.drawing import palette as ink
 from sparserob_rerun.drawing.canvas import view
 from sparserob_rerun.exchange import bounds, rounds
-from sparserob_rerun.physics import physics
+from sparserob_rerun.physics import feedback, physics
 from sparserob_rerun.physics.pages import heading, pages
 from sparserob_rerun.search import views as search
 
@@ -22,7 +22,7 @@ class Shown:
     """What a run has to show: its problem, if it is one of control, how many families, whether tuples are searched, and
     the landscape; of a search what the maximiser has ``told`` of itself, and the coordinates that have ``moved``.
     ``clash``, once a run is infeasible: the limits of the drawing of what clashes, empty where it cannot be drawn;
-    ``drawn``: whether there were decisions before that."""
+    ``drawn``: whether there were decisions before that; ``answers``: whether the control answers what it measures."""
 
     problem: sr.OptimalControlProblem | None
     families: int
@@ -32,6 +32,7 @@ class Shown:
     moved: frozenset[str] = frozenset()
     clash: tuple[float, ...] | None = None
     drawn: bool = True
+    answers: bool = False
 
 
 def layout(shown: Shown) -> Any:
@@ -51,7 +52,8 @@ def layout(shown: Shown) -> Any:
         overview.name = "Before it was known that nothing is feasible"
         tabs = [_infeasible(rrb, shown, shown.clash), *(tabs if shown.drawn else [])]
     elif shown.problem is not None:
-        tabs.append(_signals(rrb))
+        tabs += [_feedback(rrb, shown.problem)] if shown.answers else []
+        tabs.append(_signals(rrb, shown.answers))
     tabs.append(_log(rrb, shown))
     return rrb.Blueprint(
         rrb.Tabs(*tabs, active_tab=0),
@@ -115,13 +117,22 @@ def _further(rrb: Any, problem: sr.OptimalControlProblem) -> Any:
     return rrb.Horizontal(*more, name="Further signals") if len(more) < 4 else rrb.Grid(*more, name="Further signals")
 
 
-def _signals(rrb: Any) -> Any:
+def _feedback(rrb: Any, problem: sr.OptimalControlProblem) -> Any:
+    limits = feedback.extent(problem.system.controls, problem.system.states)
+    name = "How the control answers what is measured: red adds, blue takes away"
+    return rrb.Horizontal(view("/feedback", name, limits), name="Feedback")
+
+
+def _signals(rrb: Any, answers: bool) -> Any:
     legend = rrb.Corner2D.RightTop
+    effort = rrb.TimeSeriesView(origin="/signals/effort", name="Size of the controls under disturbances, over t",
+                                plot_legend=legend)  # fmt: skip
     return rrb.Vertical(
         rrb.TextDocumentView(origin="/howto", name="These series have a timeline of their own"),
         rrb.TimeSeriesView(origin="/signals/control", name="Controls over t, in seconds", plot_legend=legend),
         rrb.TimeSeriesView(origin="/signals/states", name="States over t, in seconds", plot_legend=legend),
-        row_shares=[1, 5, 5],
+        *([effort] if answers else []),
+        row_shares=[1, 5, 5, *([5] if answers else [])],
         name="Signals (choose the timeline t)",
     )
 

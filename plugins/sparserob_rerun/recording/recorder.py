@@ -329,7 +329,8 @@ def shown_of(inspection: sr.Inspection | None, landscape: LandscapeOptions | Non
     """What a run has to show."""
     if inspection is None:
         return Shown(None, 0, True, False)
-    return Shown(inspection.problem, len(inspection.program.families), inspection.searches, landscape is not None)
+    program, answers = inspection.program, inspection.problem is not None and inspection.program.spread is not None
+    return Shown(inspection.problem, len(program.families), inspection.searches, landscape is not None, answers=answers)
 
 
 def active(cuts: Any, multipliers: Floats) -> list[sr.Cut]:

@@ -98,13 +98,15 @@ class Inspection:
         built: Method = self._loaded.registry.build("method", method.name, method.options)
         return bool(built.searches)
 
-    def picture(self, decision: Array, active_times: Array | None = None) -> FigureData:
-        """Control, nominal states, worst-case tube and walls at a decision ``(m N,)``; raises `InputError` for a
-        program that is no control problem."""
+    def picture(self, decision: Array, active_times: Array | None = None, draws: int = 0) -> FigureData:
+        """Control, nominal states, worst-case tube and walls at a decision ``(m N,)``; under feedback also the effort
+        under so many random ``draws``, and what moves the control in the worst case. Raises `InputError` for a program
+        that is no control problem."""
         from sparserob_core.experiment.figures.drawing import figure_data
 
         theta = np.asarray(decision, dtype=float)
-        return figure_data(self._experiment, theta, np.empty(0) if active_times is None else active_times, (), None)
+        times = np.empty(0) if active_times is None else active_times
+        return figure_data(self._experiment, theta, times, (), None, draws)
 
     def clash(self, result: Result) -> list[Strip]:
         """Of an infeasible result the quantities that clash: what is allowed, where the control can bring them, and
