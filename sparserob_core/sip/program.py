@@ -147,7 +147,8 @@ class ConstraintFamily:
     ``uncertain(index (d,))``  for rows that must hold for every deviation in the program's `Spread`: these rows. Such a
         family is not linear in the decision: ``rows`` refuses, ``excess(x, indices (k, d))`` are its violations
         ``(k, r)``, and ``start (k, d)`` the indices that a method begins with; ``defines``: whether it only bounds
-        variables that the program's ``settle`` puts at what bounds them, so that it is never the worst one.
+        variables that the program's ``settle`` puts at what bounds them, so that it is never the worst one;
+        ``scaled(factor)``: the same constraints where all deviations are so many times as large.
     """
 
     name: str
@@ -171,6 +172,7 @@ class ConstraintFamily:
     excess: Callable[[Array, Array], Array] | None = None
     start: Array | None = None
     defines: bool = False
+    scaled: Callable[[float], ConstraintFamily] | None = None
     formulation: Formulation = "reduced"
     source: object = None
 

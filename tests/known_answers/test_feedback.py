@@ -8,6 +8,7 @@ import pickle
 import re
 import shutil
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,10 @@ from scipy.sparse import coo_array
 
 import sparserob_core as sr
 from sparserob_core.control.studies.answer import ControlResult
+from sparserob_core.experiment.assemble import ControlExperiment, assemble, tools_of
 from sparserob_core.experiment.check.check import check
+from sparserob_core.experiment.config.load import load_config
+from sparserob_core.sip.methods.robust import largest_factor, least_slack
 from tests.support.places import CONFIGS, ROOT
 
 SPRING: dict[str, Any] = {
@@ -339,6 +343,38 @@ def test_other_methods_are_refused_before_anything_is_written(method: str, tmp_p
     with pytest.raises(sr.InputError, match="exchange"):
         run(SPRING, 10, tmp_path / "run", method={"name": method})
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["an uneven box", *(pytest.param(name, marks=pytest.mark.slow) for name in ("an ellipsoid", "a triangle"))],
+)
+def test_the_largest_factor_is_where_the_least_slack_changes_its_sign(name: str) -> None:
+    problem = {**SPRING, "disturbance": SETS[name]}
+
+    loaded = load_config(config(problem, 6))
+    tools, experiment = tools_of(loaded), assemble(loaded)
+    assert isinstance(experiment, ControlExperiment) and experiment.problem.disturbance is not None
+    chosen, grids = experiment.problem, (experiment.control, experiment.disturbance)
+
+    def at(factor: float) -> sr.SemiInfiniteProgram:
+        scaled = replace(chosen, disturbance=chosen.disturbance.scaled(factor))
+        own = sr.transcribe(scaled, *grids, policy=sr.AffinePolicy()).own_units
+        assert own is not None
+        return own.program
+
+    factor = largest_factor(at(1.0), tools, 100.0)
+    assert factor is not None and 0.5 < factor < 5.0
+    assert least_slack(at(factor * (1 - 1e-5)), tools) < 0.0 < least_slack(at(factor * (1 + 1e-5)), tools)
+
+
+@pytest.mark.slow
+def test_the_margin_of_the_first_experiment_is_where_no_causal_policy_goes_further(tmp_path: Path) -> None:
+    """With u = 1 until 0.3 the worst disturbance takes x1(0.3) to -0.7 at 0.2905 (closed form), and 0.3 is a breakpoint
+    of 50 pieces: affine feedback loses next to nothing."""
+    found = sr.margin(config(springs(0.25, 0.3), 50), of="disturbance", out=tmp_path / "margin")
+    assert found.status == "certified"
+    assert 0.2895 <= found.amounts[0] <= found.amounts[1] <= 0.2906
 
 
 @pytest.mark.slow

@@ -114,7 +114,12 @@ class FeedbackConstraint:
         start, stop = self.flat.start, self.flat.stop
         begun = np.unique(np.linspace(0, self.times.size - 1, min(BEGUN, self.times.size)).round().astype(int))
         source = self if self.exact else self.flat
-        return indexed(self, Box(np.array([start]), np.array([stop])), self.times[begun][:, None], source)
+        family = indexed(self, Box(np.array([start]), np.array([stop])), self.times[begun][:, None], source)
+        return replace(family, scaled=self.scaled) if self.loop.scales else family
+
+    def scaled(self, factor: float) -> ConstraintFamily:
+        """The same where deviations are ``factor`` times as large."""
+        return replace(self, loop=self.loop.scaled(factor)).family()
 
     @cached_property
     def times(self) -> Array:
@@ -242,7 +247,12 @@ class FeedbackControl:
         """The constraint as a family."""
         horizon = float(self.breakpoints[-1])
         family = indexed(self, Box(np.array([0.0]), np.array([horizon])), self.middles[:, None], self)
+        family = replace(family, scaled=self.scaled) if self.loop.scales else family
         return family if self.bound is None else replace(family, defines=True)
+
+    def scaled(self, factor: float) -> ConstraintFamily:
+        """The same where deviations are ``factor`` times as large."""
+        return replace(self, loop=self.loop.scaled(factor)).family()
 
     @property
     def breakpoints(self) -> Array:

@@ -7,7 +7,7 @@ the effects and by its own entry of the disturbance; where the initial states ar
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, final
 
@@ -49,6 +49,16 @@ class ClosedLoop:
     def nominal_size(self) -> int:
         """How many variables the nominal control has."""
         return self.functionals.variables
+
+    @property
+    def scales(self) -> bool:
+        """Whether deviations are those of a disturbance alone, as it is, so that they can be `scaled`."""
+        return self.measurable is None and len(self.spread.sets) == 1
+
+    def scaled(self, factor: float) -> ClosedLoop:
+        """The same loop where all deviations are ``factor`` times as large."""
+        sets = tuple((count, convex.scaled(factor)) for count, convex in self.spread.sets)
+        return replace(self, spread=replace(self.spread, sets=sets), _paths={})
 
     def nominal(self, x: Array) -> Array:
         """The nominal control ``(m, K)``."""

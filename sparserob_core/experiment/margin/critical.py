@@ -15,7 +15,7 @@ from sparserob_core.experiment.run.events import StudyProgress
 from sparserob_core.sip.events import Notify
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.methods.exchange import Exchange
-from sparserob_core.sip.methods.robust import least_slack
+from sparserob_core.sip.methods.robust import largest_factor, least_slack
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.relaxed.parametric import ParametricProgram, extreme_program, slack_program
 
@@ -52,7 +52,23 @@ def critical_factor(
         found = _by_one_program(joined, scaling, tools, width)
         if found.status != "unknown" or not scaling.nested:
             return found
+    if scaling.of == "disturbance":
+        found = _by_scaled_gains(programs, scaling, tools)
+        if found.status != "unknown":
+            return found
     return _by_slack(programs, scaling, tools, width, notify, seen)
+
+
+def _by_scaled_gains(programs: ParametricProgram, scaling: Scaling, tools: Tools) -> Critical:
+    """Under feedback the gains times the factor take the place of the gains: one program that is linear in both."""
+    program = programs.program(1.0)
+    program = program if program.own_units is None else program.own_units.program
+    factor = largest_factor(program, tools, scaling.highest)
+    if factor is None:
+        return Critical("unknown")
+    if factor >= (1.0 - 1e-6) * scaling.highest:
+        return Critical("always", good=scaling.highest)
+    return Critical("found", factor, factor)
 
 
 def _by_one_program(programs: ParametricProgram, scaling: Scaling, tools: Tools, width: float) -> Critical:

@@ -37,8 +37,8 @@ DRAWN = (
 @dataclass(frozen=True, eq=False)
 class RobustAnswer:
     """``x (n,)``, multipliers ``y (r,)`` of all rows in order and the deviation ``(r, Q)`` of each, ``mu (e,)``;
-    ``slack``: by how much the rows must be relaxed, where that was asked for. ``solved``: whether there is an answer;
-    ``said``: the solver's words."""
+    ``slack``: by how much the rows must be relaxed, or the factor, where that was asked for. ``solved``: whether there
+    is an answer; ``said``: the solver's words."""
 
     solved: bool
     said: str
@@ -71,13 +71,17 @@ class Counterpart:
     """Uncertain rows over one program and one spread, to which rows are added; solved by HiGHS, from the last basis.
 
     Its columns are the positive and the negative parts of the decision, a slack of all rows where it is ``elastic``
-    (the only cost, at least ``lowest``), and what rows need beside them.
+    (the only cost, at least ``lowest``), and what rows need beside them. Where it ``scales`` there is a factor instead,
+    at most ``highest``, which is to be as large as possible: so many times as large are the deviations, and the
+    variables that answer them answer the deviations of the factor 1.
     """
 
     program: FiniteProgram
     spread: Spread
     elastic: bool = False
     lowest: float = 0.0
+    scales: bool = False
+    highest: float = 0.0
     calls: int = 0
     blocks: list[UncertainRows] = field(default_factory=list)
     _imposed: list[tuple[np.ndarray, Array, list[_Part]]] = field(default_factory=list, repr=False)
@@ -87,13 +91,15 @@ class Counterpart:
         self._linear = Growing()
         program, n = self.program, self.program.n
         low, high = program.lower, program.upper
-        priced = not self.elastic
+        priced = not (self.elastic or self.scales)
         for side, sign in ((1.0, 1.0), (-1.0, -1.0)):
             ends = (low, high) if side > 0 else (-high, -low)
             cost = (program.weights + sign * program.q) * priced
             self._linear.variables(np.maximum(ends[0], 0.0), np.maximum(ends[1], 0.0), cost)
         if self.elastic:
             self._linear.variables(np.full(1, self.lowest), np.full(1, np.inf), np.ones(1))
+        if self.scales:
+            self._linear.variables(np.zeros(1), np.full(1, self.highest), -np.ones(1))
         self._fixed = np.zeros(0, dtype=int)
         if program.b.size:
             row, column = np.nonzero(program.A)
@@ -115,7 +121,10 @@ class Counterpart:
         for p, part in enumerate(parts):
             mine = np.flatnonzero(block.part == p)
             scale = np.abs(block.factor[mine])
-            limits[mine] -= scale * part.constant
+            if self.scales:
+                entries.append((mine, np.full(mine.size, 2 * self.program.n), scale * part.constant))
+            else:
+                limits[mine] -= scale * part.constant
             row, column = np.repeat(mine, part.columns.size), np.tile(part.columns, mine.size)
             entries.append((row, column, (scale[:, None] * part.sizes).ravel()))
         if self.elastic:
@@ -139,7 +148,10 @@ class Counterpart:
         pairs = [self._linear.variables(nothing, free, nothing) for _ in range(2)]
         inner, rows, ones = C[entries].tocoo(), np.arange(count), np.ones(count)
         split = [_both(inner.row, inner.col, inner.data, n), (rows, pairs[0], -ones), (rows, pairs[1], ones)]
-        at = self._linear.rows(split, -d[entries], -d[entries])
+        if self.scales:
+            split.append((rows, np.full(count, 2 * n), d[entries]))
+        rest = nothing if self.scales else -d[entries]
+        at = self._linear.rows(split, rest, rest)
         return _Part(np.concatenate(pairs), np.tile(radii[entries], 2), constant, entries, at)
 
     def _pointed(self, C: csr_array, d: Array) -> _Part:
@@ -180,7 +192,10 @@ class Counterpart:
                     number = np.full(column.size, len(limits))
                     entries.append(_both(number, column, row[column], self.program.n))
                     entries.append((np.array([len(limits)]), np.array([name]), -np.ones(1)))
-                    limits.append(-float(point @ d[place]))
+                    offset = float(point @ d[place])
+                    if self.scales:
+                        entries.append((np.array([len(limits)]), np.array([2 * self.program.n]), np.array([offset])))
+                    limits.append(0.0 if self.scales else -offset)
         if limits:
             self._linear.rows(entries, np.full(len(limits), -np.inf), np.array(limits))
         return bool(limits)
@@ -200,7 +215,7 @@ class Counterpart:
             return RobustAnswer(False, said, none, none, np.zeros((0, 0)), none)
         n, mu = self.program.n, rows[self._fixed]
         y, deviations = self._multipliers(rows, mu)
-        slack = float(columns[2 * n]) if self.elastic else 0.0
+        slack = float(columns[2 * n]) if self.elastic or self.scales else 0.0
         return RobustAnswer(True, said, columns[:n] - columns[n : 2 * n], y, deviations, mu, slack)
 
     def _multipliers(self, even: Array, mu: Array) -> tuple[Array, Array]:
