@@ -55,7 +55,7 @@ def check(case: Case, gap_tolerance: float | None) -> list[Finding]:
         if status == "refuted":
             return [*claims, judged("violation", lambda: _witness(case))]
         if case.problem.control_step is not None:
-            claims.append(judged("control_step", lambda: _steps(case)))
+            claims.append(judged("control_step", lambda: _changed(case)))
         if case.equalities:
             claims.append(judged("equalities", lambda: _equalities(case)))
         claims += [judged(window.name, lambda window=window: _kept(case, window)) for window in case.windows]  # type: ignore[misc]
@@ -128,6 +128,10 @@ def _control(case: Case) -> str:
             raise Broken(f"{where} leaves its set by {over:.3g} of its own unit, from t = {float(start):.6g} on")
         worst = max(worst, over)
     return f"{case.control.pieces} pieces in their set" + (f", to {worst:.1e} of its own units" if worst > 0 else "")
+
+
+def _changed(case: Case) -> str:
+    return _steps(case) if case.policy is None else feedback_of(case).steps()
 
 
 def _steps(case: Case) -> str:

@@ -13,6 +13,7 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import balls, below
 from sparserob_core.checker.claims.case import Case, number, numbers
 from sparserob_core.checker.claims.constraints import covered, cut, normals_of
+from sparserob_core.checker.claims.duality import before, steps
 from sparserob_core.checker.claims.units import RowUnits
 from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import EQUALITY, RESOLVED, TOLERANCE, Broken, Unchecked
@@ -30,7 +31,8 @@ if TYPE_CHECKING:
     from flint import arb, arb_mat
 
 MOST_CELLS = 40_000  # cells of time examined for each constraint
-PEAK, CONTROL, RATE, EQUALS, WORST, EFFORT = "peak", "control", "rate", "equals", "worst", "effort"
+PEAK, CONTROL, RATE, EQUALS, STEP = "peak", "control", "rate", "equals", "control_step"
+WORST, EFFORT = "worst", "effort"
 FIGURES, SMALL_COST = 1e-11, 1e-6  # of an effort, and of the largest possible one: how closely it is known
 
 
@@ -107,7 +109,7 @@ class FeedbackClaims:
     def _control_turning(self) -> str:
         """Every piece of the control in its curved set, for every disturbance."""
         shape, loop = known(self.case.problem.control), self.loop
-        every = Directions(loop, shape, np.diag(1.0 / np.array(shape.radius)), self._acting)
+        every = Directions(loop, shape, np.diag(1.0 / np.array(shape.radius)), loop.acting)
         m, pieces = shape.dimension, len(loop.effects)
         faces = [(-np.ones(m), np.ones(m)) for _ in range(2 * m)]
         for place, (low, high) in enumerate(faces):
@@ -115,10 +117,33 @@ class FeedbackClaims:
         count, most = self._shown(every, [(k, 0.0, 0.0, *face) for k in range(pieces) for face in faces])
         return f"{pieces} pieces in their set for every disturbance, to {most:.1e} ({count} cells of directions)"
 
-    def _acting(self, k: int) -> arb_mat:
-        """The nominal control and its answers on a piece, ``(m, 1 + Q)``."""
-        nominal = balls(self.loop.nominal[:, k])
-        return stacked([[v, *row] for v, row in zip(nominal, self.loop.effects[k], strict=True)])
+    def steps(self) -> str:
+        """Every change of the control in its set, for every disturbance."""
+        case, loop, worst = self.case, self.loop, -np.inf
+        assert case.problem.control_step is not None
+        shape, found = known(case.problem.control_step), steps(case.problem, case.control)
+        if shape.facets is None:
+            raise Unchecked("the checker knows steps into sets with flat sides only, under feedback")
+        rows = np.array([c for c, _ in shape.facets])
+        for k in found:
+            case.clock.check()
+            heights = loop.heights(self._change(k), rows)
+            for (_, b), height, unit in zip(shape.facets, heights, shape.units(), strict=True):
+                over = float((height - b).upper()) / (max(unit, RESOLVED * float((abs(height) + abs(b)).mid())) or 1.0)
+                if over > TOLERANCE:
+                    raise Broken(
+                        f"the change of the control leaves its set by {over:.3g} of its own unit for some disturbance,"
+                        f" at t = {loop.breakpoints[k]:.6g}"
+                    )
+                worst = max(worst, over)
+        return f"{len(found)} steps in their set for every disturbance, to {worst:.1e} of its own units"
+
+    def _change(self, k: int) -> arb_mat:
+        """The change of the nominal control, and of its answers, to piece ``k``, ``(m, 1 + Q)``."""
+        if k:
+            return self.loop.acting(k) - self.loop.acting(k - 1)
+        zero = [0.0] * self.loop.starts[-1]
+        return self.loop.acting(0) - stacked([balls([float(u), *zero]) for u in before(self.case.problem)])
 
     def cost(self) -> arb:
         """The cost of the policy; where that is an effort, the written one, which is shown to be none too small."""
@@ -168,9 +193,9 @@ class FeedbackClaims:
             return self._turning(window, entry)
         lower, upper = numbers(entry.get("lower"), "lower"), numbers(entry.get("upper"), "upper")
         covered(case, window, lower, upper)
-        sides = _Sides(self.loop, flat, case.units(window).rows)
-        grid = np.array(case.grid)
-        todo = [part for a, b in zip(lower, upper, strict=True) for part in cut(grid, grid, float(a[0]), float(b[0]))]
+        sides = _Sides(self.loop, window, flat, case.units(window).rows)
+        grid, cuts = np.array(case.grid), self._cuts(window)
+        todo = [part for a, b in zip(lower, upper, strict=True) for part in cut(grid, cuts, float(a[0]), float(b[0]))]
         count, most = 0, -np.inf
         while todo:
             case.clock.check()
@@ -188,18 +213,25 @@ class FeedbackClaims:
             todo += [(piece, start, half), (piece, half, stop)]
         return f"kept for every disturbance, to {most:.1e} of its own unit ({count} cells)"
 
+    def _cuts(self, window: Window) -> Array:
+        """The times at which the state, or what stands beside it, turns or jumps."""
+        return np.unique([*self.case.grid, *window.cuts(self.loop.breakpoints)])
+
     def _turning(self, window: Window, entry: Mapping[str, Any]) -> str:
         """The same for a curved set: cells of times and directions."""
         case = self.case
+        if case.measurable:
+            raise Unchecked("the checker knows measurable disturbances with flat sets of states only, under feedback")
         lower, upper = numbers(entry.get("lower"), "lower"), numbers(entry.get("upper"), "upper")
         normals = normals_of(window, entry.get("normals"))
         covered(case, window, lower, upper)
-        every = Directions(self.loop, window.seen, normals)
-        grid = np.array(case.grid)
+        about = None if window.reference is None else (lambda time: window.moved(time, time)[0])
+        every = Directions(self.loop, window.seen, normals, about=about)
+        grid, cuts = np.array(case.grid), self._cuts(window)
         todo = [
             (*part, low[1:], high[1:])
             for low, high in zip(lower, upper, strict=True)
-            for part in cut(grid, grid, float(low[0]), float(high[0]))
+            for part in cut(grid, cuts, float(low[0]), float(high[0]))
         ]
         count, most = self._shown(every, todo)
         return f"kept for every disturbance, to {most:.1e} ({count} cells)"
@@ -306,6 +338,13 @@ class FeedbackClaims:
             return [float(value.mid()) for value in over], TOLERANCE * max(
                 known(case.problem.control).units(), default=1.0
             )
+        if name == STEP and case.problem.control_step is not None:
+            sides = known(case.problem.control_step).facets
+            if sides is None or time not in loop.breakpoints[:-1]:
+                raise Broken(f"there is no step at t = {time!r}")
+            found = loop.heights(self._change(loop.breakpoints.index(time)), np.array([c for c, _ in sides]))
+            slack = TOLERANCE * max(known(case.problem.control_step).units(), default=1.0)
+            return [float((height - b).mid()) for height, (_, b) in zip(found, sides, strict=True)], slack
         if name == EQUALS and case.equalities:
             state = self._last(loop)
             return [float(self._missed(state, row, value).mid()) for row, value in case.equalities], TOLERANCE * max(
@@ -318,9 +357,13 @@ class FeedbackClaims:
         if flat is None:
             raise Unchecked("the worst direction of a curved set is not told")
         piece = min(max(bisect_right(case.grid, time) - 1, 0), len(case.grid) - 2)
-        found = loop.highest(piece, time, np.array([c for c, _ in flat]))
+        seen = _Sides(loop, window, flat, np.ones(len(flat)))
+        at = [int(np.searchsorted(loop.breakpoints, time, side=side)) - 1 for side in ("left", "right")]
+        at = [min(max(k, 0), case.control.pieces - 1) for k in at]
+        found = [height for k in sorted({*at}) for height in seen.heights(piece, time, k)]
         slack = TOLERANCE * float(case.units(window).rows.max(initial=0.0))
-        return [float((height - b).mid()) for height, (_, b) in zip(found, flat, strict=True)], slack
+        limits = [b for _, b in flat] * (len(found) // max(1, len(flat)))
+        return [float((height - b).mid()) for height, b in zip(found, limits, strict=True)], slack
 
     def driven(self, data: Mapping[str, Any]) -> tuple[arb, float]:
         """By how much a witness exceeds the constraint that it names, under the disturbance and from the initial state
@@ -330,19 +373,32 @@ class FeedbackClaims:
             raise Unchecked("the certificate holds no disturbance of the witness")
         direction = numbers(data.get("direction"), "direction")
         z = [x for block in _deviations(case, loop, data, name) for x in block]
-        of_control = name == self.of_control
-        if direction.shape != (loop.gains.shape[2:][not of_control],):
+        held = {self.of_control: case.problem.control, STEP: case.problem.control_step}.get(name)
+        window = None if held is not None or name == EQUALS else case.window(name)
+        size = case.problem.system.controls if held is not None else case.problem.system.states
+        if direction.shape != (size if window is None else window.shape.dimension,):
             raise Broken(f"{name}: {direction.size} numbers in the direction")
-        if of_control:
+        if window is None and held is None:
+            values = [row[0] + _along(row[1:], z) for row in self._last(loop)]
+            over = _dot(direction, values) - _fixed(case, direction, time)
+            return over, EQUALITY * max(self._added(row) for row, _ in case.equalities)
+        if window is None:
+            assert held is not None
             k = int(np.clip(bisect_right(loop.breakpoints, time) - 1, 0, case.control.pieces - 1))
-            table, limit = loop.effects[k], known(case.problem.control).limit(direction)
-            values = [v + _along(row, z) for v, row in zip(balls(loop.nominal[:, k]), table, strict=True)]
-            return _dot(direction, values) - limit, TOLERANCE * max(known(case.problem.control).units(), default=1.0)
-        window = case.window(name)
+            acting = loop.acting(k) if name == self.of_control else self._change(k)
+            limit = known(held).limit(direction)
+            unit = 1.0 if known(held).facets is None else max(known(held).units(), default=1.0)
+            return _dot(direction, [row[0] + _along(row[1:], z) for row in acting.tolist()]) - limit, TOLERANCE * unit
         if not window.start <= time <= window.stop:
             raise Broken(f"t = {time!r} is not within {window.start:g} to {window.stop:g}")
         piece = min(max(bisect_right(case.grid, time) - 1, 0), len(case.grid) - 2)
         state, limit = loop.state(piece, time).tolist(), window.limit(direction, time)
+        if window.is_mixed:
+            said = data.get("piece")
+            if type(said) is not int:
+                raise Broken(f"{name}: the piece of the control is {said!r}")
+            window.meets(loop.breakpoints, said, time)
+            state += loop.acting(said).tolist()
         values = [row[0] + _along(row[1:], z) for row in state]
         return _dot(direction, values) - limit, case.units(window).slack(direction, limit)
 
@@ -534,11 +590,13 @@ class FeedbackClaims:
 
 @final
 class _Sides:
-    """The rows of a flat set, seen along the trajectories of a closed loop; ``unit (r,)`` is that of each."""
+    """The rows of a window with flat sides, seen along the trajectories of a closed loop; ``unit (r,)`` is that of
+    each."""
 
-    def __init__(self, loop: ClosedLoop, flat: Sequence[tuple[Array, arb]], unit: Array) -> None:
-        self.loop, self.unit = loop, unit
-        self.rows = np.array([c for c, _ in flat]).reshape(len(flat), -1)
+    def __init__(self, loop: ClosedLoop, window: Window, flat: Sequence[tuple[Array, arb]], unit: Array) -> None:
+        self.loop, self.window, self.unit = loop, window, unit
+        both = np.array([c for c, _ in flat]).reshape(len(flat), -1)
+        self.rows, self.gains = both[:, : window.states], both[:, window.states :]
         self.limits = np.array([below(b) for _, b in flat])
         self._known: dict[tuple[int, float], Array] = {}
 
@@ -549,9 +607,20 @@ class _Sides:
         found = (ends + self.loop.bent(piece, start, stop, self.rows) - self.limits) * (1.0 + 1e-15) / self.unit
         return float(found.max())
 
+    def heights(self, piece: int, time: float, k: int) -> list[arb]:
+        """The largest left sides at a time in a piece of the grid, with the control on piece ``k``."""
+        beside = None
+        if self.gains.shape[1]:
+            beside = stacked([balls(row) for row in self.gains]) * self.loop.acting(k)
+        found = self.loop.highest(piece, time, self.rows, beside)
+        if self.window.reference is None:
+            return found
+        about = self.window.moved(time, time)[0]
+        return [height - _dot(c, about) for height, c in zip(found, self.rows, strict=True)]
+
     def _heights(self, piece: int, time: float) -> Array:
         if (piece, time) not in self._known:
-            found = self.loop.highest(piece, time, self.rows)
+            found = self.heights(piece, time, self.loop.on(piece))
             self._known[piece, time] = np.array([float(x.upper()) for x in found])
             over = (np.array([float(x.lower()) for x in found]) - self.limits) / self.unit
             if (over > TOLERANCE).any():
@@ -602,17 +671,36 @@ class _Row:
             return _Row._of_control(case, loop, (name, direction, time, y), z, cost == PEAK)
         if name == EFFORT and cost == WORST:
             return _Row._of_effort(case, loop, direction, y, z)
+        if name == STEP and case.problem.control_step is not None:
+            if direction.shape != (case.problem.system.controls,):
+                raise Broken(f"{name}: {direction.size} numbers where {case.problem.system.controls} are expected")
+            row = case.duality.step_row(direction, time)
+            return _Row(y, row.constant, row.slope, _seen(loop, z, case.problem.system.states), None)
+        return _Row._of_state(case, loop, (name, direction, time, y), z, entry.get("piece"))
+
+    @staticmethod
+    def _of_state(
+        case: Case, loop: ClosedLoop, said: tuple[str, Array, float, float], z: list[list[arb]], piece: object
+    ) -> _Row:
+        """A constraint on the state, and on the control on a piece of it."""
+        name, direction, time, y = said
         d = case.problem.system.states
-        if direction.shape != (d,):
-            raise Broken(f"{name}: {direction.size} numbers where {d} are expected")
-        if name == EQUALS and case.equalities:
-            row = case.duality.row(direction, time, [], _fixed(case, direction, time), disturbed=False)
-            return _Row(y, row.constant + _given(case, loop, direction, time, z), row.slope, _seen(loop, z, d), None)
-        window = case.window(name)
-        if not window.start <= time <= window.stop:
+        window = None if name == EQUALS and case.equalities else case.window(name)
+        if direction.shape != (d if window is None else window.shape.dimension,):
+            raise Broken(f"{name}: {direction.size} numbers where another number of them is expected")
+        if window is not None and not window.start <= time <= window.stop:
             raise Broken(f"{name}: t = {time!r} is not within {window.start:g} to {window.stop:g}")
-        row = case.duality.row(direction, time, [], window.limit(direction, time), disturbed=False)
-        return _Row(y, row.constant + _given(case, loop, direction, time, z), row.slope, _seen(loop, z, d), None)
+        limit = _fixed(case, direction, time) if window is None else window.limit(direction, time)
+        c, gain = np.split(direction, [d])
+        row = case.duality.row(c, time, [], limit, disturbed=False)
+        slope = row.slope
+        if window is not None and window.is_mixed:
+            if not isinstance(piece, int) or isinstance(piece, bool):
+                raise Broken(f"{name}: the piece of the control is {piece!r}")
+            window.meets(loop.breakpoints, piece, time)
+            own = [a + b for a, b in zip(slope[piece], balls(gain), strict=True)]
+            slope = [own if k == piece else values for k, values in enumerate(slope)]
+        return _Row(y, row.constant + _given(case, loop, c, time, z), slope, _seen(loop, z, d), None)
 
     @staticmethod
     def _of_control(

@@ -250,14 +250,26 @@ class ClosedLoop:
                     total = total - x * arb(float(m)) if m else total
         return total
 
-    def heights(self, state: arb_mat, rows: Array | arb_mat) -> list[arb]:
-        """``max c'x`` over all deviations for every row ``c`` of ``rows (r, d)``, at a time with this `state`."""
-        along = (exactly(rows) * state).tolist()
+    def acting(self, k: int) -> arb_mat:
+        """The nominal control and its answers on a piece of it, ``(m, 1 + Q)``."""
+        from flint import arb
+
+        return stacked([[arb(float(v)), *row] for v, row in zip(self.nominal[:, k], self.effects[k], strict=True)])
+
+    def on(self, piece: int) -> int:
+        """The piece of the control that acts on a piece of the grid."""
+        return self._places(piece)[0]
+
+    def heights(self, state: arb_mat, rows: Array | arb_mat, beside: arb_mat | None = None) -> list[arb]:
+        """``max c'x`` over all deviations for every row ``c`` of ``rows (r, d)``, at a time with this `state`, and with
+        what stands ``beside`` it, ``(r, 1 + Q)``."""
+        product = exactly(rows) * state
+        along = (product if beside is None else product + beside).tolist()
         return [row[0] + self.support(row[1:]) for row in along]
 
-    def highest(self, piece: int, time: float, rows: Array) -> list[arb]:
+    def highest(self, piece: int, time: float, rows: Array, beside: arb_mat | None = None) -> list[arb]:
         """`heights` at a time in a piece of the grid."""
-        return self.heights(self.state(piece, time), rows)
+        return self.heights(self.state(piece, time), rows, beside)
 
     def bent(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:
         """By how much ``max c'x(t)`` may lie above its chord on ``[start, stop]``, a part of a piece of the grid, at

@@ -36,6 +36,8 @@ class Directions:
     shape: Shape
     normals: Array
     held: Callable[[int], arb_mat] | None = None
+    about: Callable[[float], list[arb]] | None = None
+    """Where the set is at a time; at rest where there is none."""
     _known: dict[tuple[int, float, Corner], arb] = field(default_factory=dict, repr=False)
 
     def over(
@@ -66,6 +68,7 @@ class Directions:
         if key not in self._known:
             state = self.loop.state(piece, time) if self.held is None else self.held(piece)
             (found,) = self.loop.heights(state, stacked([c]))
+            found = found if self.about is None else found - _dot(self.about(time), c)
             limit = self.shape.support(c)
             room = limit - along(self.shape.centre, c)
             if found - limit > room * TOLERANCE:

@@ -322,14 +322,15 @@ class MeasurableLoop(ClosedLoop):
                     total[n] = total[n] + known(shape).support(block) - off
         return total
 
-    def heights(self, state: arb_mat, rows: Array | arb_mat) -> list[arb]:
-        along = (exactly(rows) * state).tolist()
+    def heights(self, state: arb_mat, rows: Array | arb_mat, beside: arb_mat | None = None) -> list[arb]:
+        product = exactly(rows) * state
+        along = (product if beside is None else product + beside).tolist()
         return [row[0] + more for row, more in zip(along, self.supports([row[1:] for row in along]), strict=True)]
 
-    def highest(self, piece: int, time: float, rows: Array) -> list[arb]:
+    def highest(self, piece: int, time: float, rows: Array, beside: arb_mat | None = None) -> list[arb]:
         from flint import arb
 
-        found = super().highest(piece, time, rows)
+        found = super().highest(piece, time, rows, beside)
         if time == self.grid[piece]:
             return found
         share = float(((arb(time) - arb(self.grid[piece])) / (arb(self.grid[piece + 1]) - arb(self.grid[piece]))).mid())

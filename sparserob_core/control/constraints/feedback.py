@@ -96,8 +96,9 @@ def indexed(constraint: Uncertain, index_set: Box, start: Array, source: object)
 @final
 @dataclass(frozen=True, eq=False)
 class FeedbackConstraint:
-    """``H x(t) <= h`` for all times of a window and every disturbance, with the control that it causes; the index is
-    ``(t,)``, or with the deviations of the disturbance ``(t, w)``. ``flat``: the same constraint without feedback."""
+    """``H (x(t) - r(t)) + G u(t) <= h`` for all times of a window and every disturbance, with the control that it
+    causes; the index is ``(t,)``, or with the deviations of the disturbance ``(t, w)``. ``flat``: the same constraint
+    without feedback, which has every row of a mixed constraint twice, for both values of a control that jumps."""
 
     flat: FlatConstraint
     loop: ClosedLoop
@@ -128,12 +129,43 @@ class FeedbackConstraint:
 
     def excess(self, x: Array, indices: Array) -> Array:
         """Violations ``(k, r)`` at times ``(k, 1)`` under the worst disturbances."""
-        return self.loop.values(x, indices[:, 0], self.flat.H) - self.flat.h
+        found = self.loop.height(self._along(x, indices[:, 0])) - self.flat.h
+        within = self.loop.measurable
+        return found if within is None else found + within.within(indices[:, 0], self.flat.H)
+
+    def _along(self, x: Array, times: Array) -> Array:
+        """The left sides at times ``(k,)``, with their answers to the deviations, ``(k, r, 1 + Q)``."""
+        flat = self.flat
+        found = flat.H @ self.loop.states(x, times)
+        if flat.reference is not None:
+            found[:, :, 0] += flat.moved(times)
+        if flat.gains is not None:
+            found += np.einsum("rm,krmq->krq", flat.gains, self.loop.controls(x)[flat.commanded(times)])
+        return np.asarray(found)
 
     def uncertain(self, index: Array) -> UncertainRows:
         """The rows at one time."""
-        rows = self.loop.state_rows(float(index[0]), self.flat.H, self.flat.h, *self._shared)
-        return replace(rows, exact=self.exact)
+        flat, time = self.flat, index[:1]
+        allowed = flat.h - flat.moved(time)[0]
+        if flat.gains is None:
+            rows = self.loop.state_rows(float(time[0]), flat.H, allowed, *self._shared)
+            return replace(rows, exact=self.exact)
+        pieces, (part, factor) = flat.commanded(time)[0], self._shared
+        if pieces[0] != pieces[-1]:  # the rows of a control that jumps are others before and after
+            half = part.size // 2
+            part = np.concatenate([part[:half], part[half:] + 1 + part.max()])
+        return self.loop.with_control(
+            self.loop.state_rows(float(time[0]), flat.H, allowed, part, factor), flat.gains, pieces
+        )
+
+    def against(self, x: Array, index: Array, row: int) -> tuple[Array, float]:
+        """A deviation ``(Q,)`` that is the worst at an index, and what the control adds to the row then."""
+        time, gains = index[:1], self.flat.gains
+        w = self.loop.spread.worst(self._along(x, time)[0, row, 1:])
+        if gains is None:
+            return w, 0.0
+        control = self.loop.controls(x)[self.flat.commanded(time)[0, row]]
+        return w, float(gains[row] @ (control[:, 0] + control[:, 1:] @ w))
 
     def met(self, x: Array) -> Array:
         """The nearest decision that meets an equality to rounding; one that no control enters is left as it is."""
@@ -147,7 +179,12 @@ class FeedbackConstraint:
 
     @cached_property
     def _shared(self) -> tuple[np.ndarray, Array]:
-        return shared(self.flat.H, self.loop.spread)
+        gains = self.flat.gains
+        if gains is None:
+            return shared(self.flat.H, self.loop.spread)
+        half = self.flat.h.size // 2
+        part, factor = shared(np.hstack([self.flat.H, gains])[:half], self.loop.spread)
+        return np.tile(part, 2), np.tile(factor, 2)
 
     def worst(self, x: Array) -> Separation:
         """The largest local maxima of the violation over the window, refined between the samples."""
@@ -172,6 +209,9 @@ class FeedbackConstraint:
             found = np.where(moved, heights[np.arange(rows.size), highest], found)
             width = width / CLOSER
         order = np.argsort(-found, kind="stable")
+        if self.flat.gains is not None:  # where nothing jumps, both halves of the rows say the same
+            pieces = self.flat.commanded(best[order])
+            order = order[(rows[order] < self.flat.h.size // 2) | (pieces[:, 0] != pieces[:, -1])]
         return Separation(best[order][:, None], rows[order], found[order])
 
     def _sampled(self, x: Array) -> tuple[Array, Array]:
@@ -205,8 +245,16 @@ class FeedbackConstraint:
         return self.flat.cells
 
     def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
-        """Proven upper bounds of the violation on cells of time, each within one piece."""
-        bounds = (self.loop.bounds(x, lower[:, 0], upper[:, 0], self.flat.H) - self.flat.h).max(axis=1)
+        """Proven upper bounds of the violation on cells of time, each within one piece, with the control of that."""
+        flat, ends = self.flat, (lower[:, 0], upper[:, 0])
+        proven = flat.h.size if flat.gains is None else flat.h.size // 2
+        beside = [flat.moved(times)[:, :proven, None] for times in ends]
+        if flat.gains is not None:
+            acting = flat.commanded((ends[0] + ends[1]) / 2)[:, 0]
+            added = flat.gains[:proven] @ self.loop.controls(x)[acting]
+            beside = [np.concatenate([more + added[..., :1], added[..., 1:]], axis=-1) for more in beside]
+        found = self.loop.bounded(x, *ends, flat.H[:proven], (beside[0], beside[1]))[0]
+        bounds = (found - flat.h[:proven]).max(axis=1)
         return Enclosure(bounds, np.zeros(bounds.size, dtype=int))
 
     def explain(self, index: Array, row: int) -> Explanation:
@@ -336,6 +384,84 @@ class FeedbackControl:
         text = f"{self.name}: {' + '.join(terms)} <= {right}"
         said = TimedExplanation(text, self.name, text, time, direction)
         return told(said, self.loop, index[1:], controls=True)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class FeedbackSteps:
+    """``H (u_k - u_{k-1}) <= h`` at every breakpoint for every disturbance, from the control ``before (m,)`` time 0 on
+    where that is told. An index is the time of a step, or with the deviations ``(t, w)``."""
+
+    name: str
+    loop: ClosedLoop
+    H: Array
+    h: Array
+    before: Array | None
+
+    def family(self) -> ConstraintFamily:
+        """The constraint as a family."""
+        index_set = Box(self.times[:1], self.loop.functionals.dictionary.breakpoints[-1:])
+        return indexed(self, index_set, self.times[:, None], self)
+
+    @property
+    def times(self) -> Array:
+        """When the steps are taken, ``(q,)``."""
+        return self.loop.functionals.dictionary.breakpoints[int(self.before is None) : -1]
+
+    def _steps(self, times: Array) -> np.ndarray:
+        """The step that each time follows."""
+        return np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, self.times.size - 1)
+
+    def _heights(self, x: Array) -> tuple[Array, Array]:
+        """Violations ``(q, r)`` of all steps, and the sizes of the numbers that were added up."""
+        controls = self.loop.controls(x)
+        first = np.zeros_like(controls[:1])
+        if self.before is not None:
+            first[0, :, 0] = self.before
+            controls = np.concatenate([first, controls])
+        along = self.H @ np.diff(controls, axis=0)
+        size = np.abs(self.H) @ (np.abs(controls[1:]) + np.abs(controls[:-1]))
+        radii = np.concatenate([[1.0], self.loop.spread.radii])
+        return self.loop.height(along) - self.h, size @ radii + np.abs(self.h)
+
+    def excess(self, x: Array, indices: Array) -> Array:
+        """Violations ``(k, r)`` of the steps at times ``(k, 1)`` under the worst disturbances."""
+        return np.asarray(self._heights(x)[0][self._steps(indices[:, 0])])
+
+    def uncertain(self, index: Array) -> UncertainRows:
+        """The rows of one step."""
+        place = int(self._steps(index[:1])[0])
+        piece = place + int(self.before is None)
+        rows = self.loop.control_rows(piece, self.H, self.h)
+        if piece == 0 and self.before is not None:
+            return replace(rows, h=rows.h + self.H @ self.before)
+        return self.loop.with_control(rows, -self.H, np.full(self.h.size, piece - 1))
+
+    def worst(self, x: Array) -> Separation:
+        """The worst row of every step, worst first."""
+        found, _ = self._heights(x)
+        rows = found.argmax(axis=1)
+        heights = found[np.arange(rows.size), rows]
+        order = np.argsort(-heights, kind="stable")
+        return Separation(self.times[order][:, None], rows[order], heights[order], float(found.max()))
+
+    @property
+    def cells(self) -> tuple[Array, Array]:
+        """From each step to the next."""
+        return self.times[:, None], np.append(self.times[1:], self.loop.functionals.dictionary.breakpoints[-1])[:, None]
+
+    def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
+        """The violation itself."""
+        found, size = self._heights(x)
+        bounds = (found + ROUND_OFF * size).max(axis=1)[self._steps((lower[:, 0] + upper[:, 0]) / 2)]
+        return Enclosure(bounds, np.zeros(bounds.size, dtype=int))
+
+    def explain(self, index: Array, row: int) -> Explanation:
+        """One constraint for people."""
+        time = float(self.times[self._steps(index[:1])[0]])
+        terms = " + ".join(f"{value:.4g} u{i + 1}" for i, value in enumerate(self.H[row]) if value)
+        text = f"{self.name}: the change of {terms} at {time:.6g} <= {self.h[row]:.6g}"
+        return told(TimedExplanation(text, self.name, text, time, self.H[row]), self.loop, index[1:], True)
 
 
 def told(said: TimedExplanation, loop: ClosedLoop, w: Array, controls: bool = False) -> TimedExplanation:

@@ -189,6 +189,11 @@ class Turning(ABC):
         split = np.where(upper[:, 0] > lower[:, 0], split, widest)
         return Enclosure(over, split)
 
+    def against(self, x: Array, index: Array, row: int) -> tuple[Array, float]:
+        """A deviation ``(Q,)`` that is the worst at an index, and what stands beside the state then."""
+        along = self.normals(index[None, 1:])[0] @ self.answers(x, index[:1])[0]
+        return self.loop.spread.worst(along[1:]), 0.0
+
     def explain(self, index: Array, row: int) -> Explanation:
         """One constraint for people, at every disturbance, or at the deviations that the index says."""
         return told(self.explained(index[: 1 + self._b]), self.loop, index[1 + self._b :])
@@ -232,13 +237,17 @@ class FeedbackCurved(Turning):
         return lower[:, 0], upper[:, 0]
 
     def answers(self, x: Array, times: Array) -> Array:
-        return self.loop.states(x, times)
+        found = self.loop.states(x, times)
+        found[:, :, 0] += self.curved.beside(x, times)
+        return found
 
     def between(self, x: Array, lower: Array, upper: Array, H: Array) -> tuple[Array, Array]:
-        return self.loop.bounded(x, lower, upper, H)
+        beside = tuple(H @ self.curved.beside(x, times)[:, :, None] for times in (lower, upper))
+        return self.loop.bounded(x, lower, upper, H, (beside[0], beside[1]))
 
     def rows(self, time: float, H: Array, h: Array) -> UncertainRows:
-        return self.loop.state_rows(time, H, h, np.zeros(1, dtype=int), np.ones(1))
+        moved = H @ self.curved.beside(np.zeros(0), np.array([time]))[0]
+        return self.loop.state_rows(time, H, h - moved, np.zeros(1, dtype=int), np.ones(1))
 
     def explained(self, index: Array) -> TimedExplanation:
         said = self.curved.explain(index, 0)
@@ -278,12 +287,8 @@ class FeedbackCurvedControl(Turning):
         starts = self.spans[0]
         return np.clip(np.searchsorted(starts, times, side="right") - 1, 0, starts.size - 1)
 
-    def _answers(self, x: Array) -> Array:
-        """The nominal control and its answers on every piece, ``(K, m, 1 + Q)``."""
-        return np.concatenate([self.loop.nominal(x).T[:, :, None], self.loop.effects(x)], axis=2)
-
     def answers(self, x: Array, times: Array) -> Array:
-        return np.asarray(self._answers(x)[self._pieces(times)])
+        return np.asarray(self.loop.controls(x)[self._pieces(times)])
 
     def between(self, x: Array, lower: Array, upper: Array, H: Array) -> tuple[Array, Array]:
         along = self.answers(x, (lower + upper) / 2)
@@ -296,7 +301,7 @@ class FeedbackCurvedControl(Turning):
 
     def worst(self, x: Array) -> Separation:
         """Every piece in its worst direction, worst first."""
-        every, (z, c, reach) = self._answers(x), self._lattice
+        every, (z, c, reach) = self.loop.controls(x), self._lattice
         start = z[(self.loop.height(c @ every) - reach).argmax(axis=1)]
 
         def excess(at: Array, which: np.ndarray) -> Array:

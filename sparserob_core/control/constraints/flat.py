@@ -208,7 +208,7 @@ class FlatConstraint(StateConstraint):
         self, indices: Float[Array, "k j"]
     ) -> tuple[Float[Array, " n"], Float[Array, "n d"], Float[Array, "n nu"], Float[Array, " n"]]:
         parameters = np.repeat(self.parameters.clamp(indices[:, 1:]), self.h.size, axis=0)
-        count, rhs = indices.shape[0], self.h[None] - self._moved(indices[:, 0])
+        count, rhs = indices.shape[0], self.h[None] - self.moved(indices[:, 0])
         return np.repeat(indices[:, 0], self.h.size), np.tile(self.H, (count, 1)), parameters, rhs.ravel()
 
     @shaped
@@ -224,9 +224,9 @@ class FlatConstraint(StateConstraint):
 
     @shaped
     def beside(self, x: Float[Array, " n"], times: Float[Array, " k"]) -> Float[Array, "k r"]:
-        added = self._moved(times)
+        added = self.moved(times)
         if self.gains is not None:
-            control = self.functionals.dictionary.control(x)[:, self._commanded(times)]
+            control = self.functionals.dictionary.control(x)[:, self.commanded(times)]
             added = added + np.einsum("rm,mkr->kr", self.gains, control)
         return added
 
@@ -234,18 +234,18 @@ class FlatConstraint(StateConstraint):
     def direct(self, times: Float[Array, " k"]) -> Float[Array, "q n"] | None:
         if self.gains is None:
             return None
-        values = self.functionals.dictionary.at(self._commanded(times))
+        values = self.functionals.dictionary.at(self.commanded(times))
         return np.asarray(np.einsum("rm,nkr->krmn", self.gains, values).reshape(times.size * self.h.size, -1))
 
     @shaped
-    def _moved(self, times: Float[Array, " k"]) -> Float[Array, "k r"]:
+    def moved(self, times: Float[Array, " k"]) -> Float[Array, "k r"]:
         """``-H r(t)``."""
         if self.reference is None:
             return np.zeros((times.size, self.h.size))
         return Moving(self.reference, self.H).at(times)
 
     @shaped
-    def _commanded(self, times: Float[Array, " k"]) -> Int[np.ndarray, "k r"]:
+    def commanded(self, times: Float[Array, " k"]) -> Int[np.ndarray, "k r"]:
         """The piece of the control's dictionary that every row looks at: the first half the one that a time ends or is
         in, the second half the one that it begins or is in; among those that meet the window in positive length."""
         ends = self.functionals.dictionary.breakpoints
@@ -281,17 +281,17 @@ class FlatConstraint(StateConstraint):
                 indices[unsure], found[unsure] = self._refined(x, indices[unsure], rows[unsure])
         order = np.argsort(-found, kind="stable")
         if self.gains is not None:  # where nothing jumps, both halves of the rows say the same
-            pieces = self._commanded(indices[order, 0])
+            pieces = self.commanded(indices[order, 0])
             order = order[(rows[order] < self.samples.proven) | (pieces[:, 0] != pieces[:, -1])]
         return Separation(indices[order], rows[order], found[order])
 
     @shaped
     def explain(self, index: Float[Array, " j"], row: int) -> Explanation:
         time, parameter = float(index[0]), self.parameters.clamp(index[None, 1:])[0]
-        allowed = self.h - self._moved(index[:1])[0]
+        allowed = self.h - self.moved(index[:1])[0]
         if self.gains is None:
             return explanation(self.name, self.functionals, self.H, allowed, row, time, parameter)
-        mixed = (self.gains, int(self._commanded(index[:1])[0, row]))
+        mixed = (self.gains, int(self.commanded(index[:1])[0, row]))
         return explanation(self.name, self.functionals, self.H, allowed, row, time, parameter, mixed=mixed)
 
     def nominal(self) -> FlatConstraint:

@@ -162,8 +162,11 @@ class ClosedLoop:
         of the grid."""
         return self.bounded(x, lower, upper, H)[0]
 
-    def bounded(self, x: Array, lower: Array, upper: Array, H: Array) -> tuple[Array, Array]:
-        """The bounds, ``H (r, d)`` or ``(k, r, d)``, and how much of each is owed to the length of the cell.
+    def bounded(
+        self, x: Array, lower: Array, upper: Array, H: Array, beside: tuple[Array, Array] | None = None
+    ) -> tuple[Array, Array]:
+        """The bounds, ``H (r, d)`` or ``(k, r, d)``, and how much of each is owed to the length of the cell;
+        ``beside``: what is added at both ends, ``(k, r, 1 + Q)`` or ``(k, r, 1)`` each, and linear between.
 
         On a cell every functional is within ``(b - a)^2 / 8`` times its largest second derivative of its chord, and a
         support function of a chord lies below the chord of the support functions.
@@ -189,6 +192,9 @@ class ClosedLoop:
         bent = second + tail
         radii = np.concatenate([[1.0], self.spread.radii])
         size = np.abs(H) @ np.maximum(np.abs(ends[0]), np.abs(ends[1]))
+        for end, more in zip(along, beside or (), strict=False):
+            end[..., : more.shape[-1]] += more
+            size[..., : more.shape[-1]] += np.abs(more)
         late = (h[..., 0] ** 2 / 8.0) * (bent @ radii)
         found, lost = [self.height(one) for one in along], ROUND_OFF * (size @ radii)
         if self.measurable is not None:
@@ -246,6 +252,23 @@ class ClosedLoop:
             offset = offset + self.measurable.within(np.array([time]), H)[0]
         return UncertainRows(csr_array(g), h - offset, part, factor, tuple(parts), d)
 
+    def with_control(self, rows: UncertainRows, G: Array, pieces: np.ndarray) -> UncertainRows:
+        """The rows with ``G u_k`` added on the left, ``G (r, m)``, of the piece ``k`` of each, ``(r,)``; rows of one
+        part have the same direction of the control, times their factors, and the same piece."""
+        from scipy.sparse import csr_array
+
+        K, Q = self.functionals.dictionary.pieces, self.spread.size
+        row, channel = np.nonzero(G)
+        place = (row, channel * K + pieces[row])
+        g = csr_array(rows.g + csr_array((G[row, channel], place), shape=rows.g.shape))
+        parts = []
+        for p, C in enumerate(rows.C):
+            first = int(np.flatnonzero(rows.part == p)[0])
+            at, which, value = self.of_piece(int(pieces[first]))
+            added = csr_array((G[first][at // Q] * value, (at % Q, self.nominal_size + which)), shape=C.shape)
+            parts.append(csr_array(C + added))
+        return replace(rows, g=g, C=tuple(parts))
+
     def control_rows(self, piece: int, H: Array, h: Array, extra: Array | None = None) -> UncertainRows:
         """The rows ``H u_k <= h`` on one piece for every deviation; ``extra (r, n)`` is added on the left."""
         from scipy.sparse import csr_array
@@ -266,6 +289,10 @@ class ClosedLoop:
         if extra is not None:
             g = csr_array(g + csr_array(extra))
         return UncertainRows(g, h, part, factor, tuple(parts), np.zeros((len(firsts), Q)))
+
+    def controls(self, x: Array) -> Array:
+        """The nominal control and its answers to the deviations on every piece, ``(K, m, 1 + Q)``."""
+        return np.concatenate([self.nominal(x).T[:, :, None], self.effects(x)], axis=2)
 
     def of_piece(self, piece: int) -> tuple[np.ndarray, np.ndarray, Array]:
         """Of `Answers.effect` what is about one piece: positions in ``(m, Q)``, variables and values."""

@@ -73,11 +73,12 @@ def find_adversary(constraint: StateConstraint, decision: Array, feedback: Feedb
 
 
 def _of_loop(constraint: StateConstraint, decision: Array, loop: ClosedLoop) -> Adversary:
-    worst = of_state(constraint, loop).worst(decision)
+    held = of_state(constraint, loop)
+    worst = held.worst(decision)
     row, time = int(worst.rows[0]), float(worst.indices[0, 0])
     _, directions, _, bounds = constraint.functionals_at(worst.indices[:1])
     response, direction = constraint.functionals.response, directions[row]
-    deviation = loop.worst(decision, time, direction)
+    deviation, beside = held.against(decision, worst.indices[0], row)
     breakpoints, disturbance = response.grid.breakpoints, None
     if constraint.functionals.disturbance is not None:
         breakpoints, disturbance = loop.signal(deviation, time, direction)
@@ -86,7 +87,7 @@ def _of_loop(constraint: StateConstraint, decision: Array, loop: ClosedLoop) -> 
         row=row,
         time=time,
         direction=direction,
-        bound=float(bounds[row]),
+        bound=float(bounds[row]) - beside,
         parameter=np.zeros(0),
         initial_state=loop.begun(deviation),
         violation=float(worst.violations[0]),

@@ -111,7 +111,8 @@ class CausalSearch:
     ) -> None:
         assert model.feedback is not None
         self.model, self.loop, self.decision = model, model.feedback.loop, decision
-        self.constraints = [one for one in model.constraints if isinstance(one, FlatConstraint)]
+        flat = [one for one in model.constraints if isinstance(one, FlatConstraint)]
+        self.constraints = [one for one in flat if one.gains is None and one.reference is None]  # fewer: a bound still
         grid, disturbance = model.response.grid, model.functionals.disturbance
         places = np.zeros(0, dtype=int) if disturbance is None or disturbance.starts is None else disturbance.starts
         self.starts = grid.breakpoints[places]

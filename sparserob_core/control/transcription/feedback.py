@@ -9,7 +9,7 @@ from functools import reduce
 import numpy as np
 
 from sparserob_core.control.constraints.effort import FeedbackEffort
-from sparserob_core.control.constraints.feedback import FeedbackConstraint, FeedbackControl
+from sparserob_core.control.constraints.feedback import FeedbackConstraint, FeedbackControl, FeedbackSteps
 from sparserob_core.control.constraints.feedback_curved import FeedbackCurvedControl, of_state
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.state import StateConstraint
@@ -24,15 +24,16 @@ from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.response.measurable import MISSED
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.sets.sets import Equality
-from sparserob_core.control.transcription.own_units import reaches
+from sparserob_core.control.transcription.own_units import extent, reaches, units_of_sides
 from sparserob_core.control.transcription.record import Feedback, Transcription
+from sparserob_core.control.transcription.steps import before
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import Spread
 from sparserob_core.sip.program import ConstraintFamily, OwnUnits, SemiInfiniteProgram
 
 CONTROL, RATE, PEAK, EFFORT = "control", "rate", "peak", "effort"  # names of the families that are about the control
-EQUALS = "equals"  # that of the terminal equalities
+EQUALS, STEP = "equals", "control_step"  # those of the terminal equalities, and of the control's steps
 FINER = 2.0**-11  # of the numbers that are added up, the unit of an equality: it is met to `EQUALITY` of them
 
 
@@ -56,14 +57,14 @@ def with_feedback(
 
     acting = None if pieces is None else pieces.in_units_of(model.functionals, units.states, units.disturbances)
     fixed = _fixed(problem, own, units)
-    mine = _program(model, policy, known, acting, fixed[0])
-    theirs = _program(own, policy, scaled, pieces, fixed[1])
+    repeated = own.control.pieces
+    mine = _program(model, policy, known, acting, fixed[0], _steps(model.problem, repeated, own=False))
+    theirs = _program(own, policy, scaled, pieces, fixed[1], _steps(own.problem, repeated, own=True))
     told = [
         _told_by(family, other, units, deviations, own)
         for family, other in zip(theirs[0].families, mine[0].families, strict=True)
     ]
     scaled_program = replace(theirs[0], families=told, cost_unit=units.cost)
-    repeated = own.control.pieces
     decision = np.concatenate(
         [
             np.repeat(units.controls, repeated),
@@ -100,11 +101,11 @@ def of_control(problem: OptimalControlProblem) -> str:
 def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary, cost: str) -> None:
     """Raise `InputError` for what a policy is not built for, in one sentence."""
     disturbed = problem.disturbance is not None
-    paths = [entry for entry in problem.path if isinstance(entry, PathConstraint)]
+    paths = [entry for entry in problem.path if isinstance(entry, PathConstraint | MixedConstraint)]
     sets = [entry.set for entry in paths] + [end for end in problem.terminal if not isinstance(end, Equality)]
     curved = [one.kind for one in (*sets, problem.control) if one.halfspaces() is None]
     own = CONTROL if problem.control.halfspaces() is None else of_control(problem)
-    named = [entry.name for entry in paths if entry.name in (own, PEAK, EFFORT, EQUALS)]
+    named = [entry.name for entry in paths if entry.name in (own, PEAK, EFFORT, EQUALS, STEP)]
     kind, bound = problem.disturbance_class, problem.disturbance
     measurable = bound is not None and kind == "measurable"
     ends = any(isinstance(end, Equality) for end in problem.terminal)
@@ -128,11 +129,7 @@ def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dic
         "terminal set with an interior under measurable disturbances: they reach a fixed state": measurable and ends,
         "control that acts at once, without a delay": problem.system.delay > 0.0,
         "single linear system, without pieces": bool(problem.system.switches),
-        "path constraint on the state alone, without mixed": any(
-            isinstance(one, MixedConstraint) for one in problem.path
-        ),
-        "path set that stands still, without relative_to": any(entry.relative_to is not None for entry in paths),
-        "control whose steps are free, without control_step": problem.control_step is not None,
+        "control_step with flat sides": problem.control_step is not None and problem.control_step.halfspaces() is None,
         "cost that is the L1 norm alone, without group": not problem.cost.is_linear,
     }
     for wanted, hindered in reasons.items():
@@ -156,8 +153,10 @@ def _program(
     known: Answers,
     acting: MeasurablePieces | None,
     fixed: tuple[Array, Array],
+    steps: Callable[[ClosedLoop], FeedbackSteps] | None,
 ) -> tuple[SemiInfiniteProgram, ClosedLoop]:
-    """The program of one transcription, in its units; ``fixed``: the rows of its terminal equalities."""
+    """The program of one transcription, in its units; ``fixed``: the rows of its terminal equalities, ``steps``: what
+    its control's steps are."""
     functionals, problem, pieces = model.functionals, model.problem, model.control.pieces
     nominal, first = functionals.variables, functionals.variables + known.variables
     size = first + {"nominal": 0, "peak": nominal, "worst": 1}[policy.cost]
@@ -178,6 +177,7 @@ def _program(
         else FeedbackControl(of_control(problem), loop, *flat)
     )
     families.append(within.family())
+    families += [] if steps is None else [steps(loop).family()]
     axes = np.eye(problem.system.controls)
     low, high = -problem.control.support(-axes), problem.control.support(axes)
     most = (high - low)[known.channel] / loop.spread.chords[known.entry]
@@ -197,7 +197,7 @@ def _program(
         effort = FeedbackEffort(EFFORT, loop, cost, first)
         families.append(effort.family())
         settled.append(effort.settled)
-        guide = (_program(model, policy.model_copy(update={"cost": "peak"}), known, acting, fixed)[0], first)
+        guide = (_program(model, policy.model_copy(update={"cost": "peak"}), known, acting, fixed, steps)[0], first)
         weights[first:] = 1.0
         lower = np.append(lower, 0.0)
         largest = float(cost @ np.maximum(np.abs(low), np.abs(high)))
@@ -248,7 +248,7 @@ def _told_by(
         rows = np.ones(1)
     else:
         mine, others = family.source, theirs.source
-        assert isinstance(mine, FeedbackControl) and isinstance(others, FeedbackControl)
+        assert isinstance(mine, FeedbackControl | FeedbackSteps) and isinstance(others, FeedbackControl | FeedbackSteps)
         rows = _shares(mine.H, others.H * units.controls)
 
     def told(one: ConstraintFamily, scale: Array) -> ConstraintFamily:
@@ -258,6 +258,17 @@ def _told_by(
 
     reduced = told(family, index)
     return replace(reduced, literal=replace(told(literal, np.concatenate([index, deviations])), reduced=reduced))
+
+
+def _steps(problem: OptimalControlProblem, pieces: int, own: bool) -> Callable[[ClosedLoop], FeedbackSteps] | None:
+    """The steps of the control, every row divided by its ``own`` unit where that is asked for; ``None`` for none."""
+    step, first = problem.control_step, before(problem)
+    flat = None if step is None else step.halfspaces()
+    if step is None or flat is None or (pieces == 1 and first is None):
+        return None
+    (H, h), far = flat, 2.0 * np.abs(flat[0]) @ extent(problem.control)
+    unit = units_of_sides(H, h, np.minimum(step.reach(H), far), far) if own else np.ones(h.size)
+    return lambda loop: FeedbackSteps(STEP, loop, H / unit[:, None], h / unit, first)
 
 
 def _shares(mine: Array, theirs: Array) -> Array:

@@ -14,7 +14,7 @@ from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.control.studies.answer import ControlResult
 from sparserob_core.control.studies.causal import CausalBound
-from sparserob_core.control.transcription.feedback import of_control
+from sparserob_core.control.transcription.feedback import STEP, of_control
 from sparserob_core.control.transcription.steps import Steps
 from sparserob_core.control.transcription.transcribe import slanted
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment
@@ -296,8 +296,13 @@ def _driven(experiment: ControlExperiment, said: TimedExplanation, decision: Arr
     feedback = experiment.transcription.feedback
     if feedback is None or experiment.problem.disturbance_class != "piecewise_constant":
         return said
-    loop, time = feedback.loop, said.time
-    if said.constraint != of_control(experiment.problem):
-        return told(said, loop, loop.worst(decision, time, said.direction))
+    loop, time, controls = feedback.loop, said.time, feedback.loop.controls(decision)
     piece = int(np.searchsorted(experiment.control.breakpoints[1:-1], time, side="right"))
-    return told(said, loop, loop.spread.worst(said.direction @ loop.effects(decision)[piece]))
+    if said.constraint == STEP:
+        along = said.direction @ (controls[piece] - controls[piece - 1] * (piece > 0))
+    elif said.constraint == of_control(experiment.problem):
+        along = said.direction @ controls[piece]
+    else:
+        along = said.direction @ loop.states(decision, np.array([time]))[0]
+        along = along if said.gain is None or said.piece is None else along + said.gain @ controls[said.piece]
+    return told(said, loop, loop.spread.worst(along[1:]))

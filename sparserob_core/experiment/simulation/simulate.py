@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -109,7 +109,8 @@ def _sampled(
 ) -> Simulation:
     model = finished.experiment.transcription
     response, parameters = model.response, model.parameters
-    control = controlled(model, finished.decision, np.arange(response.grid.pieces))
+    control, acting = controlled(model, finished.decision, np.arange(response.grid.pieces)), _Acting()
+    control = acting.of(control) if callable(control) else control
     ends = [moment for constraint in model.constraints for moment in (constraint.start, constraint.stop)]
     times = fine_times(response, parameters, np.concatenate([ends, worst.get("times", np.zeros(0))]))
     fine = Response(response.system, finer(response.grid, times), response.initial_state)
@@ -132,7 +133,7 @@ def _sampled(
         for position, state in enumerate(walk(fine, control, drawn, disturbances, begun)):
             envelope.add(position, state)
             for one in counts:
-                one.add(position, state)
+                one.add(position, state, acting.now(position, model.functionals.channels))
         out += int(np.any([one.close() for one in counts], axis=0).sum())
         done += size
         notify(StudyProgress(text=f"{done} of {count} trajectories", done=done, total=count))
@@ -154,6 +155,26 @@ def _sampled(
         upper=envelope.upper,
         seconds=time.perf_counter() - started,
     )
+
+
+class _Acting:
+    """What acts at the moment, where it answers the states."""
+
+    def __init__(self) -> None:
+        self._now: Array | None = None
+
+    def of(self, control: Callable[[int, Array], Array]) -> Callable[[int, Array], Array]:
+        """The same control, which is listened to."""
+
+        def answered(piece: int, state: Array) -> Array:
+            self._now = control(piece, state)
+            return self._now
+
+        return answered
+
+    def now(self, position: int, channels: int) -> Array | None:
+        """What acted until a position, ``(m, n)``; nothing at the beginning."""
+        return None if self._now is None or position == 0 else self._now[:channels]
 
 
 class _Envelope:

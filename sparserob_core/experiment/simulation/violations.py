@@ -29,6 +29,7 @@ class ViolationCount:
         self._inside = (times >= constraint.start - slack) & (times <= constraint.stop + slack)
         self._beside, self._beside_own = constraint.beside(x, times), self._in_own_units.beside(x, times)
         self.violated, self.largest, self.time = 0, -np.inf, np.nan
+        self._last = np.zeros((constraint.functionals.response.initial_state.size, 0))
 
     @property
     def tolerance(self) -> float:
@@ -41,13 +42,25 @@ class ViolationCount:
         self._own = np.full(count, -np.inf)
         self._states = np.zeros((self.constraint.functionals.response.initial_state.size, count))
 
-    def add(self, position: int, state: Array) -> None:
-        """The states ``(d, n)`` at one of the times."""
-        if not self._inside[position]:
-            return
-        value = self.constraint.outwardness(state, self._beside[position])
-        if not self._is_curved:
-            own = self._in_own_units.outwardness(state, self._beside_own[position])
+    def add(self, position: int, state: Array, control: Array | None = None) -> None:
+        """The states ``(d, n)`` at one of the times; ``control (m, n)``: what acted until then, where it differs from
+        one trajectory to another."""
+        gains = self.constraint.gains
+        if control is None or gains is None:
+            if self._inside[position]:
+                value = self.constraint.outwardness(state, self._beside[position])
+                own = None
+                if not self._is_curved:
+                    own = self._in_own_units.outwardness(state, self._beside_own[position])
+                self._take(position, state, value, own)
+        elif position and self._inside[position - 1] and self._inside[position]:
+            for at, x in ((position - 1, self._last), (position, state)):
+                value, own = (_mixed(one, x, control) for one in (self.constraint, self._in_own_units))
+                self._take(at, x, value, own)
+        self._last = state
+
+    def _take(self, position: int, state: Array, value: Array, own: Array | None) -> None:
+        if own is not None:
             np.maximum(self._own, own, out=self._own)
         better = value > self._best
         if better.any():
@@ -68,3 +81,10 @@ class ViolationCount:
         if found[top] > self.largest:
             self.largest, self.time = float(found[top]), float(self.times[self._when[top]])
         return out
+
+
+def _mixed(constraint: StateConstraint, state: Array, control: Array) -> Array:
+    """The largest ``H x + G u - h`` of a mixed constraint, ``(n,)``."""
+    assert constraint.sides is not None and constraint.gains is not None
+    H, h = constraint.sides
+    return np.asarray((H @ state + constraint.gains @ control - h[:, None]).max(axis=0))
