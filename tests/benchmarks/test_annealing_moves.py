@@ -76,7 +76,7 @@ def test_a_move_costs_a_fiftieth_of_a_cold_solve(formulation, capsys):
         f"\n{formulation}: a move {1e3 * np.mean(seconds):.2f} ms on average, median {1e3 * np.median(seconds):.2f} ms"
     ]
     ratios = {}
-    for solver in ("piqp", "clarabel"):
+    for solver in ("piqp", "clarabel", "highs"):
         took, u = cold(program, G, h, 0.01 * curvature[0], solver)
         ratios[solver] = took / np.mean(seconds)
         lines.append(f"  cold {solver:9} {1e3 * took:8.1f} ms, {ratios[solver]:6.0f} moves")

@@ -301,6 +301,8 @@ class Propagator:
     def _partial(self, steps: Steps, which: np.ndarray, within: Array, pieces: np.ndarray) -> tuple[Array, Array]:
         horizon = self.grid.breakpoints[-1]
         shares = np.round(within / horizon, 15)
+        if steps.A.shape[:2] == (1, 1) and shares.size == 1:
+            return self._transitions(steps.A[:, 0], shares * horizon)
         if steps.A.shape[:2] == (1, 1):
             distinct, inverse = np.unique(shares, return_inverse=True)
             key = distinct.tobytes()

@@ -232,8 +232,13 @@ class TupleValue:
         back, place = before.find(changed, slots[changed])
         self._G[changed[back]], self._h[changed[back]] = before.G[place], before.h[place]
         fresh = changed[~back]
+        new = np.isnan(self.slots[fresh]).any(axis=1)
         for family, first, last in self._columns if fresh.size else ():
-            self._G[fresh, first:last], self._h[fresh, first:last] = self._family_rows(family, slots[fresh])
+            # an index may move where the point at which it imposes a family does not, as at the end of the horizon
+            here, there = (self.layout.indices(family, one[fresh]) for one in (self.slots, slots))
+            moved = fresh[new | (here != there).any(axis=1)]
+            if moved.size:
+                self._G[moved, first:last], self._h[moved, first:last] = self._family_rows(family, slots[moved])
         self._norms[changed] = np.maximum(np.linalg.norm(self._G[changed], axis=2), np.finfo(float).tiny)
         self.slots[changed] = slots[changed]
         return changed

@@ -116,6 +116,26 @@ def test_only_the_rows_of_changed_indices_are_built(tools):
         assert built == expected
 
 
+def test_a_family_that_an_index_imposes_where_it_did_before_is_not_built_again(tools):
+    program, built = oscillator("reduced"), []
+
+    def watched(family):
+        return replace(family, rows=lambda indices: built.append(family.name) or family.rows(indices))
+
+    program = replace(program, families=[watched(family) for family in program.families])
+    g, rng = value(program, tools, 5), np.random.default_rng(1)
+    point = drawn(g, rng)
+    g.at(point)
+    assert set(built) == {"path", "terminal"}
+    built.clear()
+    g.at(moved(g, point, rng, 1))
+    assert built == ["path"]
+    g.forget()
+    built.clear()
+    g.at(point)
+    assert set(built) == {"path", "terminal"}
+
+
 def test_what_the_optimum_keeps_is_not_solved_again(tools):
     program = oscillator("reduced")
     g = value(program, tools, 4)
