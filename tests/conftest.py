@@ -28,9 +28,12 @@ __all__ = ["command", "config", "process"]
 settings.register_profile("repeatable", derandomize=True)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable"))
 
-gc.set_threshold(
-    50_000, 20, 20
-)  # what thousands of tests and modules hold need not be searched for cycles all the time
+gc.set_threshold(50_000, 20, 20)
+
+
+def pytest_collection_finish() -> None:
+    """What modules and thousands of collected tests hold need not be searched for cycles again and again."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")
