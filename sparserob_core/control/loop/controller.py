@@ -59,9 +59,9 @@ class Controller:
     @property
     def covered(self) -> bool:
         """Whether the proof covers every state that was measured since the last `reset`, or since the last plan that
-        was made of a measured state. Exact where the disturbance moves all states alike; else it may be true a step too
-        long, since states are compared one by one. Parameters are not told from a disturbance: with uncertain ones it
-        is always true."""
+        was made of a measured state. Exact where every state tells what the disturbance was, that is, one value on
+        each piece of the control, which moves the states independently; else states are compared one by one, and it may
+        be true too long. Parameters are not told from a disturbance: with uncertain ones it is always true."""
         return self._covered
 
     @property
@@ -79,6 +79,7 @@ class Controller:
         self._take(self._planned)
         self._next, self._covered, self._steps = 0, True, list[Step]()
         self._before: Array | None = None
+        self._last: Array | None = None
         self._reach: tuple[Array, Array] | None = None
 
     def step(self, time: float, state: npt.ArrayLike) -> Array:
@@ -98,7 +99,7 @@ class Controller:
                 answer = answer.declined()
         u = self._control(piece - self._plan.first, measured)
         self._reach = self._plan.reach(piece - self._plan.first, measured, u)
-        self._next, self._covered, self._before = piece + 1, covered, u
+        self._next, self._covered, self._before, self._last = piece + 1, covered, u, measured
         at = float(self._planned.model.control.breakpoints[piece])
         taken = (False, np.nan, np.nan) if answer is None else (answer.plan is not None, answer.cost, answer.lower)
         self._steps.append(Step(at, clock.perf_counter() - began, taken[0], covered, *taken[1:]))
@@ -106,6 +107,7 @@ class Controller:
 
     def _take(self, plan: Plan) -> None:
         self._plan = plan
+        self._acting: tuple[int, Array] | None = None  # the last piece of the disturbance that was seen, and its value
         feedback = plan.model.feedback
         self._measuring = None if feedback is None else Measuring.of(plan.model, plan.decision)
         self._nominal = plan.model.pieces(plan.decision)
@@ -155,7 +157,21 @@ class Controller:
             return True
         lower, upper = self._reach
         room = SEEN * max(float(np.abs(lower).max()), float(np.abs(upper).max()), np.finfo(float).tiny)
-        return bool((state >= lower - room).all() and (state <= upper + room).all())
+        return bool((state >= lower - room).all() and (state <= upper + room).all()) and self._caused(state, room)
+
+    def _caused(self, state: Array, room: float) -> bool:
+        """Whether an admissible disturbance led from the last state to this one, where that can be told."""
+        assert self._last is not None and self._before is not None
+        told = self._plan.caused(self._next - 1 - self._plan.first, self._last, self._before, state)
+        bound = self._planned.model.problem.disturbance
+        if told is None or bound is None:
+            return True
+        block, value, rest, growth = told
+        near = growth * room + SEEN * float(np.abs(value).max())
+        known = self._acting is None or self._acting[0] != block
+        same = known or bool((np.abs(value - self._acting[1]) <= 2.0 * near).all())  # type: ignore[index]
+        self._acting = (block, value)
+        return same and bool((np.abs(rest) <= room).all()) and float(bound.violation(value)) <= near
 
     def _innovations(self, state: Array) -> list[Array]:
         """What the applied plan knows of the disturbance when this state is measured, one vector for each breakpoint

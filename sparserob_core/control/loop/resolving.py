@@ -10,7 +10,7 @@ from typing import final
 
 import numpy as np
 
-from sparserob_core.control.feedback.innovations import KNOWN
+from sparserob_core.control.feedback.innovations import DEPENDENT, KNOWN
 from sparserob_core.control.loop.remaining import refuse_remaining, remaining
 from sparserob_core.control.loop.retuning import Retuning, retuned
 from sparserob_core.control.loop.tracking import Tracking, trackable
@@ -63,6 +63,26 @@ class Plan:
             for push in pushes:
                 upper, lower = upper + problem.disturbance.support(push), lower - problem.disturbance.support(-push)
         return lower, upper
+
+    def caused(self, piece: int, state: Array, control: Array, after: Array) -> tuple[int, Array, Array, float] | None:
+        """What the disturbance was on a piece that led from ``state (d,)`` to ``after (d,)`` under a ``control (m,)``:
+        the number of its own piece, its value ``(mw,)``, what of the state that leaves unexplained ``(d,)``, and by how
+        much at most an error of the state grows in the value; ``None`` where the state does not tell it."""
+        problem, response, signal = self.model.problem, self.model.response, self.model.functionals.disturbance
+        numbers = np.flatnonzero(response.grid.control_piece == piece).tolist()
+        if problem.disturbance is None or signal is None or signal.starts is None or len(numbers) != 1:
+            return None
+        steps, length = response.steps(KNOWN), int(response.which[numbers[0]])
+        Phi, Gamma = steps.Phi[0, length], steps.Gamma[0, length]
+        pushed = Gamma @ steps.E[0]
+        sizes = np.linalg.svd(pushed, compute_uv=False)
+        if pushed.shape[0] < pushed.shape[1] or not sizes[-1] > DEPENDENT * sizes[0]:
+            return None
+        driven = steps.B[0] @ np.append(control, np.ones(response.grid.constants))
+        moved = after - Phi @ state - Gamma @ driven
+        value = np.linalg.lstsq(pushed, moved, rcond=None)[0]
+        block = int(np.searchsorted(signal.starts, numbers[0], side="right")) - 1
+        return block, value, moved - pushed @ value, 1.0 / float(sizes[-1])
 
     def drawn_in(self, control: Array, nominal: Array) -> Array:
         """A control ``(m,)`` within the set of controls: as it is, but for rounding, where the proof covers what was

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from sparserob_core.experiment.run.run import Outcome
 
 LOOPS, RESOLVED_LOOPS = 10, 1  # of every law, unless told
-SHOWN, DRAWN = 400, 6  # times, and loops of every law, that are drawn
+SHOWN, DRAWN = 400, 3  # times, and loops of every law, that are drawn
 CONTROL = "control"
 ROUNDING = 1e-12  # of the size of the set of controls
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 import sparserob_core as sr
 from sparserob_core.control.loop.remaining import remaining
@@ -49,8 +50,6 @@ class Plant:
 
     def moved(self, state, u, w, length):
         """The states at ten times within a piece and at its end."""
-        from scipy.linalg import expm
-
         d = state.size
         block = np.zeros((d + 1, d + 1))
         block[:d, :d], block[:d, d] = self.A, self.B @ u + self.E @ w
@@ -278,3 +277,35 @@ def test_a_controller_needs_a_proven_control() -> None:
         sr.controller(BASE, "yes")
     with pytest.raises(sr.InputError, match=r"^seconds"):
         sr.controller(BASE, seconds=1.0)
+
+
+def test_a_disturbance_that_is_not_one_of_the_set_is_told_at_the_next_step() -> None:
+    ball = {**GAINS, "policy": {"name": "open_loop"}}
+    ball["problem"] = {**GAINS["problem"], "disturbance": {"ellipsoid": {"shape": [[0.0036, 0], [0, 0.0036]]}}}
+    controller = sr.controller(ball)
+    A, B = np.array([[0, 1], [-2, -0.5]]), np.array([0.0, 1.0])
+    radius = float(controller.plan.model.problem.disturbance.support(np.array([[1.0, 0.0]]))[0])
+    for share, covered in ((0.70, True), (0.80, False)):  # of the radius in each coordinate: inside, and in a corner
+        controller.reset()
+        u, state = controller.step(0.0, [-1, 1]), np.array([-1.0, 1.0, 1.0])
+        block = np.zeros((3, 3))
+        block[:2, :2], block[:2, 2] = A, B * u[0] + share * radius
+        state = expm(block * 0.25) @ state
+        controller.step(0.25, state[:2])
+        assert controller.covered is covered
+
+
+def test_a_disturbance_that_changes_within_its_own_piece_is_told() -> None:
+    pieces = {"control": 12, "disturbance": 6}
+    coarse = {**GAINS, "dictionaries": {k: {"name": "piecewise_constant", "pieces": n} for k, n in pieces.items()}}
+    controller = sr.controller(coarse)
+    A, B = np.array([[0, 1], [-2, -0.5]]), np.array([0.0, 1.0])
+    for second, covered in ((0.05, True), (-0.05, False)):
+        controller.reset()
+        state = np.array([-1.0, 1.0])
+        for k, w in enumerate((0.05, second, 0.0)):
+            u = controller.step(k * 0.25, state)
+            block = np.zeros((3, 3))
+            block[:2, :2], block[:2, 2] = A, B * u[0] + w
+            state = (expm(block * 0.25) @ np.append(state, 1.0))[:2]
+        assert controller.covered is covered
