@@ -129,6 +129,22 @@ def test_the_control_answers_the_initial_state_from_the_first_piece_on(tmp_path:
     assert np.count_nonzero(gains.any(axis=(2, 3))) == 1
 
 
+def test_no_causal_policy_is_better_than_one_that_begins_in_the_middle_of_the_initial_states(tmp_path: Path) -> None:
+    """The middle of the set is one of the initial states: what is proven from it holds for the set, and only that."""
+    lower = {}
+    for name, begun in (("one", {}), ("set", {"box": [0.02, 0.02]})):
+        problem = {**SPRING, "initial_state": {"centre": [-1, 1], **begun} if begun else [-1, 1]}
+        config = {"problem": problem, "policy": {"name": "affine"}, "observers": []}
+        config["dictionaries"] = {"control": {"name": "piecewise_constant", "pieces": 10}}
+        outcome = sr.run(config, out=tmp_path / name, quiet=True, figures=False)
+        found = check(outcome.directory)
+        assert found.status == "verified", [claim for claim in found.claims if claim.verdict != "holds"]
+        assert "causal" in {claim.name for claim in found.claims}
+        lower[name] = outcome.summary["causal_lower_bound"]
+        assert 0.0 < lower[name] <= outcome.result.lower_bound + 1e-9
+    assert lower["set"] == pytest.approx(lower["one"], rel=0.05)
+
+
 def test_larger_initial_states_than_any_policy_can_take_are_infeasible_with_their_reason(tmp_path: Path) -> None:
     problem = {**SPRING, "initial_state": {"centre": [-1, 1], "box": [0.6, 0.6]}}
     outcome = run(problem, tmp_path / "run")

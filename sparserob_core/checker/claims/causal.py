@@ -9,10 +9,12 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
+from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.claims.case import Case, listed, number, numbers
 from sparserob_core.checker.claims.duality import Row
 from sparserob_core.checker.outcome import Broken, Unchecked
@@ -74,17 +76,17 @@ def _shares(data: Mapping[str, Any], count: int) -> list[arb]:
     found = numbers(data.get("shares", []), "causal: shares")
     if found.shape != (count,) or not (found >= 0.0).all():
         raise Broken(f"causal: expected shares of {count} signals, not below 0")
-    balls = [arb(float(share)) for share in found]
-    if not sum(balls, arb(0)) <= 1:
+    held = balls(found)
+    if not sum(held, arb(0)) <= 1:
         raise Broken(f"causal: the shares of the signals add up to {found.sum()!r}, expected at most 1")
-    return balls
+    return held
 
 
 def _refuse(case: Case) -> None:
     if case.policy is None or case.problem.system.parameter_count or not case.problem.cost.is_linear:
         raise Unchecked("the checker bounds causal policies of known systems, with the cost of an L1 norm, only")
-    if case.problem.initial_set is not None or not case.control.is_indicators or case.problem.system.delay:
-        raise Unchecked("the checker bounds causal policies from one initial state, with indicators, without delay")
+    if not case.control.is_indicators or case.problem.system.delay:
+        raise Unchecked("the checker bounds causal policies in indicators, without delay")
 
 
 def _row(case: Case, entry: object, signals: int, rows: Rows) -> tuple[float, int, tuple[Row, list[list[arb]]]]:
@@ -105,6 +107,12 @@ def _row(case: Case, entry: object, signals: int, rows: Rows) -> tuple[float, in
     key = (name, time, direction.tobytes())
     if key not in rows:
         row = case.duality.row(direction, time, [], window.limit(direction, time), disturbed=False)
+        if case.problem.initial_set is not None:  # its middle is one of the initial states
+            about = middle(case.problem.initial_set)
+            if not known(case.problem.initial_set).contains(about):
+                raise Unchecked("the middle of the initial states is not shown to be one of them")
+            parts = zip(case.duality.carried(direction, time), balls(about), strict=True)
+            row = replace(row, constant=sum((c * x for c, x in parts), row.constant))
         rows[key] = row, case.duality.pushed(direction, time)
     return y, which, rows[key]
 

@@ -58,14 +58,14 @@ class Sampled:
             at, side = np.repeat(times, H.shape[0]), np.tile(np.arange(H.shape[0]), times.size)
             free, gains, B, W = response.adjoint(at, H[side], np.zeros((at.size, 0)))
             weights = gains @ B
-            constant = free @ response.initial_state + loop.functionals.given(weights)
+            constant = free @ loop.start + loop.functionals.given(weights)
             on_noise = gains @ W
             constant = constant + np.einsum("rli,li->r", on_noise, loop.middles)
             T = loop.functionals.on_decision(weights).reshape(at.size, -1, K)
-            N = np.einsum("rli,liq->rq", on_noise, loop.entries)
+            N = np.einsum("rli,liq->rq", on_noise, loop.entries[..., ~loop.begins.any(axis=0)])
             limits, numbers = h[side] - constant, np.full(at.size, number)
             parts.append((T, N, limits, numbers, side, at, np.searchsorted(starts, at)))
-        m, Q = loop.answers.shape[1], loop.spread.size
+        m, Q = loop.answers.shape[1], int((~loop.begins.any(axis=0)).sum())
         if not parts:
             none = np.zeros(0, dtype=int)
             return Sampled(np.zeros((0, m, K)), np.zeros((0, Q)), np.zeros(0), none, none, np.zeros(0), none)

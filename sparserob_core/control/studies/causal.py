@@ -10,11 +10,11 @@ from typing import Literal, TypeAlias, final
 import numpy as np
 
 from sparserob_core.control.constraints.flat import FlatConstraint
-from sparserob_core.control.feedback.closed_loop import ClosedLoop
 from sparserob_core.control.feedback.tree import Grown, Sampled, Tree
 from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.sip.convex_set import Array, ConvexSet
+from sparserob_core.sip.finite import Spread
 from sparserob_core.sip.result import Result
 
 Ended: TypeAlias = Literal["settled", "signals", "work", "seconds"]
@@ -116,6 +116,8 @@ class CausalSearch:
         grid, disturbance = model.response.grid, model.functionals.disturbance
         places = np.zeros(0, dtype=int) if disturbance is None or disturbance.starts is None else disturbance.starts
         self.starts = grid.breakpoints[places]
+        begins = model.problem.initial_set is not None
+        self.spread = Spread(self.loop.spread.sets[:-1] if begins else self.loop.spread.sets)
         asked = [(one.H, one.h, self._times(one, active)) for one in self.constraints]
         self.sampled = Sampled.of(self.loop, asked, self.starts)
         self._active = active
@@ -130,18 +132,18 @@ class CausalSearch:
 
     def tree(self, limits: Limits, highest: float | None = None) -> Tree:
         """A tree of the nominal signal and those that the policy's bound rests on."""
-        loop, problem, feedback = self.loop, self.model.problem, self.model.feedback
+        problem, feedback = self.model.problem, self.model.feedback
         assert feedback is not None
         prices = problem.cost.l1 * np.outer(np.asarray(problem.weights, dtype=float), self.model.control.lengths)
         seen = np.searchsorted(self.starts, self.model.control.breakpoints[:-1])
-        width = loop.spread.size // max(1, self.starts.size)
-        worst = extreme(loop, self.sampled.N)
+        width = self.spread.size // max(1, self.starts.size)
+        worst = extreme(self.spread, self.sampled.N)
         tree = Tree(self.sampled, worst, problem.control, prices, seen, width, feedback.policy.cost, highest)
-        tree.add(np.zeros(loop.spread.size))
+        tree.add(np.zeros(self.spread.size))
         tree.seconds = lambda: limits.seconds
         for _, _, deviation in self._active:
             if deviation is not None and deviation.any() and not limits.over(tree):
-                tree.add(extreme(loop, deviation))
+                tree.add(extreme(self.spread, deviation))
         limits.begin(tree)
         return tree
 
@@ -190,12 +192,12 @@ class CausalSearch:
         answers them as the policy does: those that exceed it most, no two of one signal and block; whether there are.
         """
         s, loop, scale = self.sampled, self.loop, 1.0 if tree.priced else max(centre.x[0], NONE)
-        K, Q = s.T.shape[2], loop.spread.size
-        effects = np.zeros((K, s.T.shape[1], Q)) if self.decision is None else loop.effects(self.decision)
+        K, Q = s.T.shape[2], self.spread.size
+        effects = np.zeros((K, s.T.shape[1], Q)) if self.decision is None else loop.effects(self.decision)[..., :Q]
         answered = np.einsum("rmk,kmq->rq", s.T, effects)
         closed = answered + s.N
         closed = np.where(np.abs(closed) > NONE * np.abs(s.N), closed, s.N * NONE)
-        worst = extreme(loop, closed)
+        worst = extreme(self.spread, closed)
         z = np.array(tree.signals)
         own = np.einsum("rmk,smk->sr", s.T, centre.u)
         past = _before(tree, s.N * z[:, None])
@@ -263,9 +265,8 @@ def _values(z: Array, disturbance: ConvexSet | None, blocks: int) -> Array:
     return np.asarray(np.where(deviations == 0.0, middle, values).T)
 
 
-def extreme(loop: ClosedLoop, along: Array) -> Array:
+def extreme(spread: Spread, along: Array) -> Array:
     """An extreme deviation ``(..., Q)`` of the set that is the worst along ``(..., Q)``; any where nothing is."""
-    spread = loop.spread
     if spread.is_box:
         return np.asarray(np.where(along >= 0.0, 1.0, -1.0) * spread.radii)
     return np.asarray(spread.worst(along))

@@ -36,7 +36,7 @@ def causal_upper(
     model = model_at(base)
     assert model.feedback is not None
     policy, result = model.feedback.policy, results.get(base)
-    if not policy.causal_signals or model.problem.initial_set is not None:
+    if not policy.causal_signals:
         return np.nan
     notify(StudyProgress(text=f"looking for the factor of {scaling.of} above which no causal policy exists"))
     refused = [one for factor, one in results.items() if one.status == "infeasible" and factor > 0.0]

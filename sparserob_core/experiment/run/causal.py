@@ -29,7 +29,7 @@ def with_causal(result: ControlResult, tools: Tools) -> ControlResult:
     if model.feedback is None or result.status == "failed" or result.stopped or tools.deadline.passed:
         return result
     policy = model.feedback.policy
-    if not policy.causal_signals or model.problem.initial_set is not None:
+    if not policy.causal_signals:
         return result
     try:
         search = searched(model, result.decision, active(model, result))
@@ -53,6 +53,12 @@ def with_causal(result: ControlResult, tools: Tools) -> ControlResult:
     return replace(result, causal=replace(stated, lower=min(derived, cost)))
 
 
+def _from(rest: Array, signal: Array) -> Array:
+    """The deviations of a disturbance ``(mw, blocks)``; ``rest`` has those of the initial state after it."""
+    found: Array = signal.T.ravel() - rest[: signal.size]
+    return found
+
+
 def active(model: Transcription, result: Result) -> list[tuple[str, float, Array | None]]:
     """Names, times and deviations of the constraints that the bound of a result rests on."""
     assert model.feedback is not None
@@ -62,7 +68,7 @@ def active(model: Transcription, result: Result) -> list[tuple[str, float, Array
         said = None if family is None else family.explanation(cut.index, cut.row)
         if isinstance(said, TimedExplanation):
             signal = None if model.feedback.loop.measurable is not None else said.disturbance
-            found.append((cut.family, said.time, None if signal is None else np.asarray(signal).T.ravel() - rest))
+            found.append((cut.family, said.time, None if signal is None else _from(rest, np.asarray(signal))))
     return found
 
 
