@@ -1,5 +1,5 @@
-"""Times how long feedback takes beside the linear program that imposes the path at the breakpoints alone, as HiGHS
-solves it by its interior point method: what proof over all times costs."""
+"""Guards the time that feedback takes beside the linear program that imposes the path at the breakpoints alone, as
+HiGHS solves it by its interior point method: what proof over all times costs."""
 
 from __future__ import annotations
 

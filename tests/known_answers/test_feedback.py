@@ -377,7 +377,6 @@ def test_the_margin_of_the_first_experiment_is_where_no_causal_policy_goes_furth
     assert 0.2895 <= found.amounts[0] <= found.amounts[1] <= 0.2906
 
 
-@pytest.mark.slow
 def test_the_margin_of_a_policy_is_bracketed_where_independent_programs_found_it(tmp_path: Path) -> None:
     """The spring with 20 pieces and the path from 0.5 withstands between 0.33612 and 0.33619, five times as much as
     without feedback."""
