@@ -311,15 +311,13 @@ class Spread:
         ``a`` is at least that times ``|a_i|``."""
         found = [np.zeros(0)]
         for _, count, convex, middle in self.parts:
-            lengths = np.zeros(convex.dimension)
-            for i, axis in enumerate(np.eye(convex.dimension)):
-                if convex.is_box:
-                    box = convex.bounding_box()
-                    lengths[i] = box.upper[i] - box.lower[i]
-                    continue
-                low, high = convex.chord(middle[None], axis[None])
-                lengths[i] = max(0.0, float(high[0] - low[0]))
-            found.append(np.tile(lengths, count))
+            if convex.is_box:
+                box = convex.bounding_box()
+                low, high = box.lower, box.upper
+            else:
+                axes = np.eye(convex.dimension)
+                low, high = convex.chord(np.broadcast_to(middle, axes.shape), axes)
+            found.append(np.tile(np.maximum(high - low, 0.0), count))
         return np.concatenate(found)
 
     @property

@@ -105,6 +105,17 @@ class Zonoid(ConvexSet):
     def interior_point(self) -> Array:
         return np.zeros(self.dimension)
 
+    def chord(self, points: Array, directions: Array) -> tuple[Array, Array]:
+        if not points.any() and np.array_equal(directions, np.eye(self.dimension)):
+            return self._chords
+        return super().chord(points, directions)
+
+    @cached_property
+    def _chords(self) -> tuple[Array, Array]:
+        """The chords through 0 along the axes, of which every program asks."""
+        axes = np.eye(self.dimension)
+        return super().chord(np.zeros_like(axes), axes)
+
     @property
     def is_symmetric(self) -> bool:
         return all(part.shape[0] == 2 and not part.sum(axis=0).any() for part in self.parts)
