@@ -41,7 +41,7 @@ def mixed_rows(independent: PolicyProgram, within: int) -> None:
                 independent.below(sign * both, 1.1)
 
 
-@pytest.mark.parametrize("cost", ["nominal", "peak"])
+@pytest.mark.parametrize("cost", [pytest.param("nominal", marks=pytest.mark.slow), "peak"])
 def test_bounds_of_state_and_control_together_cost_what_a_linear_program_says(cost: str, tmp_path: Path) -> None:
     outcome = run({**SPRING, "path": [*SPRING["path"], MIXED]}, tmp_path / "run", cost)
     proven(outcome)
@@ -94,7 +94,7 @@ def step_rows(independent: PolicyProgram, least: float, most: float, first: floa
         independent.below(-controls[0], -least - first)
 
 
-@pytest.mark.parametrize("cost", ["nominal", "peak"])
+@pytest.mark.parametrize("cost", [pytest.param("nominal", marks=pytest.mark.slow), "peak"])
 @pytest.mark.parametrize(
     ("changed", "rows"),
     [
@@ -121,7 +121,9 @@ def test_steps_of_the_control_cost_what_a_linear_program_says(
     bracketed(outcome.result.cost, programs)
 
 
-@pytest.mark.parametrize("cost", ["nominal", "peak", "worst"])
+@pytest.mark.parametrize(
+    "cost", [pytest.param("nominal", marks=pytest.mark.slow), "peak", pytest.param("worst", marks=pytest.mark.slow)]
+)
 def test_everything_together_keeps_every_guarantee(cost: str, tmp_path: Path) -> None:
     together = {
         **SPRING,
@@ -133,9 +135,10 @@ def test_everything_together_keeps_every_guarantee(cost: str, tmp_path: Path) ->
     proven(run(together, tmp_path / "run", cost, pieces=8))
 
 
+@pytest.mark.slow
 def test_steps_and_sets_that_move_hold_under_measurable_disturbances(tmp_path: Path) -> None:
     measurable = {"disturbance": {"box": [0.05, 0.05]}, "disturbance_class": "measurable"}
-    outcome = run({**SPRING, **STEPS, **measurable, "path": [MOVING]}, tmp_path / "run", "peak", pieces=5)
+    outcome = run({**SPRING, **STEPS, **measurable, "path": [MOVING]}, tmp_path / "run", "peak", pieces=4)
     assert outcome.status == "certified", outcome.result.message
     found = check(outcome.directory)
     assert found.status == "verified", [claim for claim in found.claims if claim.verdict != "holds"]
@@ -228,6 +231,7 @@ def test_what_is_forged_beside_the_state_is_found(name: str, tmp_path: Path) -> 
     assert forged(outcome.directory, tmp_path / "copy", forgery) == "refuted"
 
 
+@pytest.mark.slow
 def test_a_bound_of_state_and_control_has_a_margin(tmp_path: Path) -> None:
     problem = {**SPRING, "path": [MIXED]}
     found = sr.margin(config(problem, pieces=PIECES), of="disturbance", tolerance=1e-2, out=tmp_path / "margin")

@@ -32,7 +32,7 @@ def tangents(shape: np.ndarray) -> list[tuple[np.ndarray, float]]:
     return [(c, float(np.sqrt(c @ shape @ c))) for c in every]
 
 
-@pytest.mark.parametrize("cost", ["nominal", "peak"])
+@pytest.mark.parametrize("cost", [pytest.param("nominal", marks=pytest.mark.slow), "peak"])
 def test_an_elliptic_final_set_costs_what_its_tangents_say(cost: str, tmp_path: Path) -> None:
     problem = {**SPRING, "terminal": [{"ellipsoid": {"centre": [0, 0], "shape": ELLIPSE}}]}
     outcome = run(problem, tmp_path / "run", cost)
@@ -86,7 +86,9 @@ SETS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("name", SETS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if "and an" in name else name for name in SETS]
+)
 def test_curved_sets_keep_every_guarantee(name: str, tmp_path: Path) -> None:
     proven(run({**SPRING, **SETS[name]}, tmp_path / "run", "peak", pieces=8))
 
@@ -99,6 +101,7 @@ def test_a_curved_set_that_no_policy_keeps_is_infeasible_with_its_reason(tmp_pat
     assert check(outcome.directory).status == "verified"
 
 
+@pytest.mark.slow
 def test_a_curved_set_has_a_margin_between_those_of_its_tangents(tmp_path: Path) -> None:
     problem = {**THRUSTERS, "terminal": [{"norm": {"p": 2, "radius": 0.2}}]}
     found = sr.margin(config(problem, pieces=3), of="disturbance", tolerance=1e-2, out=tmp_path / "margin")

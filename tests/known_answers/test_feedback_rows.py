@@ -84,7 +84,10 @@ def bracketed(cost: float, programs: Callable[[int], float], within: float = 2e-
 
 
 @pytest.mark.parametrize("cost", ["nominal", "peak"])
-@pytest.mark.parametrize("begun", [[0.1, 0.1], [0.3, 0.0], [0.05, 0.4]])
+@pytest.mark.parametrize(
+    "begun",
+    [[0.3, 0.0], pytest.param([0.1, 0.1], marks=pytest.mark.slow), pytest.param([0.05, 0.4], marks=pytest.mark.slow)],
+)
 def test_a_box_of_initial_states_costs_what_a_linear_program_says(
     cost: str, begun: list[float], tmp_path: Path
 ) -> None:
@@ -108,7 +111,7 @@ STATES: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("disturbed", [True, False])
+@pytest.mark.parametrize("disturbed", [pytest.param(True, marks=pytest.mark.slow), False])
 @pytest.mark.parametrize("name", STATES)
 def test_sets_of_initial_states_keep_every_guarantee(name: str, disturbed: bool, tmp_path: Path) -> None:
     disturbance = SPRING["disturbance"] if disturbed else None
@@ -153,6 +156,7 @@ def test_larger_initial_states_than_any_policy_can_take_are_infeasible_with_thei
     assert check(outcome.directory).status == "verified"
 
 
+@pytest.mark.slow
 def test_feedback_takes_more_initial_states_than_a_plan(tmp_path: Path) -> None:
     problem = {**SPRING, "initial_state": {"centre": [-1, 1], "box": [0.1, 0.1]}, "disturbance": {"box": [0.03, 0.03]}}
     found = [
@@ -174,7 +178,7 @@ def begun(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("cost", ["nominal", "peak"])
-@pytest.mark.parametrize("fixed", [[0.0, 0.0], [None, 0.1]])
+@pytest.mark.parametrize("fixed", [pytest.param([0.0, 0.0], marks=pytest.mark.slow), [None, 0.1]])
 def test_final_states_are_fixed_from_every_initial_state(cost: str, fixed: list[float | None], tmp_path: Path) -> None:
     start = {"centre": [-1, 1], "box": [0.1, 0.2]}
     problem = {**SPRING, "initial_state": start, "disturbance": None, "terminal": [{"equals": fixed}]}
@@ -232,6 +236,7 @@ def test_what_no_disturbance_reaches_is_fixed_beside_what_it_reaches(tmp_path: P
     assert outcome.result.cost == pytest.approx(independent.solve(1.0, "peak"), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_fixed_final_states_have_a_margin(tmp_path: Path) -> None:
     start = {"centre": [-1, 1], "box": [0.1, 0.1]}
     problem = {**SPRING, "initial_state": start, "disturbance": None, "terminal": [{"equals": [0, 0]}]}

@@ -401,7 +401,12 @@ class FeedbackSteps:
     def family(self) -> ConstraintFamily:
         """The constraint as a family."""
         index_set = Box(self.times[:1], self.loop.functionals.dictionary.breakpoints[-1:])
-        return indexed(self, index_set, self.times[:, None], self)
+        family = indexed(self, index_set, self.times[:, None], self)
+        return replace(family, scaled=self.scaled) if self.loop.scales else family
+
+    def scaled(self, factor: float) -> ConstraintFamily:
+        """The same where deviations are ``factor`` times as large."""
+        return replace(self, loop=self.loop.scaled(factor)).family()
 
     @property
     def times(self) -> Array:

@@ -7,7 +7,7 @@ For a fixed direction a row is as any other. What proves all directions of a cel
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from typing import final
@@ -92,7 +92,12 @@ class Turning(ABC):
         begun = np.unique(np.linspace(0, self.times.size - 1, min(BEGUN, self.times.size)).round().astype(int))
         axes = np.vstack([np.eye(self._b), -np.eye(self._b)])
         start = np.hstack([np.repeat(self.times[begun], len(axes))[:, None], np.tile(axes, (begun.size, 1))])
-        return indexed(self, index_set, start, self.source)
+        family = indexed(self, index_set, start, self.source)
+        return replace(family, scaled=self.scaled) if self.loop.scales else family
+
+    def scaled(self, factor: float) -> ConstraintFamily:
+        """The same where deviations are ``factor`` times as large."""
+        return replace(self, loop=self.loop.scaled(factor)).family()
 
     @property
     def _b(self) -> int:
