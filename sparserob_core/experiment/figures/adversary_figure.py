@@ -12,7 +12,7 @@ import numpy as np
 from sparserob_core.experiment.figures import style as look
 from sparserob_core.experiment.figures.figure_data import FigureData
 from sparserob_core.experiment.figures.run_figures import draw_legend, draw_time_axis, draw_walls
-from sparserob_core.experiment.figures.style import panels, require_matplotlib, style, write_figure
+from sparserob_core.experiment.figures.style import held, panels, require_matplotlib, style, write_figure
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -64,8 +64,7 @@ def draw_adversary(arrays: Mapping[str, Array], data: FigureData) -> Figure:
                 )
         for channel, ax in enumerate(axes[states:]):
             ax.stairs(
-                disturbances[number, channel],
-                arrays["breakpoints"],
+                *held(disturbances[number, channel], arrays["breakpoints"]),
                 baseline=None,
                 linewidth=1.3,
                 zorder=3 - 0.01 * number,

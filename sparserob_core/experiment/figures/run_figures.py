@@ -10,7 +10,7 @@ import numpy as np
 
 from sparserob_core.experiment.figures import style as look
 from sparserob_core.experiment.figures.figure_data import FigureData, Wall
-from sparserob_core.experiment.figures.style import panels, require_matplotlib, style, write_figure
+from sparserob_core.experiment.figures.style import held, panels, require_matplotlib, style, write_figure
 from sparserob_core.sip.result import relative_gap
 
 if TYPE_CHECKING:
@@ -47,11 +47,10 @@ def draw_control(data: FigureData) -> Figure:
     figure, axes = panels(len(data.control), 1.9, extra=0.5)
     for channel, ax in enumerate(axes):
         steps = data.control[channel]
+        edges = held(steps, data.breakpoints)
         ax.axhline(0.0, color=look.GREY, linewidth=0.6, zorder=1)
         if data.control_least is None or data.control_most is None:
-            ax.stairs(
-                steps, data.breakpoints, baseline=0.0, fill=True, color=look.SKY, alpha=0.35, linewidth=0, zorder=2
-            )
+            ax.stairs(*edges, baseline=0.0, fill=True, color=look.SKY, alpha=0.35, linewidth=0, zorder=2)
         else:
             ax.stairs(
                 data.control_most[channel],
@@ -64,7 +63,7 @@ def draw_control(data: FigureData) -> Figure:
                 zorder=2,
                 label="under any disturbance",
             )
-        ax.stairs(steps, data.breakpoints, baseline=None, color=look.BLUE, linewidth=1.5, zorder=3, label="control")
+        ax.stairs(*edges, baseline=None, color=look.BLUE, linewidth=1.5, zorder=3, label="control")
         _bounds(ax, float(data.control_lower[channel]), float(data.control_upper[channel]), steps)
         _rug(ax, data.active_times)
         ax.set_ylabel(data.control_label(channel))

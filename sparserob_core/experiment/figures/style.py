@@ -8,8 +8,11 @@ from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from sparserob_core.errors import InputError, SparseRobError
 from sparserob_core.experiment.directory.artefacts import write_whole
+from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -117,3 +120,10 @@ def require_matplotlib() -> None:
     """Raise `InputError` with the way to install it when matplotlib is missing."""
     if missing := missing_matplotlib():
         raise InputError(missing)
+
+
+def held(values: Array, breakpoints: Array) -> tuple[Array, Array]:
+    """Steps ``values (K,)`` between ``breakpoints (K + 1,)`` with equal neighbours joined: a figure of many pieces has
+    as many edges as the signal has."""
+    begins = np.append(True, values[1:] != values[:-1])
+    return values[begins], breakpoints[np.append(begins, True)]

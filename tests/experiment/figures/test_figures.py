@@ -12,6 +12,7 @@ import pytest
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.figures.figure_data import FigureData, Wall
 from sparserob_core.experiment.figures.run_figures import draw_control, draw_convergence, draw_states, write_figures
+from sparserob_core.experiment.figures.style import held
 from sparserob_core.sip.events import RoundFinished
 
 
@@ -62,8 +63,10 @@ def test_the_drawn_steps_are_the_control(data: FigureData) -> None:
         drawn = [patch for patch in axes.patches if patch.get_label() == "control"]
         assert len(drawn) == 1
         values, edges, _ = drawn[0].get_data()  # type: ignore[attr-defined]
-        assert np.array_equal(values, data.control[channel])
-        assert np.array_equal(edges, data.breakpoints)
+        middles = (data.breakpoints[:-1] + data.breakpoints[1:]) / 2
+        assert np.array_equal(values[np.searchsorted(edges, middles) - 1], data.control[channel])
+        assert np.isin(edges, data.breakpoints).all()
+        assert np.array_equal(edges[[0, -1]], data.breakpoints[[0, -1]])
 
 
 def test_walls_appear_only_in_the_panel_of_their_state(data: FigureData) -> None:
@@ -118,3 +121,9 @@ def test_a_missing_matplotlib_is_named_with_the_extra_that_brings_it(
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(InputError, match=r"sparserob\[figures\]"):
         write_figures(tmp_path, data)
+
+
+def test_equal_steps_are_drawn_as_one() -> None:
+    values, ends = held(np.array([1.0, 1.0, 0.0, 2.0, 2.0, 2.0]), np.arange(7.0))
+    np.testing.assert_array_equal(values, [1.0, 0.0, 2.0])
+    np.testing.assert_array_equal(ends, [0.0, 2.0, 3.0, 6.0])
