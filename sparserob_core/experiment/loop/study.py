@@ -21,8 +21,8 @@ class ClosedLoops:
     ``constraints``: the largest violation of each (negative: a margin), with its ``tolerance``, over the breakpoints
     and times inside every piece; the set of controls is ``control``. ``milliseconds (steps,)`` of every step.
     ``cost`` is that of the run, ``planned`` the first term of it for the plan's own control (under feedback the nominal
-    one), ``costs (loops,)`` the same term for the control that was applied. ``paths`` and ``controls`` are the first
-    loops of every law, for drawing.
+    one), ``costs (loops,)`` the same term for the control that was applied, law after law. ``paths`` and ``controls``
+    are the first loops of every law, for drawing.
     """
 
     title: str
@@ -60,6 +60,12 @@ class ClosedLoops:
         """Whether a loop does what is proven impossible."""
         return bool(self.violated) or self.uncovered > 0
 
+    @property
+    def paid(self) -> Mapping[str, Array]:
+        """The ``costs`` of every law."""
+        ends = np.cumsum(list(self.laws.values()))[:-1]
+        return dict(zip(self.laws, np.split(self.costs, ends), strict=True))
+
     def summary(self) -> dict[str, Any]:
         """What ``loop.json`` holds."""
         median, late = np.quantile(self.milliseconds, [0.5, 0.99]).tolist()
@@ -79,6 +85,9 @@ class ClosedLoops:
                 "mean": float(self.costs.mean()),
                 "least": float(self.costs.min()),
                 "largest": float(self.costs.max()),
+                "laws": {
+                    law: {"mean": float(one.mean()), "largest": float(one.max())} for law, one in self.paid.items()
+                },
             },
             "constraints": [
                 {"name": name, "largest": largest, "tolerance": tolerance, "violated": largest > tolerance}
@@ -100,6 +109,10 @@ class ClosedLoops:
             ("cost of the run", f"{cost['run']:.7g}"),
             ("cost of its control", f"{cost['plan']:.7g}" + " when nothing happens"),
             ("cost of the loops", f"{cost['mean']:.7g} on average, {cost['least']:.7g} to {cost['largest']:.7g}"),
+            *(
+                (f"cost under {law}", f"{one.mean():.7g} on average, {one.max():.7g} at most")
+                for law, one in self.paid.items()
+            ),
             *((f"largest violation of {name}", f"{found:.3e}") for name, (found, _) in self.constraints.items()),
         ]
         return (), rows

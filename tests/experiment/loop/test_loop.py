@@ -55,6 +55,10 @@ def test_a_study_counts_its_loops_and_pays_no_more_than_the_peaks(outcome) -> No
     told = json.loads((outcome.directory / "loop.json").read_text())
     assert told["steps"] == found.steps
     assert told["cost"]["plan"] == pytest.approx(float(np.abs(outcome.control[0]).sum() * 0.3))
+    assert set(told["cost"]["laws"]) == set(found.laws)
+    assert sum(told["cost"]["laws"][law]["mean"] * n for law, n in found.laws.items()) == pytest.approx(
+        sum(found.costs)
+    )
     assert {one["name"] for one in told["constraints"]} == {"path", "terminal", "control"}
     assert told["milliseconds"]["median"] <= told["milliseconds"]["99%"] <= told["milliseconds"]["largest"]
 
