@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 import sparserob_core as sr
 from sparserob_core.control.transcription.record import Transcription
@@ -282,3 +283,19 @@ def test_the_margin_is_bracketed_and_lies_below_what_any_causal_policy_withstand
     found = sr.margin(config, tolerance=0.02, out=tmp_path / "margin")
     assert 1.0 < found.lower <= found.upper <= 1.05 * found.lower
     assert not np.isfinite(found.causal_upper) or found.causal_upper >= found.lower
+
+
+def test_a_controller_takes_a_force_that_switches_within_its_pieces_for_one_of_the_set(certified: Path) -> None:
+    A, B, step = np.array([[0.0, 1.0], [-2.0, -0.5]]), np.array([0.0, 1.0]), 4.0 / PIECES
+    controller, rng = sr.controller(certified), np.random.default_rng(0)
+    for _ in range(5):
+        controller.reset()
+        state = np.array([-1.0, 1.0])
+        for k in range(PIECES):
+            u = controller.step(k * step, state)
+            cut, sign = rng.uniform(0.1, 0.9), rng.choice([-1.0, 1.0])
+            for share, force in ((cut, 0.25 * sign), (1.0 - cut, -0.25 * sign)):
+                rest = np.linalg.solve(A, B * (u[0] + force))
+                state = expm(A * share * step) @ (state + rest) - rest
+        assert controller.covered
+        assert (np.abs(state) <= 0.3 + 1e-9).all()
