@@ -70,8 +70,7 @@ class Plan:
         much at most an error of the state grows in the value; ``None`` where the state does not tell it."""
         problem, response, signal = self.model.problem, self.model.response, self.model.functionals.disturbance
         numbers = np.flatnonzero(response.grid.control_piece == piece).tolist()
-        held = signal is not None and signal.kind == "piecewise_constant"
-        if problem.disturbance is None or signal is None or signal.starts is None or not held or len(numbers) != 1:
+        if problem.disturbance is None or signal is None or signal.starts is None or len(numbers) != 1:
             return None
         steps, length = response.steps(KNOWN), int(response.which[numbers[0]])
         Phi, Gamma = steps.Phi[0, length], steps.Gamma[0, length]
