@@ -128,13 +128,14 @@ def _answered(model: Transcription, decision: Array, times: Array, draws: int) -
     assert model.feedback is not None
     loop, alone = model.feedback.loop, tube(replace(model, feedback=None), model.nominal(decision), times)
     nominal, effects = loop.nominal(decision), loop.effects(decision)
+    held = model.problem.disturbance_class == "piecewise_constant"  # what others make of a piece is slow to draw
     return {
         "alone_lower": alone.lower,
         "alone_upper": alone.upper,
         "control_least": nominal - loop.spread.support(-effects).T,
         "control_most": nominal + loop.spread.support(effects).T,
         "gains": loop.gains(decision),
-        **(_drawn(loop, nominal, effects, draws) if draws else {}),
+        **(_drawn(loop, nominal, effects, draws) if draws and held else {}),
         **(_moved(model, decision) if draws else {}),
     }
 
