@@ -1,0 +1,44 @@
+"""Guards answers on random problems whose control answers what it measures, in any units, against linear programs that
+share no code with the package (tests/support/policies.py); and `check` of every run.
+
+``SPARSEROB_POLICIES`` is how many the second stage takes (5 unless given), ``SPARSEROB_FIRST_POLICY`` the number of
+the first. Five, since `check` takes minutes for some of those that follow.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sparserob_core as sr
+from tests.support.policies import answered, truth_answered
+
+QUICK = 1
+COUNT, FIRST = int(os.environ.get("SPARSEROB_POLICIES", "5")), int(os.environ.get("SPARSEROB_FIRST_POLICY", "0"))
+
+
+@pytest.mark.parametrize(
+    "number",
+    [pytest.param(n, marks=pytest.mark.slow if n >= FIRST + QUICK else ()) for n in range(FIRST, FIRST + COUNT)],
+)
+def test_what_is_said_of_a_random_policy_in_any_units_is_true(number: int, tmp_path: Path) -> None:
+    one = answered(number)
+    lower, upper = truth_answered(one)
+    outcome = sr.run(one.config(), out=tmp_path / "run", quiet=True, figures=False)
+    result, summary, value = outcome.result, outcome.summary, one.units.value
+    if np.isinf(lower):
+        assert result.status == "infeasible", result.message
+    elif np.isfinite(upper):
+        assert result.status in ("certified", "verified"), result.message
+    if result.status in ("certified", "verified"):
+        close = 1e-6 * max(1e-3 * one.problem.largest, result.cost / value)
+        assert result.cost / value >= lower - close
+        assert result.lower_bound / value <= upper + close
+        assert result.cost / value <= upper + close + result.gap * upper
+        causal = summary["causal_lower_bound"]
+        assert causal is None or causal <= result.lower_bound + close * value
+    found = [claim for claim in sr.check(tmp_path / "run").claims if claim.verdict != "holds"]
+    assert not found, found
