@@ -124,26 +124,50 @@ class Tree:
     def __post_init__(self) -> None:
         m, K = self.prices.shape
         axes = np.eye(m)
-        self._low, self._high = -self.control.support(-axes), self.control.support(axes)
-        self._far = np.maximum(np.abs(self._low), np.abs(self._high))
+        low, high = -self.control.support(-axes), self.control.support(axes)
+        far = np.maximum(np.abs(low), np.abs(high))
+        self._far = np.where(far > 0.0, far, 1.0)  # columns are controls in this unit, and costs in that of the largest
+        self._low, self._high = low / self._far, high / self._far
+        largest = float((self.prices * self._far[:, None]).sum())
+        self._unit = largest if largest > 0.0 else 1.0
         self._linear = Growing()
-        high, price = (0.0, 0.0) if self.highest is None else (self.highest, -1.0)
-        self._linear.variables(np.zeros(1), np.array([high]), np.array([price]))
+        most, price = (0.0, 0.0) if self.highest is None else (self.highest, -1.0)
+        self._linear.variables(np.zeros(1), np.array([most]), np.array([price]))
         self._sizes = np.zeros((m, 0), dtype=int)
         if self.priced:
-            self._charges, far = self.prices.ravel(), np.repeat(self._far, K)
+            self._charges, reach = self._rates.ravel(), np.ones(m * K)
             if self.cost == "worst":
-                self._charges, far = np.ones(1), np.array([2.0 * self._charges @ far])
-            self._charged = self._linear.variables(np.zeros(far.size), far, self._charges)
+                self._charges, reach = np.ones(1), np.array([2.0])
+            self._charged = self._linear.variables(np.zeros(reach.size), reach, self._charges)
             if self.cost != "worst":
                 self._sizes = self._charged.reshape(m, K)
-            entries = [(np.zeros(far.size, dtype=int), self._charged, self._charges)]
+            entries = [(np.zeros(reach.size, dtype=int), self._charged, self._charges)]
             self._budget = int(self._linear.rows(entries, np.array([-np.inf]), np.array([np.inf]))[0])
 
     @property
     def priced(self) -> bool:
         """Whether the program has a cost."""
         return self.highest is None
+
+    @cached_property
+    def _rates(self) -> Array:
+        """The prices of the columns, ``(m, K)``."""
+        return np.asarray(self.prices * self._far[:, None] / self._unit)
+
+    @cached_property
+    def _flat(self) -> tuple[Array, Array] | None:
+        """Half-spaces of the columns of a piece, each in the unit of what it can be; the bounds of a box are none."""
+        flat = None if self.control.is_box else self.control.halfspaces()
+        if flat is None:
+            return None
+        H = flat[0] * self._far
+        size = np.maximum(np.abs(H).sum(axis=1), np.finfo(float).tiny)
+        return H / size[:, None], flat[1] / size
+
+    @cached_property
+    def _moves(self) -> Array:
+        """What the columns give to the rows, ``(R, m, K)``."""
+        return np.asarray(self.sampled.T * self._far[:, None])
 
     @property
     def blocks(self) -> int:
@@ -154,7 +178,7 @@ class Tree:
     def units(self) -> Array:
         """What every row is divided by: how large it can be."""
         s = self.sampled
-        size = np.einsum("rmk,m->r", np.abs(s.T), self._far) + np.abs(s.N * self.worst).sum(axis=1) + np.abs(s.b)
+        size = np.abs(self._moves).sum(axis=(1, 2)) + np.abs(s.N * self.worst).sum(axis=1) + np.abs(s.b)
         return np.where(size > 0.0, size, 1.0)
 
     def add(self, z: Array) -> bool:
@@ -163,9 +187,7 @@ class Tree:
         if any(np.array_equal(z, other) for other in self.signals):
             return False
         m, K = self.prices.shape
-        columns, nominal, flat = np.zeros((m, K), dtype=int), not self.signals, None
-        if not self.control.is_box:
-            flat = self.control.halfspaces()
+        columns, nominal, flat = np.zeros((m, K), dtype=int), not self.signals, self._flat
         for k in range(K):
             key = (k, self._until(z, int(self.seen[k])))
             fresh = key not in self._groups
@@ -178,7 +200,7 @@ class Tree:
             if fresh and self.priced and (nominal or self.cost != "nominal"):
                 which = np.arange(m)
                 if self.cost == "worst":
-                    self._own[key] = self._linear.variables(np.zeros(m), self._far, np.zeros(m))
+                    self._own[key] = self._linear.variables(np.zeros(m), np.ones(m), np.zeros(m))
                 sizes = self._own[key] if self.cost == "worst" else self._sizes[:, k]
                 for sign in (1.0, -1.0):
                     self._rows([(which, columns[:, k], np.full(m, sign)), (which, sizes, -np.ones(m))], np.zeros(m))
@@ -186,7 +208,7 @@ class Tree:
             own = [self._own[k, self._until(z, int(self.seen[k]))] for k in range(K)]
             column = np.concatenate([*own, self._charged])
             self._efforts.append(
-                self._rows([(np.zeros(column.size, dtype=int), column, np.append(self.prices.T, -1.0))], np.zeros(1))
+                self._rows([(np.zeros(column.size, dtype=int), column, np.append(self._rates.T, -1.0))], np.zeros(1))
             )
         self.signals.append(z)
         self._columns.append(columns)
@@ -212,9 +234,9 @@ class Tree:
             return False
         self._imposed.add(key)
         late, unit, end = self.seen > block, self.units[row], block * self.width
-        channel, piece = np.nonzero(s.T[row] * ~late)
+        channel, piece = np.nonzero(self._moves[row] * ~late)
         noise = float(s.N[row, :end] @ z[:end]) + float(self._pushed[row, block])
-        columns, values = [self._columns[signal][channel, piece]], [s.T[row][channel, piece]]
+        columns, values = [self._columns[signal][channel, piece]], [self._moves[row][channel, piece]]
         columns.append(np.zeros(1, dtype=int))
         values.append(np.array([-unit if self.priced else noise]))
         limit = s.b[row] - (noise if self.priced else 0.0)
@@ -237,14 +259,14 @@ class Tree:
     @cached_property
     def _by_size(self) -> Array:
         """How much a control no larger than its peak can take off every row, times the peak, ``(R, m, K)``."""
-        T = self.sampled.T
+        T = self._moves
         moves = np.where(T > 0.0, (self._low < 0.0)[:, None], (self._high > 0.0)[:, None])
         return np.asarray(np.abs(T) * moves)
 
     @cached_property
     def _fixed(self) -> Array:
         """What it must give to every row where 0 is out of its reach, ``(R, m, K)``."""
-        T = self.sampled.T
+        T = self._moves
         return np.asarray(
             T * np.where(T > 0.0, np.maximum(self._low, 0.0)[:, None], np.minimum(self._high, 0.0)[:, None])
         )
@@ -275,7 +297,7 @@ class Tree:
         highs.changeColCost(0, 1.0)
         for column in self._charged.tolist():
             highs.changeColCost(column, 0.0)
-        highs.changeRowBounds(self._budget, -np.inf, budget)
+        highs.changeRowBounds(self._budget, -np.inf, budget / self._unit)
         if central:
             highs.setOptionValue("solver", "ipm")
             highs.setOptionValue("run_crossover", "off")
@@ -300,12 +322,13 @@ class Tree:
             self.work += self._linear.work + len(self.signals) * (self.sampled.T.size + self.sampled.N.size)
             if not done:
                 return None
-            u, mine = x[np.array(self._columns)], np.array([y[at] for at in self._numbers])
+            u, mine = x[np.array(self._columns)] * self._far[:, None], np.array([y[at] for at in self._numbers])
             kept = np.flatnonzero(mine > 0.0)
             signals, rows, blocks = np.array(self._order, dtype=int).reshape(-1, 3)[kept].T
-            value = float(x[0]) if relaxed or not self.priced else float(self._charges @ x[self._charged])
+            unit = 1.0 if relaxed or not self.priced else self._unit
+            value = float(x[0]) if relaxed or not self.priced else unit * float(self._charges @ x[self._charged])
             shares = np.maximum([y[at] for at in self._efforts], 0.0)
-            found = Grown(value, x, u, signals, rows, blocks, mine[kept] / self.units[rows], shares)
+            found = Grown(value, x, u, signals, rows, blocks, unit * mine[kept] / self.units[rows], shares)
             if not self._separate(found):
                 break
         return found

@@ -316,6 +316,7 @@ class Growing:
 
         self.highs: Any = highspy.Highs()
         self.columns = self.count = 0
+        self.refused = False
         self.work = 0.0  # of the last solution: entries times steps
         for name, value in {
             "output_flag": False,
@@ -335,12 +336,14 @@ class Growing:
 
     def rows(self, entries: list[tuple[np.ndarray, np.ndarray, Array]], lower: Array, upper: Array) -> np.ndarray:
         """New rows, by number; ``entries`` are rows counted from 0, columns and values."""
+        import highspy
         from scipy.sparse import csr_array
 
         row, column, value = (np.concatenate(part) for part in zip(*entries, strict=True))
         table = csr_array((value, (row, column)), shape=(upper.size, self.columns))
         starts, places = table.indptr[:-1].astype(np.int32), table.indices.astype(np.int32)
-        self.highs.addRows(upper.size, lower, upper, table.nnz, starts, places, table.data)
+        said = self.highs.addRows(upper.size, lower, upper, table.nnz, starts, places, table.data)
+        self.refused |= said == highspy.HighsStatus.kError  # an entry that is too large
         self.count += upper.size
         return np.arange(self.count - upper.size, self.count)
 
@@ -354,6 +357,8 @@ class Growing:
         is not where ``seconds`` do not suffice."""
         import highspy
 
+        if self.refused:
+            return False, "HiGHS: a row is refused", np.zeros(0), np.zeros(0)
         if np.isfinite(seconds):
             self.highs.setOptionValue("time_limit", self.highs.getRunTime() + max(seconds, 0.0))
         self.highs.run()

@@ -193,3 +193,17 @@ def test_a_signal_outside_of_its_set_proves_nothing() -> None:
     assert bound is not None
     wide: list[Array] = [signal * (1.0 + 1e-9) for signal in bound.signals]
     assert proven(result.model, problem, replace(bound, signals=tuple(wide))) is None
+
+
+@pytest.mark.parametrize("cost", ["nominal", "peak", "worst"])
+def test_the_units_of_the_control_change_nothing(cost: str) -> None:
+    plain, unit = scalar(0.2, 0.7, 0.9), 1e12
+    far = replace(
+        plain,
+        system=sr.LinearSystem([[RATE]], [[unit]], [[1.0]]),
+        control=sr.Polytope([[1e3 * unit], [-1e-3 * unit]], [1e3, 1e-3]),  # |unit u| <= 1
+        weights=[unit],
+    )
+    (_, one), (_, other) = (tree(problem, 3, 3, cost=cost) for problem in (plain, far))
+    assert one is not None and other is not None and one.lower > 0.1
+    assert other.lower == pytest.approx(one.lower, rel=1e-6)
