@@ -108,16 +108,16 @@ class Controller:
     def _take(self, plan: Plan) -> None:
         self._plan = plan
         self._acting: tuple[int, Array] | None = None  # the last piece of the disturbance that was seen, and its value
-        feedback = plan.model.feedback
-        self._measuring = None if feedback is None else Measuring.of(plan.model, plan.decision)
-        self._nominal = plan.model.pieces(plan.decision)
+        feedback = plan.known.feedback
+        self._measuring = None if feedback is None else Measuring.of(plan.known, plan.decision)
+        self._nominal = plan.known.pieces(plan.decision)
 
     def _go_on(self, plan: Plan) -> None:
         """Apply a new plan from now on; one with the same gains goes on answering what was seen so far."""
-        if self._measuring is None or plan.model is not self._plan.model:
+        if self._measuring is None or plan.known is not self._plan.known:
             self._take(plan)
             return
-        self._plan, self._nominal = plan, plan.model.pieces(plan.decision)
+        self._plan, self._nominal = plan, plan.known.pieces(plan.decision)
         self._measuring = replace(self._measuring, nominal=self._nominal)
 
     def _timed(self, time: object) -> int:
@@ -176,7 +176,7 @@ class Controller:
     def _innovations(self, state: Array) -> list[Array]:
         """What the applied plan knows of the disturbance when this state is measured, one vector for each breakpoint
         since it began."""
-        feedback = self._plan.model.feedback
+        feedback = self._plan.known.feedback
         if self._measuring is None or feedback is None:
             return [np.zeros(state.size)]
         if self._next == self._plan.first:
@@ -187,7 +187,7 @@ class Controller:
         nominal = self._nominal[:, piece]
         if self._measuring is None:
             return nominal.copy()
-        grid, control = self._plan.model.response.grid, nominal
+        grid, control = self._plan.known.response.grid, nominal
         for number in np.flatnonzero(grid.control_piece == piece).tolist():
             inputs = self._measuring(number, state[:, None])
             control = inputs[: nominal.size, 0]

@@ -6,6 +6,7 @@ import time as clock
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import final
 
 import numpy as np
@@ -37,17 +38,24 @@ BETTER = 1e-6  # of the cost of what is left: less than that is no better
 @dataclass(frozen=True, eq=False)
 class Plan:
     """A proven decision ``(n,)`` of a transcribed problem, whose time 0 is the beginning of piece ``first`` of the
-    control that it is a plan for; ``cuts`` are the constraints that mattered."""
+    control that it is a plan for; ``cuts`` are the constraints that mattered. ``known`` is the problem, or the same one
+    from another initial state than its own, ``state (d,)``."""
 
-    model: Transcription
+    known: Transcription
     decision: Array
     first: int = 0
     cuts: Sequence[Cut] = ()
+    state: Array | None = None
+
+    @cached_property
+    def model(self) -> Transcription:
+        """The transcribed problem; written down when it is asked for, since a controller does without it."""
+        return self.known if self.state is None else from_state(self.known, self.state)
 
     def reach(self, piece: int, state: Array, control: Array) -> tuple[Array, Array] | None:
         """The least and the largest of every state ``(d,)`` to which a piece that begins in ``state (d,)`` may lead
         under a ``control (m,)``; ``None`` where that is not told from one piece alone."""
-        problem, response = self.model.problem, self.model.response
+        problem, response = self.known.problem, self.known.response
         if problem.system.parameters is not None or problem.system.delay > 0.0 or problem.system.switches:
             return None
         if problem.disturbance is not None and problem.disturbance_class != "piecewise_constant":
@@ -68,7 +76,7 @@ class Plan:
         """What the disturbance was on a piece that led from ``state (d,)`` to ``after (d,)`` under a ``control (m,)``:
         the number of its own piece, its value ``(mw,)``, what of the state that leaves unexplained ``(d,)``, and by how
         much at most an error of the state grows in the value; ``None`` where the state does not tell it."""
-        problem, response, signal = self.model.problem, self.model.response, self.model.functionals.disturbance
+        problem, response, signal = self.known.problem, self.known.response, self.known.functionals.disturbance
         numbers = np.flatnonzero(response.grid.control_piece == piece).tolist()
         if problem.disturbance is None or signal is None or signal.starts is None or len(numbers) != 1:
             return None
@@ -87,7 +95,7 @@ class Plan:
     def drawn_in(self, control: Array, nominal: Array) -> Array:
         """A control ``(m,)`` within the set of controls: as it is, but for rounding, where the proof covers what was
         measured."""
-        bound = self.model.problem.control
+        bound = self.known.problem.control
         flat = bound.halfspaces()
         if bound.is_box:
             box = bound.bounding_box()
@@ -102,8 +110,8 @@ class Plan:
     def left(self, piece: int, innovations: Sequence[Array]) -> Array:
         """The nominal control ``(m, K')`` that is left from piece ``piece`` of this plan on, when nothing more happens
         than what was seen: one innovation ``(d,)`` for each breakpoint so far."""
-        nominal = self.model.pieces(self.decision)[:, piece:]
-        feedback = self.model.feedback
+        nominal = self.known.pieces(self.decision)[:, piece:]
+        feedback = self.known.feedback
         if feedback is None:
             return nominal
         gains = feedback.loop.gains(self.decision)[piece:, : len(innovations)]
@@ -111,18 +119,18 @@ class Plan:
 
     def cost_left(self, piece: int, innovations: Sequence[Array]) -> float:
         """The cost of that under feedback: of the nominal control, or of its peaks over what may still happen."""
-        feedback, problem = self.model.feedback, self.model.problem
+        feedback, problem = self.known.feedback, self.known.problem
         assert feedback is not None
         nominal, spread = self.left(piece, innovations), feedback.loop.spread
         size = np.abs(nominal)
         if feedback.policy.cost == "peak":
             effects = feedback.loop.effects(self.decision)[piece:].copy()
-            begin, grid = float(self.model.control.breakpoints[piece]), self.model.response.grid
+            begin, grid = float(self.known.control.breakpoints[piece]), self.known.response.grid
             acting = feedback.loop.entries[grid.breakpoints[1:] > begin]  # (L', mw, Q): which deviations act later
             effects[:, :, np.abs(acting).sum(axis=(0, 1)) == 0.0] = 0.0
             size = np.maximum(nominal.T + spread.support(effects), -nominal.T + spread.support(-effects)).T
         weights = problem.cost.l1 * np.asarray(problem.weights)
-        return float(weights @ size @ self.model.control.lengths[piece:])
+        return float(weights @ size @ self.known.control.lengths[piece:])
 
 
 @final
@@ -214,15 +222,15 @@ class Resolving:
 
     def _tuned(self, plan: Plan, piece: int, state: Array, innovations: Sequence[Array]) -> Solved:
         """The same gains with the best nominal control for them, where `Retuning` knows such problems."""
-        retuning = next((one for one in self._retuning if one.model is plan.model), None)
+        retuning = next((one for one in self._retuning if one.model is plan.known), None)
         if retuning is None:
-            retuning = Retuning(plan.model, plan.decision)
+            retuning = Retuning(plan.known, plan.decision)
             self._retuning = [*self._retuning[:1], retuning]  # that of the plan that loops begin with, and the last
         begun = piece - plan.first
         found = retuning.solve(begun, state)
         if found is None:
             return Solved(None)
-        decision = retuned(plan.model, plan.decision, begun, plan.left(begun, innovations), found.decision)
+        decision = retuned(plan.known, plan.decision, begun, plan.left(begun, innovations), found.decision)
         tuned = replace(plan, decision=decision)
         cost, known = (one.cost_left(begun, innovations) for one in (tuned, plan))
         return Solved(tuned, cost, cheaper=cost < known - BETTER * max(abs(known), abs(cost)))
@@ -277,9 +285,8 @@ class Resolving:
         theirs = np.repeat(units.controls, own.control.functions)
         known = float(own.program.cost(plan.left(piece - plan.first, innovations).ravel() / theirs))
         decision, cost = found.decision * theirs, units.cost * found.cost
-        moved = from_state(model, state)
         return Solved(
-            Plan(moved, decision, piece),
+            Plan(model, decision, piece, state=state.copy()),
             cost,
             units.cost * found.lower,
             found.cost < known - BETTER * max(abs(known), abs(found.cost)),

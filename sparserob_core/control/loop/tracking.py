@@ -7,6 +7,7 @@ only the nominal state is new.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, final
@@ -21,6 +22,7 @@ from sparserob_core.sip.program import TOLERANCE
 from sparserob_core.sip.relaxed.warm import WarmProgram
 
 PARTS, LEVELS = 32, 3  # a cell that is open is cut in so many parts, so many times
+SHARP = 2  # the level on which the instant of a new row lies at least
 TERMS = 8  # of the Taylor expansion that bounds a curvature
 ROUND_OFF = 2.0**-46  # of the numbers that are added up
 MARGIN = 2e-9  # by which rows are tightened, in their own units
@@ -135,6 +137,8 @@ class Tracking:
         self.factors = np.array(factors)
         self.last = np.linalg.norm(self.rates[-1] @ self.A, axis=1)
         self.growth = float(np.linalg.norm(self.A, 2))
+        self._summed = np.tile(np.eye(self.h.size), (TERMS, 1))
+        self._series: dict[float, tuple[Array, Array]] = {}
         self._blocks: dict[tuple[int, int], _Instants] = {}
         self._offsets: dict[int, tuple[Array, Array]] = {}
         self._given = self.kernel @ self.E
@@ -146,6 +150,7 @@ class Tracking:
             self._first = np.concatenate(ends)
             self._bent, made = self._answering.bending(lambda rates: self._curvature(rates, self.length))
         self._flat = self.nodes.reshape(-1, self.nodes.shape[2])
+        self._sizes = np.abs(self.powers)
         self._absolute = ROUND_OFF * np.abs(self.H).T
         number = np.arange(self.K + 1)[:, None]
         self._seen = (number >= self.start) & (number <= self.stop)
@@ -164,17 +169,15 @@ class Tracking:
     def solve(self, state: Array) -> Tracked | None:
         """The answer from an initial state; ``None`` where none was proven."""
         if len(self._places) > KEPT:
-            needed = list(dict.fromkeys(self._recent))[-KEPT // 2 :]
-            self._begin()
-            if needed:
-                self._impose(needed)
-        for _ in range(ROUNDS):
+            self._forget()
+        nominal = self._undriven(state)
+        for round_ in range(ROUNDS):
             h = self._right - self._free @ state
             found = self._program.solve(h - MARGIN)
             if found is None:
                 return None
             x, y = found
-            open_ = self._open(x, state)
+            open_ = self._open(x, *nominal)
             if open_ is None:
                 return None
             if not open_:
@@ -184,8 +187,25 @@ class Tracking:
             fresh = [place for place in open_ if place not in self._places]
             if not fresh:
                 return None
-            self._impose(fresh)
+            self._impose(fresh + self._between(fresh) if round_ else fresh)
         return None
+
+    def _forget(self) -> None:
+        """Leave out the rows that had no multiplier for long."""
+        needed = set(list(dict.fromkeys(self._recent))[-KEPT // 2 :])
+        kept = self._program.keep(np.array([place in needed for place in self._places], dtype=bool))
+        self._places = [self._places[i] for i in np.flatnonzero(kept)]
+        self._free, self._right = self._free[kept], self._right[kept]
+
+    def _between(self, fresh: list[tuple[int, int, int, int]]) -> list[tuple[int, int, int, int]]:
+        """Instants halfway from new ones to the next on both sides: a peak between two rows is else halved round by
+        round."""
+        found = list[tuple[int, int, int, int]]()
+        for row, piece, level, number in fresh:
+            known = sorted(n for *same, n in self._places if same == [row, piece, level])
+            after = bisect_left(known, number)
+            found += [(row, piece, level, (number + n) // 2) for n in known[max(after - 1, 0) : after + 1]]
+        return [place for place in dict.fromkeys(found) if place not in fresh and place not in self._places]
 
     def _impose(self, places: list[tuple[int, int, int, int]]) -> None:
         G, F, right = [], [], []
@@ -206,16 +226,22 @@ class Tracking:
         self._right = np.concatenate([self._right, right])
         self._places += places
 
-    def _open(self, x: Array, state: Array) -> list[tuple[int, int, int, int]] | None:
+    def _undriven(self, state: Array) -> tuple[Array, Array]:
+        """The states ``(K + 1, d)`` at the breakpoints without control, and what rounding may do to the rows there,
+        ``(K + 1, R)``."""
+        return self.powers @ state + self.fixed, self._noise + self._sizes @ np.abs(state) @ self._absolute
+
+    def _open(self, x: Array, undriven: Array, noise: Array) -> list[tuple[int, int, int, int]] | None:
         """The worst instant of every row in every run of cells in which it is not proven to hold; none where all are
         proven, ``None`` where that is not told."""
-        nodes = (self._flat @ x).reshape(self.fixed.shape) + self.powers @ state + self.fixed
-        noise = self._noise + np.abs(self.powers) @ np.abs(state) @ self._absolute
+        nodes = (self._flat @ x).reshape(self.fixed.shape) + undriven
         drives = x.reshape(self.m, self.K).T @ self.B.T + self.drift
         heights = nodes @ self.H.T + self._first - self.h
         wrong = (heights + noise > TOLERANCE) & self._seen
         if wrong.any():
-            return self._peaks(np.where(wrong, heights, -np.inf), 0, np.zeros(self.K + 1, int), np.arange(self.K + 1))
+            worst = np.where(wrong, heights, -np.inf)
+            peaks = self._peaks(worst, 0, np.zeros(self.K + 1, int), np.arange(self.K + 1))
+            return self._sharpened(peaks, nodes, drives)
         rates = nodes[:-1] @ self.A.T + drives
         bent = (self._curvature(rates, self.length) + self._bent) * (self.length**2 / 8.0)
         noise = np.maximum(noise[:-1], noise[1:])
@@ -242,7 +268,7 @@ class Tracking:
                     still = ((above > TOLERANCE) & self._inside[k]).any(axis=1)
                     left += [(k, first + int(one)) for one in np.flatnonzero(still)]
             if found:
-                return found
+                return self._sharpened(found, nodes, drives)
             cells = left
         return None if cells else []
 
@@ -252,15 +278,44 @@ class Tracking:
         top = (worst > padded[:-2]) & (worst >= padded[2:]) & np.isfinite(worst)
         return [(int(row), int(pieces[k]), level, int(at[k])) for k, row in np.argwhere(top)]
 
+    def _sharpened(
+        self, places: list[tuple[int, int, int, int]], nodes: Array, drives: Array
+    ) -> list[tuple[int, int, int, int]]:
+        """Where the rows at these places are worst close by: a row at the very peak of a trajectory saves the rounds
+        that would come closer to it one by one."""
+        found = []
+        for row, piece, level, number in places:
+            while level < SHARP:
+                size, tried = PARTS**level, list[tuple[float, int, int]]()
+                for before in (1, 0):  # the cells that end and begin in the instant
+                    k, cell = (piece - 1, size - 1) if number < before else (piece, number - before)
+                    k, cell = (k + 1, 0) if cell == size else (k, cell)
+                    if 0 <= k < self.K and self._inside[k, row]:
+                        at = self._block(level + 1, cell)
+                        states = at.flow @ nodes[k] + at.driven @ drives[k]
+                        heights = states @ self.H[row] + self._at(level + 1, cell, k)[:, row]
+                        worst = int(heights.argmax())
+                        tried.append((float(heights[worst]), k, cell * PARTS + worst))
+                if not tried:
+                    break
+                _, piece, number = max(tried)
+                level += 1
+            found.append((row, piece, level, number))
+        return list(dict.fromkeys(found))
+
     def _curvature(self, rates: Array, width: float) -> Array:
         """Bounds ``(..., R)`` of the second derivative over a cell in whose beginning the states have ``rates (...,
         d)``."""
-        total, power = np.zeros((*rates.shape[:-1], self.h.size)), 1.0
-        for factor, row in zip(self.factors.tolist(), self.rates, strict=True):
-            total += (factor * power) * np.abs(rates @ row.T)
-            power *= width
-        tail = self.factors[-1] / TERMS * power * np.exp(self.growth * width)
-        return np.asarray(total + tail * np.linalg.norm(rates, axis=-1, keepdims=True) * self.last)
+        if rates.ndim > 2:
+            return np.array([self._curvature(one, width) for one in rates]).reshape(*rates.shape[:-1], self.h.size)
+        if width not in self._series:
+            powers = np.cumprod([1.0] + [width] * TERMS)
+            tail = self.factors[-1] / TERMS * powers[-1] * np.exp(self.growth * width)
+            terms = np.array(self.rates) * (self.factors * powers[:-1])[:, None, None]  # (TERMS, R, d)
+            self._series[width] = terms.reshape(-1, rates.shape[-1]).T.copy(), tail * self.last
+        terms, tail = self._series[width]
+        sizes = np.sqrt(np.einsum("ki,ki->k", rates, rates))
+        return np.asarray(np.abs(rates @ terms) @ self._summed + sizes[:, None] * tail)
 
     def _block(self, level: int, parent: int) -> _Instants:
         """The ``PARTS + 1`` ends of the parts of one cell of the level before."""

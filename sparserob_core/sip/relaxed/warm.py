@@ -6,6 +6,7 @@ from __future__ import annotations
 from typing import Any, final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sparserob_core.sip.convex_set import Array
 
@@ -23,6 +24,7 @@ class WarmProgram:
     def __init__(self, weights: Array, lower: Array, upper: Array) -> None:
         import highspy
 
+        self._optimal = highspy.HighsModelStatus.kOptimal
         self.weights, self.lower, self.upper = weights, lower, upper
         self.G = np.zeros((0, weights.size))
         n = weights.size
@@ -36,18 +38,34 @@ class WarmProgram:
 
     def add(self, G: Array) -> None:
         """More rows ``(r, n)``."""
-        places = np.arange(2 * self.weights.size, dtype=np.int32)
-        for row in G:
-            self._highs.addRow(-np.inf, np.inf, places.size, places, np.concatenate([row, -row]))
+        r, n = G.shape
+        starts, places = np.arange(r, dtype=np.int32) * (2 * n), np.tile(np.arange(2 * n, dtype=np.int32), r)
+        free = np.full(r, np.inf)
+        self._highs.addRows(r, -free, free, places.size, starts, places, np.hstack([G, -G]).ravel())
         self.G = np.vstack([self.G, G])
+
+    def keep(self, wanted: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Leave out rows but for those that are ``wanted (r,)`` and those that are active now, so that the basis is one
+        without them too; which rows are kept ``(r,)``."""
+        import highspy
+
+        basis, basic = self._highs.getBasis(), highspy.HighsBasisStatus.kBasic
+        status = list(basis.row_status) if basis.valid else [basic] * wanted.size
+        kept: NDArray[np.bool_] = wanted | np.array([one != basic for one in status], dtype=bool)
+        gone = np.flatnonzero(~kept).astype(np.int32)
+        self._highs.deleteRows(gone.size, gone)
+        if basis.valid:
+            basis.row_status = [one for one, stays in zip(status, kept, strict=True) if stays]
+            self._highs.setBasis(basis)
+        self.G = self.G[kept]
+        return kept
 
     def solve(self, h: Array) -> tuple[Array, Array] | None:
         """``x (n,)`` and multipliers ``y (r,)``, for right-hand sides ``h (r,)``; ``None`` where there is no
         optimum."""
-        for row, right in enumerate(h.tolist()):
-            self._highs.changeRowBounds(row, -np.inf, right)
+        self._highs.changeRowsBounds(h.size, np.arange(h.size, dtype=np.int32), np.full(h.size, -np.inf), h)
         self._highs.run()
-        if str(self._highs.getModelStatus()).rpartition(".")[2] != "kOptimal":
+        if self._highs.getModelStatus() != self._optimal:
             return None
         found, n = self._highs.getSolution(), self.weights.size
         values = np.array(found.col_value)

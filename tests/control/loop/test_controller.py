@@ -10,6 +10,7 @@ from scipy.linalg import expm
 import sparserob_core as sr
 from sparserob_core.control.loop.remaining import remaining
 from sparserob_core.control.studies.adversary import find_adversary
+from sparserob_core.sip.proof.branch_and_bound import prove
 
 BASE = {
     "problem": {
@@ -192,6 +193,18 @@ def test_the_cost_that_a_policy_has_left_is_the_cost_of_its_program(plans) -> No
     for name in ("nominal", "peak"):
         plan = sr.controller(plans[name]).plan
         assert plan.cost_left(0, [np.zeros(2)]) == pytest.approx(plans[name].result.cost, rel=1e-7)
+
+
+def test_a_plan_that_was_solved_anew_offers_its_program_from_the_measured_state(plans) -> None:
+    controller, state = sr.controller(plans["open loop"], True), np.array([-0.99, 1.0])
+    controller.step(0.0, state)  # not the initial state of the problem: the old plan proves nothing
+    state[:] = 7.0
+    assert controller.covered
+    plan = controller.plan
+    assert np.asarray(plan.model.problem.initial_state).tolist() == [-0.99, 1.0]
+    assert plan.model is plan.model
+    assert all(proof.verdict == "proven" for proof in prove(plan.model.program, plan.decision))
+    assert plan.model.program.cost(plan.decision) == pytest.approx(controller.steps[-1].cost, rel=1e-12)
 
 
 def test_what_is_left_at_the_beginning_is_the_problem_itself(plans) -> None:

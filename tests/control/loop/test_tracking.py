@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.control.loop.tracking import Tracking, trackable
+from sparserob_core.control.loop.tracking import PARTS, SHARP, Tracking, trackable
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.transcription.transcribe import from_state, in_own_units, prepare
 from sparserob_core.sip.program import TOLERANCE
@@ -65,11 +65,34 @@ def test_what_it_leaves_open_is_violated_or_not_told() -> None:
     for share in (0.0, 1e-9, 1e-7, 1e-4, 0.1):
         x = np.clip(best + share * rng.uniform(-1, 1, best.size), low, high)
         verdicts = [proof.verdict for proof in prove(from_state(own, state).program, x)]
-        open_ = tracking._open(x, state)
+        open_ = tracking._open(x, *tracking._undriven(state))
         if open_ == []:
             assert "refuted" not in verdicts
         if verdicts == ["proven", "proven"]:
             assert not open_
+
+
+def test_new_rows_lie_at_the_peaks_of_what_is_violated() -> None:
+    own, units = spring()
+    tracking, state = Tracking(own), np.array([-1, 1]) / units.states
+    best, moved, seen = tracking.solve(state).decision, from_state(own, state), 0
+    for share in (1e-6, 1e-4, 0.1):
+        x, finest = (1.0 - share) * best, PARTS**SHARP
+        open_ = tracking._open(x, *tracking._undriven(state))
+        assert open_
+        for row, piece, level, number in open_:
+            if piece == tracking.stop[row] == tracking.start[row]:
+                continue  # a time alone
+            assert level == SHARP
+            seen += 1
+            begin, end = tracking.start[row] * tracking.length, tracking.stop[row] * tracking.length
+            times = np.clip((piece + (number + np.array([-1, 0, 1])) / finest) * tracking.length, begin, end)
+            before, here, after = moved.functionals.values(
+                x, times, np.tile(tracking.H[row], (3, 1)), np.zeros((3, 0))
+            )  # fmt: skip
+            assert here > tracking.h[row] + TOLERANCE
+            assert here >= max(before, after) - 1e-12
+    assert seen
 
 
 def test_its_bounds_lie_above_the_worst_case_between_the_instants() -> None:
@@ -109,6 +132,39 @@ def test_many_states_do_not_let_it_grow() -> None:
 def test_what_it_does_not_know_it_leaves_to_the_exchange() -> None:
     assert not trackable(spring(control_step=sr.Box([-0.2], [0.2]))[0])
     assert not trackable(spring(initial_set=sr.Box([-0.1, -0.1], [0.1, 0.1]))[0])
+
+
+def test_rows_that_are_not_active_are_left_out_and_the_optimum_stays() -> None:
+    rng = np.random.default_rng(5)
+    warm, G = WarmProgram(rng.uniform(0.5, 2, 12), -np.ones(12), np.ones(12)), rng.standard_normal((9, 12))
+    warm.add(G)
+    h = rng.uniform(-1.5, 2.0, 9)
+    x, y = warm.solve(h)
+    kept = warm.keep(np.arange(9) == 3)
+    assert kept[3]
+    assert kept[y > 0.0].all()
+    assert 2 <= kept.sum() < 9
+    again, multipliers = warm.solve(h[kept])
+    assert again == pytest.approx(x, abs=1e-9)
+    assert multipliers == pytest.approx(y[kept], abs=1e-9)
+    assert warm._highs.getInfo().simplex_iteration_count == 0  # the basis is one of what is left
+    warm.add(G[~kept])
+    right = np.concatenate([h[kept], h[~kept]])
+    assert warm.bound(right, warm.solve(right)[1]) == pytest.approx(warm.weights @ np.abs(x), abs=1e-9)
+
+
+def test_rows_that_were_never_solved_or_have_no_solution_are_left_out_too() -> None:
+    for begun in (False, True):
+        warm = WarmProgram(np.ones(2), -np.ones(2), np.ones(2))
+        warm.add(np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]]))
+        if begun:
+            assert warm.solve(np.array([-2.0, 0.0, 0.0])) is None
+        warm.add(np.array([[0.0, -1.0]]))
+        kept = warm.keep(np.array([False, True, False, True]))
+        assert kept[[1, 3]].all()
+        x, y = warm.solve(np.array([0.0, 1.0, 0.0, -0.5])[kept])
+        assert x == pytest.approx([0.0, 0.5], abs=1e-9)
+        assert warm.bound(np.array([0.0, 1.0, 0.0, -0.5])[kept], y) == pytest.approx(0.5, abs=1e-9)
 
 
 def test_the_bound_of_a_linear_program_is_its_optimum() -> None:
