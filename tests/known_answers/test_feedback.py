@@ -386,11 +386,6 @@ def test_the_margin_of_a_policy_is_bracketed_where_independent_programs_found_it
     assert found.amounts[0] >= 0.33612 and found.amounts[1] <= 0.33622
 
 
-def test_sets_of_initial_states_are_refused_with_a_policy(tmp_path: Path) -> None:
-    with pytest.raises(sr.InputError, match="open_loop"):
-        sr.initial_states(config(SPRING, 10), out=tmp_path / "states")
-
-
 def test_a_record_is_solved_without_files() -> None:
     problem = sr.OptimalControlProblem(
         system=sr.LinearSystem([[0, 1], [0, 0]], [[0], [1]], [[0], [1]]),

@@ -16,11 +16,13 @@ import numpy as np
 
 from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.control.enclosures.cache import remember
+from sparserob_core.control.transcription.feedback import made_again
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.transcribe import from_state
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Cut
+from sparserob_core.sip.finite import UncertainRows
 from sparserob_core.sip.program import (
     TOLERANCE,
     ConstraintFamily,
@@ -50,6 +52,15 @@ class InitialPlane:
     centre: Array
     radius: Array
     _programs: dict[bytes, SemiInfiniteProgram] = field(default_factory=dict, repr=False)
+
+    @cached_property
+    def free(self) -> InitialPlane:
+        """The same plane where nothing has a price that needs variables of its own."""
+        feedback = self.model.feedback
+        if feedback is None or feedback.policy.cost == "nominal":
+            return self
+        model = made_again(self.model, feedback.policy.model_copy(update={"cost": "nominal"}))
+        return InitialPlane(model, self.states, self.centre, self.radius)
 
     def point(self, z: Array) -> Array:
         """The two coordinates ``(..., 2)`` of the initial state."""
@@ -87,8 +98,12 @@ class InitialPlane:
         initial states.
 
         ``known`` are constraints that are likely to matter: they are among the program's fixed rows, which changes
-        nothing but its work.
+        nothing but its work; under feedback, what a method begins with.
         """
+        if self.free is not self:
+            return self.free.support(direction, known)
+        if self.model.feedback is not None:
+            return self._support_under_feedback(direction, known)
         base, finite, n = self._base, self._base.finite, self._base.n
         G, h = self._rows(known)
         A = None if base.A is None else np.hstack([base.A, self._columns])
@@ -105,6 +120,29 @@ class InitialPlane:
             families=self._families,
             channels=base.channels,
         )
+
+    def _support_under_feedback(self, direction: Array, known: Sequence[Cut]) -> SemiInfiniteProgram:
+        base, finite, n = self._base, self._base.finite, self._base.n
+
+        def settle(x: Array) -> Array:
+            settled = self.at(x[-2:]).settle
+            return x if settled is None else np.append(settled(x[:-2]), x[-2:])
+
+        return SemiInfiniteProgram(
+            n=n + 2,
+            q=np.concatenate([np.zeros(n), -direction]),
+            lower=np.append(finite.lower, [-1.0, -1.0]),
+            upper=np.append(finite.upper, [1.0, 1.0]),
+            families=[_JoinedUncertain(self, family).family(known) for family in base.families],
+            channels=base.channels,
+            spread=base.spread,
+            settle=None if base.settle is None else settle,
+        )
+
+    @cached_property
+    def ends(self) -> list[SemiInfiniteProgram]:
+        """The ordinary programs where one of ``z`` is 1 and the other 0."""
+        return [from_state(self.centred, self._state(z)).program for z in np.eye(2)]
 
     def _rows(self, cuts: Sequence[Cut]) -> tuple[Array | None, Array | None]:
         if not cuts:
@@ -206,6 +244,77 @@ class _Joined:
     def explain(self, index: Array, row: int) -> Explanation:
         """The constraint for people, without what the initial state gives: it is free."""
         said = self.plane.model.program.family(self.base.name).explanation(index, row)
+        return said.from_any_state() if isinstance(said, TimedExplanation) else said
+
+    def _at(self, x: Array) -> ConstraintFamily:
+        return self.plane.at(x[-2:]).family(self.base.name)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _JoinedUncertain:
+    """One family of the ordinary program under feedback as a family in ``(v, M, z)``: at every deviation its rows are
+    affine in the initial state, which enters their right-hand sides alone."""
+
+    plane: InitialPlane
+    base: ConstraintFamily
+
+    def family(self, known: Sequence[Cut]) -> ConstraintFamily:
+        base = self.base
+        assert base.start is not None
+        d = base.index_set.dimension
+        begun = [cut.index[:d] for cut in known if cut.family == base.name]
+        family = ConstraintFamily(
+            name=base.name,
+            index_set=base.index_set,
+            rows=base.rows,
+            uncertain=self.uncertain,
+            excess=self.excess,
+            start=np.unique(np.vstack([base.start, *begun]), axis=0),
+            worst=self.worst,
+            cells=base.cells,
+            enclosure=self.enclosure,
+            explain=self.explain,
+            row_units=base.row_units,
+            index_units=base.index_units,
+            source=base.source,
+        )
+        literal = base.literal
+        return family if literal is None else replace(family, literal=replace(literal, explain=self.explain))
+
+    def uncertain(self, index: Array) -> UncertainRows:
+        """The rows at the centre, and two columns more."""
+        from scipy.sparse import csr_array, hstack
+
+        one, *others = (
+            each.uncertain for each in (self.base, *(end.family(self.base.name) for end in self.plane.ends))
+        )
+        assert one is not None
+        rows = one(index)
+        moved = np.stack([rows.h - other(index).h for other in others if other is not None], axis=1)
+        n = rows.g.shape[1] + 2
+        wider = tuple(csr_array((C.data, C.indices, C.indptr), shape=(C.shape[0], n)) for C in rows.C)
+        return replace(rows, g=csr_array(hstack([rows.g, csr_array(moved)])), C=wider)
+
+    def excess(self, x: Array, indices: Array) -> Array:
+        """The violations from that initial state."""
+        return self._at(x).violations(x[:-2], indices)
+
+    def worst(self, x: Array) -> Separation:
+        """The separation of the family at that initial state."""
+        worst = self._at(x).worst
+        assert worst is not None
+        return worst(x[:-2])
+
+    def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
+        """The enclosure of the family at that initial state."""
+        enclosure = self._at(x).enclosure
+        assert enclosure is not None
+        return enclosure(x[:-2], lower, upper)
+
+    def explain(self, index: Array, row: int) -> Explanation:
+        """The constraint for people, without what the initial state gives: it is free."""
+        said = self.plane.model.program.family(self.base.name).explanation(index[: self.base.index_set.dimension], row)
         return said.from_any_state() if isinstance(said, TimedExplanation) else said
 
     def _at(self, x: Array) -> ConstraintFamily:

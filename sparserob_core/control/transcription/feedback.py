@@ -39,9 +39,9 @@ FINER = 2.0**-11  # of the numbers that are added up, the unit of an equality: i
 
 def with_feedback(
     problem: OptimalControlProblem, model: Transcription, own: Transcription, units: Units, policy: AffinePolicy
-) -> Transcription:
+) -> tuple[Transcription, Transcription]:
     """The program of a problem under a policy, from its transcription ``model`` without feedback and without terminal
-    equalities, and the same in its ``own`` ``units``."""
+    equalities, and the same in its ``own`` ``units``: the user's and the own one."""
     pieces = measurable_pieces(own.functionals)
     spread = _spread(own, pieces)
     begins = own.problem.initial_set is not None
@@ -58,8 +58,14 @@ def with_feedback(
     acting = None if pieces is None else pieces.in_units_of(model.functionals, units.states, units.disturbances)
     fixed = _fixed(problem, own, units)
     repeated = own.control.pieces
-    mine = _program(model, policy, known, acting, fixed[0], _steps(model.problem, repeated, own=False))
-    theirs = _program(own, policy, scaled, pieces, fixed[1], _steps(own.problem, repeated, own=True))
+
+    def in_users(one: Transcription, policy: AffinePolicy) -> tuple[SemiInfiniteProgram, ClosedLoop]:
+        return _program(one, policy, known, acting, fixed[0], _steps(one.problem, repeated, own=False))
+
+    def in_own(one: Transcription, policy: AffinePolicy) -> tuple[SemiInfiniteProgram, ClosedLoop]:
+        return _program(one, policy, scaled, pieces, fixed[1], _steps(one.problem, repeated, own=True))
+
+    mine, theirs = in_users(model, policy), in_own(own, policy)
     told = [
         _told_by(family, other, units, deviations, own)
         for family, other in zip(theirs[0].families, mine[0].families, strict=True)
@@ -73,7 +79,25 @@ def with_feedback(
         ]
     )[: scaled_program.n]
     program = mine[0].mirrored(lambda _: OwnUnits(scaled_program, decision, decision, np.zeros(0), units.cost))
-    return replace(model, problem=problem, program=program, feedback=Feedback(policy, mine[1]))
+    scaled_problem = units.of_problem(problem)
+    return (
+        replace(model, problem=problem, program=program, feedback=Feedback(policy, mine[1], in_users)),
+        replace(own, problem=scaled_problem, program=scaled_program, feedback=Feedback(policy, theirs[1], in_own)),
+    )
+
+
+def made_again(model: Transcription, policy: AffinePolicy) -> Transcription:
+    """The transcription with the program that belongs to its initial state and to a policy that costs something
+    else."""
+    assert model.feedback is not None
+    program, loop = model.feedback.made(model, policy)
+    named = {family.name: family for family in model.program.families}
+    families = [
+        replace(one, explain=told.explain, row_units=told.row_units, index_units=told.index_units)
+        for one, told in ((one, named.get(one.name, one)) for one in program.families)
+    ]
+    program = replace(program, families=families, cost_unit=model.program.cost_unit)
+    return replace(model, program=program, feedback=replace(model.feedback, policy=policy, loop=loop))
 
 
 def _fixed(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import final
 
@@ -38,10 +39,14 @@ class RowUnits:
 @final
 @dataclass(frozen=True, eq=False)
 class Feedback:
-    """How the control of a transcribed problem answers what it measures: its ``policy`` and the closed ``loop``."""
+    """How the control of a transcribed problem answers what it measures: its ``policy`` and the closed ``loop``.
+
+    ``made(model, policy)``: the program and the loop of another transcription of the problem, in the same units, from
+    another initial state, under a policy that differs in what it costs."""
 
     policy: AffinePolicy
     loop: ClosedLoop
+    made: Callable[[Transcription, AffinePolicy], tuple[SemiInfiniteProgram, ClosedLoop]]
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,7 +27,7 @@ from sparserob_core.control.response.quadratic import quadratic_cost
 from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.response.response import SAME_TIME, Response, merge_grids
 from sparserob_core.control.sets.sets import Equality
-from sparserob_core.control.transcription.feedback import refuse, with_feedback
+from sparserob_core.control.transcription.feedback import made_again, refuse, with_feedback
 from sparserob_core.control.transcription.own_units import (
     RESOLVED,
     extent,
@@ -96,14 +96,22 @@ def prepare(
         refuse(problem, control, disturbance, policy.cost)
         if formulation != "reduced":
             raise InputError(f"formulation: expected reduced with policy: affine, got {formulation!r}")
-        ends = [end for end in problem.terminal if not isinstance(end, Equality)]
-        model = _assembled(replace(problem, terminal=ends), control, disturbance, formulation)
-        return with_feedback(problem, model, *in_own_units(model), policy)
+        return _answering(problem, control, disturbance, policy)[0]
     model = _assembled(problem, control, disturbance, formulation)
     if policy is not None and policy.knows:
         known = ", ".join(sorted(policy.knows))
         raise InputError(path="policy.name", expected="open_loop or affine", got=f"one that knows the {known}")
     return replace(model, program=model.program.mirrored(lambda _: _in_own_units(model)))
+
+
+def _answering(
+    problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary, policy: AffinePolicy
+) -> tuple[Transcription, Transcription, Units]:
+    """A problem under a policy, in the user's units, in its own, and these."""
+    ends = [end for end in problem.terminal if not isinstance(end, Equality)]
+    model = _assembled(replace(problem, terminal=ends), control, disturbance, "reduced")
+    own, units = in_own_units(model)
+    return *with_feedback(problem, model, own, units, policy), units
 
 
 def _functionals(
@@ -179,6 +187,8 @@ def _assembled(
 def in_own_units(model: Transcription) -> tuple[Transcription, Units]:
     """The same problem in its own units (decision 0016), every row divided by its own, and these units; its families
     are explained in the user's."""
+    if model.feedback is not None:
+        return _answering(model.problem, model.control, model.disturbance, model.feedback.policy)[1:]
     problem, rough = model.problem, rough_units(model.problem)
     dictionaries = (model.control, model.disturbance)
     known, _ = _functionals(rough.of_problem(problem), *(rough.of_dictionary(one) for one in dictionaries))
@@ -330,6 +340,9 @@ def from_state(model: Transcription, initial_state: Array) -> Transcription:
     functionals = model.functionals.from_state(initial_state)
     problem = replace(model.problem, initial_state=initial_state)
     constraints = tuple(one.from_state(initial_state) for one in model.constraints)
+    if model.feedback is not None:
+        begun = replace(model, problem=problem, functionals=functionals, constraints=constraints)
+        return made_again(begun, model.feedback.policy)
     moved = {
         one.name: replace(_reduced(one), row_units=told.row_units, index_units=told.index_units)
         for one, told in zip(constraints, model.program.families, strict=False)

@@ -27,7 +27,9 @@ class InitialStates:
 
     ``inner (k, 2)`` and ``outer (k', 2)``: vertices, anticlockwise, of a polygon proven to lie within the set and of
     one proven to contain it, in the units of the states. ``controls (k, m, K)``: a control for each vertex of
-    ``inner``; between them, convex combinations serve. ``directions (n, 2)`` with ``bounds (n,)``: half-planes
+    ``inner``; between them, convex combinations serve. Under feedback these are the nominal ones, with the ``gains (k,
+    K, K, m, d)`` of their policies, and the set is that from which some affine policy satisfies every constraint.
+    ``directions (n, 2)`` with ``bounds (n,)``: half-planes
     ``d'x <= bound`` that contain the set, and ``reached (n,)``: what proven points reach. ``points (v, 2)`` with
     ``costs (v,)``: initial states and the cost of a proven control from each, and ``lower_bounds (v,)`` of its optimum.
     ``origin (d,)``: the config's initial state; the coordinates that are not in the plane are as there. ``path``:
@@ -44,6 +46,7 @@ class InitialStates:
     inner: Array = field(default_factory=lambda: np.zeros((0, 2)))
     outer: Array = field(default_factory=lambda: np.zeros((0, 2)))
     controls: Array = field(default_factory=lambda: np.zeros((0, 0, 0)), repr=False)
+    gains: Array = field(default_factory=lambda: np.zeros((0, 0, 0, 0, 0)), repr=False)
     directions: Array = field(default_factory=lambda: np.zeros((0, 2)), repr=False)
     bounds: Array = field(default_factory=lambda: np.zeros(0), repr=False)
     reached: Array = field(default_factory=lambda: np.zeros(0), repr=False)
@@ -102,13 +105,23 @@ class InitialStates:
         return np.inf if weights is None else float(weights @ self.costs)
 
     def control(self, point: npt.ArrayLike) -> Array:
-        """A control ``(m, K)`` that is proven for the initial state at a point ``(2,)`` of the inner polygon; raises
-        `InputError` outside."""
+        """A control ``(m, K)`` that is proven for the initial state at a point ``(2,)`` of the inner polygon, under
+        feedback the nominal one of `policy`; raises `InputError` outside."""
+        return np.asarray(np.tensordot(self._weights(point), self.controls, axes=1))
+
+    def policy(self, point: npt.ArrayLike) -> tuple[Array, Array]:
+        """The nominal control ``(m, K)`` and the gains ``(K, K, m, d)`` of a policy that is proven for the initial
+        state at a point ``(2,)`` of the inner polygon; raises `InputError` outside, and without feedback."""
+        if not self.gains.size:
+            raise InputError("policy: expected a set that was found with policy: affine; without, use control")
+        return self.control(point), np.asarray(np.tensordot(self._weights(point), self.gains, axes=1))
+
+    def _weights(self, point: npt.ArrayLike) -> Array:
         x = _point(point)
         weights = _combination(self.inner, x, np.zeros(self.inner.shape[0]))
         if weights is None:
             raise InputError(f"point: expected one in the inner polygon, got {x.tolist()}")
-        return np.asarray(np.tensordot(weights, self.controls, axes=1))
+        return weights
 
     def summary(self) -> dict[str, Any]:
         """``initial_states.json``."""
@@ -149,7 +162,7 @@ class InitialStates:
             "lower_bounds",
             "origin",
         )
-        return {name: getattr(self, name) for name in names}
+        return {name: getattr(self, name) for name in (*names, *(["gains"] if self.gains.size else []))}
 
     def rows(self) -> list[tuple[str, str]]:
         """What a user wants to know, as rows of a table."""
@@ -169,7 +182,8 @@ class InitialStates:
                 if self.costs.size
                 else []
             )
-            text = {"inside": "feasible, proven", "outside": "infeasible, proven", "open": "between the polygons"}[
+            outside = "no affine policy, proven" if self.gains.size else "infeasible, proven"
+            text = {"inside": "feasible, proven", "outside": outside, "open": "between the polygons"}[
                 self.where(self.start)
             ]
             rows += [("the config's own", f"({self.start[0]:.6g}, {self.start[1]:.6g}): {text}")]

@@ -152,7 +152,7 @@ def _boundaries(ax: Axes, found: InitialStates) -> None:
         linewidth=1.1,
         linestyle=(0, (5, 2.5)),
         zorder=5,
-        label="infeasible outside, proven",
+        label=f"{'no affine policy' if found.gains.size else 'infeasible'} outside, proven",
     )
     if found.inner.shape[0]:
         ax.plot(*_closed(found.inner), color=look.INK, linewidth=1.4, zorder=6, label="feasible inside, proven")

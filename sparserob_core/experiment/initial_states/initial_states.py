@@ -53,7 +53,8 @@ def initial_states(
     or of ``about (d,)``. ``directions``: support functions asked for at most, at least 4. ``values``: costs are
     measured on a lattice of so many points each way, 0 for none. ``within``: only coordinates of at most this size are
     looked at; needed where the set is unbounded. ``out``: a new or empty directory for the config,
-    ``initial_states.json``, ``.npz`` and ``.png``. ``notify`` receives `StudyProgress`. An interrupt, and the limit
+    ``initial_states.json``, ``.npz`` and ``.png``. With ``policy: affine`` they are those from which an affine policy
+    satisfies every constraint. ``notify`` receives `StudyProgress`. An interrupt, and the limit
     ``limits.seconds`` of the config, end the search with what it has proven by then. Raises
     `InputError` when an argument or the config is at fault, and when the set is unbounded.
     """
@@ -66,12 +67,6 @@ def initial_states(
     if not isinstance(experiment, ControlExperiment):
         raise InputError("problem: expected a control problem, which has an initial state, got a semi-infinite program")
     model = experiment.transcription
-    if model.feedback is not None:
-        raise InputError(
-            path="policy.name",
-            expected="open_loop: the set of feasible initial states is one of controls",
-            got="affine",
-        )
     if about is not None:
         model = from_state(model, _about(about, model.problem))
     pair = check_states(states, model.problem.system.states)
@@ -104,6 +99,7 @@ def _in_users_units(own: InitialStates, units: Units, limit: float | None) -> In
         inner=own.inner * x,
         outer=outer,
         controls=own.controls * units.controls[:, None] if own.controls.size else own.controls,
+        gains=own.gains * units.controls[:, None] / units.states if own.gains.size else own.gains,
         directions=normals / norms[:, None],
         bounds=own.bounds / norms,
         reached=own.reached / norms,

@@ -56,6 +56,7 @@ class InitialStatesSearch:
     bounded: bool
     cuts: dict[tuple[float, ...], Sequence[Cut]] = field(default_factory=dict)
     controls: dict[bytes, Array] = field(default_factory=dict)
+    gains: dict[bytes, Array] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
     asked: list[Support] = field(default_factory=list)
     interrupted: str = ""
@@ -82,7 +83,7 @@ class InitialStatesSearch:
         if isinstance(framed, Result):
             # amounts would be relative to rows that hold the initial state in units of the box: of no use
             why = framed.message if framed.infeasible is None else framed.infeasible.sentence(amounts=False)
-            message = f"no initial state of this plane, up to {limit} in size, is feasible: {why}"
+            message = f"no initial state of this plane, up to {limit} in size, is feasible{self._under}: {why}"
             return self._finished(bare, status="infeasible", message=message)
         try:
             self._tell("direction", len(framed), directions)
@@ -109,7 +110,7 @@ class InitialStatesSearch:
         return self._finished(
             found,
             status="certified" if share <= CLOSED else "verified",
-            message=f"between two polygons, both proven, that differ by {share:.2%} of the area",
+            message=f"between two polygons, both proven{self._under}, that differ by {share:.2%} of the area",
         )
 
     def _polygons(self, bare: InitialStates, supports: Sequence[Support], inner: Array) -> InitialStates:
@@ -122,6 +123,7 @@ class InitialStatesSearch:
             inner=vertices,
             outer=outer,
             controls=np.array([self.controls[vertex.tobytes()] for vertex in inner]),
+            gains=np.array([self.gains[vertex.tobytes()] for vertex in inner]) if self.gains else bare.gains,
             directions=normals,
             bounds=np.array([s.bound for s in supports]) / norms + normals @ plane.centre,
             reached=(normals @ vertices.T).max(axis=1, initial=-np.inf),
@@ -137,6 +139,11 @@ class InitialStatesSearch:
             seconds=time.perf_counter() - self.started,
             **changes,
         )
+
+    @property
+    def _under(self) -> str:
+        """What is known of the control, for messages: what is proven infeasible is so for such policies."""
+        return "" if self.plane.model.feedback is None else " for affine policies"
 
     def _size(self, radius: Array) -> str:
         """The size of a box about 0 in the user's units."""
@@ -210,6 +217,9 @@ class InitialStatesSearch:
         point = None if result.decision is None else np.array(result.decision[-2:])
         if point is not None and proven and result.decision is not None:
             self.controls[point.tobytes()] = self.plane.model.pieces(result.decision[:-2])
+            feedback = self.plane.model.feedback
+            if feedback is not None:
+                self.gains[point.tobytes()] = feedback.loop.gains(result.decision[:-2])
         if not proven:
             self.remarks.append(
                 f"in the direction {np.round(direction, 4).tolist()} no point is proven: {result.message}"

@@ -361,16 +361,24 @@ class Growing:
             return False, "HiGHS: a row is refused", np.zeros(0), np.zeros(0)
         if np.isfinite(seconds):
             self.highs.setOptionValue("time_limit", self.highs.getRunTime() + max(seconds, 0.0))
-        self.highs.run()
-        done = self.highs.getInfo()
-        steps = 1 + max(0, done.simplex_iteration_count) + INNER * max(0, done.ipm_iteration_count)
-        self.work = float(steps) * self.highs.getNumNz()
+        steps = self._run()
         status = self.highs.getModelStatus()
+        if status == highspy.HighsModelStatus.kUnknown:  # the last basis led nowhere: once more from none
+            self.highs.clearSolver()
+            steps += self._run()
+            status = self.highs.getModelStatus()
+        self.work = float(steps) * self.highs.getNumNz()
         said = f"HiGHS: {self.highs.modelStatusToString(status)}"
         if status != highspy.HighsModelStatus.kOptimal:
             return False, said, np.zeros(0), np.zeros(0)
         found = self.highs.getSolution()
         return True, said, np.array(found.col_value), -np.array(found.row_dual)
+
+    def _run(self) -> int:
+        """Solve it; the steps that this took."""
+        self.highs.run()
+        done = self.highs.getInfo()
+        return int(1 + max(0, done.simplex_iteration_count) + INNER * max(0, done.ipm_iteration_count))
 
 
 def _both(row: np.ndarray, column: np.ndarray, value: Array, n: int) -> tuple[np.ndarray, np.ndarray, Array]:

@@ -61,8 +61,8 @@ def initial_states(
     """Find the initial states from which the experiment that CONFIG describes is feasible.
 
     They make a convex set. The command prints an inner polygon, every point of which is proven feasible, and an outer
-    one, outside of which every point is proven infeasible, and draws both with the cost as colour. KEY=VALUE changes
-    the config.
+    one, outside of which every point is proven infeasible, and draws both with the cost as colour. With policy: affine,
+    infeasible says that there is no affine policy. KEY=VALUE changes the config.
 
     Exit status: 0 the set is known from both sides, 2 the input is at fault, 3 it is empty, proven, 4 no point is
     proven, 130 interrupted.
