@@ -171,6 +171,16 @@ def test_runs_are_certified_inside_and_infeasible_outside(name: str, tmp_path: P
         assert status(problem, beyond(found, direction, 1e-3), tmp_path / f"out{number}") == "infeasible"
 
 
+@pytest.mark.slow
+def test_a_basis_from_which_the_solver_finds_no_way_is_given_up() -> None:
+    """In one of these programs HiGHS ends with "unknown" where it goes on from the last basis, not from none."""
+    disturbance = {"ellipsoid": {"centre": [0, 0], "shape": [[0.04, 0], [0, 0.04]]}}
+    hard = {"horizon": 5.0, "path": [{"box": [1.5, None]}], "terminal": [{"box": [0.3, 0.3]}]}
+    found = sr.initial_states(config({**SPRING, **hard, "disturbance": disturbance}), directions=4, values=0)
+    assert not found.remarks
+    assert len(found.inner) >= 3
+
+
 @pytest.mark.parametrize("cost", ["nominal", "peak"])
 def test_a_plane_under_feedback_agrees_with_the_problem_transcribed_afresh(cost: str) -> None:
     def problem(x0: np.ndarray) -> sr.OptimalControlProblem:
