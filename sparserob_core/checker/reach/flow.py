@@ -114,7 +114,7 @@ class Remainder:
         monomials = Monomials(len(flow.centre), degree)
         wide = [arb(c, abs(r)) for c, r in zip(flow.centre, flow.radius, strict=True)]
         parts = expanded(flow.system, monomials, wide, flow.radius)
-        T = _coordinates(_middles(flow.parts["A"][0]), horizon, speed)
+        T = _coordinates(middles(flow.parts["A"][0]), horizon, speed)
         exact = arb_mat(T.tolist())
         inverse = exact.inv()
 
@@ -223,14 +223,15 @@ def held(matrix: arb_mat, inputs: arb_mat, time: arb) -> tuple[arb_mat, arb_mat]
     return Phi.parts[0], Gamma.parts[0]
 
 
-def _middles(matrix: arb_mat) -> Array:
+def middles(matrix: arb_mat) -> Array:
+    """The middles of balls."""
     return np.array([[float(x.mid()) for x in row] for row in matrix.tolist()])
 
 
 def _coordinates(A: Array, horizon: float, speed: Array) -> Array:
     """Any invertible matrix would be right; this one keeps ``e^{mu t}`` small: every state in a unit of its own, and
     real modal coordinates where these are not worse conditioned than they help."""
-    units = _balanced(A, horizon, speed)
+    units = balanced(A, horizon, speed)
     scaled = A / units[:, None] * units
     best, least = np.eye(A.shape[0]), np.inf
     for T in (best, _modal(scaled)):
@@ -245,7 +246,7 @@ def _coordinates(A: Array, horizon: float, speed: Array) -> Array:
     return np.asarray(units[:, None] * best, dtype=float)
 
 
-def _balanced(A: Array, horizon: float, speed: Array) -> Array:
+def balanced(A: Array, horizon: float, speed: Array) -> Array:
     """Units ``(d,)`` of the states, powers of two, in which rows and columns of ``A`` are about as large as each other
     (Osborne 1960).
 

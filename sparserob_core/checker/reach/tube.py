@@ -14,7 +14,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.series import Series, norm, upper
 from sparserob_core.checker.reach.disturbance_support import DisturbanceSupports, Scene
-from sparserob_core.checker.reach.flow import Flow, Remainder, beyond, held, in_time, stacked, up_to
+from sparserob_core.checker.reach.flow import Flow, Remainder, beyond, held, in_time, middles, stacked, up_to
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.sip.convex_set import Array
@@ -273,7 +273,7 @@ class Tube:
         from flint import arb
 
         assert self.scene.disturbance is not None
-        inverse = np.abs(_middles(self.remainders[leg].inverse)) * OUTWARD
+        inverse = np.abs(middles(self.remainders[leg].inverse)) * OUTWARD
         effect, far = self.sigmas[leg].effect, np.array(known(self.scene.disturbance).radius)
         every = (np.abs(effect.mid) + effect.rad) @ far  # (P, M, d)
         size = (inverse @ every.sum(axis=0).T).T * OUTWARD**2
@@ -321,10 +321,6 @@ def _exact(value: float) -> arb:
 def _sizes_of(matrix: arb_mat) -> arb_mat:
     """The absolute values of balls."""
     return stacked([[abs(x) for x in row] for row in matrix.tolist()])
-
-
-def _middles(matrix: arb_mat) -> Array:
-    return np.array([[float(x.mid()) for x in row] for row in matrix.tolist()])
 
 
 def _sizes(matrix: arb_mat) -> Array:
