@@ -4,7 +4,6 @@ HiGHS solves it by its interior point method: what proof over all times costs.""
 from __future__ import annotations
 
 import time
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,19 +14,11 @@ from sparserob_core.experiment.config.load import load_config
 from sparserob_core.sip.inner.counterpart import Counterpart
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.methods.own_units import solve_in_own_units
+from tests.support.problems import spring
 
 pytestmark = pytest.mark.benchmark
 
-SPRING: dict[str, Any] = {
-    "name": "linear",
-    "system": {"A": [[0, 1], [-2, -0.5]], "B": [[0], [1]]},
-    "horizon": 5.0,
-    "initial_state": [-1, 1],
-    "control": {"box": 1.0},
-    "disturbance": {"box": [0.3, 0.3]},
-    "path": [{"box": [0.7, None], "from": 0.5}],
-    "terminal": [{"box": [0.3, 0.3]}],
-}
+SPRING = spring(0.3, since=0.5)
 TIMES_AS_LONG = 3.0  # at most: the goal is 1
 
 

@@ -19,6 +19,7 @@ from sparserob_core.errors import SparseRobError
 from sparserob_core.experiment.assemble import dictionaries_of, gap_tolerance, problem_of
 from sparserob_core.experiment.check.check import Check, check
 from sparserob_core.experiment.config.load import load_config
+from tests.support.problems import spring
 from tests.support.subtle import RUNS, SUBTLE
 from tests.support.tampering import (
     CONFIG,
@@ -39,16 +40,7 @@ from tests.support.tampering import (
 
 CRUDE = [*KINDS][::12]
 
-SPRING: dict[str, Any] = {
-    "name": "linear",
-    "system": {"A": [[0, 1], [-2, -0.5]], "B": [[0], [1]]},
-    "horizon": 5.0,
-    "initial_state": [-1, 1],
-    "control": {"box": 1.0},
-    "disturbance": {"box": [0.05, 0.05]},
-    "path": [{"box": [0.7, None], "from": 0.3}],
-    "terminal": [{"box": [0.3, 0.3]}],
-}
+SPRING = spring(0.05)
 DECAY: dict[str, Any] = {
     "name": "linear",
     "system": {"A": [["-p1"]], "B": [[1]], "parameters": {"p1": [0.5, 1.0]}},

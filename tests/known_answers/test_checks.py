@@ -13,17 +13,9 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.experiment.check.check import check
+from tests.support.problems import spring
 
-SPRING: dict[str, Any] = {
-    "name": "linear",
-    "system": {"A": [[0, 1], [-2, -0.5]], "B": [[0], [1]]},
-    "horizon": 5.0,
-    "initial_state": [-1, 1],
-    "control": {"box": 1.0},
-    "disturbance": {"box": [0.04, 0.04]},
-    "path": [{"box": [0.7, None], "from": 0.3}],
-    "terminal": [{"box": [0.3, 0.3]}],
-}
+SPRING = spring(0.04)
 TWO: dict[str, Any] = {**SPRING, "system": {"A": [[0, 1], [-2, -0.5]], "B": [[0, 0.5], [1, 0]]}}
 DIAMOND = {"polytope": {"H": [[1, 1], [1, -1], [-1, 1], [-1, -1]], "h": [1, 1, 1, 1]}}
 ROUND = {"ellipsoid": {"centre": [0, 0], "shape": [[0.5, 0.1], [0.1, 0.4]]}}

@@ -16,18 +16,10 @@ from scipy.sparse import csc_matrix
 
 import sparserob_core as sr
 from sparserob_core.experiment.check.check import check
+from tests.support.problems import spring
 from tests.support.tampering import Forgery, forged
 
-SPRING: dict[str, Any] = {
-    "name": "linear",
-    "system": {"A": [[0, 1], [-2, -0.5]], "B": [[0], [1]]},
-    "horizon": 5.0,
-    "initial_state": [-1, 1],
-    "control": {"box": 1.0},
-    "disturbance": {"box": [0.05, 0.05]},
-    "path": [{"box": [0.7, None], "from": 0.3}],
-    "terminal": [{"box": [0.3, 0.3]}],
-}
+SPRING = spring(0.05)
 EVERYTHING = {
     "state": {"Q": [[0.2, 0], [0, 0.1]]},
     "control": {"R": [[0.05]]},

@@ -23,18 +23,10 @@ from sparserob_core.experiment.check.check import check
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import Spread
 from sparserob_core.sip.inner.counterpart import Growing
+from tests.support.problems import double_integrator
 
 RATE, T = 0.4, 3.0
-DOUBLE: dict[str, Any] = {
-    "name": "linear",
-    "system": {"A": [[0, 1], [0, 0]], "B": [[0], [1]], "E": [[0], [1]]},
-    "horizon": 5.0,
-    "initial_state": [4, 0],
-    "control": {"box": 1.0},
-    "disturbance": {"box": 0.3},
-    "path": [{"box": [4.2, 1.6]}],
-    "terminal": [{"box": [0.5, 0.4]}],
-}
+DOUBLE = double_integrator(0.3)
 PLANE: dict[str, Any] = {
     "system": {"A": [[0, 1], [-2, -0.5]], "B": [[0], [1]]},
     "initial_state": [-1, 1],

@@ -25,27 +25,10 @@ from sparserob_core.experiment.check.check import check
 from sparserob_core.experiment.config.load import load_config
 from sparserob_core.sip.methods.robust import largest_factor, least_slack
 from tests.support.places import CONFIGS, ROOT
+from tests.support.problems import double_integrator, spring
 
-SPRING: dict[str, Any] = {
-    "name": "linear",
-    "system": {"A": [[0, 1], [-2, -0.5]], "B": [[0], [1]]},
-    "horizon": 5.0,
-    "initial_state": [-1, 1],
-    "control": {"box": 1.0},
-    "disturbance": {"box": [0.25, 0.25]},
-    "path": [{"box": [0.7, None], "from": 0.5}],
-    "terminal": [{"box": [0.3, 0.3]}],
-}
-DOUBLE: dict[str, Any] = {
-    "name": "linear",
-    "system": {"A": [[0, 1], [0, 0]], "B": [[0], [1]], "E": [[0], [1]]},
-    "horizon": 5.0,
-    "initial_state": [4, 0],
-    "control": {"box": 1.0},
-    "disturbance": {"box": 0.1},
-    "path": [{"box": [4.2, 1.6]}],
-    "terminal": [{"box": [0.5, 0.4]}],
-}
+SPRING = spring(0.25, since=0.5)
+DOUBLE = double_integrator(0.1)
 MASSES: dict[str, Any] = {
     "name": "linear",
     "system": {

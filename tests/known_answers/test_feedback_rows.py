@@ -15,17 +15,9 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.experiment.check.check import check
 from tests.support.policy_programs import PolicyProgram
+from tests.support.problems import spring
 
-SPRING: dict[str, Any] = {
-    "name": "linear",
-    "system": {"A": [[0, 1], [-2, -0.5]], "B": [[0], [1]]},
-    "horizon": 5.0,
-    "initial_state": [-1, 1],
-    "control": {"box": 1.0},
-    "disturbance": {"box": [0.15, 0.15]},
-    "path": [{"box": [0.7, None], "from": 0.5}],
-    "terminal": [{"box": [0.3, 0.3]}],
-}
+SPRING = spring(0.15, since=0.5)
 PIECES = 10
 
 

@@ -11,17 +11,9 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
+from tests.support.problems import spring
 
-SPRING = {
-    "name": "linear",
-    "system": {"A": [[0, 1], [-2, -0.5]], "B": [[0], [1]]},
-    "horizon": 5.0,
-    "initial_state": [-1, 1],
-    "control": {"box": 1.0},
-    "disturbance": {"box": [0.06, 0.06]},
-    "path": [{"box": [0.7, None], "from": 0.3}],
-    "terminal": [{"box": [0.3, 0.3]}],
-}
+SPRING = spring(0.06)
 TWO = {"box": {"lower": [-1.0, -0.5], "upper": [1.0, 0.5]}}
 
 

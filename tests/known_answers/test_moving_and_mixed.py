@@ -14,20 +14,13 @@ from scipy.optimize import linprog
 
 import sparserob_core as sr
 from sparserob_core.experiment.check.check import check
+from tests.support.problems import spring
 from tests.support.tampering import Change, Forgery, forged
 
 BOX = {"box": [0.7, None], "from": 0.3}
 MIXED = {"mixed": {"H": [[0, 1], [0, -1]], "G": [[0.5], [-0.5]], "h": 1.2}, "from": 0.6}
 MOVING = {**BOX, "relative_to": [[0, 0, 0], [1.03, 0.1, 0], [1.83, -0.15, 0], [5, 0.2, 0]]}
-SPRING: dict[str, Any] = {
-    "name": "linear",
-    "system": {"A": [[0, 1], [-2, -0.5]], "B": [[0], [1]]},
-    "horizon": 5.0,
-    "initial_state": [-1, 1],
-    "control": {"box": 1.0},
-    "disturbance": {"box": [0.05, 0.05]},
-    "terminal": [{"box": [0.3, 0.3]}],
-}
+SPRING = spring(0.05, since=None)
 UNSURE = {"A": [[0, 1], ["-2 + p", -0.5]], "B": [[0], [1]], "parameters": {"p": [-0.05, 0.05]}}
 
 

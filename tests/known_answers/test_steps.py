@@ -13,20 +13,10 @@ from scipy.optimize import linprog
 
 import sparserob_core as sr
 from sparserob_core.experiment.check.check import check
+from tests.support.problems import spring
 from tests.support.tampering import Forgery, forged
 
-SPRING: dict[str, Any] = {
-    "name": "linear",
-    "system": {"A": [[0, 1], [-2, -0.5]], "B": [[0], [1]]},
-    "horizon": 5.0,
-    "initial_state": [-1, 1],
-    "control": {"box": 1.0},
-    "disturbance": {"box": [0.05, 0.05]},
-    "path": [{"box": [0.7, None], "from": 0.3}],
-    "terminal": [{"box": [0.3, 0.3]}],
-    "control_step": {"box": 0.25},
-    "initial_control": [0],
-}
+SPRING = spring(0.05, control_step={"box": 0.25}, initial_control=[0])
 MASSES: dict[str, Any] = {  # two inputs, a round set of steps, an uncertain friction
     "name": "linear",
     "system": {

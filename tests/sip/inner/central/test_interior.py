@@ -4,7 +4,6 @@ later, refutations, programs that it leaves to others."""
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +16,7 @@ from sparserob_core.sip.finite import FiniteProgram, Spread, UncertainRows
 from sparserob_core.sip.inner.central import layout
 from sparserob_core.sip.inner.central.interior import Interior
 from sparserob_core.sip.inner.counterpart import Counterpart, robust_bound
+from tests.support.problems import spring
 
 BLOCKS, EACH, JOINT = 6, 4, 5  # entries of the deviations, variables that answer each, and variables that answer none
 
@@ -115,16 +115,7 @@ def test_equalities_and_sets_that_are_no_boxes_are_left_to_the_simplex_method() 
     assert not central.fits()
 
 
-SPRING: dict[str, Any] = {
-    "name": "linear",
-    "system": {"A": [[0, 1], [-2, -0.5]], "B": [[0], [1]]},
-    "horizon": 5.0,
-    "initial_state": [-1, 1],
-    "control": {"box": 1.0},
-    "disturbance": {"box": [0.25, 0.25]},
-    "path": [{"box": [0.7, None], "from": 0.5}],
-    "terminal": [{"box": [0.3, 0.3]}],
-}
+SPRING = spring(0.25, since=0.5)
 
 
 @pytest.mark.slow
