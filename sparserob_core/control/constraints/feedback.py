@@ -358,11 +358,7 @@ class FeedbackControl:
 
     def worst(self, x: Array) -> Separation:
         """The worst row of every piece, worst first."""
-        found, _ = self.heights(x)
-        rows = found.argmax(axis=1)
-        heights = found[np.arange(rows.size), rows]
-        order = np.argsort(-heights, kind="stable")
-        return Separation(self.middles[order][:, None], rows[order], heights[order], float(found.max()))
+        return worst_of_each(self.heights(x)[0], self.middles)
 
     @property
     def cells(self) -> tuple[Array, Array]:
@@ -444,11 +440,7 @@ class FeedbackSteps:
 
     def worst(self, x: Array) -> Separation:
         """The worst row of every step, worst first."""
-        found, _ = self._heights(x)
-        rows = found.argmax(axis=1)
-        heights = found[np.arange(rows.size), rows]
-        order = np.argsort(-heights, kind="stable")
-        return Separation(self.times[order][:, None], rows[order], heights[order], float(found.max()))
+        return worst_of_each(self._heights(x)[0], self.times)
 
     @property
     def cells(self) -> tuple[Array, Array]:
@@ -467,6 +459,14 @@ class FeedbackSteps:
         terms = " + ".join(f"{value:.4g} u{i + 1}" for i, value in enumerate(self.H[row]) if value)
         text = f"{self.name}: the change of {terms} at {time:.6g} <= {self.h[row]:.6g}"
         return told(TimedExplanation(text, self.name, text, time, self.H[row]), self.loop, index[1:], True)
+
+
+def worst_of_each(found: Array, times: Array) -> Separation:
+    """Of violations ``(k, r)`` at ``times (k,)`` the worst row of every time, worst first."""
+    rows = found.argmax(axis=1)
+    heights = found[np.arange(rows.size), rows]
+    order = np.argsort(-heights, kind="stable")
+    return Separation(times[order][:, None], rows[order], heights[order], float(found.max()))
 
 
 def told(said: TimedExplanation, loop: ClosedLoop, w: Array, controls: bool = False) -> TimedExplanation:

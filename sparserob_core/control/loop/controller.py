@@ -96,7 +96,7 @@ class Controller:
                 self._go_on(answer.plan)
                 covered = True
             else:
-                answer = answer.declined()
+                answer = None
         u = self._control(piece - self._plan.first, measured)
         self._reach = self._plan.reach(piece - self._plan.first, measured, u)
         self._next, self._covered, self._before, self._last = piece + 1, covered, u, measured

@@ -144,10 +144,6 @@ class Solved:
     lower: float = np.nan
     cheaper: bool = False
 
-    def declined(self) -> Solved:
-        """The same without its plan."""
-        return Solved(None)
-
 
 @final
 class Resolving:
@@ -233,7 +229,7 @@ class Resolving:
         decision = retuned(plan.known, plan.decision, begun, plan.left(begun, innovations), found.decision)
         tuned = replace(plan, decision=decision)
         cost, known = (one.cost_left(begun, innovations) for one in (tuned, plan))
-        return Solved(tuned, cost, cheaper=cost < known - BETTER * max(abs(known), abs(cost)))
+        return Solved(tuned, cost, cheaper=is_cheaper(cost, known))
 
     def _fixed(
         self,
@@ -289,7 +285,7 @@ class Resolving:
             Plan(model, decision, piece, state=state.copy()),
             cost,
             units.cost * found.lower,
-            found.cost < known - BETTER * max(abs(known), abs(found.cost)),
+            is_cheaper(found.cost, known),
         )
 
     def _prepared(self, piece: int, state: Array) -> tuple[Transcription, Transcription, Units]:
@@ -319,8 +315,12 @@ class Resolving:
     ) -> Solved:
         if result.status not in PROVEN or decision is None:
             return Solved(None)
-        cheaper = cost < known - BETTER * max(abs(known), abs(cost))
-        return Solved(Plan(model, decision, piece, result.indices), cost, lower, cheaper)
+        return Solved(Plan(model, decision, piece, result.indices), cost, lower, is_cheaper(cost, known))
+
+
+def is_cheaper(cost: float, known: float) -> bool:
+    """Whether a cost is less than a known one by more than rounding."""
+    return cost < known - BETTER * max(abs(known), abs(cost))
 
 
 def shifted(cuts: Sequence[Cut], gap: float, program: SemiInfiniteProgram) -> Violated:

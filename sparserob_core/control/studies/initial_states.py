@@ -195,13 +195,38 @@ def check_states(states: object, count: int) -> tuple[int, int]:
     return a, b
 
 
-@final
 @dataclass(frozen=True, eq=False)
-class _Joined:
-    """One family of the ordinary program as a family in ``(theta, z)``."""
+class _OfPlane:
+    """One family of the ordinary program, whose initial state is the end ``z (2,)`` of the decision."""
 
     plane: InitialPlane
     base: ConstraintFamily
+
+    def worst(self, x: Array) -> Separation:
+        """The exact separation of the family at that initial state."""
+        worst = self._at(x).worst
+        assert worst is not None  # every family of a control problem has its own separation
+        return worst(x[:-2])
+
+    def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
+        """The enclosure of the family at that initial state."""
+        enclosure = self._at(x).enclosure
+        assert enclosure is not None
+        return enclosure(x[:-2], lower, upper)
+
+    def explain(self, index: Array, row: int) -> Explanation:
+        """The constraint for people, without what the initial state gives: it is free."""
+        said = self.plane.model.program.family(self.base.name).explanation(index[: self.base.index_set.dimension], row)
+        return said.from_any_state() if isinstance(said, TimedExplanation) else said
+
+    def _at(self, x: Array) -> ConstraintFamily:
+        return self.plane.at(x[-2:]).family(self.base.name)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Joined(_OfPlane):
+    """One family of the ordinary program as a family in ``(theta, z)``."""
 
     def family(self) -> ConstraintFamily:
         offers = self.base.enclosure is not None
@@ -229,35 +254,12 @@ class _Joined:
         columns = free[:, list(self.plane.states)] * self.plane.radius
         return np.concatenate([G, columns.reshape(*G.shape[:2], 2)], axis=2), h
 
-    def worst(self, x: Array) -> Separation:
-        """The exact separation of the family at that initial state."""
-        worst = self._at(x).worst
-        assert worst is not None  # every family of a control problem has its own separation
-        return worst(x[:-2])
-
-    def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
-        """The enclosure of the family at that initial state."""
-        enclosure = self._at(x).enclosure
-        assert enclosure is not None
-        return enclosure(x[:-2], lower, upper)
-
-    def explain(self, index: Array, row: int) -> Explanation:
-        """The constraint for people, without what the initial state gives: it is free."""
-        said = self.plane.model.program.family(self.base.name).explanation(index, row)
-        return said.from_any_state() if isinstance(said, TimedExplanation) else said
-
-    def _at(self, x: Array) -> ConstraintFamily:
-        return self.plane.at(x[-2:]).family(self.base.name)
-
 
 @final
 @dataclass(frozen=True, eq=False)
-class _JoinedUncertain:
+class _JoinedUncertain(_OfPlane):
     """One family of the ordinary program under feedback as a family in ``(v, M, z)``: at every deviation its rows are
     affine in the initial state, which enters their right-hand sides alone."""
-
-    plane: InitialPlane
-    base: ConstraintFamily
 
     def family(self, known: Sequence[Cut]) -> ConstraintFamily:
         base = self.base
@@ -299,26 +301,6 @@ class _JoinedUncertain:
     def excess(self, x: Array, indices: Array) -> Array:
         """The violations from that initial state."""
         return self._at(x).violations(x[:-2], indices)
-
-    def worst(self, x: Array) -> Separation:
-        """The separation of the family at that initial state."""
-        worst = self._at(x).worst
-        assert worst is not None
-        return worst(x[:-2])
-
-    def enclosure(self, x: Array, lower: Array, upper: Array) -> Enclosure:
-        """The enclosure of the family at that initial state."""
-        enclosure = self._at(x).enclosure
-        assert enclosure is not None
-        return enclosure(x[:-2], lower, upper)
-
-    def explain(self, index: Array, row: int) -> Explanation:
-        """The constraint for people, without what the initial state gives: it is free."""
-        said = self.plane.model.program.family(self.base.name).explanation(index[: self.base.index_set.dimension], row)
-        return said.from_any_state() if isinstance(said, TimedExplanation) else said
-
-    def _at(self, x: Array) -> ConstraintFamily:
-        return self.plane.at(x[-2:]).family(self.base.name)
 
 
 def _with_identity(S: csc_array | None) -> csc_array | None:
