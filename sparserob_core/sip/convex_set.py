@@ -486,7 +486,7 @@ class Box(ConvexSet):
         upper = np.where(np.isfinite(self.upper), self.upper, np.maximum(self.lower, -1.0) + 1.0)
         return 0.5 * (lower + upper)
 
-    @property
+    @cached_property
     def is_bounded(self) -> bool:
         return bool(np.isfinite(self.lower).all() and np.isfinite(self.upper).all())
 

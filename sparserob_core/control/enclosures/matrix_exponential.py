@@ -17,6 +17,7 @@ Transitions: TypeAlias = Callable[[Array, Array], tuple[Array, Array]]
 
 # 1 / k!; beyond degree 18 nothing is left on the unit ball (1 / 19! < 1e-17)
 COEFFICIENTS = 1.0 / np.cumprod([1.0, *range(1, 19)])
+FEW = 1000  # numbers of which a call costs no more than itself
 
 
 @shaped
@@ -28,15 +29,21 @@ def exponential(matrices: Float[Array, "*k d d"]) -> Float[Array, "*k d d"]:
     all its threads: on a busy machine that takes twenty times as long.
     """
     norms = np.abs(matrices).sum(axis=-2).max(axis=-1)
-    squarings = np.maximum(0, np.ceil(np.log2(np.maximum(norms, np.finfo(float).tiny)))).astype(int)
-    scaled = matrices / np.exp2(squarings)[..., None, None]
+    scaled, squarings = matrices, np.zeros(1, dtype=int)
+    if norms.max(initial=0.0) > 1.0:
+        squarings = np.maximum(0, np.ceil(np.log2(np.maximum(norms, np.finfo(float).tiny)))).astype(int)
+        scaled = matrices / np.exp2(squarings)[..., None, None]
     second = scaled @ scaled
     third = second @ scaled
-    powers = (np.broadcast_to(np.eye(matrices.shape[-1]), matrices.shape), scaled, second)
-    result: Array = COEFFICIENTS[18] * powers[0]
-    for block in (15, 12, 9, 6, 3, 0):  # in blocks of three: Paterson and Stockmeyer 1973
-        one, first, square = COEFFICIENTS[block : block + 3]
-        result = result @ third + (one * powers[0] + first * scaled + square * second)
+    identity = np.eye(matrices.shape[-1])
+    result: Array = np.broadcast_to(COEFFICIENTS[18] * identity, matrices.shape)
+    # in blocks of three (Paterson and Stockmeyer 1973), of few numbers all at once
+    blocks = COEFFICIENTS[:18].reshape(-1, 3, *(1 for _ in matrices.shape))
+    group = 6 if matrices.size <= FEW else 1
+    for stop in range(6, 0, -group):
+        one, first, square = blocks[stop - group : stop].swapaxes(0, 1)
+        for part in (one * identity + first * scaled + square * second)[::-1]:
+            result = result @ third + part
     for done in range(int(squarings.max(initial=0))):
         result = np.where((squarings > done)[..., None, None], result @ result, result)
     return result

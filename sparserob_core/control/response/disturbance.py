@@ -68,6 +68,8 @@ class DisturbanceModel:
     def blocks(self, weights: Float[Array, "*k L mw"]) -> Float[Array, "*k nb q"]:
         """The functional on every block, ``(..., nb, q)``, from weights ``(..., L, mw)``; linear, so it also serves
         Taylor coefficients."""
+        if self.by_piece:
+            return weights
         if self.starts is not None:
             return np.add.reduceat(weights, self.starts, axis=-2)
         assert self.functions is not None
@@ -100,6 +102,8 @@ class DisturbanceModel:
     @shaped
     def signals(self, points: Float[Array, "*k nb q"]) -> Float[Array, "*k mw L"]:
         """Disturbances ``(..., mw, L)`` on the grid's pieces from one point of the set per block, ``(..., nb, q)``."""
+        if self.by_piece:
+            return np.swapaxes(points, -1, -2)
         if self.starts is not None:
             which = np.searchsorted(self.starts, np.arange(self.grid.pieces), side="right") - 1
             return np.swapaxes(points[..., which, :], -1, -2)

@@ -69,7 +69,7 @@ class WorstCase:
         support = self.measurable if measurable else None
         return replace(self, response=self.response.from_state(initial_state), shared=support)
 
-    @property
+    @cached_property
     def channels(self) -> int:
         """Number ``m`` of controls; ``B`` may have columns of constants beyond them."""
         return self.response.system.controls - self.response.grid.constants
@@ -79,7 +79,7 @@ class WorstCase:
         """Whether there is a disturbance, or more than one initial state."""
         return self.disturbance is not None or self.initial is not None
 
-    @property
+    @cached_property
     def variables(self) -> int:
         return self.channels * self.dictionary.functions
 
@@ -298,14 +298,22 @@ class WorstCase:
     def on_decision(self, weights: Float[Array, "k L mc"]) -> Float[Array, "k n"]:
         """Weights ``(k, L, m + constants)`` on the columns of ``B`` on every grid piece, as rows ``(k, n)`` of the
         decision."""
-        acting = self.response.grid.control_piece[self.response.grid.decided]
-        starts = np.flatnonzero(np.diff(acting, prepend=-1))
-        on_pieces = np.add.reduceat(self.decided(weights), starts, axis=1)
+        acting, starts = self._acting
+        on_pieces = self.decided(weights)
+        if starts.size < on_pieces.shape[1]:
+            on_pieces = np.add.reduceat(on_pieces, starts, axis=1)
         if starts.size < self.dictionary.pieces:  # the last ones act after the horizon
             every = np.zeros((weights.shape[0], self.dictionary.pieces, self.channels))
-            every[:, acting[starts]] = on_pieces
+            every[:, acting] = on_pieces
             on_pieces = every
         return self.dictionary.gathered(on_pieces).swapaxes(1, 2).reshape(-1, self.variables)
+
+    @cached_property
+    def _acting(self) -> tuple[np.ndarray, np.ndarray]:
+        """The pieces of the control that act, and where each begins among the grid pieces on which one acts."""
+        acting = self.response.grid.control_piece[self.response.grid.decided]
+        starts = np.flatnonzero(np.diff(acting, prepend=-1))
+        return acting[starts], starts
 
     @shaped
     def on_grid(self, theta: Float[Array, " n"]) -> Float[Array, "mc L"]:

@@ -18,6 +18,8 @@ from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
 from sparserob_core.sip.relaxed.index_gradient import index_gradient
 from sparserob_core.sip.relaxed.relaxed import LAZY, Imposed, RelaxedProgram, Rows, value_of
 
+TINY = float(np.finfo(float).tiny)
+
 
 @dataclass(frozen=True, eq=False)
 class TupleLayout:
@@ -52,7 +54,7 @@ class TupleLayout:
     def indices(self, family: ConstraintFamily, slots: Array) -> Array:
         """The indices ``(k, d)`` at which a family is imposed by the indices ``(k, width)`` of a tuple."""
         box = family.index_set
-        return np.clip(slots[:, : box.dimension], box.lower, box.upper)
+        return np.asarray(np.minimum(np.maximum(slots[:, : box.dimension], box.lower), box.upper))
 
 
 def imposed_program(program: SemiInfiniteProgram, formulation: Literal["reduced", "literal"]) -> SemiInfiniteProgram:
@@ -95,7 +97,8 @@ class TupleValue:
         self.imposed, self.solution = Imposed(np.zeros(0, dtype=int), np.zeros(0)), _nothing(program.n)
         self._solved_for = np.nan
         self._owed: Array | None = None
-        first = [self._family_rows(family, self.layout.slot.lower[np.newaxis]) for family in program.families]
+        lowest = self.layout.slot.lower[np.newaxis]
+        first = [self._family_rows(family, self.layout.indices(family, lowest)) for family in program.families]
         ends = np.cumsum([h.shape[1] for _, h in first], dtype=int)
         self._columns = list(zip(program.families, ends - [h.shape[1] for _, h in first], ends, strict=True))
         self._kinds = np.tile(np.arange(ends[-1] if first else 0), count)
@@ -104,7 +107,7 @@ class TupleValue:
             np.zeros((count, self._kinds.size // count)),
         )
         self._norms = np.ones(self._h.shape)
-        self._before = _Before(np.zeros(0, dtype=int), self.slots[:0], self._G[:0], self._h[:0])
+        self._before = _Before(np.zeros(0, dtype=int), self.slots[:0], self._G[:0], self._h[:0], self._norms[:0])
 
     def __call__(self, points: Array) -> Array:
         return np.array([self.at(point) for point in points])
@@ -114,7 +117,7 @@ class TupleValue:
         which is then evaluated for it."""
         self.slots = np.full_like(self.slots, np.nan)
         self.imposed, self.solution = Imposed(np.zeros(0, dtype=int), np.zeros(0)), _nothing(self.program.n)
-        self._before = _Before(np.zeros(0, dtype=int), self.slots[:0], self._G[:0], self._h[:0])
+        self._before = _Before(np.zeros(0, dtype=int), self.slots[:0], self._G[:0], self._h[:0], self._norms[:0])
         self._owed = None if point is None else point.copy()
 
     def _settle(self) -> None:
@@ -127,7 +130,7 @@ class TupleValue:
         changed = self._move(point.reshape(self.slots.shape))
         if self._unmoved(changed):
             return value_of(self.solution)
-        rows, self._solved_for = self._kinds.size, self.epsilon
+        rows, self._solved_for = self._kinds.size, np.nan
         self.imposed, self.solution = self.relaxed.lazily(
             self._G.reshape(rows, -1),
             self._h.reshape(rows),
@@ -136,6 +139,7 @@ class TupleValue:
             self.imposed,
             self._norms.reshape(rows),
         )
+        self._solved_for = self.epsilon
         return value_of(self.solution)
 
     def gradient(self, point: Array) -> Array:
@@ -218,7 +222,7 @@ class TupleValue:
         """Whether the last optimum still is one: of its rows none has changed, and it keeps the changed ones."""
         if self.solution.status != "optimal" or self._solved_for != self.epsilon:
             return False
-        if np.isin(self.imposed.positions // self._h.shape[1], changed).any():
+        if ((self.imposed.positions // self._h.shape[1])[:, None] == changed).any():
             return False
         return bool((self._G[changed] @ self.solution.x - self._h[changed] <= LAZY * self._norms[changed]).all())
 
@@ -227,24 +231,32 @@ class TupleValue:
         changed = np.flatnonzero((slots != self.slots).any(axis=1))
         if not changed.size:
             return changed
-        before = self._before
-        self._before = _Before(changed, self.slots[changed], self._G[changed], self._h[changed])
-        back, place = before.find(changed, slots[changed])
-        self._G[changed[back]], self._h[changed[back]] = before.G[place], before.h[place]
-        fresh = changed[~back]
-        new = np.isnan(self.slots[fresh]).any(axis=1)
-        for family, first, last in self._columns if fresh.size else ():
-            # an index may move where the point at which it imposes a family does not, as at the end of the horizon
-            here, there = (self.layout.indices(family, one[fresh]) for one in (self.slots, slots))
-            moved = fresh[new | (here != there).any(axis=1)]
-            if moved.size:
-                self._G[moved, first:last], self._h[moved, first:last] = self._family_rows(family, slots[moved])
-        self._norms[changed] = np.maximum(np.linalg.norm(self._G[changed], axis=2), np.finfo(float).tiny)
+        before, fresh, old = self._before, changed, self.slots[changed]
+        self._before = _Before(changed, old, self._G[changed], self._h[changed], self._norms[changed])
+        self.slots[changed] = np.nan  # whatever is interrupted here, nobody takes their rows for those of an index
+        if before.changed.size:
+            back, place = before.find(changed, slots[changed])
+            known, fresh, old = changed[back], changed[~back], old[~back]
+            self._G[known], self._h[known], self._norms[known] = before.G[place], before.h[place], before.norms[place]
+        if fresh.size:
+            self._build(fresh, old, slots[fresh])
         self.slots[changed] = slots[changed]
         return changed
 
-    def _family_rows(self, family: ConstraintFamily, slots: Array) -> tuple[Array, Array]:
-        indices = self.layout.indices(family, slots)
+    def _build(self, fresh: np.ndarray, old: Array, wanted: Array) -> None:
+        """The rows of some indices ``fresh (k,)`` that go from ``old`` to ``wanted (k, width)``."""
+        new = np.isnan(old).any(axis=1)
+        for family, first, last in self._columns:
+            # an index may move where the point at which it imposes a family does not, as at the end of the horizon
+            indices = self.layout.indices(family, wanted)
+            moves = new | (self.layout.indices(family, old) != indices).any(axis=1)
+            if moves.any():
+                moved = fresh[moves]
+                G, self._h[moved, first:last] = self._family_rows(family, indices[moves])
+                self._G[moved, first:last] = G
+                self._norms[moved, first:last] = np.maximum(np.sqrt((G * G).sum(axis=2)), TINY)
+
+    def _family_rows(self, family: ConstraintFamily, indices: Array) -> tuple[Array, Array]:
         G, h = family.rows(indices)
         if np.ndim(G) != 3 or np.shape(G)[::2] != (len(indices), self.program.n) or np.shape(G)[:2] != np.shape(h):
             raise InputError(
@@ -256,19 +268,18 @@ class TupleValue:
 
 @dataclass(frozen=True, eq=False)
 class _Before:
-    """What the last change replaced: the indices ``changed (k,)`` of the tuple, sorted, with their coordinates and
-    rows."""
+    """What the last change replaced: the indices ``changed (k,)`` of the tuple, sorted, with their coordinates, rows
+    and the norms of these."""
 
     changed: np.ndarray
     slots: Array
     G: Array
     h: Array
+    norms: Array
 
     def find(self, changed: np.ndarray, slots: Array) -> tuple[np.ndarray, np.ndarray]:
         """Which of the indices ``changed`` return to what they were ``(k,)``, and where that is kept."""
-        if not self.changed.size:
-            return np.zeros(changed.size, dtype=bool), np.zeros(0, dtype=int)
-        place = np.minimum(np.searchsorted(self.changed, changed), self.changed.size - 1)
+        place = np.minimum(self.changed.searchsorted(changed), self.changed.size - 1)
         back = (self.changed[place] == changed) & (self.slots[place] == slots).all(axis=1)
         return back, place[back]
 
