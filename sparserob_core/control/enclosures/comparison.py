@@ -21,6 +21,14 @@ from sparserob_core.sip.convex_set import Array
 
 SAFE = 1.0 + 1e-6  # on every bound: sums of numbers of one sign, whose rounding is far below this
 KEPT = 64
+EQUAL = 1e-9  # durations that differ by less than this share of them, or by `NOTHING` of the longest, share a bound
+NOTHING = 1e-12
+MOST = 10_000_000  # numbers in the matrices of one kind, beyond which durations that differ by `NEAR` share one too
+NEAR = 1e-2
+BITS = 30  # to which the ends of durations that differ are rounded outwards
+AT_ONCE = 4_000_000  # numbers of the exponentials that are made at a time
+FEW = 4  # times as many durations as matrices, from which every matrix is applied to all its durations at once
+LONG = 256  # equal durations from which what adds up over them is summed in blocks
 
 
 @shaped
@@ -47,14 +55,82 @@ def comparison_matrix(D: Float[Array, "d d"], starts: Int[np.ndarray, " q"]) -> 
     return M
 
 
-class Reach(NamedTuple):
-    """Bounds for all durations ``r <= width``, ``(k, q, q)`` each: of ``|e^{A r}|`` at the end, ``r = width``
-    (``flow``), and of ``int_0^r |e^{A s}| ds``, ``|e^{A r}|`` and ``|e^{A r} - I|`` up to there."""
+@dataclass(frozen=True, eq=False)
+class NormBounds:
+    """A matrix of bounds for each of ``k`` durations: ``matrices (u, q', q)``, of which ``which (k,)`` says whose is
+    whose. Durations that are nearly equal share one, which holds for all of them."""
 
-    flow: Array
-    integral: Array
-    peak: Array
-    departure: Array
+    matrices: Array
+    which: np.ndarray
+
+    @property
+    def transposed(self) -> NormBounds:
+        """The bounds on rows, where these are on columns."""
+        return NormBounds(np.swapaxes(self.matrices, 1, 2), self.which)
+
+    @shaped
+    def on(self, norms: Float[Array, "*r k q"]) -> Float[Array, "*r k p"]:
+        """What each duration makes of block norms of its own."""
+        if self.matrices.shape[0] == 1:
+            return product(norms, self.matrices[0].T)
+        if self.which.size < FEW * self.matrices.shape[0] and self.matrices[0].size * self.which.size <= MOST:
+            return np.asarray(product(self.matrices[self.which], norms[..., None])[..., 0])
+        found = np.empty((*norms.shape[:-1], self.matrices.shape[1]))
+        for number, here in enumerate(self._places):
+            found[..., here, :] = product(norms[..., here, :], self.matrices[number].T)
+        return found
+
+    @shaped
+    def summed(self, start: Float[Array, "*r q"], added: Float[Array, "*r k q"]) -> Float[Array, "*r points q"]:
+        """What begins at ``start`` and grows by these bounds and what is ``added``, duration after duration: ``k + 1``
+        vectors."""
+        found = np.empty((*added.shape[:-2], added.shape[-2] + 1, added.shape[-1]))
+        found[..., 0, :], found[..., 1:, :] = start, added
+        with np.errstate(over="ignore", invalid="ignore"):
+            if self.matrices.shape[0] == 1 and self.which.size >= LONG:
+                self._sum_in_blocks(found)
+            else:
+                for place, number in enumerate(self.which.tolist()):
+                    found[..., place + 1, :] += found[..., place, :] @ self.matrices[number].T
+        if not np.isfinite(found).all():  # something is infinite, and nothing times that is nothing
+            found[..., 0, :], found[..., 1:, :] = start, added
+            for place, number in enumerate(self.which.tolist()):
+                found[..., place + 1, :] += product(found[..., place, None, :], self.matrices[number].T)[..., 0, :]
+        return found
+
+    def _sum_in_blocks(self, found: Array) -> None:
+        """`summed`, for one matrix: first from 0 in every block of as many durations, all blocks at once, then what
+        each begins with."""
+        flow, size, count = self.matrices[0].T, int(np.sqrt(self.which.size)), self.which.size
+        blocks, q = count // size, flow.shape[0]
+        inside = found[..., 1 : blocks * size + 1, :].reshape(*found.shape[:-2], blocks, size, q)
+        for place in range(1, size):
+            inside[..., place, :] += inside[..., place - 1, :] @ flow
+        powers = [flow]  # the bounds over 1, 2, 3, ... durations
+        while len(powers) < size:
+            powers.append(powers[-1] @ flow)
+        begun, every = found[..., 0, :], np.concatenate(powers, axis=1)
+        for number in range(blocks):
+            inside[..., number, :, :] += (begun @ every).reshape(*begun.shape[:-1], size, q)
+            begun = inside[..., number, -1, :]
+        found[..., 1 : blocks * size + 1, :] = inside.reshape(*found.shape[:-2], blocks * size, q)
+        for place in range(blocks * size, count):
+            found[..., place + 1, :] += found[..., place, :] @ flow
+
+    @cached_property
+    def _places(self) -> list[np.ndarray]:
+        order = np.argsort(self.which, kind="stable")
+        return np.split(order, np.cumsum(np.bincount(self.which, minlength=self.matrices.shape[0]))[:-1])
+
+
+class Reach(NamedTuple):
+    """Bounds for durations ``width (k,)``: of ``|e^{A r}|`` at the end, ``r = width`` (``flow``), and for all
+    ``r <= width`` of ``int_0^r |e^{A s}| ds``, ``|e^{A r}|`` and ``|e^{A r} - I|``."""
+
+    flow: NormBounds
+    integral: NormBounds
+    peak: NormBounds
+    departure: NormBounds
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +139,7 @@ class ComparisonSystem:
 
     metzler: Array
     sizes: Array
-    _known: dict[bytes, Reach] = field(default_factory=dict, repr=False)
+    _known: dict[bytes, tuple[Array, Array, Array, Array]] = field(default_factory=dict, repr=False)
 
     def over(self, widths: Array) -> Reach:
         """The bounds for ``widths (k,)``.
@@ -71,40 +147,87 @@ class ComparisonSystem:
         With ``M = P - N``, ``P >= 0`` and ``N >= 0`` diagonal, ``e^{M r} <= I + P int_0^r e^{M s} ds``: a stable
         system stays bounded however long it runs.
         """
-        key = widths.tobytes()
+        shortest, longest, which = alike(widths, self.sizes.size)
+        key = shortest.tobytes() + longest.tobytes()
         if key not in self._known:
-            remember(self._known, key, self._over(widths), KEPT)
-        return self._known[key]
+            remember(self._known, key, self._over(shortest, longest), KEPT)
+        return Reach(*(NormBounds(part, which) for part in self._known[key]))
 
     @cached_property
     def rising(self) -> Array:
         """``P``: ``M`` without what decays."""
-        return np.where(np.eye(self.metzler.shape[0]) > 0, np.maximum(self.metzler, 0.0), self.metzler)
+        return rising(self.metzler)
 
     @shaped
-    def slips(
-        self, slack: Float[Array, "q q"], widths: Float[Array, " k"]
-    ) -> tuple[Float[Array, "k q q"], Float[Array, "k q q"]]:
-        """How much ``e^{(A + S) r}`` and its integral differ from those of ``A`` at ``r = width``, for any ``S`` with
-        blocks of norm ``slack (q, q)``: ``(k, q, q)`` each.
+    def slips(self, slack: Float[Array, "q q"], widths: Float[Array, " k"]) -> tuple[NormBounds, NormBounds]:
+        """How much ``e^{(A + S) r}`` and its integral differ from those of ``A`` at ``r = width (k,)``, for any ``S``
+        with blocks of norm ``slack (q, q)``.
 
         The difference is ``int_0^r e^{A (r - s)} S e^{(A + S) s} ds``, which is a block of one exponential.
         """
         q = slack.shape[0]
         both = np.block([[self.metzler, slack], [np.zeros((q, q)), self.metzler + slack]])
-        distinct, which = np.unique(widths, return_inverse=True)
+        shortest, longest, which = alike(widths, both.size)
         with np.errstate(over="ignore", invalid="ignore"):
-            flow, integral = (finite(SAFE * part[:, :q, q:]) for part in transitions(both, distinct))
-        return flow[which.reshape(-1)], integral[which.reshape(-1)]
+            flow, integral = (part[:, :q, q:] for part in flows_between(both, shortest, longest))
+        return NormBounds(flow, which), NormBounds(integral, which)
 
-    def _over(self, widths: Array) -> Reach:
-        distinct, which = np.unique(widths, return_inverse=True)
+    def _over(self, shortest: Array, longest: Array) -> tuple[Array, Array, Array, Array]:
         one = np.eye(self.metzler.shape[0])
         with np.errstate(over="ignore", invalid="ignore"):
-            flow, integral = (finite(SAFE * part) for part in transitions(self.metzler, distinct))
+            flow, integral = flows_between(self.metzler, shortest, longest)
             peak = one + SAFE * product(self.rising, integral)
             departure = np.minimum(SAFE * product(self.sizes, integral), one + peak)
-        return Reach(*(part[which.reshape(-1)] for part in (flow, integral, peak, departure)))
+        return flow, integral, peak, departure
+
+
+@shaped
+def alike(
+    durations: Float[Array, " k"], numbers: int
+) -> tuple[Float[Array, " u"], Float[Array, " u"], Int[np.ndarray, " k"]]:
+    """Nearly equal durations together: the shortest and the longest ``(u,)`` of each group, those of a group that
+    differ rounded outwards, and which group each is of; ``numbers`` are there to be kept of every group."""
+    distinct, which = np.unique(durations, return_inverse=True)
+    nothing, share = NOTHING * distinct.max(initial=0.0), EQUAL
+    group = np.cumsum(np.diff(distinct, prepend=distinct[:1]) > share * distinct + nothing)
+    if group.size and (group[-1] + 1) * numbers > MOST:  # in steps of a ratio, where there are very many
+        steps = np.floor(np.log(np.maximum(distinct, nothing) / nothing) / np.log1p(NEAR))
+        group = np.unique(steps, return_inverse=True)[1]
+    first = np.flatnonzero(np.diff(group, prepend=-1))
+    shortest, longest = distinct[first], distinct[np.append(first, distinct.size)[1:] - 1]
+    differ = shortest < longest
+    shortest = np.where(differ, _rounded(shortest, np.floor), shortest)
+    return shortest, np.where(differ, _rounded(longest, np.ceil), longest), group[which.reshape(-1)]
+
+
+def _rounded(values: Array, to: np.ufunc) -> Array:
+    """Numbers with ``BITS`` bits, all of them rounded ``to`` one side, so that what differs by rounding is the same."""
+    mantissa, exponent = np.frexp(values)
+    return np.asarray(np.ldexp(to(np.ldexp(mantissa, BITS)), exponent - BITS))
+
+
+def flows_between(metzler: Array, shortest: Array, longest: Array) -> tuple[Array, Array]:
+    """Bounds ``(u, q, q)`` of ``e^{M r}`` for all ``r`` from ``shortest`` to ``longest (u,)``, and of its integral
+    until the longest."""
+    differ = np.flatnonzero(shortest < longest)
+    durations = np.concatenate([shortest, longest[differ] - shortest[differ]])
+    flow, integral = np.empty((2, durations.size, *metzler.shape))
+    step = max(1, AT_ONCE // (4 * metzler.size))
+    for start in range(0, durations.size, step):
+        part = slice(start, start + step)
+        flow[part], integral[part] = (finite(SAFE * one) for one in transitions(metzler, durations[part]))
+    flow = flow[: shortest.size]
+    if differ.size:  # e^{M (r + s)} = e^{M r} e^{M s}
+        rest, integral = integral[shortest.size :], integral[: shortest.size].copy()
+        begun, one = flow[differ], np.eye(metzler.shape[0])
+        integral[differ] += SAFE * product(begun, rest)
+        flow[differ] = product(begun, one + SAFE * product(rising(metzler), rest))
+    return flow, integral
+
+
+def rising(metzler: Array) -> Array:
+    """A comparison matrix ``(q, q)`` without what decays."""
+    return np.where(np.eye(metzler.shape[0]) > 0, np.maximum(metzler, 0.0), metzler)
 
 
 def finite(values: Array) -> Array:
@@ -113,9 +236,11 @@ def finite(values: Array) -> Array:
 
 
 def product(left: Array, right: Array) -> Array:
-    """The product of matrices of bounds, in which nothing times infinity is nothing."""
-    if np.isfinite(left).all() and np.isfinite(right).all():
+    """The product of matrices of bounds, in which nothing times infinity is nothing; what is no number is taken for
+    infinite."""
+    endless_left, endless_right = ~np.isfinite(left), ~np.isfinite(right)
+    if not (endless_left.any() or endless_right.any()):
         return np.asarray(left @ right)
-    with np.errstate(invalid="ignore"):
-        terms = left[..., :, :, None] * right[..., None, :, :]
-    return np.asarray(np.where(np.isnan(terms), 0.0, terms).sum(axis=-2))
+    met = (endless_left * 1.0) @ (endless_right | (right > 0)) + (left > 0) @ (endless_right * 1.0)
+    found = np.where(endless_left, 0.0, left) @ np.where(endless_right, 0.0, right)
+    return np.asarray(np.where(met > 0, np.inf, found))

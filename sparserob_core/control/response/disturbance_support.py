@@ -69,20 +69,17 @@ class DisturbanceSupport:
         pieces = np.clip(np.searchsorted(grid.breakpoints, start, side="right") - 1, 0, grid.pieces - 1)
         moved = comparison.over(start - grid.breakpoints[pieces]).flow
         reach = comparison.over(widths)
-        old, young = product(moved, self._gains[pieces][..., None]), product(moved, self._drive[:, None])
+        young = moved.on(np.broadcast_to(self._drive, (start.size, self._drive.size)))
+        old = moved.on(self._gains[pieces])
         square = (widths**2 / 8)[:, None]
-        exact = square * (
-            sizes
-            + product(twice, product(reach.departure, old)[..., 0].T).T
-            + product(once, product(reach.peak, young)[..., 0].T).T
-        )
+        exact = square * (sizes + product(twice, reach.departure.on(old).T).T + product(once, reach.peak.on(young).T).T)
         ended = np.minimum(
-            square * product(comparison.sizes @ comparison.sizes, product(reach.peak, old))[..., 0],
-            2.0 * product(comparison.sizes, product(reach.integral, old))[..., 0],
+            square * product(reach.peak.on(old), (comparison.sizes @ comparison.sizes).T),
+            2.0 * product(reach.integral.on(old), comparison.sizes.T),
         )
         lasting = np.minimum(
-            square * product(comparison.sizes, product(reach.peak, young))[..., 0],
-            2.0 * product(reach.integral, young)[..., 0],
+            square * product(reach.peak.on(young), comparison.sizes.T),
+            2.0 * reach.integral.on(young),
         )
         by_mode = product(block_norms(self.rows, starts), (ended + lasting).T).T
         return np.asarray(np.minimum(exact, by_mode))
@@ -226,12 +223,10 @@ class DisturbanceSupport:
     def _gains(self) -> Array:
         """``int_0^t e^{M s} |W| ds`` for the comparison system at the breakpoints, ``(L+1, q)``: what any disturbance
         until then can have made of every block."""
-        grid, gains = self.lifted.grid, np.zeros((self.lifted.grid.pieces + 1, self.lifted.starts.size))
+        grid = self.lifted.grid
         reach = self.lifted.comparison.over(grid.lengths)
-        gains[0], gains[1:] = self.before, product(reach.integral, self._drive[:, None])[..., 0]
-        for piece in range(grid.pieces):
-            gains[piece + 1] += product(reach.flow[piece], gains[piece][:, None])[:, 0]
-        return gains
+        driven = reach.integral.on(np.broadcast_to(self._drive, (grid.pieces, self._drive.size)))
+        return reach.flow.summed(self.before, driven)
 
 
 @dataclass(frozen=True, eq=False)

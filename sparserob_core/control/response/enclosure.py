@@ -178,12 +178,10 @@ class CellEnclosure:
         slopes = states @ lifted.matrix.T + self._drive[pieces]
         bent = (slopes @ lifted.matrix.T).reshape(shape)
         along = np.abs(np.einsum("ri,kai->kra", self._rows, bent)).sum(axis=2)
-        once, twice = (
-            block_norms(part.reshape(shape), lifted.starts).sum(axis=1)[..., None] for part in (slopes, bent)
-        )
+        once, twice = (block_norms(part.reshape(shape), lifted.starts).sum(axis=1) for part in (slopes, bent))
         reach, square, rows = lifted.comparison.over(width), (width**2 / 8)[:, None], self._row_norms
-        exact = square * (along + product(rows, product(reach.departure, twice)[..., 0].T).T)
-        by_mode = np.minimum(square * product(reach.peak, twice)[..., 0], 2.0 * product(reach.integral, once)[..., 0])
+        exact = square * (along + product(rows, reach.departure.on(twice).T).T)
+        by_mode = np.minimum(square * reach.peak.on(twice), 2.0 * reach.integral.on(once))
         total = np.minimum(exact, product(rows, by_mode.T).T)
         return np.asarray(total if self.sigma is None else total + self.sigma.deviation(start, width))
 

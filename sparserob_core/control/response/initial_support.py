@@ -102,7 +102,7 @@ class InitialSupport:
         comparison, starts = lifted.comparison, lifted.starts
         pieces = np.clip(np.searchsorted(grid.breakpoints, start, side="right") - 1, 0, grid.pieces - 1)
         moved = comparison.over(start - grid.breakpoints[pieces]).flow
-        old, reach = product(moved, self._gains[pieces][..., None]), comparison.over(widths)
+        old, reach = moved.on(self._gains[pieces]), comparison.over(widths)
         bent = self._lifted_rows(start) @ lifted.row_matrix @ lifted.row_matrix
         sizes = self._reaches(self._parts(bent)).sum(axis=2)
         square = (widths**2 / 8)[:, None]
@@ -110,10 +110,10 @@ class InitialSupport:
         first[:, : lifted.states] = self.rows
         twice = first @ lifted.row_matrix @ lifted.row_matrix
         norms = block_norms(twice.reshape(*twice.shape[:-1], -1, lifted.states), starts).sum(axis=-2)
-        exact = square * (sizes + product(norms, product(reach.departure, old)[..., 0].T).T)
+        exact = square * (sizes + product(norms, reach.departure.on(old).T).T)
         ended = np.minimum(
-            square * product(comparison.sizes @ comparison.sizes, product(reach.peak, old))[..., 0],
-            2.0 * product(comparison.sizes, product(reach.integral, old))[..., 0],
+            square * product(reach.peak.on(old), (comparison.sizes @ comparison.sizes).T),
+            2.0 * product(reach.integral.on(old), comparison.sizes.T),
         )
         return np.asarray(np.minimum(exact, product(block_norms(self.rows, starts), ended.T).T))
 
@@ -131,7 +131,7 @@ class InitialSupport:
     def reached(self) -> Array:
         """What any deviation can have made of every block of the coordinates on every piece, ``(L, q)``."""
         peak = self.lifted.comparison.over(self.lifted.grid.lengths).peak
-        return np.asarray(product(peak, self._gains[:-1][..., None])[..., 0])
+        return peak.on(self._gains[:-1])
 
     @property
     def _space(self) -> TaylorSpace:
@@ -223,8 +223,4 @@ class InitialSupport:
         """What any deviation can have made of every block at the breakpoints, ``(L + 1, q)``."""
         grid = self.lifted.grid
         flow = self.lifted.comparison.over(grid.lengths).flow
-        gains = np.zeros((grid.pieces + 1, self.lifted.starts.size))
-        gains[0] = self._sizes
-        for piece in range(grid.pieces):
-            gains[piece + 1] = product(flow[piece], gains[piece][:, None])[:, 0]
-        return gains
+        return flow.summed(self._sizes, np.zeros((grid.pieces, self._sizes.size)))

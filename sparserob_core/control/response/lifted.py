@@ -24,11 +24,14 @@ from sparserob_core.control.enclosures.algebra import (
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.comparison import (
     ComparisonSystem,
+    NormBounds,
+    alike,
     block_norms,
     block_sizes,
     comparison_matrix,
     finite,
     product,
+    rising,
 )
 from sparserob_core.control.enclosures.decoupling import (
     Decoupling,
@@ -307,27 +310,27 @@ class LiftedSystem:
             np.minimum(chord, ends[:, :-1] + moved), _applied(peak, ends[:, :-1]) + _applied(integral, pushed)
         )
 
-    def _majorants(self, lengths: Array, rows: bool) -> tuple[Array, Array]:
+    def _majorants(self, lengths: Array, rows: bool) -> tuple[NormBounds, NormBounds]:
         """What bounds ``int |e^{lifted s}| ds`` and ``|e^{lifted r}|`` on every fine piece, coefficient by coefficient,
-        ``(L', M q, M q)``; as in `ComparisonSystem.over`."""
+        matrices ``(M q, M q)``; as in `ComparisonSystem.over`."""
         if rows not in self._majorised:
-            distinct, which = self.fine.distinct(lengths)
+            _, longest, which = alike(lengths, (self.space.size * self.starts.size) ** 2)
             growths = block_sizes(self.A, self.starts)
             growths[0] = comparison_matrix(self.A[0], self.starts)
-            rising = growths.copy()
-            rising[0] = np.where(np.eye(self.starts.size) > 0, np.maximum(growths[0], 0.0), growths[0])
+            grows = growths.copy()
+            grows[0] = rising(growths[0])
             if rows:
-                growths, rising = np.swapaxes(growths, 1, 2), np.swapaxes(rising, 1, 2)
+                growths, grows = np.swapaxes(growths, 1, 2), np.swapaxes(grows, 1, 2)
             with np.errstate(over="ignore", invalid="ignore"):
-                integral = finite(flows_of(self.space, growths, distinct)[1])
-                peak = finite(multiplied(self.space, np.broadcast_to(rising, integral.shape), integral))
+                integral = finite(flows_of(self.space, growths, longest)[1])
+                peak = finite(multiplied(self.space, np.broadcast_to(grows, integral.shape), integral))
             peak[:, 0] += np.eye(self.starts.size)
-            both = (lifted_matrix(self.space, part, rows=False)[which] for part in (integral, peak))
+            both = (NormBounds(lifted_matrix(self.space, part, rows=False), which) for part in (integral, peak))
             self._majorised[rows] = (next(both), next(both))
         return self._majorised[rows]
 
     @cached_property
-    def _majorised(self) -> dict[bool, tuple[Array, Array]]:
+    def _majorised(self) -> dict[bool, tuple[NormBounds, NormBounds]]:
         return {}
 
     def _neglected(
@@ -342,33 +345,36 @@ class LiftedSystem:
         """
         comparison, lengths = self.comparison, self.fine.lengths
         reach = comparison.over(lengths)
-        flow, integral, peak = (
-            np.swapaxes(part, 1, 2) if rows else part for part in (reach.flow, reach.integral, reach.peak)
-        )
+        flow, integral, peak = (part.transposed if rows else part for part in (reach.flow, reach.integral, reach.peak))
         begin = block_norms(nodes[:, :-1], self.starts).sum(axis=2)
-        reached = _by_piece(peak, begin) + _by_piece(integral, np.broadcast_to(driven, begin.shape))
+        drives = np.broadcast_to(driven, begin.shape)
+        reached = peak.on(begin) + integral.on(drives)
         whole, within = self._rounded(reached, driven, rows)
 
         slack = self.slack_A.T if rows else self.slack_A
-        slips = ComparisonSystem(comparison.metzler.T, comparison.sizes.T) if rows else comparison
-        rising = ComparisonSystem(
-            slips.rising, slips.sizes
-        )  # whose slips grow with the time, so that the last is the largest
-        slipped, largest = (
-            _by_piece(one, begin) + _by_piece(two, np.broadcast_to(driven, begin.shape))
-            for one, two in (slips.slips(slack, lengths), rising.slips(slack, lengths))
-        )
-        largest = np.minimum(finite(largest), _by_piece(integral, reached @ slack.T))
+        slipped, largest = (one.on(begin) + two.on(drives) for one, two in self._slips(rows))
+        largest = np.minimum(finite(largest), integral.on(product(reached, slack.T)))
 
         spilt = self.spilt(block_sizes(self.A, self.starts))
         residual = np.einsum("rlaj,aij->rli" if not rows else "rlai,aij->rlj", sizes, spilt) + extra
-        pushed = _by_piece(integral, residual)
+        pushed = integral.on(residual)
         added = pushed + whole + np.minimum(slipped, largest)
-        bound, bounds = np.broadcast_to(start, pushed[:, 0].shape), np.empty_like(pushed)
-        for piece in range(lengths.size):
-            bounds[:, piece] = bound
-            bound = bound @ flow[piece].T + added[:, piece]
-        return np.asarray(_by_piece(peak, bounds) + pushed + within + largest), np.asarray(bound)
+        bounds = flow.summed(np.broadcast_to(start, pushed[:, 0].shape), added)
+        return np.asarray(peak.on(bounds[:, :-1]) + pushed + within + largest), bounds[:, -1]
+
+    def _slips(self, rows: bool) -> tuple[tuple[NormBounds, NormBounds], tuple[NormBounds, NormBounds]]:
+        """`ComparisonSystem.slips` at the end of every fine piece, and the largest on it; remembered."""
+        if rows not in self._slipping:
+            comparison, slack, lengths = self.comparison, self.slack_A.T if rows else self.slack_A, self.fine.lengths
+            here = ComparisonSystem(comparison.metzler.T, comparison.sizes.T) if rows else comparison
+            # where nothing decays, slips grow with the time, so that the last is the largest
+            grown = ComparisonSystem(here.rising, here.sizes)
+            self._slipping[rows] = here.slips(slack, lengths), grown.slips(slack, lengths)
+        return self._slipping[rows]
+
+    @cached_property
+    def _slipping(self) -> dict[bool, tuple[tuple[NormBounds, NormBounds], tuple[NormBounds, NormBounds]]]:
+        return {}
 
     def _rounded(self, reached: Array, driven: Array, rows: bool) -> tuple[Array, Array]:
         """What rounding changes over every fine piece and within it, at most, ``(r, L', q)`` each, where block norms
@@ -391,14 +397,9 @@ class LiftedSystem:
         return np.asarray(np.tensordot(leaves.astype(float), coefficients, axes=1))
 
 
-def _by_piece(matrices: Array, norms: Array) -> Array:
-    """Matrices of bounds ``(L', q, q)`` on block norms ``(r, L', q)``."""
-    return np.asarray(np.einsum("lij,rlj->rli", matrices, norms))
-
-
-def _applied(matrices: Array, norms: Array) -> Array:
-    """Matrices of bounds ``(L', M q, M q)`` on block norms ``(r, L', M, q)``."""
-    return np.asarray(np.einsum("lij,rlj->rli", matrices, norms.reshape(*norms.shape[:2], -1)).reshape(norms.shape))
+def _applied(bounds: NormBounds, norms: Array) -> Array:
+    """Bounds by matrices ``(M q, M q)`` on block norms ``(r, L', M, q)``."""
+    return bounds.on(norms.reshape(*norms.shape[:2], -1)).reshape(norms.shape)
 
 
 def lift(system: LinearSystem, grid: TimeGrid, initial_state: Array, centre: Array, radius: Array) -> LiftedSystem:

@@ -180,14 +180,14 @@ class MeasurableCellSupport:
         rows, W = self.rows @ lifted.transform, lifted.W[0]
         slopes = rows @ lifted.forward.flows(start)[0] @ lifted.A[0]  # (k, r, d)
         reach = comparison.over(widths)
-        drive = self._drive
+        drive = np.broadcast_to(self._drive, (start.size, self._drive.size))
         square = (widths**2 / 8)[:, None]
-        moved = product(block_norms(slopes, lifted.starts), product(reach.departure, drive[:, None]))[..., 0]
+        moved = product(block_norms(slopes, lifted.starts), reach.departure.on(drive)[..., None])[..., 0]
         exact = square * (bound.reach(slopes @ W) + moved)
-        now = product(comparison.over(start).flow, drive[:, None])
+        now = comparison.over(start).flow.on(drive)
         by_mode = np.minimum(
-            square * product(comparison.sizes, product(reach.peak, now))[..., 0],
-            2.0 * product(reach.integral, now)[..., 0],
+            square * product(reach.peak.on(now), comparison.sizes.T),
+            2.0 * reach.integral.on(now),
         )
         return np.asarray(np.minimum(exact, product(block_norms(rows, lifted.starts), by_mode.T).T))
 
@@ -203,7 +203,7 @@ class MeasurableCellSupport:
     def reached(self) -> Array:
         """As in `DisturbanceSupport`, ``(L, q)``."""
         reach = self.lifted.comparison.over(self.lifted.grid.breakpoints[1:])
-        return np.asarray(product(reach.integral, self._drive[:, None])[..., 0])
+        return reach.integral.on(np.broadcast_to(self._drive, (self.lifted.grid.pieces, self._drive.size)))
 
     @property
     def _drive(self) -> Array:

@@ -102,20 +102,20 @@ def test_no_trajectory_is_larger_than_the_comparison_system_allows(seed, d, stif
     for r in width * np.linspace(0, 1, 21):
         flow, driven = (part[0] for part in decoupled_transitions(basis, D, np.array([r])))
         for moved, bound in (
-            (flow @ z, reach.peak[0]),
-            (driven @ z, reach.integral[0]),
-            (flow @ z - z, reach.departure[0]),
+            (flow @ z, reach.peak.matrices[0]),
+            (driven @ z, reach.integral.matrices[0]),
+            (flow @ z - z, reach.departure.matrices[0]),
         ):
             allowed = bound @ norms
             assert (block_norms(moved, basis.starts) <= allowed + 1e-9 * np.abs(allowed).max()).all()
-    allowed = reach.flow[0] @ norms
+    allowed = reach.flow.matrices[0] @ norms
     assert (block_norms(flow @ z, basis.starts) <= allowed + 1e-9 * np.abs(allowed).max()).all()
 
 
 def test_a_stable_system_stays_bounded_however_long_it_runs():
     basis, D, _ = made(np.array(MATRICES["a defective fast mode"]))
     comparison = ComparisonSystem(comparison_matrix(D, basis.starts), block_sizes(D, basis.starts))
-    assert comparison.over(np.array([1e3])).peak.max() <= 20.0
+    assert comparison.over(np.array([1e3])).peak.matrices.max() <= 20.0
 
 
 @pytest.mark.parametrize("seed", range(3))
