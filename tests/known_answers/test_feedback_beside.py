@@ -144,11 +144,6 @@ def test_steps_and_sets_that_move_hold_under_measurable_disturbances(tmp_path: P
     assert found.status == "verified", [claim for claim in found.claims if claim.verdict != "holds"]
 
 
-def test_mixed_constraints_under_measurable_disturbances_are_refused_in_one_sentence(tmp_path: Path) -> None:
-    with pytest.raises(sr.InputError, match="without mixed"):
-        run({**SPRING, "path": [MIXED], "disturbance_class": "measurable"}, tmp_path / "run")
-
-
 def test_small_steps_are_judged_in_their_own_unit(tmp_path: Path) -> None:
     """A double integrator that needs little: steps of a thousandth of what the control could be."""
     problem = {

@@ -94,7 +94,28 @@ def test_what_is_held_is_the_worst_where_one_state_is_disturbed(tmp_path: Path) 
     assert found[0].result.cost == pytest.approx(found[1].result.cost, rel=1e-7)
 
 
+def test_a_control_beside_the_state_has_answered_what_happened_until_it_jumped(tmp_path: Path) -> None:
+    """``x' = u + w``, ``|x + u| <= 1/2`` from 1, where the control jumps, to 1.2: the second piece of the control takes
+    back all that the first one of the disturbance did, so that ``2 + v_0 + v_1 <= 1/2`` is all that is asked for."""
+    problem = {
+        "name": "linear",
+        "system": {"A": [[0.0]], "B": [[1.0]]},
+        "horizon": 2.0,
+        "initial_state": [2.0],
+        "control": {"box": 1.0},
+        "disturbance": {"box": 0.3},
+        "disturbance_class": "measurable",
+        "path": [{"mixed": {"H": [[1], [-1]], "G": [[1], [-1]], "h": 0.5}, "from": 1.0, "to": 1.2}],
+    }
+    outcome = run(problem, tmp_path / "run", dictionaries={"control": {"name": "piecewise_constant", "pieces": 2}})
+    proven(outcome)
+    assert outcome.result.cost == pytest.approx(1.5, rel=1e-7)
+
+
 VARIANTS: dict[str, dict[str, Any]] = {
+    "bounds of state and control together": {
+        "path": [{"mixed": {"H": [[1, 0.3], [-1, -0.3]], "G": [[0.3], [-0.3]], "h": 0.75}, "from": 0.8, "to": 3.2}],
+    },
     "a polytope off the origin": {
         "system": {"A": [[0, 1], [-2, -0.5]], "B": [[0], [1]]},
         "disturbance": {"polytope": {"H": [[-1, 0], [0, -1], [1, 1]], "h": [0.08, 0.1, 0.15]}},
@@ -112,7 +133,12 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "initial states in a set": {"initial_state": {"centre": [-1, 1], "box": [0.05, 0.05]}},
     "no deviation at all": {"disturbance": {"box": {"lower": [0.1], "upper": [0.1]}}},
 }
-LONG = {"a polytope off the origin", "initial states in a set", "one channel that is known"}
+LONG = {
+    "bounds of state and control together",
+    "a polytope off the origin",
+    "initial states in a set",
+    "one channel that is known",
+}
 
 
 @pytest.mark.parametrize(

@@ -131,12 +131,29 @@ class FeedbackConstraint:
         """Violations ``(k, r)`` at times ``(k, 1)`` under the worst disturbances."""
         found = self.loop.height(self._along(x, indices[:, 0])) - self.flat.h
         within = self.loop.measurable
-        return found if within is None else found + within.within(indices[:, 0], self.flat.H)
+        if within is not None:
+            for rows, pieces in self._halves(indices[:, 0]):
+                found[:, rows] += within.within(indices[:, 0], self.flat.H[rows], pieces)
+        return found
+
+    def _halves(self, times: Array) -> list[tuple[slice, np.ndarray]]:
+        """The rows that look at the state at times ``(k,)`` in the same pieces of the grid, and these pieces: those of
+        a mixed constraint before and after the control jumps."""
+        flat, loop = self.flat, self.loop
+        if flat.gains is None or loop.measurable is None:
+            return [(slice(None), loop.seen_from(times))]
+        commanded, half = flat.commanded(times), flat.h.size // 2
+        return [
+            (slice(half), loop.seen_from(times, commanded[:, 0])),
+            (slice(half, None), loop.seen_from(times, commanded[:, -1])),
+        ]
 
     def _along(self, x: Array, times: Array) -> Array:
         """The left sides at times ``(k,)``, with their answers to the deviations, ``(k, r, 1 + Q)``."""
         flat = self.flat
-        found = flat.H @ self.loop.states(x, times)
+        found = np.concatenate(
+            [flat.H[rows] @ self.loop.states(x, times, pieces) for rows, pieces in self._halves(times)], axis=1
+        )
         if flat.reference is not None:
             found[:, :, 0] += flat.moved(times)
         if flat.gains is not None:
@@ -155,17 +172,19 @@ class FeedbackConstraint:
             half = part.size // 2
             part = np.concatenate([part[:half], part[half:] + 1 + part.max()])
         return self.loop.with_control(
-            self.loop.state_rows(float(time[0]), flat.H, allowed, part, factor), flat.gains, pieces
+            self.loop.state_rows(float(time[0]), flat.H, allowed, part, factor, pieces), flat.gains, pieces
         )
 
-    def against(self, x: Array, index: Array, row: int) -> tuple[Array, float]:
-        """A deviation ``(Q,)`` that is the worst at an index, and what the control adds to the row then."""
+    def against(self, x: Array, index: Array, row: int) -> tuple[Array, float, int | None]:
+        """A deviation ``(Q,)`` that is the worst at an index, what the control adds to the row then, and the piece of
+        the control that does so."""
         time, gains = index[:1], self.flat.gains
         w = self.loop.spread.worst(self._along(x, time)[0, row, 1:])
         if gains is None:
-            return w, 0.0
-        control = self.loop.controls(x)[self.flat.commanded(time)[0, row]]
-        return w, float(gains[row] @ (control[:, 0] + control[:, 1:] @ w))
+            return w, 0.0, None
+        acting = int(self.flat.commanded(time)[0, row])
+        control = self.loop.controls(x)[acting]
+        return w, float(gains[row] @ (control[:, 0] + control[:, 1:] @ w)), acting
 
     def met(self, x: Array) -> Array:
         """The nearest decision that meets an equality to rounding; one that no control enters is left as it is."""
@@ -480,7 +499,7 @@ def told(said: TimedExplanation, loop: ClosedLoop, w: Array, controls: bool = Fa
     point, width = loop.spread.middle + w, loop.steps.E.shape[2]
     signal = changes = None
     if loop.measurable is not None:
-        breakpoints, signal = loop.signal(w, said.time, None if controls else said.direction)
+        breakpoints, signal = loop.signal(w, said.time, None if controls else said.direction, said.piece)
         changes = breakpoints[:-1]
     elif problem.disturbance is not None:
         signal = point[: point.size - int(loop.begins.sum())].reshape(-1, width).T

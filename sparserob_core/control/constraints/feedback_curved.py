@@ -194,10 +194,10 @@ class Turning(ABC):
         split = np.where(upper[:, 0] > lower[:, 0], split, widest)
         return Enclosure(over, split)
 
-    def against(self, x: Array, index: Array, row: int) -> tuple[Array, float]:
-        """A deviation ``(Q,)`` that is the worst at an index, and what stands beside the state then."""
+    def against(self, x: Array, index: Array, row: int) -> tuple[Array, float, int | None]:
+        """A deviation ``(Q,)`` that is the worst at an index, and what stands beside the state then: no control."""
         along = self.normals(index[None, 1:])[0] @ self.answers(x, index[:1])[0]
-        return self.loop.spread.worst(along[1:]), 0.0
+        return self.loop.spread.worst(along[1:]), 0.0, None
 
     def explain(self, index: Array, row: int) -> Explanation:
         """One constraint for people, at every disturbance, or at the deviations that the index says."""

@@ -209,21 +209,36 @@ class ClosedLoop:
         along = direction @ self.states(x, np.array([time]))[0]
         return self.spread.worst(along[1:])
 
-    def signal(self, deviation: Array, time: float, direction: Array | None) -> tuple[Array, Array]:
+    def seen_from(self, times: Array, acting: np.ndarray | None = None) -> np.ndarray:
+        """The pieces ``(k,)`` of the grid in which the state at ``times (k,)`` is looked at. A breakpoint is one of the
+        piece that it ends; but where the control on a piece ``acting (k,)`` stands beside the state, which begins then,
+        of that: this control has answered what happened before."""
+        grid = self.functionals.response.grid
+        found = grid.locate(times)
+        return found if acting is None else np.maximum(found, np.searchsorted(grid.control_piece, acting))
+
+    def signal(
+        self, deviation: Array, time: float, direction: Array | None, acting: int | None = None
+    ) -> tuple[Array, Array]:
         """Breakpoints and the disturbance ``(mw, L)`` between them that has a deviation ``(Q,)``: on the pieces of the
-        grid, or measurable and the worst for ``direction'x(time)`` on the piece that holds ``time``."""
+        grid, or measurable and the worst for ``direction'x(time)`` on the piece that holds ``time``, where the control
+        on piece ``acting`` may stand beside it."""
         if self.measurable is not None:
-            return self.measurable.signal(deviation, time, direction)
+            beside = None if acting is None else np.array([acting])
+            over = int(self.seen_from(np.array([time]), beside)[0])
+            return self.measurable.signal(deviation, time, direction, over)
         return self.functionals.response.grid.breakpoints, (self.entries @ (self.spread.middle + deviation)).T
 
     def begun(self, deviation: Array) -> Array:
         """The initial state ``(d,)`` of a deviation ``(Q,)``."""
         return np.asarray(self.start + self.begins @ deviation)
 
-    def state_rows(self, time: float, H: Array, h: Array, part: np.ndarray, factor: Array) -> UncertainRows:
-        """The rows ``H x(t) <= h`` at one time, as `UncertainRows`: row ``r`` is ``factor_r`` times the direction of
-        its
-        ``part_r``, the first row with which it shares it."""
+    def state_rows(
+        self, time: float, H: Array, h: Array, part: np.ndarray, factor: Array, acting: np.ndarray | None = None
+    ) -> UncertainRows:
+        """The rows ``H x(t) <= h`` at one time, beside the control on the pieces ``acting (r,)`` where that is given,
+        as `UncertainRows`: row ``r`` is ``factor_r`` times the direction of its ``part_r``, the first row with which it
+        shares it."""
         from scipy.sparse import csr_array
 
         count = H.shape[0]
@@ -248,8 +263,11 @@ class ClosedLoop:
         g[:, : self.nominal_size] = on_control
         d = np.einsum("pli,liq->pq", on_noise[firsts], self.entries) + free[firsts] @ self.begins
         if self.measurable is not None:
-            d[:, : self.measurable.size] = self.measurable.weights(time, H[firsts])
-            offset = offset + self.measurable.within(np.array([time]), H)[0]
+            pieces = self.seen_from(np.full(count, time), acting)
+            d[:, : self.measurable.size] = self.measurable.weights(time, H[firsts], pieces[firsts])
+            for piece in np.unique(pieces):
+                rows = pieces == piece
+                offset[rows] += self.measurable.within(np.array([time]), H[rows], np.array([piece]))[0]
         return UncertainRows(csr_array(g), h - offset, part, factor, tuple(parts), d)
 
     def with_control(self, rows: UncertainRows, G: Array, pieces: np.ndarray) -> UncertainRows:

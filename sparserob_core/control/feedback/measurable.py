@@ -123,25 +123,23 @@ class MeasurablePieces:
             slope += factor * np.exp(np.linalg.norm(A, 2) * h) * np.linalg.norm(row, axis=2) * far
         return np.asarray(h**2 / 8.0 * slope + MISSED * np.abs(self.within(upper, H, pieces)))
 
-    def weights(self, time: float, H: Array) -> Array:
-        """What a deviation gives to ``H x(time)`` without any control, ``(r, Q)``."""
+    def weights(self, time: float, H: Array, pieces: np.ndarray) -> Array:
+        """What a deviation gives to ``H x(time)`` without any control, ``(r, Q)``; every row sees the state from one of
+        ``pieces (r,)``, and what happens in that one is not part of it."""
         response, found = self.functionals.response, np.zeros((H.shape[0], self.size))
-        over = self._over(time)
-        flows = response.flows(time - response.grid.breakpoints[1 : over + 1])[0]
+        over = int(pieces.max(initial=0))
+        flows = response.flows(np.clip(time - response.grid.breakpoints[1 : over + 1], 0.0, None))[0]
         for piece in range(over):
             place, outward = self.at(piece)
-            found[:, place] = H @ flows[piece] @ outward
+            rows = pieces > piece
+            found[rows, place] = H[rows] @ flows[piece] @ outward
         return found
 
-    def _over(self, time: float) -> int:
-        """How many pieces are over before a time; the one that ends then is not."""
-        return int(self.functionals.response.grid.locate(np.array([time]))[0])
-
-    def signal(self, deviation: Array, time: float, direction: Array | None) -> tuple[Array, Array]:
+    def signal(self, deviation: Array, time: float, direction: Array | None, over: int) -> tuple[Array, Array]:
         """Breakpoints ``(L + 1,)``, those of the grid among them, and a disturbance ``(mw, L)`` between them that has
-        the ``deviation (Q,)``; on the piece that holds ``time`` the worst for ``direction'x(time)``, afterwards the
-        middle."""
-        grid, over = self.functionals.response.grid, self._over(time)
+        the ``deviation (Q,)``; on piece ``over``, in which the state is looked at, the worst for ``direction'x(time)``,
+        and the middle after that."""
+        grid = self.functionals.response.grid
         made, ends, values = self._arcs(deviation), [], []
         for piece, (start, stop) in enumerate(zip(grid.breakpoints[:-1], grid.breakpoints[1:], strict=True)):
             if direction is not None and piece == over and time > start:

@@ -78,10 +78,10 @@ def _of_loop(constraint: StateConstraint, decision: Array, loop: ClosedLoop) -> 
     row, time = int(worst.rows[0]), float(worst.indices[0, 0])
     _, directions, _, bounds = constraint.functionals_at(worst.indices[:1])
     response, direction = constraint.functionals.response, directions[row]
-    deviation, beside = held.against(decision, worst.indices[0], row)
+    deviation, beside, acting = held.against(decision, worst.indices[0], row)
     breakpoints, disturbance = response.grid.breakpoints, None
     if constraint.functionals.disturbance is not None:
-        breakpoints, disturbance = loop.signal(deviation, time, direction)
+        breakpoints, disturbance = loop.signal(deviation, time, direction, acting)
     return Adversary(
         name=constraint.name,
         row=row,

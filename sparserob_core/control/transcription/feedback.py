@@ -151,8 +151,6 @@ def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dic
         and not disturbance.is_complete,
         f"path constraint of another name than {' or '.join(map(str, named))}, which is taken": bool(named),
         "terminal set with an interior under measurable disturbances: they reach a fixed state": measurable and ends,
-        "path constraint on the state alone under measurable disturbances, without mixed": measurable
-        and any(isinstance(one, MixedConstraint) for one in problem.path),
         "control that acts at once, without a delay": problem.system.delay > 0.0,
         "single linear system, without pieces": bool(problem.system.switches),
         "control_step with flat sides": problem.control_step is not None and problem.control_step.halfspaces() is None,
