@@ -14,7 +14,6 @@ from sparserob_core.control.constraints.explanation import explanation
 from sparserob_core.control.constraints.local_maxima import TINY, climb, local_maxima, step_out, vertices
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.cache import remember
-from sparserob_core.control.enclosures.matrix_exponential import transitions
 from sparserob_core.control.problem.problem import MixedConstraint
 from sparserob_core.control.response.enclosure import CELLS_KEPT, Bounded, CellEnclosure, enclose, over_legs
 from sparserob_core.control.response.functional import WorstCase
@@ -22,7 +21,7 @@ from sparserob_core.control.response.initial_support import Supports
 from sparserob_core.control.response.lifted import LiftedSystem, lift_legs
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import Direct, Moving, Reference
-from sparserob_core.control.response.response import Response, distinct_times
+from sparserob_core.control.response.response import Outputs, Response, distinct_times
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.program import Enclosure, Explanation, Separation
@@ -116,18 +115,21 @@ class Samples:
         return self.h[None, :, None] - np.tile(sigma, (1, copies, 1))
 
     @cached_property
-    def steps(self) -> tuple[np.ndarray, Array, Array]:
-        """The piece of every sampled time ``(times,)``, and the transitions from its start, ``(v, times, d, d)``
-        each."""
-        pieces = self._response.grid.locate(self.times)
-        grid, A = self._response.grid, self._response.steps(self.lattice[0]).A
-        distinct, which = grid.distinct(self.times - grid.breakpoints[pieces])
-        if grid.mode is None:
-            flow, driven = transitions(A, distinct[None])
-        else:
-            flow, driven = transitions(A[:, grid.mode[pieces]], distinct[which][None])
-            which = np.arange(which.size)
-        return pieces, flow[:, which], driven[:, which]
+    def outputs(self) -> Outputs:
+        """``H x`` at the sampled times and parameters; of rows that are opposite to others by these."""
+        return Outputs(self._response.propagator, self.H[self._apart[0]], self.times, self.lattice[0])
+
+    def along(self, response: Response, control: Array) -> Array:
+        """``H x (v, r, times)`` from the initial state of a response, under a control ``(m, K)``."""
+        _, which, signs = self._apart
+        return np.asarray(self.outputs.at(response, control)[:, which] * signs[:, None])
+
+    @cached_property
+    def _apart(self) -> tuple[np.ndarray, np.ndarray, Array]:
+        """The rows of ``H`` without copies and opposites, which of them every row is, and with which sign."""
+        signs = np.where(self.H[np.arange(self.h.size), np.abs(self.H).argmax(axis=1)] < 0.0, -1.0, 1.0)
+        _, first, which = np.unique(self.H * signs[:, None], axis=0, return_index=True, return_inverse=True)
+        return first, which.reshape(-1), signs * signs[first[which.reshape(-1)]]
 
     @shaped
     def support_over(
@@ -388,16 +390,8 @@ class FlatConstraint(StateConstraint):
     @shaped
     def on_lattice(self, x: Float[Array, " n"]) -> Float[Array, "v r t"]:
         """Violations ``(v, r, times)`` at every lattice point and sampled time."""
-        response, points = self.functionals.response, self.lattice[0]
-        control = self.functionals.dictionary.control(x)
-        nodes = response.states(control, points)
-        pieces, flow, driven = self.samples.steps
-        steps = response.steps(points)
-        drive = response.grid.driven(steps.B, self.functionals.on_grid(x))
-        states = np.einsum("vtij,vtj->vti", flow, nodes[:, pieces]) + np.einsum(
-            "vtij,vtj->vti", driven, drive[:, pieces]
-        )
-        answer: Array = np.einsum("ri,vti->vrt", self.H, states) - self.samples.margins
+        along = self.samples.along(self.functionals.response, self.functionals.dictionary.control(x))
+        answer: Array = along - self.samples.margins
         beside = self.reference is not None or self.gains is not None
         return answer + self.beside(x, self.times).T if beside else answer
 

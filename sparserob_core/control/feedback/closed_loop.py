@@ -243,10 +243,9 @@ class ClosedLoop:
 
         count = H.shape[0]
         firsts = [int(np.flatnonzero(part == p)[0]) for p in range(int(part.max()) + 1)]
-        free, gains, B, W = self.functionals.response.adjoint(np.full(count, time), H, np.zeros((count, 0)))
-        on_control = self.functionals.on_decision(gains @ B)  # (r, m K), channel-major
-        offset = free @ self.start + self.functionals.given(gains @ B)
-        on_noise = gains @ W  # (r, L, mw)
+        free, weights, on_noise = self.functionals.response.weights(np.full(count, time), H, np.zeros((count, 0)))
+        on_control = self.functionals.on_decision(weights)  # (r, m K), channel-major
+        offset = free @ self.start + self.functionals.given(weights)
         offset = offset + np.einsum("rli,li->r", on_noise, self.middles)
         K = self.functionals.dictionary.pieces
         at, which, value = self.answers.effect

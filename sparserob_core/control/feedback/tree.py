@@ -56,10 +56,8 @@ class Sampled:
             if not H.shape[0] or not times.size:
                 continue
             at, side = np.repeat(times, H.shape[0]), np.tile(np.arange(H.shape[0]), times.size)
-            free, gains, B, W = response.adjoint(at, H[side], np.zeros((at.size, 0)))
-            weights = gains @ B
+            free, weights, on_noise = response.weights(at, H[side], np.zeros((at.size, 0)))
             constant = free @ loop.start + loop.functionals.given(weights)
-            on_noise = gains @ W
             constant = constant + np.einsum("rli,li->r", on_noise, loop.middles)
             T = loop.functionals.on_decision(weights).reshape(at.size, -1, K)
             N = np.einsum("rli,liq->rq", on_noise, loop.entries[..., ~loop.begins.any(axis=0)])

@@ -15,7 +15,10 @@ from sparserob_core.control.enclosures.polynomial import distinct_patterns, face
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.lifted import LiftedSystem, Past
+from sparserob_core.control.response.response import Impulses
 from sparserob_core.sip.convex_set import Array, ConvexSet
+
+AT_ONCE = 4_000_000  # numbers that are summed over all ages at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,10 +142,26 @@ class DisturbanceSupport:
         flow, driven = backward.flows(within)
         young = self._weights(start @ driven)[..., None, :]
         moved = np.einsum("rd,qde->qre", start, flow)
-        kernel = backward.kernel[:, : int(pieces.max(initial=0))]
-        old = np.moveaxis(self._weights(np.tensordot(moved, kernel, axes=1)), -2, -3)
-        parts = np.concatenate([of_blocks(combined(young)), of_blocks(combined(old))], axis=2)
-        return np.asarray(np.cumsum(parts, axis=2)[which, :, pieces])
+        count, answer = int(pieces.max(initial=0)), None
+        share = max(1, AT_ONCE // max(1, start.shape[0] * count * self._impulses.columns.shape[1]))
+        for begin in range(0, within.size, share):  # the sums over all ages, of some durations at once
+            part = slice(begin, begin + share)
+            old = self._impulses.of(moved[part], count)
+            old = np.moveaxis(old.reshape(*old.shape[:-1], young.shape[2], young.shape[4]), -2, -3)
+            sums = [of_blocks(combined(young[part])), of_blocks(combined(old))]
+            found = np.cumsum(np.concatenate(sums, axis=2), axis=2)
+            mine = np.flatnonzero((which >= part.start) & (which < part.stop))
+            if answer is None:
+                answer = np.empty((times.size, found.shape[1], found.shape[3]))
+            answer[mine] = found[which[mine] - begin, :, pieces[mine]]
+        assert answer is not None
+        return answer
+
+    @cached_property
+    def _impulses(self) -> Impulses:
+        """What the disturbance on a piece gives to the Taylor coefficients of a functional, by the piece's age."""
+        whole = self._weights(np.eye(self.lifted.row_matrix.shape[0]))
+        return Impulses(self.lifted.backward.propagator, whole.reshape(whole.shape[0], -1))
 
     def _combined(self, blocks: Array) -> Array:
         return blocks if self.combination is None else self.combination.apply(blocks)

@@ -20,7 +20,7 @@ from sparserob_core.control.response.disturbance_support import DisturbanceSuppo
 from sparserob_core.control.response.initial_support import InitialSupport, Support, Supports
 from sparserob_core.control.response.lifted import LiftedSystem, frozen
 from sparserob_core.control.response.measurable import MeasurableCellSupport, MeasurableSupport
-from sparserob_core.control.response.response import Response
+from sparserob_core.control.response.response import Response, TimeGrid, Weights
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
@@ -112,6 +112,21 @@ class WorstCase:
         response = Response(known, self.response.grid, self.response.initial_state)
         return WorstCase(response, self.dictionary, model, names=self.names)
 
+    def coarser(self, pieces: int) -> WorstCase:
+        """The same functionals where about so many equal pieces are the whole horizon, of a known system on many equal
+        ones on each of which every input may act: what they can bring to the state is almost the same. Else these."""
+        response, model = self.response, self.disturbance
+        grid, share = response.grid, response.grid.pieces // pieces
+        bound = grid.before is not None or (model is not None and not model.by_piece)
+        if share < 2 or bound or not response.propagator.aged(response.system.parameters is not None):
+            return self
+        ends = np.linspace(0.0, float(grid.breakpoints[-1]), grid.pieces // share + 1)
+        which = np.arange(ends.size - 1)
+        coarse = TimeGrid(ends, which, which, constants=grid.constants)
+        if model is not None:
+            model = replace(model, grid=coarse, starts=which)
+        return replace(self, response=Response(response.system, coarse, response.initial_state), disturbance=model)
+
     @shaped
     def rows(
         self, times: Float[Array, " k"], directions: Float[Array, "k d"], parameters: Float[Array, "k nu"]
@@ -121,7 +136,7 @@ class WorstCase:
             times,
             directions,
             parameters,
-            lambda part, free, gains, W: self._support(free, gains, W, times[part], directions[part], parameters[part]),
+            lambda part, known: self._support(known, times[part], directions[part], parameters[part]),
         )
 
     @shaped
@@ -137,12 +152,13 @@ class WorstCase:
         on the grid's pieces, from given ``deviations (k, d)`` of the initial state; the worst one of every index where
         none are given."""
 
-        def pushed(part: slice, free: Array, gains: Array, W: Array) -> Array:
+        def pushed(part: slice, known: Weights) -> Array:
+            free = known.free
             begun = self._begun(free) if deviations is None else (free * deviations[part]).sum(axis=1)
             return (
                 begun
                 if disturbances is None
-                else begun + np.einsum("kli,kil->k", self._through(gains, W), disturbances[part])
+                else begun + np.einsum("kli,kil->k", known.disturbance, disturbances[part])
             )
 
         return self._rows(times, directions, parameters, pushed)
@@ -153,16 +169,15 @@ class WorstCase:
         times: Float[Array, " k"],
         directions: Float[Array, "k d"],
         parameters: Float[Array, "k nu"],
-        pushed: Callable[[slice, Array, Array, Array], Array | float],
+        pushed: Callable[[slice, Weights], Array | float],
     ) -> tuple[Float[Array, "k n"], Float[Array, " k"]]:
-        """Rows and offsets; ``pushed(part, free, gains, W)`` is what the uncertainty adds to the offsets of a part of
-        the indices."""
+        """Rows and offsets; ``pushed(part, weights)`` is what the uncertainty adds to the offsets of a part of the
+        indices."""
         G, offset = np.empty((times.size, self.variables)), np.empty(times.size)
-        for part in self._chunks(times.size):
-            free, gains, B, W = self.response.adjoint(times[part], directions[part], parameters[part])
-            weights = self._through(gains, B)
-            G[part] = self.on_decision(weights)
-            offset[part] = free @ self.response.initial_state + self.given(weights) + pushed(part, free, gains, W)
+        for part in self._chunks(parameters):
+            known = self.response.weights(times[part], directions[part], parameters[part])
+            G[part] = self.on_decision(known.control)
+            offset[part] = known.free @ self.response.initial_state + self.given(known.control) + pushed(part, known)
         return G, offset
 
     @shaped
@@ -171,8 +186,8 @@ class WorstCase:
     ) -> Float[Array, "k nb q"]:
         """The coefficients ``(k, nb, q)`` of a worst disturbance at every index."""
         assert self.disturbance is not None
-        _, gains, _, W = self.response.adjoint(times, directions, parameters)
-        return self.disturbance.set.support_point(self.disturbance.blocks(self._through(gains, W)))
+        weights = self.response.weights(times, directions, parameters).disturbance
+        return self.disturbance.set.support_point(self.disturbance.blocks(weights))
 
     @shaped
     def values(
@@ -185,11 +200,11 @@ class WorstCase:
         """``max_w c'x(t)`` at a decision, ``(k,)``, without building the rows."""
         control = self.on_grid(theta)
         result = np.empty(times.size)
-        for part in self._chunks(times.size):
-            free, gains, B, W = self.response.adjoint(times[part], directions[part], parameters[part])
-            driven = np.einsum("klm,ml->k", self._through(gains, B), control)
-            support = self._support(free, gains, W, times[part], directions[part], parameters[part])
-            result[part] = free @ self.response.initial_state + driven + support
+        for part in self._chunks(parameters):
+            known = self.response.weights(times[part], directions[part], parameters[part])
+            driven = np.einsum("klm,ml->k", known.control, control)
+            support = self._support(known, times[part], directions[part], parameters[part])
+            result[part] = known.free @ self.response.initial_state + driven + support
         return result
 
     @shaped
@@ -240,9 +255,9 @@ class WorstCase:
         if not self.disturbed:
             return np.zeros(times.size)
         result = np.empty(times.size)
-        for part in self._chunks(times.size):
-            free, gains, _, W = self.response.adjoint(times[part], directions[part], parameters[part])
-            result[part] = self._support(free, gains, W, times[part], directions[part], parameters[part])
+        for part in self._chunks(parameters):
+            known = self.response.weights(times[part], directions[part], parameters[part])
+            result[part] = self._support(known, times[part], directions[part], parameters[part])
         return result
 
     @shaped
@@ -256,13 +271,13 @@ class WorstCase:
     def parts(self, time: float, direction: Float[Array, " d"], parameter: Float[Array, " nu"]) -> Parts:
         """What the largest ``c'x(t)`` is made of at one index, beside the control."""
         at = (np.array([time]), direction[None], parameter[None])
-        free, gains, B, W = self.response.adjoint(*at)
+        known = self.response.weights(*at)
         return Parts(
-            float(free[0] @ self.response.initial_state + self.given(self._through(gains, B))[0]),
-            float(self._support(free, gains, W, *at)[0]),
-            float(self._begun(free)[0]),
-            None if self.disturbance is None else self.disturbance.worst(self._through(gains, W))[0],
-            None if self.initial is None else self.initial.support_point(free)[0],
+            float(known.free[0] @ self.response.initial_state + self.given(known.control)[0]),
+            float(self._support(known, *at)[0]),
+            float(self._begun(known.free)[0]),
+            None if self.disturbance is None else self.disturbance.worst(known.disturbance)[0],
+            None if self.initial is None else self.initial.support_point(known.free)[0],
         )
 
     @shaped
@@ -272,7 +287,7 @@ class WorstCase:
         """The deviation ``(k, d)`` of a worst initial state at every index; 0 where there is one initial state."""
         if self.initial is None:
             return np.zeros(directions.shape)
-        return self.initial.support_point(self.response.adjoint(times, directions, parameters)[0])
+        return self.initial.support_point(self.response.weights(times, directions, parameters).free)
 
     @cached_property
     def measurable(self) -> MeasurableSupport:
@@ -324,32 +339,28 @@ class WorstCase:
     @shaped
     def _support(
         self,
-        free: Float[Array, "k d"],
-        gains: Float[Array, "k L d"],
-        W: Float[Array, "k d wj"],
+        known: Weights,
         times: Float[Array, " k"],
         directions: Float[Array, "k d"],
         parameters: Float[Array, "k nu"],
     ) -> Float[Array, " k"]:
-        begun = self._begun(free)
+        begun = self._begun(known.free)
         if self.disturbance is None:
             return begun
         if self.disturbance.kind == "measurable":
             return begun + self.measurable(times, directions, parameters)
-        return begun + self.disturbance.support(self._through(gains, W))
+        return begun + self.disturbance.support(known.disturbance)
 
     @shaped
     def _begun(self, free: Float[Array, "k d"]) -> Float[Array, " k"]:
         """What the worst initial state adds to functionals with the weights ``free (k, d)`` on it."""
         return np.zeros(free.shape[0]) if self.initial is None else self.initial.support(free)
 
-    def _through(self, gains: Array, matrices: Array) -> Array:
-        return self.response.grid.through(gains, matrices)
-
     @cached_property
     def _gives(self) -> bool:
         return bool(self.known.any())
 
-    def _chunks(self, count: int) -> list[slice]:
-        size = max(1, CHUNK // (self.response.grid.pieces * self.response.initial_state.size))
+    def _chunks(self, parameters: Array) -> list[slice]:
+        count = parameters.shape[0]
+        size = max(1, CHUNK // self.response.numbers(parameters.shape[1]))
         return [slice(start, start + size) for start in range(0, count, size)]

@@ -12,22 +12,27 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
-from sparserob_core.control.enclosures.matrix_exponential import EPSILON, Transitions, transitions
+from sparserob_core.control.enclosures.matrix_exponential import EPSILON, Transitions, exponential, transitions
 from sparserob_core.control.problem.system import System
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 
 LONG = 1000  # pieces from which the states are computed in blocks
+BLOCK = 32  # pieces of a block in which outputs are computed: what grows with it is as large as what does not
 TINY = float(np.finfo(float).tiny)
 KERNEL = 1_000_000  # numbers of what all ages give in all directions, up to which they are remembered
+STEP = 4 * EPSILON  # of the horizon: times that differ by less are a whole piece apart, or not at all
+SHORT, SERIES = 1.0, 1e-17  # norm of A times a part of a piece up to which a series is summed, and its last term
 FEW = 128  # indices for which a table beats the loop over the pieces
 INSIDE_KEPT = 4  # sets of durations within pieces whose transitions are remembered
 STEPS_KEPT = 16  # sets of parameters whose transitions are remembered
 SAME_DURATION = 1e-15  # of the horizon: durations that differ by less are computed once
+ALIKE = 1e-13  # of the horizon: pieces whose lengths differ by less are equally long
 SAME_TIME = 1e-12  # times closer than this share of the horizon are one
 
 
@@ -192,6 +197,70 @@ class Steps:
         return np.concatenate([self.Gamma, self.Phi], axis=-1)
 
 
+class Weights(NamedTuple):
+    """Functionals ``c'x(t)`` of ``k`` indices as weights on all that they depend on: ``free (k, d)`` on the initial
+    state, ``control (k, L, m)`` on what acts through the columns of ``B`` on every piece, ``disturbance (k, L, mw)`` on
+    what acts through those of ``E``."""
+
+    free: Array
+    control: Array
+    disturbance: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Impulses:
+    """What inputs through ``columns M (d, c)`` on a piece give to later states, by the age of the piece: ``e^{A i h}
+    Gamma(h) M``; for a known system and equal pieces, whose response is a convolution with this.
+
+    No table of all ages is made where it would be large. Those of the first ``reach`` ages (baby steps) and rows that
+    went on by a multiple of ``reach`` (giant steps) are multiplied: ``O(sqrt(L) d^2)`` numbers for the steps, and one
+    product. Either are doubled, so that every step is a product of few transitions, however late it is: where powers of
+    one of them were taken, its rounding would grow with the number of pieces.
+    """
+
+    propagator: Propagator
+    columns: Array
+
+    @cached_property
+    def reach(self) -> int:
+        """The number of baby steps, a power of two; all ages where their table is small."""
+        pieces, entries = self.propagator.grid.pieces, self.columns.size
+        places = (pieces - 1).bit_length()
+        return int(2 ** (places if pieces * entries <= KERNEL else places // 2 + 1))
+
+    @cached_property
+    def steps(self) -> Array:
+        """``e^{A i h} Gamma(h) M`` side by side for ``i < reach``, ``(d, reach c)``."""
+        d, c = self.columns.shape
+        first = self.propagator.steps(np.zeros((1, 0))).Gamma[0, 0] @ self.columns
+        steps = np.empty((d, min(self.reach, self.propagator.grid.pieces) * c))
+        steps[:, :c], done = first, c
+        for leap in self.propagator.leaps:
+            if done >= steps.shape[1]:
+                break
+            more = min(done, steps.shape[1] - done)
+            steps[:, done : done + more] = leap @ steps[:, :more]
+            done += more
+        return steps
+
+    def of(self, rows: Array, count: int) -> Array:
+        """What pieces of age ``0, ..., count - 1`` give to ``rows (..., d)``: ``(..., count, c)``."""
+        c, lead = self.columns.shape[1], rows.shape[:-1]
+        if count <= self.reach:
+            return np.asarray((rows @ self.steps[:, : count * c]).reshape(*lead, count, c))
+        flat = rows.reshape(-1, rows.shape[-1])
+        giants = np.empty((flat.shape[0], -(-count // self.reach), flat.shape[1]))
+        giants[:, 0], done = flat, 1
+        for leap in self.propagator.leaps[self.reach.bit_length() - 1 :]:
+            if done >= giants.shape[1]:
+                break
+            more = min(done, giants.shape[1] - done)
+            giants[:, done : done + more] = giants[:, :more] @ leap
+            done += more
+        found = (giants.reshape(-1, flat.shape[1]) @ self.steps).reshape(flat.shape[0], -1, c)
+        return np.asarray(found[:, :count].reshape(*lead, count, c))
+
+
 @dataclass(frozen=True, eq=False)
 class Propagator:
     """What the responses of one system on one time grid share, from whatever initial state: transition matrices, and
@@ -205,13 +274,16 @@ class Propagator:
     @cached_property
     def which(self) -> np.ndarray:
         """Which of the distinct modes and lengths, in the order of `Steps`, every piece has, ``(L,)``."""
-        lengths = np.round(self.grid.lengths / self.grid.breakpoints[-1], 13)
+        lengths = self.grid.lengths / self.grid.breakpoints[-1]
+        if self.grid.mode is None and np.ptp(lengths) <= ALIKE:  # rounded, some might go up and others down
+            return np.zeros(lengths.size, dtype=int)
+        lengths = np.round(lengths / ALIKE)
         mode = np.zeros(lengths.size) if self.grid.mode is None else self.grid.mode
         _, which = np.unique(np.stack([mode, lengths]), axis=1, return_inverse=True)
         return np.asarray(which.reshape(-1))
 
     @cached_property
-    def _lengths(self) -> Array:
+    def lengths(self) -> Array:
         """The lengths ``(q,)`` of distinct modes and lengths, as means: the rounding must not add up."""
         means: Array = np.bincount(self.which, self.grid.lengths) / np.bincount(self.which)
         return means
@@ -219,7 +291,7 @@ class Propagator:
     @cached_property
     def _modes(self) -> np.ndarray:
         """The mode ``(q,)`` of every entry of `Steps`."""
-        modes = np.zeros(self._lengths.size, dtype=int)
+        modes = np.zeros(self.lengths.size, dtype=int)
         if self.grid.mode is not None:
             modes[self.which] = self.grid.mode
         return modes
@@ -235,7 +307,7 @@ class Propagator:
                 np.stack([one[0] for one in every], axis=1),
                 *(np.concatenate([one[part] for one in every], axis=2) for part in (1, 2)),
             )
-            Phi, Gamma = self._transitions(A[:, self._modes], self._lengths[None, :])
+            Phi, Gamma = self._transitions(A[:, self._modes], self.lengths[None, :])
             remember(self._steps, key, Steps(A, B, E, Phi, Gamma), STEPS_KEPT)
         return self._steps[key]
 
@@ -279,6 +351,81 @@ class Propagator:
         back[order] = np.arange(order.size)
         return rows[back, 0], gains[back], steps.B[which[back]], steps.E[which[back]]
 
+    @shaped
+    def weights(
+        self, times: Float[Array, " k"], directions: Float[Array, "k d"], parameters: Float[Array, "k nu"]
+    ) -> Weights:
+        """The functional ``c'x(t)`` of each index as weights on what is given and on inputs: `adjoint` and
+        `TimeGrid.through`, without ``(k, L, d)`` numbers where the system is known and the pieces are equal."""
+        if self.aged(parameters.shape[1]):
+            return self._weights_by_age(times, directions)
+        free, gains, B, E = self.adjoint(times, directions, parameters)
+        return Weights(free, self.grid.through(gains, B), self.grid.through(gains, E))
+
+    def aged(self, parameters: int) -> bool:
+        """Whether what a piece gives depends on its age alone, with so many ``parameters``."""
+        return not parameters and self.uniform
+
+    def _weights_by_age(self, times: Array, directions: Array) -> Weights:
+        pieces, steps = self.grid.locate(times), self.steps(np.zeros((1, 0)))
+        rows, entered = self._over_parts(steps, directions, times - self.grid.breakpoints[pieces])
+        count, channels = int(pieces.max(initial=0)), steps.B.shape[2]
+        apart, which = rows, np.arange(times.size)
+        if times.size > 1 and self.inputs.reach < self.grid.pieces:  # later times are shifts of one impulse response
+            apart, which = _unique_rows(rows)
+        by_age = self.inputs.of(apart, count)
+        control = np.zeros((times.size, self.grid.pieces, channels))
+        disturbance = np.zeros((times.size, self.grid.pieces, steps.E.shape[2]))
+        for number, (piece, row) in enumerate(zip(pieces.tolist(), which.tolist(), strict=True)):
+            if piece:
+                backwards = by_age[row, piece - 1 :: -1]
+                control[number, :piece], disturbance[number, :piece] = (
+                    backwards[:, :channels],
+                    backwards[:, channels:],
+                )
+        last = entered @ self.inputs.columns
+        every = np.arange(times.size)
+        control[every, pieces], disturbance[every, pieces] = last[:, :channels], last[:, channels:]
+        return Weights(self._leapt(rows, pieces), control, disturbance)
+
+    @cached_property
+    def inputs(self) -> Impulses:
+        """What the columns of ``B`` and of ``E``, side by side, give by age."""
+        steps = self.steps(np.zeros((1, 0)))
+        return Impulses(self, np.concatenate([steps.B[0], steps.E[0]], axis=1))
+
+    def _over_parts(self, steps: Steps, rows: Array, within: Array) -> tuple[Array, Array]:
+        """``c'e^{A r}`` and ``c'Gamma(r)`` of ``rows (k, d)`` over parts ``within (k,)`` of pieces of a known system,
+        ``(k, d)`` each. Short parts by the exponential series on the rows: no matrix is built."""
+        length, least = float(self.lengths[0]), STEP * float(self.grid.breakpoints[-1])
+        whole = np.abs(within - length) <= least
+        if whole.all():
+            return rows @ steps.Phi[0, 0], rows @ steps.Gamma[0, 0]
+        within = np.where(np.abs(within) <= least, 0.0, np.where(whole, length, within))
+        A = steps.A[0, 0]
+        size = float(np.linalg.norm(A)) * float(within.max())
+        if size > SHORT:
+            Phi, Gamma = self._partial(
+                steps, np.zeros(within.size, dtype=int), within, np.zeros(within.size, dtype=int)
+            )
+            return (rows[:, None] @ Phi)[:, 0], (rows[:, None] @ Gamma)[:, 0]
+        elapsed = within[:, None]
+        flown, driven, term, order, bound = rows, rows * elapsed, rows, 0, 1.0
+        while bound > SERIES:
+            order += 1
+            term = term @ A * (elapsed / order)
+            flown, driven = flown + term, driven + term * (elapsed / (order + 1))
+            bound *= size / order
+        return flown, driven
+
+    def _leapt(self, rows: Array, pieces: np.ndarray) -> Array:
+        """``rows (k, d)`` that went on by so many whole ``pieces (k,)``, ``(k, d)``."""
+        free = rows.copy()
+        for place, leap in enumerate(self.leaps[: int(pieces.max(initial=0)).bit_length()]):
+            far = np.flatnonzero(pieces >> place & 1)
+            free[far] = free[far] @ leap
+        return free
+
     def _adjoint_of_few(
         self, steps: Steps, times: Array, directions: Array, pieces: np.ndarray
     ) -> tuple[Array, Array, Array, Array]:
@@ -288,14 +435,11 @@ class Propagator:
         Phi, Gamma = self._partial(steps, np.zeros_like(pieces), within, pieces)
         rows = np.einsum("kd,kde->ke", directions, Phi)
         gains = np.zeros((times.size, self.grid.pieces, directions.shape[1]))
-        by_age = self._aged(rows, int(pieces.max()))
+        by_age = self._every_state.of(rows, int(pieces.max()))
         for number, piece in enumerate(pieces.tolist()):
             gains[number, :piece] = by_age[number, :piece][::-1]
         gains[np.arange(times.size), pieces] = np.einsum("kd,kde->ke", directions, Gamma)
-        free = rows.copy()
-        for place, leap in enumerate(self._leaps[: int(pieces.max()).bit_length()]):
-            far = np.flatnonzero(pieces >> place & 1)
-            free[far] = free[far] @ leap
+        free = self._leapt(rows, pieces)
         return free, gains, np.repeat(steps.B, times.size, axis=0), np.repeat(steps.E, times.size, axis=0)
 
     def _partial(self, steps: Steps, which: np.ndarray, within: Array, pieces: np.ndarray) -> tuple[Array, Array]:
@@ -318,14 +462,14 @@ class Propagator:
     @property
     def uniform(self) -> bool:
         """Whether all pieces of the grid are equally long, and of one mode."""
-        return bool(self._lengths.size == 1)
+        return bool(self.lengths.size == 1)
 
     def block(self, steps: Steps) -> int:
         """How many equal pieces are taken together where the states of many are asked for; 1: none. No more than the
         system moves little on, so that what a block adds from 0 is not much larger than the states."""
         if self.grid.pieces < LONG:
             return 1
-        pace = float(np.linalg.norm(steps.A, axis=(2, 3)).max()) * float(self._lengths[0])
+        pace = float(np.linalg.norm(steps.A, axis=(2, 3)).max()) * float(self.lengths[0])
         return int(max(1.0, min(np.sqrt(self.grid.pieces), 1.0 / max(pace, TINY))))
 
     def flows(self, durations: Array) -> tuple[Array, Array]:
@@ -336,45 +480,141 @@ class Propagator:
         return (self.propagate or transitions)(A, durations)
 
     @cached_property
-    def _leaps(self) -> Array:
+    def leaps(self) -> Array:
         """The transitions over 1, 2, 4, ... pieces, ``(q, d, d)``; for a known system and equal pieces."""
-        return self.flows(2.0 ** np.arange(self.grid.pieces.bit_length()) * self._lengths[0])[0]
+        durations = 2.0 ** np.arange(self.grid.pieces.bit_length()) * self.lengths[0]
+        if self.propagate is not None:
+            return self.flows(durations)[0]
+        answer: Array = exponential(self.steps(np.zeros((1, 0))).A[0, 0] * durations[:, None, None])
+        return answer
 
-    def _aged(self, rows: Array, count: int) -> Array:
-        """What a piece of age ``0, ..., count - 1`` still gives to ``rows (k, d)``, ``(k, count, d)``: all ages of a
-        row at once, twice as many each time, where the `kernel` would be large."""
-        if self.grid.pieces * rows.shape[1] ** 2 <= KERNEL:
-            return np.asarray(np.einsum("kd,dle->kle", rows, self.kernel[:, :count]))
-        powers, done = np.empty((rows.shape[0], count, rows.shape[1])), min(1, count)
-        powers[:, :done] = rows[:, None]
-        for leap in self._leaps:
-            if done >= count:
-                break
-            more = min(done, count - done)
-            powers[:, done : done + more] = powers[:, :more] @ leap
-            done += more
-        return np.asarray(powers @ self.steps(np.zeros((1, 0))).Gamma[0, 0])
+    @cached_property
+    def _every_state(self) -> Impulses:
+        return Impulses(self, np.eye(self.system.states))
 
     @cached_property
     def kernel(self) -> Array:
-        """``e^{A i h} Gamma(h)`` for ``i = 0, ..., L - 1``: what a piece of age ``i`` still gives; for a known system
-        and equal pieces, whose response is a convolution (a Toeplitz matrix) with this kernel. ``(d, L, d)``, so that
-        products with rows run through memory."""
-        steps = self.steps(np.zeros((1, 0)))
-        powers = np.empty((self.grid.pieces, *steps.A.shape[2:]))
-        powers[0] = steps.Gamma[0, 0]
-        for place, leap in enumerate(self._leaps[: (self.grid.pieces - 1).bit_length()]):
-            done = 2**place  # e^{A (done + i) h} = e^{A done h} e^{A i h}
-            count = min(done, powers.shape[0] - done)
-            powers[done : done + count] = leap @ powers[:count]
-        return np.ascontiguousarray(powers.swapaxes(0, 1))
+        """``e^{A i h} Gamma(h)`` for ``i = 0, ..., L - 1``, ``(d, L, d)``: a table of all that `Impulses` tell, for a
+        known system and equal pieces."""
+        return self._every_state.of(np.eye(self.system.states), self.grid.pieces)
 
     @cached_property
     def lateness(self) -> tuple[float, float]:
         """How far durations that are used may be from those that are meant: of pieces, where nearly equal ones are
         taken for equal, and within a piece, where they are rounded (`TimeGrid.distinct`)."""
-        unequal, elapsed = np.abs(self.grid.lengths - self._lengths[self.which]).max(), self.grid.elapsed
+        unequal, elapsed = np.abs(self.grid.lengths - self.lengths[self.which]).max(), self.grid.elapsed
         return float(unequal + EPSILON * elapsed), float(SAME_DURATION * (self.grid.breakpoints[-1] + elapsed))
+
+
+@dataclass(frozen=True, eq=False)
+class Outputs:
+    """``H x(t)`` at many ``times (T,)``, for rows ``H (r, d)``, at parameters ``points (v, nu)``, under any control.
+
+    For a known system and equal pieces the states at all breakpoints are never made: only those at the beginning of
+    blocks of pieces, and what these and the inputs within a block bring to ``H x`` in it, which is the same in every
+    block.
+    """
+
+    propagator: Propagator
+    H: Array
+    times: Array
+    points: Array
+
+    @cached_property
+    def within(self) -> tuple[np.ndarray, Array, np.ndarray]:
+        """The piece of every time, the distinct durations ``(q,)`` since the beginning of a piece, and which of them
+        each is, ``(T,)``; durations that differ by the rounding of breakpoints are one."""
+        grid = self.propagator.grid
+        pieces = grid.locate(self.times)
+        since = self.times - grid.breakpoints[pieces]
+        order = np.argsort(since, kind="stable")
+        group = np.cumsum(np.diff(since[order], prepend=since[order[:1]]) > STEP * float(grid.breakpoints[-1]))
+        which = np.empty_like(group)
+        which[order] = group
+        return pieces, np.bincount(which, since) / np.bincount(which), which
+
+    @cached_property
+    def _steps(self) -> tuple[Array, Array]:
+        """``H e^{A r}`` and ``H Gamma(r)`` for the distinct durations: ``(v, q, r, d)`` each, of several modes ``(v, T,
+        r, d)``."""
+        steps, grid = self.propagator.steps(self.points), self.propagator.grid
+        pieces, durations, which = self.within
+        if grid.mode is None:
+            found = transitions(steps.A, durations[None])
+        else:
+            found = transitions(steps.A[:, grid.mode[pieces]], durations[which][None])
+        return self.H @ found[0], self.H @ found[1]
+
+    def at(self, response: Response, control: Array) -> Array:
+        """``(v, r, T)`` from the initial state of a response, under a control ``(m, K)`` on its own pieces."""
+        if self.propagator.aged(self.points.shape[1]) and self.propagator.grid.pieces >= LONG:
+            return self._in_blocks(response.initial_state, self.propagator.grid.inputs(control))[None]
+        steps, grid = self.propagator.steps(self.points), self.propagator.grid
+        nodes, drive = response.states(control, self.points), grid.driven(steps.B, grid.inputs(control))
+        pieces, _, which = self.within
+        which = which if grid.mode is None else np.arange(which.size)
+        flow, driven = (part[:, which] for part in self._steps)
+        found = np.einsum("vtri,vti->vrt", flow, nodes[:, pieces]) + np.einsum(
+            "vtri,vti->vrt", driven, drive[:, pieces]
+        )
+        return np.asarray(found)
+
+    def _in_blocks(self, initial_state: Array, inputs: Array) -> Array:
+        """``(r, T)`` from inputs ``(m, L)``."""
+        block, first, count = self._blocks
+        carried, entered = self._tables
+        pieces, durations, which = self.within
+        m, d = inputs.shape[0], initial_state.size
+        padded = np.zeros(((first + count) * block, m))
+        kept = min(padded.shape[0], inputs.shape[1])
+        padded[:kept] = inputs[:, :kept].T
+        by_block = padded.reshape(first + count, block * m)
+        begun, pushed = np.empty((first + count, d)), by_block @ self._pushed
+        begun[0], over = initial_state, self._over_block
+        for number in range(1, first + count):
+            begun[number] = over @ begun[number - 1] + pushed[number - 1]
+        found = begun[first:] @ carried + by_block[first:] @ entered
+        every = found.reshape(count * block, durations.size, self.H.shape[0])
+        return np.asarray(every[pieces - first * block, which].T)
+
+    @cached_property
+    def _blocks(self) -> tuple[int, int, int]:
+        """How many pieces a block has, the first block that is looked at, and how many are."""
+        steps, pieces = self.propagator.steps(self.points), self.within[0]
+        block = min(BLOCK, self.propagator.block(steps))
+        first = int(pieces.min()) // block
+        return block, first, int(pieces.max()) // block + 1 - first
+
+    @cached_property
+    def _over_block(self) -> Array:
+        """The transition over a block, ``(d, d)``."""
+        steps, block = self.propagator.steps(self.points), self._blocks[0]
+        return np.asarray(transitions(steps.A[0, 0], block * self.propagator.lengths[:1])[0][0])
+
+    @cached_property
+    def _pushed(self) -> Array:
+        """What the inputs of a block make of the state at its end, ``(block m, d)``."""
+        block, m = self._blocks[0], self.propagator.steps(self.points).B.shape[2]
+        every = self.propagator.inputs.of(np.eye(self.H.shape[1]), block)  # (d, block, m + mw)
+        return np.ascontiguousarray(every[:, ::-1, :m].reshape(every.shape[0], -1).T)
+
+    @cached_property
+    def _tables(self) -> tuple[Array, Array]:
+        """What the state at the beginning of a block, ``(d, block q r)``, and the inputs in it, ``(block m, block q
+        r)``, bring to ``H x`` on its pieces, for all distinct durations."""
+        steps, block = self.propagator.steps(self.points), self._blocks[0]
+        flow, driven = (part[0].reshape(-1, self.H.shape[1]) for part in self._steps)  # (q r, d)
+        m, rows = steps.B.shape[2], flow.shape[0]
+        carried = np.empty((block, rows, self.H.shape[1]))
+        carried[0] = flow
+        for place in range(1, block):
+            carried[place] = carried[place - 1] @ steps.Phi[0, 0]
+        older = self.propagator.inputs.of(flow, block)[:, :, :m]  # (q r, block, m)
+        entered = np.zeros((block, m, block, rows))
+        for place in range(block):
+            entered[place, :, place] = (driven @ steps.B[0]).T
+            entered[:place, :, place] = older[:, :place][:, ::-1].transpose(1, 2, 0)
+        return carried.reshape(block * rows, -1).T, entered.reshape(block * m, block * rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -415,6 +655,19 @@ class Response:
     ) -> tuple[Float[Array, "k d"], Float[Array, "k L d"], Float[Array, "k d m"], Float[Array, "k d mw"]]:
         """`Propagator.adjoint`."""
         return self.propagator.adjoint(times, directions, parameters)
+
+    @shaped
+    def weights(
+        self, times: Float[Array, " k"], directions: Float[Array, "k d"], parameters: Float[Array, "k nu"]
+    ) -> Weights:
+        """`Propagator.weights`."""
+        return self.propagator.weights(times, directions, parameters)
+
+    def numbers(self, parameters: int) -> int:
+        """How many numbers `weights` of one index make at once, with so many ``parameters``."""
+        system, grid = self.system, self.grid
+        width = system.controls + system.disturbances if self.propagator.aged(parameters) else system.states
+        return int(grid.pieces * width)
 
     def flows(self, durations: Array) -> tuple[Array, Array]:
         """`Propagator.flows`."""

@@ -250,7 +250,7 @@ class _Joined(_OfPlane):
         if constraint is None:
             return np.concatenate([G, np.zeros((*G.shape[:2], 2))], axis=2), h
         times, directions, parameters, _ = constraint.functionals_at(indices)
-        free = constraint.functionals.response.adjoint(times, directions, parameters)[0]
+        free = constraint.functionals.response.weights(times, directions, parameters).free
         columns = free[:, list(self.plane.states)] * self.plane.radius
         return np.concatenate([G, columns.reshape(*G.shape[:2], 2)], axis=2), h
 

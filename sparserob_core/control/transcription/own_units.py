@@ -14,6 +14,8 @@ from sparserob_core.control.sets.sets import Equality
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 TIMES = 17  # at most, at which a reach is looked at
+AT_ONCE = 2_000_000  # numbers that functionals are made of
+LOOKED_AT = 1000  # pieces, in about so many of which a reach is computed
 PARAMETERS = 9  # at most, at which a reach is looked at
 RESOLVED = 2.0**-18  # of the numbers that are added up, the least unit: 1e-9 of it is 17 units of rounding
 COST = 0.125  # of the largest possible cost, its unit: weights of a regulariser keep their size in the paper's problems
@@ -57,6 +59,7 @@ def own_units(problem: OptimalControlProblem, rough: Units, functionals: WorstCa
     """The units of a problem, from how far its states reach: ``functionals`` are those of the problem in rough
     units."""
     axes, parameters = np.eye(problem.system.states), ParameterIndex(functionals.response.system.parameters)
+    functionals = functionals.coarser(LOOKED_AT)
     times = window_times(functionals, 0.0, float(functionals.response.grid.breakpoints[-1]))
     reach, _ = reaches(functionals, parameters, rough.of_problem(problem).control, axes, times)
     usable = np.isfinite(reach) & (reach > 0.0)
@@ -89,7 +92,7 @@ def _cost_per_time(problem: OptimalControlProblem, states: Array, time: float) -
 def row_units(constraint: StateConstraint, control: ConvexSet) -> Array:
     """The unit ``(r,)`` of each row of a constraint: see `units_of_sides`; of a curved set, whose rows are in multiples
     of its gauge, 1, or what double precision resolves of that."""
-    functionals, sides = constraint.functionals, constraint.sides
+    functionals, sides = constraint.functionals.coarser(LOOKED_AT), constraint.sides
     times = window_times(functionals, constraint.start, constraint.stop)
     moved = constraint.reference
     if sides is not None:
@@ -140,15 +143,14 @@ def reaches(
     the worst initial state, ``(r,)``, and the largest sum of absolute values from which they are computed, ``(r,)``.
     ``beside (times, r)`` is added to them, and ``G u`` of any control where there is ``G (r, m)``."""
     points, r = looked_at(parameters), H.shape[0]
-    shape = (points.shape[0], times.size, r)
-    at = np.tile(np.repeat(times, r), shape[0])
-    directions, p = np.tile(H, (shape[0] * shape[1], 1)), np.repeat(points, shape[1] * r, axis=0)
+    shape = (points.shape[0], r, times.size)
+    at, p = np.tile(times, shape[0] * r), np.repeat(points, r * times.size, axis=0)
+    directions = np.tile(np.repeat(H, times.size, axis=0), (shape[0], 1))
     up, down, added = (np.zeros(at.size) for _ in range(3))
-    size = max(1, 2_000_000 // (functionals.response.grid.pieces * functionals.response.initial_state.size))
+    size = max(1, AT_ONCE // functionals.response.numbers(p.shape[1]))
     for begin in range(0, at.size, size):
         part = slice(begin, begin + size)
-        free, gains, B, W = functionals.response.adjoint(at[part], directions[part], p[part])
-        every = functionals.response.grid.through(gains, B)
+        free, every, on_noise = functionals.response.weights(at[part], directions[part], p[part])
         on_control, known = functionals.decided(every), functionals.given(every)
         rest = free @ functionals.response.initial_state + known
         up[part], down[part] = (
@@ -164,11 +166,10 @@ def reaches(
             down[part] += initial.support(-free)
             added[part] += np.abs(free) @ extent(initial)
         if model is not None:
-            on_noise = functionals.response.grid.through(gains, W)
             up[part] += model.support(on_noise)
             down[part] += model.support(-on_noise)
             added[part] += np.abs(on_noise @ np.diag(extent(model.bound))).sum(axis=(1, 2))
-    high, low, sums = (one.reshape(shape) for one in (up, down, added))
+    high, low, sums = (one.reshape(shape).swapaxes(1, 2) for one in (up, down, added))
     if beside is not None:
         high, low, sums = high + beside, low - beside, sums + np.abs(beside)
     if G is not None:

@@ -64,16 +64,15 @@ def _added(model: Transcription, result: Result) -> float:
     if not rows:
         return 0.0
     multipliers, times, directions, parameters = (np.array(column, dtype=float) for column in zip(*rows, strict=True))
-    free, gains, B, E = model.response.adjoint(times, directions, parameters.reshape(len(rows), -1))
+    free, weights, on_noise = model.response.weights(times, directions, parameters.reshape(len(rows), -1))
     sizes = np.abs(free) @ np.abs(model.response.initial_state)
     if model.problem.initial_set is not None:
         sizes += np.abs(free) @ _far(model.problem.initial_set)
-    functionals, grid = model.functionals, model.response.grid
-    weights = grid.through(gains, B)
+    functionals = model.functionals
     sizes += np.einsum("klm,ml->k", np.abs(weights), np.abs(functionals.known))
     sizes += (np.abs(functionals.decided(weights)) @ _far(model.problem.control)).sum(axis=1)
     if model.problem.disturbance is not None:
-        sizes += (np.abs(grid.through(gains, E)) @ _far(model.problem.disturbance)).sum(axis=1)
+        sizes += (np.abs(on_noise) @ _far(model.problem.disturbance)).sum(axis=1)
     return float(multipliers @ sizes) + besides
 
 
