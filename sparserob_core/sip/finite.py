@@ -8,6 +8,7 @@ deviation is in closed form, ``max_w w'a`` a sum of support functions (Ben-Tal, 
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal, final
@@ -20,6 +21,10 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array, csr_array
+
+
+NAN = "finite program: a bound or right-hand side is NaN"
+SIGNS = "finite program: expected weights >= 0 and right-hand sides above -inf"
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +112,55 @@ class FiniteProgram:
         """Number of decision variables."""
         return int(self.q.size)
 
+    @cached_property
+    def curvature(self) -> Array | None:
+        """The diagonal ``(n,)`` of ``P``, zeros where there is none; ``None`` where it has other entries."""
+        return diagonal(self.P, self.n)
+
+    @cached_property
+    def steepest(self) -> float:
+        """The largest coefficient of the linear cost and of the absolute values."""
+        return float(max(self.weights.max(initial=0.0), np.abs(self.q).max(initial=0.0)))
+
+    @cached_property
+    def separable(self) -> bool:
+        """Whether every entry has a cost and bounds for itself: ``S`` the identity, ``P`` diagonal, and no blocks."""
+        return self.S is None and self.blocks is None and self.curvature is not None
+
+    def under(self, G: Array, h: Array) -> FiniteProgram:
+        """The same program under more rows ``G x <= h``, which come after its own."""
+        own = self.h.size
+        G, h = (np.vstack([self.G, G]), np.concatenate([self.h, h])) if own else (G, h)
+        more = FiniteProgram(
+            self.q,
+            self.weights,
+            self.lower,
+            self.upper,
+            G,
+            h,
+            self.A,
+            self.b,
+            self.P,
+            self.S,
+            self.constant,
+            self.blocks,
+        )
+        # what does not depend on the rows
+        more.__dict__.update(curvature=self.curvature, steepest=self.steepest, bounded=self.bounded, _sound=self._sound)
+        return more
+
+    def curved(self, P: csc_array, q: Array) -> FiniteProgram:
+        """The same program with another quadratic and linear cost."""
+        other = replace(self, P=P, q=q)
+        if q is self.q:
+            other.__dict__.update(steepest=self.steepest, bounded=self.bounded, _sound=self._sound)
+        return other
+
+    @cached_property
+    def bounded(self) -> bool:
+        """Whether all bounds are finite."""
+        return bool(np.isfinite(self.lower).all() and np.isfinite(self.upper).all())
+
     @shaped
     def image(self, x: Float[Array, " n"]) -> Float[Array, " k"]:
         """``S x`` ``(k,)``."""
@@ -115,7 +169,7 @@ class FiniteProgram:
     @shaped
     def objective(self, x: Float[Array, " n"]) -> float:
         """The cost at ``x``."""
-        quadratic = 0.0 if self.P is None else 0.5 * float(x @ (self.P @ x))
+        quadratic = 0.0 if self.P is None else 0.5 * float(x @ self._bent(x))
         return float(self.weights @ self._lengths(x) + self.q @ x) + quadratic + self.constant
 
     @shaped
@@ -123,12 +177,19 @@ class FiniteProgram:
         image = self.image(x)
         return np.abs(image) if self.blocks is None else self.blocks.lengths(image)
 
+    def _bent(self, x: Array) -> Array:
+        """``P x``."""
+        if self.curvature is not None:
+            return self.curvature * x
+        assert self.P is not None
+        return np.asarray(self.P @ x, dtype=float)
+
     @shaped
     def tangent(self, at: Float[Array, " n"]) -> FiniteProgram:
         """The same program with ``1/2 x'P x`` replaced by its tangent at ``at``, which lies below it."""
         if self.P is None:
             return self
-        bent = np.asarray(self.P @ at, dtype=float)
+        bent = self._bent(at)
         return replace(self, P=None, q=self.q + bent, constant=self.constant - 0.5 * float(at @ bent))
 
     @shaped
@@ -148,8 +209,10 @@ class FiniteProgram:
             worst = scaled_violation(self.G @ x - self.h, self.G, self.h, size)
         worst = max(worst, self.missed(x))
         image = self.image(x)
-        outside = np.maximum(self.lower - image, image - self.upper) / np.maximum(1.0, np.abs(image))
-        return max(worst, float(outside.max(initial=0.0)))
+        outside = np.maximum(self.lower - image, image - self.upper)
+        if outside.max(initial=0.0) == 0.0:
+            return worst
+        return max(worst, float((outside / np.maximum(1.0, np.abs(image))).max()))
 
     @shaped
     def missed(self, x: Float[Array, " n"]) -> float:
@@ -164,20 +227,32 @@ class FiniteProgram:
 
     def validate(self) -> None:
         """Raise `InputError` when shapes disagree or a number is not one."""
+        self._demand({"G": (self.h.size, self.n)}, ("G",))
+        if not self.h.min(initial=np.inf) > -np.inf:
+            raise InputError(NAN if np.isnan(self.h).any() else SIGNS)
+        assert self._sound
+
+    @cached_property
+    def _sound(self) -> bool:
+        """`validate`, but for the rows."""
         k = self.n if self.S is None else int(self.S.shape[0])
-        shapes = {"weights": (k,), "lower": (k,), "upper": (k,), "G": (self.h.size, self.n), "A": (self.b.size, self.n)}
+        shapes = {"weights": (k,), "lower": (k,), "upper": (k,), "A": (self.b.size, self.n)}
+        self._demand(shapes, ("q", "weights", "A", "b"))
+        if np.isnan(self.lower).any() or np.isnan(self.upper).any():
+            raise InputError(NAN)
+        if (self.weights < 0).any():
+            raise InputError(SIGNS)
+        if not np.isfinite(self.constant):
+            raise InputError(f"finite program: constant is {self.constant}, expected a finite number")
+        return True
+
+    def _demand(self, shapes: Mapping[str, tuple[int, ...]], finite: Sequence[str]) -> None:
         for name, shape in shapes.items():
             if getattr(self, name).shape != shape:
                 raise InputError(f"finite program: {name} has shape {getattr(self, name).shape}, expected {shape}")
-        for name in ("q", "weights", "G", "A", "b"):
+        for name in finite:
             if not np.isfinite(getattr(self, name)).all():
                 raise InputError(f"finite program: {name} has an entry that is not a finite number")
-        if np.isnan(self.lower).any() or np.isnan(self.upper).any() or np.isnan(self.h).any():
-            raise InputError("finite program: a bound or right-hand side is NaN")
-        if np.isneginf(self.h).any() or (self.weights < 0).any():
-            raise InputError("finite program: expected weights >= 0 and right-hand sides above -inf")
-        if not np.isfinite(self.constant):
-            raise InputError(f"finite program: constant is {self.constant}, expected a finite number")
 
 
 def diagonal(P: csc_array | None, n: int) -> Array | None:

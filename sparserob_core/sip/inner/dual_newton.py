@@ -20,13 +20,14 @@ from sparserob_core.shapes import Bool, Float, shaped
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution, diagonal
 from sparserob_core.sip.inner.change_of_variables import in_new_variables
-from sparserob_core.sip.inner.duality import measure, minimisers
+from sparserob_core.sip.inner.duality import bent_minimisers, measure
 from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
 
 ITERATIONS = 60
 PATIENCE = 10
 SEARCH = 25
 TARGET = 1e-12
+TINY = float(np.finfo(float).tiny)
 DAMPING, DAMPED = 1e-13, 1e4  # of the trace of a Hessian, and what that becomes where a step climbs nothing
 # below this, relative to the linear cost, the curvature amplifies round-off too much for Newton's method alone
 FLAT = 1e-4
@@ -54,7 +55,8 @@ class DualNewton(Solver, Options):
     def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
         """See `Solver.solve`; ``solved`` where residual and gap, both measured here, are at most ``accuracy``, or what
         double precision can tell."""
-        if diagonal(program.P, program.q.size) is None:
+        P = program.P if program.P.nnz else None
+        if diagonal(P, program.q.size) is None:
             none = np.full(program.q.size, np.nan)
             return Claim("failed", none, np.zeros(program.h.size), np.zeros(program.b.size), none, NOT_SEPARABLE)
         finite = FiniteProgram(
@@ -66,7 +68,7 @@ class DualNewton(Solver, Options):
             program.h,
             program.A.toarray(),
             program.b,
-            P=program.P if program.P.nnz else None,
+            P=P,
         )
         found, steps = from_nothing(finite, accuracy, self.points)
         bent = 0.0 if finite.P is None else finite.P @ found.x
@@ -85,7 +87,7 @@ def not_separable(program: FiniteProgram) -> str:
     easier = None if program.S is None else in_new_variables(program)
     if program.S is not None and easier is None:
         return "its costs and bounds are of sums of entries, and there are no variables in which each has its own"
-    if diagonal((easier.program if easier else program).P, program.n) is None:
+    if (easier.program if easier else program).curvature is None:
         return "its quadratic cost, or its regulariser, couples entries"
     return ""
 
@@ -95,9 +97,9 @@ def from_nothing(program: FiniteProgram, accuracy: float, points: int) -> tuple[
     took; it is not sought further once residual and gap are at most ``accuracy``."""
     from scipy.sparse import dia_array
 
-    curvature = diagonal(program.P, program.n)
+    curvature = program.curvature
     assert curvature is not None
-    least, cost = float(curvature.min(initial=np.inf)), _cost(program) or 1.0
+    least, cost = float(curvature.min(initial=np.inf)), program.steepest or 1.0
     y, mu, x = np.zeros(program.h.size), np.zeros(program.b.size), np.clip(0.0, program.lower, program.upper)
     best = measure(program, x, y, mu, message="nothing")
     weight, idle, number = cost, 0, 0
@@ -131,16 +133,12 @@ def polish(
 ) -> FiniteSolution | None:
     """The optimum to round-off from a nearby claim, by `newton_solve` or, where the curvature is too small for it,
     `proximal_polish`."""
-    curvature = diagonal(program.P, program.n) if program.S is None and program.blocks is None else None
+    curvature = program.curvature if program.separable else None
     if curvature is None or x.shape != program.q.shape or y.shape != program.h.shape or mu.shape != program.b.shape:
         return None
-    bent = float(curvature.min(initial=np.inf)) >= FLAT * _cost(program)
+    bent = float(curvature.min(initial=np.inf)) >= FLAT * program.steepest
     found = newton_solve(program, y, mu) if bent else None
     return proximal_polish(program, x, y, mu) if found is None else found
-
-
-def _cost(program: FiniteProgram) -> float:
-    return float(max(program.weights.max(initial=0.0), np.abs(program.q).max(initial=0.0)))
 
 
 @shaped
@@ -153,14 +151,14 @@ def proximal_polish(
     A polyhedral program ends after finitely many rounds at an exact optimum. A strictly convex one needs weights as
     small as its curvature to bring ``x`` itself, not only the value, to the optimiser. The best round is returned.
     """
-    curvature = diagonal(program.P, program.n)
+    curvature = program.curvature
     if program.S is not None or curvature is None:
         return None
     from scipy.sparse import dia_array
 
     flat = not curvature.min(initial=np.inf) > 0
     best: FiniteSolution | None = None
-    for weight in _weights(_cost(program) or 1.0, float(curvature.min(initial=np.inf))):
+    for weight in _weights(program.steepest or 1.0, float(curvature.min(initial=np.inf))):
         P = dia_array(((curvature + weight)[None], [0]), shape=(program.n, program.n)).tocsc()
         near = newton_solve(replace(program, P=P, q=program.q - weight * x), y, mu)
         if near is None:
@@ -218,7 +216,7 @@ class _Dual:
     def decision(self, slope: Float[Array, " n"]) -> Float[Array, " n"]:
         """The minimising ``x (n,)`` of the Lagrangian whose linear part is ``slope (n,)``."""
         program = self.program
-        return minimisers(program.weights, self.curvature, slope, program.lower, program.upper)
+        return bent_minimisers(program.weights, self.curvature, slope, program.lower, program.upper)
 
     @shaped
     def at(self, dual: Float[Array, " v"]) -> _Point:
@@ -236,12 +234,10 @@ class _Dual:
         free = (point.x != 0) & (point.x > self.program.lower) & (point.x < self.program.upper)
         rows = self.M[:, free]
         hessian: Array = (rows / self.curvature[free]) @ rows.T
-        flat = hessian.diagonal() <= 1e-14 / self.curvature.max()
-        hessian[np.diag_indices_from(hessian)] += (
-            damping * float(hessian.trace())
-            + np.where(flat, np.linalg.norm(point.gradient), 0.0)
-            + np.finfo(float).tiny
-        )
+        sizes = hessian.reshape(-1)[:: hessian.shape[0] + 1]  # its diagonal, to write to
+        flat = sizes <= 1e-14 / self.curvature.max()
+        extra = damping * float(sizes.sum())
+        sizes += extra + np.where(flat, np.linalg.norm(point.gradient), 0.0) + TINY if flat.any() else extra + TINY
         return hessian
 
 
@@ -260,25 +256,27 @@ def newton_solve(
     entry. Converges in a finite number of steps, as the dual is piecewise quadratic, but from far away it may take too
     many: then ``None``, as for a program of another structure.
     """
-    curvature = diagonal(program.P, program.n) if program.S is None and program.P is not None else None
+    curvature = program.curvature if program.S is None and program.P is not None else None
     if curvature is None or not (curvature > 0).all() or y0.size != program.h.size:
         return None
     keep = np.isfinite(program.h)
-    M, c = np.vstack([program.G[keep], program.A]), np.concatenate([program.h[keep], program.b])
+    G, h = (program.G, program.h) if keep.all() else (program.G[keep], program.h[keep])
+    M, c = (np.vstack([G, program.A]), np.concatenate([h, program.b])) if program.b.size else (G, h)
     norms = np.sqrt(np.einsum("ij,ij->i", M, M))
     norms[norms == 0] = 1.0
     start = np.concatenate([np.maximum(y0[keep], 0.0), np.zeros(program.b.size) if mu0 is None else mu0]) * norms
-    dual = _Dual(program, curvature, M / norms[:, None], c / norms, np.arange(c.size) < int(keep.sum()))
+    dual = _Dual(program, curvature, M / norms[:, None], c / norms, np.arange(c.size) < h.size)
     try:
-        point = _ascend(dual, start, steps, patience)
+        with np.errstate(over="ignore"):
+            point = _ascend(dual, start, steps, patience)
     except np.linalg.LinAlgError:
         return None
     if point is None:
         return None
     multipliers = point.dual / norms
     y = np.zeros(program.h.size)
-    y[keep] = multipliers[: int(keep.sum())]
-    return measure(program, point.x, y, multipliers[int(keep.sum()) :], message="Newton")
+    y[keep] = multipliers[: h.size]
+    return measure(program, point.x, y, multipliers[h.size :], message="Newton")
 
 
 @shaped
@@ -318,10 +316,12 @@ def _non_negative(
     1974, chapter 23)."""
     passive = support | ~signed
     v = np.zeros(signed.size)
-    floor = 1e-13 * float(np.abs(linear).max(initial=0.0))
     for _ in range(3 * signed.size + 10):
-        wanted = np.zeros_like(v)
-        wanted[passive] = np.linalg.solve(hessian[np.ix_(passive, passive)], linear[passive])
+        wanted = np.zeros(signed.size)
+        if passive.all():
+            wanted[:] = np.linalg.solve(hessian, linear)
+        else:
+            wanted[passive] = np.linalg.solve(hessian[passive][:, passive], linear[passive])
         blocked = signed & passive & (wanted <= 0)
         if blocked.any():
             share = float((v[blocked] / (v[blocked] - wanted[blocked] + np.finfo(float).tiny)).min())
@@ -330,8 +330,10 @@ def _non_negative(
             v = np.where(passive, v, 0.0)
             continue
         v = wanted
+        if passive.all():
+            break
         pull = np.where(passive, -np.inf, linear - hessian @ v)
-        if not pull.max(initial=-np.inf) > floor:
+        if not pull.max() > 1e-13 * float(np.abs(linear).max()):
             break
         passive[int(np.argmax(pull))] = True
     return v

@@ -8,13 +8,15 @@ slopes that they ask for, and `vertex_multipliers` are those of the plain progra
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import accumulate
+from math import isfinite
 from typing import TypeAlias
 
 import numpy as np
 
 from sparserob_core.shapes import Bool, Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.finite import FiniteProgram, FiniteSolution, diagonal
+from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
 from sparserob_core.sip.inner.equalities import onto_equalities
 from sparserob_core.sip.inner.extended import extended_bound
 from sparserob_core.sip.inner.image import onto_stationary
@@ -78,7 +80,12 @@ def proving(
     """`dual_bound` with the ``y``, ``mu`` and ``z`` that prove it: those given, or where these prove nothing the ones
     that they were moved to. Whoever writes the bound down must write these."""
     y = _usable(program, y)
-    terms = _terms(program, y, mu, z, at)
+    return _proven(program, _terms(program, y, mu, z, at), y, mu, z, at)
+
+
+def _proven(
+    program: FiniteProgram, terms: _Terms, y: Array, mu: Array, z: Array | None, at: Array | None
+) -> tuple[float, Array, Array, Array | None]:
     bound = _bound(terms, program)
     if bound > -np.inf:
         large = ROUND_OFF * terms.magnitude > NOTABLE * abs(bound)
@@ -142,14 +149,16 @@ def measure(
 ) -> FiniteSolution:
     """Everything that can be checked about a claim, as a `FiniteSolution` that nobody has judged yet (``failed``)."""
     if program.S is None:
-        x = np.clip(x, program.lower, program.upper)
+        x = np.minimum(np.maximum(x, program.lower), program.upper)
     x = onto_equalities(program, x) if program.b.size else x
     y = _usable(program, y)
     value, residual = program.objective(x), program.residual(x)
-    lower = dual_bound(program, y, mu, z, at=x)
-    if z is None:
-        z = _stationary(program, y, mu, x)
-        z = -z if program.S is None else onto_stationary(program, np.zeros(program.weights.size), z)
+    terms = _terms(program, y, mu, z, x)
+    lower = _proven(program, terms, y, mu, z, x)[0]
+    if z is None and program.S is None:
+        z = -terms.slope if terms.curvature is None else -(terms.slope + terms.curvature * x)
+    elif z is None:
+        z = onto_stationary(program, np.zeros(program.weights.size), _stationary(program, y, mu, x))
     return FiniteSolution("failed", x, value, lower, y, mu, z, residual, value - lower, message)
 
 
@@ -163,13 +172,15 @@ def minimisers(
 ) -> Float[Array, " k"]:
     """The minimiser of ``weights |s| + 1/2 curvature s^2 + slope s`` over ``[lower, upper]``, entry by entry; may be
     infinite."""
-    pull = -slope - np.clip(-slope, -weights, weights)
-    if curvature is None:
-        free = np.where(pull > 0, np.inf, np.where(pull < 0, -np.inf, 0.0))
-    else:
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            free = np.where(pull == 0, 0.0, pull / curvature)
-    return np.minimum(np.maximum(free, lower), upper)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        return bent_minimisers(weights, 0.0 if curvature is None else curvature, slope, lower, upper)
+
+
+def bent_minimisers(weights: Array, curvature: Array | float, slope: Array, lower: Array, upper: Array) -> Array:
+    """`minimisers`, which may warn of a division by a curvature of 0."""
+    pull = -slope - np.minimum(np.maximum(-slope, -weights), weights)
+    free = np.where(pull == 0, 0.0, pull / curvature)
+    return np.asarray(np.minimum(np.maximum(free, lower), upper))
 
 
 @shaped
@@ -181,7 +192,7 @@ def _usable(program: FiniteProgram, y: Float[Array, " r"]) -> Float[Array, " r"]
 def _stationary(
     program: FiniteProgram, y: Float[Array, " r"], mu: Float[Array, " e"], at: Float[Array, " n"] | None
 ) -> Float[Array, " n"]:
-    slope = program.q + y @ program.G + mu @ program.A
+    slope = program.q + _weighed(y, program.G, mu, program.A)
     return slope if program.P is None or at is None else slope + program.P @ at
 
 
@@ -194,12 +205,12 @@ def _terms(
     at: Float[Array, " n"] | None,
 ) -> _Terms:
     finite = np.where(y > 0, program.h, 0.0)
-    constant = program.constant - float(y @ finite + mu @ program.b)
-    magnitude = float(y @ np.abs(finite) + np.abs(mu) @ np.abs(program.b)) + abs(program.constant)
+    constant = program.constant - float(_weighed(y, finite, mu, program.b))
+    magnitude = float(_weighed(y, np.abs(finite), np.abs(mu), np.abs(program.b))) + abs(program.constant)
     image = None if at is None or program.blocks is None else program.image(at)
-    noise = np.abs(program.q) + y @ np.abs(program.G) + np.abs(mu) @ np.abs(program.A)
-    curvature = diagonal(program.P, program.n) if program.S is None else None
-    slope = program.q + y @ program.G + mu @ program.A
+    noise = np.abs(program.q) + _weighed(y, np.abs(program.G), np.abs(mu), np.abs(program.A))
+    curvature = program.curvature if program.S is None else None
+    slope = program.q + _weighed(y, program.G, mu, program.A)
     if curvature is None and program.P is not None:
         at = np.zeros(program.n) if at is None else at
         bent = np.asarray(program.P @ at)
@@ -213,6 +224,11 @@ def _terms(
     start = np.zeros(program.weights.size) if z is None else z
     z = onto_stationary(program, start, slope)
     return _Terms(constant, -z, np.abs(z) + np.abs(noise).max(initial=0.0), program.weights, None, magnitude, image)
+
+
+def _weighed(y: Array, rows: Array, mu: Array, equalities: Array) -> Array:
+    """``y'rows + mu'equalities``."""
+    return np.asarray(y @ rows + mu @ equalities if mu.size else y @ rows)
 
 
 def _without_norms(terms: _Terms, program: FiniteProgram) -> _Terms:
@@ -254,11 +270,11 @@ def _shrinking(weights: Array, norms: Array) -> Array:
 def _bound(terms: _Terms, program: FiniteProgram) -> float:
     terms = _without_norms(terms, program)
     slope = terms.slope
-    if not (np.isfinite(terms.constant) and np.isfinite(slope).all()):
+    if not (isfinite(terms.constant) and np.isfinite(slope).all()):
         return -np.inf
     s = minimisers(terms.weights, terms.curvature, slope, program.lower, program.upper)
-    away = ~np.isfinite(s)
-    if away.any():
+    away = None if program.bounded else ~np.isfinite(s)
+    if away is not None and away.any():
         if (np.abs(slope[away]) - terms.weights[away] > ROUND_OFF * 10 * terms.noise[away]).any():
             return -np.inf
         s = np.where(away, np.clip(0.0, program.lower, program.upper), s)
@@ -324,14 +340,14 @@ def _corrected(
     at: Float[Array, " n"] | None,
 ) -> Multipliers | None:
     tangent = None
-    if program.P is not None and (program.S is not None or diagonal(program.P, program.n) is None):
+    if program.P is not None and (program.S is not None or program.curvature is None):
         tangent = program.P.toarray()
         at = np.zeros(program.n) if at is None else at
     slope = program.q + y @ program.G + mu @ program.A + (0.0 if tangent is None else tangent @ at)
     used = y > 0
     blocks = [program.G[used].T, program.A.T, np.zeros((program.n, 0)) if tangent is None else tangent]
     if program.S is None:
-        tight = _at_limit(program, -slope) & (tangent is not None or diagonal(program.P, program.n) == 0)
+        tight = _at_limit(program, -slope) & (tangent is not None or program.curvature == 0)
         target = np.sign(slope[tight]) * program.weights[tight] - slope[tight]
         moved = _least_norm([block[tight] for block in blocks], target)
     else:
@@ -358,9 +374,10 @@ def _least_norm(blocks: list[Array], target: Array) -> list[Array] | None:
     columns = np.hstack(blocks)
     if not columns.size:
         return None
-    change = np.linalg.lstsq(columns, target, rcond=1e-12)[0]
-    change = change + np.linalg.lstsq(columns, target - columns @ change, rcond=1e-12)[0]
-    return np.split(change, np.cumsum([block.shape[1] for block in blocks])[:-1])
+    change = np.asarray(np.linalg.lstsq(columns, target, rcond=1e-12)[0], dtype=float)
+    change += np.linalg.lstsq(columns, target - columns @ change, rcond=1e-12)[0]
+    ends = list(accumulate(block.shape[1] for block in blocks))
+    return [change[stop - block.shape[1] : stop] for block, stop in zip(blocks, ends, strict=True)]
 
 
 @shaped

@@ -10,7 +10,7 @@ import numpy as np
 
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.finite import FiniteProgram, diagonal
+from sparserob_core.sip.finite import FiniteProgram
 
 WIDE = np.longdouble
 NEAR = 1e-9
@@ -32,9 +32,8 @@ def extended_bound(program: FiniteProgram, y: Float[Array, " r"], mu: Float[Arra
     ``s`` that is computed may miss the minimiser by ``2 u (|slope| + weights) / p``, which costs at most
     ``p/2`` times the square of that.
     """
-    curvature = diagonal(program.P, program.n) if program.S is None else None
-    bounded = np.isfinite(program.lower).all() and np.isfinite(program.upper).all()
-    if curvature is None or program.blocks is not None or not bounded:
+    curvature = program.curvature if program.S is None else None
+    if curvature is None or program.blocks is not None or not program.bounded:
         return -np.inf
     used = y > 0.0
     v = np.concatenate([y[used], mu]).astype(WIDE)

@@ -30,7 +30,6 @@ from sparserob_core.sip.finite import (
     Directions,
     FiniteProgram,
     FiniteSolution,
-    diagonal,
 )
 from sparserob_core.sip.inner.change_of_variables import NewVariables, in_new_variables
 from sparserob_core.sip.inner.dual_newton import polish
@@ -75,11 +74,12 @@ class _Case:
             self.program, solution.value
         )
 
-    def judge(self, solution: FiniteSolution, name: str) -> FiniteSolution | None:
-        """The solution as ``optimal`` if believed and sharp; otherwise keep it, or note why it is not believed."""
+    def judge(self, solution: FiniteSolution, name: str, by: str = "") -> FiniteSolution | None:
+        """The solution, which is ``by`` somebody, as ``optimal`` if believed and sharp; otherwise keep it, or note why
+        it is not believed."""
         if self.believes(solution):
-            said = f"{name}: {solution.message}"
-            found = replace(solution, status="optimal", attempts=tuple(self.attempts), message=said)
+            said, attempts = f"{name}: {solution.message}", tuple(self.attempts)
+            found = replace(solution, status="optimal", attempts=attempts, message=said, by=by or solution.by)
             if solution.gap <= 10 * self.tolerance * max(abs(solution.value), self.small):
                 return found
             if self.blunt is None or solution.gap < self.blunt.gap:
@@ -120,8 +120,8 @@ def _answer(case: _Case, guess: FiniteSolution | None) -> FiniteSolution:
     impossible = _contradiction(program, case.tolerance)
     if impossible is not None:
         return replace(impossible, by=CLOSED_FORM)
-    for solution in _cheap(case, guess):
-        believed = case.judge(solution, "without a solver")
+    for by, solution in _cheap(case, guess):
+        believed = case.judge(solution, "without a solver", by)
         if believed is not None:
             return believed
     case.attempts.clear()
@@ -232,7 +232,7 @@ def _newton(
 def _tried(case: _Case) -> FiniteSolution:
     """Form after form, accuracy after accuracy."""
     program, attempts = case.program, ATTEMPTS
-    if program.P is not None and program.S is None and diagonal(program.P, program.n) is None:
+    if program.P is not None and program.S is None and program.curvature is None:
         attempts = (ATTEMPTS[1], ATTEMPTS[0], *ATTEMPTS[2:])  # parts would double a dense matrix
     for form, factor in attempts:
         claim, answer = _ask(case, program, form, factor * case.tolerance)
@@ -291,31 +291,29 @@ def _through(case: _Case, easier: NewVariables, guess: FiniteSolution | None) ->
 
 def cost_scale(program: FiniteProgram, value: float) -> float:
     """What a gap is relative to: the value, but no less than the largest cost coefficient, or 1 if that is larger."""
-    largest = max(float(program.weights.max(initial=0.0)), float(np.abs(program.q).max(initial=0.0)))
+    largest = program.steepest
     if program.P is not None:
         largest = max(largest, float(np.abs(program.P.data).max(initial=0.0)))
     return max(abs(value), min(1.0, largest or 1.0))
 
 
-def _cheap(case: _Case, guess: FiniteSolution | None) -> Iterator[FiniteSolution]:
-    """What needs no solver: the optimum without rows, the simplex method where few of many entries matter to it, and
-    Newton's method from a guess."""
+def _cheap(case: _Case, guess: FiniteSolution | None) -> Iterator[tuple[str, FiniteSolution]]:
+    """What needs no solver, and who it is by: the optimum without rows, the simplex method where few of many entries
+    matter to it, and Newton's method from a guess."""
     program = case.program
-    curvature = diagonal(program.P, program.n) if program.S is None and program.blocks is None else None
-    if curvature is not None:
-        x = minimisers(program.weights, curvature, program.q, program.lower, program.upper)
+    if program.separable:
+        x = minimisers(program.weights, program.curvature, program.q, program.lower, program.upper)
         if np.isfinite(x).all() and program.residual(x) <= case.tolerance:
-            free = measure(program, x, np.zeros(program.h.size), np.zeros(program.b.size), message="no row is active")
-            yield replace(free, by=CLOSED_FORM)
+            zero, none = np.zeros(program.h.size), np.zeros(program.b.size)
+            yield CLOSED_FORM, measure(program, x, zero, none, message="no row is active")
     if many(program):
         corner = sifted(program, *((None, None) if guess is None else (guess.y, guess.mu)))
         if corner.status == "optimal":
-            at_vertex = measure(program, corner.x, corner.y, corner.mu, message="simplex method")
-            yield replace(at_vertex, by=HIGHS)
+            yield HIGHS, measure(program, corner.x, corner.y, corner.mu, message="simplex method")
     if guess is not None:
         found = polish(program, guess.x, guess.y, guess.mu)
         if found is not None:
-            yield replace(found, by=DUAL_NEWTON)
+            yield DUAL_NEWTON, found
 
 
 def _ask(
@@ -437,11 +435,11 @@ def _contradiction(program: FiniteProgram, tolerance: float) -> FiniteSolution |
             f"the bounds of image entry {k} cross: {program.lower[k]} > {program.upper[k]}",
             float(crossed[k]),
         )
-    elif (short := ~program.G.any(axis=1) & (program.h < -tolerance)).any():
+    elif (short := program.h < -tolerance).any() and (short := short & ~program.G.any(axis=1)).any():
         i = int(np.argmax(short))
         y[i] = 1.0
         reason, amount = f"row {i} has no entries and asks for 0 <= {program.h[i]}", np.inf
-    elif (short := ~program.A.any(axis=1) & (np.abs(program.b) > tolerance)).any():
+    elif program.b.size and (short := ~program.A.any(axis=1) & (np.abs(program.b) > tolerance)).any():
         i = int(np.argmax(short))
         mu[i] = -np.sign(program.b[i])
         reason, amount = f"equality {i} has no entries and asks for 0 = {program.b[i]}", np.inf

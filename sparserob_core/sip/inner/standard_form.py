@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.finite import Blocks, Directions, FiniteProgram, diagonal
+from sparserob_core.sip.finite import Blocks, Directions, FiniteProgram
 from sparserob_core.sip.inner.image import Memory
 from sparserob_core.sip.solver import Claim, QuadraticProgram
 
@@ -142,7 +142,7 @@ def _substituted(program: FiniteProgram, model: ImageModel) -> tuple[QuadraticPr
     """Variables ``v``; ``x = T v + offset``."""
     from scipy.sparse import csc_array
 
-    curvature = diagonal(program.P, program.n)
+    curvature = program.curvature
     q = program.q
     if program.P is not None and curvature is None:
         q = q + program.P @ model.offset

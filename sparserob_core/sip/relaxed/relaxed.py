@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Cut, Dual
-from sparserob_core.sip.finite import FiniteProgram, FiniteSolution, diagonal
+from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
 from sparserob_core.sip.inner.dual_newton import DualNewton, not_separable
 from sparserob_core.sip.inner.duality import homogeneous, minimisers, proving, vertex_multipliers
 from sparserob_core.sip.inner.image import onto_stationary
@@ -104,6 +105,9 @@ class Imposed:
     solution: FiniteSolution | None = None
 
 
+_Proven: TypeAlias = tuple[float, Array, Array, Array | None, Array]
+
+
 def value_of(solution: FiniteSolution) -> float:
     """``g``: ``+inf`` where proven infeasible; where no optimum was believed the proven lower bound, so never more than
     the truth."""
@@ -149,10 +153,9 @@ def require_separable(program: SemiInfiniteProgram, solver: Solver, regulariser:
 def _touched(plain: FiniteProgram, y: Array, mu: Array, x: Array) -> Array:
     """Where the cost is replaced by its tangent, for a bound from these multipliers: at their own minimiser where that
     is explicit, which gives the bound of the cost itself; else at ``x``."""
-    curvature = diagonal(plain.P, plain.n) if plain.S is None and plain.blocks is None else None
-    if plain.P is not None and curvature is not None:
+    if plain.P is not None and plain.separable:
         slope = plain.q + np.maximum(y, 0.0) @ plain.G + mu @ plain.A
-        own = minimisers(plain.weights, curvature, slope, plain.lower, plain.upper)
+        own = minimisers(plain.weights, plain.curvature, slope, plain.lower, plain.upper)
         if np.isfinite(own).all():
             return own
     return np.where(np.isfinite(x), x, 0.0)
@@ -176,6 +179,7 @@ class RelaxedProgram:
     deadline: Deadline = field(default_factory=Deadline)
     _terms: tuple[csc_array, Array] | None = None
     _last: RelaxedSolution | None = None
+    _least: tuple[float, Array, Array, Array | None] | None = None
     _programs: dict[float, FiniteProgram] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -186,7 +190,8 @@ class RelaxedProgram:
             base, images = self.program.finite, self.program.image_size
             S = csc_array(eye_array(self.program.n)) if base.S is None else base.S[:images]
             lengths = np.ones(images) if self.program.lengths is None else self.program.lengths
-            self._terms = self.regulariser.quadratic(ControlImage(csc_array(S), self.program.channels, lengths))
+            P, q = self.regulariser.quadratic(ControlImage(csc_array(S), self.program.channels, lengths))
+            self._terms = P.tocsc(), q
 
     def solve(
         self, rows: Rows, epsilon: float, margin: float = 0.0, guess: FiniteSolution | None = None
@@ -204,33 +209,44 @@ class RelaxedProgram:
         none.
         """
         plain = self.finite(rows.G, rows.h, 0.0)
-        offers = [
-            (np.zeros_like(solution.y), np.zeros_like(solution.mu), np.zeros_like(solution.z)),
-            (solution.y, solution.mu, solution.z),
-        ]
-        known = bool(np.isfinite(solution.x).all())
-        if known:
+        offers = [(solution.y, solution.mu, solution.z)]
+        if np.isfinite(solution.x).all():
             linear = plain.tangent(solution.x)
             offers.append((*vertex_multipliers(linear, solution.x, solution.y, solution.mu), solution.z))
-        points = [_touched(plain, y, mu, solution.x) for y, mu, _ in offers]
-        proven = [proving(plain.tangent(at), y, mu, z, at=at) for at, (y, mu, z) in zip(points, offers, strict=True)]
-        bounds = [bound - self.rounding(plain, y, mu, solution.x) for bound, y, mu, _ in proven]
-        best = int(np.argmax(bounds))
-        _, y, mu, z = proven[best]
-        found = self.dual(rows, y, mu, solution.z if z is None else z, bounds[best], points[best])
-        return found if plain.P is not None or plain.blocks is not None else replace(found, at=None)
+        proven = [self._without(plain, solution), *(self._proven(plain, solution, *offer) for offer in offers)]
+        bound, y, mu, z, at = proven[int(np.argmax([one[0] for one in proven]))]
+        curved = plain.P is not None or plain.blocks is not None
+        return self.dual(rows, y, mu, solution.z if z is None else z, bound, at if curved else None)
+
+    def _without(self, plain: FiniteProgram, solution: FiniteSolution) -> _Proven:
+        """The bound of no multipliers at all, which is the same again and again where the cost is linear."""
+        zero, x = np.zeros_like(solution.y), solution.x
+        if plain.P is not None or plain.blocks is not None:
+            return self._proven(plain, solution, zero, np.zeros_like(solution.mu), np.zeros_like(solution.z))
+        if self._least is None:
+            self._least = proving(plain, zero, np.zeros_like(solution.mu), np.zeros_like(solution.z))
+        bound, _, mu, z = self._least
+        return bound - self.rounding(plain, zero, mu, x), zero, mu, z, x
+
+    def _proven(self, plain: FiniteProgram, solution: FiniteSolution, y: Array, mu: Array, z: Array) -> _Proven:
+        """A lower bound, less its rounding, with the multipliers that prove it and where the cost is touched."""
+        at = _touched(plain, y, mu, solution.x)
+        bound, y, mu, moved = proving(plain.tangent(at), y, mu, z, at=at)
+        return bound - self.rounding(plain, y, mu, solution.x), y, mu, moved, at
 
     @shaped
     def rounding(
         self, plain: FiniteProgram, y: Float[Array, " r"], mu: Float[Array, " e"], x: Float[Array, " n"]
     ) -> float:
         """What the rounding of the rows themselves may do to a lower bound from these multipliers near ``x (n,)``."""
-        size = np.where(np.isfinite(x), np.abs(x), 0.0)
         used = (y > 0) & np.isfinite(plain.h)
-        total = y[used] @ (np.abs(plain.h[used]) + np.abs(plain.G[used]) @ size) + np.abs(mu) @ (
-            np.abs(plain.b) + np.abs(plain.A) @ size
-        )
-        return ROUNDING * float(total)
+        if not (used.any() or mu.any()):
+            return 0.0
+        size = np.where(np.isfinite(x), np.abs(x), 0.0)
+        total = float(y[used] @ (np.abs(plain.h[used]) + np.abs(plain.G[used]) @ size))
+        if mu.size:
+            total += float(np.abs(mu) @ (np.abs(plain.b) + np.abs(plain.A) @ size))
+        return ROUNDING * total
 
     @shaped
     def dual(
@@ -338,7 +354,7 @@ class RelaxedProgram:
     def finite(self, G: Float[Array, "r n"], h: Float[Array, " r"], epsilon: float) -> FiniteProgram:
         """The finite program with these rows."""
         base = self._regularised(epsilon)
-        return replace(base, G=np.vstack([base.G, G]), h=np.concatenate([base.h, h]))
+        return base.under(G, h)
 
     def _regularised(self, epsilon: float) -> FiniteProgram:
         base = self.program.finite
@@ -346,6 +362,10 @@ class RelaxedProgram:
             return base
         if epsilon not in self._programs:
             P, q = self._terms
-            total = epsilon * P if base.P is None else base.P + epsilon * P
-            self._programs = {epsilon: replace(base, P=total.tocsc(), q=base.q + epsilon * q)}
+            if base.P is None:  # the same entries, without what it takes to look them over again
+                total = copy(P)
+                total.data = epsilon * P.data
+            else:
+                total = (base.P + epsilon * P).tocsc()
+            self._programs = {epsilon: base.curved(total, base.q + epsilon * q if q.any() else base.q)}
         return self._programs[epsilon]

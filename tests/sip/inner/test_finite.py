@@ -259,6 +259,28 @@ def test_a_program_at_fault_is_refused_by_the_name_of_what_is_wrong(change, word
         solve_finite(replace(robust_terminal(), **change), PIQP)
 
 
+@given(SEEDS, st.booleans())
+@settings(max_examples=15, deadline=None)
+def test_a_program_under_more_rows_is_the_one_that_is_written_down_with_them(seed, bent):
+    rng = np.random.default_rng(seed)
+    base = random_program(rng)
+    if bent:
+        base = base.curved(diags_array(rng.uniform(0.1, 1.0, base.n)).tocsc(), base.q)
+    more, allowed = rng.standard_normal((2, base.n)), rng.random(2)
+    under = base.under(more, allowed)
+    whole = replace(base, G=np.vstack([base.G, more]), h=np.append(base.h, allowed))
+    found, expected = solve_finite(under, PIQP), solve_finite(whole, PIQP)
+    assert (found.status, found.value, found.lower_bound) == (expected.status, expected.value, expected.lower_bound)
+    assert np.array_equal(found.x, expected.x)
+    for rows, right, words in (
+        (more, [0.0, np.nan], "NaN"),
+        (more, [0.0, -np.inf], "above"),
+        (np.inf * more, allowed, "G"),
+    ):
+        with pytest.raises(sr.InputError, match=words):
+            solve_finite(base.under(rows, np.array(right)), PIQP)
+
+
 def test_no_program_is_both_optimal_and_infeasible_at_the_edge():
     rows = np.vstack([np.ones(50), -np.ones(50)])
     for shift in (1e-3, 1e-6, 1e-8, 1e-9, 1e-10, 1e-12, 0.0):
