@@ -98,13 +98,13 @@ class DisturbanceSupport:
         sizes, remainder = lifted.row_bounds(self.rows)
         spilt = lifted.spilt(_row_norms(lifted.W, lifted.starts)) + np.linalg.norm(lifted.slack_W, axis=1)
         pushed = remainder @ self._drive + radius * np.einsum("rlaj,aj->rl", sizes, spilt)
-        within = np.cumsum(pushed * lifted.fine.lengths, axis=1)[:, lifted.ends[1:] - 1]
+        within = np.cumsum(pushed[:, lifted.span] * lifted.fine.lengths, axis=1)[:, lifted.ends[1:] - 1]
         before = self._carried
         if before is None:
             return np.asarray(within)
         missed = remainder @ (before.reached + before.left_out) + sizes.sum(axis=2) @ before.left_out
         missed = missed + np.einsum("rlaj,aj->rl", sizes, lifted.spilt(before.sizes))
-        return np.asarray(within + np.maximum.reduceat(missed, lifted.ends[:-1], axis=1))
+        return np.asarray(within + np.maximum.reduceat(missed[:, lifted.span], lifted.ends[:-1], axis=1))
 
     @property
     def reached(self) -> Array:

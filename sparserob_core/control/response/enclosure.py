@@ -145,7 +145,7 @@ class CellEnclosure:
         start = self._nodes.reshape(self._nodes.shape[0], -1)[pieces]
         size = self.lifted.norm * float(within.max(initial=0.0))
         moved = (
-            self._by_series(start, self._slopes[pieces], within[:, None], size)
+            self._by_series(start, start @ self.lifted.matrix.T + self._drive(pieces), within[:, None], size)
             if size < LONG_STEP
             else self._by_exponential(start, pieces, within)
         )
@@ -165,7 +165,7 @@ class CellEnclosure:
         distinct, which = self.lifted.grid.distinct(within)
         flow, driven = self.lifted.forward.flows(distinct)
         return np.asarray(
-            np.einsum("kij,kj->ki", flow[which], start) + np.einsum("kij,kj->ki", driven[which], self._drive[pieces])
+            np.einsum("kij,kj->ki", flow[which], start) + np.einsum("kij,kj->ki", driven[which], self._drive(pieces))
         )
 
     def _deviation(self, start: Array, stop: Array, pieces: np.ndarray) -> Array:
@@ -175,7 +175,7 @@ class CellEnclosure:
         lifted, width = self.lifted, stop - start
         shape = (start.size, lifted.space.size, lifted.states)
         states = self._states(start, pieces).reshape(start.size, -1)
-        slopes = states @ lifted.matrix.T + self._drive[pieces]
+        slopes = states @ lifted.matrix.T + self._drive(pieces)
         bent = (slopes @ lifted.matrix.T).reshape(shape)
         along = np.abs(np.einsum("ri,kai->kra", self._rows, bent)).sum(axis=2)
         once, twice = (block_norms(part.reshape(shape), lifted.starts).sum(axis=1) for part in (slopes, bent))
@@ -197,15 +197,13 @@ class CellEnclosure:
     def _nodes(self) -> Array:
         return self.lifted.nodes(self.control)
 
-    @cached_property
-    def _drive(self) -> Array:
-        inputs = self.lifted.grid.inputs(self.control)
-        return np.asarray(inputs.T @ self.lifted.B.reshape(-1, self.lifted.B.shape[2]).T)
+    def _drive(self, pieces: np.ndarray) -> Array:
+        """What drives the Taylor coefficients on some pieces, ``(k, M d)``."""
+        return np.asarray(self._inputs[pieces] @ self.lifted.B.reshape(-1, self.lifted.B.shape[2]).T)
 
     @cached_property
-    def _slopes(self) -> Array:
-        start = self._nodes[:-1].reshape(self.lifted.grid.pieces, -1)
-        return np.asarray(start @ self.lifted.matrix.T + self._drive)
+    def _inputs(self) -> Array:
+        return self.lifted.grid.inputs(self.control).T
 
     @cached_property
     def _shares(self) -> Array:
@@ -228,17 +226,15 @@ class CellEnclosure:
     def _neglected(self) -> Array:
         """What the Taylor models leave out, and what the last products and sums may round, ``(r, L)``."""
         lifted = self.lifted
-        remainder, sizes = lifted.state_remainder(self.control)
-        total = product(self._row_norms, remainder.T)
         widest = block_norms(np.abs(self.H) @ np.abs(lifted.transform), lifted.starts)  # with what cancels in H T
-        if self.sigma is not None:
-            total = total + self.sigma.neglected
-            sizes = sizes + self.sigma.reached
         terms = rounding(2 * lifted.states + self.rhs.shape[1])
+        total = lifted.along(self.control, self._row_norms, terms * widest)
+        if self.sigma is not None:
+            total = total + self.sigma.neglected + terms * product(widest, self.sigma.reached.T)
         sides = np.abs(self.rhs).sum(axis=1, keepdims=True)  # of every row, or of the one that a combination makes
         for part in (self.moving, self.direct):
             sides = sides if part is None else sides + part.size[:, None]
-        return np.asarray(total + terms * (product(widest, sizes.T) + sides))
+        return np.asarray(total + terms * sides)
 
 
 @dataclass(frozen=True, eq=False)

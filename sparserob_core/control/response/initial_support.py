@@ -125,7 +125,7 @@ class InitialSupport:
         pushed = remainder @ self._sizes + sizes.sum(axis=2) @ self._slack
         if self._carried is not None:
             pushed = pushed + np.einsum("rlaj,aj->rl", sizes, lifted.spilt(self._carried.sizes))
-        return np.asarray(np.maximum.reduceat(pushed, lifted.ends[:-1], axis=1))
+        return np.asarray(np.maximum.reduceat(pushed[:, lifted.span], lifted.ends[:-1], axis=1))
 
     @cached_property
     def reached(self) -> Array:

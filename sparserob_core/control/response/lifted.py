@@ -43,7 +43,7 @@ from sparserob_core.control.enclosures.decoupling import (
 from sparserob_core.control.enclosures.matrix_exponential import Transitions, rounding
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.system import LinearSystem, System
-from sparserob_core.control.response.response import Response, TimeGrid
+from sparserob_core.control.response.response import TINY, Response, TimeGrid
 from sparserob_core.sip.convex_set import Array
 
 DEGREES = {0: 0, 1: 6, 2: 4, 3: 3}  # of the Taylor models, by the number of parameters; 2 beyond
@@ -51,7 +51,8 @@ KNOWN = np.zeros((1, 0))
 # growth of the comparison system times length of the parts that pieces are cut into for what is neglected, and how
 # many of a piece at most
 SHORT, MOST_CUTS = 0.5, 64
-PATHS_KEPT = 4
+PATHS_KEPT, PATHS_SIZE = 4, 40_000_000  # paths that are remembered, and the numbers in all of them beyond the first
+SPANS = 256  # of several pieces each, for which what is left out is bounded, where there are four times as many pieces
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,10 +155,12 @@ class LiftedSystem:
     def fine(self) -> TimeGrid:
         """The grid with long pieces cut into equal parts: a norm bound over a part is only good if the modes grow
         little on it."""
+        if not self.space.nu:  # without truncation there is little to bound
+            return self.grid
         growth = float(np.abs(np.linalg.eigvals(self.comparison.rising)).max())
         counts = np.clip(np.ceil(growth * self.grid.lengths / SHORT), 1, MOST_CUTS).astype(int)
         breaks = self.grid.breakpoints
-        if counts.max() == 1 or not self.space.nu:  # without truncation there is little to bound
+        if counts.max() == 1:
             return self.grid
         inner = [
             np.linspace(a, b, count, endpoint=False)
@@ -171,6 +174,30 @@ class LiftedSystem:
             self.grid.constants,
             elapsed=self.grid.elapsed,
         )
+
+    @cached_property
+    def spans(self) -> np.ndarray:
+        """The first piece of the fine grid in every span, ``(S,)``: what is left out is bounded span by span. For a
+        known system, of which nothing but rounding is left out, a span may be many pieces on which it moves little."""
+        pieces = self.fine.pieces
+        if self.space.nu or pieces < 4 * SPANS:
+            return np.arange(pieces)
+        growth = float(np.abs(np.linalg.eigvals(self.comparison.rising)).max()) * float(self.fine.lengths.max())
+        return np.arange(0, pieces, int(max(1.0, min(pieces // SPANS, SHORT / max(growth, TINY)))))
+
+    @cached_property
+    def span(self) -> np.ndarray:
+        """Which span every piece of the fine grid is of, ``(L',)``."""
+        return np.repeat(np.arange(self.spans.size), self._counts)
+
+    @cached_property
+    def _counts(self) -> np.ndarray:
+        return np.diff(np.append(self.spans, self.fine.pieces))
+
+    @cached_property
+    def _durations(self) -> Array:
+        """How long the spans are, ``(S,)``."""
+        return np.diff(self.fine.breakpoints[np.append(self.spans, self.fine.pieces)])
 
     @cached_property
     def ends(self) -> np.ndarray:
@@ -213,16 +240,29 @@ class LiftedSystem:
 
     def nodes(self, control: Array) -> Array:
         """Taylor coefficients ``(L+1, M, d)`` of the state at the breakpoints, under ``control (m, K)``."""
-        answer: Array = self._path(control)[self.ends]
-        return answer
+        path = self._path(control)
+        return path if self.fine is self.grid else path[self.ends]
 
     def state_remainder(self, control: Array) -> tuple[Array, Array]:
         """Norm bounds ``(L, q)``, per piece and block, of the part of the state that the Taylor models leave out,
         rounding included; and of the Taylor models themselves, summed over their coefficients."""
-        return self._left_out(control)[:2]
+        left_out, sizes, _ = self._left_out(control)
+        return left_out[self.shared], sizes[self.shared]
+
+    @property
+    def shared(self) -> np.ndarray | slice:
+        """Which of the bounds that `along` makes is of every piece of the grid."""
+        return self.span if self.spans.size < self.fine.pieces else slice(None)
+
+    def along(self, control: Array, rows: Array, others: Array) -> Array:
+        """Both of `state_remainder`, by the product with ``rows`` and ``others (r, q)``, added up: ``(r, L)``."""
+        left_out, sizes, _ = self._left_out(control)
+        answer: Array = (product(rows, left_out.T) + product(others, sizes.T))[:, self.shared]
+        return answer
 
     def _left_out(self, control: Array) -> tuple[Array, Array, Array]:
-        """`state_remainder`, and the first of them at the end, ``(q,)``; remembered."""
+        """`state_remainder` on the spans, where these are many pieces, and the first of both at the end, ``(q,)``;
+        remembered."""
         key = control.tobytes()
         if key not in self._remainders:
             remember(self._remainders, key, self._remainder(control), PATHS_KEPT)
@@ -233,16 +273,24 @@ class LiftedSystem:
         return {}
 
     def _remainder(self, control: Array) -> tuple[Array, Array, Array]:
-        inputs = self.fine.inputs(control)
-        driven = inputs.T @ self.forward.steps(KNOWN).B[0].T
+        inputs, slack = np.abs(self.fine.inputs(control)), self._slack(control)[None]
+        size = np.abs(self.B).sum(axis=0)
+        if self.spans.size < self.fine.pieces:
+            most = np.maximum.reduceat(inputs, self.spans, axis=1)
+            pushed, drive = block_norms((size @ most).T, self.starts), (self.slack_B @ most).T[None]
+            begin = block_norms(self._path(control)[self.spans, 0], self.starts)[None]
+            neglected, bounds, reached = self._neglected(begin, pushed, drive, slack, rows=False)
+            return neglected[0], reached[0], bounds[0, -1]
+        driven = self.fine.inputs(control).T @ self.forward.steps(KNOWN).B[0].T
         nodes = self._path(control)[None]
         sizes = self._sizes(nodes, driven, rows=False)
-        drive = (self.slack_B @ np.abs(inputs)).T[None]
-        pushed = block_norms((np.abs(self.B).sum(axis=0) @ np.abs(inputs)).T, self.starts)
-        neglected, end = self._neglected(nodes, sizes, pushed, drive, self._slack(control)[None], rows=False)
+        pushed, drive = block_norms((size @ inputs).T, self.starts), (self.slack_B @ inputs).T[None]
+        begin = block_norms(nodes[:, :-1], self.starts).sum(axis=2)
+        residual = self._spilt(sizes, rows=False) + drive
+        neglected, bounds, _ = self._neglected(begin, pushed, residual, slack, rows=False)
         first = self.ends[:-1]
         left_out: Array = np.maximum.reduceat(neglected[0], first, axis=0)
-        return left_out, np.maximum.reduceat(sizes[0].sum(axis=1), first, axis=0), end[0]
+        return left_out, np.maximum.reduceat(sizes[0].sum(axis=1), first, axis=0), bounds[0, -1]
 
     def _slack(self, control: Array) -> Array:
         """What the Taylor models leave out at time 0, ``(q,)``."""
@@ -263,7 +311,8 @@ class LiftedSystem:
                 ended = self.past.lifted.nodes(control)[-1]
                 forward = forward.from_state((ended @ self.past.turn.T).ravel())
             states = forward.states(control, KNOWN)[0]
-            remember(self._paths, key, states.reshape(-1, self.space.size, self.states), PATHS_KEPT)
+            most = max(1, min(PATHS_KEPT, PATHS_SIZE // states.size))
+            remember(self._paths, key, states.reshape(-1, self.space.size, self.states), most)
         return self._paths[key]
 
     @cached_property
@@ -272,22 +321,32 @@ class LiftedSystem:
 
     def row_bounds(self, directions: Array) -> tuple[Array, Array]:
         """For the Taylor models of ``c'e^{A(p) s}`` of ``directions (r, d)``, read backwards from ``t``: block norms
-        ``(r, L', M, q)`` of their coefficients, the largest on every piece of the fine grid, and norm bounds
-        ``(r, L', q)`` of what they leave out."""
-        nodes = self.row_nodes(directions)
+        ``(r, S, M, q)`` of their coefficients, the largest on every span, and norm bounds ``(r, S, q)`` of what they
+        leave out."""
+        nodes, still = self.row_nodes(directions), np.zeros((self.spans.size, self.starts.size))
+        begin, start = block_norms(nodes[:, :-1], self.starts).sum(axis=2), still[:1]
+        if self.spans.size < self.fine.pieces:
+            neglected, _, reached = self._neglected(begin, still, still[None], start, rows=True)
+            return reached[:, :, None], neglected
         sizes = self._sizes(nodes, np.zeros(1), rows=True)
-        still = np.zeros((1, 1, self.starts.size))
-        return sizes, self._neglected(nodes, sizes, still[0], still, np.zeros((1, self.starts.size)), rows=True)[0]
+        return sizes, self._neglected(begin, still, self._spilt(sizes, rows=True), start, rows=True)[0]
 
     def row_nodes(self, directions: Array) -> Array:
-        """Taylor coefficients ``(r, L'+1, M, d)`` of ``c'e^{A(p) s}`` at the breakpoints ``s`` of the fine grid."""
-        response = self._backward_fine
-        steps, pieces = response.steps(KNOWN), self.fine.pieces
-        rows = np.zeros((pieces + 1, directions.shape[0], self.row_matrix.shape[0]))
+        """Taylor coefficients ``(r, S+1, M, d)`` of ``c'e^{A(p) s}`` at the ends ``s`` of the spans."""
+        response, count = self._backward_spans, self.spans.size
+        steps = response.steps(KNOWN)
+        rows = np.zeros((count + 1, directions.shape[0], self.row_matrix.shape[0]))
         rows[0, :, : self.states] = directions
         for piece, length in enumerate(response.which.tolist()):
             rows[piece + 1] = rows[piece] @ steps.Phi[0, length]
-        return np.moveaxis(rows, 0, 1).reshape(directions.shape[0], pieces + 1, self.space.size, self.states)
+        return np.moveaxis(rows, 0, 1).reshape(directions.shape[0], count + 1, self.space.size, self.states)
+
+    @cached_property
+    def _backward_spans(self) -> Response:
+        if self.spans.size == self.fine.pieces:
+            return self._backward_fine
+        ends, none = np.append(self.spans, self.fine.pieces), np.zeros(self.spans.size, dtype=int)
+        return self._adjoint_on(TimeGrid(self.fine.breakpoints[ends], none, none, elapsed=self.fine.elapsed))
 
     def _sizes(self, nodes: Array, driven: Array, rows: bool) -> Array:
         """Block norms ``(r, L', M, q)`` of Taylor coefficients ``(r, L'+1, M, d)``, the largest on every fine piece.
@@ -333,39 +392,73 @@ class LiftedSystem:
     def _majorised(self) -> dict[bool, tuple[NormBounds, NormBounds]]:
         return {}
 
-    def _neglected(
-        self, nodes: Array, sizes: Array, driven: Array, extra: Array, start: Array, rows: bool
-    ) -> tuple[Array, Array]:
-        """Gronwall: ``|e|' <= M |e| + residual`` block by block, ``(r, L', q)``, from ``|e(0)| <= start (r, q)``; and
-        at the end, ``(r, q)``.
+    def _spilt(self, sizes: Array, rows: bool) -> Array:
+        """The residual of the truncation on every fine piece, ``(r, L', q)``, by the ``sizes (r, L', M, q)`` of the
+        coefficients."""
+        spilt = self.spilt(block_sizes(self.A, self.starts))
+        return np.asarray(np.einsum("rlaj,aij->rli" if not rows else "rlai,aij->rlj", sizes, spilt))
 
-        The residual of the truncation is bounded on every fine piece by the ``sizes (r, L', M, q)`` of the
-        coefficients, and by ``extra (r, L', q)``. Every piece adds what the slack of ``A`` and rounding make of what
-        it starts from, ``nodes (r, L'+1, M, d)``, and of what drives it, ``driven (L', q)``.
+    def _neglected(
+        self, begin: Array, driven: Array, residual: Array, start: Array, rows: bool
+    ) -> tuple[Array, Array, Array]:
+        """Gronwall: ``|e|' <= M |e| + residual`` block by block, ``(r, S, q)``, from ``|e(0)| <= start (r, q)``; at
+        the ends of the spans, ``(r, S+1, q)``; and how large what it is an error of may become, ``(r, S, q)``.
+
+        Every span adds what the slack of ``A`` and rounding make of what it begins with, of block norms ``begin
+        (r, S, q)``, and of what drives it, at most ``driven (S, q)``.
         """
-        comparison, lengths = self.comparison, self.fine.lengths
-        reach = comparison.over(lengths)
+        reach = self.comparison.over(self._durations)
         flow, integral, peak = (part.transposed if rows else part for part in (reach.flow, reach.integral, reach.peak))
-        begin = block_norms(nodes[:, :-1], self.starts).sum(axis=2)
         drives = np.broadcast_to(driven, begin.shape)
-        reached = peak.on(begin) + integral.on(drives)
-        whole, within = self._rounded(reached, driven, rows)
+        reached, grown = peak.on(begin) + integral.on(drives), flow
+        if self.spans.size < self.fine.pieces:
+            lost, late = self._lost(peak, rows)
+            whole = within = lost.on(reached) + late * peak.on(drives)
+            reached = reached + whole
+            if rows:  # what is computed piece by piece begins a span elsewhere, and its rounding is that of where it is
+                grown = NormBounds(flow.matrices + product(lost.matrices, peak.matrices), flow.which)
+        else:
+            relative, speed = self._relative(self.fine.lengths)[:, None] * reached, self._speed(reached, driven, rows)
+            whole, within = (
+                relative + late * speed for late in (self._backward_fine if rows else self.forward).lateness
+            )
 
         slack = self.slack_A.T if rows else self.slack_A
         slipped, largest = (one.on(begin) + two.on(drives) for one, two in self._slips(rows))
         largest = np.minimum(finite(largest), integral.on(product(reached, slack.T)))
 
-        spilt = self.spilt(block_sizes(self.A, self.starts))
-        residual = np.einsum("rlaj,aij->rli" if not rows else "rlai,aij->rlj", sizes, spilt) + extra
         pushed = integral.on(residual)
         added = pushed + whole + np.minimum(slipped, largest)
-        bounds = flow.summed(np.broadcast_to(start, pushed[:, 0].shape), added)
-        return np.asarray(peak.on(bounds[:, :-1]) + pushed + within + largest), bounds[:, -1]
+        bounds = grown.summed(np.broadcast_to(start, begin[:, 0].shape), added)
+        carried = peak.on(bounds[:, :-1])
+        if grown is not flow:
+            carried = carried + lost.on(carried)
+            reached = reached + carried
+        return np.asarray(carried + pushed + within + largest), bounds, reached
+
+    def _lost(self, peak: NormBounds, rows: bool) -> tuple[NormBounds, float]:
+        """How far, at most, what is computed piece by piece gets from the truth on spans of many pieces, by the sizes
+        that it would have; and a time, for which anything that drives it counts.
+
+        Every piece loses a small share ``W`` of the sizes, and no more than the ``peak`` is made of that until the end
+        of the span; the sizes have to be the larger by this, and so on: ``peak + peak W peak + ... <= 2 peak`` where
+        ``peak W peak`` is at most half of it.
+        """
+        longest = np.maximum.reduceat(self.fine.lengths, self.spans)
+        whole, within = (self._backward_fine if rows else self.forward).lateness
+        share, late = (self._counts + 1) * self._relative(longest), self._counts.max() * whole + within
+        if rows:  # the ends of the spans are computed by transitions of their own
+            share = share + 2.0 * self._relative(self._durations)
+            late = late + 2.0 * self._backward_spans.lateness[0]
+        sizes = self.comparison.sizes.T if rows else self.comparison.sizes
+        once = product(peak.matrices, share.max() * np.eye(sizes.shape[0]) + late * sizes)
+        small = (product(once, peak.matrices) <= 0.5 * peak.matrices).all()
+        return NormBounds(np.where(small, 2.0 * once, np.inf), peak.which), 2.0 * late
 
     def _slips(self, rows: bool) -> tuple[tuple[NormBounds, NormBounds], tuple[NormBounds, NormBounds]]:
-        """`ComparisonSystem.slips` at the end of every fine piece, and the largest on it; remembered."""
+        """`ComparisonSystem.slips` at the end of every span, and the largest on it; remembered."""
         if rows not in self._slipping:
-            comparison, slack, lengths = self.comparison, self.slack_A.T if rows else self.slack_A, self.fine.lengths
+            comparison, slack, lengths = self.comparison, self.slack_A.T if rows else self.slack_A, self._durations
             here = ComparisonSystem(comparison.metzler.T, comparison.sizes.T) if rows else comparison
             # where nothing decays, slips grow with the time, so that the last is the largest
             grown = ComparisonSystem(here.rising, here.sizes)
@@ -376,19 +469,17 @@ class LiftedSystem:
     def _slipping(self) -> dict[bool, tuple[tuple[NormBounds, NormBounds], tuple[NormBounds, NormBounds]]]:
         return {}
 
-    def _rounded(self, reached: Array, driven: Array, rows: bool) -> tuple[Array, Array]:
-        """What rounding changes over every fine piece and within it, at most, ``(r, L', q)`` each, where block norms
-        of ``reached (r, L', q)`` are reached: by the exponentials, by the products with them, and by the time that is
-        looked at."""
-        lengths = self.fine.lengths
+    def _relative(self, lengths: Array) -> Array:
+        """What transitions over such ``lengths (S,)`` and a product with them may be off by, relative to the sizes."""
         if self.space.nu:
             relative = flows_rounding(self.space, self.A, lengths)
         else:
             relative = decoupled_rounding(self.decoupling, self.A[0], lengths)
-        relative = relative + rounding(self.A.shape[1] * int(np.bincount(self.space.products[2]).max()))
-        speed = reached @ (self.comparison.sizes if rows else self.comparison.sizes.T) + driven
-        whole, within = (self._backward_fine if rows else self.forward).lateness
-        return relative[:, None] * reached + whole * speed, relative[:, None] * reached + within * speed
+        return np.asarray(relative + rounding(self.A.shape[1] * int(np.bincount(self.space.products[2]).max())))
+
+    def _speed(self, reached: Array, driven: Array, rows: bool) -> Array:
+        """How fast anything of the sizes ``reached (r, S, q)`` moves, at most."""
+        return np.asarray(product(reached, self.comparison.sizes if rows else self.comparison.sizes.T) + driven)
 
     def spilt(self, coefficients: Array) -> Array:
         """For every monomial, the sum of those norms ``(M, ...)`` of the coefficients of a factor that push its product

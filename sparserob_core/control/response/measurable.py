@@ -196,7 +196,7 @@ class MeasurableCellSupport:
         """What rounding may change of ``e^{A' s} c``, times the disturbance, at most, ``(r, L)``."""
         lifted = self.lifted
         _, remainder = lifted.row_bounds(self.rows @ lifted.transform)
-        pushed = np.cumsum(remainder @ self._drive * lifted.fine.lengths, axis=1)
+        pushed = np.cumsum((remainder @ self._drive)[:, lifted.span] * lifted.fine.lengths, axis=1)
         return np.asarray(pushed[:, lifted.ends[1:] - 1])
 
     @property

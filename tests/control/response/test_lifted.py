@@ -3,6 +3,10 @@ sampling finds."""
 
 from __future__ import annotations
 
+import tracemalloc
+from contextlib import contextmanager
+
+import flint
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,6 +18,7 @@ from sparserob_core.control.enclosures.polynomial import polynomial_bound
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.response import lifted as lifted_module
 from sparserob_core.control.response.disturbance_support import DisturbanceSupport
 from sparserob_core.control.response.lifted import frozen, lift
 from sparserob_core.sip.convex_set import Box
@@ -302,3 +307,127 @@ def test_polynomials_without_variables_are_their_constants():
     bound, spread = polynomial_bound(TaylorSpace(0, 0), np.array([[[1.0], [-2.0]]]))
     assert bound.tolist() == [[1.0, -2.0]]
     assert spread.shape == (1, 2, 0)
+
+
+KNOWN = {  # name: (A, horizon)
+    "oscillating": ([[0.0, 1.0], [-4.0, -0.1]], 3.0),
+    "unstable": ([[0.8, 1.0, 0.0], [0.2, 0.5, 0.0], [0.0, 1.0, -1.0]], 6.0),
+    "stiff": ([[-1e4, 9e3, 0.0], [0.0, -50.0, 49.0], [0.0, 0.0, -1.0]], 2.0),
+    "defective": ([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]], 4.0),
+    "badly scaled": ([[-1.0, 1e-5], [1e5, -2.0]], 2.0),
+}
+UNEVEN = np.random.default_rng(5).uniform(0.2, 1.8, 60)
+LONG = {
+    "equal": np.linspace(0.0, 1.0, 61),
+    "uneven": np.append(0.0, np.cumsum(UNEVEN) / UNEVEN.sum()),
+    "tiny": np.append(np.linspace(0.0, 1e-6, 51), np.linspace(0.1, 1.0, 10)),
+}
+
+
+def known(name, grid):
+    """A known system on 60 pieces, with a disturbance, and its functionals."""
+    A, horizon = np.array(KNOWN[name][0]), KNOWN[name][1]
+    d = A.shape[0]
+    system = LinearSystem(A, np.eye(d)[:, -1:], np.eye(d))
+    dictionary = indicators(horizon * LONG[grid])
+    functionals = worst_case(
+        system, dictionary, bound=Box(-np.ones(d), np.ones(d)), initial_state=np.arange(1.0, d + 1)
+    )
+    return functionals, lambda: lift(
+        system, functionals.response.grid, functionals.response.initial_state, np.zeros(0), np.zeros(0)
+    )
+
+
+@pytest.mark.parametrize("grid", sorted(LONG))
+@pytest.mark.parametrize("name", sorted(KNOWN))
+def test_what_rounding_changes_over_spans_of_many_pieces_is_no_hundred_times_that_of_each_piece(
+    name, grid, monkeypatch
+):
+    functionals, lifting = known(name, grid)
+    rng = np.random.default_rng(4)
+    control, rows = rng.choice([-1.0, 0.0, 1.0], size=(1, 60)), rng.normal(size=(2, len(KNOWN[name][0])))
+    plain = lifting()
+    assert plain.spans.size == 60
+    monkeypatch.setattr(lifted_module, "SPANS", 12)
+    monkeypatch.setattr(lifted_module, "SHORT", np.inf)
+    spanned = lifting()
+    assert spanned.spans.size == 12
+    for mine, alone in zip(spanned.state_remainder(control), plain.state_remainder(control), strict=True):
+        assert mine.max() <= 100.0 * alone.max()
+    met = block_norms(spanned.nodes(control)[:, 0], spanned.starts)
+    assert (spanned.state_remainder(control)[1] >= np.maximum(met[:-1], met[1:])).all()
+    supports = [DisturbanceSupport(one, functionals.disturbance, rows @ one.transform) for one in (spanned, plain)]
+    mine, alone = (support.neglected for support in supports)
+    assert (mine.max(axis=1) <= 100.0 * alone.max(axis=1)).all()
+
+
+@pytest.mark.parametrize("name", sorted(KNOWN))
+def test_states_and_rows_are_as_near_to_the_truth_as_spans_of_many_pieces_say(name, monkeypatch):
+    """The truth is an exponential in balls of 400 bits."""
+    monkeypatch.setattr(lifted_module, "SPANS", 12)
+    functionals, lifting = known(name, "equal")
+    lifted, A = lifting(), np.array(KNOWN[name][0])
+    d, breaks = A.shape[0], functionals.response.grid.breakpoints
+    control = np.random.default_rng(4).choice([-1.0, 0.0, 1.0], size=(1, 60))
+    rows = np.random.default_rng(6).normal(size=(2, d))
+    nodes, remainder = lifted.nodes(control)[:, 0], lifted.state_remainder(control)[0]
+    weights = lifted.backward.adjoint(breaks[1:], np.repeat(rows[:1], 60, axis=0), np.zeros((60, 0)))[0]
+    missed = lifted.row_bounds(rows)[1][0][lifted.span]
+    with balls(400):
+        T = flint.arb_mat(lifted.transform.tolist())
+        state = T.inv() * flint.arb_mat(functionals.response.initial_state[:, None].tolist())
+        own, row = T.inv() * flint.arb_mat(A.tolist()) * T, flint.arb_mat(rows[:1].tolist())
+        drive = T.inv() * flint.arb_mat(np.eye(d)[:, -1:].tolist())
+        for piece in range(60):
+            length = flint.arb(float(breaks[piece + 1])) - flint.arb(float(breaks[piece]))
+            block = flint.arb_mat(d + 1, d + 1)
+            for i in range(d):
+                for j in range(d):
+                    block[i, j] = own[i, j] * length
+                block[i, d] = drive[i, 0] * float(control[0, piece]) * length
+            moved = block.exp() * flint.arb_mat([*[[state[i, 0]] for i in range(d)], [1]])
+            state = flint.arb_mat([[moved[i, 0]] for i in range(d)])
+            off = np.array([float(abs(state[i, 0] - float(nodes[piece + 1, i])).upper()) for i in range(d)])
+            assert (block_norms(off, lifted.starts) <= remainder[piece]).all()
+            row = row * (own * length).exp()
+            off = np.array([float(abs(row[0, i] - float(weights[piece, i])).upper()) for i in range(d)])
+            assert (block_norms(off, lifted.starts) <= missed[piece]).all()
+
+
+@contextmanager
+def balls(bits):
+    before, flint.ctx.prec = flint.ctx.prec, bits
+    try:
+        yield
+    finally:
+        flint.ctx.prec = before
+
+
+def test_spans_of_many_pieces_are_short_where_the_system_moves_much():
+    system = LinearSystem([[30.0, 0.0], [0.0, -1.0]], [[0.0], [1.0]])
+    grid = worst_case(system, uniform(2000, 3.0)).response.grid
+    lifted = lift(system, grid, np.ones(2), np.zeros(0), np.zeros(0))
+    assert 2000 > lifted.spans.size > 256
+    assert np.isfinite(lifted.state_remainder(np.ones((1, 2000)))[0]).all()
+
+
+def test_what_is_bounded_of_many_states_takes_no_more_memory_than_the_path():
+    """Of 20 000 pieces and 40 states: bounds piece by piece of every mode would be 20 times the path."""
+    masses = 20
+    stiffness = 2.0 * np.eye(masses) - np.eye(masses, k=1) - np.eye(masses, k=-1)
+    A = np.block([[np.zeros((masses, masses)), np.eye(masses)], [-stiffness, -0.1 * stiffness]])
+    functionals = worst_case(LinearSystem(A, np.eye(40)[:, -1:], np.eye(40)[:, -2:]), uniform_of_many(20_000, 5.0))
+    lifted = lift(functionals.response.system, functionals.response.grid, np.ones(40), np.zeros(0), np.zeros(0))
+    control = np.ones((1, 20_000))
+    path = lifted.nodes(control).nbytes
+    tracemalloc.start()
+    try:
+        lifted.row_bounds(np.eye(40)[:10])
+        lifted.along(control, np.ones((10, lifted.starts.size)), np.ones((10, lifted.starts.size)))
+        assert tracemalloc.get_traced_memory()[1] <= 1.5 * path
+    finally:
+        tracemalloc.stop()
+
+
+def uniform_of_many(pieces, horizon):
+    return Dictionary.indicators(np.linspace(0.0, horizon, pieces + 1))
