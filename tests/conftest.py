@@ -17,12 +17,13 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 from hypothesis import settings
 
+from tests.support.drafts import drafts
 from tests.support.places import ROOT
 from tests.support.stub import command, config, process
 
 assert sparserob_core.shapes.CHECKED
 
-__all__ = ["command", "config", "process"]
+__all__ = ["command", "config", "drafts", "process"]
 
 # the same examples in every run; HYPOTHESIS_PROFILE=default searches for new ones
 settings.register_profile("repeatable", derandomize=True)

@@ -41,7 +41,7 @@ CONFIG: Mapping[str, Any] = {
         "initial_state": [1, 0],
         "control": {"box": 1.0},
         "disturbance": {"box": [0.01, 0.01]},
-        "path": [{"box": [2.0, None]}],
+        "path": [{"box": [2.0, None], "from": 1.8}],
         "terminal": [{"box": [0.5, 0.5]}],
     },
     "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 10}},
@@ -56,7 +56,7 @@ METHODS: Mapping[str, Mapping[str, Any]] = {
     "exchange": {},
     "sparserob": SEARCH,
     "scenario": {"method": {"name": "scenario", "scenarios": 20}},
-    "infeasible": {"problem": {**CONFIG["problem"], "horizon": 0.5}},
+    "infeasible": {"problem": {**CONFIG["problem"], "horizon": 0.5, "path": []}},
 }
 BROKEN_OFF = (1, 2, 4)  # the events after which a run is interrupted: at once, and in the middle
 EVENTS = 300

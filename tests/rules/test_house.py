@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tokenize
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -37,32 +37,40 @@ def relative(path: Path) -> str:
     return str(path.relative_to(ROOT))
 
 
-@cache
-def parsed(path: Path) -> ast.Module:
-    return ast.parse(path.read_text())
-
-
-def trees(paths: Iterable[Path]) -> Iterator[tuple[Path, ast.Module]]:
-    return ((path, parsed(path)) for path in paths)
+Imports = list[tuple[str, tuple[str, ...]]]
 
 
 @cache
-def nodes(tree: ast.AST) -> list[ast.AST]:
-    """All nodes that import something."""
-    return [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
-
-
-def imports(tree: ast.AST) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Every imported module with the names taken from it, wherever it stands, for types too."""
-    for node in nodes(tree):
+def read(path: Path) -> tuple[Imports, set[str]]:
+    """Every module that a file imports with the names taken from it, wherever it stands, for types too; and the
+    top-level packages that it imports when it is imported itself: neither inside a function nor for types only. Trees
+    are large, and not kept."""
+    tree = ast.parse(path.read_text())
+    found = Imports()
+    for node in statements(tree):
         if isinstance(node, ast.Import):
-            yield from ((alias.name, ()) for alias in node.names)
+            found += [(alias.name, ()) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
-            yield "." * node.level + (node.module or ""), tuple(alias.name for alias in node.names)
+            found.append(("." * node.level + (node.module or ""), tuple(alias.name for alias in node.names)))
+    return found, imported_at_start(tree)
+
+
+def statements(tree: ast.AST) -> Iterator[ast.AST]:
+    """What may hold an import: statements, and what holds statements."""
+    pending = [tree]
+    while pending:
+        node = pending.pop()
+        yield node
+        for part in ("body", "orelse", "finalbody", "handlers", "cases"):
+            inside = getattr(node, part, ())
+            pending += inside if isinstance(inside, list) else ()
+
+
+def imports(path: Path) -> Imports:
+    return read(path)[0]
 
 
 def imported_at_start(tree: ast.Module) -> set[str]:
-    """Top-level packages imported by importing the module: neither inside a function nor for types only."""
     found, pending = set(), list(tree.body)
     while pending:
         node = pending.pop()
@@ -85,10 +93,10 @@ def import_graph() -> Mapping[str, set[str]]:
     """Which modules of the core each of its modules imports, wherever and for whatever."""
     known = {module_name(path) for path in CORE}
     graph: dict[str, set[str]] = {}
-    for path, tree in trees(CORE):
+    for path in CORE:
         targets = {
             f"{module}.{name}" if f"{module}.{name}" in known else module
-            for module, names in imports(tree)
+            for module, names in imports(path)
             for name in names or ("",)
         }
         graph[module_name(path)] = (targets & known) - {module_name(path)}
@@ -151,16 +159,16 @@ def test_no_import_goes_round_in_a_circle_between_modules_or_folders() -> None:
 
 
 def test_imports_are_absolute_and_heavy_packages_are_imported_where_they_are_used() -> None:
-    offenders = [relative(path) for path, tree in trees(CORE) if HEAVY & imported_at_start(tree)]
-    offenders += [relative(path) for path, tree in trees(CORE + PLUGINS) if any(m[0] == "." for m, _ in imports(tree))]
+    offenders = [relative(path) for path in CORE if HEAVY & read(path)[1]]
+    offenders += [relative(path) for path in CORE + PLUGINS if any(m[0] == "." for m, _ in imports(path))]
     assert not offenders
 
 
 def test_the_core_imports_no_plugin_and_plugins_only_the_public_face() -> None:
     offenders = [
         f"{relative(path)} imports {module}"
-        for path, tree in trees(CORE + PLUGINS)
-        for module, _ in imports(tree)
+        for path in CORE + PLUGINS
+        for module, _ in imports(path)
         if module.startswith("sparserob_") and not allowed(path, module)
     ]
     assert not offenders
@@ -172,7 +180,7 @@ def allowed(path: Path, module: str) -> bool:
 
 
 def test_only_the_command_line_knows_the_library_of_commands() -> None:
-    users = [relative(path) for path, tree in trees(CORE) if "click" in {module for module, _ in imports(tree)}]
+    users = [relative(path) for path in CORE if "click" in {module for module, _ in imports(path)}]
     assert users
     assert not [user for user in users if not user.startswith(PLACES)]
 
@@ -201,7 +209,8 @@ def test_the_spelling_is_british() -> None:
     american = re.compile(
         r"\b(?:regulariz|maximiz|minimiz|optimiz|discretiz|normaliz|initializ|behavior|neighbor)\w*", re.IGNORECASE
     )
-    assert not {relative(path): words for path in CORE + PLUGINS if (words := american.findall(prose(path)))}
+    suspects = [path for path in CORE + PLUGINS if american.search(path.read_text())]
+    assert not {relative(path): words for path in suspects if (words := american.findall(prose(path)))}
 
 
 def test_a_test_file_says_in_its_first_line_what_it_guards() -> None:

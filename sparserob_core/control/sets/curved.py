@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.errors import InputError
-from sparserob_core.shapes import Float, shaped
+from sparserob_core.shapes import Bool, Float, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet, as_bound, bisect, few_digits, ratios, vertex_excess
 
 _SIGN_DIMENSIONS = 10
@@ -247,6 +247,20 @@ class NormBall(ConvexSet):
         steepest = self.dimension ** max(0.0, 1.0 / self.p - 0.5)
         signed: Array = np.where(excess > 0.0, distance, excess / steepest)
         return signed
+
+    @shaped
+    def contains(self, points: Float[Array, "*k d"], tolerance: float = 1e-9) -> Bool[np.ndarray, " *k"]:
+        """As for every set; the projection is sought only where the ``p``-norm, which is at most ``most`` times the
+        Euclidean distance and at least that by ``least``, leaves it open."""
+        if self.halfspaces() is not None:
+            return super().contains(points, tolerance)
+        rays = np.asarray(points, dtype=float) - self.centre
+        excess = np.atleast_1d(np.linalg.norm(rays, ord=self.p, axis=-1) - self.radius)
+        most, least = (self.dimension ** max(0.0, sign * (1.0 / self.p - 0.5)) for sign in (1.0, -1.0))
+        inside = excess <= most * tolerance
+        open_yet = inside & (excess > 0.0) & (least * excess > tolerance)
+        inside[open_yet] = self.violation(self.centre + rays.reshape(*excess.shape, -1)[open_yet]) <= tolerance
+        return np.asarray(inside.reshape(rays.shape[:-1]))
 
     def _projected(self, z: Array) -> Array:
         """Euclidean projection of ``z >= 0`` on the unit ball: ``y_i + multiplier y_i^(p-1) = z_i``, and the multiplier

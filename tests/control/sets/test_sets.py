@@ -87,6 +87,18 @@ def test_violation_is_the_largest_excess_over_unit_normals(seed: int, d: int) ->
         assert member.contains(member.interior_point(), 1e-9)
 
 
+@pytest.mark.parametrize("p", [1.2, 2.0, 3.0, 7.0])
+@pytest.mark.parametrize("radius", [0.0, 0.5])
+def test_a_ball_contains_what_violates_it_by_no_more_than_the_tolerance(p: float, radius: float) -> None:
+    ball = NormBall(p, radius, centre=[1.0, -2.0, 0.5])
+    points = ball.centre + np.random.default_rng(7).normal(scale=0.5, size=(10, 5, 3))
+    for tolerance in (-0.1, 0.0, 0.1, 0.3):
+        inside = ball.contains(points, tolerance)
+        assert (inside == (ball.violation(points) <= tolerance)).all()
+        assert inside.any() != (radius == 0.0 and tolerance <= 0.0)
+        assert bool(ball.contains(points[0, 0], tolerance)) == inside[0, 0]
+
+
 @settings(max_examples=25, deadline=None)
 @given(seeds, st.integers(1, 4))
 def test_the_linearisation_excess_bounds_the_support_function_around_a_direction(seed: int, d: int) -> None:

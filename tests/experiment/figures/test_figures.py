@@ -97,15 +97,18 @@ def test_bounds_that_are_not_known_yet_are_not_drawn(data: FigureData) -> None:
     assert drawn["upper bound"] == 2
 
 
+@pytest.mark.usefixtures("drafts")
 def test_a_run_that_ended_in_its_first_round_can_be_drawn(data: FigureData, tmp_path: Path) -> None:
     only = replace(data, history=data.history[:1], tolerance=None, active_times=np.empty(0), walls=())
     assert len(write_figures(tmp_path, only)) == 6
 
 
+@pytest.mark.usefixtures("drafts")
 def test_a_closed_gap_in_the_only_round_can_be_drawn(data: FigureData, tmp_path: Path) -> None:
     assert len(write_figures(tmp_path, replace(data, history=data.history[-1:]))) == 6
 
 
+@pytest.mark.usefixtures("drafts")
 def test_a_run_without_rounds_has_no_convergence_figure(data: FigureData, tmp_path: Path) -> None:
     assert {file.stem for file in write_figures(tmp_path, replace(data, history=()))} == {"control", "states"}
 

@@ -75,13 +75,16 @@ def test_the_worst_case_of_every_constraint_is_reached_in_the_loop(outcome) -> N
     assert found.constraints["terminal"][0] > -1e-5
 
 
-def test_a_loop_that_is_solved_anew_pays_less(outcome) -> None:
+def test_a_loop_that_is_solved_anew_pays_less(config, tmp_path) -> None:
+    coarse = {"dictionaries.control.pieces": 6}
+    outcome = sr.run(config, coarse, out=tmp_path / "run", quiet=True, figures=False)
     applied, anew = (sr.loop(outcome, resolve, 1) for resolve in (False, True))
     assert anew.resolved > 0
     assert anew.costs.mean() < applied.costs.mean()
     assert not anew.contradicts
 
 
+@pytest.mark.usefixtures("drafts")
 def test_the_command_runs_a_config_and_closes_the_loop(config, tmp_path, capsys) -> None:
     out = tmp_path / "run"
     assert status("loop", config, "problem.disturbance.box=[0.1,0.1]", "--out", out, "--trajectories", 1) == 0
