@@ -429,7 +429,7 @@ class Spread:
         found = np.empty(a.shape)
         for part, count, convex, middle in self.parts:
             blocks = a[..., part].reshape(*a.shape[:-1], count, convex.dimension)
-            found[..., part] = (convex.support_point(blocks) - middle).reshape(*a.shape[:-1], -1)
+            found[..., part] = (convex.support_point(blocks) - middle).reshape(*a.shape[:-1], part.stop - part.start)
         return found
 
 

@@ -93,6 +93,15 @@ def test_curved_sets_keep_every_guarantee(name: str, tmp_path: Path) -> None:
     proven(run({**SPRING, **SETS[name]}, tmp_path / "run", "peak", pieces=8))
 
 
+def test_nothing_need_be_flat(tmp_path: Path) -> None:
+    """The bound against every causal policy has no rows then, and is 0 or that of the set of the control."""
+    round_ = {"terminal": [{"norm": {"p": 2, "radius": 0.3}}], "disturbance": {"norm": {"p": 2, "radius": 0.05}}}
+    system = {"A": [[0, 1], [-1, -0.2]], "B": [[0.4, 0], [0, 1]]}
+    outcome = run({**THRUSTERS, **round_, "system": system}, tmp_path / "run", pieces=3)
+    assert outcome.status == "certified", outcome.result.message
+    assert check(outcome.directory).status == "verified"
+
+
 def test_a_curved_set_that_no_policy_keeps_is_infeasible_with_its_reason(tmp_path: Path) -> None:
     problem = {**SPRING, "terminal": [{"norm": {"p": 2, "radius": 0.05}}]}
     outcome = run(problem, tmp_path / "run")

@@ -206,18 +206,20 @@ def test_what_the_last_piece_of_a_disturbance_reaches_is_fixed_by_nothing(tmp_pa
     assert check(outcome.directory).status == "verified"
 
 
+SIDE_BY_SIDE: dict[str, Any] = {
+    **SPRING,
+    "system": {"A": [[-1, 0], [0, 0]], "B": [[1, 0], [0, 1]], "E": [[1], [0]]},
+    "initial_state": [1, 1],
+    "control": {"box": [1, 1]},
+    "disturbance": {"box": 0.2},
+    "path": [],
+    "terminal": [{"box": [0.1, None]}, {"equals": [None, 0.25]}],
+}
+
+
 def test_what_no_disturbance_reaches_is_fixed_beside_what_it_reaches(tmp_path: Path) -> None:
     """Two integrators side by side: the disturbance acts on the first alone, the second can be fixed."""
-    system = {"A": [[-1, 0], [0, 0]], "B": [[1, 0], [0, 1]], "E": [[1], [0]]}
-    problem = {
-        **SPRING,
-        "system": system,
-        "initial_state": {"centre": [1, 1], "box": [0.1, 0.1]},
-        "control": {"box": [1, 1]},
-        "disturbance": {"box": 0.2},
-        "path": [],
-        "terminal": [{"box": [0.1, None]}, {"equals": [None, 0.25]}],
-    }
+    problem = {**SIDE_BY_SIDE, "initial_state": {"centre": [1, 1], "box": [0.1, 0.1]}}
     outcome = run(problem, tmp_path / "run", "peak")
     proven(outcome)
     independent = program(problem, PIECES, [0.2], [0.1, 0.1])
@@ -226,6 +228,29 @@ def test_what_no_disturbance_reaches_is_fixed_beside_what_it_reaches(tmp_path: P
         independent.below(sign * x[0], 0.1)
     independent.equal(x[1], 0.25)
     assert outcome.result.cost == pytest.approx(independent.solve(1.0, "peak"), rel=1e-6)
+
+
+def test_the_margin_of_a_disturbance_beside_a_fixed_state_is_what_its_last_piece_can_do() -> None:
+    """``x1' = -x1 + u1 + w`` where ``|x1(5)| <= 0.1``: ``w (1 - e^{-h})`` on the last piece is answered by nothing."""
+    found = sr.margin(config(SIDE_BY_SIDE), tolerance=1e-5)
+    assert found.status == "certified", found.message
+    exact = 0.1 / (1.0 - np.exp(-5.0 / PIECES))
+    assert found.amounts[0] <= exact <= found.amounts[1]
+
+
+@pytest.mark.parametrize("pushed", [{"box": [0.1, 0.0]}, {"box": {"lower": [-0.1, 0.05], "upper": [0.1, 0.05]}}])
+def test_a_fixed_state_that_only_a_known_disturbance_reaches_is_met(pushed: dict[str, Any], tmp_path: Path) -> None:
+    system = {**SIDE_BY_SIDE["system"], "E": [[1, 0], [0, 1]]}
+    proven(run({**SIDE_BY_SIDE, "system": system, "disturbance": pushed}, tmp_path / "run"))
+
+
+def test_a_fixed_state_that_the_last_disturbance_reaches_has_the_margin_zero() -> None:
+    system = {**SPRING["system"], "E": [[0], [1]]}
+    problem = {**SPRING, "system": system, "disturbance": {"box": 0.1}, "path": [], "terminal": [{"equals": [0, 0]}]}
+    found = sr.margin(config(problem), tolerance=1e-3)
+    assert found.status == "certified", found.message
+    assert found.lower == 0.0 < found.upper <= 1e-3
+    assert "reaches it unanswered" in found.message
 
 
 @pytest.mark.slow

@@ -166,7 +166,8 @@ class FeedbackConstraint:
         allowed = flat.h - flat.moved(time)[0]
         if flat.gains is None:
             rows = self.loop.state_rows(float(time[0]), flat.H, allowed, *self._shared)
-            return replace(rows, exact=self.exact)
+            # what cannot deviate need not be answered
+            return replace(rows, exact=True, d=rows.d * (self.loop.spread.radii > 0.0)) if self.exact else rows
         pieces, (part, factor) = flat.commanded(time)[0], self._shared
         if pieces[0] != pieces[-1]:  # the rows of a control that jumps are others before and after
             half = part.size // 2

@@ -111,7 +111,13 @@ class Counterpart:
         if block.exact and not (self.elastic and self.lowest == 0.0):
             table, rhs = block.equations
             table = table.tocoo()
-            at = self._linear.rows([_both(table.row, table.col, table.data, self.program.n)], rhs, rhs)
+            entries = [_both(table.row, table.col, table.data, self.program.n)]
+            if self.scales:  # what answers deviations answers those of the factor 1, times the factor
+                answers = np.arange(rhs.size) % (1 + self.spread.size) > 0
+                grown = np.flatnonzero(answers & (rhs != 0.0))
+                entries.append((grown, np.full(grown.size, 2 * self.program.n), -rhs[grown]))
+                rhs = np.where(answers, 0.0, rhs)
+            at = self._linear.rows(entries, rhs, rhs)
             self.blocks.append(block)
             self._imposed.append((at, rhs, []))
             return

@@ -464,8 +464,6 @@ def largest_factor(program: SemiInfiniteProgram, tools: Tools, highest: float, a
             if key in known or family.uncertain is None:
                 continue
             rows = family.uncertain(index)
-            if rows.exact:
-                return None
             known.add(key)
             answers[rows.stacked.indices] = True
             growing.add(rows)
