@@ -211,7 +211,8 @@ class FlatConstraint(StateConstraint):
     ) -> tuple[Float[Array, " n"], Float[Array, "n d"], Float[Array, "n nu"], Float[Array, " n"]]:
         parameters = np.repeat(self.parameters.clamp(indices[:, 1:]), self.h.size, axis=0)
         count, rhs = indices.shape[0], self.h[None] - self.moved(indices[:, 0])
-        return np.repeat(indices[:, 0], self.h.size), np.tile(self.H, (count, 1)), parameters, rhs.ravel()
+        H = self.H if count == 1 else np.tile(self.H, (count, 1))
+        return np.repeat(indices[:, 0], self.h.size), H, parameters, rhs.ravel()
 
     @shaped
     def violations(

@@ -118,6 +118,8 @@ class LiteralConstraint:
     def _split(self, indices: Array) -> tuple[Array, Array]:
         """The reduced index, and the coefficients of the disturbance."""
         beta = self.disturbance.block_count * self.disturbance.set.dimension
+        if indices.shape[1] == 1 + beta:
+            return indices[:, :1], indices[:, 1:]
         return np.hstack([indices[:, :1], indices[:, 1 + beta :]]), indices[:, 1 : 1 + beta]
 
     def _signals(self, beta: Array) -> Array:

@@ -361,6 +361,8 @@ class WorstCase:
         return bool(self.known.any())
 
     def _chunks(self, parameters: Array) -> list[slice]:
-        count = parameters.shape[0]
-        size = max(1, CHUNK // self.response.numbers(parameters.shape[1]))
+        count, numbers = parameters.shape[0], self.response.numbers(parameters.shape[1])
+        size = max(1, CHUNK // numbers)
+        if 0 < count <= size:
+            return [slice(None)]
         return [slice(start, start + size) for start in range(0, count, size)]

@@ -28,6 +28,7 @@ TINY = float(np.finfo(float).tiny)
 KERNEL = 1_000_000  # numbers of what all ages give in all directions, up to which they are remembered
 STEP = 4 * EPSILON  # of the horizon: times that differ by less are a whole piece apart, or not at all
 SHORT, SERIES = 1.0, 1e-17  # norm of A times a part of a piece up to which a series is summed, and its last term
+AT_ONCE = 50_000  # numbers of a term of the series
 FEW = 128  # indices for which a table beats the loop over the pieces
 INSIDE_KEPT = 4  # sets of durations within pieces whose transitions are remembered
 STEPS_KEPT = 16  # sets of parameters whose transitions are remembered
@@ -127,7 +128,7 @@ class TimeGrid:
     @shaped
     def locate(self, times: Float[Array, " k"]) -> Int[np.ndarray, " k"]:
         """Index of the piece that each time ``(k,)`` lies in; a breakpoint belongs to the piece that it ends."""
-        return np.clip(np.searchsorted(self.breakpoints, times, side="left") - 1, 0, self.pieces - 1)
+        return np.minimum(np.maximum(self.breakpoints.searchsorted(times) - 1, 0), self.pieces - 1)
 
 
 @shaped
@@ -370,7 +371,8 @@ class Propagator:
         pieces, steps = self.grid.locate(times), self.steps(np.zeros((1, 0)))
         rows, entered = self._over_parts(steps, directions, times - self.grid.breakpoints[pieces])
         count, channels = int(pieces.max(initial=0)), steps.B.shape[2]
-        apart, which = rows, np.arange(times.size)
+        every = np.arange(times.size)
+        apart, which = rows, every
         if times.size > 1 and self.inputs.reach < self.grid.pieces:  # later times are shifts of one impulse response
             apart, which = _unique_rows(rows)
         by_age = self.inputs.of(apart, count)
@@ -384,7 +386,6 @@ class Propagator:
                     backwards[:, channels:],
                 )
         last = entered @ self.inputs.columns
-        every = np.arange(times.size)
         control[every, pieces], disturbance[every, pieces] = last[:, :channels], last[:, channels:]
         return Weights(self._leapt(rows, pieces), control, disturbance)
 
@@ -409,21 +410,21 @@ class Propagator:
                 steps, np.zeros(within.size, dtype=int), within, np.zeros(within.size, dtype=int)
             )
             return (rows[:, None] @ Phi)[:, 0], (rows[:, None] @ Gamma)[:, 0]
-        elapsed = within[:, None]
-        flown, driven, term, order, bound = rows, rows * elapsed, rows, 0, 1.0
-        while bound > SERIES:
-            order += 1
-            term = term @ A * (elapsed / order)
-            flown, driven = flown + term, driven + term * (elapsed / (order + 1))
-            bound *= size / order
-        return flown, driven
+        count = max(1, AT_ONCE // rows.shape[1])
+        if len(rows) <= count:
+            return _series(A, rows, within, size)
+        found = [_series(A, rows[i : i + count], within[i : i + count], size) for i in range(0, len(rows), count)]
+        return np.concatenate([flown for flown, _ in found]), np.concatenate([driven for _, driven in found])
 
     def _leapt(self, rows: Array, pieces: np.ndarray) -> Array:
         """``rows (k, d)`` that went on by so many whole ``pieces (k,)``, ``(k, d)``."""
-        free = rows.copy()
+        free, together = rows.copy(), int(pieces[0]) if pieces.size and (pieces == pieces[0]).all() else None
         for place, leap in enumerate(self.leaps[: int(pieces.max(initial=0)).bit_length()]):
-            far = np.flatnonzero(pieces >> place & 1)
-            free[far] = free[far] @ leap
+            if together is None:
+                far = np.flatnonzero(pieces >> place & 1)
+                free[far] = free[far] @ leap
+            elif together >> place & 1:
+                free = free @ leap
         return free
 
     def _adjoint_of_few(
@@ -751,6 +752,21 @@ class Response:
         for piece in range(count * block, self.grid.pieces):
             path[:, piece + 1] += (path[:, piece, None] @ Phi)[:, 0]
         return path
+
+
+def _series(A: Array, rows: Array, times: Array, size: float) -> tuple[Array, Array]:
+    """``c'e^{A r}`` and ``c'int_0^r e^{A s} ds`` of ``rows (k, d)`` over ``times (k,)``, where ``|A r|`` is at most
+    ``size``."""
+    longest, terms, bound = float(times.max(initial=0.0)), [rows], 1.0
+    step = A * longest
+    while bound > SERIES:
+        bound *= size / len(terms)
+        terms.append(terms[-1] @ step / len(terms))
+    shares = (times[:, None] / (longest or 1.0)) ** np.arange(len(terms))
+    stacked = np.array(terms)
+    flown = np.einsum("kj,jkd->kd", shares, stacked)
+    driven = np.einsum("kj,jkd->kd", shares / np.arange(1, len(terms) + 1), stacked)
+    return flown, driven * times[:, None]
 
 
 @shaped

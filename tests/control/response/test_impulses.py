@@ -148,3 +148,19 @@ def test_equal_pieces_are_equal_whatever_their_number(horizon):
     for pieces in (10, 16384, 81920, 100_000):
         ends = np.linspace(0, horizon, pieces + 1)
         assert Response(LinearSystem([[0.0]], [[1.0]]), merge_grids(ends, ends), np.zeros(1)).uniform
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_rows_of_many_instants_are_those_of_each_alone(together):
+    rng = np.random.default_rng(11)
+    system, _ = symmetric(rng, RATES["slow"], 3.0)
+    ends = np.linspace(0, 3.0, 38)
+    response = Response(system, merge_grids(ends, ends), np.zeros(4))
+    times = np.full(9, 1.7) if together else rng.uniform(0, 3.0, 9)
+    directions, none = rng.normal(size=(9, 4)), np.zeros((9, 0))
+    with patch(f"{HOME}.AT_ONCE", 8):  # two rows of the series at once
+        found = response.weights(times, directions, none)
+    for i in range(9):
+        alone = response.weights(times[[i]], directions[[i]], none[[i]])
+        for one, other in zip(found, alone, strict=True):
+            np.testing.assert_allclose(one[i], other[0], rtol=1e-14, atol=1e-15)
