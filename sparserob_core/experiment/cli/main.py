@@ -37,7 +37,11 @@ from sparserob_core.experiment.cli.shell.process import (
 from sparserob_core.experiment.terminal.printing import printable
 
 DEBUG = "SPARSEROB_DEBUG"
-RARELY = (50_000, 20, 20)  # allocations between two searches for cycles: at first nearly all are of modules, which stay
+RARELY = (
+    200_000,
+    20,
+    20,
+)  # allocations between two searches for cycles: at first nearly all are of modules, which stay
 QUESTIONS = frozenset({"-h", "--help", "--version"})  # that need no numbers
 
 

@@ -32,6 +32,9 @@ Finder: TypeAlias = Callable[[Sequence[str]], list[metadata.EntryPoint]]
 
 OWN = "sparserob"  # the name of this distribution
 
+_free: list[pluggy.PluginManager] = []
+"""Managers that know the hooks, and hold no plugin: to read what the hooks expect takes as long as all the rest."""
+
 
 def load_own_registry(extra_paths: Iterable[str | Path] = ()) -> Registry:
     """The components of this distribution, and of the files that the user himself names (``--plugins FILE``); nobody
@@ -97,7 +100,7 @@ def _load(disabled: Sequence[str], installed: Finder, hint: str = "") -> Registr
     records: list[Plugin] = []
     for plugin in found:
         with _noted(failures, plugin.name):
-            records += list(_records(plugin))
+            records += _records(plugin)
     return Registry(records, failures, disabled, hint)
 
 
@@ -160,13 +163,25 @@ def _module(file: Path) -> ModuleType:
         return files.load(file)
 
 
-def _records(plugin: _Loaded) -> Iterator[Plugin]:
+def _records(plugin: _Loaded) -> Sequence[Plugin]:
+    """What a plugin yields, which is alone with its manager."""
     who = f"plugin '{plugin.name}'" + (f" ({plugin.source})" if plugin.source else "")
-    manager = pluggy.PluginManager(GROUP)
-    manager.add_hookspecs(SPECIFICATIONS)
+    manager = _free.pop() if _free else _manager()
     with attributed(who, "registering it", but=()):
         manager.register(plugin.module, name=plugin.name)
-    callers = manager.get_hookcallers(plugin.module) or []
+    found = list(_yielded(plugin, who, manager.get_hookcallers(plugin.module) or []))
+    manager.unregister(plugin.module)
+    _free.append(manager)
+    return found
+
+
+def _manager() -> pluggy.PluginManager:
+    manager = pluggy.PluginManager(GROUP)
+    manager.add_hookspecs(SPECIFICATIONS)
+    return manager
+
+
+def _yielded(plugin: _Loaded, who: str, callers: Sequence[pluggy.HookCaller]) -> Iterator[Plugin]:
     for caller in callers:
         if not caller.has_spec():
             raise PluginError(f"{who}: unknown hook '{caller.name}'{nearest(caller.name, HOOKS)}")

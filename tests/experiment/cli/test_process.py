@@ -431,8 +431,73 @@ def test_a_study_without_matplotlib_has_a_note_and_its_own_status(
 def test_modules_that_scipy_looks_at_are_imported_only_when_something_of_them_is_used() -> None:
     code = (
         "import sys; from sparserob_core.experiment.cli.shell.process import spare_imports; spare_imports();"
-        " import scipy.sparse; before = 'numpy.f2py.crackfortran' in sys.modules; import numpy.f2py;"
-        " print(before, callable(numpy.f2py.get_include), callable(numpy.testing.assert_allclose))"
+        " import scipy.sparse; before = {'numpy.f2py.crackfortran', 'numpy.polynomial.chebyshev'} & set(sys.modules);"
+        " import numpy.f2py; print(before, callable(numpy.f2py.get_include), callable(numpy.testing.assert_allclose),"
+        " numpy.polynomial.Polynomial([1.0, 2.0])(3.0) == 7.0)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["False", "True", "True"]
+    assert done.stdout.split() == ["set()", *["True"] * 3]
+
+
+RECORDS = """
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+def told(what):
+    try:
+        return what()
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+
+def made():
+    @dataclass(frozen=True)
+    class Point:
+        x: float
+        hidden: Any = field(default=None, repr=False)
+
+    @dataclass(frozen=True, eq=False)
+    class Marked(Point):
+        label: str = "{x}"
+
+    class Loose(Marked):
+        pass
+
+    @dataclass
+    class Free:
+        x: Any = 0
+
+        def __repr__(self):
+            return "own"
+
+    @dataclass(frozen=True)
+    class Empty:
+        pass
+
+    point, marked, loose, free = Point(1.0), Marked(2.0, 3), Loose(4.0), Free()
+    again = Point([])
+    again.x.append(again)
+    loose.other, free.x = 5, 6
+    return [
+        repr(one) for one in (point, marked, loose, free, again, Empty(), replace(marked, label="b"))
+    ] + [
+        told(lambda: setattr(one, name, 1)) for one in (point, marked, loose, Empty()) for name in ("x", "label", "new")
+    ] + [
+        told(lambda: delattr(one, name)) for one in (point, marked, loose, Empty()) for name in ("x", "label", "new")
+    ] + [
+        hash(point) == hash(Point(1.0)), point == Point(1.0), loose.other, free.x,
+        *(getattr(kind, f"__{name}__").__qualname__ for kind in (Point, Marked) for name in ("setattr", "repr")),
+    ]
+
+before = made()
+from sparserob_core.experiment.cli.shell.process import spare_imports
+spare_imports()
+after = made()
+assert before == after, [pair for pair in zip(before, after) if pair[0] != pair[1]]
+assert any("cannot assign to field" in str(said) for said in after)
+assert any("cannot delete field" in str(said) for said in after)
+"""
+
+
+def test_records_behave_as_those_of_the_standard_library_whoever_writes_their_methods() -> None:
+    done = subprocess.run([sys.executable, "-c", RECORDS], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
