@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,11 +20,13 @@ from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.disturbance_support import DisturbanceSupport
 from sparserob_core.control.response.initial_support import InitialSupport, Support, Supports
 from sparserob_core.control.response.lifted import LiftedSystem, frozen
-from sparserob_core.control.response.measurable import MeasurableCellSupport, MeasurableSupport
 from sparserob_core.control.response.response import Response, TimeGrid, Weights
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
+
+if TYPE_CHECKING:
+    from sparserob_core.control.response.measurable import MeasurableSupport
 
 # said where it is met, and before anything is solved
 WITHOUT_PROOF = "measurable disturbances are proven only for known systems and sets with flat sides"
@@ -242,6 +245,8 @@ class WorstCase:
         elif model is not None:
             if lifted.space.nu or joined is not None:
                 raise NotEnclosable(f"{WITHOUT_PROOF}; with disturbance_class piecewise_constant there is one")
+            from sparserob_core.control.response.measurable import MeasurableCellSupport
+
             found.append(MeasurableCellSupport(self.measurable, H, lifted))
         if self.initial is not None:
             found.append(InitialSupport(lifted, self.initial, rows, joined))
@@ -292,6 +297,8 @@ class WorstCase:
     @cached_property
     def measurable(self) -> MeasurableSupport:
         """The support of measurable disturbances; the ``shared`` one where it is of this system and set."""
+        from sparserob_core.control.response.measurable import MeasurableSupport
+
         assert self.disturbance is not None
         given = self.shared
         if given and given.response.propagator is self.response.propagator and given.bound is self.disturbance.bound:

@@ -4,17 +4,19 @@ replayed."""
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sparserob_core.control.constraints.feedback_curved import of_state
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.matrix_exponential import transitions
-from sparserob_core.control.feedback.closed_loop import ClosedLoop
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.transcription.record import Feedback
 from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from sparserob_core.control.feedback.closed_loop import ClosedLoop
 
 PARTS = 4  # equal parts of every piece on which a measurable worst case is looked for
 HALVINGS = 40  # of a part across a switch of the worst disturbance
@@ -73,6 +75,8 @@ def find_adversary(constraint: StateConstraint, decision: Array, feedback: Feedb
 
 
 def _of_loop(constraint: StateConstraint, decision: Array, loop: ClosedLoop) -> Adversary:
+    from sparserob_core.control.constraints.feedback_curved import of_state
+
     held = of_state(constraint, loop)
     worst = held.worst(decision)
     row, time = int(worst.rows[0]), float(worst.indices[0, 0])

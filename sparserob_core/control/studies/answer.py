@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 import numpy.typing as npt
@@ -14,11 +14,13 @@ from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.studies.adversary import Adversary, find_adversary
-from sparserob_core.control.studies.causal import CausalBound
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.result import Result
+
+if TYPE_CHECKING:
+    from sparserob_core.control.studies.causal import CausalBound
 
 PARAMETERS = 27  # at most, at which the tube of an uncertain system is computed
 INSTANTS = 20_000  # functionals that are asked for at once

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 
 from sparserob_core.control.constraints.state import StateConstraint
-from sparserob_core.control.feedback.closed_loop import ClosedLoop
-from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.response.functional import WorstCase
@@ -18,6 +16,10 @@ from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.response import Response
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.program import ConstraintFamily, Formulation, SemiInfiniteProgram
+
+if TYPE_CHECKING:
+    from sparserob_core.control.feedback.closed_loop import ClosedLoop
+    from sparserob_core.control.policies.affine import AffinePolicy
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,10 +8,8 @@ from typing import TYPE_CHECKING, Literal, TypedDict
 import numpy as np
 
 from sparserob_core.control.constraints.control import ControlConstraint
-from sparserob_core.control.constraints.curved import CurvedConstraint
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.literal import LiteralConstraint
-from sparserob_core.control.constraints.scenario import ScenarioConstraint, sample_disturbances, sample_parameters
 from sparserob_core.control.constraints.sensitivity import Sensitivity
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.taylor import TaylorSpace
@@ -23,11 +21,9 @@ from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.response.disturbance import DisturbanceModel, disturbance_model
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
-from sparserob_core.control.response.quadratic import quadratic_cost
 from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.response.response import SAME_TIME, Response, merge_grids
 from sparserob_core.control.sets.sets import Equality
-from sparserob_core.control.transcription.feedback import made_again, refuse, with_feedback
 from sparserob_core.control.transcription.own_units import (
     RESOLVED,
     extent,
@@ -93,6 +89,8 @@ def prepare(
             )
     refuse_without_steps(problem, control)
     if isinstance(policy, AffinePolicy):
+        from sparserob_core.control.transcription.feedback import refuse
+
         refuse(problem, control, disturbance, policy.cost)
         if formulation != "reduced":
             raise InputError(f"formulation: expected reduced with policy: affine, got {formulation!r}")
@@ -108,6 +106,8 @@ def _answering(
     problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary, policy: AffinePolicy
 ) -> tuple[Transcription, Transcription, Units]:
     """A problem under a policy, in the user's units, in its own, and these."""
+    from sparserob_core.control.transcription.feedback import with_feedback
+
     ends = [end for end in problem.terminal if not isinstance(end, Equality)]
     model = _assembled(replace(problem, terminal=ends), control, disturbance, "reduced")
     own, units = in_own_units(model)
@@ -341,6 +341,8 @@ def from_state(model: Transcription, initial_state: Array) -> Transcription:
     problem = replace(model.problem, initial_state=initial_state)
     constraints = tuple(one.from_state(initial_state) for one in model.constraints)
     if model.feedback is not None:
+        from sparserob_core.control.transcription.feedback import made_again
+
         begun = replace(model, problem=problem, functionals=functionals, constraints=constraints)
         return made_again(begun, model.feedback.policy)
     moved = {
@@ -382,6 +384,8 @@ def _state_constraints(
             continue
         moved = Reference.of(entry.relative_to)
         if sides is None:
+            from sparserob_core.control.constraints.curved import CurvedConstraint
+
             window = (entry.start, stop)
             found.append(CurvedConstraint(name, functionals, entry.set, *window, parameters, reference=moved))
         elif sides[1].size:
@@ -464,6 +468,8 @@ def _quadratic(problem: OptimalControlProblem, dictionary: Dictionary) -> Quadra
     largest of the quadratic terms at a control that stays 0, or stays at one end of one channel."""
     if not problem.cost.is_quadratic:
         return {}
+    from sparserob_core.control.response.quadratic import quadratic_cost
+
     on_pieces = quadratic_cost(problem, dictionary.breakpoints)
     terms, axes = on_pieces.on(dictionary), np.eye(problem.system.controls)
     reach = problem.control.reach(axes)
@@ -557,6 +563,12 @@ def family_of(constraint: StateConstraint) -> ConstraintFamily:
             raise InputError(
                 f"method: scenario: the constraint {constraint.name} has a curved set; expected sets with flat sides"
             )
+        from sparserob_core.control.constraints.scenario import (
+            ScenarioConstraint,
+            sample_disturbances,
+            sample_parameters,
+        )
+
         disturbances = None if model is None else sample_disturbances(model, count, rng)
         drawn = sample_parameters(constraint.parameters.set, count, rng)
         bound = constraint.functionals.initial

@@ -9,7 +9,6 @@ import numpy as np
 
 from sparserob_core.control.response.response import Response
 from sparserob_core.control.studies.adversary import Adversary, find_adversary
-from sparserob_core.control.studies.measuring import Measuring
 from sparserob_core.control.studies.simulate import fine_times, finer, walk
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
@@ -73,6 +72,8 @@ def controlled(model: Transcription, decision: Array, which: np.ndarray) -> Arra
     ``(m, pieces)``, or under feedback what answers the states."""
     if model.feedback is None:
         return model.functionals.on_grid(model.nominal(decision))[:, which]
+    from sparserob_core.control.studies.measuring import Measuring
+
     measuring, latest = Measuring.of(model, decision), (-1, np.zeros(0))
 
     def acting(piece: int, state: Array) -> Array:

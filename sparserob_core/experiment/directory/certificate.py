@@ -4,17 +4,14 @@ it."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sparserob_core.control.constraints.explanation import TimedExplanation
-from sparserob_core.control.constraints.feedback import told
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.control.studies.answer import ControlResult
-from sparserob_core.control.studies.causal import CausalBound
-from sparserob_core.control.transcription.feedback import STEP, of_control
 from sparserob_core.control.transcription.steps import Steps
 from sparserob_core.control.transcription.transcribe import slanted
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment
@@ -22,6 +19,9 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Activity, Branch, Dual, Proof
 from sparserob_core.sip.program import TOLERANCE, Formulation, SemiInfiniteProgram
 from sparserob_core.sip.result import Result
+
+if TYPE_CHECKING:
+    from sparserob_core.control.studies.causal import CausalBound
 
 FORMAT = 1
 MANY_CELLS = 1000  # from which those that are whole pieces, and follow one another, are written as one
@@ -296,6 +296,9 @@ def _driven(experiment: ControlExperiment, said: TimedExplanation, decision: Arr
     feedback = experiment.transcription.feedback
     if feedback is None or experiment.problem.disturbance_class != "piecewise_constant":
         return said
+    from sparserob_core.control.constraints.feedback import told
+    from sparserob_core.control.transcription.feedback import STEP, of_control
+
     loop, time, controls = feedback.loop, said.time, feedback.loop.controls(decision)
     piece = int(np.searchsorted(experiment.control.breakpoints[1:-1], time, side="right"))
     if said.constraint == STEP:

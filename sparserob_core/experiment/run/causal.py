@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,7 +11,6 @@ from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.studies.answer import ControlResult
-from sparserob_core.control.studies.causal import CausalBound, CausalSearch, Limits
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.transcribe import prepare
 from sparserob_core.experiment.directory.artefacts import finite
@@ -18,6 +18,9 @@ from sparserob_core.experiment.directory.certificate import causal_data
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.result import Result
+
+if TYPE_CHECKING:
+    from sparserob_core.control.studies.causal import CausalBound, CausalSearch
 
 SECONDS = 20.0  # for a bound in ball arithmetic
 WORDS = "; nor does any other causal policy with this dictionary exist: {} signals of the disturbance prove it"
@@ -28,6 +31,8 @@ def with_causal(result: ControlResult, tools: Tools) -> ControlResult:
     model = result.model
     if model.feedback is None or result.status == "failed" or result.stopped or tools.deadline.passed:
         return result
+    from sparserob_core.control.studies.causal import CausalBound, Limits
+
     policy = model.feedback.policy
     if not policy.causal_signals:
         return result
@@ -78,6 +83,8 @@ def searched(
     """The search for a bound, beside a policy's ``decision`` and what its own bound ``rests`` on. Of measurable
     disturbances those are looked at that are constant on the pieces of the grid: what no policy can do against these,
     none can do against all."""
+    from sparserob_core.control.studies.causal import CausalSearch
+
     assert model.feedback is not None
     if model.feedback.loop.measurable is None:
         return CausalSearch(model, decision, rests)

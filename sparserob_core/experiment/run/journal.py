@@ -18,7 +18,6 @@ from sparserob_core.experiment.directory.artefacts import RunDirectory, trace_co
 from sparserob_core.experiment.directory.certificate import certificate
 from sparserob_core.experiment.directory.record import arrays_of, control_of, summary_of, versions
 from sparserob_core.experiment.directory.rounds import round_arrays
-from sparserob_core.experiment.run.drawing import drawn
 from sparserob_core.experiment.run.events import Event, Observer, RoundFinished
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
@@ -140,7 +139,11 @@ class Journal(Observer):
         worst = adversaries(experiment, np.asarray(result.decision)) if control is not None else {}
         if worst:
             write.write_arrays(ADVERSARY, worst)
-        return control, summary, drawn(experiment, result, write.path, worst, notify) if figures else ()
+        if not figures:
+            return control, summary, ()
+        from sparserob_core.experiment.run.drawing import drawn
+
+        return control, summary, drawn(experiment, result, write.path, worst, notify)
 
 
 def gains_of(experiment: Experiment, result: Result) -> Array | None:

@@ -6,14 +6,13 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy.typing as npt
 
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.studies.adversary import Adversary
 from sparserob_core.control.studies.answer import ControlResult, Tube
-from sparserob_core.control.studies.causal import CausalBound
 from sparserob_core.control.transcription.provable import SECONDS, announced, unprovable
 from sparserob_core.errors import InputError, named
 from sparserob_core.experiment.assemble import Anew, ControlExperiment, Experiment, assemble, build, name_of, tools_of
@@ -36,6 +35,9 @@ from sparserob_core.sip.methods.own_units import solve_in_own_units
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.relaxed.relaxed import require_separable
 from sparserob_core.sip.result import Result
+
+if TYPE_CHECKING:
+    from sparserob_core.control.studies.causal import CausalBound
 
 ROWS = 4  # of a table, in a line each of what `repr` says
 HEADING = "Complete and resolved. To repeat the run: sparserob run config.yaml"

@@ -24,8 +24,6 @@ from sparserob_core.sip.inner.vertex import MANY, vertex
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.methods.counting import count, met, tidied
 from sparserob_core.sip.methods.ledger import Answer, Found, Ledger, Prover
-from sparserob_core.sip.methods.robust import robust_exchange
-from sparserob_core.sip.methods.unbounded import bounding_rows, falls_for_ever
 from sparserob_core.sip.program import EQUALITY, TOLERANCE, ConstraintFamily, SemiInfiniteProgram, Separation
 from sparserob_core.sip.proof.branch_and_bound import prove
 from sparserob_core.sip.proof.verdict import worst_of
@@ -71,6 +69,8 @@ class Exchange(Method, Options):
         if not self.exact and tools.regulariser is None:
             raise InputError(path="exact", expected="true, for there is no regulariser", got="false")
         if program.spread is not None:
+            from sparserob_core.sip.methods.robust import robust_exchange
+
             return robust_exchange(program, tools, prover, self.tolerance, self.rounds)
         relaxed = RelaxedProgram(program, tools.solver, tools.regulariser, deadline=tools.deadline)
         ledger = Ledger(program, relaxed, tools, self.tolerance)
@@ -93,6 +93,8 @@ class Exchange(Method, Options):
             answer = _relaxed(self, working, ledger)
             if answer.solution.status == "failed" and not _usable(answer.solution) and not last:
                 # Without enough rows the cost may fall for ever: impose those that stop it, where there are any.
+                from sparserob_core.sip.methods.unbounded import bounding_rows, falls_for_ever
+
                 close = self.model_copy(update={"exact": True}).close
                 ray, fresh = bounding_rows(program, tools, close)
                 if ray is not None:

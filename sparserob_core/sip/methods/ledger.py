@@ -23,7 +23,6 @@ from sparserob_core.sip.program import (
     Separation,
     WorstConstraint,
 )
-from sparserob_core.sip.proof.irreducible import irreducible
 from sparserob_core.sip.proof.verdict import as_bad_as_found, infeasible_subsystem, verdict, witness, worst_of
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
 from sparserob_core.sip.result import MEANING, Result, Status, relative_gap
@@ -192,6 +191,8 @@ class Ledger:
         solution = answer.solution
         if solution.status != "infeasible":
             return self.result("failed", solution.message, answer)
+        from sparserob_core.sip.proof.irreducible import irreducible
+
         rows, solution = irreducible(self.relaxed, answer.rows, solution)
         answer = replace(answer, rows=rows, solution=solution)
         found, worst = infeasible_subsystem(self.relaxed.program, rows, solution.y, solution.infeasibility)

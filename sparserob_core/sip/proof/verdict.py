@@ -18,7 +18,6 @@ from sparserob_core.sip.program import (
     WorstConstraint,
     told_apart,
 )
-from sparserob_core.sip.proof.reasons import least_of, least_within, reasons, sentence
 from sparserob_core.sip.relaxed.relaxed import Rows
 from sparserob_core.sip.result import MEANING, Status
 
@@ -94,6 +93,8 @@ def infeasible_subsystem(
     reason that needs no solver; where there is none, the rows that cannot hold together, and what they ask of the
     decision against what it can give. With it the constraint that matters most.
     """
+    from sparserob_core.sip.proof.reasons import least_of, least_within, reasons, sentence
+
     found, equalities = reasons(program), bool(program.finite.b.size)
     multipliers = y[y.size - rows.h.size :]
     active = np.flatnonzero(multipliers > 0)
@@ -124,6 +125,8 @@ def _together(
     program: SemiInfiniteProgram, rows: Rows, multipliers: Array, order: np.ndarray, amount: float
 ) -> InfeasibleSubsystem:
     """Several rows that cannot hold together: each by name, and the sum of them that proves it."""
+    from sparserob_core.sip.proof.reasons import least_of, least_within
+
     told = [_explanation(program, rows.cuts[i]) for i in order[:NAMED]]
     units = np.array([program.family(cut.family).row_unit(cut.row) for cut in rows.cuts])
     y = multipliers / units

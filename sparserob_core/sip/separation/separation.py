@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,8 +13,9 @@ from sparserob_core.sip.events import EvaluationsFinished, Notify, forwarded, ig
 from sparserob_core.sip.maximiser import Maximiser
 from sparserob_core.sip.method import Deadline, Tools
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram, Separation
-from sparserob_core.sip.search.search import Rules, Target, maximise
-from sparserob_core.sip.separation.refinement import Candidates, refine
+
+if TYPE_CHECKING:
+    from sparserob_core.sip.separation.refinement import Candidates
 
 GRID_SIDE = {1: 257, 2: 33, 3: 13, 4: 7}
 RANDOM_POINTS = 2048
@@ -68,6 +70,8 @@ def search_worst(
     A search proves nothing: ``bound`` is ``inf`` unless the maximiser proved one, or the index set is a single point.
     Raises `InputError` when a row is not a number or the index set is unbounded, and `OutOfTime` past the deadline.
     """
+    from sparserob_core.sip.separation.refinement import refine
+
     field = _Violation(family, x, deadline or Deadline())
     found = refine(field, _grid_maxima(field, rng))
     bound = np.inf
@@ -176,6 +180,8 @@ def _peak_above(values: Array, axis: int) -> Array:
 
 def _promising(unit: Array, values: Array, promise: Array, radius: float) -> Candidates:
     """The best points by ``promise (k, r)`` for every row."""
+    from sparserob_core.sip.separation.refinement import Candidates
+
     rows = values.shape[1]
     share = min(len(unit), max(2, min(REFINED_PER_ROW, 16 * REFINED_PER_ROW // rows)))
     order = np.argsort(-promise, axis=0, kind="stable")[:share]
@@ -189,6 +195,9 @@ def _ask(
     field: _Violation, maximiser: Maximiser, budget: int, rng: np.random.Generator, polish: float, notify: Notify
 ) -> tuple[Candidates, float]:
     """The best index that a maximiser finds, as a candidate of every row."""
+    from sparserob_core.sip.search.search import Rules, Target, maximise
+    from sparserob_core.sip.separation.refinement import Candidates
+
     target = Target(lambda indices: field.at(indices).max(axis=1), field.box)
     report = maximise(target, maximiser, budget, rng, Rules(polish=polish), notify)
     if report.interrupted:

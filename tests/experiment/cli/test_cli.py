@@ -170,6 +170,13 @@ def test_a_small_run_imports_neither_an_optimiser_nor_the_checker_nor_what_draws
     loaded = set(done.stdout.split())
     assert "scipy.sparse" in loaded
     assert not loaded & {"scipy.optimize", "piqp", "sparserob_core.checker", "matplotlib", "rich", "flint"}
+    elsewhere = (
+        "control.feedback.closed_loop",
+        "control.response.measurable",
+        "sip.methods.robust",
+        "sip.search.search",
+    )
+    assert not loaded & {f"sparserob_core.{module}" for module in elsewhere}
 
 
 def test_a_reader_that_stops_reading_is_no_error(tmp_path: Path) -> None:
