@@ -48,10 +48,12 @@ class Separation:
 @dataclass(frozen=True, eq=False)
 class Enclosure:
     """Proven upper bounds ``(k,)`` of the violation on index cells, and the coordinate ``(k,)`` whose halving would
-    help most."""
+    help most. ``bend (k,)``, where it is known: what of the bounds falls with the square of a cell's width, of a family
+    whose index is one number; its separation then says where cells have to be short."""
 
     bounds: Array
     split: Array
+    bend: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -197,7 +197,7 @@ class CurvedConstraint(StateConstraint):
             centre, radius = (low + high)[nu:] / 2, (high - low)[nu:] / 2
             free = np.flatnonzero(radius > 0)
             H = np.vstack([centre, np.diag(radius)[free]]) @ self.set.frame / self.unit
-            legs = self._flat.legs(low[:nu], high[:nu])
+            legs = self.functionals.legs(low[:nu], high[:nu])
             joined = self._combination(legs[0], free.size)
             rhs, looseness = self._minorant(H, joined, nu)
             control = self.functionals.dictionary.control(x)

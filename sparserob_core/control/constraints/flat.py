@@ -18,7 +18,7 @@ from sparserob_core.control.problem.problem import MixedConstraint
 from sparserob_core.control.response.enclosure import CELLS_KEPT, Bounded, CellEnclosure, enclose, over_legs
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.initial_support import Supports
-from sparserob_core.control.response.lifted import LiftedSystem, lift_legs
+from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import Direct, Moving, Reference
 from sparserob_core.control.response.response import Outputs, Response, distinct_times
@@ -30,9 +30,11 @@ SURE = 1e-8  # a vertex that is predicted to this accuracy is one
 NEARER, LOOKS = 8, 4  # an unsure vertex is predicted from samples so many times nearer, and so often
 ARRIVED = 1e-11  # what a vertex that was arrived at may still promise
 INSIDE, MOST_INSIDE = 3, 64  # times sampled inside every piece, beside its ends: more where the system moves on it
+STENCIL = np.array([-1.0, 0.0, 1.0])
 SMOOTH = 0.1  # norm of A times the spacing of samples between which a parabola is a good guide
 CLIMBED = 10  # of them, those that parameters are climbed for
 KEPT = 12  # separated constraints per row and round
+FOUND_KEPT = 1  # decisions whose separation is remembered
 
 
 @final
@@ -193,7 +195,7 @@ class FlatConstraint(StateConstraint):
         """``H``, ``h``."""
         return self.H, self.h
 
-    @property
+    @cached_property
     def index_set(self) -> Box:
         if not self.parameters.count:
             return Box(np.array([self.start]), np.array([self.stop]))
@@ -259,29 +261,30 @@ class FlatConstraint(StateConstraint):
     @shaped
     def worst(self, x: Float[Array, " n"]) -> Separation:
         """The largest local maxima of the violation over the index set, times refined between the nodes, parameters
-        between lattice points."""
+        between lattice points; remembered, since the proof asks for them again."""
+        key = x.tobytes()
+        return self._found[key] if key in self._found else remember(self._found, key, self._worst(x), FOUND_KEPT)
+
+    @shaped
+    def _worst(self, x: Float[Array, " n"]) -> Separation:
         values = self.on_lattice(x)
         positions = local_maxima(values, self.lattice[1], KEPT)
         heights, rows = values[tuple(positions.T)], positions[:, 1]
-        times, predicted = vertices(values, positions, self.times)
-        indices = np.hstack([times[:, None], self.lattice[0][positions[:, 0]]])
+        indices = np.hstack([self.times[positions[:, 2], None], self.lattice[0][positions[:, 0]]])
         if self.parameters.count:
             likely = np.argsort(-heights, kind="stable")[:CLIMBED]
             # a maximum at a breakpoint is a kink: it is climbed along, not across
-            indices[:, 0] = self.times[positions[:, 2]]
             indices, found = self._climbed(x, indices[likely], rows[likely])
             rows = rows[likely]
         else:
-            found = self.violations(x, indices, rows)
-            error = np.abs(predicted - found)
-            lost = heights > found  # a kink, where a parabola is no guide
-            indices[lost, 0], found[lost] = self.times[positions[lost, 2]], heights[lost]
-            unsure = np.flatnonzero(
-                (error > SURE * np.maximum(1.0, np.abs(found))) & (found + 4.0 * error >= found.max(initial=-np.inf))
-            )
-            unsure = unsure[np.argsort(-found[unsure], kind="stable")][:CLIMBED]
-            if unsure.size:
-                indices[unsure], found[unsure] = self._refined(x, indices[unsure], rows[unsure])
+            found = heights
+            times, predicted = vertices(values, positions, self.times)
+            between = np.flatnonzero(times != indices[:, 0])  # the others are samples
+            if between.size:
+                refined = self._refined(x, times[between], rows[between], predicted[between], found)
+                higher = refined[1] >= found[between]  # at a kink a parabola is no guide
+                between = between[higher]
+                indices[between, 0], found[between] = (part[higher] for part in refined)
         order = np.argsort(-found, kind="stable")
         if self.gains is not None:  # where nothing jumps, both halves of the rows say the same
             pieces = self.commanded(indices[order, 0])
@@ -336,24 +339,10 @@ class FlatConstraint(StateConstraint):
         return enclose(lower, upper, touched, self.parameters.count, lambda low, high: self._cell(x, low, high))
 
     @shaped
-    def legs(self, low: Float[Array, " nu"], high: Float[Array, " nu"]) -> tuple[LiftedSystem, ...]:
-        """The lifted system over a cell of parameters, leg by leg; remembered."""
-        key = low.tobytes() + high.tobytes()
-        if key not in self._lifted:
-            response = self.functionals.response
-            remember(
-                self._lifted,
-                key,
-                lift_legs(response.system, response.grid, response.initial_state, (low + high) / 2, (high - low) / 2),
-                CELLS_KEPT,
-            )
-        return self._lifted[key]
-
-    @shaped
     def _cell(self, x: Float[Array, " n"], low: Float[Array, " j"], high: Float[Array, " j"]) -> Bounded:
         key = x.tobytes() + low.tobytes() + high.tobytes()
         if key not in self._cells:
-            legs = self.legs(low, high)
+            legs = self.functionals.legs(low, high)
             control, cuts = self.functionals.dictionary.control(x), self.parameters.cuts(low, high)
             rows = self.samples.proven
             rhs, H = np.zeros((rows, legs[0].space.size)), self.H[:rows]
@@ -375,7 +364,7 @@ class FlatConstraint(StateConstraint):
         return {}
 
     @cached_property
-    def _lifted(self) -> dict[bytes, tuple[LiftedSystem, ...]]:
+    def _found(self) -> dict[bytes, Separation]:
         return {}
 
     @property
@@ -398,29 +387,47 @@ class FlatConstraint(StateConstraint):
 
     @shaped
     def _refined(
-        self, x: Float[Array, " n"], indices: Float[Array, "k 1"], rows: Int[np.ndarray, " k"]
-    ) -> tuple[Float[Array, "k 1"], Float[Array, " k"]]:
-        """The vertices of parabolas through nearer and nearer samples; where these are no guide, at a kink or beyond
-        one, the candidate is climbed from."""
-        count, spacing = rows.size, float(np.diff(self.times).max(initial=0.0))
-        width = np.full(count, min(spacing / NEARER, (self.stop - self.start) / 2))
-        middle = indices[:, 0]
-        for _ in range(LOOKS):
-            middle = np.clip(middle, self.start + width, self.stop - width)
-            around = middle[:, None] + width[:, None] * np.array([-1.0, 0.0, 1.0])
-            before, found, after = self.violations(x, around.reshape(-1, 1), rows.repeat(3)).reshape(count, 3).T
-            slope, bend = (after - before) / 2, 2 * found - before - after
+        self,
+        x: Float[Array, " n"],
+        times: Float[Array, " k"],
+        rows: Int[np.ndarray, " k"],
+        predicted: Float[Array, " k"],
+        heights: Float[Array, " q"],
+    ) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
+        """Times ``(k,)`` near the vertices of parabolas, and the violations there: by parabolas through nearer and
+        nearer samples, as long as one may be the largest of all; where these are no guide, at a kink or beyond one, the
+        candidate is climbed from. ``predicted (k,)``, ``heights (q,)``: what the first parabolas say, and what is known
+        at samples."""
+        spacing = float((self.times[1:] - self.times[:-1]).max())
+        middle, found, live = times.copy(), predicted.copy(), np.arange(times.size)
+        width = np.full(times.size, min(spacing / NEARER, (self.stop - self.start) / 2))
+        for look in range(LOOKS):
+            far = width[live]
+            at = np.minimum(np.maximum(middle[live], self.start + far), self.stop - far)
+            around = at[:, None] + far[:, None] * STENCIL
+            seen = self.violations(x, around.reshape(-1, 1), rows[live].repeat(3)).reshape(-1, 3)
+            before, now, after = seen.T
+            slope, bend = (after - before) / 2, 2 * now - before - after
             inside = np.abs(slope) < bend
             share = slope / np.where(inside, bend, np.maximum(np.abs(slope), TINY))
-            sure = inside & (share * slope <= 2 * ARRIVED * np.maximum(1.0, np.abs(found)))
-            if sure.all():
+            error, size = np.abs(found[live] - now), np.maximum(1.0, np.abs(now))
+            sure = inside & (share * slope <= 2 * ARRIVED * size)
+            if look == 0:
+                sure |= error <= SURE * size
+            middle[live], found[live] = at, now
+            wanted = now + 4.0 * np.maximum(error, np.abs(slope)) >= max(float(found.max()), float(heights.max()))
+            going = ~sure & wanted
+            if not going.any():
+                live = live[going]
                 break
-            middle = np.where(sure, middle, middle + width * share)
-            width = np.where(inside & ~sure, width / NEARER, width)
-        points, kinks = middle[:, None], np.flatnonzero(~sure)
+            middle[live] = np.where(going, at + far * share, at)
+            width[live] = np.where(inside, far / NEARER, far)
+            live = live[going]
+        kinks = live[np.argsort(-found[live], kind="stable")][:CLIMBED]
         if kinks.size:
-            points[kinks], found[kinks] = self._climbed(x, indices[kinks], rows[kinks])
-        return points, found
+            points, found[kinks] = self._climbed(x, times[kinks, None], rows[kinks])
+            middle[kinks] = points[:, 0]
+        return middle, found
 
     @shaped
     def _climbed(

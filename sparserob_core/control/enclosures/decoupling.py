@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
@@ -82,7 +83,7 @@ class Decoupling:
         bound = products + self.defect @ (np.abs(moved) + products) + np.abs(moved - result)
         return result, 1.001 * bound.astype(float)
 
-    @property
+    @cached_property
     def parts(self) -> list[tuple[slice, bool]]:
         """The groups, and whether each is a single block."""
         ends = np.append(self.groups[1:], self.transform.shape[0])
@@ -292,5 +293,9 @@ def _mode(D: Array, durations: Array) -> tuple[Array, Array]:
     driven = np.expm1(rate * durations) / rate if rate != 0 else durations
     if not rotates:
         return flow[..., None, None], driven[..., None, None]
-    flow, driven = (np.stack([z.real, z.imag, -z.imag, z.real], axis=-1) for z in (flow, driven))
-    return flow.reshape(*durations.shape, 2, 2), driven.reshape(*durations.shape, 2, 2)
+    both = np.empty((2, *durations.shape, 2, 2))
+    for turned, z in zip(both, (flow, driven), strict=True):
+        turned[..., 0, 0] = turned[..., 1, 1] = z.real
+        turned[..., 0, 1] = z.imag
+        turned[..., 1, 0] = -z.imag
+    return both[0], both[1]

@@ -297,9 +297,10 @@ class LinearSystem:
 
     @shaped
     def _values(self, name: str, points: Float[Array, "k nu"]) -> Float[Array, "k rows columns"]:
-        entry, shape = self._entry(name), self._shape(name)
+        entry = self._entry(name)
         if isinstance(entry, np.ndarray):
-            return np.broadcast_to(entry, (len(points), *shape))
+            return np.broadcast_to(entry, (len(points), *entry.shape)) if len(points) != 1 else _still(entry[None])
+        shape = self._shape(name)
         if isinstance(entry, ExpressionMatrix):
             values = entry.evaluate(points)
         else:
@@ -585,6 +586,12 @@ class SystemInUnits(LinearSystem):
         found = self.base.taylor(space, centre * self.units, radius * self.units)
         every = [part * self.factors[name] for name, part in zip("AABBEE", found, strict=True)]
         return every[0], every[1], every[2], every[3], every[4], every[5]
+
+
+def _still(view: Array) -> Array:
+    """A view that nobody writes to."""
+    view.flags.writeable = False
+    return view
 
 
 def _seen(array: npt.NDArray[np.float64]) -> str:

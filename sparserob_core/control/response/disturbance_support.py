@@ -61,15 +61,10 @@ class DisturbanceSupport:
         missed by at most ``width^2 / 8`` of the largest second derivative, and mode by mode by at most twice what it
         moves: that bound serves fast modes, which have died away long before a cell is as short as they are.
         """
-        lifted, grid, rows = self.lifted, self.lifted.grid, self._lifted_rows
-        matrix, comparison, starts = lifted.row_matrix, lifted.comparison, lifted.starts
-        sloping, bent = rows @ matrix, rows @ matrix @ matrix
+        grid, comparison = self.lifted.grid, self.lifted.comparison
+        bent, once, twice, norms, squared = self._bending
         sizes = self._gathered(start, self._reaches, bent, plain=True).sum(axis=2)
-        once, twice = (
-            block_norms(part.reshape(*part.shape[:-1], -1, lifted.states), starts).sum(axis=-2)
-            for part in (sloping, bent)
-        )
-        pieces = np.clip(np.searchsorted(grid.breakpoints, start, side="right") - 1, 0, grid.pieces - 1)
+        pieces = np.minimum(np.maximum(grid.breakpoints.searchsorted(start, side="right") - 1, 0), grid.pieces - 1)
         moved = comparison.over(start - grid.breakpoints[pieces]).flow
         reach = comparison.over(widths)
         young = moved.on(np.broadcast_to(self._drive, (start.size, self._drive.size)))
@@ -77,15 +72,29 @@ class DisturbanceSupport:
         square = (widths**2 / 8)[:, None]
         exact = square * (sizes + product(twice, reach.departure.on(old).T).T + product(once, reach.peak.on(young).T).T)
         ended = np.minimum(
-            square * product(reach.peak.on(old), (comparison.sizes @ comparison.sizes).T),
+            square * product(reach.peak.on(old), squared.T),
             2.0 * product(reach.integral.on(old), comparison.sizes.T),
         )
         lasting = np.minimum(
             square * product(reach.peak.on(young), comparison.sizes.T),
             2.0 * reach.integral.on(young),
         )
-        by_mode = product(block_norms(self.rows, starts), (ended + lasting).T).T
+        by_mode = product(norms, (ended + lasting).T).T
         return np.asarray(np.minimum(exact, by_mode))
+
+    @cached_property
+    def _bending(self) -> tuple[Array, Array, Array, Array, Array]:
+        """What `deviation` needs at all times: the lifted functionals times the square of the matrix, the block norms
+        ``(r, q)`` of these and of their first derivative (before them), those of the functionals, and the square of the
+        comparison's sizes."""
+        lifted, rows = self.lifted, self._lifted_rows
+        sloping, bent = rows @ lifted.row_matrix, rows @ lifted.row_matrix @ lifted.row_matrix
+        once, twice = (
+            block_norms(part.reshape(*part.shape[:-1], -1, lifted.states), lifted.starts).sum(axis=-2)
+            for part in (sloping, bent)
+        )
+        sizes = lifted.comparison.sizes
+        return bent, once, twice, block_norms(self.rows, lifted.starts), sizes @ sizes
 
     @cached_property
     def neglected(self) -> Array:
@@ -141,15 +150,15 @@ class DisturbanceSupport:
         within, which = grid.distinct(times - grid.breakpoints[pieces])
         flow, driven = backward.flows(within)
         young = self._weights(start @ driven)[..., None, :]
-        moved = np.einsum("rd,qde->qre", start, flow)
+        moved = start @ flow
         count, answer = int(pieces.max(initial=0)), None
         share = max(1, AT_ONCE // max(1, start.shape[0] * count * self._impulses.columns.shape[1]))
         for begin in range(0, within.size, share):  # the sums over all ages, of some durations at once
             part = slice(begin, begin + share)
             old = self._impulses.of(moved[part], count)
-            old = np.moveaxis(old.reshape(*old.shape[:-1], young.shape[2], young.shape[4]), -2, -3)
+            old = old.reshape(*old.shape[:-1], young.shape[2], young.shape[4]).swapaxes(-2, -3)
             sums = [of_blocks(combined(young[part])), of_blocks(combined(old))]
-            found = np.cumsum(np.concatenate(sums, axis=2), axis=2)
+            found = np.concatenate(sums, axis=2).cumsum(axis=2)
             mine = np.flatnonzero((which >= part.start) & (which < part.stop))
             if answer is None:
                 answer = np.empty((times.size, found.shape[1], found.shape[3]))
@@ -214,6 +223,8 @@ class DisturbanceSupport:
         disturbance."""
         space = self.lifted.space
         parts = gains.reshape(*gains.shape[:-1], space.size, self.lifted.states)
+        if space.size == 1:
+            return np.asarray(parts @ self.lifted.W[0])
         weights = np.zeros((*parts.shape[:-1], self.lifted.W.shape[2]))
         used = [part.any() for part in self.lifted.W]
         for left, right, target in zip(*space.products, strict=True):
@@ -290,6 +301,9 @@ def over_faces(
 ) -> tuple[Array, Array]:
     """Coefficients ``(k, r, M)`` and excess ``(k, r)`` where every functional has its own pattern of ``ends (k, r,
     nu)``; ``parts(here, face)`` gives both as ``(k', r, M + 1)`` for the times ``here`` on one face of the cell."""
+    if not space.nu:
+        found = parts(np.arange(ends.shape[0]), None)
+        return found[..., :-1], found[..., -1]
     k, r, _ = ends.shape
     patterns, which = distinct_patterns(ends)
     coefficients, excess = np.empty((k, r, space.size)), np.empty((k, r))
@@ -307,7 +321,7 @@ def summed(bound: ConvexSet, blocks: Array, face: Array | None) -> Array:
     Taylor coefficients ``(k, r, M, nb, q)``."""
     blocks = blocks if face is None else np.einsum("ab,krbnq->kranq", face, blocks, optimize=True)
     point = bound.support_point(blocks[:, :, 0])
-    coefficients = np.einsum("krbq,krabq->krba", point, blocks, optimize=True)
+    coefficients = np.einsum("krbq,krabq->krba", point, blocks)
     excess = np.zeros(coefficients.shape[:3])
     if blocks.shape[2] > 1:
         excess = bound.linearisation_excess(blocks[:, :, 0], np.moveaxis(blocks[:, :, 1:], 2, 3))

@@ -37,6 +37,7 @@ TIME_FIRST = (
     0.25  # times are halved before anything else unless that gains less than this share: their cells share all work
 )
 TINY = 1e-4  # of a cell of parameters: a cell on which a system that can be enclosed at all will be
+FEW_CELLS = 64  # whose ends are looked at as they come
 TAYLOR_TERMS = 1e-17  # relative size below which further terms of the exponential series are left out
 
 
@@ -277,8 +278,10 @@ def _on_faces(space: TaylorSpace, coefficients: Array, ends: Array) -> Array:
 
 
 def _ends(start: Array, stop: Array, pieces: np.ndarray) -> tuple[tuple[Array, np.ndarray], np.ndarray]:
-    """The distinct ends of the cells with the piece that each is looked at from, and where each of ``start`` and then
-    ``stop`` is among them."""
+    """The ends of the cells with the piece that each is looked at from, the same ones once where cells share a piece,
+    and where each of ``start`` and then ``stop`` is among them."""
+    if start.size <= FEW_CELLS or (pieces[1:] > pieces[:-1]).all():
+        return (np.concatenate([start, stop]), np.concatenate([pieces, pieces])), np.arange(2 * start.size)
     both = np.stack([np.concatenate([start, stop]), np.concatenate([pieces, pieces])])
     unique, which = np.unique(both, axis=1, return_inverse=True)
     return (unique[0], unique[1].astype(int)), which.reshape(-1)
@@ -294,6 +297,9 @@ def enclose(
     tiny one has none either.
     """
     bounds, split = np.full(lower.shape[0], -np.inf), np.zeros(lower.shape[0], dtype=int)
+    if lower.shape[1] == 1:
+        bounds, bend, _ = cell_over(lower[0, 1:], upper[0, 1:]).bounds(lower[:, 0], upper[:, 0])
+        return Enclosure(bounds, split, bend)
     for members in _groups(np.hstack([lower[:, 1:], upper[:, 1:]]), touched):
         low, high = lower[members[0], 1:], upper[members[0], 1:]
         try:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.combination import Combination
 from sparserob_core.control.enclosures.matrix_exponential import transitions
 from sparserob_core.control.problem.cost import nominal_point
@@ -19,7 +20,7 @@ from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.disturbance_support import DisturbanceSupport
 from sparserob_core.control.response.initial_support import InitialSupport, Support, Supports
-from sparserob_core.control.response.lifted import LiftedSystem, frozen
+from sparserob_core.control.response.lifted import LiftedSystem, frozen, lift_legs
 from sparserob_core.control.response.response import Response, TimeGrid, Weights
 from sparserob_core.errors import NotEnclosable
 from sparserob_core.shapes import Float, shaped
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 
 # said where it is met, and before anything is solved
 WITHOUT_PROOF = "measurable disturbances are proven only for known systems and sets with flat sides"
+LEGS_KEPT = 256  # cells of parameters whose lifted systems are kept
 CHUNK = 4_000_000  # entries of a gain array that are built at once (32 MB)
 
 
@@ -104,6 +106,10 @@ class WorstCase:
     def nominal(self) -> WorstCase:
         """The functionals of the system at an interior point of its parameters, from the centre of the initial states,
         under one admissible disturbance: none, where it may be."""
+        return self._nominal
+
+    @cached_property
+    def _nominal(self) -> WorstCase:
         system, model = self.response.system, self.disturbance
         middle = np.zeros((1, 0)) if system.parameters is None else system.parameters.interior_point()[None]
         modes = [LinearSystem(*(part[0] for part in mode.matrices(middle))) for mode in system.modes]
@@ -224,7 +230,10 @@ class WorstCase:
             return self.offsets(np.repeat(times, r), np.tile(directions, (k, 1)), every).reshape(k, r)
         sigma = np.zeros((k, r))
         if model is not None:
-            known = frozen(self.response.system.modes[0], self.response.grid, self.response.initial_state, parameter)
+            known = self._frozen.get(parameter.tobytes())
+            if known is None:
+                fixed = (self.response.system.modes[0], self.response.grid, self.response.initial_state, parameter)
+                known = remember(self._frozen, parameter.tobytes(), frozen(*fixed), LEGS_KEPT)
             sigma = DisturbanceSupport(known, model, directions).at(times, np.zeros((k, r, 0)))[0][:, :, 0]
         if self.initial is not None:
             flows = transitions(self.response.system.modes[0].matrices(parameter[None])[0][0], times)[0]
@@ -336,6 +345,24 @@ class WorstCase:
         acting = self.response.grid.control_piece[self.response.grid.decided]
         starts = np.flatnonzero(np.diff(acting, prepend=-1))
         return acting[starts], starts
+
+    @shaped
+    def legs(self, low: Float[Array, " nu"], high: Float[Array, " nu"]) -> tuple[LiftedSystem, ...]:
+        """The lifted system over a cell of parameters, leg by leg; remembered, for all constraints."""
+        key, response = low.tobytes() + high.tobytes(), self.response
+        if key not in self._legs:
+            cell = (low + high) / 2, (high - low) / 2
+            legs = lift_legs(response.system, response.grid, response.initial_state, *cell)
+            remember(self._legs, key, legs, LEGS_KEPT)
+        return self._legs[key]
+
+    @cached_property
+    def _frozen(self) -> dict[bytes, LiftedSystem]:
+        return {}
+
+    @cached_property
+    def _legs(self) -> dict[bytes, tuple[LiftedSystem, ...]]:
+        return {}
 
     @shaped
     def on_grid(self, theta: Float[Array, " n"]) -> Float[Array, "mc L"]:

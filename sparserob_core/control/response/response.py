@@ -122,7 +122,7 @@ class TimeGrid:
         """The distinct durations ``(u,)`` among ``(k,)``, those that differ by rounding as one, and which of them each
         is."""
         horizon = self.breakpoints[-1]
-        shares, which = np.unique(np.round(durations / horizon, 15), return_inverse=True)
+        shares, which = np.unique((durations / horizon).round(15), return_inverse=True)
         return shares * horizon, which.reshape(-1)
 
     @shaped

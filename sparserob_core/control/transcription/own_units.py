@@ -55,13 +55,13 @@ def rough_units(problem: OptimalControlProblem) -> Units:
     )
 
 
-def own_units(problem: OptimalControlProblem, rough: Units, functionals: WorstCase) -> Units:
-    """The units of a problem, from how far its states reach: ``functionals`` are those of the problem in rough
-    units."""
+def own_units(problem: OptimalControlProblem, rough: Units, functionals: WorstCase, control: ConvexSet) -> Units:
+    """The units of a problem, from how far its states reach: ``functionals`` and the set of the ``control`` are those
+    of the problem in rough units."""
     axes, parameters = np.eye(problem.system.states), ParameterIndex(functionals.response.system.parameters)
     functionals = functionals.coarser(LOOKED_AT)
     times = window_times(functionals, 0.0, float(functionals.response.grid.breakpoints[-1]))
-    reach, _ = reaches(functionals, parameters, rough.of_problem(problem).control, axes, times)
+    reach, _ = reaches(functionals, parameters, control, axes, times)
     usable = np.isfinite(reach) & (reach > 0.0)
     states = rough.states * power_of_two(np.where(usable, reach, 1.0))
     states = np.where(usable, states, power_of_two(walls(problem)))

@@ -191,8 +191,9 @@ def in_own_units(model: Transcription) -> tuple[Transcription, Units]:
         return _answering(model.problem, model.control, model.disturbance, model.feedback.policy)[1:]
     problem, rough = model.problem, rough_units(model.problem)
     dictionaries = (model.control, model.disturbance)
-    known, _ = _functionals(rough.of_problem(problem), *(rough.of_dictionary(one) for one in dictionaries))
-    units = own_units(problem, rough, known)
+    moved = rough.of_problem(problem)
+    known, _ = _functionals(moved, *(rough.of_dictionary(one) for one in dictionaries))
+    units = own_units(problem, rough, known, moved.control)
     control, disturbance = (units.of_dictionary(one) for one in dictionaries)
     own = _assembled(units.of_problem(problem), control, disturbance, model.formulation, own=True)
     families = [

@@ -14,7 +14,7 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ProofProgress, ignore
 from sparserob_core.sip.evidence import Proof
 from sparserob_core.sip.method import Deadline
-from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram
+from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram, Separation
 
 CELLS = 400_000  # cells examined per family before the proof is given up
 BATCH = 4096  # cells bounded at a time, worst first
@@ -33,6 +33,9 @@ OFTEN = 1.0  # seconds after which a batch that is not over is told of
 STALLED, ADVANCED = 30.0, 0.99  # a worst bound that has not fallen below this share within so many seconds is stuck
 REST, TINY = 8, 1e-5  # halvings without progress after which a bound below `TINY` of its unit is taken for rounding
 MOVES = 24  # steps of such a climb at most
+MOST_CUT = 32  # open cells that are cut towards peaks
+SHARE, GROWN = 0.8, (1 / 16, 1.0)  # of what such parts may be long; how much longer each is than the one before
+_NOWHERE = Separation(np.zeros((0, 1)), np.zeros(0, dtype=int), np.zeros(0))
 
 
 def prove(
@@ -128,14 +131,20 @@ def _branch_and_bound(family: ConstraintFamily, x: Array, course: Course) -> Pro
     slacks: list[float] = []
     while True:
         # Bound every cell, and close those where no violation is left.
-        bounds, split = _bounded(course, x, lower, upper)
+        bounds, split, bend = _bounded(course, x, lower, upper)
         course.examined += bounds.size
         open_ = bounds > tolerance
         leaves.append((lower[~open_], upper[~open_]))
         closed = max(closed, float(bounds[~open_].max(initial=-np.inf)))
 
-        # Look for a witness in the worst cells.
-        best = max(best, _probe(family, x, lower, upper, bounds), key=lambda found: found[0])
+        # Look for a witness: where separation finds the largest violations, and in the worst cells.
+        first, peaks = len(leaves) == 1, _NOWHERE
+        if first and bend is not None and family.worst is not None:
+            peaks = family.worst(x)
+        if peaks.violations.size:
+            best = (float(peaks.violations[0]), peaks.indices[0], int(peaks.rows[0]))
+        elif first or open_.any():
+            best = max(best, _probe(family, x, lower, upper, bounds), key=lambda found: found[0])
         if open_.any() and best[0] <= tolerance and len(leaves) in CLIMBED and box.dimension > 1:
             worst_cell = (corner[bounds.argmax()] for corner in (lower, upper))
             best = max(best, _climb(family, x, *worst_cell), key=lambda found: found[0])
@@ -145,17 +154,20 @@ def _branch_and_bound(family: ConstraintFamily, x: Array, course: Course) -> Pro
             leaf_cells = _in_order(leaves)
             return Proof(family.name, "proven", closed, best[0], best[1], best[2], course.examined, leaves=leaf_cells)
 
-        # Halve what is open, as long as cells, their width and time allow.
+        # Cut what is open, as long as cells, their width and time allow: once towards the peaks, then into halves.
         worst, at = float(bounds.max()), int(bounds.argmax())
         course.tell(int(open_.sum()), worst, lower[at], upper[at])
-        halves = _halved(lower[open_], upper[open_], split[open_])
+        low, high = lower[open_], upper[open_]
+        parts = None if bend is None else _towards(peaks, low, high, bounds[open_], bend[open_])
+        if parts is None or course.examined + parts[0].shape[0] > course.budget:
+            parts = _halved(low, high, split[open_])
         slacks.append(worst - best[0])
-        spent = halves is None or course.examined + halves[0].shape[0] > course.budget or course.deadline.passed
-        if halves is None or spent or _at_rest(slacks):
+        spent = parts is None or course.examined + parts[0].shape[0] > course.budget or course.deadline.passed
+        if parts is None or spent or _at_rest(slacks):
             hindrance = course.hindrance(worst, lower[at], upper[at])
             reason = f"{int(open_.sum())} of {course.examined} cells were left; {hindrance}"
             return Proof(family.name, "undecided", worst, best[0], best[1], best[2], course.examined, reason)
-        lower, upper = halves
+        lower, upper = parts
 
 
 def _at_rest(slacks: Sequence[float]) -> bool:
@@ -164,8 +176,9 @@ def _at_rest(slacks: Sequence[float]) -> bool:
     return len(slacks) > 2 * REST and slacks[-1] <= TINY and slacks[-1] > ADVANCED * slacks[-1 - REST]
 
 
-def _bounded(course: Course, x: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
-    """Bounds ``(k,)`` of cells, and the coordinates ``(k,)`` to halve; infinite for cells that there was no time for.
+def _bounded(course: Course, x: Array, lower: Array, upper: Array) -> tuple[Array, Array, Array | None]:
+    """Bounds ``(k,)`` of cells, the coordinates ``(k,)`` to halve, and what falls with the square of their widths
+    ``(k,)``, where that is known; infinite for cells that there was no time for.
 
     In batches, so that memory does not grow with their number. Only where a deadline is set are batches as small as
     the time that they take asks for: what a cell costs is not known before, and a result that has no limit shall not
@@ -173,20 +186,57 @@ def _bounded(course: Course, x: Array, lower: Array, upper: Array) -> tuple[Arra
     """
     family, count = course.family, lower.shape[0]
     assert family.enclosure is not None
-    bounds, split = np.full(count, np.inf), (upper - lower).argmax(axis=1)
+    bounds, split, bend = np.full(count, np.inf), (upper - lower).argmax(axis=1), np.full(count, np.inf)
+    known = True
     start, size = 0, FIRST_BATCH if course.deadline.bounded or course.deadline.passed else BATCH
     while start < count and not (start and course.deadline.passed):
         began, part = time.perf_counter(), slice(start, start + size)
         enclosed = family.enclosure(x, lower[part], upper[part])
         bounds[part] = np.where(np.isnan(enclosed.bounds), np.inf, enclosed.bounds)
         split[part] = enclosed.split
+        known = known and enclosed.bend is not None
+        bend[part] = np.inf if enclosed.bend is None else enclosed.bend
         start, ended = start + size, time.perf_counter()
         if course.deadline.bounded:
             size = min(BATCH, 2 * size) if ended - began < QUICK else max(1, size // 2)
         if start < count and ended - course.told > OFTEN:
             at = int(bounds[:start].argmax())
             course.tell(count, float(bounds[at]), lower[at], upper[at], start)
-    return bounds, split
+    return bounds, split, bend if known else None
+
+
+def _towards(peaks: Separation, lower: Array, upper: Array, bounds: Array, bend: Array) -> tuple[Array, Array] | None:
+    """Cells ``(k, 1)``, those beside or around a peak cut at once into parts that are as short there as they must be
+    and longer the farther they are from it, the others halved; ``None`` where no cell or too many would be cut so.
+
+    From ``D`` to ``(1 + g) D`` beside a smooth peak of height ``v`` and curvature ``c`` the bound is about
+    ``v - c D^2 / 2 + b (g D)^2 / 8``, with ``b`` the bound of the second derivative: so ``g = 2 sqrt(c / b)`` will do.
+    """
+    if not peaks.violations.size or lower.shape[0] > MOST_CUT:
+        return None
+    starts, stops = list[Array](), list[Array]()
+    reach = np.clip(peaks.indices[:, 0], lower, upper)
+    away = np.abs(reach - peaks.indices[:, 0])
+    for i, nearest in enumerate(away.argmin(axis=1)):
+        low, high, at, top = lower[i, 0], upper[i, 0], reach[i, nearest], peaks.violations[nearest]
+        width = high - low
+        short = SHARE / 2 * width * np.sqrt(max(TOLERANCE - top, TOLERANCE / 16) / max(bend[i], TOLERANCE))
+        cuts = np.array([low, (low + high) / 2, high])
+        if away[i, nearest] <= width and 0.0 < short < width / 4:
+            inside, grow = min(at - low, high - at), 0.5
+            if inside > width / 8:  # the ends are below the peak by what its curvature makes of the distance
+                curved = max(top - (bounds[i] - bend[i]), 0.0) / bend[i] * (width / inside) ** 2 / 4
+                grow = float(np.clip(2 * SHARE * np.sqrt(curved), *GROWN))
+            offsets = short * (1 + grow) ** np.arange(np.ceil(np.log(width / short) / np.log1p(grow)))
+            cuts = np.concatenate([[low], at - offsets[::-1], at + offsets, [high]])
+            cuts = np.concatenate([[low], cuts[(cuts > low) & (cuts < high)], [high]])
+        if not (np.diff(cuts) > 0.0).all():
+            return None
+        starts.append(cuts[:-1])
+        stops.append(cuts[1:])
+    if all(one.size == 2 for one in starts):
+        return None
+    return np.concatenate(starts)[:, None], np.concatenate(stops)[:, None]
 
 
 def _probe(family: ConstraintFamily, x: Array, lower: Array, upper: Array, bounds: Array) -> tuple[float, Array, int]:

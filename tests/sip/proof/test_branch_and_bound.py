@@ -93,6 +93,48 @@ def test_a_peak_between_the_nodes_decides(slack):
         assert abs(proof.index[0] - np.pi / 2) <= np.sqrt(-2 * slack) + 1e-9
 
 
+@pytest.mark.parametrize("slack", [0.0, 1e-9, 1e-7])
+@pytest.mark.parametrize("offset", [0.0, 0.02, -0.02])
+def test_a_peak_that_nearly_touches_is_proven_in_few_batches_however_it_lies_in_its_piece(slack, offset):
+    """Halving takes one batch for every bit of the width that the slack asks for: about fifteen."""
+    constraint = FlatConstraint(
+        "path", peak(), np.array([[1.0, 0.0]]), np.array([1 + slack]), offset + 0.05, HORIZON, ParameterIndex(None)
+    )
+    family, sizes = family_of(constraint), []
+
+    def counted(x, lower, upper):
+        sizes.append(lower.shape[0])
+        return constraint.enclosure(x, lower, upper)
+
+    proof = prove_family(replace(family, enclosure=counted), np.zeros(2))
+    assert proof.verdict == "proven"
+    assert len(sizes) <= 3
+    assert sum(sizes) <= 120
+    lower, upper = proof.leaves
+    assert np.array_equal(lower[1:], upper[:-1])
+    assert [lower[0, 0], upper[-1, 0]] == [offset + 0.05, HORIZON]
+    assert (constraint.enclosure(np.zeros(2), lower, upper).bounds <= 1e-9).all()
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 10**6), slack=st.sampled_from([1e-9, 1e-8, 1e-6]))
+def test_cells_cut_towards_peaks_prove_what_halves_prove(seed, slack):
+    """Under a disturbance, whose support function has kinks; the right-hand side is just above the largest violation
+    that separation finds."""
+    rng = np.random.default_rng(seed)
+    functionals = worst_case(random_system(rng), GRIDS["uniform"], bound=DISTURBANCE, initial_state=rng.normal(size=2))
+    x = rng.normal(size=functionals.variables)
+    constraint = FlatConstraint(
+        "path", functionals, rng.normal(size=(2, 2)), np.zeros(2), 0.3, HORIZON, ParameterIndex(None)
+    )
+    tight = raised(constraint, float(constraint.worst(x).violations[0]) + slack)
+    found = prove_family(family_of(tight), x)
+    halved = prove_family(replace(family_of(tight), worst=None), x)
+    assert found.verdict == halved.verdict == "proven"
+    assert found.violation >= halved.violation
+    assert found.cells <= 2 * halved.cells
+
+
 def oscillator(p):
     return np.array([[0 * p[0], 1 + 0 * p[0]], [-(p[0] ** 2), 0 * p[0]]])
 

@@ -128,9 +128,7 @@ def test_a_system_that_can_be_enclosed_on_small_cells_only_is_halved_until_it_ca
     )
     index = ParameterIndex(functionals.response.system.parameters)
     with pytest.raises(NotEnclosable):
-        FlatConstraint("path", functionals, np.eye(2), np.ones(2), 0.5, 1.0, index).legs(
-            np.array([-1.0]), np.array([0.7])
-        )
+        functionals.legs(np.array([-1.0]), np.array([0.7]))
     made = (
         CurvedConstraint("path", functionals, Ellipsoid([0.0, 0.0], 9 * np.eye(2)), 0.5, 1.0, index)
         if curved_set
