@@ -87,7 +87,7 @@ class Robust:
         """The optimum with the rows tightened, as accurate as this round asks for; ``size``: of the cost. Not solved
         where ``seconds`` do not suffice."""
         if isinstance(self.counterpart, Interior):
-            answer = self.counterpart.solve(self.margin, self.accuracy * size)
+            answer = self.counterpart.solve(self.margin, self.accuracy * size, seconds)
             self.calls[INTERIOR] += 1
         else:
             answer = self.counterpart.solve(self.margin, seconds)
@@ -128,6 +128,15 @@ class Robust:
         )
         return Dual(bound - (ROUNDING + self.counterpart.spread.missed) * size, cuts, answer.mu)
 
+    @property
+    def at_rest(self) -> Dual:
+        """What the bounds of the decision prove alone, without a multiplier."""
+        rows, size = len(self.cuts), self.counterpart.spread.size
+        none = RobustAnswer(
+            True, "", np.zeros(0), np.zeros(rows), np.zeros((rows, size)), np.zeros(self.program.finite.b.size)
+        )
+        return self.dual(none, priced=True)
+
     def refuted(self, answer: RobustAnswer) -> Dual | None:
         """What the multipliers of an answer prove of all decisions alike: that there is none; or nothing."""
         total = float(answer.y.sum() + np.abs(answer.mu).sum())
@@ -144,6 +153,7 @@ def robust_exchange(
     relaxed = RelaxedProgram(program, tools.solver, None, deadline=tools.deadline)
     ledger = Ledger(program, relaxed, tools, tolerance)
     working = Robust.start(program)
+    ledger.improve(working.at_rest)
     try:
         with tools.deadline.enforced():
             return _exchange(working, ledger, prover, rounds)
@@ -312,7 +322,10 @@ def _solved(working: Robust, ledger: Ledger) -> Answer | Result:
         _count(working, ledger)
         if answer.solved:
             break
-        ledger.tools.deadline.check()
+        if ledger.tools.deadline.passed:
+            if answer.x.size:  # broken off: what it has come to is what is known
+                _told(working, ledger, answer)
+            ledger.tools.deadline.check()
         if isinstance(working.counterpart, Interior):
             refuted = working.refuted(answer)
             if refuted is not None:
@@ -325,18 +338,27 @@ def _solved(working: Robust, ledger: Ledger) -> Answer | Result:
             if working.margin > 0.0:
                 continue
         return _infeasible(working, ledger, answer.said)
-    x = np.clip(answer.x, program.finite.lower, program.finite.upper)
-    working.raw = x
-    x = x if program.settle is None else program.settle(x)
-    dual = working.dual(answer, priced=True)
-    ledger.improve(dual)
+    told = _told(working, ledger, answer)
     price = working.price = float(answer.y.sum())
-    budget = 0.4 * ledger.tolerance * _size(program, x)
+    budget = 0.4 * ledger.tolerance * _size(program, told.solution.x)
     if working.slater and price * working.margin > budget:
         working.margin = max(SMALLEST, min(working.margin, budget / price))
-    none = np.zeros(0)
-    solution = FiniteSolution("optimal", x, np.inf, dual.bound, answer.y, answer.mu, none, np.inf, np.inf)
-    return _at(working, Answer(solution, _rows(working), 0.0, np.inf), x)
+    return told
+
+
+def _told(working: Robust, ledger: Ledger, found: RobustAnswer) -> Answer:
+    """The decision of an answer, with the bound that its multipliers prove; the first one is kept, should there be no
+    time for another."""
+    program, none = working.program, np.zeros(0)
+    working.raw = x = np.clip(found.x, program.finite.lower, program.finite.upper)
+    x = x if program.settle is None else program.settle(x)
+    dual = working.dual(found, priced=True)
+    ledger.improve(dual)
+    solution = FiniteSolution("optimal", x, np.inf, dual.bound, found.y, found.mu, none, np.inf, np.inf)
+    answer = _at(working, Answer(solution, _rows(working), 0.0, np.inf), x)
+    if ledger.best is None:
+        ledger.keep(answer)
+    return answer
 
 
 def _left(tools: Tools) -> float:

@@ -109,6 +109,42 @@ def test_a_limit_that_is_over_before_anything_was_solved_returns_without_a_decis
     assert result.lower_bound == -np.inf
 
 
+@pytest.mark.parametrize("when", ["before the first program", "before the first round"])
+def test_a_limit_under_feedback_leaves_what_is_known(when, monkeypatch):
+    from sparserob_core.sip.methods import robust
+
+    system = sr.LinearSystem(A=[[-1.0]], B=[[1.0]])
+    problem = sr.OptimalControlProblem(
+        system=system,
+        horizon=2.0,
+        initial_state=[1.0],
+        control=sr.Box([-1.0], [1.0]),
+        disturbance=sr.Box([-0.1], [0.1]),
+        terminal=[sr.Box([-0.1], [0.1])],
+    )
+    policy = sr.AffinePolicy(causal_signals=0)
+
+    def solve():
+        return sr.solve(problem, control={"name": "piecewise_constant", "pieces": 4}, policy=policy)
+
+    certified = solve()
+    assert certified.status == "certified" and certified.lower_bound > 0.0
+
+    def over(*_, **__):
+        raise OutOfTime("the time is over")
+
+    step = {"before the first program": "_solved", "before the first round": "separate"}[when]
+    monkeypatch.setattr(robust, step, over)
+    result = solve()
+    assert result.stopped == "the time is over"
+    if step == "_solved":
+        assert (result.status, result.decision, result.upper_bound) == ("undecided", None, np.inf)
+        assert result.lower_bound == 0.0  # of an L1 norm that much is known
+    else:  # the only relaxed program, looked at once
+        assert result.decision is not None
+        assert result.lower_bound == pytest.approx(certified.cost, rel=1e-3)
+
+
 def test_a_single_step_that_takes_long_is_ended_too():
     def worst(x):
         time.sleep(30.0)

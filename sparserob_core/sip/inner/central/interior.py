@@ -12,8 +12,9 @@ slacks of the size of the violation are in the middle, and the next solve begins
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, final
+from typing import final
 
 import numpy as np
 
@@ -21,9 +22,6 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram, Spread, UncertainRows
 from sparserob_core.sip.inner.central.layout import Block, Layout
 from sparserob_core.sip.inner.counterpart import RobustAnswer
-
-if TYPE_CHECKING:
-    pass
 
 STEPS = 80  # Newton steps of one solve at most
 CORRECTIONS = 2  # of a step at most (Gondzio 1996)
@@ -73,8 +71,10 @@ class Interior:
         """Nothing stands for the rows but they themselves."""
         return False
 
-    def solve(self, margin: float, accuracy: float) -> RobustAnswer:
-        """The optimum with every row tightened by ``margin``, to about ``accuracy`` in the cost."""
+    def solve(self, margin: float, accuracy: float, seconds: float = np.inf) -> RobustAnswer:
+        """The optimum with every row tightened by ``margin``, to about ``accuracy`` in the cost. It is not solved where
+        ``seconds`` do not suffice, and says how far it has come."""
+        until = time.monotonic() + seconds
         if self._stale:
             self._extend(margin)
         first = self._limits.size
@@ -88,6 +88,8 @@ class Interior:
                     return self._answer(True, "interior point method: optimal")
                 if not self._y.max() < ENDLESS or not self._step():
                     return self._answer(False, "the interior point method came to a halt")
+                if time.monotonic() > until:
+                    return self._answer(False, "the interior point method is out of time")
                 self.steps += 1
         return self._answer(False, f"the interior point method took {STEPS} steps")
 

@@ -7,6 +7,7 @@ variables that answer nothing (*joint* variables).
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, final
 
@@ -66,7 +67,7 @@ class Layout:
         self.program, self.spread = program, spread
         self.parts = 0
         self.taken = 0  # absolute values that stand in `blocks`
-        self._known: dict[tuple[bytes, bytes, bytes, bytes], int] = {}
+        self._known: dict[bytes, int] = {}
         self._rests: list[float] = []
         self._still: list[Array] = []
         self._values: list[tuple[np.ndarray, np.ndarray, np.ndarray, Array]] = []
@@ -82,7 +83,7 @@ class Layout:
         self._rows.append((block.g, names[block.part], np.abs(block.factor), block.h))
 
     def _part(self, C: csr_array, d: Array) -> int:
-        key = (C.indptr.tobytes(), C.indices.tobytes(), C.data.tobytes(), d.tobytes())
+        key = _digest(C.indptr, C.indices, C.data, d)
         if key in self._known:
             return self._known[key]
         radii, counts = self.spread.radii, np.diff(C.indptr)
@@ -204,3 +205,12 @@ class Layout:
         plain = not program.weights[mine].any() and not program.q[mine].any()
         plain = plain and not any(rows[0].tocsc()[:, mine].nnz for rows in self._rows)
         return plain and mine.size >= WORTH and int(np.diff(self.starts).max()) <= LARGEST
+
+
+def _digest(*arrays: np.ndarray) -> bytes:
+    """A short name of arrays, the same for equal ones."""
+    found = hashlib.blake2b(digest_size=16)
+    for array in arrays:
+        found.update(array.size.to_bytes(8, "little"))
+        found.update(np.ascontiguousarray(array).data)
+    return found.digest()

@@ -106,6 +106,32 @@ def test_what_no_decision_meets_is_refuted_by_multipliers_at_deviations_in_the_s
     assert robust_bound(program(), central.blocks, y, found.deviations, np.zeros(0), priced=False)[0] > 1e-3
 
 
+def test_a_solve_that_is_out_of_time_says_how_far_it_has_come() -> None:
+    rng = np.random.default_rng(2)
+    central = Interior(program(), spread())
+    for k in range(EACH):
+        central.add(answering(k, k))
+    central.add(rows(rng, 2.0))
+    broken_off = central.solve(0.0, 1e-9, seconds=0.0)
+    assert not broken_off.solved and "out of time" in broken_off.said
+    assert broken_off.x.shape == (program().n,) and central.steps == 0
+    answer = central.solve(0.0, 1e-9)  # from where it was
+    assert answer.solved
+    least = float(program().weights @ np.abs(answer.x))
+    assert bound(central, broken_off.y, broken_off.deviations) <= least + 1e-7
+
+
+def test_rows_that_are_there_already_are_known_by_a_short_name() -> None:
+    rng = np.random.default_rng(3)
+    central = Interior(program(), spread())
+    fresh = rows(rng, 2.0)
+    central.add(fresh)
+    central.add(fresh)
+    central.add(rows(rng, 2.0))
+    layout_ = central._layout
+    assert layout_.parts == 2 and all(isinstance(name, bytes) and len(name) <= 32 for name in layout_._known)
+
+
 def test_equalities_and_sets_that_are_no_boxes_are_left_to_the_simplex_method() -> None:
     rng = np.random.default_rng(0)
     plain = program()
