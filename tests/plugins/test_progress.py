@@ -3,6 +3,7 @@ and gone afterwards."""
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
@@ -199,18 +200,35 @@ def small(tmp_path: Path) -> None:
     (tmp_path / "small.yaml").write_text(json.dumps(watched))
 
 
-def on_terminal(tmp_path: Path, terminal: int, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """``sparserob run`` in a process of its own, with its standard error stream on a terminal."""
-    return subprocess.run(
-        [sys.executable, "-m", "sparserob_core", "run", "small.yaml", "--no-figures", *arguments],
-        cwd=tmp_path,
-        text=True,
-        stdout=subprocess.PIPE,
-        stderr=terminal,
-        timeout=120,
-        check=False,
-        env={**os.environ, "TERM": "xterm"},
-    )
+def on_terminal(tmp_path: Path, *arguments: str) -> tuple[subprocess.CompletedProcess[str], str]:
+    """``sparserob run`` in a process of its own, and all that its standard error stream showed on a terminal."""
+    reading, terminal = os.openpty()
+    shown = bytearray()
+
+    def read() -> None:
+        # A full terminal lets the writer wait. At its end some systems read nothing, others fail.
+        with contextlib.suppress(OSError):
+            while part := os.read(reading, 1 << 16):
+                shown.extend(part)
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", "sparserob_core", "run", "small.yaml", "--no-figures", *arguments],
+            cwd=tmp_path,
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=terminal,
+            timeout=120,
+            check=False,
+            env={**os.environ, "TERM": "xterm"},
+        )
+    finally:
+        os.close(terminal)
+        reader.join()
+        os.close(reading)
+    return done, shown.decode()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a pseudo-terminal")
@@ -218,15 +236,7 @@ def on_terminal(tmp_path: Path, terminal: int, *arguments: str) -> subprocess.Co
 def test_on_a_real_terminal_it_shows_and_clears_its_lines_and_quiet_and_json_silence_it(tmp_path: Path) -> None:
     shown = {}
     for arguments in ((), ("--quiet",), ("--json",)):
-        reading, terminal = os.openpty()
-        done = on_terminal(tmp_path, terminal, *arguments)
-        os.set_blocking(reading, False)
-        try:
-            shown[arguments] = os.read(reading, 1 << 20).decode()
-        except BlockingIOError:
-            shown[arguments] = ""
-        os.close(terminal)
-        os.close(reading)
+        done, shown[arguments] = on_terminal(tmp_path, *arguments)
         assert done.returncode in (0, 4)
         assert (arguments == ("--quiet",)) == (done.stdout == "")
         if arguments == ("--json",):
