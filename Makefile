@@ -26,7 +26,7 @@ endef
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help install demo live paper test test-slow lint bench docs docs-pictures clean
+.PHONY: help install demo live paper test tests test-slow lint style types bench docs docs-pictures clean
 
 help:
 	@echo "make demo        solve the repaired experiment 1, print the bounds, draw the figures"
@@ -73,13 +73,21 @@ live: $(INSTALLED)
 paper: $(INSTALLED)
 	@$(BIN)/python docs/paper/build.py
 
-lint: $(INSTALLED)
+lint: style types
+
+style: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-test: lint
+types: $(INSTALLED)
+	$(BIN)/mypy
+
+# Types are checked beside the tests, so that both processors have work from the first second.
+test: style
+	@$(MAKE) --no-print-directory --jobs 2 types tests
+
+tests: $(INSTALLED)
 	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal
 
 test-slow: $(INSTALLED)

@@ -19,7 +19,7 @@ def family(name, lower, upper, rows):
 
 
 def solved(program, solver):
-    return sr.solve(program, method="exchange", solver=solver, maximiser="direct", tolerance=1e-7, seed=0)
+    return sr.solve(program, method="exchange", solver=solver, maximiser="direct", budget=200, tolerance=1e-7, seed=0)
 
 
 def apart(result):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 import pickle
@@ -59,6 +60,16 @@ class Forgery:
 Change = Callable[[Forgery], None]
 
 
+_CONFIGS: dict[str, dict[str, Any]] = {}
+
+
+def _config(text: str, file: Path) -> dict[str, Any]:
+    """What a config says; that of one run is read for many forgeries of it."""
+    if text not in _CONFIGS:
+        _CONFIGS[text] = read_source(file).data
+    return _CONFIGS[text]
+
+
 def copied(source: Path, target: Path | None = None) -> Forgery:
     """A copy of a run directory; only of what its files say, without a target."""
     if target is None:
@@ -67,7 +78,7 @@ def copied(source: Path, target: Path | None = None) -> Forgery:
         shutil.copytree(source, target)
     return Forgery(
         target,
-        read_source(target / "config.yaml").data,
+        copy.deepcopy(_config((target / "config.yaml").read_text(), target / "config.yaml")),
         json.loads((target / "certificate.json").read_text()),
         json.loads((target / "result.json").read_text()),
     )

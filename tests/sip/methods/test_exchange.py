@@ -19,7 +19,7 @@ def options():
     from sparserob_direct import Direct
     from sparserob_piqp import Piqp
 
-    return {"solver": Piqp(), "maximiser": Direct(), "tolerance": 1e-7, "seed": 0}
+    return {"solver": Piqp(), "maximiser": Direct(), "budget": 200, "tolerance": 1e-7, "seed": 0}
 
 
 def random_program(rng, n=6, families=2, equality=False, q=True):
