@@ -127,6 +127,7 @@ class ConstraintFamily:
 
     ``rows`` maps indices ``(k, d)`` to ``(G (k, r, n), h (k, r))``. The rest is optional, and used when offered:
 
+    ``chosen(indices (k, d), rows (k,))``  one row of each index, ``(G (k, n), h (k,))``, where all would take longer;
     ``worst(x)``      exact separation (a `Separation`);
     ``enclosure(x, lower (k, d), upper (k, d))``  an `Enclosure` of the violation on cells, for proofs;
     ``cells``         ``(lower, upper)``, a partition of the index set on whose cells the enclosure converges;
@@ -146,16 +147,18 @@ class ConstraintFamily:
     ``row_units (r,)``, ``index_units (d,)``  what a violation of 1 and each coordinate of an index are in the user's
         units, for a family in units of its own (`OwnUnits`);
     ``explain(index (d,), row)``  one constraint for people (an `Explanation`);
+    ``excess(x, indices (k, d))``  the violations ``(k, r)`` at indices, where no rows need be built for them;
     ``uncertain(index (d,))``  for rows that must hold for every deviation in the program's `Spread`: these rows. Such a
-        family is not linear in the decision: ``rows`` refuses, ``excess(x, indices (k, d))`` are its violations
-        ``(k, r)``, and ``start (k, d)`` the indices that a method begins with; ``defines``: whether it only bounds
-        variables that the program's ``settle`` puts at what bounds them, so that it is never the worst one;
+        family is not linear in the decision: ``rows`` refuses, ``excess`` is offered, and ``start (k, d)`` are the
+        indices that a method begins with; ``defines``: whether it only bounds variables that the program's ``settle``
+        puts at what bounds them, so that it is never the worst one;
         ``scaled(factor)``: the same constraints where all deviations are so many times as large.
     """
 
     name: str
     index_set: Box
     rows: Callable[[Array], tuple[Array, Array]]
+    chosen: Callable[[Array, np.ndarray], tuple[Array, Array]] | None = None
     worst: Callable[[Array], Separation] | None = None
     enclosure: Callable[[Array, Array, Array], Enclosure] | None = None
     cells: tuple[Array, Array] | None = None

@@ -21,7 +21,7 @@ from sparserob_core.control.response.initial_support import Supports
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import Direct, Moving, Reference
-from sparserob_core.control.response.response import Outputs, Response, distinct_times
+from sparserob_core.control.response.response import LONG, Outputs, Response, distinct_times
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.program import Enclosure, Explanation, Separation
@@ -280,6 +280,9 @@ class FlatConstraint(StateConstraint):
             found = heights
             times, predicted = vertices(values, positions, self.times)
             between = np.flatnonzero(times != indices[:, 0])  # the others are samples
+            if self.functionals.response.grid.pieces >= LONG:  # among many samples, those well below 0 are only told
+                promised = heights + 4.0 * (predicted - heights)
+                between = between[promised[between] >= min(0.0, heights.max(initial=-np.inf))]
             if between.size:
                 refined = self._refined(x, times[between], rows[between], predicted[between], found)
                 higher = refined[1] >= found[between]  # at a kink a parabola is no guide

@@ -135,6 +135,25 @@ class StateConstraint(ABC):
         return directions if gains is None else np.hstack([directions, gains])
 
     @shaped
+    def at(self, x: Float[Array, " n"], indices: Float[Array, "k j"]) -> Float[Array, "k r"]:
+        """`violations` of all rows at indices ``(k, ...)``, ``(k, r)``."""
+        times, directions, parameters, rhs = self.functionals_at(indices)
+        found, direct = self.functionals.values(x, times, directions, parameters) - rhs, self.direct(indices[:, 0])
+        shape = (indices.shape[0], times.size // max(1, indices.shape[0]))
+        return np.asarray(found if direct is None else found + direct @ x).reshape(shape)
+
+    @shaped
+    def chosen(
+        self, indices: Float[Array, "k j"], rows: Int[np.ndarray, " k"]
+    ) -> tuple[Float[Array, "k n"], Float[Array, " k"]]:
+        """``G (k, n)``, ``rhs (k,)`` of one row of each index ``(k, ...)``, none of the others made."""
+        times, directions, parameters, rhs = self.functionals_at(indices)
+        mine = np.arange(rows.size) * (times.size // max(1, rows.size)) + rows
+        G, offset = self.functionals.rows(times[mine], directions[mine], parameters[mine])
+        direct = self.direct(indices[:, 0])
+        return (G if direct is None else G + direct[mine]), rhs[mine] - offset
+
+    @shaped
     def rows(self, indices: Float[Array, "k j"]) -> tuple[Float[Array, "k r n"], Float[Array, "k r"]]:
         """``G (k, r, n)``, ``rhs (k, r)`` at indices ``(k, ...)``."""
         times, directions, parameters, rhs = self.functionals_at(indices)

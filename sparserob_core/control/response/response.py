@@ -371,20 +371,20 @@ class Propagator:
         pieces, steps = self.grid.locate(times), self.steps(np.zeros((1, 0)))
         rows, entered = self._over_parts(steps, directions, times - self.grid.breakpoints[pieces])
         count, channels = int(pieces.max(initial=0)), steps.B.shape[2]
-        every = np.arange(times.size)
+        every, signs = np.arange(times.size), np.ones(times.size)
         apart, which = rows, every
-        if times.size > 1 and self.inputs.reach < self.grid.pieces:  # later times are shifts of one impulse response
-            apart, which = _unique_rows(rows)
+        if times.size > 1 and self.inputs.reach < self.grid.pieces:
+            # later times are shifts of one impulse response, and an opposite row has the opposite one
+            signs = np.where(rows[every, np.abs(rows).argmax(axis=1)] < 0.0, -1.0, 1.0)
+            apart, which = _unique_rows(rows * signs[:, None])
         by_age = self.inputs.of(apart, count)
         control = np.zeros((times.size, self.grid.pieces, channels))
         disturbance = np.zeros((times.size, self.grid.pieces, steps.E.shape[2]))
-        for number, (piece, row) in enumerate(zip(pieces.tolist(), which.tolist(), strict=True)):
+        for number, (piece, row, sign) in enumerate(zip(pieces.tolist(), which.tolist(), signs.tolist(), strict=True)):
             if piece:
                 backwards = by_age[row, piece - 1 :: -1]
-                control[number, :piece], disturbance[number, :piece] = (
-                    backwards[:, :channels],
-                    backwards[:, channels:],
-                )
+                np.multiply(backwards[:, :channels], sign, out=control[number, :piece])
+                np.multiply(backwards[:, channels:], sign, out=disturbance[number, :piece])
         last = entered @ self.inputs.columns
         control[every, pieces], disturbance[every, pieces] = last[:, :channels], last[:, channels:]
         return Weights(self._leapt(rows, pieces), control, disturbance)

@@ -588,6 +588,8 @@ def _reduced(constraint: StateConstraint) -> ConstraintFamily:
         name=constraint.name,
         index_set=constraint.index_set,
         rows=constraint.rows,
+        chosen=constraint.chosen,
+        excess=constraint.at,
         worst=constraint.worst,
         enclosure=constraint.enclosure,
         cells=constraint.cells,

@@ -67,16 +67,20 @@ def rows_at(
     if not indices.shape[0]:
         return Rows.none(program.n)
     constraints = program.family(family)
-    G, h = constraints.rows(indices)
-    count, per_index = h.shape
-    where, which = (
-        (np.arange(count), rows)
-        if rows is not None
-        else (np.repeat(np.arange(count), per_index), np.tile(np.arange(per_index), count))
-    )
+    every = np.arange(indices.shape[0])
+    if rows is not None and constraints.chosen is not None:
+        where, which, (G, h) = every, rows, constraints.chosen(indices, rows)
+    else:
+        G, h = constraints.rows(indices)
+        where, which = (
+            (every, rows)
+            if rows is not None
+            else (np.repeat(every, h.shape[1]), np.tile(np.arange(h.shape[1]), every.size))
+        )
+        G, h = G[where, which], h[where, which]
     form = constraints.formulation
     cuts = tuple(Cut(family, indices[i], int(r), formulation=form) for i, r in zip(where, which, strict=True))
-    return Rows(np.asarray(G[where, which], dtype=float), np.asarray(h[where, which], dtype=float), cuts)
+    return Rows(np.asarray(G, dtype=float), np.asarray(h, dtype=float), cuts)
 
 
 @dataclass(frozen=True, eq=False)

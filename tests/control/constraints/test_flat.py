@@ -4,6 +4,7 @@ parameters, against dense grids."""
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
+from sparserob_core.control.constraints import flat
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.parameters import ParameterIndex
@@ -136,6 +138,26 @@ def test_a_path_that_peaks_at_a_kink_is_separated_at_the_kink():
     found = constraint.worst(np.array([1.0, -1 / 3]))
     assert abs(found.violations[0] - 0.1) <= 1e-9
     assert abs(found.indices[0, 0] - 1.0) <= 1e-9
+
+
+def test_among_many_pieces_the_worst_violation_is_the_same_and_the_others_are_met(monkeypatch):
+    """What is well below 0 at a sample is told as it is there; what is not is refined as ever."""
+    rng, dictionary = np.random.default_rng(3), uniform(40, HORIZON)
+    system = LinearSystem([[0.0, 1.0], [-9.0, -0.1]], [[0.0], [1.0]])
+    constraint = constraint_of(rng, system, dictionary, Box([-0.1, -0.3], [0.2, 0.1]), rows=4)
+    x = rng.uniform(-1, 1, size=constraint.functionals.variables)
+    height = constraint.worst(x).violations.max()
+    for lowered in (0.0, height, height + 1.0):  # violated, touched, met
+        moved = replace(constraint, h=constraint.h + lowered)
+        few = moved.worst(x)
+        monkeypatch.setattr(flat, "LONG", 1)
+        many = replace(moved, shared=None).worst(x)
+        monkeypatch.undo()
+        assert many.violations[0] == pytest.approx(few.violations[0], abs=1e-12)
+        assert (np.sort(many.violations) <= np.sort(few.violations) + 1e-12).all()
+        assert (many.violations > 0.0).sum() == (few.violations > 0.0).sum()
+        found = violations(moved, x, many.indices)[np.arange(many.rows.size), many.rows]
+        np.testing.assert_allclose(found, many.violations, atol=1e-11)
 
 
 def test_a_window_that_starts_just_before_a_sample_is_searched():

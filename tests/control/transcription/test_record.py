@@ -68,6 +68,22 @@ def test_every_form_of_a_family_names_its_constraint_and_what_its_indices_say(na
 
 
 @pytest.mark.parametrize("name", CASES)
+def test_single_rows_and_violations_of_a_family_are_those_of_all_its_rows(name: str) -> None:
+    model, rng = model_of(name), np.random.default_rng(7)
+    for family in model.program.families:
+        box, x = family.index_set, rng.uniform(-1, 1, model.program.n)
+        indices = rng.uniform(box.lower, box.upper, size=(6, box.dimension))
+        G, h = family.rows(indices)
+        rows = rng.integers(h.shape[1], size=6)
+        assert family.chosen is not None
+        one, rhs = family.chosen(indices, rows)
+        np.testing.assert_allclose(one, G[np.arange(6), rows], atol=1e-12)
+        np.testing.assert_allclose(rhs, h[np.arange(6), rows], atol=1e-12)
+        np.testing.assert_allclose(family.violations(x, indices), G @ x - h, atol=1e-11)
+        assert family.violations(x, indices[:0]).size == 0
+
+
+@pytest.mark.parametrize("name", CASES)
 def test_a_constraint_from_another_state_is_that_of_the_problem_stated_afresh(name: str) -> None:
     model, rng = model_of(name), np.random.default_rng(3)
     for state in ((0.3, -0.2), (-0.4, 0.9)):
