@@ -23,7 +23,6 @@ from sparserob_core.sip.maximiser import Maximiser
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.regulariser import Regulariser
 from sparserob_core.sip.result import Result
-from sparserob_core.sip.rules import Geometric
 from sparserob_core.sip.solver import Solver
 
 GRACE = 1.0  # seconds after a limit in which a method may end by itself
@@ -35,7 +34,8 @@ class Continuation(Options):
     """How the weight of the regulariser decreases.
 
     The weight ``epsilon`` goes from ``start`` by ``factor`` (the paper's ``Regu``) down to ``stop`` at the latest, or
-    until the cost ``J`` changes by no more than ``tolerance`` when it is reduced again (``SC1``).
+    until the cost ``J`` changes by no more than ``tolerance`` when it is reduced again (``SC1``). The method
+    ``exchange`` takes two and more steps at once, down to an eighth of a weight, as long as its gap is open.
     """
 
     start: float = Field(default=1.0, gt=0.0)
@@ -56,7 +56,7 @@ class Continuation(Options):
 
         Raises `InputError` for a schedule that does not give a positive weight below ``epsilon``.
         """
-        weight: object = (regu or Geometric(factor=self.factor))(epsilon, j)
+        weight: object = self.factor * epsilon if regu is None else regu(epsilon, j)
         if isinstance(weight, int | float | np.floating) and 0.0 < weight < epsilon:
             return max(self.stop, float(weight))
         raise InputError(f"regu: expected a positive weight below {epsilon!r}, got {weight!r}")

@@ -29,18 +29,18 @@ def local_maxima(values: Array, lattice: tuple[int, ...], kept: int) -> np.ndarr
     tensor = values.reshape(*lattice, r, times)
     peak = np.ones(tensor.shape, dtype=bool)
     for axis in (*range(len(lattice)), tensor.ndim - 1):
-        ahead = np.diff(tensor, axis=axis)
         first = [slice(None)] * tensor.ndim
         last = [slice(None)] * tensor.ndim
         first[axis], last[axis] = slice(None, -1), slice(1, None)
+        ahead = tensor[tuple(last)] - tensor[tuple(first)]
         peak[tuple(first)] &= ahead <= 0
         peak[tuple(last)] &= ahead >= 0
-    positions = np.argwhere(peak.reshape(v, r, times))
+    positions = np.array(peak.reshape(v, r, times).nonzero()).T
     heights = values[tuple(positions.T)]
     best: list[np.ndarray] = []
     for row in range(r):  # every row keeps its own maxima, so that none starves another
         mine = positions[:, 1] == row
-        best.append(positions[mine][np.argsort(-heights[mine], kind="stable")][:kept])
+        best.append(positions[mine][(-heights[mine]).argsort(kind="stable")][:kept])
     return np.concatenate(best)
 
 
@@ -57,7 +57,7 @@ def vertices(values: Array, positions: np.ndarray, times: Array) -> tuple[Array,
     curvature, slope = (d2 - d1) / (h1 + h2), (d1 * h2 + d2 * h1) / (h1 + h2)
     bent = curvature < 0
     shift = np.zeros(ti.size)
-    shift[bent] = np.clip(-slope[bent] / (2 * curvature[bent]), -h1[bent], h2[bent])
+    shift[bent] = np.minimum(np.maximum(-slope[bent] / (2 * curvature[bent]), -h1[bent]), h2[bent])
     moved[inner] += shift
     height[inner] += slope * shift + curvature * shift**2
     return moved, height

@@ -27,6 +27,7 @@ MOST = 10_000_000  # numbers in the matrices of one kind, beyond which durations
 NEAR = 1e-2
 BITS = 30  # to which the ends of durations that differ are rounded outwards
 AT_ONCE = 4_000_000  # numbers of the exponentials that are made at a time
+SMALL = 256  # numbers in the matrices of one kind, up to which it is not looked for durations that are alike
 FEW = 4  # times as many durations as matrices, from which every matrix is applied to all its durations at once
 LONG = 256  # equal durations from which what adds up over them is summed in blocks
 
@@ -147,7 +148,10 @@ class ComparisonSystem:
         With ``M = P - N``, ``P >= 0`` and ``N >= 0`` diagonal, ``e^{M r} <= I + P int_0^r e^{M s} ds``: a stable
         system stays bounded however long it runs.
         """
-        shortest, longest, which = alike(widths, self.sizes.size)
+        if widths.size * self.sizes.size <= SMALL:  # each for itself: it takes longer to see which are alike
+            shortest, longest, which = widths, widths, np.arange(widths.size)
+        else:
+            shortest, longest, which = alike(widths, self.sizes.size)
         key = shortest.tobytes() + longest.tobytes()
         if key not in self._known:
             remember(self._known, key, self._over(shortest, longest), KEPT)
@@ -209,6 +213,8 @@ def _rounded(values: Array, to: np.ufunc) -> Array:
 def flows_between(metzler: Array, shortest: Array, longest: Array) -> tuple[Array, Array]:
     """Bounds ``(u, q, q)`` of ``e^{M r}`` for all ``r`` from ``shortest`` to ``longest (u,)``, and of its integral
     until the longest."""
+    if metzler.size == 1 and shortest is longest:
+        return _of_one_block(float(metzler[0, 0]), longest[:, None, None])
     differ = np.flatnonzero(shortest < longest)
     durations = np.concatenate([shortest, longest[differ] - shortest[differ]])
     flow, integral = np.empty((2, durations.size, *metzler.shape))
@@ -225,6 +231,12 @@ def flows_between(metzler: Array, shortest: Array, longest: Array) -> tuple[Arra
     return flow, integral
 
 
+def _of_one_block(rate: float, durations: Array) -> tuple[Array, Array]:
+    """`flows_between` of a single block, ``(u, 1, 1)``, by numbers."""
+    flow, grown = SAFE * np.exp(rate * durations), np.expm1(rate * durations)
+    return flow, SAFE * (grown / rate if rate != 0.0 else durations)
+
+
 def rising(metzler: Array) -> Array:
     """A comparison matrix ``(q, q)`` without what decays."""
     return np.where(np.eye(metzler.shape[0]) > 0, np.maximum(metzler, 0.0), metzler)
@@ -238,9 +250,10 @@ def finite(values: Array) -> Array:
 def product(left: Array, right: Array) -> Array:
     """The product of matrices of bounds, in which nothing times infinity is nothing; what is no number is taken for
     infinite."""
-    endless_left, endless_right = ~np.isfinite(left), ~np.isfinite(right)
-    if not (endless_left.any() or endless_right.any()):
+    largest = np.maximum.reduce(left, axis=None, initial=0.0), np.maximum.reduce(right, axis=None, initial=0.0)
+    if largest[0] < np.inf and largest[1] < np.inf:  # and is a number
         return np.asarray(left @ right)
+    endless_left, endless_right = ~np.isfinite(left), ~np.isfinite(right)
     met = (endless_left * 1.0) @ (endless_right | (right > 0)) + (left > 0) @ (endless_right * 1.0)
     found = np.where(endless_left, 0.0, left) @ np.where(endless_right, 0.0, right)
     return np.asarray(np.where(met > 0, np.inf, found))

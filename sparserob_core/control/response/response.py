@@ -421,7 +421,7 @@ class Propagator:
         free, together = rows.copy(), int(pieces[0]) if pieces.size and (pieces == pieces[0]).all() else None
         for place, leap in enumerate(self.leaps[: int(pieces.max(initial=0)).bit_length()]):
             if together is None:
-                far = np.flatnonzero(pieces >> place & 1)
+                far = (pieces >> place & 1).nonzero()[0]
                 free[far] = free[far] @ leap
             elif together >> place & 1:
                 free = free @ leap
@@ -551,7 +551,7 @@ class Outputs:
         if self.propagator.aged(self.points.shape[1]) and self.propagator.grid.pieces >= LONG:
             return self._in_blocks(response.initial_state, self.propagator.grid.inputs(control))[None]
         steps, grid = self.propagator.steps(self.points), self.propagator.grid
-        nodes, drive = response.states(control, self.points), grid.driven(steps.B, grid.inputs(control))
+        nodes, drive = response.nodes(control, self.points), grid.driven(steps.B, grid.inputs(control))
         pieces, _, which = self.within
         which = which if grid.mode is None else np.arange(which.size)
         flow, driven = (part[:, which] for part in self._steps)
@@ -728,9 +728,25 @@ class Response:
         else:
             for piece, length in enumerate(lengths):
                 path[:, piece + 1] = moved(steps.Gamma[:, length], drive[:, piece])
+        if shared and self.uniform:
+            Phi = steps.Phi[0, 0].T
+            for piece in range(self.grid.pieces):
+                path[:, piece + 1] += path[:, piece] @ Phi
+            return path
         for piece, length in enumerate(lengths):
             path[:, piece + 1] += moved(steps.Phi[:, length], path[:, piece])
         return path
+
+    def nodes(self, control: Array, parameters: Array) -> Array:
+        """`states` without a disturbance, remembered for the last control, since all constraints ask for them."""
+        key = control.tobytes() + parameters.tobytes()
+        if key not in self._nodes:
+            remember(self._nodes, key, self.states(control, parameters), 1)
+        return self._nodes[key]
+
+    @cached_property
+    def _nodes(self) -> dict[bytes, Array]:
+        return {}
 
     def _in_blocks(self, path: Array, steps: Steps, block: int) -> Array:
         """``x_{k+1} = Phi x_k + f_k`` from a ``path (v, L+1, d)`` that holds ``x_0, f_0, f_1, ...``: first from 0 in

@@ -36,6 +36,7 @@ DROPPING_ROUNDS = 40  # rounds after which rows are only added, so that nothing 
 ALLOWANCES = 4  # times that a proof is helped over rounding
 THINNER = 1e-3  # share of a margin that leaves nothing feasible, which is tried next
 SMALLEST_MARGIN, LARGEST_MARGIN = 1e-15, 1e-6  # in units of the decision's bounds, where those are below 1
+FASTEST = 0.125  # of a weight, what steps of the continuation that are taken at once may leave
 CRUDE = 1e-4  # residual and relative gap of a relaxed solution that a round can do with
 SPARSIFYING = 60  # rounds after which no vertex is looked for any more
 ALLOWED = TOLERANCE / 2  # a violation that the search may leave to the proof
@@ -297,12 +298,17 @@ def _or_earlier(
 
 
 def _relaxed(method: Exchange, working: Working, ledger: Ledger) -> Answer:
-    """The relaxed program, with lighter and lighter regularisers while the cost still changes and the gap is open; for
-    the regularised problem, down to the last weight."""
+    """The relaxed program, with lighter and lighter regularisers while the cost still changes and the gap is open, one
+    step of the continuation and then more of them at once; for the regularised problem, step by step down to the last
+    weight."""
     solution, regu = working.solve(ledger, working.epsilon), ledger.tools.continuation
+    steps, most = 1, max(1, int(np.log(FASTEST) / np.log(regu.factor))) if method.exact else 1
     while _usable(solution) and working.epsilon > regu.stop and (not method.exact or ledger.open(solution.x)):
         ledger.tools.deadline.check()
-        lighter = regu.lighter(working.epsilon)
+        lighter = working.epsilon
+        for _ in range(steps):
+            lighter = regu.lighter(lighter) if lighter > regu.stop else lighter
+        steps = min(steps + 1, most)
         candidate = working.solve(ledger, lighter)
         if not _usable(candidate):
             break

@@ -56,6 +56,7 @@ class UsersUnits:
     def __init__(self, own: OwnUnits) -> None:
         self.program, self.decision, self.image = own.program, own.decision, own.image
         self.equalities, self.cost = own.equalities, own.cost
+        self._families = {family.name: family for family in own.program.families}
 
     def result(self, own: Result) -> Result:
         """A result of the program in its own units, in the user's."""
@@ -245,7 +246,7 @@ class UsersUnits:
 
     def _family(self, name: str) -> ConstraintFamily | None:
         """The family of that name; ``None`` for one that only the method knows, which then has no units."""
-        return next((family for family in self.program.families if family.name == name), None)
+        return self._families.get(name)
 
 
 def _in_units(sketch: Sketch, units: Array) -> Sketch:
