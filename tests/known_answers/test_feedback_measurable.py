@@ -136,6 +136,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 LONG = {
     "bounds of state and control together",
     "a polytope off the origin",
+    "a state that nothing pushes",
     "initial states in a set",
     "one channel that is known",
 }

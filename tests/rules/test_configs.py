@@ -67,6 +67,7 @@ SLOW = {  # every status, formulation and kind of uncertainty has a lighter conf
     "experiment2_repaired",
     "experiment3_literal",
     "experiment3_reduced",
+    "measurable_feedback",
     "parameters_and_disturbance",
 }
 SEARCHES = [f"experiment{number}_{formulation}" for number in (1, 2, 3) for formulation in ("reduced", "literal")]
