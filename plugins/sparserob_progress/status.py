@@ -98,7 +98,7 @@ def _bounds(lower: float, upper: float, gap: float) -> str:
 
 def _round(event: sr.RoundFinished) -> str:
     where = f" in {event.worst_family}" if event.worst_family else ""
-    cost = "" if math.isnan(event.cost) else f"  J {_number(event.cost)}"
+    cost = "" if math.isnan(event.cost) else f"  cost {_number(event.cost)}"
     return f"{event.round}{cost}  violation {event.violation:.1e}{where}  eps {event.epsilon:.1e}"
 
 

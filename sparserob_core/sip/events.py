@@ -133,7 +133,8 @@ class RoundFinished(Event):
     ``worst_family``; ``active_indices`` are the rows kept, ``cuts_added`` and ``cuts_dropped`` the change since the
     round before; ``seconds`` since the start.
 
-    ``decision (n,)`` has the ``cost`` J. ``separations``: per family what was found most violated at it, worst first.
+    ``decision (n,)`` has this ``cost``, of what the method minimises. ``separations``: per family what was found most
+    violated at it, worst first.
     ``imposed``: the constraints of this round's relaxed program, with their ``multipliers (r,)`` (the multiplier within
     each `Cut` is not filled); ``added`` and ``dropped``: how they differ from those of the round before.
     ``gap``: the relative gap of the two bounds (`sip.result.relative_gap`).

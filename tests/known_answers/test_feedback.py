@@ -490,6 +490,17 @@ def test_the_margin_of_a_policy_says_above_which_factor_no_causal_policy_exists(
     found = sr.margin(given, tolerance=1e-4)
     assert found.lower <= found.causal_upper
     assert found.causal_upper * 0.2 <= cap * (1.0 + 1e-6)
+    assert found.causal_ended in ("settled", "signals", "work")
+
+
+def test_the_margin_says_when_the_time_for_the_causal_bound_was_over(tmp_path: Path) -> None:
+    given = config({**springs(0.2, 0.5), "path": []}, 3)
+    given["policy"] = {**given["policy"], "causal_seconds": 0.0}
+    found = sr.margin(given, tolerance=1e-2, out=tmp_path / "margin")
+    assert found.causal_ended == "seconds"
+    assert json.loads((tmp_path / "margin" / "margin.json").read_text())["causal_ended"] == "seconds"
+    given["policy"] = {**given["policy"], "causal_signals": 0}
+    assert sr.margin(given, tolerance=1e-2).causal_ended is None
 
 
 @pytest.fixture(scope="module")

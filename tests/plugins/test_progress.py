@@ -94,7 +94,7 @@ def test_a_verbose_run_has_one_plain_line_for_every_event(monkeypatch: pytest.Mo
     ).splitlines()
     assert [line.partition("s  ")[2] for line in lines] == [
         (
-            "round 2  J 0.75  violation 1.0e-03 in path  eps 5.0e-01  lower 0.25  upper unknown  7 cuts  30 relaxed"
+            "round 2  cost 0.75  violation 1.0e-03 in path  eps 5.0e-01  lower 0.25  upper unknown  7 cuts  30 relaxed"
             " programs at 15/s"
         ),
         "proof of path  cells open 12  100 examined at 200/s  violation not excluded 1.0e-04",
@@ -136,7 +136,7 @@ def test_plain_lines_say_everything_that_is_known(monkeypatch: pytest.MonkeyPatc
         "lower 0.5",
         "upper unknown",
         "round 2",
-        "J 0.75",
+        "cost 0.75",
         "best g -0.5",
         "20 of 50 evaluations",
         "10/s",

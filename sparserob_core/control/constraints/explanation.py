@@ -178,7 +178,7 @@ def explanation(
     sign = -1.0 if np.count_nonzero(normal) == 1 and normal.sum() < 0 else 1.0
     parts = functionals.parts(time, direction, parameter)
     sigma = parts.sigma
-    free, limit = sign * parts.free + 0.0, sign * float(h[row])
+    free, limit = sign * parts.free + 0.0, sign * float(h[row]) + 0.0  # no negative zeros
     names = [
         name
         for name, moved in (("disturbance", sigma - parts.begun), ("initial state", parts.begun))
@@ -249,5 +249,5 @@ def _bound(words: str, limit: float, opposite: float | None, sign: float) -> str
     """``|x1| <= 0.7``, ``-0.2 <= x1 <= 0.3`` or ``x1 >= -0.7``, of a quantity in words."""
     if opposite is None:
         return f"{words} {'>=' if sign < 0 else '<='} {limit:.6g}"
-    low, high = sorted([limit, -sign * opposite])
+    low, high = sorted([limit, -sign * opposite + 0.0])
     return f"|{words}| <= {high:.6g}" if low == -high else f"{low:.6g} <= {words} <= {high:.6g}"

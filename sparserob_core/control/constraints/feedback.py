@@ -396,7 +396,7 @@ class FeedbackControl:
         time, direction = float(index[0]), self.H[row]
         terms = [f"{'-' if v < 0 else ''}{'' if abs(v) == 1 else f'{abs(v):.4g} '}u{i + 1}({time:.6g})"
                  for i, v in enumerate(direction) if v]  # fmt: skip
-        right = "its peak" if self.bound is not None else f"{self.h[row]:.6g}"
+        right = "its peak" if self.bound is not None else f"{self.h[row] + 0.0:.6g}"
         text = f"{self.name}: {' + '.join(terms)} <= {right}"
         said = TimedExplanation(text, self.name, text, time, direction)
         return told(said, self.loop, index[1:], controls=True)
@@ -477,7 +477,7 @@ class FeedbackSteps:
         """One constraint for people."""
         time = float(self.times[self._steps(index[:1])[0]])
         terms = " + ".join(f"{value:.4g} u{i + 1}" for i, value in enumerate(self.H[row]) if value)
-        text = f"{self.name}: the change of {terms} at {time:.6g} <= {self.h[row]:.6g}"
+        text = f"{self.name}: the change of {terms} at {time:.6g} <= {self.h[row] + 0.0:.6g}"
         return told(TimedExplanation(text, self.name, text, time, self.H[row]), self.loop, index[1:], True)
 
 

@@ -416,6 +416,12 @@ class LinearProblem(LinearKeys):
     def build(self) -> OptimalControlProblem:
         """The problem; raises `InputError` that begins with the key at fault."""
         system = self.system.build()
+        if self.initial_control is not None and self.control_step is None and not system.delay > 0.0:
+            raise InputError(
+                path="initial_control",
+                expected="control_step or a system.delay beside it, since the control before time 0 does nothing else",
+                got="neither of them",
+            )
         return OptimalControlProblem(
             system=system,
             horizon=self.horizon,

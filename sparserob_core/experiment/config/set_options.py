@@ -181,7 +181,8 @@ class PathOptions(SetOptions, populate_by_name=True):
             return found
         if self.relative_to is not None:
             raise InputError(
-                "moves a set of states; a mixed constraint beside it has none: write it as an entry of its own",
+                "moves the set of states that stands in the same entry, and a mixed constraint is about the state"
+                " itself: write that as an entry of its own",
                 path=f"{where}.relative_to",
             )
         return [*found, MixedConstraint(self.mixed.H, self.mixed.G, self.mixed.h, self.start, stop)]

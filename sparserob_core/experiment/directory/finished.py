@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 UNFINISHED = "the run has not finished"
 NUMBERS = ("cost", "value", "epsilon", "lower_bound", "upper_bound", "gap", "seconds")
+SAME = 1e-9  # of the largest number of an array, how far it may be from what follows from another
 LARGEST = 2**31
 """Bytes of arrays in one file, at most: no run writes as many, and a small file can pretend to hold any number."""
 IMPOSED = {"multipliers": "f", "times": "f", "indices": "f", "rows": "i", "families": "U"}
@@ -147,19 +148,62 @@ class FinishedRun:
     experiment: ControlExperiment
     theta: Array
 
-    @property
+    @cached_property
     def decision(self) -> Array:
         """The whole decision ``(n,)``: ``theta``, and under feedback the variables of the gains. Raises `InputError`
-        where ``solution.npz`` does not hold it."""
+        where ``solution.npz`` does not hold it, or where its arrays are not of one decision."""
         if self.experiment.transcription.feedback is None:
-            return self.theta.ravel()
-        found, shape = self.solution.get("decision", np.zeros(0)), (self.experiment.program.n,)
-        if found.shape != shape or found.dtype.kind != "f" or not np.isfinite(found).all():
-            raise InputError(
-                f"{self.directory / 'solution.npz'}: decision: expected finite numbers of shape {shape}, as config.yaml"
-                f" says, got {found.dtype} of shape {found.shape}"
-            )
+            found = self.theta.ravel()
+        else:
+            found, shape = self.solution.get("decision", np.zeros(0)), (self.experiment.program.n,)
+            if found.shape != shape or found.dtype.kind != "f" or not np.isfinite(found).all():
+                raise InputError(
+                    f"{self.directory / 'solution.npz'}: decision: expected finite numbers of shape {shape}, as"
+                    f" config.yaml says, got {found.dtype} of shape {found.shape}"
+                )
+        self._agrees(found)
         return found
+
+    def require_certified(self) -> None:
+        """Raise `InputError` where ``certificate.json``, if there is one, is about another control. Whether what it
+        claims of that control is true is for `check` to say."""
+        file = self.directory / "certificate.json"
+        said = read_json(file) if file.is_file() else {}
+        held = {"decision": self.theta, "gains": self.solution.get("gains", np.zeros(0))}
+        for name in (name for name in held if said.get(name) is not None):
+            try:
+                same = np.array_equal(np.array(said[name], dtype=float), held[name])
+            except (TypeError, ValueError, OverflowError):
+                same = False
+            if not same:
+                raise InputError(
+                    f"{self.directory}: {name}: solution.npz and certificate.json hold two different controls;"
+                    " sparserob check says what holds of the run"
+                )
+
+    def _agrees(self, decision: Array) -> None:
+        """Raise `InputError` where what ``solution.npz`` holds beside a decision is not what follows from it."""
+        model = self.experiment.transcription
+        followed = {"theta": model.nominal(decision), "control": model.pieces(decision)}
+        if model.feedback is not None:
+            followed["gains"] = model.feedback.loop.gains(decision)
+        elif self.solution.get("decision", np.zeros(0)).shape == decision.shape:
+            followed["decision"] = decision
+        for name, value in followed.items():
+            held = self.solution.get(name)
+            if held is None and name != "gains":
+                continue
+            size = float(np.abs(value).max(initial=0.0))
+            if (
+                held is None
+                or held.size != value.size
+                or held.dtype.kind != "f"
+                or not (np.abs(held.ravel() - value.ravel()) <= SAME * size).all()
+            ):
+                raise InputError(
+                    f"{self.directory / 'solution.npz'}: {name}: expected what follows from the decision beside it, got"
+                    " another control; sparserob check says what holds of the run"
+                )
 
     @property
     def directory(self) -> Path:

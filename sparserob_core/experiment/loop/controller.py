@@ -67,6 +67,7 @@ def _planned(config: object, plugins: Iterable[str | Path]) -> tuple[Plan, Contr
         return _plan(experiment, result.status, result.message, result.decision, result.indices)
     if isinstance(config, str | Path) and Path(config).is_dir():
         finished = read_finished(Path(config), plugins)
+        finished.require_certified()
         status, message = str(finished.summary["status"]), str(finished.summary["message"])
         return _plan(finished.experiment, status, message, finished.decision)
     if not isinstance(config, str | Path | Mapping):

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sparserob_core.control.studies.causal import Limits
+from sparserob_core.control.studies.causal import Ended, Limits
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.experiment.margin.scaling import Scaling
 from sparserob_core.experiment.run.causal import active, proven, searched
@@ -23,8 +23,9 @@ def causal_upper(
     results: dict[float, Result],
     tools: Tools,
     notify: Notify,
-) -> float:
-    """A factor at which, and above which, no causal policy exists, by checked multipliers; NaN where none was found.
+) -> tuple[float, Ended | None]:
+    """A factor at which, and above which, no causal policy exists, by checked multipliers, NaN where none was found;
+    and why the search for it ended, ``None`` where there was none.
 
     A policy for a set serves every smaller one, so that what is excluded at a factor is excluded above. ``model_at``
     transcribes the problem at a factor, ``results`` are the policy's own runs by their factor.
@@ -37,7 +38,7 @@ def causal_upper(
     assert model.feedback is not None
     policy, result = model.feedback.policy, results.get(base)
     if not policy.causal_signals:
-        return np.nan
+        return np.nan, None
     notify(StudyProgress(text=f"looking for the factor of {scaling.of} above which no causal policy exists"))
     refused = [one for factor, one in results.items() if one.status == "infeasible" and factor > 0.0]
     rests = [] if result is None else active(model, result)
@@ -46,14 +47,14 @@ def causal_upper(
     limits = Limits.of(policy, list(results.values()), model.program.n, lambda: tools.deadline.passed)
     found = search.largest_factor(scaling.highest / base, limits)
     if found is None:
-        return np.nan
+        return np.nan, limits.ended
     tree, grown = found
     for step in BEYOND:
         factor = base * grown.value * (1.0 + step)
         if not 0.0 < factor <= scaling.highest:
-            return np.nan
+            break
         problem = scaling.at(factor)
         stated = search.bound(tree, grown, np.inf, problem.disturbance, limits.ended, factor / base)
         if proven(model, problem, stated) is not None:
-            return factor
-    return np.nan
+            return factor, limits.ended
+    return np.nan, limits.ended

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.studies.causal import Ended
 from sparserob_core.errors import InputError, SparseRobError
 from sparserob_core.experiment.assemble import ControlExperiment, assemble, name_of, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
@@ -89,7 +90,8 @@ def margin_rows(found: Margin) -> list[tuple[str, str]]:
         (found.quantity, _between(*found.amounts)),
     ]
     if np.isfinite(found.causal_upper):
-        rows.append(("no causal policy", f"from the factor {found.causal_upper:.9g} on"))
+        over = " (the time for the search was over)" if found.causal_ended == "seconds" else ""
+        rows.append(("no causal policy", f"from the factor {found.causal_upper:.9g} on{over}"))
     for name, point in (("proven feasible", found.feasible), ("proven infeasible", found.infeasible)):
         if point is not None:
             cost = f", cost {point.upper_bound:.9g}" if np.isfinite(point.upper_bound) else ""
@@ -145,7 +147,7 @@ def _search(loaded: Loaded, of: str, tolerance: float, notify: Notify) -> Margin
     if policy is None or of != "disturbance":
         return search
 
-    def beyond(results: dict[float, Result]) -> float:
+    def beyond(results: dict[float, Result]) -> tuple[float, Ended | None]:
         return causal_upper(
             lambda factor: prepare(chosen.at(factor), control, disturbance, policy=policy),
             chosen,

@@ -10,6 +10,7 @@ from typing import Literal, TypeAlias, final
 
 import numpy as np
 
+from sparserob_core.control.studies.causal import Ended
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.margin.critical import Critical, critical_factor
 from sparserob_core.experiment.margin.scaling import Scaling, Sense
@@ -68,6 +69,9 @@ class Margin:
     the cells ``covered`` fill, each proven by one set of multipliers with the horizon as a parameter; at ``upper`` a
     control is proven, the shortest for which one was found. ``infeasible``: no horizon up to the config's is feasible.
     ``curve``: runs at equally spaced horizons, feasible or not.
+
+    Under a policy, of the ``disturbance``: at ``causal_upper`` and above no causal policy exists; ``causal_ended`` says
+    why no smaller factor was sought (as in ``result.json``), ``None`` where none was.
     """
 
     title: str
@@ -87,6 +91,7 @@ class Margin:
     directory: Path | None = None
     covered: tuple[tuple[float, float], ...] = ()
     causal_upper: float = np.nan
+    causal_ended: Ended | None = None
 
 
 @final
@@ -95,7 +100,7 @@ class MarginSearch:
     """One search. ``programs``: those of ordinary runs, by their factor; ``joined``: the same in units that do not
     depend on it, where the factor enters linearly. ``width``: how close the two sides are to be, relative to the factor
     if that is above 1. ``beyond``: what tells, of the ``results`` by their factor, above
-    which factor nothing exists that answers the disturbance in whatever way."""
+    which factor nothing exists that answers the disturbance in whatever way, and why no smaller one was sought."""
 
     title: str
     programs: ParametricProgram
@@ -108,7 +113,7 @@ class MarginSearch:
     points: list[Point] = field(default_factory=list)
     seen: dict[float, str] = field(default_factory=dict)
     results: dict[float, Result] = field(default_factory=dict)
-    beyond: Callable[[dict[float, Result]], float] | None = None
+    beyond: Callable[[dict[float, Result]], tuple[float, Ended | None]] | None = None
 
     def margin(self, count: int) -> Margin:
         """The margin, with a curve of ``count`` points."""
@@ -123,10 +128,10 @@ class MarginSearch:
             said = str(pressed) or "interrupted from the keyboard"
             sides, known = self._known(said, sides)
             curve = known if count else ()
-        causal = np.nan
+        causal, ended = np.nan, None
         if self.beyond is not None:
             try:
-                causal = self.beyond(self.results)
+                causal, ended = self.beyond(self.results)
             except KeyboardInterrupt as pressed:
                 self.tools.deadline.interrupt(pressed)
         status, message, feasible, infeasible = sides
@@ -149,6 +154,7 @@ class MarginSearch:
             infeasible=infeasible,
             curve=curve,
             causal_upper=causal,
+            causal_ended=ended,
             seconds=time.perf_counter() - started,
         )
 

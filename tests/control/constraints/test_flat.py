@@ -266,3 +266,11 @@ def test_the_explanation_of_a_constraint_carries_its_worst_disturbance():
     assert words.time == 1.3
     assert words.disturbance.shape == (2, 6)
     assert "the disturbance alone moves it by" in words.text
+
+
+def test_a_bound_at_zero_has_no_sign():
+    functionals = worst_case(random_system(np.random.default_rng(0), 2), GRIDS["uniform"], None, None)
+    both, none = np.array([[-1.0, 0.0], [1.0, 0.0]]), ParameterIndex(None)
+    constraint = FlatConstraint("path", functionals, both, np.array([0.0, 0.0]), 0.0, HORIZON, none)
+    below = constraint.explain(np.array([1.5]), 0)
+    assert below.statement == "path: x1(1.5) >= 0" and "-0" not in below.bound

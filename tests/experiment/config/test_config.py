@@ -67,6 +67,12 @@ def edited(config: Path, old: str, new: str) -> Path:
         ("B: [[0], [1]]", "B: [0, 1]", "problem.system.B", "list"),
         ("control: {box: 1.0}", "control: {bax: 1.0}", ":9:13: problem.control.bax:", "did you mean 'box'?"),
         ("control: {box: 1.0}", "control: {box: {lower: 2, upper: 1}}", ":9:13: problem.control.box", "above"),
+        (
+            "horizon: 2.0",
+            "horizon: 2.0\n  initial_control: 0.5",
+            ":8:3: problem.initial_control:",
+            "expected control_step or a system.delay beside it",
+        ),
         ("pieces: 10", "pieces: ten", ":12:39: dictionaries.control.pieces:", "must be a whole number"),
         ("pieces: 10", "pieces: 0", ":12:39: dictionaries.control.pieces:", "greater than or equal to 1"),
         ("pieces: 10", "peices: 10", ":12:39: dictionaries.control.peices:", "did you mean 'pieces'?"),

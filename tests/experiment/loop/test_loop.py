@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -136,3 +137,31 @@ def test_what_is_no_run_is_refused(tmp_path, capsys) -> None:
     assert status("loop", tmp_path / "nothing.yaml") == 2
     assert status("loop", tmp_path) == 2
     assert "expected the directory of a run" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["theta", "control", "gains", "decision"])
+def test_another_control_than_the_proven_one_is_not_applied(name: str, outcome, tmp_path) -> None:
+    """Whoever changes one array of solution.npz is found out by the others and by the certificate."""
+    copy = tmp_path / "copy"
+    shutil.copytree(outcome.directory, copy)
+    arrays = dict(np.load(copy / "solution.npz"))
+    sr.controller(copy)
+    changed = arrays[name].copy()
+    changed.flat[int(np.abs(changed).argmax())] += 1e-3
+    np.savez(copy / "solution.npz", **{**arrays, name: changed})
+    with pytest.raises(sr.InputError, match="sparserob check says"):
+        sr.controller(copy)
+    with pytest.raises(sr.InputError, match="sparserob check says"):
+        sr.loop(copy, trajectories=1)
+
+
+def test_a_whole_policy_that_was_exchanged_is_not_applied(outcome, tmp_path) -> None:
+    """All arrays of solution.npz agree, with a control without gains, which is not that of the certificate."""
+    copy = tmp_path / "copy"
+    shutil.copytree(outcome.directory, copy)
+    arrays = dict(np.load(copy / "solution.npz"))
+    arrays["decision"][arrays["theta"].size :] = 0.0
+    arrays["gains"][:] = 0.0
+    np.savez(copy / "solution.npz", **arrays)
+    with pytest.raises(sr.InputError, match=r"gains: .* hold two different controls"):
+        sr.controller(copy)
