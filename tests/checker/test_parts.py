@@ -10,6 +10,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
+import scipy.linalg
 from flint import arb, ctx
 
 import sparserob_core as sr
@@ -21,7 +22,7 @@ from sparserob_core.checker.claims.duality import Duality
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.reach import disturbance_support
 from sparserob_core.checker.reach.disturbance_support import Scene
-from sparserob_core.checker.reach.flow import Flow, stacked
+from sparserob_core.checker.reach.flow import Flow, flows, stacked
 from sparserob_core.checker.reach.tube import Tube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.expression import parse_matrix
@@ -260,6 +261,44 @@ def test_tubes_are_above_the_worst_case_and_not_far_above(nu, spread, degree, ne
                 assert (value - poly.error - poly.kinks <= truth + 1e-13).all()
 
 
+def test_ages_hold_wherever_one_looks_from_or_equal_pieces_are_not_taken_for_it():
+    """`_uneven` promises for all places at once what is otherwise looked at for each of them."""
+    rng, bound, start = np.random.default_rng(4), SETS["box"], np.array([-1.0, 0.5])
+    for off, promised in ((0.0, True), (1e-13, False), (1e-4, False)):
+        ends = np.linspace(0.0, 3.0, 61)
+        ends[1:-1] += off * rng.uniform(-1, 1, size=59)
+        control = sr.Dictionary.indicators(ends)
+        with ctx.workprec(96):
+            tube, _, _ = tube_of(plant(0, 0.0), control, control, bound, 0, np.zeros(60), start)
+            sigmas = tube.sigmas[0]
+            jumps, tick = sigmas._jumps, tube.scene.tick
+            off_by = [
+                np.abs((node - jumps[k::-1]) / tick - sigmas._ages[: k + 1]).max() for k, node in enumerate(jumps)
+            ]
+            assert (sigmas._uneven <= 1.0) == promised
+            assert max(off_by) <= sigmas._uneven
+            found = sigmas._of_equal_pieces(known(bound), float(jumps[40]), 0, np.eye(2))
+            assert (found is None) == (off_by[40] > 1.0)
+            assert (found is None) == (not promised)
+
+
+def test_a_lag_is_the_exponential_of_the_whole_way_whatever_it_was_carried_on_from():
+    """`_lags` goes from time to time; on pieces of many lengths, over many of them, it holds what one step gives."""
+    ends = np.concatenate([np.linspace(0.0, 1.0, 150), 1.0 + np.sort(np.random.default_rng(5).uniform(0.0, 2.0, 40))])
+    stiff = LinearSystem(np.array([[0.0, 40.0], [-40.0, -0.1]]), np.eye(2), E=np.eye(2))
+    problem = sr.OptimalControlProblem(
+        system=stiff, horizon=float(ends[-1]), initial_state=[1.0, 0.0], control=Box(-np.ones(2), np.ones(2))
+    )
+    with ctx.workprec(96):
+        duality, time = Duality(problem, sr.Dictionary.indicators(ends), None), float(ends[-3])
+        lags = duality._lags(flows(stiff, ()), np.array([1.0, 2.0]), time, {float(s) for s in ends[:-3]})
+        assert len(lags) == ends.size - 3
+        for s, lag in lags.items():
+            exact = scipy.linalg.expm(stiff.A.T * (time - s)) @ [1.0, 2.0]
+            assert [float(x.mid()) for x in lag[:2]] == pytest.approx(exact.tolist(), abs=1e-11)
+            assert max(float(x.rad()) for x in lag) < 1e-15
+
+
 @pytest.mark.parametrize("name", ["box", "polytope", "zonotope"])
 def test_sums_over_equal_pieces_are_those_piece_by_piece_and_no_further_off(name):
     rng, bound, control = np.random.default_rng(2), SETS[name], uniform(41, 2.0)
@@ -272,11 +311,12 @@ def test_sums_over_equal_pieces_are_those_piece_by_piece_and_no_further_off(name
             a, b = tubes[0].scene.grid[piece], tubes[0].scene.grid[piece + 1]
             for begin, end in ((a, b), (a + 0.25 * (b - a), b), (b, b)):
                 ticks = tubes[0].scene.ticks(begin, end)
-                with patch.object(disturbance_support, "FEWEST_SUMMED", 1):
+                with patch.object(disturbance_support, "FEWEST_SUMMED", (1, 1)):
                     sums = tubes[0].sigmas[0]._of_equal_pieces(known(bound), begin, ticks, z)
                     assert sums is not None
                     moved, error, kinks = sums
-                plain, off, _ = tubes[1].sigmas[0].bounds(begin, ticks, z, False)
+                with patch.object(disturbance_support, "FEWEST_SUMMED", (1_000, 1_000)):
+                    plain, off, _ = tubes[1].sigmas[0].bounds(begin, ticks, z, False)
                 assert (np.abs(moved - plain).sum(axis=(1, 2)) <= error + off).all()
                 assert (error <= 1.01 * off + 1e-14).all()
                 assert (kinks <= error).all()

@@ -143,7 +143,7 @@ def test_a_control_outside_a_small_component_is_refused_with_any_multiplier() ->
 def test_a_row_of_a_polytope_of_controls_means_the_same_at_any_factor(factor: float) -> None:
     H, h = np.array([[1.0, 0], [-1, 0], [0, 1], [0, -1], [factor, factor]]), np.array([1, 1, 1, 1, 0.5 * factor])
     shape = sr.Polytope(H, h)
-    assert known(shape).units()[4] == pytest.approx(0.5 * factor, rel=1e-12)
+    assert known(shape).units[4] == pytest.approx(0.5 * factor, rel=1e-12)
     for point, over in (([0.25, 0.25 + 1e-8], 2e-8), ([0.95, 0.95], 2.8), ([0.25, 0.2], 0.0)):
         found, where = known(shape).excess([arb(x) for x in point])
         assert found == pytest.approx(over, rel=1e-6)

@@ -146,15 +146,20 @@ class Case:
         return self.on_pieces(self.theta)
 
     def on_pieces(self, coefficients: Array) -> list[arb_mat]:
-        """A control ``(m, 1)`` on every piece of its dictionary, from coefficients ``(m, N)``."""
-        from flint import arb
+        """A control ``(m, 1)`` on every piece of its dictionary, from coefficients ``(m, N)``; equal ones are one
+        object."""
+        from flint import arb, arb_mat
 
         columns, none = self.control.sparse.tocsc(), arb(0)
-        found = []
+        found, made = [], dict[bytes, arb_mat]()
         for start, stop in pairwise(columns.indptr.tolist()):
-            terms = list(zip(columns.indices[start:stop].tolist(), columns.data[start:stop].tolist(), strict=True))
-            rows = [sum((arb(float(row[i])) * arb(v) for i, v in terms), none) for row in coefficients]
-            found.append(stacked([[x] for x in rows]))
+            which, values = columns.indices[start:stop], columns.data[start:stop]
+            key = coefficients[:, which].tobytes() + values.tobytes()
+            if key not in made:
+                terms = list(zip(which.tolist(), values.tolist(), strict=True))
+                rows = [sum((arb(float(row[i])) * arb(v) for i, v in terms), none) for row in coefficients]
+                made[key] = stacked([[x] for x in rows])
+            found.append(made[key])
         return found
 
     @cached_property
@@ -164,9 +169,9 @@ class Case:
         which = np.clip(np.searchsorted(self.acting, middles, side="right") - 1, 0, len(self.acting) - 1)
         changes, constants = self.changes, 0 if self.problem.system.c is None else 1
         known = [stacked([[v] for v in balls([*before(self.problem)])])] if self.problem.system.delay > 0.0 else []
-        inputs = [
-            stacked([[v] for v in (*piece.entries(), *balls([1.0] * constants))]) for piece in (*known, *self.pieces)
-        ]
+        inputs = [*known, *self.pieces]
+        if constants:
+            inputs = [stacked([[v] for v in (*piece.entries(), *balls([1.0]))]) for piece in inputs]
         return Scene(
             self.grid,
             [inputs[k] for k in which],

@@ -11,6 +11,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import cached_property
 from typing import TYPE_CHECKING, final
 
@@ -27,6 +28,9 @@ from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
     from flint import arb, arb_mat
+
+
+LEAPS = 64  # times in a row that a lag is carried on from the one before
 
 
 @final
@@ -122,15 +126,26 @@ class Duality:
 
     def _lags(self, every: Sequence[Flow], direction: Array, time: float, since: set[float]) -> dict[float, list[arb]]:
         """``c'e^{A (t - s)}`` and its integrals from each of the times ``since`` to ``time``, times ``B`` and ``E``;
-        back through the systems that took turns until then."""
+        back through the systems that took turns until then. From one time to the next by the exponential of the step,
+        which is the same wherever pieces are equally long; every `LEAPS` times anew, since balls grow."""
+        from flint import arb_mat
+
         switches, d = self.problem.system.switches, direction.size
         matrices = [_joined(flow) for flow in every]
         column, found = [_exact(v) for v in (*direction, *np.zeros(matrices[0].nrows() - d))], {}
         for leg in range(bisect_left(switches, time), -1, -1):
             begin, end = (0.0, *switches)[leg], min((*switches, time)[leg], time)
             row, totals = stacked([[v] for v in column[:d]] + [[_exact(0.0)] for _ in column[d:]]), column[d:]
-            for s in {begin, *(s for s in since if begin <= s < end)}:
-                lag = ((matrices[leg] * (_exact(end) - _exact(s))).exp() * row).entries()
+            steps, latest, moved = dict[Fraction, arb_mat](), end, row
+            for number, s in enumerate(sorted({begin, *(s for s in since if begin <= s < end)}, reverse=True)):
+                if number % LEAPS == 0:
+                    moved = (matrices[leg] * (_exact(end) - _exact(s))).exp() * row
+                else:
+                    length = Fraction(latest) - Fraction(s)
+                    if length not in steps:
+                        steps[length] = (matrices[leg] * (_exact(latest) - _exact(s))).exp()
+                    moved = steps[length] * moved
+                latest, lag = s, moved.entries()
                 found[s] = lag[:d] + [a + b for a, b in zip(lag[d:], totals, strict=True)]
             column = found[begin]
         return found

@@ -94,7 +94,7 @@ class FeedbackClaims:
         for k, effect in enumerate(loop.effects):
             self.case.clock.check()
             v = balls(loop.nominal[:, k])
-            for (c, b), unit in zip(flat, known(shape).units(), strict=True):
+            for (c, b), unit in zip(flat, known(shape).units, strict=True):
                 along = [_dot(c, [row[q] for row in effect]) for q in range(len(effect[0]))] if effect else []
                 height = _dot(c, v) + loop.support(along)
                 unit = max(unit, RESOLVED * float((abs(height) + abs(b)).mid())) or 1.0
@@ -128,7 +128,7 @@ class FeedbackClaims:
         for k in found:
             case.clock.check()
             heights = loop.heights(self._change(k), rows)
-            for (_, b), height, unit in zip(shape.facets, heights, shape.units(), strict=True):
+            for (_, b), height, unit in zip(shape.facets, heights, shape.units, strict=True):
                 over = float((height - b).upper()) / (max(unit, RESOLVED * float((abs(height) + abs(b)).mid())) or 1.0)
                 if over > TOLERANCE:
                     raise Broken(
@@ -336,14 +336,14 @@ class FeedbackClaims:
             columns = [[row[q] for row in effect] for q in range(len(effect[0]))]
             over = [_dot(c, v) + loop.support([_dot(c, column) for column in columns]) - b for c, b in sides]
             return [float(value.mid()) for value in over], TOLERANCE * max(
-                known(case.problem.control).units(), default=1.0
+                known(case.problem.control).units, default=1.0
             )
         if name == STEP and case.problem.control_step is not None:
             sides = known(case.problem.control_step).facets
             if sides is None or time not in loop.breakpoints[:-1]:
                 raise Broken(f"there is no step at t = {time!r}")
             found = loop.heights(self._change(loop.breakpoints.index(time)), np.array([c for c, _ in sides]))
-            slack = TOLERANCE * max(known(case.problem.control_step).units(), default=1.0)
+            slack = TOLERANCE * max(known(case.problem.control_step).units, default=1.0)
             return [float((height - b).mid()) for height, (_, b) in zip(found, sides, strict=True)], slack
         if name == EQUALS and case.equalities:
             state = self._last(loop)
@@ -387,7 +387,7 @@ class FeedbackClaims:
             k = int(np.clip(bisect_right(loop.breakpoints, time) - 1, 0, case.control.pieces - 1))
             acting = loop.acting(k) if name == self.of_control else self._change(k)
             limit = known(held).limit(direction)
-            unit = 1.0 if known(held).facets is None else max(known(held).units(), default=1.0)
+            unit = 1.0 if known(held).facets is None else max(known(held).units, default=1.0)
             return _dot(direction, [row[0] + _along(row[1:], z) for row in acting.tolist()]) - limit, TOLERANCE * unit
         if not window.start <= time <= window.stop:
             raise Broken(f"t = {time!r} is not within {window.start:g} to {window.stop:g}")

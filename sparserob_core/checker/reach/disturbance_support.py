@@ -15,7 +15,7 @@ from sparserob_core.checker.arithmetic.bernstein import bernstein
 from sparserob_core.checker.arithmetic.series import Series
 from sparserob_core.checker.reach.flow import Flow, in_time, stacked, up_to
 from sparserob_core.checker.sets.known import known
-from sparserob_core.checker.sets.polynomials import OUTWARD, ROUNDING, Enclosed, lengths, rounding
+from sparserob_core.checker.sets.polynomials import HALF_ULP, OUTWARD, ROUNDING, Enclosed, lengths, rounding
 from sparserob_core.checker.sets.shape import Shape
 from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.sip.convex_set import Array
@@ -24,7 +24,10 @@ if TYPE_CHECKING:
     from flint import arb, arb_mat
 
 TABLES_KEPT = 8  # parts of pieces whose integrals are remembered
-FEWEST_SUMMED = 256  # pieces from which sums over them are remembered
+FEWEST_SUMMED = (
+    16,
+    256,
+)  # pieces from which sums over them are remembered: of a known system, over a box of parameters
 SAME = 1e-14  # of the horizon: durations closer than this are treated as one ball that holds them all
 
 
@@ -47,7 +50,7 @@ class Scene:
         """Which system acts on a piece of the grid; the last one at its end."""
         return bisect_right(self.switches, self.grid[piece]) if piece < len(self.grid) - 1 else len(self.switches)
 
-    @property
+    @cached_property
     def tick(self) -> float:
         """The unit in which durations are told apart."""
         return SAME * self.grid[-1]
@@ -304,13 +307,16 @@ class DisturbanceSupports:
         """`bounds` where what a piece adds depends on its age alone, since they are equally long: a sum over the ages,
         which is remembered; ``None`` where they are not, or are few."""
         grid, count = self.scene.grid, int(np.searchsorted(self._jumps, start, side="right"))
-        if count < FEWEST_SUMMED or self.scene.switches:
+        if count < FEWEST_SUMMED[bool(self.flow.centre)] or self.scene.switches:
             return None
         # no piece begins at the end, which is looked at from the beginning of the last one
         node = float(self._jumps[-1]) if start == grid[-1] else grid[bisect_right(grid, start) - 1]
         ages = self._ages[:count]
         # an age may be off by a tick, and its offset by half of one: two are allowed for (`_factors`)
-        if not np.abs((node - self._jumps[count - 1 :: -1]) / self.scene.tick - ages).max() <= 1.0:
+        late = abs(node - float(self._jumps[count - 1])) / self.scene.tick
+        if late + self._uneven > 1.0 and not (
+            np.abs((node - self._jumps[count - 1 :: -1]) / self.scene.tick - ages).max() <= 1.0
+        ):
             return None
         offset = round((start - node) / self.scene.tick)
         key = (offset, ticks, z.tobytes())
@@ -359,6 +365,14 @@ class DisturbanceSupports:
     def _ages(self) -> Array:
         """How long before the latest jump every piece began, in ticks, first the latest."""
         return np.asarray(np.rint((self._jumps[-1] - self._jumps[::-1]) / self.scene.tick).astype(int))
+
+    @cached_property
+    def _uneven(self) -> float:
+        """How far the time since a piece began may be from its age, in ticks, wherever one looks from: four times what
+        the beginnings are off equal distances by (twice for the time, twice for the age), an age's own rounding, and
+        that of these numbers."""
+        even = np.linspace(self._jumps[0], self._jumps[-1], self._jumps.size)
+        return float(4.0 * np.abs(self._jumps - even).max() / self.scene.tick) + 0.5 + 16.0 * HALF_ULP / SAME
 
     @cached_property
     def _jumps(self) -> Array:

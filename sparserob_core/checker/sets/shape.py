@@ -93,6 +93,7 @@ class Shape(ABC):
         """Numbers ``y (k,) >= 0`` with ``c`` the sum of the facets' normals times ``y``, to rounding."""
         raise Unchecked(f"the checker does not know the facets of a {self.source.kind}")
 
+    @cached_property
     def units(self) -> list[float]:
         """The own unit of every facet of a flat set: the smallest that is not zero of how far it reaches over the set,
         the width between it and the opposite facet, and what else the kind of set names."""
@@ -180,7 +181,7 @@ class Shape(ABC):
                 raise Unchecked("the size of a point cannot be bounded")
             return max(0.0, float((gauge - 1).upper())), "it"
         worst, where = 0.0, ""
-        for number, ((c, b), unit) in enumerate(zip(self.facets, self.units(), strict=True)):
+        for number, ((c, b), unit) in enumerate(zip(self.facets, self.units, strict=True)):
             terms = [a * x for a, x in zip(balls(c), point, strict=True) if not a.is_zero()]
             unit = max(unit, RESOLVED * float((abs(b) + total(abs(t) for t in terms)).mid())) or 1.0
             over = float((total(terms) - b).upper()) / unit
