@@ -3,74 +3,162 @@ basis."""
 
 from __future__ import annotations
 
-from typing import Any, final
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.finite import FiniteProgram
+from sparserob_core.sip.inner.vertex import simplex
 
 ROUNDING = 2.0**-46  # of the numbers that are added up
+FEASIBLE = 1e-10  # a violation that is none
+PIVOTS, MORE = 100, 20  # steps after which HiGHS is asked, and as many more for every row
+LEAST = 1e-9  # of the largest: a change of a slope that is no pivot
+SINGULAR = 1e11  # entries of an inverse that nothing is computed from
 
 
 @final
 class WarmProgram:
     """Minimise ``sum_k weights_k |x_k|`` over ``lower <= x <= upper (n,)``, which hold 0, and rows ``G x <= h``.
 
-    Rows are added with `add`; `solve` says the right-hand sides. HiGHS goes on from its last basis (Huangfu and Hall
-    2018, dual simplex): a basis that was optimal stays dual feasible when right-hand sides change.
+    Rows are added with `add`; `solve` says the right-hand sides. The dual simplex method for piecewise linear costs
+    (Fourer 1985): with multipliers ``y`` the slope of entry ``k`` is ``(G'y)_k``, and the entry is at 0 while that is
+    within its weight, at a bound beyond. A basis is as many ``rows`` with multipliers as entries whose slope is at its
+    limit, ``free`` between 0 and a bound; the rows then say where. Where one is beyond, or a row is violated, the
+    multipliers move until the dual no longer rises, over as many limits of other slopes as that takes. A basis that was
+    optimal is one for other right-hand sides. Where no basis is found in time, HiGHS begins anew.
     """
 
     def __init__(self, weights: Array, lower: Array, upper: Array) -> None:
-        import highspy
-
-        self._optimal = highspy.HighsModelStatus.kOptimal
         self.weights, self.lower, self.upper = weights, lower, upper
         self.G = np.zeros((0, weights.size))
-        n = weights.size
-        self._highs: Any = highspy.Highs()
-        for name, value in (("output_flag", False), ("presolve", "off"), ("solver", "simplex"), ("threads", 1)):
-            self._highs.setOptionValue(name, value)
-        self._highs.setOptionValue("primal_feasibility_tolerance", 1e-10)
-        self._highs.setOptionValue("dual_feasibility_tolerance", 1e-10)
-        self._highs.addVars(2 * n, np.zeros(2 * n), np.concatenate([upper, -lower]))
-        self._highs.changeColsCost(2 * n, np.arange(2 * n, dtype=np.int32), np.concatenate([weights, weights]))
+        self._begin()
+
+    def _begin(self) -> None:
+        """The basis of no rows: everything is at 0."""
+        n = self.weights.size
+        self._rows, self._free = list[int](), list[int]()
+        self._side = list[
+            int
+        ]()  # of every free entry: 1 where its slope is at its weight, so that it is at most 0; or -1
+        self._place = np.zeros(n)  # -1, 0 or 1: at its lower bound, at 0, at its upper bound
 
     def add(self, G: Array) -> None:
         """More rows ``(r, n)``."""
-        r, n = G.shape
-        starts, places = np.arange(r, dtype=np.int32) * (2 * n), np.tile(np.arange(2 * n, dtype=np.int32), r)
-        free = np.full(r, np.inf)
-        self._highs.addRows(r, -free, free, places.size, starts, places, np.hstack([G, -G]).ravel())
         self.G = np.vstack([self.G, G])
 
     def keep(self, wanted: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Leave out rows but for those that are ``wanted (r,)`` and those that are active now, so that the basis is one
-        without them too; which rows are kept ``(r,)``."""
-        import highspy
-
-        basis, basic = self._highs.getBasis(), highspy.HighsBasisStatus.kBasic
-        status = list(basis.row_status) if basis.valid else [basic] * wanted.size
-        kept: NDArray[np.bool_] = wanted | np.array([one != basic for one in status], dtype=bool)
-        gone = np.flatnonzero(~kept).astype(np.int32)
-        self._highs.deleteRows(gone.size, gone)
-        if basis.valid:
-            basis.row_status = [one for one, stays in zip(status, kept, strict=True) if stays]
-            self._highs.setBasis(basis)
+        """Leave out rows but for those that are ``wanted (r,)`` and those that have multipliers now, so that the basis
+        is one without them too; which rows are kept ``(r,)``."""
+        kept = wanted.copy()
+        kept[self._rows] = True
+        number = np.cumsum(kept) - 1
+        self._rows = [int(number[row]) for row in self._rows]
         self.G = self.G[kept]
         return kept
 
     def solve(self, h: Array) -> tuple[Array, Array] | None:
         """``x (n,)`` and multipliers ``y (r,)``, for right-hand sides ``h (r,)``; ``None`` where there is no
         optimum."""
-        self._highs.changeRowsBounds(h.size, np.arange(h.size, dtype=np.int32), np.full(h.size, -np.inf), h)
-        self._highs.run()
-        if self._highs.getModelStatus() != self._optimal:
+        try:
+            found = self._pivoted(h)
+        except np.linalg.LinAlgError:
+            found = None
+        if found is not None:
+            return found
+        self._begin()
+        n, none = self.weights.size, np.zeros(0)
+        program = FiniteProgram(np.zeros(n), self.weights, self.lower, self.upper, self.G, h, np.zeros((0, n)), none)
+        corner = simplex(program)
+        return (corner.x, corner.y) if corner.status == "optimal" else None
+
+    def _pivoted(self, h: Array) -> tuple[Array, Array] | None:
+        """The answer by steps from the last basis; ``None`` where they lead nowhere."""
+        for _ in range(PIVOTS + MORE * h.size):
+            x = np.where(self._place > 0.0, self.upper, np.where(self._place < 0.0, self.lower, 0.0))
+            x[self._free] = 0.0
+            rest, columns = h - self.G @ x, self.G[:, self._free]
+            inverse = np.linalg.inv(columns[self._rows])
+            if not np.abs(inverse).max(initial=0.0) < SINGULAR:
+                return None
+            x[self._free] = at = inverse @ rest[self._rows]
+            y = (self.weights[self._free] * self._side) @ inverse
+            slack = rest - columns @ at
+            slack[self._rows] = np.inf
+            row = int(slack.argmin()) if slack.size else -1
+            short = -float(slack[row]) if slack.size else 0.0
+            beyond, entry, up = self._furthest(at.tolist())
+            if max(beyond, short) <= FEASIBLE:
+                multipliers = np.zeros(h.size)
+                multipliers[self._rows] = np.maximum(y, 0.0)
+                return np.minimum(np.maximum(x, self.lower), self.upper), multipliers
+            if short >= beyond:  # the multiplier of the row rises from 0
+                change = -self.G[row, self._free] @ inverse
+                moved, kept = self.G[row] + change @ self.G[self._rows], self._free
+            else:  # the slope of the entry leaves its limit
+                change = inverse[entry] if up else -inverse[entry]
+                moved, kept = change @ self.G[self._rows], self._free[:entry] + self._free[entry + 1 :]
+                self._place[self._free[entry]] = (1 - self._side[entry]) // 2 - up
+            moved[kept] = 0.0
+            end = self._end(y, change, moved, max(beyond, short))
+            if end is None:
+                return None
+            leaving, entering = end
+            if leaving is not None:
+                del self._rows[leaving]
+            if short >= beyond:
+                self._rows.append(row)
+            else:
+                del self._free[entry], self._side[entry]
+            if entering is not None:
+                self._free.append(entering[0])
+                self._side.append(entering[1])
+        return None
+
+    def _furthest(self, at: list[float]) -> tuple[float, int, bool]:
+        """By how much the free entry that is furthest out is beyond 0 or its bound, which one it is, and whether it is
+        below."""
+        found = (0.0, -1, False)
+        for number, (value, free, side) in enumerate(zip(at, self._free, self._side, strict=True)):
+            low, high = (0.0, float(self.upper[free])) if side < 0 else (float(self.lower[free]), 0.0)
+            found = max(found, (low - value, number, True), (value - high, number, False))
+        return found
+
+    def _end(
+        self, y: Array, change: Array, moved: Array, rising: float
+    ) -> tuple[int | None, tuple[int, int] | None] | None:
+        """Move multipliers ``y`` along ``change``, and slopes along ``moved (n,)``, while the dual rises, at first by
+        ``rising``: the place of the multiplier that comes to 0, or the entry whose slope comes to a limit, and the sign
+        of that; ``None`` where it rises for ever."""
+        slopes, size, ways = y @ self.G[self._rows], np.abs(moved), np.sign(moved)
+        ahead = ways * self._place  # 1: two limits are ahead of a slope; 0: one; -1: none
+        second = np.flatnonzero((ahead >= 0.0) & (size > LEAST * size.max(initial=0.0)))
+        first = second[ahead[second] > 0.0]
+        met = np.concatenate([first, second])
+        lower_limit = np.concatenate([ways[first] > 0.0, ways[second] < 0.0])
+        limits = np.concatenate([-self.weights[first], self.weights[second]])
+        lengths = np.maximum((limits - ways[met] * slopes[met]) / size[met], 0.0)
+        # beyond the lower limit of its slope, minus the weight, an entry is at its upper bound
+        drops = size[met] * np.where(lower_limit, self.upper[met], -self.lower[met])
+        order = np.argsort(lengths, kind="stable")
+        passed = int(np.cumsum(drops[order]).searchsorted(rising))
+        stop = float(lengths[order[passed]]) if passed < order.size else np.inf
+        least, soonest, leaving = LEAST * float(np.abs(change).max(initial=0.0)), np.inf, -1
+        for number, (multiplier, rate) in enumerate(zip(y.tolist(), change.tolist(), strict=True)):
+            if -rate > least and max(multiplier, 0.0) / -rate < soonest:
+                soonest, leaving = max(multiplier, 0.0) / -rate, number
+        if min(stop, soonest) == np.inf:
             return None
-        found, n = self._highs.getSolution(), self.weights.size
-        values = np.array(found.col_value)
-        x = np.clip(values[:n] - values[n:], self.lower, self.upper)
-        return x, np.maximum(-np.array(found.row_dual), 0.0)
+        if soonest <= stop:
+            passed = int(lengths[order].searchsorted(soonest))
+        over = met[order[:passed]]
+        np.subtract.at(self._place, over, ways[over])
+        if soonest <= stop:
+            return leaving, None
+        enters = order[passed]
+        return None, (int(met[enters]), -1 if lower_limit[enters] else 1)
 
     def bound(self, h: Array, y: Array) -> float:
         """A lower bound of the cost under right-hand sides ``h (r,)``, by weak duality from any ``y (r,) >= 0``, less

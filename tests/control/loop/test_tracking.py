@@ -3,6 +3,8 @@ the long way proves, and claims no more."""
 
 from __future__ import annotations
 
+from unittest.mock import patch
+
 import numpy as np
 import pytest
 
@@ -144,10 +146,10 @@ def test_rows_that_are_not_active_are_left_out_and_the_optimum_stays() -> None:
     assert kept[3]
     assert kept[y > 0.0].all()
     assert 2 <= kept.sum() < 9
-    again, multipliers = warm.solve(h[kept])
+    with patch.object(WarmProgram, "_end", side_effect=AssertionError):  # the basis is one of what is left
+        again, multipliers = warm.solve(h[kept])
     assert again == pytest.approx(x, abs=1e-9)
     assert multipliers == pytest.approx(y[kept], abs=1e-9)
-    assert warm._highs.getInfo().simplex_iteration_count == 0  # the basis is one of what is left
     warm.add(G[~kept])
     right = np.concatenate([h[kept], h[~kept]])
     assert warm.bound(right, warm.solve(right)[1]) == pytest.approx(warm.weights @ np.abs(x), abs=1e-9)
