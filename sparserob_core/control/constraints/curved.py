@@ -15,7 +15,7 @@ from sparserob_core.control.constraints.local_maxima import climb, local_maxima,
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.combination import Combination, combination
-from sparserob_core.control.response.enclosure import CELLS_KEPT, Bounded, CellEnclosure, enclose, over_legs
+from sparserob_core.control.response.enclosure import Bounded, CellEnclosure, enclose, kept, over_legs
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.parameters import ParameterIndex
@@ -208,7 +208,7 @@ class CurvedConstraint(StateConstraint):
                 sigma = self.functionals.support_over(leg, H, joined)
                 return CellEnclosure(leg, sigma, H, rhs, control, joined, looseness, cuts, moving)
 
-            remember(self._cells, key, over_legs(legs, cell), CELLS_KEPT)
+            remember(self._cells, key, over_legs(legs, cell), kept(control))
         return self._cells[key]
 
     @shaped

@@ -15,8 +15,8 @@ from sparserob_core.control.constraints.local_maxima import TINY, climb, local_m
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.problem.problem import MixedConstraint
-from sparserob_core.control.response.enclosure import CELLS_KEPT, Bounded, CellEnclosure, enclose, over_legs
-from sparserob_core.control.response.functional import WorstCase
+from sparserob_core.control.response.enclosure import Bounded, CellEnclosure, enclose, kept, over_legs
+from sparserob_core.control.response.functional import LEGS_KEPT, WorstCase
 from sparserob_core.control.response.initial_support import Supports
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.parameters import ParameterIndex
@@ -141,7 +141,7 @@ class Samples:
         key = low.tobytes() + high.tobytes()
         if key not in self._supports:
             found = [self.functionals.support_over(leg, self.H[: self.proven]) for leg in legs]
-            remember(self._supports, key, found, CELLS_KEPT)
+            remember(self._supports, key, found, LEGS_KEPT)
         return self._supports[key]
 
     @property
@@ -359,7 +359,7 @@ class FlatConstraint(StateConstraint):
                     leg, next(supports), H, rhs, control, cuts=cuts, moving=moving, direct=direct
                 ),
             )
-            remember(self._cells, key, made, CELLS_KEPT)
+            remember(self._cells, key, made, kept(control))
         return self._cells[key]
 
     @cached_property

@@ -19,6 +19,8 @@ from sparserob_core.control.response.response import Impulses
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 AT_ONCE = 4_000_000  # numbers that are summed over all ages at once
+SAME = 1e-9  # of a piece: a time that is no nearer to its end is inside
+KEPT = 8_000_000  # numbers of sums over all ages, up to which they are remembered
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +52,9 @@ class DisturbanceSupport:
         return over_faces(
             self._space,
             ends,
-            lambda here, face: self._gathered(times[here], partial(summed, self.disturbance.set, face=face)),
+            lambda here, face: self._gathered(
+                times[here], partial(summed, self.disturbance.set, face=face), kept="worst" if face is None else ""
+            ),
         )
 
     def deviation(self, start: Array, widths: Array) -> Array:
@@ -63,7 +67,7 @@ class DisturbanceSupport:
         """
         grid, comparison = self.lifted.grid, self.lifted.comparison
         bent, once, twice, norms, squared = self._bending
-        sizes = self._gathered(start, self._reaches, bent, plain=True).sum(axis=2)
+        sizes = self._gathered(start, self._reaches, bent, plain=True, kept="bent").sum(axis=2)
         pieces = np.minimum(np.maximum(grid.breakpoints.searchsorted(start, side="right") - 1, 0), grid.pieces - 1)
         moved = comparison.over(start - grid.breakpoints[pieces]).flow
         reach = comparison.over(widths)
@@ -133,32 +137,40 @@ class DisturbanceSupport:
         return alone and self.lifted.backward.uniform and self.disturbance.by_piece
 
     def _gathered(
-        self, times: Array, of_blocks: Callable[[Array], Array], rows: Array | None = None, plain: bool = False
+        self,
+        times: Array,
+        of_blocks: Callable[[Array], Array],
+        rows: Array | None = None,
+        plain: bool = False,
+        kept: str = "",
     ) -> Array:
         """Sums over the blocks of a function of them: from blocks ``(k, r, M, nb, q)`` to parts ``(k, r, nb, j)``;
         returns ``(k, r, j)``.
 
         ``rows (r, M d)``: the lifted functionals, the support function's own unless given; ``plain``: leave them
-        uncombined.
+        uncombined; ``kept``: a name by which sums over the ages of whole pieces are remembered.
         """
         start = self._lifted_rows if rows is None else rows
         combined = (lambda blocks: blocks) if plain else self._combined
         if not self._repeats:
             return np.asarray(of_blocks(combined(self._blocks(times, start))).sum(axis=2))
-        backward, grid = self.lifted.backward, self.lifted.grid
+        grid = self.lifted.grid
         pieces = grid.locate(times)
         within, which = grid.distinct(times - grid.breakpoints[pieces])
-        flow, driven = backward.flows(within)
-        young = self._weights(start @ driven)[..., None, :]
-        moved = start @ flow
-        count, answer = int(pieces.max(initial=0)), None
+        if within.size == 1 and kept and self._whole(float(within[0])):
+            key = (kept, float(within[0]))
+            if key not in self._sums:
+                sums = self._by_age(within, grid.pieces - 1, start, lambda blocks: of_blocks(combined(blocks)))
+                if sums.size > KEPT:
+                    return np.asarray(sums[which, :, pieces])
+                self._sums[key] = sums
+            return np.asarray(self._sums[key][which, :, pieces])
+        count = int(pieces.max(initial=0))
         share = max(1, AT_ONCE // max(1, start.shape[0] * count * self._impulses.columns.shape[1]))
-        for begin in range(0, within.size, share):  # the sums over all ages, of some durations at once
+        answer = None
+        for begin in range(0, within.size, share):
             part = slice(begin, begin + share)
-            old = self._impulses.of(moved[part], count)
-            old = old.reshape(*old.shape[:-1], young.shape[2], young.shape[4]).swapaxes(-2, -3)
-            sums = [of_blocks(combined(young[part])), of_blocks(combined(old))]
-            found = np.concatenate(sums, axis=2).cumsum(axis=2)
+            found = self._by_age(within[part], count, start, lambda blocks: of_blocks(combined(blocks)))
             if share >= within.size:
                 return np.asarray(found[which, :, pieces])
             mine = np.flatnonzero((which >= part.start) & (which < part.stop))
@@ -167,6 +179,24 @@ class DisturbanceSupport:
             answer[mine] = found[which[mine] - begin, :, pieces[mine]]
         assert answer is not None
         return answer
+
+    def _whole(self, within: float) -> bool:
+        """Whether a time within a piece is its beginning or its end."""
+        length = float(self.lifted.backward.propagator.lengths[0])
+        return within == 0.0 or abs(within - length) <= SAME * length
+
+    @cached_property
+    def _sums(self) -> dict[tuple[str, float], Array]:
+        return {}
+
+    def _by_age(self, within: Array, count: int, start: Array, of_blocks: Callable[[Array], Array]) -> Array:
+        """The sums of `_gathered` at such times ``within (q,)`` of the pieces ``0, ..., count``, ``(q, r, count + 1,
+        j)``, since what a block receives depends on its age."""
+        flow, driven = self.lifted.backward.flows(within)
+        young = self._weights(start @ driven)[..., None, :]
+        old = self._impulses.of(start @ flow, count)
+        old = old.reshape(*old.shape[:-1], young.shape[2], young.shape[4]).swapaxes(-2, -3)
+        return np.asarray(np.concatenate([of_blocks(young), of_blocks(old)], axis=2).cumsum(axis=2))
 
     @cached_property
     def _impulses(self) -> Impulses:

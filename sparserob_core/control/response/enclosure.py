@@ -32,7 +32,7 @@ from sparserob_core.sip.program import Enclosure
 LONG_STEP = 1.0  # in norm times duration: longer steps are taken by matrix exponentials
 WILD = 1e3  # times the numbers of a constraint, a distance from the chord that no halving of a short time explains
 SMALL_SHARE = 1e-6  # so that no coordinate is ever entirely blameless
-CELLS_KEPT = 256  # cells of parameters whose matrices are kept
+CELLS_KEPT, CELLS_SIZE = 256, 2_000_000  # enclosures that are kept, and numbers in their decisions
 TIME_FIRST = (
     0.25  # times are halved before anything else unless that gains less than this share: their cells share all work
 )
@@ -72,7 +72,7 @@ class CellEnclosure:
 
     def _bounds(self, start: Array, stop: Array) -> tuple[Array, Array, Array]:
         pieces = self.lifted.grid.locate(stop)
-        ends, which = _ends(start, stop, pieces)
+        ends, which = _ends(start, stop, pieces, self.lifted.grid.breakpoints)
         bounds, spreads = self._at(*ends)
         left, right = bounds[which[: start.size]], bounds[which[start.size :]]
         bend = self._deviation(start, stop, pieces)
@@ -144,6 +144,9 @@ class CellEnclosure:
         """Taylor coefficients ``(k, M, d)`` of the state under the control alone, from the last breakpoint."""
         within = times - self.lifted.grid.breakpoints[pieces]
         start = self._nodes.reshape(self._nodes.shape[0], -1)[pieces]
+        if not within.any():
+            return np.asarray(start.reshape(times.size, self.lifted.space.size, -1))
+        pieces = np.minimum(pieces, self.lifted.grid.pieces - 1)  # beyond the last there is no time to be driven in
         size = self.lifted.norm * float(within.max(initial=0.0))
         moved = (
             self._by_series(start, start @ self.lifted.matrix.T + self._drive(pieces), within[:, None], size)
@@ -194,7 +197,7 @@ class CellEnclosure:
     def _row_norms(self) -> Array:
         return block_norms(self._rows, self.lifted.starts)
 
-    @cached_property
+    @property
     def _nodes(self) -> Array:
         return self.lifted.nodes(self.control)
 
@@ -261,6 +264,11 @@ class LegsEnclosure:
 Bounded: TypeAlias = CellEnclosure | LegsEnclosure
 
 
+def kept(control: Array) -> int:
+    """How many enclosures for such controls are remembered."""
+    return max(2, min(CELLS_KEPT, CELLS_SIZE // control.size))
+
+
 def over_legs(legs: Sequence[LiftedSystem], cell: Callable[[LiftedSystem], CellEnclosure]) -> Bounded:
     """The enclosure that ``cell`` makes of a lifted system, for every leg of it."""
     if len(legs) == 1:
@@ -277,12 +285,22 @@ def _on_faces(space: TaylorSpace, coefficients: Array, ends: Array) -> Array:
     return np.asarray(np.einsum("krab,krb->kra", matrices[which], coefficients))
 
 
-def _ends(start: Array, stop: Array, pieces: np.ndarray) -> tuple[tuple[Array, np.ndarray], np.ndarray]:
-    """The ends of the cells with the piece that each is looked at from, the same ones once where cells share a piece,
-    and where each of ``start`` and then ``stop`` is among them."""
-    if start.size <= FEW_CELLS or (pieces[1:] > pieces[:-1]).all():
-        return (np.concatenate([start, stop]), np.concatenate([pieces, pieces])), np.arange(2 * start.size)
-    both = np.stack([np.concatenate([start, stop]), np.concatenate([pieces, pieces])])
+def _ends(
+    start: Array, stop: Array, pieces: np.ndarray, breakpoints: Array
+) -> tuple[tuple[Array, np.ndarray], np.ndarray]:
+    """The ends of the cells with the piece that each is looked at from, the same ones once where cells share a piece or
+    follow one another, and where each of ``start`` and then ``stop`` is among them. The end of a piece is where the
+    next one begins."""
+    count, ended = start.size, pieces + (stop == breakpoints[pieces + 1])
+    if count <= FEW_CELLS:
+        return (np.concatenate([start, stop]), np.concatenate([pieces, ended])), np.arange(2 * count)
+    if (pieces[1:] > pieces[:-1]).all():
+        met = np.append((stop[:-1] == start[1:]) & (ended[:-1] == pieces[1:]), False)
+        which, apart = np.arange(1, count + 1), np.flatnonzero(~met)
+        which[apart] = count + np.arange(apart.size)
+        points = np.concatenate([start, stop[apart]]), np.concatenate([pieces, ended[apart]])
+        return points, np.concatenate([np.arange(count), which])
+    both = np.stack([np.concatenate([start, stop]), np.concatenate([pieces, ended])])
     unique, which = np.unique(both, axis=1, return_inverse=True)
     return (unique[0], unique[1].astype(int)), which.reshape(-1)
 

@@ -422,6 +422,7 @@ class LiftedSystem:
             whole, within = (
                 relative + late * speed for late in (self._backward_fine if rows else self.forward).lateness
             )
+            within = np.maximum(whole, within)  # the state at the end of a piece is the one that the next begins with
 
         slack = self.slack_A.T if rows else self.slack_A
         slipped, largest = (one.on(begin) + two.on(drives) for one, two in self._slips(rows))
