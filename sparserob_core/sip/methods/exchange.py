@@ -328,7 +328,7 @@ def _sparser(
     program, x = ledger.program, answer.solution.x
     if program.activity is None or ledger.open(x) or (number > SPARSIFYING and answer.epsilon == 0.0):
         return answer, found, ()
-    candidates = [tidied(program, x)]
+    candidates = [met(program, tidied(program, x))]
     if answer.epsilon == 0.0 and program.finite.P is None and program.blocks is None:
         rows = working.rows
         norms = np.linalg.norm(rows.G, axis=1)
