@@ -183,7 +183,14 @@ class LiftedSystem:
         if self.space.nu or pieces < 4 * SPANS:
             return np.arange(pieces)
         growth = float(np.abs(np.linalg.eigvals(self.comparison.rising)).max()) * float(self.fine.lengths.max())
-        return np.arange(0, pieces, int(max(1.0, min(pieces // SPANS, SHORT / max(growth, TINY)))))
+        count = int(max(1.0, min(pieces // SPANS, SHORT / max(growth, TINY))))
+        return np.arange(0, pieces, max(1, count // self._block) * self._block)
+
+    @cached_property
+    def _block(self) -> int:
+        """How many pieces the states are computed in at once: a span begins where such a block does."""
+        forward = self.forward
+        return forward.propagator.block(forward.steps(KNOWN)) if forward.uniform else 1
 
     @cached_property
     def span(self) -> np.ndarray:
@@ -279,7 +286,9 @@ class LiftedSystem:
             most = np.maximum.reduceat(inputs, self.spans, axis=1)
             pushed, drive = block_norms((size @ most).T, self.starts), (self.slack_B @ most).T[None]
             begin = block_norms(self._path(control)[self.spans, 0], self.starts)[None]
-            neglected, bounds, reached = self._neglected(begin, pushed, drive, slack, rows=False)
+            neglected, bounds, reached = self._neglected(
+                begin, pushed, drive, slack, rows=False, jumps=self._jumps(control, size)
+            )
             return neglected[0], reached[0], bounds[0, -1]
         driven = self.fine.inputs(control).T @ self.forward.steps(KNOWN).B[0].T
         nodes = self._path(control)[None]
@@ -291,6 +300,13 @@ class LiftedSystem:
         first = self.ends[:-1]
         left_out: Array = np.maximum.reduceat(neglected[0], first, axis=0)
         return left_out, np.maximum.reduceat(sizes[0].sum(axis=1), first, axis=0), bounds[0, -1]
+
+    def _jumps(self, control: Array, size: Array) -> Array:
+        """How much what drives each block jumps within each span, all its jumps added up, ``(S, q)``."""
+        inputs = self.fine.inputs(control)
+        jumps = np.abs(np.diff(inputs, axis=1, prepend=inputs[:, :1]))
+        jumps[:, self.spans] = 0.0
+        return block_norms((size @ np.add.reduceat(jumps, self.spans, axis=1)).T, self.starts)
 
     def _slack(self, control: Array) -> Array:
         """What the Taylor models leave out at time 0, ``(q,)``."""
@@ -399,13 +415,13 @@ class LiftedSystem:
         return np.asarray(np.einsum("rlaj,aij->rli" if not rows else "rlai,aij->rlj", sizes, spilt))
 
     def _neglected(
-        self, begin: Array, driven: Array, residual: Array, start: Array, rows: bool
+        self, begin: Array, driven: Array, residual: Array, start: Array, rows: bool, jumps: Array | float = 0.0
     ) -> tuple[Array, Array, Array]:
         """Gronwall: ``|e|' <= M |e| + residual`` block by block, ``(r, S, q)``, from ``|e(0)| <= start (r, q)``; at
         the ends of the spans, ``(r, S+1, q)``; and how large what it is an error of may become, ``(r, S, q)``.
 
         Every span adds what the slack of ``A`` and rounding make of what it begins with, of block norms ``begin
-        (r, S, q)``, and of what drives it, at most ``driven (S, q)``.
+        (r, S, q)``, and of what drives it, at most ``driven (S, q)``, which ``jumps (S, q)`` on spans of many pieces.
         """
         reach = self.comparison.over(self._durations)
         flow, integral, peak = (part.transposed if rows else part for part in (reach.flow, reach.integral, reach.peak))
@@ -413,7 +429,7 @@ class LiftedSystem:
         reached, grown = peak.on(begin) + integral.on(drives), flow
         if self.spans.size < self.fine.pieces:
             lost, late = self._lost(peak, rows)
-            whole = within = lost.on(reached) + late * peak.on(drives)
+            whole = within = lost.on(reached) + late * peak.on(drives + jumps)
             reached = reached + whole
             if rows:  # what is computed piece by piece begins a span elsewhere, and its rounding is that of where it is
                 grown = NormBounds(flow.matrices + product(lost.matrices, peak.matrices), flow.which)
@@ -441,13 +457,20 @@ class LiftedSystem:
         """How far, at most, what is computed piece by piece gets from the truth on spans of many pieces, by the sizes
         that it would have; and a time, for which anything that drives it counts.
 
-        Every piece loses a small share ``W`` of the sizes, and no more than the ``peak`` is made of that until the end
-        of the span; the sizes have to be the larger by this, and so on: ``peak + peak W peak + ... <= 2 peak`` where
-        ``peak W peak`` is at most half of it.
+        Every product loses a small share ``W`` of the sizes, and no more than the ``peak`` is made of that until the
+        end of the span; the sizes have to be the larger by this, and so on: ``peak + peak W peak + ... <= 2 peak``
+        where ``peak W peak`` is at most half of it. Of equal pieces it only counts how far a breakpoint is from where
+        they end: that moves what is reached by its speed, and is felt where an input jumps there (summation by parts
+        of what the durations are off by).
         """
-        longest = np.maximum.reduceat(self.fine.lengths, self.spans)
-        whole, within = (self._backward_fine if rows else self.forward).lateness
-        share, late = (self._counts + 1) * self._relative(longest), self._counts.max() * whole + within
+        longest, count = np.maximum.reduceat(self.fine.lengths, self.spans), int(self._counts.max())
+        propagator = (self._backward_fine if rows else self.forward).propagator
+        whole, within = propagator.lateness
+        if rows or self._block == 1:
+            share, late = (count + 1) * self._relative(longest), count * whole + within
+        else:
+            share = propagator.products(count, self._block) * self._relative(self._block * longest)
+            late = 2.0 * propagator.drift + within
         if rows:  # the ends of the spans are computed by transitions of their own
             share = share + 2.0 * self._relative(self._durations)
             late = late + 2.0 * self._backward_spans.lateness[0]
@@ -473,10 +496,12 @@ class LiftedSystem:
     def _relative(self, lengths: Array) -> Array:
         """What transitions over such ``lengths (S,)`` and a product with them may be off by, relative to the sizes."""
         if self.space.nu:
-            relative = flows_rounding(self.space, self.A, lengths)
-        else:
+            relative, terms = flows_rounding(self.space, self.A, lengths), self.A.shape[1]
+        else:  # beyond the groups there are zeros, whose products and sums are exact
             relative = decoupled_rounding(self.decoupling, self.A[0], lengths)
-        return np.asarray(relative + rounding(self.A.shape[1] * int(np.bincount(self.space.products[2]).max())))
+            terms = max(part.stop - part.start for part, _ in self.decoupling.parts)
+        terms = terms * int(np.bincount(self.space.products[2]).max()) + max(self.B.shape[2], self.W.shape[2])
+        return np.asarray(relative + rounding(terms))
 
     def _speed(self, reached: Array, driven: Array, rows: bool) -> Array:
         """How fast anything of the sizes ``reached (r, S, q)`` moves, at most."""

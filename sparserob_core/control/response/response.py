@@ -23,6 +23,8 @@ from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 
 LONG = 1000  # pieces from which the states are computed in blocks
+FEWEST = 64  # blocks in which states are computed, where there are that many
+LITTLE = 0.5  # norm of A times the duration of a block, at most
 BLOCK = 32  # pieces of a block in which outputs are computed: what grows with it is as large as what does not
 TINY = float(np.finfo(float).tiny)
 KERNEL = 1_000_000  # numbers of what all ages give in all directions, up to which they are remembered
@@ -466,12 +468,26 @@ class Propagator:
         return bool(self.lengths.size == 1)
 
     def block(self, steps: Steps) -> int:
-        """How many equal pieces are taken together where the states of many are asked for; 1: none. No more than the
-        system moves little on, so that what a block adds from 0 is not much larger than the states."""
+        """How many equal pieces, a power of two, are taken together where the states of many are asked for; 1: none.
+        No more than the system moves little on, so that what a block adds from 0 is not much larger than the states."""
         if self.grid.pieces < LONG:
             return 1
-        pace = float(np.linalg.norm(steps.A, axis=(2, 3)).max()) * float(self.lengths[0])
-        return int(max(1.0, min(np.sqrt(self.grid.pieces), 1.0 / max(pace, TINY))))
+        size = np.abs(steps.A)
+        pace = max(float(min(one.sum(axis=0).max(), one.sum(axis=1).max())) for one in size[:, 0])
+        most = min(self.grid.pieces / FEWEST, LITTLE / max(pace * float(self.lengths[0]), TINY))
+        return int(2 ** max(0, int(np.log2(max(1.0, most)))))
+
+    def products(self, pieces: int, block: int) -> int:
+        """Through how many products with transitions the states on ``pieces`` pieces go, at most, from the beginning of
+        one of the blocks: over blocks, down the tree of parts of one, and up those of its inputs."""
+        return pieces + 1 if block == 1 else -(-pieces // block) + 4 * block.bit_length()
+
+    @cached_property
+    def drift(self) -> float:
+        """How far the breakpoints are, at most, from where equal pieces would put them."""
+        breaks, length = self.grid.breakpoints, float(self.lengths[0])
+        off = np.abs(breaks - length * np.arange(breaks.size)).max()
+        return float(off + 4.0 * EPSILON * (breaks[-1] + self.grid.elapsed))
 
     def flows(self, durations: Array) -> tuple[Array, Array]:
         """``e^{A r}`` and its integral ``(k, d, d)`` for durations ``(k,)``; for a known system."""
@@ -488,6 +504,14 @@ class Propagator:
             return self.flows(durations)[0]
         answer: Array = exponential(self.steps(np.zeros((1, 0))).A[0, 0] * durations[:, None, None])
         return answer
+
+    def leaps_of(self, steps: Steps, count: int) -> list[Array]:
+        """The transposed transitions ``(v, d, d)`` over 1, 2, 4, ... equal pieces, ``count`` of them."""
+        if self.system.parameters is None and steps.A.shape[:2] == (1, 1):
+            return [leap.T[None] for leap in self.leaps[:count]]
+        durations = 2.0 ** np.arange(count) * self.lengths[0]
+        flows = self._transitions(steps.A[:, :1], durations[None])[0]
+        return [np.swapaxes(flows[:, place], 1, 2) for place in range(count)]
 
     @cached_property
     def _every_state(self) -> Impulses:
@@ -749,25 +773,38 @@ class Response:
         return {}
 
     def _in_blocks(self, path: Array, steps: Steps, block: int) -> Array:
-        """``x_{k+1} = Phi x_k + f_k`` from a ``path (v, L+1, d)`` that holds ``x_0, f_0, f_1, ...``: first from 0 in
-        every block of as many pieces, all blocks at once, then what each block begins with."""
-        count, d = self.grid.pieces // block, path.shape[2]
-        Phi = np.swapaxes(steps.Phi[:, 0], 1, 2)
-        inside = path[:, 1 : count * block + 1].reshape(path.shape[0], count, block, d)
-        powers = np.empty((Phi.shape[0], block, d, d))  # Phi', Phi'^2, ...
-        powers[:, 0] = Phi
-        for place in range(1, block):
-            inside[:, :, place] += inside[:, :, place - 1] @ Phi
-            powers[:, place] = powers[:, place - 1] @ Phi
-        begun = np.empty((path.shape[0], count, 1, d))
-        begun[:, 0, 0] = path[:, 0]
-        for number in range(1, count):
-            begun[:, number] = begun[:, number - 1] @ powers[:, -1] + inside[:, number - 1, -1:]
-        every = np.swapaxes(powers, 1, 2).reshape(Phi.shape[0], d, block * d)  # all powers side by side
-        inside += (begun[:, :, 0] @ every).reshape(inside.shape)
-        for piece in range(count * block, self.grid.pieces):
-            path[:, piece + 1] += (path[:, piece, None] @ Phi)[:, 0]
+        """``x_{k+1} = Phi x_k + f_k`` from a ``path (v, L+1, d)`` that holds ``x_0, f_0, f_1, ...``, in blocks: what
+        the pieces of a block add from 0, two neighbouring parts at a time, the states at the ends of blocks, and those
+        inside, each from the part that ends there (Blelloch 1990). No state goes through more products than
+        `Propagator.products`, and what is rounded does not grow with the pieces of a block."""
+        leaps = self.propagator.leaps_of(steps, block.bit_length())
+        done, v, d = 0, path.shape[0], path.shape[2]
+        sizes = [block] + [block >> place for place in range(1, block.bit_length())]  # the last block may be shorter
+        for size in sizes:
+            count, levels = (self.grid.pieces - done) // size, size.bit_length() - 1
+            if not count:
+                continue
+            inside = path[:, done + 1 : done + count * size + 1].reshape(v, count, size, d)
+            for level in range(levels):
+                step = 2**level
+                inside[:, :, 2 * step - 1 :: 2 * step] += _moved(inside[:, :, step - 1 :: 2 * step], leaps[level])
+            begun = np.empty((v, count, 1, d))
+            begun[:, 0, 0] = path[:, done]
+            for number in range(count):
+                inside[:, number, -1:] += begun[:, number] @ leaps[levels]
+                if number + 1 < count:
+                    begun[:, number + 1] = inside[:, number, -1:]
+            for level in range(levels - 1, -1, -1):
+                step = 2**level
+                before = np.concatenate([begun, inside[:, :, 2 * step - 1 :: 2 * step][:, :, :-1]], axis=2)
+                inside[:, :, step - 1 :: 2 * step] += _moved(before, leaps[level])
+            done += count * size
         return path
+
+
+def _moved(states: Array, leap: Array) -> Array:
+    """``(v, count, k, d)`` states, as rows, by the transposed transitions ``(v, d, d)``."""
+    return np.asarray(states.reshape(states.shape[0], -1, states.shape[3]) @ leap).reshape(states.shape)
 
 
 def _series(A: Array, rows: Array, times: Array, size: float) -> tuple[Array, Array]:

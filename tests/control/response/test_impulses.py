@@ -164,3 +164,44 @@ def test_rows_of_many_instants_are_those_of_each_alone(together):
         alone = response.weights(times[[i]], directions[[i]], none[[i]])
         for one, other in zip(found, alone, strict=True):
             np.testing.assert_allclose(one[i], other[0], rtol=1e-14, atol=1e-15)
+
+
+@pytest.mark.parametrize("kind", sorted(RATES))
+@pytest.mark.parametrize("pieces", [1000, 1023, 4999, 20_000])
+def test_states_in_blocks_are_the_closed_form(kind, pieces):
+    """Of a tree of parts no state goes through more products than are counted, and each of them rounds once."""
+    rng, rates, horizon = np.random.default_rng(pieces), RATES[kind], 4.0
+    system, V = symmetric(rng, rates, horizon)
+    ends = np.linspace(0, horizon, pieces + 1)
+    response = Response(system, merge_grids(ends, ends), rng.normal(size=4))
+    control = rng.choice([-1.0, 0.0, 1.0], size=(2, pieces))
+    steps = response.steps(NONE)
+    block = response.propagator.block(steps)
+    assert block & (block - 1) == 0
+    assert (kind == "slow") <= (block > 1)
+    found = response.states(control, NONE)[0]
+    value, size = exact(system, V, rates, response.grid, ends[[1, pieces // 3, -1]], np.repeat(V.T[:1], 3, axis=0))
+    # along the first eigenvector, which no other disturbs
+    rate = rates[0] / horizon
+    for place, k in enumerate((1, pieces // 3, pieces)):
+        begun = np.exp(rate * ends[k]) * (V[:, 0] @ response.initial_state)
+        true = begun + np.einsum("lm,ml->", value[place][:, :2], control)
+        scale = abs(begun) + size[place][:, :2].sum()
+        others = np.abs(np.exp(np.minimum(np.array(rates), 20.0))).max()
+        allowed = 1e-15 * response.propagator.products(pieces, block) * (10.0 + np.abs(rates).max())
+        assert abs(V[:, 0] @ found[k] - true) <= allowed * max(scale, 1.0) * others
+
+
+def test_states_at_many_parameters_are_those_at_each():
+    system = LinearSystem(lambda p: np.array([[0.0, 1.0], [p[0], -0.3]]), [[0.0], [1.0]], parameters=Box([-4.0], [0.0]))
+    ends, points = np.linspace(0, 3, 2049), np.array([[-4.0], [-1.0], [0.0]])
+    response = Response(system, merge_grids(ends, ends), np.array([1.0, 0.0]))
+    control = np.random.default_rng(2).uniform(-1, 1, size=(1, 2048))
+    every = response.states(control, points)
+    assert response.propagator.block(response.steps(points)) > 1
+    for one, path in zip(points, every, strict=True):
+        np.testing.assert_allclose(response.states(control, one[None])[0], path, atol=1e-13)
+        with patch(f"{HOME}.LONG", 10**9):
+            np.testing.assert_allclose(
+                Response(system, response.grid, path[0]).states(control, one[None])[0], path, atol=1e-11
+            )
