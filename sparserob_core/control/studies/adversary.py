@@ -31,7 +31,8 @@ class Adversary:
     mixed constraint is taken off.
 
     ``direction (d,)`` is row ``row`` of a set with flat sides, or a unit normal of a curved one. The disturbance
-    ``(mw, L)`` is constant between ``breakpoints (L + 1,)``; ``None`` where there is none.
+    ``(mw, L)`` is constant between ``breakpoints (L + 1,)``; ``None`` where there is none. ``deviation (Q,)``: under
+    feedback what the control answers, as in `ClosedLoop`.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Adversary:
     breakpoints: Array
     disturbance: Array | None
     initial_state: Array
+    deviation: Array | None = None
 
 
 def find_adversary(constraint: StateConstraint, decision: Array, feedback: Feedback | None = None) -> Adversary | None:
@@ -97,6 +99,7 @@ def _of_loop(constraint: StateConstraint, decision: Array, loop: ClosedLoop) -> 
         violation=float(worst.violations[0]),
         breakpoints=breakpoints,
         disturbance=disturbance,
+        deviation=deviation,
     )
 
 

@@ -64,15 +64,3 @@ class Measuring:
         drive = steps.B[0] @ self._inputs + (steps.E[0] @ loop.loop.middles[piece])[:, None]
         self._predicted = steps.Phi[0, length] @ self._predicted + steps.Gamma[0, length] @ drive
         return self._inputs
-
-    def follow(self, signal: Array, state: Array) -> tuple[Array, Array]:
-        """The control ``(K, m)`` and the innovations ``(K, d)`` of one trajectory from ``state (d,)`` under the
-        disturbance ``signal (mw, L)`` on the pieces of the grid."""
-        response, m = self.model.response, self.nominal.shape[0]
-        steps, x, acted = response.steps(KNOWN), state[:, None], np.zeros(self.nominal.T.shape)
-        for piece, length in enumerate(response.which.tolist()):
-            inputs = self(piece, x)
-            acted[response.grid.control_piece[piece]] = inputs[:m, 0]
-            drive = steps.B[0] @ inputs + (steps.E[0] @ signal[:, piece])[:, None]
-            x = steps.Phi[0, length] @ x + steps.Gamma[0, length] @ drive
-        return acted, np.concatenate(self._innovations, axis=1).T

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from sparserob_core.control.feedback.closed_loop import ClosedLoop
+from sparserob_core.control.feedback.innovations import innovations_seen
 from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
 from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.studies.adversary import find_adversary
 from sparserob_core.control.studies.answer import tube
-from sparserob_core.control.studies.measuring import Measuring
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, counting
@@ -128,7 +128,7 @@ def _answered(model: Transcription, decision: Array, times: Array, draws: int) -
     assert model.feedback is not None
     loop, alone = model.feedback.loop, tube(replace(model, feedback=None), model.nominal(decision), times)
     nominal, effects = loop.nominal(decision), loop.effects(decision)
-    held = model.problem.disturbance_class == "piecewise_constant"  # what others make of a piece is slow to draw
+    held = model.problem.disturbance_class == "piecewise_constant"  # of all measurable functions none is drawn evenly
     return {
         "alone_lower": alone.lower,
         "alone_upper": alone.upper,
@@ -163,16 +163,17 @@ def _drawn(loop: ClosedLoop, nominal: Array, effects: Array, draws: int) -> dict
 
 def _moved(model: Transcription, decision: Array) -> dict[str, Any]:
     """What every innovation adds to the control on every piece, in the worst case of the constraint that comes nearest
-    to being violated; nothing where that is not a disturbance of the run's pieces."""
+    to being violated."""
+    assert model.feedback is not None
     found = [find_adversary(constraint, decision, model.feedback) for constraint in model.constraints]
     worst = max((one for one in found if one is not None), key=lambda one: one.violation, default=None)
-    grid = model.response.grid.breakpoints
-    if worst is None or worst.disturbance is None or not np.array_equal(worst.breakpoints, grid):
+    if worst is None or worst.deviation is None:
         return {}
-    measuring = Measuring.of(model, decision)
-    _, innovations = measuring.follow(worst.disturbance, worst.initial_state)
+    loop = model.feedback.loop
+    disturbance, begins = model.functionals.disturbance, model.problem.initial_set is not None
+    seen = innovations_seen(model.response, model.control, disturbance, begins, loop.measurable)
     return {
-        "answers": np.einsum("kjid,jd->kji", measuring.gains, innovations),
+        "answers": np.einsum("kjid,jd->kji", loop.gains(decision), seen @ worst.deviation),
         "worst_case": f"the worst case of {printable(worst.name)} at t = {worst.time:.4g}",
     }
 

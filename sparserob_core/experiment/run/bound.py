@@ -27,7 +27,10 @@ INWARDS = 1e-13  # of it, so that whoever derives it with another precision does
 
 def bounded(experiment: ControlExperiment, result: Result) -> Result:
     """The same result with a lower bound that its multipliers prove, and with a word on what is not proven of it."""
-    found, rests = _bounded(experiment, result), remark(experiment.problem)
+    found, rests = (
+        _bounded(experiment, result),
+        remark(experiment.problem, experiment.transcription.feedback is not None),
+    )
     if not rests or found.status not in ("certified", "verified"):
         return found
     return replace(found, message=f"{found.message}; {rests}")

@@ -352,6 +352,8 @@ def _told(working: Robust, ledger: Ledger, found: RobustAnswer) -> Answer:
     program, none = working.program, np.zeros(0)
     working.raw = x = np.clip(found.x, program.finite.lower, program.finite.upper)
     x = x if program.settle is None else program.settle(x)
+    if program.finite.residual(x) > TOLERANCE:  # what is settled is beyond its bounds: then so is what it stands for
+        x = np.clip(x, program.finite.lower, program.finite.upper)
     dual = working.dual(found, priced=True)
     ledger.improve(dual)
     solution = FiniteSolution("optimal", x, np.inf, dual.bound, found.y, found.mu, none, np.inf, np.inf)

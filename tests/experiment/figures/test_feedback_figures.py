@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 import sparserob_core as sr
-from sparserob_core.control.studies.measuring import Measuring
+from sparserob_core.control.studies.adversary import Adversary
 from sparserob_core.experiment.assemble import ControlExperiment
 from sparserob_core.experiment.figures import drawing, run_figures
 from sparserob_core.experiment.figures.figure_data import FigureData
@@ -65,12 +67,53 @@ def test_the_answers_add_up_to_the_control_that_the_worst_disturbance_causes(
     outcome: sr.Outcome, data: FigureData
 ) -> None:
     assert isinstance(outcome.experiment, ControlExperiment) and data.answers is not None
-    model, decision = outcome.experiment.transcription, outcome.result.decision
     worst = max((outcome.result.adversary(one) for one in ("path", "terminal")), key=lambda one: one.violation)
-    acted, _ = Measuring.of(model, decision).follow(worst.disturbance, worst.initial_state)
-    np.testing.assert_allclose(data.control.T + data.answers.sum(axis=1), acted, atol=1e-12)
+    acted = driven(outcome, worst)
+    np.testing.assert_allclose(data.control.T + data.answers.sum(axis=1), acted, atol=1e-9)
     assert np.abs(data.answers[np.triu_indices(10, 1)]).max() == 0.0  # nothing is answered before it is seen
     assert worst.name in data.worst_case
+
+
+def driven(outcome: sr.Outcome, worst: Adversary) -> np.ndarray:
+    """The controls ``(K, m)`` of a loop around a known system without drift, under the disturbance of a worst case."""
+    assert isinstance(outcome.experiment, ControlExperiment) and worst.disturbance is not None
+    system, acting = outcome.experiment.problem.system, sr.controller(outcome)
+    A, B, E = (np.asarray(matrix, dtype=float) for matrix in (system.A, system.B, system.E))
+    x, acted, starts = worst.initial_state, list[np.ndarray](), acting.breakpoints[:-1]
+    for begin, end in pairwise(np.unique(np.concatenate([starts, worst.breakpoints]))):
+        if begin in starts:
+            acted.append(acting.step(float(begin), x))
+        w = worst.disturbance[:, np.searchsorted(worst.breakpoints, begin, side="right") - 1]
+        block = np.zeros((len(x) + 1, len(x) + 1))
+        block[:-1, :-1], block[:-1, -1] = A, B @ acted[-1] + E @ w
+        x = (expm((end - begin) * block) @ np.append(x, 1.0))[:-1]
+    return np.array(acted)
+
+
+def test_what_answers_a_measurable_disturbance_is_drawn_too(tmp_path: Path) -> None:
+    config = {
+        "problem": {
+            "name": "linear",
+            "system": {"A": [[0, 1], [-2, -0.5]], "B": [[0], [1]], "E": [[0], [1]]},
+            "horizon": 4.0,
+            "initial_state": [-1, 1],
+            "control": {"box": 1.0},
+            "disturbance": {"box": 0.25},
+            "disturbance_class": "measurable",
+            "terminal": [{"box": [0.3, 0.3]}],
+        },
+        "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 4}},
+        "policy": {"name": "affine", "cost": "peak", "causal_signals": 0},
+    }
+    outcome = sr.run(config, out=tmp_path / "run", quiet=True, figures=False)
+    decision = outcome.result.decision
+    assert decision is not None and isinstance(outcome.experiment, ControlExperiment)
+    assert outcome.result.message.endswith("which sparserob check encloses")
+    data = drawing.figure_data(outcome.experiment, decision, np.empty(0), (), None, draws=500)
+    worst = outcome.result.adversary("terminal")
+    assert data.answers is not None and np.abs(data.answers).max() > 1e-3
+    np.testing.assert_allclose(data.control.T + data.answers.sum(axis=1), driven(outcome, worst), atol=1e-7)
+    assert data.effort is None  # of all measurable functions none is drawn evenly
 
 
 def test_of_many_gains_the_largest_are_drawn_and_the_title_says_so(data: FigureData) -> None:

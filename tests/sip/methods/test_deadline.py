@@ -145,6 +145,35 @@ def test_a_limit_under_feedback_leaves_what_is_known(when, monkeypatch):
         assert result.lower_bound == pytest.approx(certified.cost, rel=1e-3)
 
 
+def test_a_limit_before_a_control_is_in_its_set_is_no_failure(monkeypatch):
+    """The first relaxed program knows the round set of controls by few tangents, and peaks beyond it are no decision
+    that is missed by its own bounds."""
+    from sparserob_core.sip.methods import robust
+
+    problem = sr.OptimalControlProblem(
+        system=sr.LinearSystem(A=[[0.0, 1.0], [-1.0, -0.2]], B=[[0.4, 0.0], [0.0, 1.0]]),
+        horizon=5.0,
+        initial_state=[-1.0, 1.0],
+        control=sr.NormBall(2, 0.5, [0.0, 0.0]),
+        disturbance=sr.NormBall(2, 0.1, [0.0, 0.0]),
+        terminal=[sr.NormBall(2, 0.3, [0.0, 0.0])],
+    )
+    rounds, separated = [], robust.separate
+
+    def over(*arguments):
+        if len(rounds) == 2:
+            raise OutOfTime("the time is over")
+        rounds.append(arguments)
+        return separated(*arguments)
+
+    monkeypatch.setattr(robust, "separate", over)
+    policy = sr.AffinePolicy(cost="peak", causal_signals=0)
+    result = sr.solve(problem, control={"name": "piecewise_constant", "pieces": 6}, policy=policy)
+    assert result.stopped == "the time is over"
+    assert result.status in ("refuted", "undecided"), result.message
+    assert np.isfinite(result.cost) and result.upper_bound == np.inf
+
+
 def test_a_single_step_that_takes_long_is_ended_too():
     def worst(x):
         time.sleep(30.0)
