@@ -7,19 +7,14 @@ from pathlib import Path
 
 import click
 
+from sparserob_core.experiment.cli.shell.options import json_option, plugins_option
 from sparserob_core.experiment.terminal.printing import EXIT, print_json
 
 
 @click.command()
 @click.argument("directory", metavar="RUN", type=click.Path(path_type=Path))
-@click.option("--json", "as_json", is_flag=True, help="Print the verdicts as JSON instead of the table.")
-@click.option(
-    "--plugins",
-    multiple=True,
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="A plugin file that RUN was made with. RUN is data: no plugin that it names is loaded. Repeatable.",
-)
+@json_option("the verdicts as JSON")
+@plugins_option
 @click.option(
     "--seconds",
     type=click.FloatRange(min=0.0, min_open=True),

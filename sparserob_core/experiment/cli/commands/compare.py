@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from sparserob_core.errors import InputError
+from sparserob_core.experiment.cli.shell.options import json_option
 from sparserob_core.experiment.terminal.printing import print_json, printable
 
 
@@ -32,7 +33,7 @@ from sparserob_core.experiment.terminal.printing import print_json, printable
     type=click.Choice(["evaluations", "seconds"]),
     help="For studies: what a run spends; evaluations unless given, or seconds where some runs do not search.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print the comparison as JSON instead of the tables.")
+@json_option("the comparison as JSON", "the tables")
 def compare(runs: tuple[Path, ...], out: Path, accuracy: float | None, measure: Any, as_json: bool) -> int:
     """Compare runs of one problem: the lower bounds that they prove, against evaluations and against seconds. Or
     compare the maximisers, solvers or methods of studies over all of their problems.
@@ -87,7 +88,7 @@ def compare(runs: tuple[Path, ...], out: Path, accuracy: float | None, measure: 
     type=click.Path(path_type=Path),
     help="A new or empty directory for profiles.png, benchmark.json and ioh/, which IOHanalyzer reads.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print everything as JSON instead of the tables.")
+@json_option("everything as JSON", "the tables")
 def benchmark(
     maximisers: tuple[str, ...],
     suites: tuple[str, ...],

@@ -6,16 +6,12 @@ from pathlib import Path
 
 import click
 
+from sparserob_core.experiment.cli.shell.options import plugins_option
+
 
 @click.command()
 @click.argument("directory", metavar="RUN", type=click.Path(path_type=Path))
-@click.option(
-    "--plugins",
-    multiple=True,
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="A plugin file that RUN was made with. RUN is data: no plugin that it names is loaded. Repeatable.",
-)
+@plugins_option
 def figures(directory: Path, plugins: tuple[Path, ...]) -> int:
     """Draw the figures of a finished run again, into RUN/figures.
 

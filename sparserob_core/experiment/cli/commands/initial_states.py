@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from sparserob_core.errors import InputError
+from sparserob_core.experiment.cli.shell.options import json_option
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
 from sparserob_core.experiment.terminal.printing import EXIT, print_json, printable
 
@@ -41,7 +42,7 @@ from sparserob_core.experiment.terminal.printing import EXIT, print_json, printa
     type=float,
     help="Only initial values of at most this size are looked at; needed where the set is unbounded.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print initial_states.json instead of the table.")
+@json_option("initial_states.json")
 @click.option(
     "--out",
     type=click.Path(path_type=Path),

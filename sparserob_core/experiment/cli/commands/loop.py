@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from sparserob_core.experiment.cli.shell.options import figures_option, json_option, plugins_option, seed_option
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
 from sparserob_core.experiment.terminal.printing import EXIT, print_json, printable
 
@@ -16,21 +17,15 @@ from sparserob_core.experiment.terminal.printing import EXIT, print_json, printa
 @click.option("--resolve", is_flag=True, help="Solve what is left of the horizon anew at every step.")
 @click.option("--seconds", type=float, help="With --resolve: about how long a step may take; no limit unless given.")
 @click.option("--trajectories", type=int, help="Loops of every law; 10 unless given, 1 with --resolve.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Seed of the random numbers.")
-@click.option("--json", "as_json", is_flag=True, help="Print loop.json instead of the table.")
+@seed_option
+@json_option("loop.json")
 @click.option(
     "--out",
     type=click.Path(path_type=Path),
     help="For a CONFIG: the run's directory, new or empty; runs/NAME/STAMP-HASH unless given.",
 )
-@click.option("--figures/--no-figures", default=True, help="Whether to draw the figures.", show_default=True)
-@click.option(
-    "--plugins",
-    multiple=True,
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="A plugin file that RUN was made with. RUN is data: no plugin that it names is loaded. Repeatable.",
-)
+@figures_option
+@plugins_option
 def loop(
     source: Path,
     overrides: tuple[str, ...],

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from sparserob_core.experiment.cli.shell.options import json_option
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
 from sparserob_core.experiment.terminal.printing import print_json, printable
 
@@ -33,7 +34,7 @@ EXIT = {"certified": 0, "unbounded": 0, "infeasible": 3, "undecided": 4}
 @click.option(
     "--curve", type=int, default=20, show_default=True, help="Points of the curve of cost against the factor; 0: none."
 )
-@click.option("--json", "as_json", is_flag=True, help="Print margin.json instead of the table.")
+@json_option("margin.json")
 @click.option(
     "--out",
     type=click.Path(path_type=Path),

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from sparserob_core.experiment.cli.shell.options import plugins_option
+
 
 @click.command()
 @click.argument("directory", metavar="RUN", type=click.Path(path_type=Path))
@@ -14,13 +16,7 @@ import click
 )
 @click.option("--serve", is_flag=True, help="Show it in a browser of this machine, until Ctrl-C.")
 @click.option("--connect", metavar="ADDRESS", help="Send it to a viewer that listens there, such as 127.0.0.1:9876.")
-@click.option(
-    "--plugins",
-    multiple=True,
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="A plugin file that RUN was made with. RUN is data: no plugin that it names is loaded. Repeatable.",
-)
+@plugins_option
 def replay(directory: Path, save: Path | None, serve: bool, connect: str | None, plugins: tuple[Path, ...]) -> int:
     """Show the finished run RUN in the viewer of Rerun; nothing is solved again.
 

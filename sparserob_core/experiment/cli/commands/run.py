@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from sparserob_core.experiment.cli.shell.options import figures_option, json_option
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
 from sparserob_core.experiment.terminal.printing import EXIT, print_json, printable
 
@@ -19,8 +20,8 @@ from sparserob_core.experiment.terminal.printing import EXIT, print_json, printa
     help="The run's directory, new or empty; runs/NAME/STAMP-HASH unless given.",
 )
 @click.option("--quiet", is_flag=True, help="Print nothing but errors.")
-@click.option("--json", "as_json", is_flag=True, help="Print result.json instead of the table.")
-@click.option("--figures/--no-figures", default=True, help="Whether to draw the figures.", show_default=True)
+@json_option("result.json")
+@figures_option
 def run(config: Path, overrides: tuple[str, ...], out: Path | None, quiet: bool, as_json: bool, figures: bool) -> int:
     """Solve the experiment that CONFIG describes, and prove the answer.
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from sparserob_core.experiment.cli.shell.options import json_option, plugins_option, seed_option
 from sparserob_core.experiment.terminal.printing import print_json, printable
 
 
@@ -22,20 +23,14 @@ from sparserob_core.experiment.terminal.printing import print_json, printable
         "neighbours (of the worst cases), or adversary (the worst cases themselves)."
     ),
 )
-@click.option("--seed", type=int, default=0, show_default=True, help="Seed of the random numbers.")
-@click.option("--json", "as_json", is_flag=True, help="Print simulation-LAW.json instead of the table.")
+@seed_option
+@json_option("simulation-LAW.json")
 @click.option(
     "--out",
     type=click.Path(path_type=Path),
     help="Draw the trajectories into this file, which ends in .png, .pdf or .svg.",
 )
-@click.option(
-    "--plugins",
-    multiple=True,
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="A plugin file that RUN was made with. RUN is data: no plugin that it names is loaded. Repeatable.",
-)
+@plugins_option
 def simulate(
     directory: Path,
     trajectories: int | None,

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from sparserob_core.experiment.cli.shell.options import figures_option
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
 from sparserob_core.experiment.terminal.printing import EXIT, printable
 
@@ -23,7 +24,7 @@ from sparserob_core.experiment.terminal.printing import EXIT, printable
     type=click.Path(path_type=Path),
     help="The run's directory, new or empty; runs/NAME/STAMP-HASH unless given.",
 )
-@click.option("--figures/--no-figures", default=True, help="Whether to draw the figures.", show_default=True)
+@figures_option
 def watch(
     config: Path,
     overrides: tuple[str, ...],
