@@ -137,7 +137,7 @@ def polish(
     if curvature is None or x.shape != program.q.shape or y.shape != program.h.shape or mu.shape != program.b.shape:
         return None
     bent = float(curvature.min(initial=np.inf)) >= FLAT * program.steepest
-    found = newton_solve(program, y, mu) if bent else None
+    found = newton_solve(program, y, mu, x0=x) if bent else None
     return proximal_polish(program, x, y, mu) if found is None else found
 
 
@@ -229,9 +229,15 @@ class _Dual:
         return float(np.abs(natural).max(initial=0.0))
 
     @shaped
+    def free(self, x: Float[Array, " n"]) -> Bool[np.ndarray, " n"]:
+        """Which entries are between 0 and their bounds."""
+        free: np.ndarray = (x != 0) & (x > self.program.lower) & (x < self.program.upper)
+        return free
+
+    @shaped
     def hessian(self, point: _Point, damping: float = DAMPING) -> Float[Array, "v v"]:
         """Minus the generalised Hessian, damped so that duplicated and flat directions stay solvable."""
-        free = (point.x != 0) & (point.x > self.program.lower) & (point.x < self.program.upper)
+        free = self.free(point.x)
         rows = self.M[:, free]
         hessian: Array = (rows / self.curvature[free]) @ rows.T
         sizes = hessian.reshape(-1)[:: hessian.shape[0] + 1]  # its diagonal, to write to
@@ -248,9 +254,10 @@ def newton_solve(
     mu0: Float[Array, " e"] | None = None,
     steps: int = ITERATIONS,
     patience: int = PATIENCE,
+    x0: Float[Array, " n"] | None = None,
 ) -> FiniteSolution | None:
     """The optimum of a program with identity image and a positive diagonal ``P``, from dual variables ``y0 (r,)``,
-    ``mu0 (e,)``.
+    ``mu0 (e,)``; or from those that go with the entries of ``x0 (n,)`` that are free, where these are nearer.
 
     Semismooth Newton (Qi and Sun 1993) on the dual, whose minimising ``x`` is explicit: a soft threshold and a clip per
     entry. Converges in a finite number of steps, as the dual is piecewise quadratic, but from far away it may take too
@@ -268,7 +275,11 @@ def newton_solve(
     dual = _Dual(program, curvature, M / norms[:, None], c / norms, np.arange(c.size) < h.size)
     try:
         with np.errstate(over="ignore"):
-            point = _ascend(dual, start, steps, patience)
+            first = dual.at(start)
+            if x0 is not None and (dual.free(x0) != dual.free(first.x)).any():
+                predicted = dual.at(_predicted(dual, start, x0))
+                first = predicted if dual.error(predicted) < dual.error(first) else first
+            point = _ascend(dual, first, steps, patience)
     except np.linalg.LinAlgError:
         return None
     if point is None:
@@ -280,8 +291,22 @@ def newton_solve(
 
 
 @shaped
-def _ascend(dual: _Dual, start: Float[Array, " v"], steps: int, patience: int) -> _Point | None:
-    point = dual.at(start)
+def _predicted(dual: _Dual, start: Float[Array, " v"], x: Float[Array, " n"]) -> Float[Array, " v"]:
+    """The multipliers under which the free entries of ``x (n,)`` move to where the rows hold, while the others stay:
+    where the program has changed a little, or only its curvature, mostly the optimal ones."""
+    x = np.minimum(np.maximum(x, dual.program.lower), dual.program.upper)
+    free, rest = dual.free(x), dual.M @ x - dual.c
+    rows, curvature = dual.M[:, free], dual.curvature[free]
+    linear = (
+        rest
+        - rows @ x[free]
+        - (rows / curvature) @ (dual.program.q[free] + dual.program.weights[free] * np.sign(x[free]))
+    )
+    return _non_negative(dual.hessian(_Point(start, x, rest)), linear, dual.signed, start > 0)
+
+
+@shaped
+def _ascend(dual: _Dual, point: _Point, steps: int, patience: int) -> _Point | None:
     scale = 1.0 + float(np.abs(point.x).max(initial=0.0))
     error = least = dual.error(point)
     stalled, damping = 0, DAMPING

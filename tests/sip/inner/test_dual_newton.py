@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 
 import sparserob_core as sr
 from sparserob_core.sip.finite import FiniteProgram
-from sparserob_core.sip.inner.dual_newton import DualNewton, from_nothing, not_separable
+from sparserob_core.sip.inner.dual_newton import DualNewton, _Dual, from_nothing, newton_solve, not_separable
 from sparserob_core.sip.inner.solve import solve_finite
 from sparserob_core.testing.solvers import (
     badly_scaled_instances,
@@ -65,6 +66,25 @@ def test_from_nothing_it_finds_the_optimum_to_round_off(seed: int, curvature: fl
     other = solve_finite(program, sr.load_registry().build("solver", "clarabel"))
     assert other.status == "optimal"
     assert found.value == pytest.approx(other.value, rel=1e-7, abs=1e-7)
+
+
+def test_under_a_lighter_curvature_the_free_entries_of_the_last_optimum_lead_to_the_next_one_in_fewer_steps() -> None:
+    steps = dict.fromkeys((True, False), 0)
+    for seed in range(12):
+        program = separable(seed, 6, 40, 0.5)
+        at = newton_solve(program, np.zeros(6))
+        assert at is not None
+        assert program.P is not None
+        lighter, answers = replace(program, P=program.P / 8.0), []
+        for known in (True, False):
+            with patch.object(_Dual, "hessian", autospec=True, side_effect=_Dual.hessian) as asked:
+                found = newton_solve(lighter, at.y, at.mu, x0=at.x if known else None)
+            assert found is not None
+            assert found.gap <= 1e-10 * (1.0 + abs(found.value))
+            answers.append(found.x)
+            steps[known] += asked.call_count
+        assert answers[0] == pytest.approx(answers[1], abs=1e-9)
+    assert steps[True] < steps[False]
 
 
 def test_every_separable_program_of_the_contract_is_answered_and_no_other() -> None:
