@@ -108,7 +108,7 @@ class DisturbanceSupport:
         does, what is left out of the state already, and the terms of too high a degree.
         """
         lifted, radius = self.lifted, self.disturbance.radius
-        sizes, remainder = lifted.row_bounds(self.rows)
+        sizes, remainder = lifted.row_bounds(self.rows, self._repeats)
         spilt = lifted.spilt(_row_norms(lifted.W, lifted.starts)) + np.linalg.norm(lifted.slack_W, axis=1)
         pushed = remainder @ self._drive + radius * np.einsum("rlaj,aj->rl", sizes, spilt)
         within = np.cumsum(pushed[:, lifted.span] * lifted.fine.lengths, axis=1)[:, lifted.ends[1:] - 1]

@@ -335,14 +335,17 @@ class LiftedSystem:
     def _paths(self) -> dict[bytes, Array]:
         return {}
 
-    def row_bounds(self, directions: Array) -> tuple[Array, Array]:
+    def row_bounds(self, directions: Array, by_age: bool = False) -> tuple[Array, Array]:
         """For the Taylor models of ``c'e^{A(p) s}`` of ``directions (r, d)``, read backwards from ``t``: block norms
         ``(r, S, M, q)`` of their coefficients, the largest on every span, and norm bounds ``(r, S, q)`` of what they
-        leave out."""
+        leave out; ``by_age``: what equal pieces make of them is computed by `Impulses`, with one length for all."""
         nodes, still = self.row_nodes(directions), np.zeros((self.spans.size, self.starts.size))
         begin, start = block_norms(nodes[:, :-1], self.starts).sum(axis=2), still[:1]
         if self.spans.size < self.fine.pieces:
-            neglected, _, reached = self._neglected(begin, still, still[None], start, rows=True)
+            neglected, _, reached = self._neglected(begin, still, still[None], start, rows=True, by_age=by_age)
+            if by_age:
+                propagator = self.backward.propagator
+                neglected = neglected + propagator.lateness[0] / float(propagator.lengths[0]) * reached
             return reached[:, :, None], neglected
         sizes = self._sizes(nodes, np.zeros(1), rows=True)
         return sizes, self._neglected(begin, still, self._spilt(sizes, rows=True), start, rows=True)[0]
@@ -415,7 +418,14 @@ class LiftedSystem:
         return np.asarray(np.einsum("rlaj,aij->rli" if not rows else "rlai,aij->rlj", sizes, spilt))
 
     def _neglected(
-        self, begin: Array, driven: Array, residual: Array, start: Array, rows: bool, jumps: Array | float = 0.0
+        self,
+        begin: Array,
+        driven: Array,
+        residual: Array,
+        start: Array,
+        rows: bool,
+        jumps: Array | float = 0.0,
+        by_age: bool = False,
     ) -> tuple[Array, Array, Array]:
         """Gronwall: ``|e|' <= M |e| + residual`` block by block, ``(r, S, q)``, from ``|e(0)| <= start (r, q)``; at
         the ends of the spans, ``(r, S+1, q)``; and how large what it is an error of may become, ``(r, S, q)``.
@@ -428,7 +438,7 @@ class LiftedSystem:
         drives = np.broadcast_to(driven, begin.shape)
         reached, grown = peak.on(begin) + integral.on(drives), flow
         if self.spans.size < self.fine.pieces:
-            lost, late = self._lost(peak, rows)
+            lost, late = self._lost(peak, rows, by_age)
             whole = within = lost.on(reached) + late * peak.on(drives + jumps)
             reached = reached + whole
             if rows:  # what is computed piece by piece begins a span elsewhere, and its rounding is that of where it is
@@ -453,7 +463,7 @@ class LiftedSystem:
             reached = reached + carried
         return np.asarray(carried + pushed + within + largest), bounds, reached
 
-    def _lost(self, peak: NormBounds, rows: bool) -> tuple[NormBounds, float]:
+    def _lost(self, peak: NormBounds, rows: bool, by_age: bool) -> tuple[NormBounds, float]:
         """How far, at most, what is computed piece by piece gets from the truth on spans of many pieces, by the sizes
         that it would have; and a time, for which anything that drives it counts.
 
@@ -466,7 +476,10 @@ class LiftedSystem:
         longest, count = np.maximum.reduceat(self.fine.lengths, self.spans), int(self._counts.max())
         propagator = (self._backward_fine if rows else self.forward).propagator
         whole, within = propagator.lateness
-        if rows or self._block == 1:
+        if by_age:  # a row and a column go through one transition for every bit of the age
+            share = (self.fine.pieces.bit_length() + 4) * self._relative(self.fine.breakpoints[-1:])
+            late = 2.0 * propagator.drift + within
+        elif rows or self._block == 1:
             share, late = (count + 1) * self._relative(longest), count * whole + within
         else:
             share = propagator.products(count, self._block) * self._relative(self._block * longest)

@@ -19,6 +19,7 @@ from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response import lifted as lifted_module
+from sparserob_core.control.response import response as response_module
 from sparserob_core.control.response.disturbance_support import DisturbanceSupport
 from sparserob_core.control.response.lifted import frozen, lift
 from sparserob_core.sip.convex_set import Box
@@ -361,10 +362,16 @@ def test_what_rounding_changes_over_spans_of_many_pieces_is_no_hundred_times_tha
     assert (mine.max(axis=1) <= 100.0 * alone.max(axis=1)).all()
 
 
+@pytest.mark.parametrize("blocks", [False, True])
 @pytest.mark.parametrize("name", sorted(KNOWN))
-def test_states_and_rows_are_as_near_to_the_truth_as_spans_of_many_pieces_say(name, monkeypatch):
-    """The truth is an exponential in balls of 400 bits."""
+def test_states_and_rows_are_as_near_to_the_truth_as_spans_of_many_pieces_say(name, blocks, monkeypatch):
+    """The truth is an exponential in balls of 400 bits. In blocks: states through a tree of parts, rows by age."""
     monkeypatch.setattr(lifted_module, "SPANS", 12)
+    if blocks:
+        monkeypatch.setattr(response_module, "LONG", 1)
+        monkeypatch.setattr(response_module, "FEWEST", 7)
+        monkeypatch.setattr(response_module, "LITTLE", np.inf)
+        monkeypatch.setattr(response_module, "KERNEL", 0)
     functionals, lifting = known(name, "equal")
     lifted, A = lifting(), np.array(KNOWN[name][0])
     d, breaks = A.shape[0], functionals.response.grid.breakpoints
@@ -372,7 +379,8 @@ def test_states_and_rows_are_as_near_to_the_truth_as_spans_of_many_pieces_say(na
     rows = np.random.default_rng(6).normal(size=(2, d))
     nodes, remainder = lifted.nodes(control)[:, 0], lifted.state_remainder(control)[0]
     weights = lifted.backward.adjoint(breaks[1:], np.repeat(rows[:1], 60, axis=0), np.zeros((60, 0)))[0]
-    missed = lifted.row_bounds(rows)[1][0][lifted.span]
+    missed = lifted.row_bounds(rows, by_age=blocks)[1][0][lifted.span]
+    assert (lifted._block == 8) == blocks
     with balls(400):
         T = flint.arb_mat(lifted.transform.tolist())
         state = T.inv() * flint.arb_mat(functionals.response.initial_state[:, None].tolist())
@@ -401,6 +409,23 @@ def balls(bits):
         yield
     finally:
         flint.ctx.prec = before
+
+
+def test_what_the_proof_leaves_out_of_known_systems_does_not_grow_with_the_pieces():
+    """A hundred times as many pieces, in blocks and by age, are not rounded a hundred times as much."""
+    found = []
+    for pieces in (2000, 200_000):
+        system = LinearSystem(KNOWN["oscillating"][0], [[0.0], [1.0]])
+        bound = Box([-0.1, -0.1], [0.1, 0.1])
+        functionals = worst_case(system, uniform_of_many(pieces, 3.0), bound=bound, initial_state=[1.0, 0.5])
+        lifted = lift(system, functionals.response.grid, np.array([1.0, 0.5]), np.zeros(0), np.zeros(0))
+        control = np.ones((1, pieces))
+        control[:, pieces // 3 :] = -1.0
+        rows = np.eye(2) @ lifted.transform
+        left = lifted.state_remainder(control)[0].max()
+        found.append((left, DisturbanceSupport(lifted, functionals.disturbance, rows).neglected.max()))
+    assert (np.array(found[1]) <= 4.0 * np.array(found[0])).all()
+    assert max(found[1]) <= 1e-10
 
 
 def test_spans_of_many_pieces_are_short_where_the_system_moves_much():
