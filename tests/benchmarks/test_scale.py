@@ -97,7 +97,7 @@ def chain(states: int, constrained: int) -> sr.OptimalControlProblem:
 
 @pytest.mark.parametrize(("states", "pieces", "most"), [(100, 100, 3.0), (200, 1000, 30.0)])
 def test_a_chain_of_masses(states: int, pieces: int, most: float, capsys: pytest.CaptureFixture[str]) -> None:
-    """What has not reached its goal is an expected failure, with the seconds it took."""
+    """In seconds of the processor, and with no more than 2 GB."""
     sr.solve(chain(10, 4), control={"name": "piecewise_constant", "pieces": 10})  # what is imported is not measured
     began = time.process_time()
     found = sr.solve(chain(states, 10), control={"name": "piecewise_constant", "pieces": pieces})
@@ -107,5 +107,5 @@ def test_a_chain_of_masses(states: int, pieces: int, most: float, capsys: pytest
             f"\n{states} states, {pieces} pieces: {found.status}, J = {found.value:.6f}, {spent:.1f} s, {memory:.0f} MB"
         )
     assert found.status == "certified"
-    if spent > most:
-        pytest.xfail(f"the goal is {most:g} s, it took {spent:.1f} s")
+    assert spent <= most
+    assert memory <= 2000.0

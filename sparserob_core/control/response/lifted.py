@@ -391,6 +391,9 @@ class LiftedSystem:
     def _majorants(self, lengths: Array, rows: bool) -> tuple[NormBounds, NormBounds]:
         """What bounds ``int |e^{lifted s}| ds`` and ``|e^{lifted r}|`` on every fine piece, coefficient by coefficient,
         matrices ``(M q, M q)``; as in `ComparisonSystem.over`."""
+        if not self.space.nu:
+            reach = self.comparison.over(lengths)
+            return (reach.integral.transposed, reach.peak.transposed) if rows else (reach.integral, reach.peak)
         if rows not in self._majorised:
             _, longest, which = alike(lengths, (self.space.size * self.starts.size) ** 2)
             growths = block_sizes(self.A, self.starts)
