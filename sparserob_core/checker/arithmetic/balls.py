@@ -40,3 +40,11 @@ def below(ball: arb) -> float:
         if ball.is_exact() and float(ball.mid()) == ball
         else float(np.nextafter(float(ball.lower()), -np.inf))
     )
+
+
+def difference(a: float, b: float) -> tuple[float, float]:
+    """``a - b`` exactly, as the nearest number and what is left of it (Knuth 1997, section 4.2.2, theorem B): equal
+    pairs are equal differences."""
+    nearest = a - b
+    part = nearest - a
+    return nearest, (a - (nearest - part)) - (b + part)

@@ -11,12 +11,12 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 from functools import cached_property
 from typing import TYPE_CHECKING, final
 
 import numpy as np
 
+from sparserob_core.checker.arithmetic.balls import difference
 from sparserob_core.checker.claims.cost import Price, Tangent
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.reach.flow import Flow, flows, stacked
@@ -136,12 +136,12 @@ class Duality:
         for leg in range(bisect_left(switches, time), -1, -1):
             begin, end = (0.0, *switches)[leg], min((*switches, time)[leg], time)
             row, totals = stacked([[v] for v in column[:d]] + [[_exact(0.0)] for _ in column[d:]]), column[d:]
-            steps, latest, moved = dict[Fraction, arb_mat](), end, row
+            steps, latest, moved = dict[tuple[float, float], arb_mat](), end, row
             for number, s in enumerate(sorted({begin, *(s for s in since if begin <= s < end)}, reverse=True)):
                 if number % LEAPS == 0:
                     moved = (matrices[leg] * (_exact(end) - _exact(s))).exp() * row
                 else:
-                    length = Fraction(latest) - Fraction(s)
+                    length = difference(latest, s)
                     if length not in steps:
                         steps[length] = (matrices[leg] * (_exact(latest) - _exact(s))).exp()
                     moved = steps[length] * moved

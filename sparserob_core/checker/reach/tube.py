@@ -5,13 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from fractions import Fraction
 from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, final
 
 import numpy as np
 
+from sparserob_core.checker.arithmetic.balls import difference
 from sparserob_core.checker.arithmetic.series import Series, norm, upper
 from sparserob_core.checker.reach.disturbance_support import DisturbanceSupports, Scene
 from sparserob_core.checker.reach.flow import Flow, Remainder, beyond, held, in_time, middles, stacked, up_to
@@ -51,9 +51,10 @@ class Tube:
     flows: Sequence[Flow]
     scene: Scene
     basis: Array
-    _lengths: dict[int | Fraction, arb] = field(default_factory=dict)
-    _transitions: dict[tuple[int, int | Fraction], tuple[Series, Series]] = field(default_factory=dict)
-    _growths: dict[tuple[int, int | Fraction], tuple[arb_mat, arb_mat]] = field(default_factory=dict)
+    _lengths: list[arb] = field(default_factory=list)
+    _transitions: dict[tuple[int, int], tuple[Series, Series]] = field(default_factory=dict)
+    _growths: dict[tuple[int, int], tuple[arb_mat, arb_mat]] = field(default_factory=dict)
+    _ahead: dict[tuple[int, int], tuple[arb_mat, arb_mat, arb_mat]] = field(default_factory=dict)
     _inside: dict[tuple[int, int], Series] = field(default_factory=dict)
     _states: dict[tuple[int, float, int], Enclosed] = field(default_factory=dict)
 
@@ -127,19 +128,23 @@ class Tube:
         return stacked([[upper(x)] for x in balls.entries()])
 
     @cached_property
-    def _spans(self) -> list[int | Fraction]:
-        """Of every piece of the grid the key of its duration; equal keys share one ball. Every duration is known before
-        one is used, since balls grow."""
+    def _spans(self) -> list[int]:
+        """Of every piece of the grid the number of its duration; equal ones share one ball. Every duration is known
+        before one is used, since balls grow."""
         from flint import arb
 
-        found = list[int | Fraction]()
+        found, numbers = list[int](), dict[int | tuple[float, float], int]()
         for start, stop in pairwise(self.scene.grid):
             length = arb(stop) - arb(start)
-            key: int | Fraction = round((stop - start) / self.scene.tick)
+            key: int | tuple[float, float] = round((stop - start) / self.scene.tick)
             if len(self.scene.grid) > MANY:
-                key = Fraction(stop) - Fraction(start)
-            self._lengths[key] = self._lengths[key].union(length) if key in self._lengths else length
-            found.append(key)
+                key = difference(stop, start)
+            number = numbers.setdefault(key, len(numbers))
+            if number == len(self._lengths):
+                self._lengths.append(length)
+            elif len(self.scene.grid) <= MANY:
+                self._lengths[number] = self._lengths[number].union(length)
+            found.append(number)
         return found
 
     def _transition(self, piece: int) -> tuple[Series, Series]:
@@ -160,14 +165,11 @@ class Tube:
     def cells(self, piece: int, start: float, stop: float, z: Array, sharp: bool = False) -> list[Polynomial]:
         """For every ``c = z_i'basis``, ``z (k, b)``, the polynomial above ``c'x`` on ``[start, stop]``, a part
         of piece ``piece`` of the grid; ``sharp``: with less for disturbances about to switch, where that can be."""
-        from flint import arb
-
         ticks = self.scene.ticks(start, stop)  # never shorter than the cell: a bound on a little more is a bound
-        offset, length = arb(start) - arb(self.scene.grid[piece]), self.scene.duration(ticks)
         state = self._state_part(piece, start, ticks)
-        mid = np.einsum("jkb,ib->ijk", state.mid, z)
+        mid = (state.mid @ z.T).transpose(2, 0, 1)
         lost = state.rad + rounding(z.shape[1]) * np.abs(state.mid)
-        rad, kinks = np.einsum("jkb,ib->i", lost, np.abs(z)), np.zeros(z.shape[0])
+        rad, kinks = np.abs(z) @ lost.sum(axis=(0, 1)), np.zeros(z.shape[0])
         if self.scene.disturbance is not None and stop > 0.0:
             moved, off, kinks = self.sigmas[self.scene.leg(piece)].bounds(start, ticks, z, sharp)
             rad += off + rounding(1) * (np.abs(mid) + np.abs(moved)).sum(axis=(1, 2))
@@ -176,7 +178,7 @@ class Tube:
             moved, off, switching = self.sigmas[self.scene.leg(piece)].begun(start, ticks, z, sharp)
             rad += off + rounding(1) * (np.abs(mid) + np.abs(moved)).sum(axis=(1, 2))
             mid, kinks = mid + moved, kinks + switching
-        rest = self._left_out(piece, offset, length, z)
+        rest = self._left_out(piece, start, ticks, z)
         return [
             Polynomial(mid[i], float(rad[i] + rest[i]) * OUTWARD, float(rest[i]), float(kinks[i]))
             for i in range(z.shape[0])
@@ -188,26 +190,56 @@ class Tube:
 
         if (piece, start, ticks) in self._states:
             return self._states[piece, start, ticks]
-        offset = arb(start) - arb(self.scene.grid[piece])
         x, u = self.nodes[piece], self.scene.control[min(piece, len(self.scene.control) - 1)]
         leg = self.scene.leg(piece)
         states, inputs = self.flows[leg].states, self.flows[leg].inputs
-        if not offset.is_zero():
-            Phi, Gamma = states.held(inputs, offset)
+        if start != self.scene.grid[piece]:
+            Phi, Gamma = states.held(inputs, arb(start) - arb(self.scene.grid[piece]))
             x = Phi * x + Gamma.applied(u)
+        if ticks and self.flow.monomials.size == 1:
+            return self._kept(piece, start, ticks, self._of_known(leg, ticks, x.parts[0], u))
         terms = [x]
         if ticks:
             length = self.scene.duration(ticks)
             if (leg, ticks) not in self._inside:
                 self._inside[leg, ticks] = states.scaled(up_to(length)).exp()
             terms += in_time(states, states * x + inputs.applied(u), length, self._inside[leg, ticks])
-        rows = stacked([[arb(float(v)) for v in c] for c in self.basis])
-        every = Enclosed.of(stacked([(rows * part).entries() for term in terms for part in term.parts]))
-        shape = (len(terms), self.flow.monomials.size, self.basis.shape[0])
+        every = [self._rows * part for term in terms for part in term.parts]
+        return self._kept(piece, start, ticks, every)
+
+    @cached_property
+    def _rows(self) -> arb_mat:
+        from flint import arb
+
+        return stacked([[arb(float(v)) for v in c] for c in self.basis])
+
+    def _kept(self, piece: int, start: float, ticks: int, every: Sequence[arb_mat]) -> Enclosed:
         if len(self._states) >= STATES_KEPT:
             self._states.clear()
-        self._states[piece, start, ticks] = Enclosed(every.mid.reshape(shape), every.rad.reshape(shape))
+        shape = (-1, self.flow.monomials.size, self.basis.shape[0])
+        self._states[piece, start, ticks] = Enclosed.all(every, shape)
         return self._states[piece, start, ticks]
+
+    def _of_known(self, leg: int, ticks: int, x: arb_mat, u: arb_mat) -> list[arb_mat]:
+        """The terms of a known system as `in_time` has them, by products with what is the same for every cell of that
+        length: all but the last at once; and the last, which must not lose what cancels in its derivative."""
+        from flint import arb_mat
+
+        if (leg, ticks) not in self._ahead:
+            A, B = self.flows[leg].states.parts[0], self.flows[leg].inputs.parts[0]
+            d, m, length = A.nrows(), B.ncols(), self.scene.duration(ticks)
+            state, unit = (
+                Series.constant(self.flow.monomials, arb_mat(d, n, [int(i == j) for i in range(d) for j in range(n)]))
+                for n in (d + m, d)
+            )
+            rate = arb_mat([[*a, *b] for a, b in zip(A.tolist(), B.tolist(), strict=True)])
+            terms = in_time(self.flows[leg].states, Series.constant(self.flow.monomials, rate), length, unit)
+            inside = self.flows[leg].states.scaled(up_to(length)).exp().parts[0]
+            table = [row for term in (state, *terms[:-1]) for row in (self._rows * term.parts[0]).tolist()]
+            self._ahead[leg, ticks] = stacked(table), self._rows * inside, terms[-1].parts[0]
+        early, inside, last = self._ahead[leg, ticks]
+        both = arb_mat(x.nrows() + u.nrows(), 1, [*x.entries(), *u.entries()])
+        return [early * both, inside * (last * both)]
 
     @cached_property
     def sigmas(self) -> list[DisturbanceSupports]:
@@ -218,12 +250,13 @@ class Tube:
             before = DisturbanceSupports(flow, self.scene, np.eye(self.basis.shape[1]), leg, before)
         return found
 
-    def _left_out(self, piece: int, offset: arb, length: arb, z: Array) -> Array:
+    def _left_out(self, piece: int, start: float, ticks: int, z: Array) -> Array:
         """Lagrange's remainder ``(k,)`` of the state and of what the disturbance adds, for every direction."""
         from flint import arb
 
         if not self.remainders:
             return np.zeros(z.shape[0])
+        offset, length = arb(start) - arb(self.scene.grid[piece]), self.scene.duration(ticks)
         leg = self.scene.leg(piece)
         rest, u = self.remainders[leg], self.scene.control[min(piece, len(self.scene.control) - 1)]
         growth, driven = held(rest.growth, rest.control, up_to(offset + length))
