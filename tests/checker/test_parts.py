@@ -6,6 +6,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
+from fractions import Fraction
 from unittest.mock import patch
 
 import numpy as np
@@ -14,6 +15,7 @@ import scipy.linalg
 from flint import arb, ctx
 
 import sparserob_core as sr
+from sparserob_core.checker.arithmetic.balls import difference
 from sparserob_core.checker.arithmetic.bernstein import highest
 from sparserob_core.checker.arithmetic.jets import Monomials, expanded
 from sparserob_core.checker.arithmetic.series import Series
@@ -22,7 +24,8 @@ from sparserob_core.checker.claims.duality import Duality
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.reach import disturbance_support
 from sparserob_core.checker.reach.disturbance_support import Scene
-from sparserob_core.checker.reach.flow import Flow, flows, stacked
+from sparserob_core.checker.reach.flow import Flow, OwnUnits, flows, stacked
+from sparserob_core.checker.reach.measurable import Kernel
 from sparserob_core.checker.reach.tube import Tube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.expression import parse_matrix
@@ -259,6 +262,31 @@ def test_tubes_are_above_the_worst_case_and_not_far_above(nu, spread, degree, ne
                 assert (truth <= value + poly.error + 1e-13).all()
                 assert poly.error - poly.kinks <= near
                 assert (value - poly.error - poly.kinks <= truth + 1e-13).all()
+
+
+@pytest.mark.parametrize("factor", [1.0, 2.0**-30, 2.0**40, 3e5])
+def test_the_kernel_of_a_measurable_disturbance_is_as_sharp_in_any_units(factor):
+    turn = np.diag([1.0, factor])
+    A, E = turn @ [[0.0, 1.0], [-2.0, -0.5]] @ np.linalg.inv(turn), turn @ [[0.3], [1.0]]
+    length, size = 0.7, np.array([1.0, factor])
+    with ctx.workprec(160):
+        balls = [stacked([exact(row) for row in matrix]) for matrix in (A, E)]
+        own = OwnUnits.of(balls[0], 5.0, np.abs(E)[:, 0])
+        kernel = Kernel.of(*balls, arb(length), own)
+    assert kernel.count == 4
+    assert (kernel.off <= 1e-14 * size[:, None]).all()
+    for part, at in itertools.product(range(kernel.count), (-1.0, -0.3, 0.5, 1.0)):
+        truth = scipy.linalg.expm(A * kernel.half * (2 * part + 1 + at)) @ E
+        value = np.einsum("p,pdw->dw", at ** np.arange(kernel.coefficients.shape[1]), kernel.coefficients[part])
+        assert (np.abs(value - truth) <= kernel.off[part] + 1e-13 * size[:, None]).all()
+
+
+def test_a_difference_of_two_numbers_is_told_exactly():
+    rng = np.random.default_rng(6)
+    for a, b in rng.normal(size=(200, 2)) * 10.0 ** rng.integers(-12, 12, size=(200, 2)):
+        nearest, rest = difference(float(a), float(b))
+        assert Fraction(nearest) + Fraction(rest) == Fraction(float(a)) - Fraction(float(b))
+        assert nearest == float(a) - float(b)
 
 
 def test_ages_hold_wherever_one_looks_from_or_equal_pieces_are_not_taken_for_it():

@@ -20,7 +20,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.series import norm
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.reach.flow import Flow, balanced, held, middles, stacked
+from sparserob_core.checker.reach.flow import Flow, OwnUnits, held, middles, stacked
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.control.sets.sets import ConvexSet
@@ -272,29 +272,20 @@ class ClosedLoop:
         return self.heights(self.state(piece, time), rows, beside)
 
     @cached_property
-    def _units(self) -> Array:
-        """Any units ``(d,)`` of the states, powers of two, would be right; in these ``|A|`` is small."""
+    def _speed(self) -> Array:
+        """How fast the sources change the states, about, ``(d,)``."""
         sizes = np.concatenate([[1.0], self.radii])
-        speed = np.max([np.abs(middles(drive)) @ sizes for drive in self.drives], axis=0)
-        return balanced(middles(self.parts["A"]), self.grid[-1], speed)
+        return np.asarray(np.max([np.abs(middles(drive)) @ sizes for drive in self.drives], axis=0))
 
     @cached_property
-    def _growth(self) -> arb:
-        """The norm of ``A`` in those units."""
-        rows = self.parts["A"].tolist()
-        return norm(
-            stacked(
-                [
-                    [x * float(other) / float(unit) for x, other in zip(row, self._units, strict=True)]
-                    for row, unit in zip(rows, self._units, strict=True)
-                ]
-            )
-        )
+    def own(self) -> OwnUnits:
+        """The units in which rests are bounded."""
+        return OwnUnits.of(self.parts["A"], self.grid[-1], self._speed)
 
     def bent(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:
         """By how much ``max c'x(t)`` may lie above its chord on ``[start, stop]``, a part of a piece of the grid, at
         most, ``(r,)``: ``(stop - start)^2 / 8`` times the largest second derivatives of the nominal state and of every
-        response, each times how far its deviation goes. The rest of the expansion is taken in `_units`."""
+        response, each times how far its deviation goes. The rest of the expansion is taken in `own` units."""
         from flint import arb
 
         A, h = self.parts["A"], arb(stop) - arb(start)
@@ -306,12 +297,10 @@ class ClosedLoop:
             total = total + (np.abs(found.mid) + found.rad) * float((factor * OUTWARD).upper())
             row, factor = row * A, factor * h / (order + 1)
         sizes = np.concatenate([[1.0], self.radii])
-        most, units = Enclosed.of(rate), self._units
-        far = (np.abs(most.mid) + most.rad) / units[:, None]
-        speed = float((np.sqrt((far**2).sum(axis=0)) @ sizes) * OUTWARD)
-        tail = float((factor * (self._growth * h).exp()).upper()) * speed
-        scaled = [[x * float(unit) for x, unit in zip(line, units, strict=True)] for line in row.tolist()]
-        lengths = np.array([float(norm(stacked([line])).upper()) for line in scaled])
+        far = Enclosed.of(self.own.states(rate))
+        speed = float((np.sqrt(((np.abs(far.mid) + far.rad) ** 2).sum(axis=0)) @ sizes) * OUTWARD)
+        tail = float((factor * (self.own.growth * h).exp()).upper()) * speed
+        lengths = np.array([float(norm(stacked([line])).upper()) for line in self.own.rows(row).tolist()])
         summed = total @ sizes * (1.0 + rounding(sizes.size)) + tail * lengths
         return np.asarray(float((h * h / 8).upper()) * summed * OUTWARD)
 

@@ -268,6 +268,36 @@ def balanced(A: Array, horizon: float, speed: Array) -> Array:
     return np.asarray(np.exp2(np.clip(np.round(exponents[:-1] - exponents[-1]), -500, 500)), dtype=float)
 
 
+@final
+@dataclass(frozen=True, eq=False)
+class OwnUnits:
+    """Units ``(d,)`` of the states, powers of two, in which a system's ``matrix`` is small: what is left of an
+    expansion is bounded in these."""
+
+    matrix: arb_mat
+    units: Array
+
+    @staticmethod
+    def of(A: arb_mat, horizon: float, speed: Array) -> OwnUnits:
+        """Those of ``x' = A x`` with sources of about this ``speed (d,)``: any would be right."""
+        return OwnUnits(A, balanced(middles(A), horizon, speed))
+
+    @cached_property
+    def growth(self) -> arb:
+        """The norm of the matrix in these units."""
+        return norm(self.rows(self.states(self.matrix)))
+
+    def states(self, columns: arb_mat) -> arb_mat:
+        """Columns of states ``(d, n)`` in these units."""
+        units = map(float, self.units)
+        return stacked([[x / unit for x in row] for row, unit in zip(columns.tolist(), units, strict=True)])
+
+    def rows(self, rows: arb_mat) -> arb_mat:
+        """Rows on states ``(r, d)``, on such in these units."""
+        units = list(map(float, self.units))
+        return stacked([[x * unit for x, unit in zip(row, units, strict=True)] for row in rows.tolist()])
+
+
 def _modal(A: Array) -> Array:
     values, vectors = np.linalg.eig(A)
     columns = [

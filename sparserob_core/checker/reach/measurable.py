@@ -19,7 +19,7 @@ from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.series import norm
 from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.checker.reach.closed_loop import ClosedLoop, exactly, middle
-from sparserob_core.checker.reach.flow import held, stacked
+from sparserob_core.checker.reach.flow import OwnUnits, column, held, middles, stacked
 from sparserob_core.checker.sets.flat import Boxed, Cornered
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
@@ -75,12 +75,12 @@ class Kernel:
     half: float
 
     @staticmethod
-    def of(A: arb_mat, E: arb_mat, length: arb) -> Kernel:
-        """The kernel of a piece."""
+    def of(A: arb_mat, E: arb_mat, length: arb, own: OwnUnits) -> Kernel:
+        """The kernel of a piece; what is left of the expansion is bounded in the states' ``own`` units."""
         from flint import arb, arb_mat
 
         d, mw = A.nrows(), E.ncols()
-        speed = float((norm(A) * length).upper())
+        speed = float((own.growth * length).upper())
         if not speed < MOST_PARTS:
             raise Unchecked("the system is too fast for its pieces to be integrated")
         count = max(PARTS, int(np.ceil(speed)))
@@ -90,15 +90,17 @@ class Kernel:
         terms, factor = [E], arb(1)
         for order in range(ORDER):
             terms.append(A * terms[-1] * (half / (order + 1)))
-            factor = factor * norm(A) * half / (order + 1)
-        rest = factor * norm(A) * half / (ORDER + 1) * (norm(A) * half).exp() * norm(E)
+            factor = factor * own.growth * half / (order + 1)
+        rest = factor * own.growth * half / (ORDER + 1) * (own.growth * half).exp()
+        pushed = [norm(column(own.states(E), w)) for w in range(mw)]
         matrices, lost = [], []
         for _ in range(count):
             matrices += [term * one for one in terms]
-            lost.append(float((rest * norm(term)).upper()))
+            left = rest * norm(own.rows(own.states(term)))
+            lost.append([float((left * size).upper()) for size in pushed])
             term = step * term
         found = Enclosed.all(matrices, (count, ORDER + 1, d, mw))
-        off = (found.rad.sum(axis=1) + np.array(lost)[:, None, None]) * OUTWARD
+        off = (found.rad.sum(axis=1) + own.units[:, None] * np.array(lost)[:, None, :]) * OUTWARD
         return Kernel(found.mid, off, float(half.mid()))
 
     @property
@@ -234,6 +236,15 @@ class MeasurableLoop(ClosedLoop):
         assert self.shape is not None
         return Side.of(self.shape)
 
+    @cached_property
+    def _speed(self) -> Array:
+        """That of the nominal state and of the disturbance: what this makes of a state is known from the kernels only,
+        whose rests are bounded in these units."""
+        assert self.shape is not None
+        nominal = np.max([np.abs(middles(drive)[:, 0]) for drive in self.drives], axis=0)
+        far = np.array(known(self.shape).radius) + np.abs(self.middle)
+        return np.asarray(nominal + np.abs(middles(self.parts["E"])) @ far)
+
     def kernel(self, piece: int) -> Kernel:
         """That of a piece."""
         from flint import arb
@@ -242,7 +253,7 @@ class MeasurableLoop(ClosedLoop):
         exact = self._exact(start, stop, stop - start)
         key = (stop - start, True) if exact else (float(piece), False)
         if key not in self._kernels:
-            self._kernels[key] = Kernel.of(self.parts["A"], self.parts["E"], arb(stop) - arb(start))
+            self._kernels[key] = Kernel.of(self.parts["A"], self.parts["E"], arb(stop) - arb(start), self.own)
         return self._kernels[key]
 
     @cached_property
