@@ -22,10 +22,10 @@ class Ridge(sr.Regulariser, sr.Options):
 
     def quadratic(self, image: sr.ControlImage) -> tuple[csc_array, sr.Array]:
         """Identity and zero."""
-        from scipy.sparse import csc_array, eye_array
+        from scipy.sparse import eye_array
 
         n = image.S.shape[1]
-        return csc_array(eye_array(n, format="csc")), np.zeros(n)
+        return eye_array(n, format="csc"), np.zeros(n)
 
 
 @final

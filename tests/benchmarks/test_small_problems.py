@@ -22,7 +22,7 @@ from tests.benchmarks.test_annealing_moves import cold
 pytestmark = pytest.mark.benchmark
 
 PIECES, TIMES = 50, 60
-MOST, GOAL = {"again": 20.0, "anew": 40.0}, 0.010  # cold solves of PIQP; seconds
+MOST, GOAL = {"again": 10.0, "anew": 30.0}, 0.010  # cold solves of PIQP; seconds
 
 
 def problem(velocity: float = 1.0) -> sr.OptimalControlProblem:

@@ -29,6 +29,8 @@ BLOCK = 32  # pieces of a block in which outputs are computed: what grows with i
 TINY = float(np.finfo(float).tiny)
 KERNEL = 1_000_000  # numbers of what all ages give in all directions, up to which they are remembered
 STEP = 4 * EPSILON  # of the horizon: times that differ by less are a whole piece apart, or not at all
+FEW_STATES, FEW_NUMBERS = 8, 10_000  # up to which tables of parts of pieces, and of many pieces, are made
+TERMS = 20  # of such a series: 1 / 20! is below 1e-18
 SHORT, SERIES = 1.0, 1e-17  # norm of A times a part of a piece up to which a series is summed, and its last term
 AT_ONCE = 50_000  # numbers of a term of the series
 FEW = 128  # indices for which a table beats the loop over the pieces
@@ -412,14 +414,42 @@ class Propagator:
                 steps, np.zeros(within.size, dtype=int), within, np.zeros(within.size, dtype=int)
             )
             return (rows[:, None] @ Phi)[:, 0], (rows[:, None] @ Gamma)[:, 0]
+        if A.shape[0] <= FEW_STATES:  # a table of the series takes fewer calls than the series on the rows
+            powers = (within / length)[:, None] ** np.arange(TERMS)
+            both = (powers @ self._series_of_parts).reshape(within.size, 2, *A.shape)
+            moved = (rows[:, None, None] @ both)[:, :, 0]
+            return moved[:, 0], moved[:, 1] * within[:, None]
         count = max(1, AT_ONCE // rows.shape[1])
         if len(rows) <= count:
             return _series(A, rows, within, size)
         found = [_series(A, rows[i : i + count], within[i : i + count], size) for i in range(0, len(rows), count)]
         return np.concatenate([flown for flown, _ in found]), np.concatenate([driven for _, driven in found])
 
+    @cached_property
+    def _series_of_parts(self) -> Array:
+        """Coefficients ``(TERMS, 2 d^2)`` of ``e^{A r}`` and ``int_0^r e^{A s} ds / r`` in powers of the share of a
+        piece that ``r`` is; for a known system and equal pieces."""
+        A = self.steps(np.zeros((1, 0))).A[0, 0] * self.lengths[0]
+        terms = [np.eye(A.shape[0])]
+        for order in range(1, TERMS):
+            terms.append(terms[-1] @ A / order)
+        return np.array([[one, one / (order + 1)] for order, one in enumerate(terms)]).reshape(TERMS, -1)
+
+    @cached_property
+    def _flown(self) -> Array:
+        """``e^{A i h}`` for ``i = 0, ..., L - 1``, ``(L, d, d)``, each the product of the leaps that it is made of."""
+        flown, done = np.empty((self.grid.pieces, *self.leaps.shape[1:])), 1
+        flown[0] = np.eye(flown.shape[1])
+        for leap in self.leaps:
+            more = min(done, flown.shape[0] - done)
+            flown[done : done + more] = flown[:more] @ leap
+            done += more
+        return flown
+
     def _leapt(self, rows: Array, pieces: np.ndarray) -> Array:
         """``rows (k, d)`` that went on by so many whole ``pieces (k,)``, ``(k, d)``."""
+        if self.propagate is None and self.grid.pieces * rows.shape[1] ** 2 <= FEW_NUMBERS:
+            return np.asarray((rows[:, None] @ self._flown[pieces])[:, 0])
         free, together = rows.copy(), int(pieces[0]) if pieces.size and (pieces == pieces[0]).all() else None
         for place, leap in enumerate(self.leaps[: int(pieces.max(initial=0)).bit_length()]):
             if together is None:

@@ -192,9 +192,9 @@ class RelaxedProgram:
             from scipy.sparse import csc_array, eye_array
 
             base, images = self.program.finite, self.program.image_size
-            S = csc_array(eye_array(self.program.n)) if base.S is None else base.S[:images]
+            S = eye_array(self.program.n, format="csc") if base.S is None else csc_array(base.S[:images])
             lengths = np.ones(images) if self.program.lengths is None else self.program.lengths
-            P, q = self.regulariser.quadratic(ControlImage(csc_array(S), self.program.channels, lengths))
+            P, q = self.regulariser.quadratic(ControlImage(S, self.program.channels, lengths))
             self._terms = P.tocsc(), q
 
     def solve(

@@ -295,3 +295,25 @@ def test_states_in_blocks_are_those_of_the_recursion(states: int, pieces: int, m
     with patch("sparserob_core.control.response.response.LONG", 10**9):
         plain = response.states(control, none, disturbance)
     np.testing.assert_allclose(fast, plain, rtol=0.0, atol=1e-12 * np.abs(plain).max())
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10**6), states=st.integers(1, 8), pieces=st.integers(1, 60))
+def test_tables_of_few_states_weigh_as_the_series_on_rows_and_the_exponential_do(seed, states, pieces):
+    rng = np.random.default_rng(seed)
+    A, horizon = rng.normal(size=(states, states)) / np.sqrt(states), 3.0
+    times, directions = rng.uniform(0.0, horizon, 5), rng.normal(size=(5, states))
+    grid = np.linspace(0.0, horizon, pieces + 1)
+
+    def weights():
+        response = Response(LinearSystem(A, np.eye(states)), merge_grids(grid, grid), np.zeros(states))
+        return response.weights(times, directions, np.zeros((5, 0)))
+
+    by_table = weights()
+    home = "sparserob_core.control.response.response"
+    with patch(f"{home}.FEW_STATES", 0), patch(f"{home}.FEW_NUMBERS", 0):
+        by_rows = weights()
+    for one, other in zip(by_table, by_rows, strict=True):
+        assert np.abs(one - other).max() <= 1e-13 * np.abs(other).max()
+    exact = np.stack([expm(A.T * t) @ c for t, c in zip(times, directions, strict=True)])
+    assert np.abs(by_table.free - exact).max() <= 1e-12 * np.abs(exact).max()
