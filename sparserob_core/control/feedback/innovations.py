@@ -8,6 +8,7 @@ the gains that have these effects are ``M_k = F_k D^+``.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, final
@@ -114,39 +115,64 @@ class Answers:
 
 def answers(D: Array, breakpoints: Array, channels: int, memory: float | None) -> Answers:
     """The coordinates of gains that answer innovations ``D (K, d, Q)`` for ``memory`` at most; in units in which states
-    and deviations are of ordinary size."""
+    and deviations are of ordinary size. Variables are numbered piece by piece of the control, and then channel by
+    channel of everything that hangs together."""
     K, d, Q = D.shape
-    clusters = _clusters((D != 0.0).any(axis=1))
-    pieces, channel, entry = [], [], []
+    alike = list(_alike(D, breakpoints, memory))
+    sizes = np.zeros((K, 1 + max((one.cluster for one in alike), default=0)), dtype=int)
+    for one in alike:
+        sizes[one.pieces, one.cluster] = channels * one.free.size
+    starts = (np.cumsum(sizes.ravel()) - sizes.ravel()).reshape(sizes.shape)
+    piece, channel, entry = (np.zeros(int(sizes.sum()), dtype=int) for _ in range(3))
     effect: list[tuple[np.ndarray, np.ndarray, Array]] = []
     gain: list[tuple[np.ndarray, np.ndarray, Array]] = []
-    count, known = 0, {}
-    horizon = breakpoints[-1]
-    for k in range(K):
-        oldest = -np.inf if memory is None else breakpoints[k] - memory - SAME_TIME * horizon
-        for number, cluster in enumerate(clusters):
-            seen = cluster[(cluster <= k) & (breakpoints[cluster] >= oldest)]
+    i = np.arange(channels)[:, None]
+    for one in alike:
+        k, r = one.pieces[:, None, None], one.free.size
+        names = starts[one.pieces, one.cluster][:, None, None] + i * r + np.arange(r)
+        piece[names], channel[names], entry[names] = k, i, one.free
+        rows, cols = np.nonzero(one.Z)
+        effect.append(_listed((k * channels + i) * Q + one.columns[cols], names[..., rows], one.Z[rows, cols]))
+        rows, cols = np.nonzero(one.G)
+        at = ((k * K + one.seen[cols // d]) * channels + i) * d + cols % d
+        gain.append(_listed(at, names[..., rows], one.G[rows, cols]))
+    return Answers((K, channels, Q, d), piece, channel, entry, _joined(effect), _joined(gain))
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Alike:
+    """``pieces`` of the control that answer the same breakpoints ``seen`` of one ``cluster``, by number, and
+    `_coordinates` of these."""
+
+    pieces: np.ndarray
+    cluster: int
+    seen: np.ndarray
+    columns: np.ndarray
+    free: np.ndarray
+    Z: Array
+    G: Array
+
+
+def _alike(D: Array, breakpoints: Array, memory: float | None) -> Iterator[_Alike]:
+    """All pieces of the control that answer anything, cluster by cluster."""
+    K = D.shape[0]
+    oldest = np.full(K, -np.inf) if memory is None else breakpoints[:K] - memory - SAME_TIME * breakpoints[-1]
+    for number, cluster in enumerate(_clusters((D != 0.0).any(axis=1))):
+        last = np.searchsorted(cluster, np.arange(K), side="right")
+        first = np.minimum(np.searchsorted(breakpoints[cluster], oldest), last)
+        windows, which = np.unique(first * (K + 1) + last, return_inverse=True)
+        for window, code in enumerate(windows.tolist()):
+            seen = cluster[code // (K + 1) : code % (K + 1)]
             if not seen.size:
                 continue
-            key = (number, int(seen[0]), int(seen[-1]))
-            if key not in known:
-                known[key] = _coordinates(D[seen])
-            columns, free, Z, G = known[key]
-            r = free.size
-            if not r:
-                continue
-            for i in range(channels):
-                names = count + np.arange(r)
-                count += r
-                pieces.append(np.full(r, k))
-                channel.append(np.full(r, i))
-                entry.append(free)
-                rows, cols = np.nonzero(Z)
-                effect.append(((k * channels + i) * Q + columns[cols], names[rows], Z[rows, cols]))
-                rows, cols = np.nonzero(G)
-                j, state = seen[cols // d], cols % d
-                gain.append((((k * K + j) * channels + i) * d + state, names[rows], G[rows, cols]))
-    return Answers((K, channels, Q, d), _whole(pieces), _whole(channel), _whole(entry), _joined(effect), _joined(gain))
+            columns, free, Z, G = _coordinates(D[seen])
+            if free.size:
+                yield _Alike(np.flatnonzero(which == window), number, seen, columns, free, Z, G)
+
+
+def _listed(at: Array, which: Array, value: Array) -> tuple[np.ndarray, np.ndarray, Array]:
+    return at.ravel(), which.ravel(), np.broadcast_to(value, which.shape).ravel()
 
 
 def _clusters(where: np.ndarray) -> list[np.ndarray]:
@@ -184,10 +210,10 @@ def _coordinates(seen: Array) -> tuple[np.ndarray, np.ndarray, Array, Array]:
     return columns, columns[chosen], Z * far / far[chosen][:, None], inverse / far[chosen][:, None]
 
 
-def _whole(parts: list[np.ndarray]) -> np.ndarray:
-    return np.concatenate([np.zeros(0, dtype=int), *parts])
-
-
 def _joined(parts: list[tuple[np.ndarray, np.ndarray, Array]]) -> tuple[np.ndarray, np.ndarray, Array]:
-    at, which, value = zip(*parts, strict=True) if parts else ((), (), ())
-    return _whole(list(at)), _whole(list(which)), np.concatenate([np.zeros(0), *value])
+    """Positions, variables and values, in the order of the variables."""
+    if not parts:
+        return np.zeros(0, dtype=int), np.zeros(0, dtype=int), np.zeros(0)
+    at, which, value = (np.concatenate(part) for part in zip(*parts, strict=True))
+    order = np.argsort(which, kind="stable")
+    return at[order], which[order], value[order]

@@ -1,0 +1,55 @@
+"""Guards control/feedback/innovations: the variables are effects of gains, numbered piece by piece; what is forgotten
+or not measured yet is not answered."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sparserob_core.control.feedback.innovations import answers
+
+
+def innovations(rng: np.random.Generator, K: int, d: int, Q: int) -> np.ndarray:
+    """Entries of the deviations that are seen at one breakpoint, or at two."""
+    D = np.zeros((K, d, Q))
+    for q in range(Q):
+        first = int(rng.integers(0, K))
+        D[first, :, q] = rng.normal(size=d)
+        if rng.random() < 0.3 and first + 1 < K:
+            D[first + 1, :, q] = rng.normal(size=d)
+    return D
+
+
+@pytest.mark.parametrize("memory", [None, 0.25])
+@pytest.mark.parametrize("seed", range(12))
+def test_gains_have_the_effects_that_the_variables_say(seed: int, memory: float | None) -> None:
+    rng = np.random.default_rng(seed)
+    K, d, channels = int(rng.integers(1, 9)), int(rng.integers(1, 4)), int(rng.integers(1, 4))
+    Q = int(rng.integers(1, 3 * K))
+    D, breakpoints = innovations(rng, K, d, Q), np.concatenate([[0.0], np.sort(rng.random(K - 1)), [1.0]])
+    known = answers(D, breakpoints, channels, memory)
+    numbers = rng.normal(size=known.variables)
+    F, M = known.effects(numbers), known.gains(numbers)
+    np.testing.assert_allclose(np.einsum("kjid,jdq->kiq", M, D), F, atol=1e-8 * max(1.0, np.abs(M).max(initial=0.0)))
+    np.testing.assert_array_equal(F[known.piece, known.channel, known.entry], numbers)
+    for k, j in np.argwhere(M.any(axis=(2, 3))):
+        assert j <= k and (memory is None or breakpoints[k] - breakpoints[j] <= memory + 1e-12)
+    assert (np.diff(known.piece) >= 0).all() and (np.diff(known.effect[0] // (channels * Q)) >= 0).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_there_are_as_many_variables_as_what_is_seen_is_independent(seed: int) -> None:
+    """Of every piece of the control: the rank of all that was seen by then, for each channel."""
+    rng = np.random.default_rng(seed)
+    K, d, Q = 5, 2, 12
+    D = innovations(rng, K, d, Q)
+    known = answers(D, np.linspace(0.0, 1.0, K + 1), 2, None)
+    for k in range(K):
+        rank = np.linalg.matrix_rank(D[: k + 1].reshape(-1, Q))
+        assert np.count_nonzero(known.piece == k) == 2 * rank
+
+
+def test_nothing_that_is_seen_is_nothing_that_is_answered() -> None:
+    known = answers(np.zeros((3, 2, 4)), np.linspace(0.0, 1.0, 4), 2, None)
+    assert known.variables == 0
+    assert not known.effects(np.zeros(0)).any() and not known.gains(np.zeros(0)).any()
