@@ -154,7 +154,8 @@ class ComparisonSystem:
             shortest, longest, which = alike(widths, self.sizes.size)
         key = shortest.tobytes() + longest.tobytes()
         if key not in self._known:
-            remember(self._known, key, self._over(shortest, longest), KEPT)
+            most = MOST // max(1, shortest.size * self.sizes.size)
+            remember(self._known, key, self._over(shortest, longest), max(1, min(KEPT, most)))
         return Reach(*(NormBounds(part, which) for part in self._known[key]))
 
     @cached_property

@@ -51,7 +51,7 @@ KNOWN = np.zeros((1, 0))
 # growth of the comparison system times length of the parts that pieces are cut into for what is neglected, and how
 # many of a piece at most
 SHORT, MOST_CUTS = 0.5, 64
-PATHS_KEPT, PATHS_SIZE = 4, 40_000_000  # paths that are remembered, and the numbers in all of them beyond the first
+PATHS_KEPT, PATHS_SIZE = 4, 20_000_000  # paths that are remembered, and the numbers in all of them beyond the first
 SPANS = 256  # of several pieces each, for which what is left out is bounded, where there are four times as many pieces
 
 
@@ -322,13 +322,15 @@ class LiftedSystem:
         share them."""
         key = control.tobytes()
         if key not in self._paths:
+            most = max(1, min(PATHS_KEPT, PATHS_SIZE // ((self.fine.pieces + 1) * self.matrix.shape[0])))
+            while len(self._paths) >= most:  # before the new one is made: either may be large
+                self._paths.pop(next(iter(self._paths)))
             forward = self.forward
             if self.past is not None:
                 ended = self.past.lifted.nodes(control)[-1]
                 forward = forward.from_state((ended @ self.past.turn.T).ravel())
             states = forward.states(control, KNOWN)[0]
-            most = max(1, min(PATHS_KEPT, PATHS_SIZE // states.size))
-            remember(self._paths, key, states.reshape(-1, self.space.size, self.states), most)
+            self._paths[key] = states.reshape(-1, self.space.size, self.states)
         return self._paths[key]
 
     @cached_property

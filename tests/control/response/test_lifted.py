@@ -457,3 +457,21 @@ def test_what_is_bounded_of_many_states_takes_no_more_memory_than_the_path():
 
 def uniform_of_many(pieces, horizon):
     return Dictionary.indicators(np.linspace(0.0, horizon, pieces + 1))
+
+
+@pytest.mark.parametrize("name", ["oscillating", "stable"])
+def test_sums_over_ages_that_are_remembered_are_those_of_any_times(name):
+    functionals, lifted = made(name, "uniform", bound=Box([-0.1, -0.3], [0.2, 0.1]))
+    sigma = DisturbanceSupport(lifted, functionals.disturbance, np.array([[1.0, 0.0], [0.5, -2.0]]) @ lifted.transform)
+    times, ends = lifted.grid.breakpoints[1:], np.zeros((6, 2, lifted.space.nu))
+    widths = np.full(6, 0.01)
+    at, bend = sigma.at(times, ends), sigma.deviation(times - 0.01, widths)
+    again = sigma.at(times[::-1], ends), sigma.deviation(times - 0.01, widths)
+    beside, none = np.append(times, 0.1), np.zeros((7, 2, lifted.space.nu))
+    for one, same, other in zip(at, again[0], sigma.at(beside, none), strict=True):
+        np.testing.assert_array_equal(one, same[::-1])
+        np.testing.assert_allclose(one, other[:-1], rtol=1e-12, atol=1e-14)
+    np.testing.assert_array_equal(bend, again[1])
+    begun = sigma.deviation(times[:-1], widths[:-1])
+    mixed = sigma.deviation(np.append(times[:-1], 0.1), widths)
+    np.testing.assert_allclose(begun, mixed[:-1], rtol=1e-12)
