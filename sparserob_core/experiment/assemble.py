@@ -13,17 +13,16 @@ import numpy as np
 from sparserob_core.control.policies.policy import Policy
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError, TimeLimitError
 from sparserob_core.experiment.config.load import Loaded, load_config
 from sparserob_core.experiment.plugins.guards import guarded
-from sparserob_core.experiment.solve import indicators
 from sparserob_core.sip.method import Deadline, OutOfTime, Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.regulariser import Regulariser
 from sparserob_core.sip.solver import Solver
 
 if TYPE_CHECKING:
+    from sparserob_core.control.transcription.record import Transcription
     from sparserob_core.experiment.config.run_config import Entry
 
 
@@ -133,7 +132,11 @@ def dictionaries_of(loaded: Loaded, horizon: float) -> tuple[Dictionary, Diction
     at fault."""
     control = _dictionary(loaded, "control", loaded.config.dictionaries.control, horizon)
     entry = loaded.config.dictionaries.disturbance
-    return control, indicators(control) if entry is None else _dictionary(loaded, "disturbance", entry, horizon)
+    if entry is not None:
+        return control, _dictionary(loaded, "disturbance", entry, horizon)
+    from sparserob_core.experiment.solve import indicators
+
+    return control, indicators(control)
 
 
 def gap_tolerance(loaded: Loaded) -> float | None:

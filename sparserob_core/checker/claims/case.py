@@ -150,6 +150,12 @@ class Case:
         object."""
         from flint import arb, arb_mat
 
+        if self.control.is_indicators:
+            values, alike = coefficients.T.tolist(), dict[tuple[float, ...], arb_mat]()
+            for value in map(tuple, values):
+                if value not in alike:
+                    alike[value] = stacked([[arb(v)] for v in value])
+            return [alike[tuple(value)] for value in values]
         columns, none = self.control.sparse.tocsc(), arb(0)
         found, made = [], dict[bytes, arb_mat]()
         for start, stop in pairwise(columns.indptr.tolist()):

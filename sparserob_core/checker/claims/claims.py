@@ -11,10 +11,8 @@ import numpy as np
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.claims import activity
 from sparserob_core.checker.claims.case import Case, listed, number, numbers
-from sparserob_core.checker.claims.causal import causal_bound
 from sparserob_core.checker.claims.constraints import bounded, equalities
 from sparserob_core.checker.claims.duality import Row, before, steps
-from sparserob_core.checker.claims.feedback import feedback_of
 from sparserob_core.checker.claims.replay import reached
 from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import TOLERANCE, Broken, Finding, Unchecked
@@ -24,6 +22,8 @@ from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
     from flint import arb, arb_mat
+
+    from sparserob_core.checker.claims.feedback import FeedbackClaims
 
 PRECISION = 96  # bits, where the numbers of a system are of one size
 MOST_PRECISION = 1024
@@ -76,6 +76,8 @@ def derived_causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> f
     how much it misses their sum. Raises `Unchecked` and `Broken` where there is none."""
     from flint import ctx
 
+    from sparserob_core.checker.claims.causal import causal_bound
+
     with ctx.workprec(_precision(case)):
         return float(np.nextafter(float(causal_bound(case, data, priced).lower()), -np.inf))
 
@@ -108,18 +110,25 @@ def judged(name: str, derive: Callable[[], str]) -> Finding:
         return Finding(name, "not checked", "a ball around a divisor holds 0")
 
 
+def _feedback(case: Case) -> FeedbackClaims:
+    """What is derived of a control that answers its measurements."""
+    from sparserob_core.checker.claims.feedback import feedback_of
+
+    return feedback_of(case)
+
+
 def _kept(case: Case, window: Window) -> str:
-    return bounded(case, window) if case.policy is None else feedback_of(case).bounded(window)
+    return bounded(case, window) if case.policy is None else _feedback(case).bounded(window)
 
 
 def _equalities(case: Case) -> str:
-    return equalities(case) if case.policy is None else feedback_of(case).equalities()
+    return equalities(case) if case.policy is None else _feedback(case).equalities()
 
 
 def _control(case: Case) -> str:
     """Every piece of the control in its set."""
     if case.policy is not None:
-        return feedback_of(case).control()
+        return _feedback(case).control()
     worst, seen = 0.0, set[int]()
     for start, piece in zip(case.control.breakpoints[:-1], case.pieces, strict=True):
         case.clock.check()
@@ -134,7 +143,7 @@ def _control(case: Case) -> str:
 
 
 def _changed(case: Case) -> str:
-    return _steps(case) if case.policy is None else feedback_of(case).steps()
+    return _steps(case) if case.policy is None else _feedback(case).steps()
 
 
 def _steps(case: Case) -> str:
@@ -158,7 +167,7 @@ def _steps(case: Case) -> str:
 def _cost(case: Case) -> str:
     if case.counts:
         return _counted(case)
-    derived = case.price.of(case.pieces) if case.policy is None else feedback_of(case).cost()
+    derived = case.price.of(case.pieces) if case.policy is None else _feedback(case).cost()
     _agrees("cost", number(case.certificate, "cost"), derived, SMALL_COST * case.price.largest)
     return f"J = {float(derived.mid()):.12g}"
 
@@ -188,7 +197,7 @@ def _multiplied(case: Case, priced: bool) -> arb:
     """The bound that the certificate's multipliers give."""
     data = case.certificate.get("multipliers")
     if case.policy is not None:
-        return feedback_of(case).multiplied(_entries(data), priced)
+        return _feedback(case).multiplied(_entries(data), priced)
     rows, pieces = _weighted(case, data)
     if not priced:
         return case.duality.bound(rows, pieces, None)
@@ -360,6 +369,8 @@ def _lower(case: Case) -> str:
 
 def _causal(case: Case) -> str:
     """The bound against every causal policy."""
+    from sparserob_core.checker.claims.causal import causal_bound
+
     data = case.certificate["causal"]
     if not isinstance(data, Mapping):
         raise Broken("causal: expected lower_bound, signals and multipliers")
@@ -451,7 +462,7 @@ def _witness(case: Case) -> str:
     if not isinstance(data, Mapping):
         raise Unchecked("the certificate holds no witness")
     if case.policy is not None:
-        return _exceeded(*feedback_of(case).driven(data), data)
+        return _exceeded(*_feedback(case).driven(data), data)
     window, time = case.window(str(data.get("constraint"))), number(data, "time")
     direction, parameter = (numbers(data.get(key), key) for key in ("direction", "parameter"))
     _sized(direction, window.shape.dimension, window.name)

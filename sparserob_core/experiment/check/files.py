@@ -285,10 +285,11 @@ def _attained(case: Case, said: Mapping[str, Any]) -> list[str]:
     named where there are several."""
     from sparserob_core.checker.arithmetic.balls import balls
     from sparserob_core.checker.claims.case import numbers
-    from sparserob_core.checker.claims.feedback import feedback_of
     from sparserob_core.checker.claims.replay import exceeded
 
     if case.policy is not None:
+        from sparserob_core.checker.claims.feedback import feedback_of
+
         found = [("", *feedback_of(case).exceeded(said))]
     else:
         found = [("", *exceeded(case, said))]

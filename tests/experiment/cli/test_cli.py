@@ -179,6 +179,25 @@ def test_a_small_run_imports_neither_an_optimiser_nor_the_checker_nor_what_draws
     assert not loaded & {f"sparserob_core.{module}" for module in elsewhere}
 
 
+def test_the_check_of_a_small_run_imports_neither_sparse_matrices_nor_what_only_policies_need(
+    repository: Path, tmp_path: Path, command: Command
+) -> None:
+    directory = str(tmp_path / "run")
+    command("run", repository / "configs" / "double_integrator.yaml", "--no-figures", "--quiet", "--out", directory)
+    program = (
+        "import sys\nfrom sparserob_core.experiment.cli.main import _status\n"
+        f"assert _status(['check', {directory!r}]) == 0\nprint(*sorted(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    assert {"flint", "sparserob_core.checker.claims.claims"} <= loaded
+    assert not loaded & {
+        "scipy.sparse",
+        "sparserob_core.checker.claims.feedback",
+        "sparserob_core.control.transcription",
+    }
+
+
 def test_a_reader_that_stops_reading_is_no_error(tmp_path: Path) -> None:
     done = subprocess.run(
         f"{sys.executable} -m sparserob_core plugins | head -n 1; exit ${{PIPESTATUS[0]}}",
