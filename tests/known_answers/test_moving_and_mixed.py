@@ -203,7 +203,7 @@ def test_baselines_are_refuted_by_a_witness_that_is_checked(method, tmp_path):
         ({**BOX, "relative_to": [[0, 0, 0], [0, 1, 0], [5, 0, 0]]}, "relative_to: expected rows whose times increase"),
         ({**BOX, "relative_to": [[0, 0, 0], [4, 1, 0]]}, "expected rows whose times cover the window, 0.3 to 5"),
         ({**BOX, "relative_to": []}, "path.0.relative_to: expected rows"),
-        ({**MIXED, "relative_to": [[0, 0, 0], [5, 0, 0]]}, "path.0.relative_to: moves a set of states"),
+        ({**MIXED, "relative_to": [[0, 0, 0], [5, 0, 0]]}, "path.0.relative_to: moves the set of states"),
         ({"mixed": {"H": [[0]], "G": [[1]], "h": 1}}, "path.0.mixed.H: expected rows of 2 finite numbers"),
         ({"mixed": {"H": [[0, 1]], "G": [[1, 2]], "h": 1}}, "path.0.mixed.G: expected rows of 1 finite numbers"),
         ({"mixed": {"H": [[0, 1]], "G": [[1], [2]], "h": 1}}, "path.0.mixed.G: expected 1 rows, as H has, got 2"),
