@@ -37,7 +37,7 @@ TIME_FIRST = (
     0.25  # times are halved before anything else unless that gains less than this share: their cells share all work
 )
 TINY = 1e-4  # of a cell of parameters: a cell on which a system that can be enclosed at all will be
-FEW_CELLS = 64  # whose ends are looked at as they come
+FEW_CELLS = 64  # of which only neighbours are asked whether they share an end
 TAYLOR_TERMS = 1e-17  # relative size below which further terms of the exponential series are left out
 
 
@@ -292,9 +292,7 @@ def _ends(
     follow one another, and where each of ``start`` and then ``stop`` is among them. The end of a piece is where the
     next one begins."""
     count, ended = start.size, pieces + (stop == breakpoints[pieces + 1])
-    if count <= FEW_CELLS:
-        return (np.concatenate([start, stop]), np.concatenate([pieces, ended])), np.arange(2 * count)
-    if (pieces[1:] > pieces[:-1]).all():
+    if count <= FEW_CELLS or (pieces[1:] > pieces[:-1]).all():
         met = np.append((stop[:-1] == start[1:]) & (ended[:-1] == pieces[1:]), False)
         which, apart = np.arange(1, count + 1), np.flatnonzero(~met)
         which[apart] = count + np.arange(apart.size)
