@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 MOST_CELLS = 40_000  # cells of time examined for each constraint
 PEAK, CONTROL, RATE, EQUALS, STEP = "peak", "control", "rate", "equals", "control_step"
 WORST, EFFORT = "worst", "effort"
+EVENED = 20  # steps in which rows and columns of a matrix become of one size
 FIGURES, SMALL_COST = 1e-11, 1e-6  # of an effort, and of the largest possible one: how closely it is known
 
 
@@ -508,14 +509,14 @@ class FeedbackClaims:
                     [lists[block][s][b] if block in lists else zero for block in blocks for b in self._chords[block]]
                     for s in range(d)
                 ]
-            D = stacked(table)
+            D, rows, columns = _evened(stacked(table))
             if self.case.measurable and members != (0,):
                 inverse = self._independent(D)
             elif D.ncols() <= D.nrows():
                 inverse = (D.transpose() * D).inv() * D.transpose()
             else:
                 inverse = D.transpose() * (D * D.transpose()).inv()
-            self._inverses[members] = (inverse, blocks)
+            self._inverses[members] = (_times(inverse, columns, rows), blocks)
         return self._inverses[members]
 
     @cached_property
@@ -803,6 +804,29 @@ def _deviations(case: Case, loop: ClosedLoop, entry: Mapping[str, Any], name: st
         [arb(float(v)) - arb(float(c)) for v, c in zip(point, about, strict=True)]
         for point, (_, about) in zip(points, loop.sets, strict=True)
     ]
+
+
+def _evened(D: arb_mat) -> tuple[arb_mat, Array, Array]:
+    """A matrix with its rows and columns multiplied by powers of two, so that the largest entry of each is about 1
+    (Ruiz 2001), and these powers: what is inverted is then of no unit."""
+    sizes = np.abs(np.array([[float(x.mid()) for x in row] for row in D.tolist()]))
+    rows, columns = np.ones(sizes.shape[0]), np.ones(sizes.shape[1])
+    for _ in range(EVENED):
+        scaled = sizes * rows[:, None] * columns
+        for factors, most in ((rows, scaled.max(axis=1)), (columns, scaled.max(axis=0))):
+            factors /= np.sqrt(np.where(most > 0.0, most, 1.0))
+    rows, columns = (np.exp2(np.round(np.log2(factors))) for factors in (rows, columns))
+    return _times(D, rows, columns), rows, columns
+
+
+def _times(D: arb_mat, rows: Array, columns: Array) -> arb_mat:
+    """A matrix with its rows and its columns multiplied by powers of two."""
+    return stacked(
+        [
+            [x * float(r) * float(c) for x, c in zip(row, columns, strict=True)]
+            for row, r in zip(D.tolist(), rows, strict=True)
+        ]
+    )
 
 
 def _dot(c: Array, x: list[arb]) -> arb:
