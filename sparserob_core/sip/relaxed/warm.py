@@ -16,6 +16,7 @@ ROUNDING = 2.0**-46  # of the numbers that are added up
 FEASIBLE = 1e-10  # a violation that is none
 PIVOTS, MORE = 100, 20  # steps after which HiGHS is asked, and as many more for every row
 LEAST = 1e-9  # of the largest: a change of a slope that is no pivot
+CLOSED = 1e-9  # of the largest cost, a gap that rounding leaves
 SINGULAR = 1e11  # entries of an inverse that nothing is computed from
 
 
@@ -40,9 +41,7 @@ class WarmProgram:
         """The basis of no rows: everything is at 0."""
         n = self.weights.size
         self._rows, self._free = list[int](), list[int]()
-        self._side = list[
-            int
-        ]()  # of every free entry: 1 where its slope is at its weight, so that it is at most 0; or -1
+        self._side = list[int]()  # 1 where the slope of a free entry is at its weight, so that it is at most 0; or -1
         self._place = np.zeros(n)  # -1, 0 or 1: at its lower bound, at 0, at its upper bound
 
     def add(self, G: Array) -> None:
@@ -62,17 +61,26 @@ class WarmProgram:
     def solve(self, h: Array) -> tuple[Array, Array] | None:
         """``x (n,)`` and multipliers ``y (r,)``, for right-hand sides ``h (r,)``; ``None`` where there is no
         optimum."""
+        found, closed = None, False
         try:
             found = self._pivoted(h)
+            closed = found is not None and self._closed(h, *found)
         except np.linalg.LinAlgError:
-            found = None
-        if found is not None:
+            pass
+        finally:  # a basis that is wrong, or that was interrupted, is none to go on from
+            if not closed:
+                self._begin()
+        if closed:
             return found
-        self._begin()
         n, none = self.weights.size, np.zeros(0)
         program = FiniteProgram(np.zeros(n), self.weights, self.lower, self.upper, self.G, h, np.zeros((0, n)), none)
         corner = simplex(program)
         return (corner.x, corner.y) if corner.status == "optimal" else None
+
+    def _closed(self, h: Array, x: Array, y: Array) -> bool:
+        """Whether multipliers prove that a point costs no more than it must."""
+        largest = float(self.weights @ np.maximum(-self.lower, self.upper))
+        return float(self.weights @ np.abs(x)) - self.bound(h, y) <= CLOSED * largest
 
     def _pivoted(self, h: Array) -> tuple[Array, Array] | None:
         """The answer by steps from the last basis; ``None`` where they lead nowhere."""

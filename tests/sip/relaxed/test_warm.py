@@ -74,8 +74,29 @@ def test_a_basis_that_is_wrong_costs_time_and_nothing_else():
         program._place = rng.integers(-1, 2, 20).astype(float)
         x, y = program.solve(h)
         assert (program.G @ x - h).max() <= 1e-9
-        assert program.bound(h, y) <= expected + 1e-12 <= program.weights @ np.abs(x) + 1e-9
-        program._begin()
+        assert program.weights @ np.abs(x) == pytest.approx(expected, abs=1e-9)
+        assert program.bound(h, y) == pytest.approx(expected, abs=1e-9)
+
+
+def test_an_interrupt_leaves_no_basis_that_is_half_changed():
+    rng = np.random.default_rng(3)
+    program = WarmProgram(np.ones(20), -np.ones(20), np.ones(20))
+    program.add(rng.standard_normal((4, 20)))
+    h = -rng.uniform(0.5, 1.0, 4)
+    expected = optimum(program, h)
+    first, calls = WarmProgram._end, []
+
+    def pressed(self, *arguments):
+        calls.append(first(self, *arguments))
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return calls[-1]
+
+    with patch.object(WarmProgram, "_end", pressed), pytest.raises(KeyboardInterrupt):
+        program.solve(h)
+    with patch(f"{HOME}.simplex", side_effect=AssertionError):
+        x, _ = program.solve(h)
+    assert program.weights @ np.abs(x) == pytest.approx(expected, abs=1e-9)
 
 
 def test_where_no_basis_is_found_in_time_highs_is_asked():
