@@ -68,9 +68,10 @@ def test_a_hundred_thousand_pieces_are_checked_within_memory(
     assert float(memory) <= 2000.0
 
 
-def chain(states: int, constrained: int) -> sr.OptimalControlProblem:
+def chain(states: int, constrained: int, room: float = 1.2) -> sr.OptimalControlProblem:
     """Masses in a row between springs, pulled at four of them, with a disturbance at two others: the pulled ones, and
-    their neighbours by half, begin away from rest; some are to stay near it, and the pulled ones are to end there."""
+    their neighbours by half, begin away from rest; some are to stay near it, within ``room``, and the pulled ones are
+    to end there."""
     masses, d = states // 2, states
     stiffness = 2.0 * np.eye(masses) - np.eye(masses, k=1) - np.eye(masses, k=-1)
     A = np.block([[np.zeros((masses, masses)), np.eye(masses)], [-stiffness, -0.1 * stiffness - 0.05 * np.eye(masses)]])
@@ -90,22 +91,30 @@ def chain(states: int, constrained: int) -> sr.OptimalControlProblem:
         initial_state=start,
         control=sr.Box(-4.0 * np.ones(pulled.size), 4.0 * np.ones(pulled.size)),
         disturbance=sr.Box(-0.02 * np.ones(hit.size), 0.02 * np.ones(hit.size)),
-        path=[sr.PathConstraint(near(stays, 1.2), start=1.5)],
+        path=[sr.PathConstraint(near(stays, room), start=1.5)],
         terminal=[near(ends, 0.1)],
     )
 
 
-@pytest.mark.parametrize(("states", "pieces", "most"), [(100, 100, 3.0), (200, 1000, 30.0)])
-def test_a_chain_of_masses(states: int, pieces: int, most: float, capsys: pytest.CaptureFixture[str]) -> None:
-    """In seconds of the processor, and with no more than 2 GB."""
+@pytest.mark.parametrize(
+    ("states", "pieces", "room", "most"),
+    [(100, 100, 1.2, 3.0), (200, 1000, 1.2, 30.0), (200, 10_000, 0.5, 30.0), (200, 100_000, 0.5, 60.0)],
+)
+def test_a_chain_of_masses(
+    states: int, pieces: int, room: float, most: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In seconds of the processor, and with no more than 2 GB. With less room the path constraint is active too."""
     sr.solve(chain(10, 4), control={"name": "piecewise_constant", "pieces": 10})  # what is imported is not measured
     began = time.process_time()
-    found = sr.solve(chain(states, 10), control={"name": "piecewise_constant", "pieces": pieces})
+    found = sr.solve(chain(states, 10, room), control={"name": "piecewise_constant", "pieces": pieces})
     spent, memory = time.process_time() - began, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    active = sorted({cut.family for cut in found.dual.cuts})
     with capsys.disabled():
         print(
-            f"\n{states} states, {pieces} pieces: {found.status}, J = {found.value:.6f}, {spent:.1f} s, {memory:.0f} MB"
+            f"\n{states} states, {pieces} pieces: {found.status}, J = {found.value:.6f}, {spent:.1f} s,"
+            f" {memory:.0f} MB, active: {', '.join(active)}"
         )
     assert found.status == "certified"
+    assert active == (["path", "terminal"] if room < 1.0 else ["terminal"])
     assert spent <= most
     assert memory <= 2000.0
