@@ -37,11 +37,8 @@ from sparserob_core.experiment.cli.shell.process import (
 from sparserob_core.experiment.terminal.printing import printable
 
 DEBUG = "SPARSEROB_DEBUG"
-RARELY = (
-    200_000,
-    20,
-    20,
-)  # allocations between two searches for cycles: at first nearly all are of modules, which stay
+# Allocations between two searches for cycles: at first nearly all are of modules, which stay.
+RARELY = (200_000, 20, 20)
 QUESTIONS = frozenset({"-h", "--help", "--version"})  # that need no numbers
 
 

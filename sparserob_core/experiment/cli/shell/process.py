@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
 import errno
 import io
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from importlib.util import LazyLoader, find_spec, module_from_spec
-from reprlib import recursive_repr
 from types import FrameType
-from typing import Any, final
+from typing import final
 
 from sparserob_core.errors import SparseRobError
 
@@ -41,7 +39,6 @@ def spare_imports() -> None:
     distributions for plugins of its own, unless ``PYDANTIC_DISABLE_PLUGINS`` says which it is to leave out.
     """
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
-    _share_methods_of_records()
     import numpy as np
 
     for name in ("char", "f2py", "polynomial", "testing"):
@@ -52,40 +49,6 @@ def spare_imports() -> None:
             module = sys.modules[known] = module_from_spec(spec)
             spec.loader.exec_module(module)
             setattr(np, name, module)
-
-
-def _share_methods_of_records() -> None:
-    """Before Python 3.13 the standard library compiles a text for each method of each dataclass, about a thousand at a
-    start, which takes a tenth of it. The text of three of them depends on nothing but the names of the fields, so that
-    a closure does the same."""
-    if sys.version_info >= (3, 13):
-        return
-    records: Any = dataclasses
-
-    def frozen(cls: Any, fields: Iterable[dataclasses.Field[object]], *_: object) -> tuple[Callable[..., None], ...]:
-        names = frozenset(field.name for field in fields)
-
-        def __setattr__(self: object, name: str, value: object) -> None:
-            if type(self) is cls or name in names:
-                raise dataclasses.FrozenInstanceError(f"cannot assign to field {name!r}")
-            super(cls, self).__setattr__(name, value)
-
-        def __delattr__(self: object, name: str) -> None:
-            if type(self) is cls or name in names:
-                raise dataclasses.FrozenInstanceError(f"cannot delete field {name!r}")
-            super(cls, self).__delattr__(name)
-
-        return __setattr__, __delattr__
-
-    def shown(fields: Iterable[dataclasses.Field[object]], *_: object) -> Callable[[object], str]:
-        names = [field.name for field in fields]
-
-        def __repr__(self: object) -> str:
-            return f"{self.__class__.__qualname__}({', '.join(f'{name}={getattr(self, name)!r}' for name in names)})"
-
-        return recursive_repr()(__repr__)
-
-    records._frozen_get_del_attr, records._repr_fn = frozen, shown
 
 
 def status_unless_interrupted(status: int) -> int:
