@@ -32,7 +32,7 @@ help:
 	@echo "make demo        solve the repaired experiment 1, print the bounds, draw the figures"
 	@echo "make live        watch the paper's annealing for a minute: in a viewer, or on a page where there is no display"
 	@echo "make paper       every experiment and figure of the paper, and docs/paper.md (a few minutes)"
-	@echo "make test        lint, types, import rules, tests: the first stage, about five minutes on two processors"
+	@echo "make test        lint, types, import rules, tests: the first stage, about six minutes on two processors"
 	@echo "make test-slow   the second stage: larger instances of what the first one tests"
 	@echo "make bench       time the certified solve, and solvers and maximisers beside other people's"
 	@echo "make docs        write the reference and the schema anew, and build the site (minutes, the first time)"
