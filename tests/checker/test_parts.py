@@ -24,7 +24,7 @@ from sparserob_core.checker.claims.duality import Duality
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.reach import disturbance_support
 from sparserob_core.checker.reach.disturbance_support import Scene
-from sparserob_core.checker.reach.flow import Flow, OwnUnits, flows, stacked
+from sparserob_core.checker.reach.flow import Flow, OwnUnits, balanced, flows, stacked
 from sparserob_core.checker.reach.measurable import Kernel
 from sparserob_core.checker.reach.tube import Tube
 from sparserob_core.checker.sets.known import known
@@ -279,6 +279,11 @@ def test_the_kernel_of_a_measurable_disturbance_is_as_sharp_in_any_units(factor)
         truth = scipy.linalg.expm(A * kernel.half * (2 * part + 1 + at)) @ E
         value = np.einsum("p,pdw->dw", at ** np.arange(kernel.coefficients.shape[1]), kernel.coefficients[part])
         assert (np.abs(value - truth) <= kernel.off[part] + 1e-13 * size[:, None]).all()
+
+
+def test_a_drive_of_nothing_but_rounding_does_not_choose_the_units():
+    A, speed = np.array([[0.0, 1.0], [-2.0, -0.5]]), np.array([np.nextafter(0.0, 1.0), 0.5])
+    assert (balanced(A, 4.0, speed) == balanced(A, 4.0, np.array([0.0, 0.5]))).all()
 
 
 def test_a_difference_of_two_numbers_is_told_exactly():

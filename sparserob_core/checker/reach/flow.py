@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 WELL_CONDITIONED = 1e6
 SWEEPS = 12  # of balancing
+LEAST = 2.0**-900  # rate that takes part in it; units end at 2^-500
 ORDER = 6  # of the expansion in time
 
 
@@ -256,6 +257,7 @@ def balanced(A: Array, horizon: float, speed: Array) -> Array:
     rates = np.zeros((speed.size + 1, speed.size + 1))
     rates[:-1, :-1], rates[:-1, -1] = np.abs(A), speed
     np.fill_diagonal(rates, 0.0)
+    rates[rates < LEAST] = 0.0  # such are what outward rounding makes of no drive at all; they have no reciprocal
     driven = np.where(rates > 0.0, rates, np.inf)
     rates = np.maximum(rates, (1.0 / horizon / horizon / driven).T)
     exponents = np.zeros(speed.size + 1)
