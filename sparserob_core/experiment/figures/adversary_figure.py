@@ -35,12 +35,12 @@ def draw_adversary(arrays: Mapping[str, Array], data: FigureData) -> Figure:
     """Above the states under the worst case of every constraint, with a dot where it is attained, below the
     disturbances that cause them."""
     disturbances = arrays["disturbances"]
-    states, channels = len(data.state), disturbances.shape[1]
+    states, channels = len(data.drawn_states), disturbances.shape[1]
     figure, axes = panels(states + channels, 1.7, extra=0.35)
     for number, name in enumerate(arrays["names"].tolist()):
         pen = {"color": COLOURS[number % len(COLOURS)], "linestyle": DASHES[number // len(COLOURS) % len(DASHES)]}
         at = int(np.abs(arrays["state_times"] - arrays["times"][number]).argmin())
-        for component, ax in enumerate(axes[:states]):
+        for component, ax in zip(data.drawn_states, axes[:states], strict=True):
             path = arrays["states"][number, component]
             ax.plot(
                 arrays["state_times"],
@@ -70,7 +70,7 @@ def draw_adversary(arrays: Mapping[str, Array], data: FigureData) -> Figure:
                 zorder=3 - 0.01 * number,
                 **pen,
             )
-    for component, ax in enumerate(axes[:states]):
+    for component, ax in zip(data.drawn_states, axes[:states], strict=True):
         draw_tube(ax, data, component)
         finish_panel(ax, data, component, tuple(arrays["states"][:, component]))
     for channel, ax in enumerate(axes[states:]):
@@ -104,7 +104,7 @@ def finish_panel(ax: Axes, data: FigureData, component: int, curves: tuple[Array
 def caption(figure: Figure, axes: list[Axes], data: FigureData, text: str) -> None:
     """The time axis, the title, a line of text, and the legend."""
     draw_time_axis(axes[-1], data)
-    axes[0].set_title(shorten(data.title, 80, placeholder=" ..."), pad=20)
+    axes[0].set_title(shorten(data.title, 80, placeholder=" ...") + data.of_states, pad=20)
     axes[0].text(0.0, 1.045, text, transform=axes[0].transAxes, fontsize=9.5, color=look.GREY)
     draw_legend(figure, axes)
     figure.align_ylabels(axes)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -13,6 +14,8 @@ from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import RoundFinished
 from sparserob_core.sip.result import UNKNOWN_SCALE
+
+MOST_STATES = 12  # drawn in one figure
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,6 +106,21 @@ class FigureData:
             shape = getattr(self, name).shape
             if shape != (self.state.shape[0], instants):
                 raise InputError(f"{name}: expected (d, {instants}) for {instants} times, got {shape}")
+
+    @cached_property
+    def drawn_states(self) -> tuple[int, ...]:
+        """The states that figures show, in their order: all, or `MOST_STATES` of them, first those that constraints
+        are about, then those that move the farthest in their units."""
+        reach = self.tube_upper.max(axis=1) - self.tube_lower.min(axis=1)
+        walled = {wall.state for wall in self.walls}
+        first = sorted(range(reach.size), key=lambda state: (state not in walled, -reach[state]))
+        return tuple(sorted(first[:MOST_STATES]))
+
+    @property
+    def of_states(self) -> str:
+        """What a title adds where not every state is shown."""
+        drawn, known = len(self.drawn_states), self.state.shape[0]
+        return "" if drawn == known else f", {drawn} of {known} states"
 
     def control_label(self, channel: int) -> str:
         """The axis label of one control channel."""

@@ -75,8 +75,8 @@ def draw_control(data: FigureData) -> Figure:
 
 def draw_states(data: FigureData) -> Figure:
     """Every state with its worst-case tube; what the constraints forbid is hatched, the terminal set is a bracket."""
-    figure, axes = panels(len(data.state), 1.9, extra=0.2)
-    for component, ax in enumerate(axes):
+    figure, axes = panels(len(data.drawn_states), 1.9, extra=0.2)
+    for component, ax in zip(data.drawn_states, axes, strict=True):
         ax.fill_between(
             data.times,
             data.tube_lower[component],
@@ -107,7 +107,7 @@ def draw_states(data: FigureData) -> Figure:
         _rug(ax, data.active_times)
         ax.set_ylabel(data.state_label(component))
     draw_time_axis(axes[-1], data)
-    axes[0].set_title(data.title)
+    axes[0].set_title(data.title + data.of_states)
     draw_legend(figure, axes)
     return figure
 

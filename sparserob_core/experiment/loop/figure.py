@@ -40,9 +40,9 @@ def write_loops(file: Path, loops: ClosedLoops, finished: FinishedRun) -> None:
 
 def draw_loops(loops: ClosedLoops, data: FigureData) -> Figure:
     """Every state of the first loops of every law, below the controls that were applied, and the plan's."""
-    states, channels = len(data.state), len(data.control)
+    states, channels = len(data.drawn_states), len(data.control)
     figure, axes = panels(states + channels, 1.7, extra=0.35)
-    for component, ax in enumerate(axes[:states]):
+    for component, ax in zip(data.drawn_states, axes[:states], strict=True):
         draw_tube(ax, data, component)
         named = set[str]()
         for law, path in loops.paths:

@@ -39,8 +39,8 @@ def write_simulation(
 def draw_simulation(simulation: Simulation, data: FigureData) -> Figure:
     """Every state: some sampled trajectories, the envelope of all of them, and around it the worst case that no sample
     reached."""
-    figure, axes = panels(len(data.state), 1.9, extra=0.35)
-    for component, ax in enumerate(axes):
+    figure, axes = panels(len(data.drawn_states), 1.9, extra=0.35)
+    for component, ax in zip(data.drawn_states, axes, strict=True):
         draw_tube(ax, data, component)
         for number, path in enumerate(simulation.fan[:, component]):
             ax.plot(

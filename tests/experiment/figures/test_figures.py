@@ -76,6 +76,17 @@ def test_walls_appear_only_in_the_panel_of_their_state(data: FigureData) -> None
     assert "terminal set" in labels[1] and "terminal set" not in labels[0]
 
 
+def test_of_many_states_those_with_constraints_are_drawn_and_those_that_move_the_farthest(data: FigureData) -> None:
+    state = np.outer(np.arange(40.0), data.state[0])
+    walls = [Wall(state=5, upper=9.0, start=0.0, end=2.0), Wall(state=2, upper=3.0, start=2.0, end=2.0)]
+    many = replace(data, state=state, tube_lower=state - 0.1, tube_upper=state + 0.1, walls=walls)
+    assert many.drawn_states == (2, 5, *range(30, 40))
+    panels = draw_states(many).axes
+    assert panels[0].get_title() == "Rotation, 12 of 40 states"
+    assert [axes.get_ylabel() for axes in panels] == [many.state_label(one) for one in many.drawn_states]
+    assert (data.drawn_states, data.of_states) == ((0, 1), "")
+
+
 def test_the_view_contains_the_whole_tube_and_every_wall(data: FigureData) -> None:
     for component, axes in enumerate(draw_states(data).axes):
         low, high = axes.get_ylim()
