@@ -20,7 +20,7 @@ from sparserob_core.checker.outcome import EQUALITY, RESOLVED, TOLERANCE, Broken
 from sparserob_core.checker.reach.closed_loop import ClosedLoop
 from sparserob_core.checker.reach.directions import Directions
 from sparserob_core.checker.reach.effort import at_most
-from sparserob_core.checker.reach.flow import stacked
+from sparserob_core.checker.reach.flow import middles, scaled, stacked
 from sparserob_core.checker.reach.measurable import MeasurableLoop
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.system import LinearSystem
@@ -516,7 +516,7 @@ class FeedbackClaims:
                 inverse = (D.transpose() * D).inv() * D.transpose()
             else:
                 inverse = D.transpose() * (D * D.transpose()).inv()
-            self._inverses[members] = (_times(inverse, columns, rows), blocks)
+            self._inverses[members] = (scaled(inverse, columns, rows), blocks)
         return self._inverses[members]
 
     @cached_property
@@ -809,24 +809,14 @@ def _deviations(case: Case, loop: ClosedLoop, entry: Mapping[str, Any], name: st
 def _evened(D: arb_mat) -> tuple[arb_mat, Array, Array]:
     """A matrix with its rows and columns multiplied by powers of two, so that the largest entry of each is about 1
     (Ruiz 2001), and these powers: what is inverted is then of no unit."""
-    sizes = np.abs(np.array([[float(x.mid()) for x in row] for row in D.tolist()]))
+    sizes = np.abs(middles(D))
     rows, columns = np.ones(sizes.shape[0]), np.ones(sizes.shape[1])
     for _ in range(EVENED):
-        scaled = sizes * rows[:, None] * columns
-        for factors, most in ((rows, scaled.max(axis=1)), (columns, scaled.max(axis=0))):
+        evened = sizes * rows[:, None] * columns
+        for factors, most in ((rows, evened.max(axis=1)), (columns, evened.max(axis=0))):
             factors /= np.sqrt(np.where(most > 0.0, most, 1.0))
     rows, columns = (np.exp2(np.round(np.log2(factors))) for factors in (rows, columns))
-    return _times(D, rows, columns), rows, columns
-
-
-def _times(D: arb_mat, rows: Array, columns: Array) -> arb_mat:
-    """A matrix with its rows and its columns multiplied by powers of two."""
-    return stacked(
-        [
-            [x * float(r) * float(c) for x, c in zip(row, columns, strict=True)]
-            for row, r in zip(D.tolist(), rows, strict=True)
-        ]
-    )
+    return scaled(D, rows, columns), rows, columns
 
 
 def _dot(c: Array, x: list[arb]) -> arb:

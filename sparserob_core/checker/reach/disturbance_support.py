@@ -24,10 +24,8 @@ if TYPE_CHECKING:
     from flint import arb, arb_mat
 
 TABLES_KEPT = 8  # parts of pieces whose integrals are remembered
-FEWEST_SUMMED = (
-    16,
-    256,
-)  # pieces from which sums over them are remembered: of a known system, over a box of parameters
+# Pieces from which sums over them are remembered: of a known system, over a box of parameters.
+FEWEST_SUMMED = (16, 256)
 SAME = 1e-14  # of the horizon: durations closer than this are treated as one ball that holds them all
 
 

@@ -177,6 +177,17 @@ def stacked(table: Sequence[Sequence[arb]]) -> arb_mat:
     return arb_mat([list(row) for row in table])
 
 
+def scaled(matrix: arb_mat, rows: Array, columns: Array) -> arb_mat:
+    """A ball matrix with its rows and its columns multiplied by powers of two, which is exact."""
+    factors = list(map(float, columns))
+    return stacked(
+        [
+            [x * row * factor for x, factor in zip(line, factors, strict=True)]
+            for line, row in zip(matrix.tolist(), map(float, rows), strict=True)
+        ]
+    )
+
+
 def column(matrix: arb_mat, number: int) -> arb_mat:
     """One column of a ball matrix."""
     return stacked([[matrix[i, number]] for i in range(matrix.nrows())])
@@ -291,13 +302,11 @@ class OwnUnits:
 
     def states(self, columns: arb_mat) -> arb_mat:
         """Columns of states ``(d, n)`` in these units."""
-        units = map(float, self.units)
-        return stacked([[x / unit for x in row] for row, unit in zip(columns.tolist(), units, strict=True)])
+        return scaled(columns, 1.0 / self.units, np.ones(columns.ncols()))
 
     def rows(self, rows: arb_mat) -> arb_mat:
         """Rows on states ``(r, d)``, on such in these units."""
-        units = list(map(float, self.units))
-        return stacked([[x * unit for x, unit in zip(row, units, strict=True)] for row in rows.tolist()])
+        return scaled(rows, np.ones(rows.nrows()), self.units)
 
 
 def _modal(A: Array) -> Array:
