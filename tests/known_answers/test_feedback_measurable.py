@@ -17,18 +17,9 @@ from scipy.linalg import expm
 import sparserob_core as sr
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.experiment.check.check import check
+from tests.support.problems import pushed_spring
 
-SPRING: dict[str, Any] = {
-    "name": "linear",
-    "system": {"A": [[0, 1], [-2, -0.5]], "B": [[0], [1]], "E": [[0], [1]]},
-    "horizon": 4.0,
-    "initial_state": [-1, 1],
-    "control": {"box": 1.0},
-    "disturbance": {"box": 0.25},
-    "disturbance_class": "measurable",
-    "path": [{"box": [0.7, None], "from": 0.5}],
-    "terminal": [{"box": [0.3, 0.3]}],
-}
+SPRING = {**pushed_spring(0.25), "path": [{"box": [0.7, None], "from": 0.5}]}
 PIECES = 5
 POLICY = sr.AffinePolicy(causal_signals=0)
 

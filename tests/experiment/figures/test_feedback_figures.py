@@ -16,6 +16,7 @@ from sparserob_core.experiment.assemble import ControlExperiment
 from sparserob_core.experiment.figures import drawing, run_figures
 from sparserob_core.experiment.figures.figure_data import FigureData
 from tests.support.places import CONFIGS
+from tests.support.problems import pushed_spring
 
 
 @pytest.fixture(scope="module")
@@ -92,16 +93,7 @@ def driven(outcome: sr.Outcome, worst: Adversary) -> np.ndarray:
 
 def test_what_answers_a_measurable_disturbance_is_drawn_too(tmp_path: Path) -> None:
     config = {
-        "problem": {
-            "name": "linear",
-            "system": {"A": [[0, 1], [-2, -0.5]], "B": [[0], [1]], "E": [[0], [1]]},
-            "horizon": 4.0,
-            "initial_state": [-1, 1],
-            "control": {"box": 1.0},
-            "disturbance": {"box": 0.25},
-            "disturbance_class": "measurable",
-            "terminal": [{"box": [0.3, 0.3]}],
-        },
+        "problem": pushed_spring(0.25),
         "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 4}},
         "policy": {"name": "affine", "cost": "peak", "causal_signals": 0},
     }

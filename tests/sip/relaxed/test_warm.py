@@ -36,6 +36,13 @@ def drawn(rng, rounded, alike):
     return program, np.round(G) if rounded else G
 
 
+def bent(rng):
+    """A program of four rows, with right-hand sides that 0 violates."""
+    program = WarmProgram(np.ones(20), -np.ones(20), np.ones(20))
+    program.add(rng.standard_normal((4, 20)))
+    return program, -rng.uniform(0.5, 1.0, 4)
+
+
 @given(st.integers(0, 10**6), st.booleans(), st.booleans())
 @settings(max_examples=60, deadline=None)
 def test_it_finds_the_optimum_that_highs_finds_for_one_right_hand_side_after_another(seed, rounded, alike):
@@ -65,9 +72,7 @@ def test_it_finds_the_optimum_that_highs_finds_for_one_right_hand_side_after_ano
 
 def test_a_basis_that_is_wrong_costs_time_and_nothing_else():
     rng = np.random.default_rng(1)
-    program = WarmProgram(np.ones(20), -np.ones(20), np.ones(20))
-    program.add(rng.standard_normal((4, 20)))
-    h = -rng.uniform(0.5, 1.0, 4)
+    program, h = bent(rng)
     expected = optimum(program, h)
     for rows, free, side in (([0, 1], [3, 3], [1, 1]), ([2], [5], [-1]), ([0, 1, 2, 3], [0, 1, 2, 3], [1, -1, 1, -1])):
         program._rows, program._free, program._side = rows, free, side
@@ -79,10 +84,7 @@ def test_a_basis_that_is_wrong_costs_time_and_nothing_else():
 
 
 def test_an_interrupt_leaves_no_basis_that_is_half_changed():
-    rng = np.random.default_rng(3)
-    program = WarmProgram(np.ones(20), -np.ones(20), np.ones(20))
-    program.add(rng.standard_normal((4, 20)))
-    h = -rng.uniform(0.5, 1.0, 4)
+    program, h = bent(np.random.default_rng(3))
     expected = optimum(program, h)
     first, calls = WarmProgram._end, []
 
@@ -100,10 +102,7 @@ def test_an_interrupt_leaves_no_basis_that_is_half_changed():
 
 
 def test_where_no_basis_is_found_in_time_highs_is_asked():
-    rng = np.random.default_rng(2)
-    program = WarmProgram(np.ones(20), -np.ones(20), np.ones(20))
-    program.add(rng.standard_normal((4, 20)))
-    h = -rng.uniform(0.5, 1.0, 4)
+    program, h = bent(np.random.default_rng(2))
     with patch(f"{HOME}.PIVOTS", 1), patch(f"{HOME}.MORE", 0):
         x, y = program.solve(h)
     again, multipliers = program.solve(h)
