@@ -30,6 +30,7 @@ from sparserob_core.experiment.cli.shell.process import (
     INTERRUPTED,
     OutputError,
     drop_output,
+    hand_back_output,
     listen,
     open_streams,
     spare_imports,
@@ -53,7 +54,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     open_streams()
     if given and QUESTIONS.isdisjoint(given):
         spare_imports()
-    sys.exit(_status(given))
+    try:
+        status = _status(given)
+    finally:
+        hand_back_output()
+    sys.exit(status)
 
 
 def _status(arguments: Sequence[str]) -> int:

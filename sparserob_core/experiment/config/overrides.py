@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -29,12 +30,23 @@ def parse_overrides(
     if isinstance(given, Mapping):
         return [Override(_path(key), value, f"{key}={value}") for key, value in given.items()]
     found = []
-    for text in given:
-        key, equals, value = str(text).partition("=")
+    for text in map(_as_utf8, given):
+        key, equals, value = text.partition("=")
         if not equals:
             raise ConfigError(f"override {shown(text)}: expected key=value, for example method.name=nominal")
-        found.append(Override(_path(key), parse(value), str(text)))
+        found.append(Override(_path(key), parse(value), text))
     return found
+
+
+def _as_utf8(text: str) -> str:
+    """The bytes of a command line's argument as UTF-8, the encoding of configs: a narrower locale (``LC_ALL=C``) leaves
+    those that it does not know as lone surrogates (PEP 383)."""
+    if not any("\ud800" <= character <= "\udfff" for character in text):
+        return text
+    try:
+        return os.fsencode(text).decode("utf-8")
+    except UnicodeError:  # of no encoding that is known: the value is refused as it stands
+        return text
 
 
 def _path(key: str) -> Path:

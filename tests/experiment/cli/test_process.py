@@ -3,6 +3,7 @@ directory, and standard streams that take nothing are told of in one line."""
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import platform
@@ -18,6 +19,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.experiment.cli.shell.process import hand_back_output, open_streams
 from sparserob_core.experiment.directory.artefacts import create_directory
 from sparserob_core.experiment.directory.lock import GUARD, NAME, Lock
 from tests.support.stub import Command
@@ -437,3 +439,35 @@ def test_modules_that_scipy_looks_at_are_imported_only_when_something_of_them_is
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["set()", *["True"] * 3]
+
+
+NARROW = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+
+
+def test_titles_overrides_and_paths_outlive_a_locale_that_has_no_letters_for_them(config: Path, tmp_path: Path) -> None:
+    there = config.rename(tmp_path / "überall.yaml")
+    command = [sys.executable, "-m", "sparserob_core", "run", there, "title=Wärme in °C", "--no-figures", "--out", "rü"]
+    done = subprocess.run(command, cwd=tmp_path, env=NARROW, capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert done.stdout.splitlines()[0] == rb"W\xe4rme in \xb0C"
+    assert "title: Wärme in °C" in (tmp_path / "rü" / "config.yaml").read_text(encoding="utf-8")
+
+
+def test_an_argument_that_is_no_text_in_any_encoding_is_an_error_of_the_override(config: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "sparserob_core", "run", config, b"title=\xff", "--out", "r"]
+    done = subprocess.run(command, cwd=tmp_path, env=NARROW, capture_output=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith(b"error: override value") and done.stderr.count(b"\n") == 1
+
+
+def test_the_interpreter_gets_its_own_kind_of_output_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At its end Python 3.13 flushes the standard output after the names of every module are gone."""
+    written = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, encoding="ascii"))
+    open_streams()
+    print("é", end="")  # what ASCII has no letter for is written out
+    assert type(sys.stdout) is not io.TextIOWrapper
+    hand_back_output()
+    assert type(sys.stdout) is io.TextIOWrapper
+    sys.stdout.flush()
+    assert written.getvalue() == rb"\xe9"

@@ -98,14 +98,30 @@ def open_streams() -> None:
     if sys.stdout is None:
         sys.stdout = Output(open(1, "wb", closefd=False))  # noqa: SIM115
     elif type(sys.stdout) is io.TextIOWrapper:
-        old = sys.stdout
-        sys.stdout = Output(
-            old.detach(),
-            encoding=old.encoding,
-            errors=old.errors,
-            line_buffering=old.line_buffering,
-            write_through=old.write_through,
-        )
+        sys.stdout = _rewrapped(sys.stdout, Output)
+        # A title may hold what a narrow locale has no letters for: it is written out, as it is on the error stream.
+        sys.stdout.reconfigure(errors="backslashreplace")
+
+
+def hand_back_output() -> None:
+    """Give the interpreter back a standard output of its own kind: it flushes that once more when the names of this
+    module are gone (Python 3.13), so that an `Output` could no longer do so."""
+    if not isinstance(sys.stdout, Output):
+        return
+    try:
+        sys.stdout.flush()
+    except (BrokenPipeError, OutputError):  # said before, or nobody reads
+        drop_output()
+    sys.stdout = _rewrapped(sys.stdout, io.TextIOWrapper)
+
+
+def _rewrapped(stream: io.TextIOWrapper, kind: type[io.TextIOWrapper]) -> io.TextIOWrapper:
+    """Another text stream over the buffer of this one, which it takes over."""
+    encoding, errors = stream.encoding, stream.errors
+    line_buffering, write_through = stream.line_buffering, stream.write_through
+    return kind(
+        stream.detach(), encoding=encoding, errors=errors, line_buffering=line_buffering, write_through=write_through
+    )
 
 
 def drop_output() -> None:
