@@ -1,4 +1,6 @@
-"""Shapes of arrays in annotations: ``Float[Array, "k d"]`` has ``k`` rows of ``d`` numbers.
+"""Arrays of records: their shapes in annotations, and that nobody writes to them.
+
+``Float[Array, "k d"]`` has ``k`` rows of ``d`` numbers.
 
 One letter means one size throughout a signature. A function that is marked `shaped` has its arguments and its result
 checked by the tests, and by nobody else: jaxtyping costs as much to import as numpy, so that outside of the tests
@@ -8,6 +10,7 @@ checked by the tests, and by nobody else: jaxtyping costs as much to import as n
 from __future__ import annotations
 
 import os
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -93,3 +96,34 @@ else:
 
 
 __all__ = ["Bool", "Float", "Int", "shaped"]
+
+
+def read_only(value: Any) -> Any:
+    """What is told, as a copy that cannot be written to where it is an array or holds some: a tuple, or a sparse
+    matrix, whose entries are put in order first. What cannot be written to already is itself, so that its identity says
+    what it holds; everything else is handed back."""
+    if isinstance(value, np.ndarray):
+        if value.base is None and not value.flags.writeable:
+            return value
+        value = value.copy()
+        value.flags.writeable = False
+        return value
+    if type(value) is tuple:
+        parts = tuple(read_only(part) for part in value)
+        return value if all(new is old for new, old in zip(parts, value, strict=True)) else parts
+    if hasattr(value, "indptr") and value.data.flags.writeable:
+        value = value.copy()
+        value.sum_duplicates()
+        for part in (value.data, value.indices, value.indptr):
+            part.flags.writeable = False
+    return value
+
+
+def sealed(record: Any) -> None:
+    """Make every array that a frozen record holds one that cannot be written to: what is derived from the record, and
+    remembered, then stays right."""
+    for field in fields(record):
+        value = getattr(record, field.name, None)
+        kept = read_only(value)
+        if kept is not value:
+            object.__setattr__(record, field.name, kept)

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.errors import InputError
-from sparserob_core.shapes import Bool, Float, shaped
+from sparserob_core.shapes import Bool, Float, sealed, shaped
 
 Array: TypeAlias = npt.NDArray[np.float64]
 
@@ -415,6 +415,7 @@ class Box(ConvexSet):
             raise InputError(f"empty, lower {lower.tolist()} is above upper {upper.tolist()}", path="box")
         object.__setattr__(self, "lower", lower)
         object.__setattr__(self, "upper", upper)
+        sealed(self)
 
     @property
     def dimension(self) -> int:

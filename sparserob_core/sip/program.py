@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias, final
 
@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.errors import InputError
-from sparserob_core.shapes import Float, shaped
+from sparserob_core.shapes import Float, read_only, sealed, shaped
 from sparserob_core.sip.convex_set import Array, Box, as_bound
 from sparserob_core.sip.finite import Blocks, FiniteProgram, Spread, UncertainRows
 
@@ -181,6 +181,9 @@ class ConstraintFamily:
     formulation: Formulation = "reduced"
     source: object = None
 
+    def __post_init__(self) -> None:
+        sealed(self)
+
     def formulated(self, formulation: Formulation) -> ConstraintFamily | None:
         """The same constraints with the indices of another formulation; ``None`` where the family does not have it.
 
@@ -282,7 +285,15 @@ class SemiInfiniteProgram:
         finite = FiniteProgram(
             q=q, weights=weights, lower=lower, upper=upper, G=G, h=h, A=A, b=b, P=P, S=S, constant=float(constant[0])
         )
-        object.__setattr__(self, "finite", replace(finite, blocks=self._blocks(weights)))
+        finite = replace(finite, blocks=self._blocks(weights))
+        sealed(finite)
+        for name, kept in (("S", finite.S), ("P", finite.P), ("finite", finite)):
+            object.__setattr__(self, name, kept)
+        for each in fields(self):
+            value = getattr(self, each.name)
+            if isinstance(value, list):
+                object.__setattr__(self, each.name, np.array(value))
+        sealed(self)
 
     def _blocks(self, weights: Array) -> Blocks | None:
         if self.blocks is None:
@@ -310,14 +321,16 @@ class SemiInfiniteProgram:
     def own_units(self) -> OwnUnits | None:
         """The same program in its own units; ``None`` for one that has none, or that was changed since."""
         own = None if self.twin is None else self.twin()
-        return own if own is not None and own.of == self._parts else None
+        if own is None or len(own.of) != len(self._parts):
+            return None
+        return own if all(mine is theirs for mine, theirs in zip(self._parts, own.of, strict=True)) else None
 
     @property
-    def _parts(self) -> tuple[int, ...]:
-        """What the program is made of, by identity."""
-        cost = (self.q, self.P, self.weights, self.constant, self.blocks)
-        numbers = (*cost, self.S, self.lower, self.upper, self.G, self.h, self.A, self.b)
-        return tuple(id(part) for part in (*numbers, *self.families))
+    def _parts(self) -> tuple[object, ...]:
+        """Everything that the program is but its twin. Its arrays cannot be written to, its families and sets are
+        frozen records of such, so that the same objects are the same program."""
+        own = [getattr(self, each.name) for each in fields(self) if each.name not in ("twin", "finite", "families")]
+        return (*own, *self.families)
 
     def mirrored(self, twin: Callable[[SemiInfiniteProgram], OwnUnits]) -> SemiInfiniteProgram:
         """This program with a twin in its own units, which is made when it is first asked for."""
@@ -374,14 +387,14 @@ class SemiInfiniteProgram:
 class OwnUnits:
     """``program``: a program in its own units, every factor a power of two; ``decision (n,)``, ``image (k,)``,
     ``equalities (e,)``, ``cost``: what one of each is in the user's. Its families know their own
-    (`ConstraintFamily.row_units`). ``of``: what the program was made of that it stands for."""
+    (`ConstraintFamily.row_units`). ``of``: all that the program is that it stands for."""
 
     program: SemiInfiniteProgram
     decision: Array
     image: Array
     equalities: Array
     cost: float
-    of: tuple[int, ...] = ()
+    of: tuple[object, ...] = field(default=(), repr=False)
 
 
 def _vector(name: str, value: object, size: int) -> Array:
@@ -397,11 +410,12 @@ def _sparse(name: str, matrix: object, square: int | None) -> csc_array | None:
     from scipy.sparse import csc_array as sparse
 
     try:
-        array = sparse(matrix)
+        array = matrix if isinstance(matrix, sparse) else sparse(matrix)
     except (TypeError, ValueError) as error:
         raise InputError(f"{name}: expected a matrix of numbers, got {matrix!r}") from error
     if array.ndim != 2 or not np.isfinite(array.data).all():
         raise InputError(f"{name}: expected a matrix of finite numbers, got shape {array.shape}")
     if square is not None and array.shape != (square, square):
         raise InputError(f"{name}: expected shape ({square}, {square}), got {array.shape}")
-    return array
+    kept: csc_array = read_only(array)
+    return kept

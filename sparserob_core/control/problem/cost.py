@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.errors import InputError
+from sparserob_core.shapes import sealed
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 EXACT = 16  # states up to which a matrix is shown to be positive semidefinite in fractions
@@ -24,6 +25,9 @@ class Quadratic:
 
     Q: Array
     reference: Array
+
+    def __post_init__(self) -> None:
+        sealed(self)
 
 
 Term: TypeAlias = Quadratic | Mapping[str, npt.ArrayLike]

@@ -16,6 +16,7 @@ from sparserob_core.control.problem.names import UNNAMED, Names
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
 from sparserob_core.control.sets.sets import Equality, Polytope
 from sparserob_core.errors import InputError
+from sparserob_core.shapes import sealed
 from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound
 
 if TYPE_CHECKING:
@@ -40,6 +41,9 @@ class PathConstraint:
     name: str | None = None
     relative_to: npt.ArrayLike | None = None
 
+    def __post_init__(self) -> None:
+        sealed(self)
+
 
 @dataclass(frozen=True, eq=False)
 class MixedConstraint:
@@ -56,6 +60,9 @@ class MixedConstraint:
     start: float = 0.0
     stop: float | None = None
     name: str | None = None
+
+    def __post_init__(self) -> None:
+        sealed(self)
 
     @cached_property
     def set(self) -> Polytope:
@@ -133,6 +140,7 @@ class OptimalControlProblem:
         windows = [self._windowed(f"path.{i}", entry) for i, entry in enumerate(_listed("path", self.path))]
         self._set("path", tuple(window for window in windows if not _restricts_nothing(window.set)))
         self._set("terminal", tuple(self._terminal()))
+        sealed(self)
 
     def _set(self, name: str, value: object) -> None:
         object.__setattr__(self, name, value)

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.errors import InputError
-from sparserob_core.shapes import Bool, Float, shaped
+from sparserob_core.shapes import Bool, Float, sealed, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet, as_bound, bisect, few_digits, ratios, vertex_excess
 
 _SIGN_DIMENSIONS = 10
@@ -45,6 +45,7 @@ class Ellipsoid(ConvexSet):
             raise InputError(f"shape must be symmetric positive definite, got {shape.tolist()}", path="ellipsoid")
         object.__setattr__(self, "centre", _finite("ellipsoid.centre", self.centre, shape.shape[0]))
         object.__setattr__(self, "shape", shape)
+        sealed(self)
 
     @property
     def dimension(self) -> int:
@@ -170,6 +171,7 @@ class NormBall(ConvexSet):
         object.__setattr__(self, "p", float(p))
         object.__setattr__(self, "radius", float(radius))
         object.__setattr__(self, "centre", middle)
+        sealed(self)
 
     @property
     def dimension(self) -> int:

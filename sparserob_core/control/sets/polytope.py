@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.errors import InputError
-from sparserob_core.shapes import Float, shaped
+from sparserob_core.shapes import Float, sealed, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound, vertex_excess
 
 _VERTEX_DIMENSIONS = 6
@@ -57,6 +57,7 @@ class Polytope(ConvexSet):
         keep = ~zero & np.isfinite(h)
         object.__setattr__(self, "H", H[keep])
         object.__setattr__(self, "h", h[keep])
+        sealed(self)
         if self.chebyshev[1] < -1e-9 * max(1.0, float(np.abs(self._balanced[1]).max(initial=0.0))):
             raise InputError("empty, no point satisfies every row of H x <= h", path="polytope")
 

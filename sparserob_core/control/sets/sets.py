@@ -14,7 +14,7 @@ from sparserob_core.control.sets.curved import Ellipsoid, NormBall
 from sparserob_core.control.sets.polytope import Polytope
 from sparserob_core.control.sets.zonotope import Zonotope
 from sparserob_core.errors import InputError
-from sparserob_core.shapes import Bool, Float, shaped
+from sparserob_core.shapes import Bool, Float, sealed, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 
 __all__ = [
@@ -72,6 +72,7 @@ class Equality:
                 path="equality", expected="a list of finite numbers, null where free", got=f"{values.tolist()}"
             )
         object.__setattr__(self, "values", values)
+        sealed(self)
 
     @property
     def dimension(self) -> int:

@@ -10,6 +10,7 @@ from typing import final
 
 import numpy as np
 
+from sparserob_core.shapes import sealed
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 MOST_SIDES = 500  # pairs of half-spaces that are listed; beyond, the set is left to its support function
@@ -27,6 +28,9 @@ class Zonotope(ConvexSet):
 
     centre: Array
     generators: Array
+
+    def __post_init__(self) -> None:
+        sealed(self)
 
     @property
     def dimension(self) -> int:
