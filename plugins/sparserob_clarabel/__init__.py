@@ -39,7 +39,7 @@ class Clarabel(sr.Solver, sr.Options):
         z_box[above] = dual[e + r : e + r + above.size]
         z_box[below] -= dual[e + r + above.size :]
         kinds: dict[Any, Literal["solved", "infeasible"]] = {"Solved": "solved", "PrimalInfeasible": "infeasible"}
-        return sr.Claim(
+        claim = sr.Claim(
             kinds.get(str(solution.status), "failed"),
             np.array(solution.x),
             dual[e : e + r],
@@ -47,6 +47,7 @@ class Clarabel(sr.Solver, sr.Options):
             z_box,
             f"{solution.status} after {solution.iterations} iterations",
         )
+        return claim.judged(program, accuracy)
 
     def _settings(self, accuracy: float) -> Any:
         import clarabel

@@ -35,7 +35,7 @@ class Piqp(sr.Solver, sr.Options):
             piqp.PIQP_SOLVED: "solved",
             piqp.PIQP_PRIMAL_INFEASIBLE: "infeasible",
         }
-        return sr.Claim(
+        claim = sr.Claim(
             kinds.get(status, "failed"),
             result.x,
             result.z_u,
@@ -43,6 +43,7 @@ class Piqp(sr.Solver, sr.Options):
             result.z_bu - result.z_bl,
             f"{status.name} after {result.info.iter} iterations",
         )
+        return claim.judged(program, accuracy)
 
 
 @sr.hookimpl

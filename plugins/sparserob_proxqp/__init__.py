@@ -64,7 +64,7 @@ class ProxQp(sr.Solver, sr.Options):
             proxqp.PROXQP_SOLVED: "solved",
             proxqp.PROXQP_PRIMAL_INFEASIBLE: "infeasible",
         }
-        return sr.Claim(
+        claim = sr.Claim(
             kinds.get(status, "failed"),
             np.array(result.x),
             np.array(result.z[:r]),
@@ -72,6 +72,7 @@ class ProxQp(sr.Solver, sr.Options):
             np.array(result.z[r:]),
             f"{status.name} after {result.info.iter_ext} outer iterations",
         )
+        return claim.judged(program, accuracy)
 
     # The default of 1e-4 ends feasible programs as infeasible; without any detection infeasible ones run to the limit
     # (80 s at N = 250).

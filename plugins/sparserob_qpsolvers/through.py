@@ -5,13 +5,14 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Callable, Mapping
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
-from pydantic import ConfigDict, Field, PrivateAttr, create_model, model_serializer, model_validator
+from pydantic import ConfigDict, Field, PrivateAttr, create_model, field_validator, model_serializer, model_validator
 
 import sparserob_core as sr
 from sparserob_qpsolvers.catalogue import SOLVERS, Known
@@ -19,6 +20,7 @@ from sparserob_qpsolvers.catalogue import SOLVERS, Known
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
+MEASURES = re.compile("eps|tol|iter")  # in the name of a tolerance or of a number of iterations
 UNKNOWN = Known("", "a solver that came to qpsolvers later", {}, {})
 Duals: TypeAlias = tuple[sr.Array, sr.Array, sr.Array]
 
@@ -58,6 +60,12 @@ class Qpsolvers(sr.Solver, sr.Options):
 
     _chosen: Through = PrivateAttr()
 
+    @field_validator("solver")
+    @classmethod
+    def _is_there(cls, name: str) -> str:
+        _require(name)
+        return name
+
     @model_validator(mode="after")
     def _choose(self) -> Qpsolvers:
         given = dict(self.model_extra or {})
@@ -78,11 +86,7 @@ def claimed(name: str, program: sr.QuadraticProgram, accuracy: float, given: Map
     """What qpsolvers' solver of that name says of a program."""
     import qpsolvers
 
-    if name not in qpsolvers.available_solvers:
-        raise sr.UnknownPluginError(
-            f"qpsolvers {qpsolvers.__version__} finds no solver {name!r}; it finds "
-            + ", ".join(qpsolvers.available_solvers)
-        )
+    _require(name)
     known = SOLVERS.get(name, UNKNOWN)
     settings = {**known.fixed, **{key: factor * accuracy for key, factor in known.asked.items()}, **_own(known, given)}
     posed, recover = _posed(program, dense=name not in qpsolvers.sparse_solvers)
@@ -103,7 +107,19 @@ def claimed(name: str, program: sr.QuadraticProgram, accuracy: float, given: Map
     # Whether a program is infeasible qpsolvers does not say; where it is, the elastic program will prove it.
     status: Literal["solved", "failed"] = "solved" if solution.found else "failed"
     z, y, z_box = recover(solution)
-    return sr.Claim(status, _vector(solution.x, program.q.size), z, y, z_box, f"{name}: {said or status}")
+    claim = sr.Claim(status, _vector(solution.x, program.q.size), z, y, z_box, f"{name}: {said or status}")
+    return claim.judged(program, accuracy)
+
+
+def _require(name: str) -> None:
+    """Raise `UnknownPluginError` for a solver that qpsolvers does not find."""
+    import qpsolvers
+
+    if name not in qpsolvers.available_solvers:
+        raise sr.UnknownPluginError(
+            f"qpsolvers {qpsolvers.__version__} finds no solver {name!r}; it finds "
+            + ", ".join(qpsolvers.available_solvers)
+        )
 
 
 def _posed(program: sr.QuadraticProgram, dense: bool) -> tuple[Any, Callable[[Any], Duals]]:
@@ -190,7 +206,7 @@ def _made(name: str) -> type[Through]:
     known = SOLVERS.get(name, UNKNOWN)
     settings = None if known.settings is None else known.settings()
     fields: dict[str, Any] = {
-        key: (_type(default, known.flags) | None, _field(name, default))
+        key: (_type(default, known.flags) | None, _field(name, key, default))
         for key, default in (settings or {}).items()
         if not hasattr(Through, key)
     }
@@ -211,12 +227,16 @@ def _type(default: object, flags: bool) -> Any:
     return type(default) if isinstance(default, bool | int | float | str) else Any
 
 
-def _field(name: str, default: object) -> Any:
-    """None: nothing is given to the solver; its own default is shown where there is a way to write it."""
+def _field(name: str, key: str, default: object) -> Any:
+    """None: nothing is given to the solver; its own default is shown where there is a way to write it. A tolerance or a
+    number of iterations that is positive by default is not negative: solvers answer that each in their own way, one
+    with an error, one as if nothing were wrong."""
     own = getattr(default, "name", default)
     written = isinstance(own, bool | int | str) or (isinstance(own, float) and np.isfinite(own))
     shown: Any = {"default": own} if written else {}
-    return Field(default=None, description=f"Setting of {name} itself.", json_schema_extra=shown)
+    counts = isinstance(own, int | float) and not isinstance(own, bool) and own > 0 and MEASURES.search(key)
+    least = (1 if isinstance(own, int) else 0) if counts else None
+    return Field(default=None, ge=least, description=f"Setting of {name} itself.", json_schema_extra=shown)
 
 
 def __getattr__(name: str) -> type[Through]:

@@ -113,8 +113,8 @@ def test_what_is_missing_is_told_by_name_before_anything_is_solved(monkeypatch):
     monkeypatch.setitem(sys.modules, "gurobipy", None)
     with pytest.raises(sr.UnknownPluginError, match="solver 'gurobi': gurobipy is not installed; `pip install"):
         REGISTRY.build("solver", "gurobi", {"Threads": 1})
-    with pytest.raises(sr.UnknownPluginError, match=r"qpsolvers .* finds no solver 'cplex'; it finds clarabel, "):
-        REGISTRY.build("solver", "qpsolvers", {"solver": "cplex"}).solve(PROGRAMS["bounded"], 1e-8)
+    with pytest.raises(sr.InputError, match=r"qpsolvers .* finds no solver 'cplex'; it finds clarabel, "):
+        REGISTRY.build("solver", "qpsolvers", {"solver": "cplex"})
 
 
 @pytest.mark.parametrize(
@@ -124,6 +124,10 @@ def test_what_is_missing_is_told_by_name_before_anything_is_solved(monkeypatch):
         ("osqp", {"eps_abs": "small"}, r"eps_abs: must be a number \(got 'small'\)"),
         ("highs", {"simplex_strategy": 1.5}, "simplex_strategy: must be a whole number"),
         ("quadprog", {"eps_abs": 1e-8}, "eps_abs: unknown key"),
+        ("osqp", {"eps_abs": -1.0}, r"eps_abs: must be greater than or equal to 0 \(got -1.0\)"),
+        ("osqp", {"max_iter": 0}, "max_iter: must be greater than or equal to 1"),
+        ("highs", {"primal_feasibility_tolerance": -1.0}, "feasibility_tolerance: must be greater"),
+        ("qpsolvers", {"solver": "piqp", "max_iter": -3}, r"piqp\.max_iter"),
         ("qpsolvers", {}, "solver: missing"),
         ("qpsolvers", {"solver": "piqp", "max_iters": 3}, "no setting 'max_iters' of piqp; the nearest is 'max_iter'"),
         ("qpsolvers", {"solver": "piqp", "max_iter": "many"}, "max_iter"),

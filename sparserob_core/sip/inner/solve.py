@@ -328,9 +328,8 @@ def _ask(
         case.attempts.append(f"{form} form: {said}")
         return None, None
     if not _well_formed(claim, qp):
-        case.attempts.append(
-            f"{form} form: {claim.status}, {claim.message}; its arrays are not finite, or not of the right size"
-        )
+        shapeless = "; its arrays are not finite, or not of the right size" if claim.status == "solved" else ""
+        case.attempts.append(f"{form} form: {claim.status}, {claim.message}{shapeless}")
         return claim, None
     return claim, recover(claim)
 
