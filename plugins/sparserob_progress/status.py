@@ -112,7 +112,7 @@ def _search(event: sr.EvaluationsFinished) -> str:
     what = (
         f"of {event.family}  largest violation"
         if event.family
-        else f"{event.round or ''}  best g"
+        else f"{event.round}{_stage(event)}  best g"
         if event.round
         else "  best"
     )
@@ -123,15 +123,21 @@ def _search(event: sr.EvaluationsFinished) -> str:
     return said.strip()
 
 
+def _stage(event: sr.EvaluationsFinished) -> str:
+    weight = "" if math.isnan(event.epsilon) else f"  eps {event.epsilon:.1e}"
+    return weight + ("  polish" if event.phase == "polish" else "")
+
+
 def _notes(event: sr.EvaluationsFinished) -> str:
-    """The scalars that the maximiser has noted since the last event; of 0 or 1 at every evaluation, the share."""
+    """The scalars that the maximiser has noted since the last event; of what a walk accepted, the share of the moves
+    that changed the value."""
     said = []
     for name, rows in event.batch.notes.items():
-        if name in UNSAID:
-            continue
-        share = name == "accepted"
-        value = sum(value for _, value in rows) / len(rows) if share else rows[-1][1]
-        said.append(f"{name} {value:.0%}" if share else f"{name} {value:.3g}")
+        if name == "accepted":
+            share = event.batch.acceptance
+            said += [] if math.isnan(share) else [f"accepted {share:.0%}"]
+        elif name not in UNSAID:
+            said.append(f"{name} {rows[-1][1]:.3g}")
     return "  ".join(said)
 
 

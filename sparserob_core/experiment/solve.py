@@ -91,7 +91,7 @@ def solve(
     policy: Choice | Policy = "open_loop",
     continuation: Continuation | Mapping[str, float] | None = None,
     budget: int = 2000,
-    polish: float = 0.0,
+    polish: float | None = None,
     seconds: float | None = None,
     notify: Notify = ignore,
 ) -> Result:
@@ -104,7 +104,8 @@ def solve(
     the ``policy``, such as `AffinePolicy`: under feedback the decision begins with the nominal control.
     ``regulariser`` is by default the ridge for control problems, whose optimisers are to be unique, and none for other
     programs, so that ``value`` is the cost. ``budget``: evaluations per search of the maximiser, of which the share
-    ``polish`` goes to a local method at its end. ``seconds``: the time after which it returns what it knows, as it does
+    ``polish`` goes to a local method at its end, unless given as in a config: the maximiser's own share over literal
+    tuples, nothing elsewhere. ``seconds``: the time after which it returns what it knows, as it does
     at an interrupt from the keyboard; ``Result.stopped`` then says so; where no control can ever be certified it is 30
     unless given. The result of a control problem knows its control, tube and worst cases as functions of time
     (`ControlResult`). Raises `InputError` when an argument is at fault.
@@ -123,7 +124,7 @@ def solve(
         regulariser=None if regulariser is None else component(registry, "regulariser", regulariser, Regulariser),
         continuation=steps,
         budget=whole("budget", budget, 1),
-        polish=share("polish", polish),
+        polish=None if polish is None else share("polish", polish),
         rng=np.random.default_rng(whole("seed", seed, 0)),
         notify=_heard(notify),
         deadline=deadline,

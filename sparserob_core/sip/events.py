@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -27,6 +27,9 @@ class Event:
 
 SKETCHED = 400
 """Points, boxes or ellipsoids in one sketch, at most."""
+
+Phase: TypeAlias = Literal["search", "polish"]
+"""Who evaluates: the maximiser, or the local method that has the last share of its budget."""
 
 Notify: TypeAlias = Callable[[Event], None]
 T = TypeVar("T", bound=Event)
@@ -59,7 +62,7 @@ class Batch:
     ``points`` and ``values`` are the pieces ``(k_i, d)`` and ``(k_i,)`` as they were evaluated, ``moments`` their sizes
     and seconds since the search began, ``notes`` per name the pairs (evaluations of the search so far, value).
     ``first`` evaluations came before, the best of which was ``best``; ``origin (d,)`` is where the walk stood then,
-    ``None`` at the start.
+    ``None`` at the start, and ``stood`` the value there.
     """
 
     points: Sequence[Array] = ()
@@ -69,6 +72,7 @@ class Batch:
     first: int = 0
     best: float = -np.inf
     origin: Array | None = None
+    stood: float = np.nan
 
     @cached_property
     def trace(self) -> Trace:
@@ -91,22 +95,52 @@ class Batch:
         The first point of a search has moved from nowhere, and is left out.
         """
         points = self.trace.points
-        place = np.arange(len(points))
-        if not place.size:
+        if not len(points):
             return np.zeros((0, 2), dtype=int)
-        standing = np.maximum.accumulate(np.where(self._accepted(), place, -1))
-        before = np.concatenate([[-1], standing[:-1]])
+        before = standing_before(self.accepted)
         origin = np.full(points.shape[1], np.nan) if self.origin is None else self.origin
         stood = np.where(before[:, np.newaxis] < 0, origin, points[before])
         return np.argwhere((points != stood) & ~np.isnan(stood))
 
-    def _accepted(self) -> np.ndarray:
+    @cached_property
+    def gains(self) -> Array:
+        """By how much each value is above that where the walk stood ``(k,)``, as `moves` has it; 0 for a move that
+        changed nothing, NaN for the first value of a search."""
+        return gains(self.trace.values, self.accepted, self.stood)
+
+    @property
+    def acceptance(self) -> float:
+        """Of the moves that changed the value, the share that the walk accepted; NaN where there was none, or no
+        walk."""
+        judged = self.trace.notes.get("accepted", np.empty((0, 2)))[:, 0].astype(int) - 1 - self.first
+        judged = judged[(judged >= 0) & (judged < self.gains.size)]
+        changing = judged[np.nan_to_num(self.gains[judged]) != 0.0]
+        return float(self.accepted[changing].mean()) if changing.size else np.nan
+
+    @cached_property
+    def accepted(self) -> np.ndarray:
+        """Whether the walk went on from each of the points ``(k,)``; always, where the maximiser does not walk."""
         accepted = np.ones(len(self.trace.points), dtype=bool)
         rows = self.trace.notes.get("accepted", np.empty((0, 2)))
         which = rows[:, 0].astype(int) - 1 - self.first
         mine = (which >= 0) & (which < accepted.size)
         accepted[which[mine]] = rows[mine, 1] > 0.0
         return accepted
+
+
+def standing_before(accepted: np.ndarray) -> np.ndarray:
+    """Which evaluation a walk stood at before each of them ``(k,)``, by which were ``accepted (k,)``; -1: one from
+    before the first."""
+    standing = np.maximum.accumulate(np.where(accepted, np.arange(accepted.size), -1))
+    return np.concatenate([[-1], standing[:-1]])[: accepted.size]
+
+
+def gains(values: Array, accepted: np.ndarray, stood: float = np.nan) -> Array:
+    """By how much each of the ``values (k,)`` is above that where the walk stood, which was ``stood`` before the first;
+    0, too, from ``-inf`` to ``-inf``."""
+    before = standing_before(accepted)
+    at = np.where(before < 0, stood, values[before])
+    return np.subtract(values, at, out=np.zeros(values.size), where=values != at)
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +225,7 @@ class EvaluationsFinished(Event):
     ``best_value`` was found at ``best_point (d,)``; ``seconds`` since the search began; ``notes`` are the maximiser's
     own scalars (temperature, ...), the last of each, and ``sketches`` by their roles what else it has shown of itself
     since the last event. A new search begins where ``total == count``. ``batch``: every one
-    of these evaluations.
+    of these evaluations; they are of one ``phase`` of the search.
 
     What is searched: the tuples of the method ``sparserob`` in the outer iteration ``round`` (from 1) with the weight
     ``epsilon``, where ``lower_bound`` is proven so far; or, where ``family`` is named, its indices for the most
@@ -207,6 +241,7 @@ class EvaluationsFinished(Event):
     best_point: Array = field(default_factory=lambda: np.zeros(0), repr=False)
     domain: Box | None = field(default=None, repr=False)
     block: int = 1
+    phase: Phase = "search"
     family: str = ""
     round: int = 0
     epsilon: float = np.nan

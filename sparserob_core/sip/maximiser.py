@@ -143,13 +143,15 @@ class EvaluationError(SparseRobError):
 class Trace:
     """Every evaluation in order: ``points (n, d)``, ``values (n,)``, the running ``best (n,)``, and for each name that
     was noted the rows ``(evaluations so far, value)`` as ``notes[name] (j, 2)``. ``points`` is empty ``(0, d)`` where
-    all of them would be too many; ``seconds (n,)`` since the search began, when each value was known."""
+    all of them would be too many; ``seconds (n,)`` since the search began, when each value was known. After the first
+    ``searched`` of them the local method went on that polishes (``None``: it did not)."""
 
     points: Array
     values: Array
     best: Array
     seconds: Array
     notes: Mapping[str, Array] = field(default_factory=dict)
+    searched: int | None = None
 
 
 @dataclass(frozen=True, eq=False)

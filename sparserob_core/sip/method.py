@@ -26,6 +26,7 @@ from sparserob_core.sip.result import Result
 from sparserob_core.sip.solver import Solver
 
 GRACE = 1.0  # seconds after a limit in which a method may end by itself
+ROUNDING = 1e-12  # relative: what a product of factors is off by; weights that are meant to differ do so by far more
 GAP_TOLERANCE = 1e-7  # relative gap at which the bounds have met, unless a method has another one
 
 
@@ -52,13 +53,14 @@ class Continuation(Options):
 
     def lighter(self, epsilon: float, j: int = 1, regu: Callable[[float, int], float] | None = None) -> float:
         """The weight of iteration ``j``, where the one before had ``epsilon``: by the schedule ``regu``, or else
-        ``factor`` times ``epsilon``; not below ``stop``.
+        ``factor`` times ``epsilon``; not below ``stop``, and ``stop`` where nothing but rounding is between the two:
+        the same program would be solved once more.
 
         Raises `InputError` for a schedule that does not give a positive weight below ``epsilon``.
         """
         weight: object = self.factor * epsilon if regu is None else regu(epsilon, j)
         if isinstance(weight, int | float | np.floating) and 0.0 < weight < epsilon:
-            return max(self.stop, float(weight))
+            return self.stop if weight <= self.stop * (1.0 + ROUNDING) else float(weight)
         raise InputError(f"regu: expected a positive weight below {epsilon!r}, got {weight!r}")
 
     @model_validator(mode="after")
@@ -171,7 +173,8 @@ class Tools:
     solved.
 
     ``budget``: evaluations that one search of the maximiser may spend, of which the share ``polish`` goes to a local
-    method at its end. ``executor``: workers for programs that do not depend on one another; ``None``: solve them here.
+    method at its end (`sip.search.search.Rules`). ``executor``: workers for programs that do not depend on one another;
+    ``None``: solve them here.
     ``rebuild`` makes the program that the method is handed, its solver and its regulariser anew on a worker, since a
     program with functions of a user cannot be sent; ``None``: it cannot be made there.
     ``deadline``: when a method has to end with what it knows.
@@ -182,7 +185,7 @@ class Tools:
     regulariser: Regulariser | None = None
     continuation: Continuation = field(default_factory=Continuation)
     budget: int = 2000
-    polish: float = 0.0
+    polish: float | None = None
     executor: Executor | None = None
     rebuild: Rebuild | None = None
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))

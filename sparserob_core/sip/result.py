@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.events import RoundFinished
+from sparserob_core.sip.events import RoundFinished, gains
 from sparserob_core.sip.evidence import NO_BOUND, Activity, Cut, Dual, InfeasibleSubsystem, Proof, Sparsest
 from sparserob_core.sip.finite import SOLVER
 from sparserob_core.sip.program import WorstConstraint
@@ -44,7 +44,8 @@ class SearchTrace:
     program, and ``seconds (n,)`` since the start.
 
     ``points (n, d)``: the tuples, ``(n, 0)`` where all of them would be more than `POINTS` numbers. ``notes``: what the
-    maximiser noted, one column ``(n,)`` for each name, NaN where it noted nothing.
+    maximiser noted, one column ``(n,)`` for each name, NaN where it noted nothing. ``polished (n,)``: whether it was
+    the local method at the end of the search that evaluated.
     """
 
     outer: Array
@@ -54,6 +55,11 @@ class SearchTrace:
     seconds: Array
     points: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     notes: Mapping[str, Array] = field(default_factory=dict, repr=False)
+    polished: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool), repr=False)
+
+    def __post_init__(self) -> None:
+        if not self.polished.size:
+            object.__setattr__(self, "polished", np.zeros(self.value.size, dtype=bool))
 
     @staticmethod
     def of(outer: int, epsilon: float, trace: Trace, bounds: Array, began: float) -> SearchTrace:
@@ -65,9 +71,27 @@ class SearchTrace:
             notes[name] = np.full(count, np.nan)
             notes[name][last[:, 0].astype(int) - 1] = last[:, 1]
         points = trace.points if 0 < trace.points.size <= POINTS else np.zeros((count, 0))
+        polished = np.arange(count) >= (count if trace.searched is None else trace.searched)
         return SearchTrace(
-            np.full(count, outer), np.full(count, epsilon), trace.values, bounds, began + trace.seconds, points, notes
+            np.full(count, outer),
+            np.full(count, epsilon),
+            trace.values,
+            bounds,
+            began + trace.seconds,
+            points,
+            notes,
+            polished,
         )
+
+    @property
+    def gains(self) -> Array:
+        """By how much each value ``(n,)`` is above that where the walk of its search stood (`sip.events.gains`)."""
+        judged = self.notes.get("accepted", np.zeros(self.value.size))
+        found = np.full(self.value.size, np.nan)
+        for outer in np.unique(self.outer):
+            mine = self.outer == outer
+            found[mine] = gains(self.value[mine], judged[mine] != 0.0)
+        return found
 
     @staticmethod
     def joined(parts: Sequence[SearchTrace]) -> SearchTrace:
@@ -82,14 +106,16 @@ class SearchTrace:
             name: np.concatenate([part.notes.get(name, np.full(part.value.size, np.nan)) for part in parts])
             for name in names
         }
-        return SearchTrace(outer, epsilon, value, bound, seconds, points, notes)
+        polished = np.concatenate([part.polished for part in parts])
+        return SearchTrace(outer, epsilon, value, bound, seconds, points, notes, polished)
 
     def arrays(self) -> dict[str, Array]:
-        """``evaluations.npz``: the columns, ``points``, and ``note_...`` for each name that was noted."""
+        """``evaluations.npz``: the columns, ``points``, ``polished``, and ``note_...`` for each name that was noted."""
         notes = {f"{NOTE}{name}": column for name, column in self.notes.items()}
         return {
             **{name: getattr(self, name) for name in COLUMNS},
             **({"points": self.points} if self.points.size else {}),
+            **({"polished": self.polished.astype(np.int8)} if self.polished.any() else {}),
             **notes,
         }
 
@@ -98,9 +124,9 @@ class SearchTrace:
         """The same from `arrays`; raises `KeyError` for a column that is missing."""
         notes = {name.removeprefix(NOTE): column for name, column in arrays.items() if name.startswith(NOTE)}
         outer, epsilon, value, bound, seconds = (arrays[name] for name in COLUMNS)
-        return SearchTrace(
-            outer, epsilon, value, bound, seconds, arrays.get("points", np.zeros((value.size, 0))), notes
-        )
+        points = arrays.get("points", np.zeros((value.size, 0)))
+        polished = arrays.get("polished", np.zeros(value.size, dtype=bool))
+        return SearchTrace(outer, epsilon, value, bound, seconds, points, notes, polished.astype(bool))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -61,7 +61,17 @@ SEARCH = sr.EvaluationsFinished(
     budget=50,
     round=3,
     lower_bound=0.5,
-    batch=sr.Batch(notes={"accepted": [(17, 1.0), (18, 0.0), (19, 0.0), (20, 0.0)], "temperature": [(20, 0.125)]}),
+    batch=sr.Batch(
+        points=[np.zeros((5, 1))],
+        values=[np.array([1.0, 2.0, 2.0, 1.0, 1.5])],  # the third changes nothing, though it is accepted
+        moments=[(5, 2.0)],
+        notes={
+            "accepted": [(16, 0.0), (17, 1.0), (18, 1.0), (19, 0.0), (20, 0.0)],
+            "temperature": [(20, 0.125)],
+        },
+        first=15,
+        stood=0.0,
+    ),
 )
 ENDING = sr.RunFinished(status="certified", message="done", seconds=1.0)
 

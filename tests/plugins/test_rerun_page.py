@@ -32,7 +32,7 @@ def variable(name: str) -> str:
 
 
 def test_make_live_watches_the_papers_annealing_with_keys_that_exist() -> None:
-    config = load_config(ROOT / variable("LIVE"), variable("LONGER").split()).config
+    config = load_config(ROOT / variable("LIVE")).config
     assert (config.method.name, config.maximiser.name) == ("sparserob", "simulated_annealing")
     assert config.method.options["formulation"] == "literal"
     assert "live: $(INSTALLED)" in (ROOT / "Makefile").read_text()
@@ -55,7 +55,7 @@ def watching(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     environment = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
     command = [sys.executable, "-m", "sparserob_core", "watch", str(ROOT / variable("LIVE")), "--serve", "--no-figures"]
     process = subprocess.Popen(
-        [*command, "method.sc2=null", "maximiser.budget=100000", "--out", str(tmp_path / "run")],
+        [*command, "maximiser.budget=100000", "--out", str(tmp_path / "run")],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

@@ -46,8 +46,9 @@ class MaximiserEntry(Entry):
     budget: int = Field(default=2000, ge=1)
     """Evaluations that one search may spend."""
 
-    polish: float = Field(default=0.0, ge=0.0, lt=1.0)
-    """Share of the budget that goes to a local method, from the best points, at the end."""
+    polish: float | None = Field(default=None, ge=0.0, lt=1.0)
+    """Share of the budget that goes to a local method, from the best points, at the end; null: what the maximiser says
+    of itself, a fifth as a rule, where the search is over literal tuples, and nothing elsewhere."""
 
 
 PIECES = Slot("dictionary", "piecewise_constant")

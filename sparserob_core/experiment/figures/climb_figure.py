@@ -56,7 +56,8 @@ def draw_climb(trace: SearchTrace, title: str, upper: float = np.inf, *, exact: 
     _draw_climb(axes[0], trace, stages)
     _draw_bound(axes[1], trace, upper, exact)
     for ax, name in zip(axes[2:], noted, strict=True):
-        _draw_note(ax, name, trace.notes[name], stages)
+        changing = np.nan_to_num(trace.gains) != 0.0 if name == "accepted" else True
+        _draw_note(ax, name, np.where(changing, trace.notes[name], np.nan), stages)
     for ax in axes:
         for _, first, _ in stages[1:]:
             ax.axvline(first + 0.5, color=look.GREY, linewidth=0.6, linestyle=":", zorder=0)
@@ -225,7 +226,7 @@ def _draw_note(ax: Axes, name: str, column: Array, stages: list[tuple[float, int
         where = np.flatnonzero(np.isfinite(column[first:last])) + first
         values = _mean(column[where]) if name == "accepted" else column[where]
         ax.plot(where + 1, values, color=look.VERMILLION, linewidth=1.0)
-    ax.set_ylabel(f"accepted\n(of last {MEAN})" if name == "accepted" else name.replace("_", " "))
+    ax.set_ylabel(f"accepted, of the\nlast {MEAN} changes" if name == "accepted" else name.replace("_", " "))
 
 
 def _mean(values: Array) -> Array:

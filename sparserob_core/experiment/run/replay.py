@@ -156,8 +156,10 @@ def _searches(trace: SearchTrace, width: int) -> Iterator[tuple[int, Evaluations
         ranked = np.where(np.isnan(values), -np.inf, values)
         best, done = np.maximum.accumulate(ranked), 0
         batches = min(which.size, max(1, BATCHES * which.size // trace.outer.size))
-        for part in np.array_split(np.arange(which.size), batches):
-            before = -np.inf if not done else float(best[done - 1])
+        walked = int((~trace.polished[which]).sum())
+        ends = [part[-1] + 1 for part in np.array_split(np.arange(which.size), batches)]
+        for part in np.split(np.arange(which.size), sorted({*ends, walked} - {0, which.size})):
+            before, stood = -np.inf if not done else float(best[done - 1]), _standing(notes, done)
             moments = [(1, float(moment)) for moment in seconds[part]]
             said = {
                 name: [(k + 1.0, column[k]) for k in part if not np.isnan(column[k])] for name, column in notes.items()
@@ -169,7 +171,8 @@ def _searches(trace: SearchTrace, width: int) -> Iterator[tuple[int, Evaluations
                 notes={name: rows for name, rows in said.items() if rows},
                 first=done,
                 best=before,
-                origin=_origin(points, notes, done) if size else None,
+                origin=points[stood] if size and done else None,
+                stood=float(values[stood]) if done else np.nan,
             )
             done = int(part[-1]) + 1
             top = int(ranked[:done].argmax())
@@ -183,6 +186,7 @@ def _searches(trace: SearchTrace, width: int) -> Iterator[tuple[int, Evaluations
                     budget=which.size,
                     best_point=points[top],
                     block=width if size and size % width == 0 else max(1, size),
+                    phase="polish" if part[0] >= walked else "search",
                     round=int(outer) + 1,
                     epsilon=float(trace.epsilon[which[0]]),
                     lower_bound=float(trace.bound[which[part[-1]]]),
@@ -191,10 +195,8 @@ def _searches(trace: SearchTrace, width: int) -> Iterator[tuple[int, Evaluations
             )
 
 
-def _origin(points: np.ndarray, notes: Mapping[str, np.ndarray], done: int) -> np.ndarray | None:
-    """Where the walk stood after ``done`` evaluations of a search: as in `Batch`."""
-    if not done:
-        return None
+def _standing(notes: Mapping[str, np.ndarray], done: int) -> int:
+    """At which evaluation the walk stood after ``done`` evaluations of a search: as in `Batch`."""
     accepted = notes.get("accepted")
     taken = np.zeros(0, dtype=int) if accepted is None else np.flatnonzero(accepted[:done] > 0.0)
-    return np.asarray(points[taken[-1] if taken.size else done - 1])
+    return int(taken[-1]) if taken.size else done - 1

@@ -10,7 +10,7 @@ from typing import final
 import numpy as np
 
 from sparserob_core.sip.convex_set import Array, Box
-from sparserob_core.sip.events import SKETCHED, Batch, EvaluationsFinished, Notify, Sketch, frozen
+from sparserob_core.sip.events import SKETCHED, Batch, EvaluationsFinished, Notify, Phase, Sketch, frozen
 
 SECONDS_BETWEEN_EVENTS = 0.05
 EVENTS = 20  # of one search, at least, where it asks for its points one after the other
@@ -21,13 +21,14 @@ NUMBERS_BETWEEN_EVENTS = 2**21  # coordinates that wait for the next event
 @dataclass(frozen=True, eq=False)
 class Standing:
     """Where a search stands: its evaluations and budget, the best point ``(d,)`` with its value, coordinates per
-    index."""
+    index, and who searches."""
 
     evaluations: int
     budget: int
     best_value: float
     best_point: Array
     block: int
+    phase: Phase = "search"
 
 
 @final
@@ -43,9 +44,9 @@ class Notifier:
         self.moments: list[tuple[int, float]] = []
         self._noted: dict[str, int] = {}
         self._sketches: dict[str, Sketch] = {}
-        self._origin: Array | None = None
-        self._last: Array | None = None
-        self._accepted: Array | None = None
+        self._origin: tuple[Array | None, float] = (None, np.nan)
+        self._last: tuple[Array | None, float] = (None, np.nan)
+        self._accepted: tuple[Array, float] | None = None
 
     def due(self, evaluations: int, budget: int) -> bool:
         """Whether it is time for an event: for the clock, after a share of the budget, or for the memory."""
@@ -61,12 +62,12 @@ class Notifier:
         self.values.append(values)
         self.moments.append((values.size, moment))
         self.numbers += points.size
-        self._last = points[-1]
+        self._last = points[-1], float(values[-1])
 
     def note(self, scalars: Mapping[str, float]) -> None:
         """Where a maximiser notes that it has accepted the last point, the walk stands there."""
-        if scalars.get("accepted"):
-            self._accepted = self._last
+        if scalars.get("accepted") and self._last[0] is not None:
+            self._accepted = self._last[0], self._last[1]
 
     def sketch(self, role: str, lower: Array, upper: Array | None, rounded: bool) -> None:
         """Keep a sketch for the next event; the last one of a role is the one that counts."""
@@ -81,7 +82,7 @@ class Notifier:
             for name, rows in notes.items()
             if len(rows) > self._noted.get(name, 0)
         }
-        batch = Batch(self.points, self.values, self.moments, fresh, self.notified, self.best, self._origin)
+        batch = Batch(self.points, self.values, self.moments, fresh, self.notified, self.best, *self._origin)
         count, self.notified, self.notified_at = (
             standing.evaluations - self.notified,
             standing.evaluations,
@@ -97,6 +98,7 @@ class Notifier:
             best_point=frozen(standing.best_point),
             domain=self.domain,
             block=standing.block,
+            phase=standing.phase,
             batch=batch,
             sketches=self._sketches,
         )

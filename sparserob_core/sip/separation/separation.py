@@ -55,7 +55,7 @@ def search_worst(
     budget: int,
     rng: np.random.Generator,
     threshold: float = 1e-9,
-    polish: float = 0.0,
+    polish: float | None = None,
     notify: Notify = ignore,
     deadline: Deadline | None = None,
 ) -> Separation:
@@ -192,7 +192,7 @@ def _promising(unit: Array, values: Array, promise: Array, radius: float) -> Can
 
 
 def _ask(
-    field: _Violation, maximiser: Maximiser, budget: int, rng: np.random.Generator, polish: float, notify: Notify
+    field: _Violation, maximiser: Maximiser, budget: int, rng: np.random.Generator, polish: float | None, notify: Notify
 ) -> tuple[Candidates, float]:
     """The best index that a maximiser finds, as a candidate of every row."""
     from sparserob_core.sip.search.search import Rules, Target, maximise

@@ -15,7 +15,7 @@ import sparserob_core as sr
 from sparserob_core.experiment.directory.finished import read_arrays
 from sparserob_core.experiment.directory.rounds import round_arrays, with_decisions
 from sparserob_core.experiment.run.events import Broadcast
-from sparserob_core.sip.events import Batch
+from sparserob_core.sip.events import Batch, gains
 from sparserob_core.testing.observers import CONFIG, METHODS
 
 SQUARE = sr.Box(np.zeros(2), np.ones(2))
@@ -313,11 +313,40 @@ def test_the_moves_are_those_of_the_walk() -> None:
     together = [tuple(row) for row in heard[0].batch.moves.tolist()]
     singly = [(event.batch.first + row, column) for event in heard[1:] for row, column in event.batch.moves.tolist()]
     assert together == singly == [(k + 1, k % 2) for k in range(12)]
+    walk = heard[0].batch
+    stood = [walk.trace.values[max(j for j in range(k + 1) if j == 0 or j % 3 != 2)] for k in range(12)]
+    assert np.array_equal(walk.gains[1:], walk.trace.values[1:] - stood)
+    assert np.isnan(walk.gains[0])
+    assert walk.gains[1:].tolist() == [event.batch.gains[0] for event in heard[2:]]
+    changing = [k for k in range(12) if walk.gains[k + 1] != 0.0]
+    assert changing == list(range(0, 12, 2))  # the second coordinate changes nothing
+    assert walk.acceptance == pytest.approx(np.mean([k % 3 != 1 for k in changing]))
+
+
+def test_from_nowhere_to_nowhere_nothing_is_gained() -> None:
+    values, accepted = np.array([-np.inf, -np.inf, 1.0, -np.inf, 2.0]), np.array([True, True, True, False, True])
+    assert gains(values, accepted).tolist()[1:] == [0.0, np.inf, -np.inf, 1.0]
+
+
+def test_events_tell_the_maximiser_from_the_polish_and_none_is_of_both() -> None:
+    heard: list[sr.EvaluationsFinished] = []
+    trace = sr.maximise(
+        lambda x: -((x - 0.3) ** 2).sum(axis=1), SQUARE, "random_search", 50, notify=heard.append, polish=0.4
+    ).trace
+    assert trace.searched == 30
+    assert trace.values.size > trace.searched
+    for event in heard:
+        first = event.total - event.count
+        assert event.phase == ("polish" if first >= trace.searched else "search")
+        assert event.phase == "polish" or event.total <= trace.searched
+    assert {event.phase for event in heard} == {"search", "polish"}
 
 
 def test_a_batch_of_nothing_has_an_empty_trace_and_no_moves() -> None:
     assert Batch().trace.values.size == 0
     assert Batch().moves.shape == (0, 2)
+    assert Batch().gains.size == 0
+    assert np.isnan(Batch().acceptance)
 
 
 def test_large_points_are_not_kept_for_long() -> None:

@@ -65,7 +65,7 @@ def test_a_literal_search_is_refuted_by_a_disturbance_that_breaks_it(exact, tmp_
     outcome = experiment1(
         tmp_path / "run",
         {"formulation": "literal", "indices": 10, "sc1": {"name": "iterations", "count": 2}},
-        {"name": "simulated_annealing", "budget": 60},
+        {"name": "simulated_annealing", "budget": 60, "polish": 0.0},
     )
     result = outcome.result
     assert result.status == "refuted"
@@ -119,6 +119,37 @@ def test_the_same_seed_gives_the_same_trace(tmp_path):
     assert not np.array_equal(first.trace.value, other.trace.value)
 
 
+def test_a_polish_is_written_down_and_read_back_and_replayed_as_one(tmp_path):
+    from sparserob_core.experiment.run.replay import BATCHES, _searches
+
+    outcome = experiment1(
+        tmp_path / "run",
+        {"indices": 3, "sc1": {"name": "iterations", "count": 2}},
+        {"name": "random_search", "budget": 30, "polish": 0.3},
+    )
+    trace = outcome.result.trace
+    with np.load(outcome.directory / "evaluations.npz") as columns:
+        read = sr.SearchTrace.stored(columns)
+    assert trace.polished.tolist() == read.polished.tolist()
+    assert np.flatnonzero(~read.polished).tolist() == [*range(21), *range(30, 51)]
+    width = outcome.program.families[0].index_set.dimension
+    told = [event for _, event in _searches(read, width)]
+    for event in told:
+        mine = read.polished[read.outer == event.round - 1][event.total - event.count : event.total]
+        assert mine.tolist() == [event.phase == "polish"] * event.count
+    assert sum(event.count for event in told) == 60
+    assert len(told) <= 2 * BATCHES
+
+
+def test_no_weight_is_a_rounding_error_above_the_last_one():
+    steps, weights = sr.Continuation(start=1.0, factor=0.1, stop=1e-3), [1.0]
+    while weights[-1] > steps.stop:
+        weights.append(steps.lighter(weights[-1]))
+    assert weights == pytest.approx([1.0, 0.1, 0.01, 0.001], rel=1e-12)
+    assert steps.lighter(0.01) == steps.stop
+    assert steps.lighter(0.0100001) > steps.stop
+
+
 def test_every_evaluation_is_written_down(tmp_path):
     outcome = experiment1(
         tmp_path / "run",
@@ -131,6 +162,7 @@ def test_every_evaluation_is_written_down(tmp_path):
         )
         assert columns["points"].shape == (60, 3 * outcome.program.families[0].index_set.dimension)
         assert columns["epsilon"].tolist() == [1.0] * 30 + [0.5] * 30
+        assert not sr.SearchTrace.stored(columns).polished.any()
         assert (np.diff(columns["seconds"]) >= 0).all()
     assert outcome.summary["counts"]["evaluations"] == 60
 

@@ -99,6 +99,31 @@ def test_a_polish_takes_the_ascent_for_every_maximiser_and_sees_only_what_can_mo
     assert (report.best_value > peaks.maximum - 1e-3) == (polish > 0.0)
 
 
+def test_a_polish_that_nobody_speaks_of_is_the_maximiser_s_own_share_where_blocks_are_linear_and_nothing_elsewhere():
+    class Yardstick(sr.Maximiser):
+        share = 0.0
+
+        @property
+        def polished(self):
+            return self.share
+
+        def search(self, objective, rng):
+            objective.evaluate(objective.domain.lower[np.newaxis])
+            return float("inf")
+
+    class Searching(Yardstick):
+        share = 0.25
+
+    peaks = Peaks()
+    for linear in (peaks.linear, None):
+        target = Target(peaks, peaks.domain, block=peaks.m + 2, linear=linear)
+        for maximiser in (Searching(), Yardstick()):
+            trace = maximise(target, maximiser, 100, np.random.default_rng(0)).trace
+            polished = linear is not None and maximiser.share > 0.0
+            assert trace.searched == (1 if polished else None)
+            assert trace.values.size == (26 if polished else 1)
+
+
 def test_an_objective_that_is_not_linear_in_blocks_is_left_alone():
     objective = CountedObjective(Target(lambda x: -(x**2).sum(axis=1), sr.Box([-1.0], [1.0])), 10)
     objective.evaluate(np.array([[0.5]]))
