@@ -20,13 +20,14 @@ from sparserob_core.checker.arithmetic.bernstein import highest
 from sparserob_core.checker.arithmetic.jets import Monomials, expanded
 from sparserob_core.checker.arithmetic.series import Series
 from sparserob_core.checker.arithmetic.subdivision import fill
+from sparserob_core.checker.claims.cells import _to_blame
 from sparserob_core.checker.claims.duality import Duality
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.checker.reach import disturbance_support
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import Flow, OwnUnits, balanced, flows, stacked
 from sparserob_core.checker.reach.measurable import Kernel
-from sparserob_core.checker.reach.tube import Tube
+from sparserob_core.checker.reach.tube import Polynomial, Tube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.expression import parse_matrix
 from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
@@ -264,6 +265,33 @@ def test_tubes_are_above_the_worst_case_and_not_far_above(nu, spread, degree, ne
                 assert (value - poly.error - poly.kinks <= truth + 1e-13).all()
 
 
+def test_what_initial_states_lose_while_they_switch_is_laid_to_what_it_depends_on():
+    """The worst corner of a 1-norm ball changes with the time; with a parameter only where ``A`` has one."""
+    start, control = np.array([1.0, -0.5]), uniform(2, 1.0)
+    for entry, because in (("-2", False), ("-2 + 3*p1", True)):
+        A, B = (
+            parse_matrix(name, rows, ("p1",))
+            for name, rows in (("A", [["0", "1"], [entry, "-0.5"]]), ("B", [["0"], ["1 + p1"]]))
+        )
+        system = LinearSystem(A, B, parameters=Box(np.array([-0.2]), np.array([0.2])))
+        with ctx.workprec(96):
+            tube, *_ = tube_of(system, control, control, None, 6, np.array([1.0, -1.0]), start)
+            tube.scene = replace(tube.scene, initial_set=NormBall(p=1.0, radius=0.1, centre=np.zeros(2)))
+            (poly,) = tube.cells(0, 0.0, 0.5, np.array([[1.0, 0.3]]))
+        assert poly.kinks > 1e-3
+        assert (poly.turning > 0.2 * poly.kinks) if because else poly.turning == 0.0
+        assert _to_blame(poly, 0.0, (0, 0.0, 0.5)) == because
+        assert _to_blame(poly, 0.0, (0, 0.5, 0.5))
+
+
+def test_a_row_that_is_certainly_exceeded_is_looked_for_where_it_changes():
+    flat = Polynomial(np.array([[0.0, 0.5], [0.1, 0.0]]), 1e-3, 0.0, 1e-3)
+    for top, blamed in ((1e-3, False), (1.0, True)):
+        assert _to_blame(flat, top, (0, 0.0, 1.0)) == blamed
+    turned = replace(flat, coefficients=np.array([[0.0, 0.1], [0.5, 0.0]]))
+    assert not _to_blame(turned, 1.0, (0, 0.0, 1.0))
+
+
 @pytest.mark.parametrize("factor", [1.0, 2.0**-30, 2.0**40, 3e5])
 def test_the_kernel_of_a_measurable_disturbance_is_as_sharp_in_any_units(factor):
     turn = np.diag([1.0, factor])
@@ -347,12 +375,13 @@ def test_sums_over_equal_pieces_are_those_piece_by_piece_and_no_further_off(name
                 with patch.object(disturbance_support, "FEWEST_SUMMED", (1, 1)):
                     sums = tubes[0].sigmas[0]._of_equal_pieces(known(bound), begin, ticks, z)
                     assert sums is not None
-                    moved, error, kinks = sums
+                    moved, error, kinks, box = sums
                 with patch.object(disturbance_support, "FEWEST_SUMMED", (1_000, 1_000)):
-                    plain, off, _ = tubes[1].sigmas[0].bounds(begin, ticks, z, False)
+                    plain, off, *_ = tubes[1].sigmas[0].bounds(begin, ticks, z, False)
                 assert (np.abs(moved - plain).sum(axis=(1, 2)) <= error + off).all()
                 assert (error <= 1.01 * off + 1e-14).all()
                 assert (kinks <= error).all()
+                assert not box.any()
 
 
 def test_the_remainder_is_needed_and_enough_on_a_wide_box():

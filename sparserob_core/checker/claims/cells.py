@@ -133,12 +133,13 @@ def _examine(place: Place, sides: Sides, todo: Sequence[Interval], left: _Left, 
         for top, row in zip(tops, sides.rows, strict=True):
             if top <= 0.0:
                 shown.add(top, row)
-        failed = [(row, poly) for row, poly, top in zip(sides.rows, found, tops, strict=True) if not top <= 0.0]
+        over = [(row, poly, top) for row, poly, top in zip(sides.rows, found, tops, strict=True) if not top <= 0.0]
+        failed = [(row, poly) for row, poly, _ in over]
         if not failed:
             continue
         if _turn(place, sides, interval, failed, max(tops)):
             left.turned.append(interval)
-        elif place.box[0] and any(_to_blame(poly, interval) for _, poly in failed):
+        elif place.box[0] and any(_to_blame(poly, top, interval) for _, poly, top in over):
             left.wide.append(interval)
             left.influence += sum(_influence(place.tube, poly) for _, poly in failed)
         else:
@@ -232,9 +233,14 @@ def _cut(place: Place, row: Bounded, poly: Polynomial) -> float:
     return top
 
 
-def _to_blame(poly: Polynomial, interval: Interval) -> bool:
-    if interval[1] == interval[2] or poly.expansion > BLAME * poly.error:
+def _to_blame(poly: Polynomial, top: float, interval: Interval) -> bool:
+    """Whether a smaller box of parameters helps more than a shorter time where a row seems to be exceeded by ``top``:
+    by what the box has to do with the error. Where the row is exceeded by more than errors make it, by how much it
+    changes over the box and over the time: halving leads to what refutes it, or to parameters outside their set."""
+    if interval[1] == interval[2] or poly.expansion + poly.turning > BLAME * poly.error:
         return True
+    if top <= 2.0 * poly.error + poly.kinks:
+        return False
     return bool(np.abs(poly.coefficients[0, 1:]).sum() > np.abs(poly.coefficients[1:]).sum())
 
 

@@ -20,8 +20,9 @@ from sparserob_core.checker.outcome import EQUALITY, RESOLVED, TOLERANCE, Broken
 from sparserob_core.checker.reach.closed_loop import ClosedLoop
 from sparserob_core.checker.reach.directions import Directions
 from sparserob_core.checker.reach.effort import at_most
-from sparserob_core.checker.reach.flow import middles, scaled, stacked
+from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.reach.measurable import MeasurableLoop
+from sparserob_core.checker.reach.preimages import Pushed, Seen
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.sets.sets import Box, Ellipsoid, NormBall
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
 MOST_CELLS = 40_000  # cells of time examined for each constraint
 PEAK, CONTROL, RATE, EQUALS, STEP = "peak", "control", "rate", "equals", "control_step"
 WORST, EFFORT = "worst", "effort"
-EVENED = 20  # steps in which rows and columns of a matrix become of one size
 FIGURES, SMALL_COST = 1e-11, 1e-6  # of an effort, and of the largest possible one: how closely it is known
 
 
@@ -496,7 +496,7 @@ class FeedbackClaims:
         return [(sorted(members), *self._inverse(loop, tuple(sorted(members)))) for members, _ in groups]
 
     def _inverse(self, loop: ClosedLoop, members: tuple[int, ...]) -> tuple[arb_mat, list[int]]:
-        """A left inverse of what is seen, or a right one where more acts than is seen."""
+        """What gives, of any combination of the states seen at these breakpoints, one of the blocks that is seen so."""
         from flint import arb
 
         if members not in self._inverses:
@@ -509,15 +509,30 @@ class FeedbackClaims:
                     [lists[block][s][b] if block in lists else zero for block in blocks for b in self._chords[block]]
                     for s in range(d)
                 ]
-            D, rows, columns = _evened(stacked(table))
-            if self.case.measurable and members != (0,):
-                inverse = self._independent(D)
-            elif D.ncols() <= D.nrows():
-                inverse = (D.transpose() * D).inv() * D.transpose()
-            else:
-                inverse = D.transpose() * (D * D.transpose()).inv()
-            self._inverses[members] = (scaled(inverse, columns, rows), blocks)
+            groups = [self._pushed(loop, block) for block in blocks]
+            pattern = np.vstack(
+                [np.hstack([g.pattern & (b in loop.seen[j]) for g, b in zip(groups, blocks, strict=True)])
+                 for j in members]
+            )  # fmt: skip
+            most = max(group.states for group in groups)
+            rows = [(d * (k + 1), most) for k in range(len(members))]
+            ends = np.cumsum([group.pattern.shape[1] for group in groups]).tolist()
+            columns = [(end, group.entries) for end, group in zip(ends, groups, strict=True)]
+            self._inverses[members] = Seen(stacked(table), pattern, rows, columns).inverse(), blocks
         return self._inverses[members]
+
+    def _pushed(self, loop: ClosedLoop, block: int) -> Pushed:
+        """Who can see the deviations of a block; of the initial state everyone sees its own."""
+        d, varying = loop.parts["A"].nrows(), tuple(self._chords[block])
+        if self.case.problem.initial_set is not None and block == loop.blocks:
+            return Pushed(np.eye(d, dtype=bool)[:, list(varying)], len(varying), len(varying))
+        if varying not in self._pushes:
+            self._pushes[varying] = Pushed.of(loop.parts["A"], loop.parts["E"], varying)
+        return self._pushes[varying]
+
+    @cached_property
+    def _pushes(self) -> dict[tuple[int, ...], Pushed]:
+        return {}
 
     @cached_property
     def _chords(self) -> list[dict[int, arb]]:
@@ -555,34 +570,6 @@ class FeedbackClaims:
         if changes[-1] >= self.case.grid[-1]:
             raise Broken(f"{name}: the disturbance changes at {float(changes[-1]):.6g}, after the end")
         return self._resting([float(t) for t in changes])
-
-    def _independent(self, D: arb_mat) -> arb_mat:
-        """A right inverse; where the disturbance cannot push the state everywhere, a left inverse of as many columns as
-        it has directions to push it in, and 0 for the others: all that it does is a combination of these. How many
-        directions there are is found without rounding."""
-        from flint import fmpq, fmpq_mat
-        from scipy.linalg import qr
-
-        A, E = ([[fmpq(*float(x.mid()).as_integer_ratio()) for x in row] for row in part.tolist()]
-                for part in (self.loop_at_rest.parts["A"], self.loop_at_rest.parts["E"]))  # fmt: skip
-        if any(not x.is_exact() for part in ("A", "E") for x in self.loop_at_rest.parts[part].entries()):
-            raise Unchecked("the numbers of the system are not exact")
-        pushed = [fmpq_mat(E)]
-        for _ in range(len(A) - 1):
-            pushed.append(fmpq_mat(A) * pushed[-1])
-        rank = fmpq_mat([column for part in pushed for column in part.transpose().tolist()]).rank()
-        if rank == len(A):
-            return D.transpose() * (D * D.transpose()).inv()
-        columns = np.array([[float(x.mid()) for x in row] for row in D.tolist()])
-        sizes = np.linalg.norm(columns, axis=0)
-        order = qr(columns / np.where(sizes > 0.0, sizes, 1.0), mode="economic", pivoting=True)[2][:rank]
-        chosen = stacked([[row[j] for j in order] for row in D.tolist()])
-        try:
-            inverse = ((chosen.transpose() * chosen).inv() * chosen.transpose()).tolist()
-        except ZeroDivisionError:
-            raise Unchecked("the checker cannot tell in which directions the disturbance pushes the state") from None
-        rows = dict(zip(order.tolist(), inverse, strict=True))
-        return stacked([rows.get(j, [0 * x for x in inverse[0]]) for j in range(D.ncols())])
 
     @cached_property
     def _inverses(self) -> dict[tuple[int, ...], tuple[arb_mat, list[int]]]:
@@ -804,19 +791,6 @@ def _deviations(case: Case, loop: ClosedLoop, entry: Mapping[str, Any], name: st
         [arb(float(v)) - arb(float(c)) for v, c in zip(point, about, strict=True)]
         for point, (_, about) in zip(points, loop.sets, strict=True)
     ]
-
-
-def _evened(D: arb_mat) -> tuple[arb_mat, Array, Array]:
-    """A matrix with its rows and columns multiplied by powers of two, so that the largest entry of each is about 1
-    (Ruiz 2001), and these powers: what is inverted is then of no unit."""
-    sizes = np.abs(middles(D))
-    rows, columns = np.ones(sizes.shape[0]), np.ones(sizes.shape[1])
-    for _ in range(EVENED):
-        evened = sizes * rows[:, None] * columns
-        for factors, most in ((rows, evened.max(axis=1)), (columns, evened.max(axis=0))):
-            factors /= np.sqrt(np.where(most > 0.0, most, 1.0))
-    rows, columns = (np.exp2(np.round(np.log2(factors))) for factors in (rows, columns))
-    return scaled(D, rows, columns), rows, columns
 
 
 def _dot(c: Array, x: list[arb]) -> arb:

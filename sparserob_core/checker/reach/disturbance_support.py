@@ -88,31 +88,32 @@ class Table:
 @final
 @dataclass(frozen=True, eq=False)
 class Sums:
-    """Sums over the last pieces of the disturbance, ``(count, k, ...)``: coefficients of a bound, its errors, and what
-    of them is due to switching. Of every piece: the ``point (count, k, mw)`` of the set, and by how much the integral
-    since its beginning may be off, ``off`` of that shape."""
+    """Sums over the last pieces of the disturbance, ``(count, k, ...)``: coefficients of a bound, its errors, what of
+    them is due to switching, and what of that to the size of the ``box`` of parameters. Of every piece: the ``point
+    (count, k, mw)`` of the set, and by how much the integral since its beginning may be off, ``off`` of that shape."""
 
     moved: Array
     error: Array
     kinks: Array
+    box: Array
     point: Array
     off: Array
 
     def joined(self, more: Sums) -> Sums:
         """With what more pieces add, one by one."""
         return Sums(
-            *(np.concatenate([old, old[-1:] + np.cumsum(new, axis=0)]) for old, new in self._pairs(more)[:3]),
-            *(np.concatenate(pair) for pair in self._pairs(more)[3:]),
+            *(np.concatenate([old, old[-1:] + np.cumsum(new, axis=0)]) for old, new in self._pairs(more)[:4]),
+            *(np.concatenate(pair) for pair in self._pairs(more)[4:]),
         )
 
     def _pairs(self, more: Sums) -> list[tuple[Array, Array]]:
-        names = ("moved", "error", "kinks", "point", "off")
+        names = ("moved", "error", "kinks", "box", "point", "off")
         return [(getattr(self, name), getattr(more, name)) for name in names]
 
     @staticmethod
     def none(shape: tuple[int, ...], k: int, mw: int) -> Sums:
         """Before the first piece: 0."""
-        return Sums(np.zeros((1, k, *shape)), *np.zeros((2, 1, k)), *np.zeros((2, 1, k, mw)))
+        return Sums(np.zeros((1, k, *shape)), *np.zeros((3, 1, k)), *np.zeros((2, 1, k, mw)))
 
 
 @final
@@ -166,10 +167,11 @@ class DisturbanceSupports:
     _latest: tuple[tuple[float, int], Array, Array] | None = None
     _sums: dict[tuple[int, int, bytes], Sums] = field(default_factory=dict)
 
-    def bounds(self, start: float, ticks: int, z: Array, sharp: bool) -> tuple[Array, Array, Array]:
+    def bounds(self, start: float, ticks: int, z: Array, sharp: bool) -> tuple[Array, Array, Array, Array]:
         """For every direction ``z_i'basis``, ``z (k, b)``: coefficients ``(k, J + 1, M)`` of a bound of the
-        disturbance's support from ``start`` on for that many ticks, its error ``(k,)``, and how much of that, or of the
-        coefficients, is due to switching. ``sharp``: less of it where the set is round, which takes longer."""
+        disturbance's support from ``start`` on for that many ticks, its error ``(k,)``, how much of that, or of the
+        coefficients, is due to switching, and about how much of that would go in smaller boxes of parameters.
+        ``sharp``: less of it where the set is round, which takes longer."""
         assert self.scene.disturbance is not None
         shape = known(self.scene.disturbance)
         if self.before is None and (not sharp or shape.round is None):
@@ -180,7 +182,7 @@ class DisturbanceSupports:
             self._latest = ((start, ticks), *self.every(start, ticks))
         return self._bounded(shape, *self._latest[1:], z, sharp)
 
-    def begun(self, start: float, ticks: int, z: Array, sharp: bool) -> tuple[Array, Array, Array]:
+    def begun(self, start: float, ticks: int, z: Array, sharp: bool) -> tuple[Array, Array, Array, Array]:
         """`bounds` of what the worst initial state adds to that of the centre: the support function of the set of
         deviations at the rows themselves."""
         assert self.scene.initial_set is not None
@@ -254,15 +256,17 @@ class DisturbanceSupports:
         mid, rad = self.before.every(self._begins, 0)
         return Enclosed(*(np.moveaxis(part[:, 0], 3, 2) for part in (mid, rad)))
 
-    def _bounded(self, shape: Shape, every: Array, errors: Array, z: Array, sharp: bool) -> tuple[Array, Array, Array]:
+    def _bounded(
+        self, shape: Shape, every: Array, errors: Array, z: Array, sharp: bool
+    ) -> tuple[Array, Array, Array, Array]:
         """Bounds of the sum of a set's support functions at weights ``(pieces, J + 1, M, mw, b)`` that are off by at
         most ``errors``, for combinations ``z (k, b)`` of them: as in `bounds`."""
         pieces = every.shape[0]
-        mid, w, lost, error, kinks = _linear(shape, every, errors, z, pieces)
+        mid, w, lost, error, kinks, share = _linear(shape, every, errors, z, pieces)
         k, mw = mid.shape[0], mid.shape[-1]
         if not sharp or shape.round is None:
             moved = np.einsum("ilw,iljkw->ijk", w, mid)
-            return moved, error.sum(axis=1) * OUTWARD, kinks.sum(axis=1) * OUTWARD
+            return moved, error.sum(axis=1) * OUTWARD, kinks.sum(axis=1) * OUTWARD, (share * kinks).sum(axis=1)
         # of every piece the better of this linear bound and of a polynomial above the length of L'f
         m, L = shape.round
         parts = (mid @ L).reshape(-1, *mid.shape[2:4], L.shape[1])
@@ -274,7 +278,7 @@ class DisturbanceSupports:
         linear = np.einsum("ilw,iljkw->iljk", w, mid)
         moved = np.where(better[:, :, None, None], above + mid @ m, linear).sum(axis=1)
         error, kinks = np.where(better, off, error), np.where(better, over, kinks)
-        return moved, error.sum(axis=1) * OUTWARD, kinks.sum(axis=1) * OUTWARD
+        return moved, error.sum(axis=1) * OUTWARD, kinks.sum(axis=1) * OUTWARD, (share * kinks).sum(axis=1)
 
     def _weights(self, start: float, ticks: int) -> tuple[Array, Array]:
         """What every piece of the disturbance before the cell adds per unit, ``(pieces, J + 1, M, mw, b)``, with errors
@@ -301,7 +305,9 @@ class DisturbanceSupports:
             self._tables[offset, ticks] = Table()
         return self._tables[offset, ticks]
 
-    def _of_equal_pieces(self, shape: Shape, start: float, ticks: int, z: Array) -> tuple[Array, Array, Array] | None:
+    def _of_equal_pieces(
+        self, shape: Shape, start: float, ticks: int, z: Array
+    ) -> tuple[Array, Array, Array, Array] | None:
         """`bounds` where what a piece adds depends on its age alone, since they are equally long: a sum over the ages,
         which is remembered; ``None`` where they are not, or are few."""
         grid, count = self.scene.grid, int(np.searchsorted(self._jumps, start, side="right"))
@@ -325,7 +331,7 @@ class DisturbanceSupports:
             sums = self._sums[key] = self._by_age(shape, sums, count, offset, ticks, z)
         outward = 1.0 + rounding(count)  # sums of so many numbers that are not negative
         ends = (sums.off[count] * np.abs(sums.point[count])).sum(axis=1)
-        return sums.moved[count], (sums.error[count] + ends) * outward, sums.kinks[count] * outward
+        return sums.moved[count], (sums.error[count] + ends) * outward, sums.kinks[count] * outward, sums.box[count]
 
     def _by_age(self, shape: Shape, sums: Sums | None, count: int, offset: int, ticks: int, z: Array) -> Sums:
         """The sums over at least ``count`` pieces, in the order of their ages.
@@ -346,7 +352,7 @@ class DisturbanceSupports:
         change[1:] -= every[:-1]
         rad[1:] += errors[:-1] + rounding(1) * np.abs(change[1:])
         change, rad = change[first:], rad[first:]
-        mid, w, _, _, kinks = _linear(shape, change, rad, z, self._ages.size)
+        mid, w, _, _, kinks, share = _linear(shape, change, rad, z, self._ages.size)
         size, terms = np.abs(z), rounding(self._ages.size * mid.shape[-1])
         rounded = np.einsum("ljkwb,ib->liw", np.abs(change), size) * (rounding(1) + rounding(z.shape[1]))
         rounded += terms * np.swapaxes(np.abs(mid).sum(axis=(2, 3)), 0, 1)
@@ -357,7 +363,7 @@ class DisturbanceSupports:
             np.concatenate([sums.point[-1:], point[:-1]]) - point
         )
         lost = (np.abs(point) * rounded + turned).sum(axis=2) * OUTWARD + kinks.T
-        return sums.joined(Sums(np.einsum("ilw,iljkw->lijk", w, mid), lost, kinks.T, point, off))
+        return sums.joined(Sums(np.einsum("ilw,iljkw->lijk", w, mid), lost, kinks.T, (share * kinks).T, point, off))
 
     @cached_property
     def _ages(self) -> Array:
@@ -461,31 +467,30 @@ class DisturbanceSupports:
 
 def _linear(
     shape: Shape, every: Array, errors: Array, z: Array, count: int
-) -> tuple[Array, Array, Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array, Array, Array]:
     """The weights ``(k, pieces, J + 1, M, mw)`` for combinations ``z (k, b)``, the points ``(k, pieces, mw)`` of the
     set that are best at them or nearly, what is lost of the weights, ``(k, pieces, mw)``, where up to ``count``
     pieces are added up, and by how much the points' products may be too small, ``(k, pieces)``; with what of that is
-    due to switching."""
+    due to switching, and about what share of this to the size of the box of parameters."""
     mid = np.einsum("ljkwb,ib->iljkw", every, z)
     rad = np.einsum("ljkwb,ib->iljkw", errors + rounding(z.shape[1]) * np.abs(every), np.abs(z)) * OUTWARD
     k, pieces, mw = mid.shape[0], mid.shape[1], mid.shape[-1]
-    value, spread = _ranges(mid, rad)
+    value, spread, of_box = _ranges(mid, rad)
     w, excess = shape.bound(value.reshape(-1, mw), spread.reshape(-1, mw))
     w, kinks = w.reshape(k, pieces, mw), excess.reshape(k, pieces) * OUTWARD
     lost = rad.sum(axis=(2, 3)) + rounding(count * mw) * np.abs(mid).sum(axis=(2, 3))
-    return mid, w, lost, np.einsum("ilw,ilw->il", np.abs(w), lost) * OUTWARD + kinks, kinks
+    radius = np.array(shape.radius)
+    far, wide = spread @ radius, of_box @ radius
+    share = np.divide(wide, far, out=np.zeros_like(far), where=far > 0.0)
+    return mid, w, lost, np.einsum("ilw,ilw->il", np.abs(w), lost) * OUTWARD + kinks, kinks, share
 
 
-def _ranges(mid: Array, rad: Array) -> tuple[Array, Array]:
+def _ranges(mid: Array, rad: Array) -> tuple[Array, Array, Array]:
     """The ranges that weights ``(k, pieces, J + 1, M, mw)`` stay in on the cell: middles and half-widths, ``(k, pieces,
-    mw)``."""
+    mw)``, and what parameters have to do with these."""
     k, pieces, orders, _, mw = mid.shape
     ends = bernstein(np.moveaxis(mid[:, :, :, 0], 2, 3).reshape(-1, orders), [False]).reshape(k, pieces, mw, -1)
     highest, lowest = ends.max(axis=3), ends.min(axis=3)
-    spread = (
-        (highest - lowest) / 2
-        + np.abs(mid[:, :, :, 1:]).sum(axis=(2, 3))
-        + rad.sum(axis=(2, 3))
-        + ROUNDING * np.abs(mid[:, :, :, 0]).sum(axis=2)
-    )
-    return (highest + lowest) / 2, spread * OUTWARD
+    of_box = np.abs(mid[:, :, :, 1:]).sum(axis=(2, 3))
+    spread = (highest - lowest) / 2 + of_box + rad.sum(axis=(2, 3)) + ROUNDING * np.abs(mid[:, :, :, 0]).sum(axis=2)
+    return (highest + lowest) / 2, spread * OUTWARD, of_box

@@ -33,13 +33,14 @@ class Polynomial:
     """``coefficients (J + 1, M)`` in powers of the time within the cell (from 0 to 1) and monomials of the parameters;
     the truth exceeds it by at most ``error``, of which ``expansion`` is due to the size of the box of parameters; both
     together exceed the truth by at most twice the ``error`` and ``kinks``, which is due to disturbances about to
-    switch.
+    switch, about ``turning`` of it because the box of parameters is so large.
     """
 
     coefficients: Array
     error: float
     expansion: float
     kinks: float
+    turning: float = 0.0
 
 
 @final
@@ -170,17 +171,18 @@ class Tube:
         mid = (state.mid @ z.T).transpose(2, 0, 1)
         lost = state.rad + rounding(z.shape[1]) * np.abs(state.mid)
         rad, kinks = np.abs(z) @ lost.sum(axis=(0, 1)), np.zeros(z.shape[0])
+        turning = kinks
         if self.scene.disturbance is not None and stop > 0.0:
-            moved, off, kinks = self.sigmas[self.scene.leg(piece)].bounds(start, ticks, z, sharp)
+            moved, off, kinks, turning = self.sigmas[self.scene.leg(piece)].bounds(start, ticks, z, sharp)
             rad += off + rounding(1) * (np.abs(mid) + np.abs(moved)).sum(axis=(1, 2))
             mid = mid + moved
         if self.scene.initial_set is not None:
-            moved, off, switching = self.sigmas[self.scene.leg(piece)].begun(start, ticks, z, sharp)
+            moved, off, switching, of_box = self.sigmas[self.scene.leg(piece)].begun(start, ticks, z, sharp)
             rad += off + rounding(1) * (np.abs(mid) + np.abs(moved)).sum(axis=(1, 2))
-            mid, kinks = mid + moved, kinks + switching
+            mid, kinks, turning = mid + moved, kinks + switching, turning + of_box
         rest = self._left_out(piece, start, ticks, z)
         return [
-            Polynomial(mid[i], float(rad[i] + rest[i]) * OUTWARD, float(rest[i]), float(kinks[i]))
+            Polynomial(mid[i], float(rad[i] + rest[i]) * OUTWARD, float(rest[i]), float(kinks[i]), float(turning[i]))
             for i in range(z.shape[0])
         ]
 

@@ -1,0 +1,148 @@
+"""Deviations that are seen as given: inverses of what innovations see of the blocks of the disturbance.
+
+Innovations are ``D z`` for deviations ``z``. Of ``p = D z`` one wants some ``q`` with ``D q = p``. Where breakpoints of
+control and disturbance differ, rows of ``D`` depend on others (all that lie within one block see the same few numbers),
+and so do columns (a state sees no more numbers than it has entries). Balls cannot tell that a number is 0; so the rank
+is bounded from above by who can see what, without rounding, and from below by rows that balls show to be independent.
+Where these agree, the other rows are combinations of them, and ``q`` from them alone is right for all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+import numpy.typing as npt
+
+from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.checker.reach.flow import middles, scaled, stacked
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from flint import arb, arb_mat, fmpq_mat
+
+EVENED = 20  # steps in which rows and columns become of one size; the first few do most, twice as many change nothing
+
+Pattern = npt.NDArray[np.bool_]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Pushed:
+    """Who of the states can see which entry of a disturbance in ``x' = A x + E w``, whatever the times: ``pattern (d,
+    mw)``; of all of these at most ``states`` are independent of each other, and at most ``entries``."""
+
+    pattern: Pattern
+    states: int
+    entries: int
+
+    @staticmethod
+    def of(A: arb_mat, E: arb_mat, varying: Sequence[int]) -> Pushed:
+        """Without rounding, for the entries ``varying`` of a disturbance; raises `Unchecked` where the numbers of the
+        system are not exact."""
+        if not all(x.is_exact() for part in (A, E) for x in part.entries()):
+            raise Unchecked("the numbers of the system are not exact")
+        a, e = _rational(A.tolist()), _rational([[row[b] for b in varying] for row in E.tolist()])
+        powers, linked = [e], middles(A) != 0.0
+        pattern: Pattern = middles(E)[:, list(varying)] != 0.0
+        for _ in range(A.nrows() - 1):
+            powers.append(a * powers[-1])
+            pattern = pattern | (linked.astype(int) @ pattern.astype(int) > 0)
+        from flint import fmpq_mat
+
+        together = fmpq_mat([column for part in powers for column in part.transpose().tolist()])
+        return Pushed(pattern, together.rank(), e.rank())
+
+
+def _rational(rows: Sequence[Sequence[arb]]) -> fmpq_mat:
+    from flint import fmpq, fmpq_mat
+
+    return fmpq_mat([[fmpq(*float(x.mid()).as_integer_ratio()) for x in row] for row in rows])
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What some innovations see of some blocks: ``matrix``, and which of its entries may be other than 0, ``pattern``.
+    ``rows``: of every group of rows, one for each innovation, where it ends and how many of it are independent at most;
+    ``columns``: the same for each block."""
+
+    matrix: arb_mat
+    pattern: Pattern
+    rows: Sequence[tuple[int, int]]
+    columns: Sequence[tuple[int, int]]
+
+    @cached_property
+    def most(self) -> int:
+        """No more rows than this are independent: a cut between rows and columns, groups of either counted once, leaves
+        nothing but zeros. Any cut is a bound; the least one is that of the largest flow (Ford and Fulkerson 1956)."""
+        from scipy.sparse import csr_array
+        from scipy.sparse.csgraph import breadth_first_order, maximum_flow
+
+        r, c = self.pattern.shape
+        sizes = [r, c, len(self.rows), len(self.columns)]
+        row, column, seeing, shown = (sum(sizes[:k]) for k in range(4))
+        source, sink = sum(sizes), sum(sizes) + 1
+        links = [(row + i, column + j, 1) for i, j in np.argwhere(self.pattern).tolist()]
+        links += [(source, seeing + g, most) for g, (_, most) in enumerate(self.rows)]
+        links += [(shown + g, sink, most) for g, (_, most) in enumerate(self.columns)]
+        links += [(seeing + g, row + i, 1) for i, g in enumerate(_groups(self.rows, r))]
+        links += [(column + j, shown + g, 1) for j, g in enumerate(_groups(self.columns, c))]
+        starts, ends, room = (np.array(values, dtype=np.int32) for values in zip(*links, strict=True))
+        network = csr_array((room, (starts, ends)), shape=(sink + 1, sink + 1))
+        left = csr_array(network - maximum_flow(network, source, sink).flow)
+        left.eliminate_zeros()
+        inside = np.zeros(sink + 1, dtype=bool)
+        inside[breadth_first_order(left, source, return_predecessors=False)] = True
+        return int(room[inside[starts] & ~inside[ends]].sum())
+
+    def inverse(self) -> arb_mat:
+        """A matrix that takes what is seen of any deviations to deviations that are seen alike; raises `Unchecked`
+        where balls do not show as many independent rows as there can be."""
+        from scipy.linalg import qr
+
+        D, rows, columns = _evened(self.matrix)
+        r, c, rank = D.nrows(), D.ncols(), self.most
+        try:
+            if rank == c:
+                found = (D.transpose() * D).inv() * D.transpose()
+            else:
+                chosen = list(range(r)) if rank == r else qr(middles(D).T, mode="r", pivoting=True)[1][:rank].tolist()
+                every = D.tolist()
+                some = stacked([every[i] for i in chosen])
+                found = _spread(some.transpose() * (some * some.transpose()).inv(), chosen, r)
+        except ZeroDivisionError:
+            raise Unchecked("the checker cannot tell in which directions the disturbance pushes the state") from None
+        return scaled(found, columns, rows)
+
+
+def _groups(groups: Sequence[tuple[int, int]], count: int) -> list[int]:
+    """The group of each of so many members."""
+    return [int(g) for g in np.searchsorted([end for end, _ in groups], np.arange(count), side="right")]
+
+
+def _spread(matrix: arb_mat, places: list[int], count: int) -> arb_mat:
+    """The columns of a matrix at these places of ``count``, 0 at the others."""
+    from flint import arb
+
+    zero, found = arb(0), []
+    for row in matrix.tolist():
+        given = dict(zip(places, row, strict=True))
+        found.append([given.get(i, zero) for i in range(count)])
+    return stacked(found)
+
+
+def _evened(D: arb_mat) -> tuple[arb_mat, Array, Array]:
+    """A matrix with its rows and columns multiplied by powers of two, so that the largest entry of each is about 1
+    (Ruiz 2001), and these powers: what is inverted is then of no unit."""
+    sizes = np.abs(middles(D))
+    rows, columns = np.ones(sizes.shape[0]), np.ones(sizes.shape[1])
+    for _ in range(EVENED):
+        evened = sizes * rows[:, None] * columns
+        for factors, most in ((rows, evened.max(axis=1)), (columns, evened.max(axis=0))):
+            factors /= np.sqrt(np.where(most > 0.0, most, 1.0))
+    rows, columns = (np.exp2(np.round(np.log2(factors))) for factors in (rows, columns))
+    return scaled(D, rows, columns), rows, columns

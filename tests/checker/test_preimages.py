@@ -1,0 +1,137 @@
+"""Guards checker: deviations that are seen as given, where breakpoints of control and disturbance differ."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from flint import arb, arb_mat, ctx
+
+import sparserob_core as sr
+from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.checker.reach.closed_loop import ClosedLoop
+from sparserob_core.checker.reach.preimages import Pushed, Seen
+from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.sets.sets import Box
+
+PLANTS = {
+    "one state": (np.array([[-0.1]]), np.array([[1.0]])),
+    "one push on two states": (np.array([[0.0, 1.0], [-2.0, -0.5]]), np.array([[0.0], [1.0]])),
+    "two pushes that are one": (np.array([[0.0, 1.0], [-2.0, -0.5]]), np.array([[0.5, 1.0], [1.0, 2.0]])),
+    "a state that nothing reaches": (np.diag([-1.0, -0.5, 0.3]), np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])),
+    "decoupled": (np.diag([-1.0, -0.5, 0.2, 0.4]), np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 1.0], [0.0, 1.0]])),
+}
+GRIDS = {
+    "alike": [0.0, 1.0, 2.0, 3.0, 4.0],
+    "four at first": [0.0, 0.2, 0.4, 0.6, 3.5, 4.0],
+    "finer": [0.0, 0.4, 0.9, 1.3, 1.6, 2.2, 2.7, 3.1, 4.0],
+    "coarser": [0.0, 2.5, 4.0],
+}
+
+
+def seen_of(A: np.ndarray, E: np.ndarray, changes: list[float]) -> Seen:
+    """What all innovations at 1, 2 and 3 see of a disturbance that may jump at these times."""
+    d, mw = E.shape
+    system = LinearSystem(A, np.ones((d, 1)), E)
+    ends = [0.0, 1.0, 2.0, 3.0, 4.0]
+    loop = ClosedLoop(
+        system,
+        [0.0] * d,
+        np.zeros((1, 4)),
+        np.zeros((4, 4, 1, d)),
+        sorted({*ends, *changes}),
+        ends,
+        changes[:-1],
+        Box(-np.ones(mw), np.ones(mw)),
+    )
+    pushed = Pushed.of(loop.parts["A"], loop.parts["E"], range(mw))
+    blocks = sorted({block for seen in loop.seen for block in seen})
+    table = np.empty((3 * d, len(blocks) * mw), dtype=object)
+    table[:] = arb(0)
+    pattern = np.zeros(table.shape, dtype=bool)
+    for j in (1, 2, 3):
+        for place, block in enumerate(blocks):
+            if block in loop.seen[j]:
+                where = slice((j - 1) * d, j * d), slice(place * mw, (place + 1) * mw)
+                table[where], pattern[where] = np.array(loop.seen[j][block].tolist(), dtype=object), pushed.pattern
+    rows = [(d * j, pushed.states) for j in (1, 2, 3)]
+    columns = [(mw * (k + 1), pushed.entries) for k in range(len(blocks))]
+    return Seen(arb_mat(table.tolist()), pattern, rows, columns)
+
+
+def floats(matrix: arb_mat) -> np.ndarray:
+    return np.array([[float(x.mid()) for x in row] for row in matrix.tolist()])
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+@pytest.mark.parametrize("name", PLANTS)
+def test_a_preimage_is_seen_as_what_it_is_a_preimage_of(name: str, grid: str) -> None:
+    with ctx.workprec(96):
+        seen = seen_of(*PLANTS[name], GRIDS[grid])
+        D, X = seen.matrix, seen.inverse()
+        off = D * X * D - D
+        assert all(abs(x) < 1e-12 for x in off.entries())
+        assert seen.most == np.linalg.matrix_rank(floats(D), tol=1e-9)
+
+
+def test_no_rank_is_above_the_bound_whatever_the_numbers_are() -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(40):
+        r, c = rng.integers(2, 5, size=2), rng.integers(1, 4, size=3)
+        most_r, most_c = (np.array([int(rng.integers(1, size + 1)) for size in sizes]) for sizes in (r, c))
+        sees = rng.random((2, 3)) < 0.6
+        parts = [
+            [
+                sees[i, j] * (rng.normal(size=(r[i], k := min(most_r[i], most_c[j]))) @ rng.normal(size=(k, c[j])))
+                for j in range(3)
+            ]
+            for i in range(2)
+        ]
+        for i in range(2):  # every block of columns and of rows of the rank that it may have
+            left = np.linalg.qr(rng.normal(size=(r[i], r[i])))[0][:, : most_r[i]]
+            parts[i] = [left @ left.T @ part for part in parts[i]]
+        for j in range(3):
+            right = np.linalg.qr(rng.normal(size=(c[j], c[j])))[0][:, : most_c[j]]
+            for i in range(2):
+                parts[i][j] = parts[i][j] @ right @ right.T
+        D, pattern = (
+            np.block(parts),
+            np.block([[np.full(parts[i][j].shape, sees[i, j]) for j in range(3)] for i in range(2)]),
+        )
+        ends = [
+            list(zip(np.cumsum(sizes).tolist(), most.tolist(), strict=True))
+            for sizes, most in ((r, most_r), (c, most_c))
+        ]
+        seen = Seen(arb_mat(D.tolist()), pattern, *ends)
+        assert np.linalg.matrix_rank(D, tol=1e-9) <= seen.most <= min(most_r.sum(), most_c.sum(), r.sum(), c.sum())
+
+
+def test_what_balls_cannot_tell_is_not_inverted() -> None:
+    """A period of an oscillator leaves next to nothing of a constant push: with few bits it may be 0."""
+    A = np.array([[0.0, 2.0 * np.pi], [-2.0 * np.pi, 0.0]])
+    with ctx.workprec(40), pytest.raises(Unchecked):
+        seen_of(A, np.eye(2), GRIDS["alike"]).inverse()
+
+
+@pytest.mark.parametrize("breakpoints", [[0, 0.2, 0.4, 0.6, 3.5, 4], [0, 1.5, 1.7, 4], [0, 0.3, 2, 2.1, 2.2, 4]])
+def test_the_lower_bound_of_a_policy_is_verified_where_the_disturbance_has_breakpoints_of_its_own(
+    breakpoints: list[float], tmp_path: object
+) -> None:
+    config = {
+        "problem": {
+            "name": "linear",
+            "system": {"A": [[-0.1]], "B": [[1]], "E": [[1]]},
+            "horizon": 4.0,
+            "initial_state": [2],
+            "control": {"box": 1.0},
+            "disturbance": {"box": [0.2]},
+            "terminal": [{"box": [0.3]}],
+        },
+        "dictionaries": {
+            "control": {"name": "piecewise_constant", "pieces": 4},
+            "disturbance": {"name": "piecewise_constant", "breakpoints": breakpoints},
+        },
+        "policy": {"name": "affine", "cost": "peak"},
+        "observers": [],
+    }
+    sr.run(config, out=f"{tmp_path}/run", quiet=True, figures=False)
+    assert sr.check(f"{tmp_path}/run").status == "verified"
