@@ -115,7 +115,7 @@ class Rerun(sr.Observer, sr.Options):
                 self._outlet = Outlet(StudyOpening(event), chosen)
                 return
             opening = Opening(event.title, event.directory, event.inspection, self.landscape, self.waits)
-            self._outlet = Outlet(opening, chosen, 0 if event.problem is None else event.problem.system.parameter_count)
+            self._outlet = Outlet(opening, chosen)
 
 
 @sr.hookimpl

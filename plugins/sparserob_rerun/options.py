@@ -11,8 +11,8 @@ class LandscapeOptions(sr.Options):
     """The landscape of ``g``, evaluated in the background."""
 
     coordinates: tuple[str, str] | None = None
-    """Two coordinates of the tuple, such as [t, p1], or [t[1], t[4]] for the times of its first and fourth index; null:
-    the most influential two."""
+    """Two coordinates, such as [t, p1] of the index that decides most, or [t, p1[2]] for a time of it and a parameter
+    of the one that decides second; null: the times of these two."""
 
     grid: int = Field(default=32, ge=8, le=256)
     """Points along each of the two."""

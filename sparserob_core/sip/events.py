@@ -31,6 +31,9 @@ SKETCHED = 400
 Phase: TypeAlias = Literal["search", "polish"]
 """Who evaluates: the maximiser, or the local method that has the last share of its budget."""
 
+DECIDING = 4
+"""Indices that are told of each tuple, at most: two decide what is drawn, and may each have a neighbour."""
+
 Notify: TypeAlias = Callable[[Event], None]
 T = TypeVar("T", bound=Event)
 
@@ -229,7 +232,10 @@ class EvaluationsFinished(Event):
 
     What is searched: the tuples of the method ``sparserob`` in the outer iteration ``round`` (from 1) with the weight
     ``epsilon``, where ``lower_bound`` is proven so far; or, where ``family`` is named, its indices for the most
-    violated one. ``block`` consecutive coordinates of the ``domain`` are one index.
+    violated one. ``block`` consecutive coordinates of the ``domain`` are one index, of which ``coordinates (c,)`` can
+    move and are not those that stay linear (`LinearBlocks`). ``deciding (count, 4)``: of each of these tuples the
+    indices whose constraints have the largest multipliers, the largest first, -1 where fewer have one
+    (`TupleValue.deciding`); ``(0, 4)`` where that is not known.
     """
 
     count: int
@@ -248,3 +254,5 @@ class EvaluationsFinished(Event):
     lower_bound: float = -np.inf
     batch: Batch = field(default_factory=Batch, repr=False)
     sketches: Mapping[str, Sketch] = field(default_factory=dict, repr=False)
+    coordinates: tuple[int, ...] = ()
+    deciding: np.ndarray = field(default_factory=lambda: np.zeros((0, DECIDING), dtype=int), repr=False)

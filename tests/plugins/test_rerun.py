@@ -242,68 +242,86 @@ def test_coordinates_of_the_landscape_are_named_as_in_the_config_or_refused_with
     g = inspection("experiment2_reduced.yaml", changes).relaxed_value(3, 0.1)
     assert g.names == ("t", "spring", "p2", "gain")
     assert g.kinds == ("time", "parameter", "parameter", "parameter")
-    assert coordinate("p2", g, 3) == (0, 2)
-    assert coordinate("t[3]", g, 3) == (2, 0)
-    for wrong in ("p1", "t[4]", "t[0]", "t[x]"):
-        with pytest.raises(sr.InputError, match=r"expected one of t, spring, p2, gain.*t\[1\] to t\[3\]"):
-            coordinate(wrong, g, 3)
+    assert coordinate("p2", g) == (0, 2)
+    assert coordinate("t[2]", g) == (1, 0)
+    for wrong in ("p1", "t[3]", "t[0]", "t[x]"):
+        with pytest.raises(sr.InputError, match=r"expected one of t, spring, p2, gain, of the index that decides most"):
+            coordinate(wrong, g)
 
 
 class Plain:
-    """A function of tuples in the place of ``g``: its values, its multipliers and its slopes."""
+    """A function of tuples in the place of ``g``: its values, and which of its indices decide."""
 
-    def __init__(self, value: Any, weights: list[float], width: int = 1) -> None:
-        self.value, self.kept = value, np.array(weights)
+    def __init__(self, value: Any, deciding: list[int], width: int = 1) -> None:
+        self.value, self.ranked = value, np.array(deciding)
         self.slot = sr.Box(np.zeros(width), np.ones(width))
         self.names, self.kinds = ("t", "p")[:width], ("time", "parameter")[:width]
+        self.coordinates = tuple(range(width))
 
     def at(self, slots: np.ndarray) -> float:
         return float(self.value(slots))
 
-    def weights(self) -> np.ndarray:
-        return self.kept
-
-    def gradient(self) -> np.ndarray:
-        return np.zeros((self.kept.size, self.slot.dimension))
+    def deciding(self) -> np.ndarray:
+        return self.ranked
 
 
-def chosen(g: Any, anchor: np.ndarray) -> tuple[tuple[int, int], tuple[int, int]] | None:
-    from sparserob_rerun.search.landscape import Choice
+def mapped(g: Any, anchor: np.ndarray, size: int = 8) -> Any:
+    from sparserob_rerun.search.landscape import Landscape, axes_of, deciding_pair, places_of
 
-    choice = Choice(g, anchor)
-    list(choice.look())
-    return choice.pair
+    axes = axes_of(g, len(anchor), None)
+    assert axes is not None
+    landscape = Landscape(g, anchor, *places_of(axes, deciding_pair(g, anchor), anchor), size, 0.0, axes)
+    list(landscape.evaluate())
+    return landscape
 
 
-def test_the_slice_is_over_the_coordinates_in_which_g_changes() -> None:
-    anchor = np.array([[0.2, 0.5], [0.4, 0.5], [0.6, 0.5]])
-    # the middle index decides, by its parameter more than by its time; at its maximum all slopes vanish
-    bump = Plain(lambda s: -((s[1, 0] - 0.4) ** 2) - 5 * (s[1, 1] - 0.5) ** 2, [0.0, 2.0, 0.0], 2)
-    assert chosen(bump, anchor) == ((1, 1), (1, 0))
-    # an index at a fixed time: the parameters of two indices
-    fixed = Plain(lambda s: -abs(s[0, 1] - 0.5) - abs(s[2, 1] - 0.5), [1.0, 0.0, 1.0], 2)
-    assert chosen(fixed, anchor) == ((0, 1), (2, 1))
-    # two indices stand in for one another: alone neither changes anything, together they do
-    twins = Plain(lambda s: -min((s[0, 0] - 0.2) ** 2, (s[2, 0] - 0.2) ** 2), [1.0, 0.0, 1.0], 1)
-    assert chosen(twins, np.array([[0.2], [0.9], [0.2]])) == ((0, 0), (2, 0))
-    assert chosen(Plain(lambda s: 1.0, [0.0]), np.array([[0.5]])) is None
+def test_the_map_is_over_the_times_of_the_two_indices_that_decide_most_the_earlier_one_across() -> None:
+    from sparserob_rerun.search.landscape import axes_of
+
+    anchor = np.array([[0.2, 0.5], [0.9, 0.5], [0.6, 0.5]])
+    both = mapped(Plain(lambda s: s[0, 0] + 10 * s[2, 0], [2, 0, -1, -1], 2), anchor)
+    assert (both.first, both.second) == ((0, 0), (2, 0)) and both.names() == ("t of the earlier", "t of the later")
+    assert both.values[0, 0] == 0.0 and both.values[-1, 0] == 1.0 and both.values[0, -1] == 10.0
+    # only one index with a time decides: the time of one more index is the second axis
+    assert mapped(Plain(lambda s: s[1, 0], [1, -1, -1, -1], 2), anchor).first == (0, 0)
+    # two indices beside one another stand for the same constraint: they are one axis, and move together
+    twins = Plain(lambda s: -min((s[0, 0] - 0.2) ** 2, (s[2, 0] - 0.2) ** 2), [0, 2, 1, -1])
+    map_of_twins = mapped(twins, np.array([[0.2], [0.9], [0.21]]))
+    assert (map_of_twins.first, map_of_twins.second) == ((0, 0), (1, 0)) and not map_of_twins.flat
+    # of an index that is alone, two of its coordinates
+    alone = axes_of(Plain(lambda s: 1.0, [0], 2), 1, None)  # type: ignore[arg-type]
+    assert alone is not None and alone.coordinates == (0, 1)
+    assert axes_of(Plain(lambda s: 1.0, [0]), 1, None) is None  # type: ignore[arg-type]
+
+
+def test_of_what_moves_on_the_map_the_disturbance_is_at_its_worst_and_the_best_tuple_lies_below() -> None:
+    small = {"dictionaries.control.pieces": 20, "dictionaries.disturbance.pieces": 20, "problem.path.0.from": 0.3}
+    literal = inspection("experiment1_literal.yaml", small).relaxed_value(3, 0.1)
+    reduced = inspection("experiment1_reduced.yaml", small).relaxed_value(3, 0.1)
+    anchor = np.random.default_rng(0).uniform(literal.slot.lower, literal.slot.upper, (3, literal.slot.dimension))
+    anchor[:, 0] = [1.8, 2.6, 4.0]
+    own = literal.at(anchor)
+    landscape = mapped(literal, anchor, 5)
+    assert literal.kinds[:2] == ("time", "disturbance") and landscape.first[1] == landscape.second[1] == 0
+    assert landscape.value > own + 0.1  # the constraints of two indices are harder than before
+    # with all three at their worst, it is the reduced form at the same times
+    worst = anchor.copy()
+    worst[:, 1:] = np.nan
+    assert literal.at(worst) == pytest.approx(reduced.at(anchor[:, :1]), abs=1e-9)
+    assert landscape.value <= literal.at(worst) + 1e-9
 
 
 def test_a_flat_slice_says_so_and_has_no_range_of_its_own() -> None:
     from sparserob_rerun.search.landscape import Landscape
     from sparserob_rerun.search.terrain import _said
 
-    constant: Any = Plain(lambda s: 0.632, [1.0, 0.0])
-    pair = chosen(constant, np.array([[0.5], [0.7]]))
-    assert pair is not None
-    landscape = Landscape(constant, np.array([[0.5], [0.7]]), *pair, 8)
-    list(landscape.evaluate())
+    landscape = mapped(Plain(lambda s: 0.632, [0, -1]), np.array([[0.5], [0.7]]))
     assert landscape.flat and landscape.limits == (0.632, 0.632)
     assert _said(landscape) == "g does not depend on these two here: it is 0.632"
-    tilted = Landscape(Plain(lambda s: s[0, 0], [1.0, 0.0]), np.array([[0.5], [0.7]]), (0, 0), (1, 0), 8)  # type: ignore[arg-type]
+    tilted = Landscape(Plain(lambda s: s[0, 0], [0, -1]), np.array([[0.5], [0.7]]), (0, 0), (1, 0), 8)  # type: ignore[arg-type]
     list(tilted.evaluate())
     assert not tilted.flat and "from 0 (dark) to 1 (bright)" in _said(tilted)
-    little: Any = Plain(lambda s: 0.67833 + 1e-6 * s[0, 0], [1.0, 0.0])
+    little: Any = Plain(lambda s: 0.67833 + 1e-6 * s[0, 0], [0, -1])
     slight = Landscape(little, np.array([[0.5], [0.7]]), (0, 0), (1, 0), 8)
     list(slight.evaluate())
     assert _said(slight) == "g from 0.67833 (dark) to 0.678331 (bright)"
@@ -313,7 +331,7 @@ def test_a_flat_slice_says_so_and_has_no_range_of_its_own() -> None:
 def test_a_tuple_beside_a_line_of_the_grid_takes_its_place(place: float) -> None:
     from sparserob_rerun.search.landscape import Landscape
 
-    tilted: Any = Plain(lambda s: s[0, 0] + s[1, 0], [1.0, 1.0])
+    tilted: Any = Plain(lambda s: s[0, 0] + s[1, 0], [0, 1])
     landscape = Landscape(tilted, np.array([[place], [0.3]]), (0, 0), (1, 0), 8)
     list(landscape.evaluate())
     assert landscape.axes[0][landscape.at[0]] == place and landscape.value == place + 0.3
@@ -429,9 +447,7 @@ def test_a_full_queue_drops_at_once_and_says_so(tmp_path: Path) -> None:
     from sparserob_rerun.recording.recorder import Opening
     from sparserob_rerun.recording.sinks import Destinations
 
-    outlet = Outlet(
-        Opening("many", None, None, None), Destinations(tmp_path / "x.rrd", None, False, None), 0, capacity=2
-    )
+    outlet = Outlet(Opening("many", None, None, None), Destinations(tmp_path / "x.rrd", None, False, None), capacity=2)
     event = sr.ProofProgress(family="path", cells=1, bound=0.0)
     started = time.perf_counter()
     for _ in range(1000):
@@ -447,7 +463,7 @@ def test_a_process_that_dies_is_noticed_and_costs_nothing(tmp_path: Path, caplog
     from sparserob_rerun.recording.recorder import Opening
     from sparserob_rerun.recording.sinks import Destinations
 
-    outlet = Outlet(Opening("killed", None, None, None), Destinations(tmp_path / "x.rrd", None, False, None), 0)
+    outlet = Outlet(Opening("killed", None, None, None), Destinations(tmp_path / "x.rrd", None, False, None))
     outlet.process.kill()
     outlet.process.join()
     started = time.perf_counter()

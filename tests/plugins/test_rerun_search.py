@@ -149,7 +149,7 @@ def test_what_was_recorded_is_in_the_file_two_seconds_later(tmp_path: Path) -> N
     from sparserob_rerun.recording.sinks import Destinations
 
     file = tmp_path / "x.rrd"
-    outlet = Outlet(Opening("kept", None, None, None), Destinations(file, None, False, None), 0)
+    outlet = Outlet(Opening("kept", None, None, None), Destinations(file, None, False, None))
     try:
         outlet.send(sr.ProofProgress(family="path", cells=7, bound=0.5))
         end = time.monotonic() + 30.0  # the process has to start, on a busy machine

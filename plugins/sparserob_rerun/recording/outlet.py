@@ -8,6 +8,7 @@ import sys
 import time
 import uuid
 import warnings
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any, final
@@ -18,11 +19,11 @@ import sparserob_core as sr
 from sparserob_rerun.recording.desk import Account, Ending, record
 from sparserob_rerun.recording.recorder import Opening
 from sparserob_rerun.recording.sinks import Destinations
+from sparserob_rerun.search.projection import Projection, Projector
 from sparserob_rerun.study.recorder import StudyOpening
 
 CAPACITY = 512  # events that may wait
 COLLECTING = 0.4  # seconds for which evaluations are collected before they are sent
-LARGE = 64  # coordinates of one index from which on only times and parameters are sent
 LASTING = 10  # seconds that the last event may wait for its place in the queue
 CLOSING = 60.0  # seconds that the process may take to finish its files, beyond the patience of the landscape
 OVER = 600.0  # the same for a run that is over, and has nothing else to wait for
@@ -33,18 +34,15 @@ START = "fork" if sys.platform.startswith("linux") else "spawn"
 class Outlet:
     """One process that records one run, or one study. Everything about it may fail, and the run does not notice."""
 
-    def __init__(
-        self, opening: Opening | StudyOpening, chosen: Destinations, parameters: int = 0, capacity: int = CAPACITY
-    ) -> None:
+    def __init__(self, opening: Opening | StudyOpening, chosen: Destinations, capacity: int = CAPACITY) -> None:
         context: Any = multiprocessing.get_context(START)
         landscape = opening.landscape if isinstance(opening, Opening) else None
         self.patience = 0.0 if landscape is None else landscape.patience
         self.file, self.incomplete = chosen.save, ""
         self.closing = OVER if opening.waits else CLOSING
-        self.parameters, self.dropped, self.dead = parameters, 0, False
-        self.pending: list[sr.EvaluationsFinished] = []
-        self.since = 0.0
-        self.kept: np.ndarray | None = None
+        self.dropped, self.dead = 0, False
+        self.pending: list[tuple[sr.EvaluationsFinished, Projection]] = []
+        self.since, self.projector = 0.0, Projector()
         self.waits = opening.waits
         self.messages = context.Queue(capacity)
         self.report, theirs = context.Pipe(duplex=False)
@@ -63,8 +61,8 @@ class Outlet:
     def send(self, event: sr.Event) -> None:
         """Pass an event on, or drop it where too many are waiting already. Evaluations are collected for a moment."""
         if isinstance(event, sr.EvaluationsFinished):
-            part = self._thin(event)
-            if self.pending and not follows(self.pending[-1], part):
+            part = self.projector.small(event)
+            if self.pending and not follows(self.pending[-1][0], event):
                 self._flush()
             if not self.pending:
                 self.since = time.monotonic()
@@ -79,9 +77,10 @@ class Outlet:
     def _flush(self) -> None:
         pending, self.pending = self.pending, []
         if pending:
-            self._put((joined(pending), self.kept))
+            events, projections = zip(*pending, strict=True)
+            self._put((joined(events), Projection.joined(projections)))
 
-    def _put(self, message: tuple[sr.Event, np.ndarray | None]) -> None:
+    def _put(self, message: tuple[sr.Event, Projection | None]) -> None:
         last, tries = isinstance(message[0], sr.RunFinished | sr.SweepFinished), LASTING
         while not self.dead:
             try:
@@ -134,26 +133,14 @@ class Outlet:
         self.incomplete = f"the recording {why}{holds}"
         return []
 
-    def _thin(self, event: sr.EvaluationsFinished) -> sr.EvaluationsFinished:
-        """The event without what is too much: of an index with many coordinates the time and the parameters are
-        sent."""
-        if event.block < LARGE or not event.best_point.size:
-            self.kept = None
-            return replace(event, domain=None)
-        offsets = [0, *range(event.block - self.parameters, event.block)]
-        kept = self.kept = (np.arange(0, event.best_point.size, event.block)[:, np.newaxis] + offsets).ravel()
-        batch = event.batch
-        origin = None if batch.origin is None else batch.origin[kept]
-        thin = replace(batch, points=[piece[:, kept] for piece in batch.points], origin=origin)
-        return replace(event, domain=None, sketches={}, batch=thin)
-
 
 def follows(before: sr.EvaluationsFinished, event: sr.EvaluationsFinished) -> bool:
     """Whether an event goes on where another one of the same search ended."""
-    return event.family == before.family and event.round == before.round and event.total - event.count == before.total
+    same = (event.family, event.round, event.phase) == (before.family, before.round, before.phase)
+    return same and event.total - event.count == before.total
 
 
-def joined(parts: list[sr.EvaluationsFinished]) -> sr.EvaluationsFinished:
+def joined(parts: Sequence[sr.EvaluationsFinished]) -> sr.EvaluationsFinished:
     """Successive events of one search as one."""
     first, batches = parts[0].batch, [part.batch for part in parts]
     notes: dict[str, list[tuple[float, float]]] = {}
@@ -164,5 +151,4 @@ def joined(parts: list[sr.EvaluationsFinished]) -> sr.EvaluationsFinished:
     values = [np.concatenate(list(batch.values)) for batch in batches if len(batch.values)]
     moments = [moment for batch in batches for moment in batch.moments]
     whole = replace(first, points=points, values=values, moments=moments, notes=notes)
-    sketches = {role: sketch for part in parts for role, sketch in part.sketches.items()}
-    return replace(parts[-1], count=sum(part.count for part in parts), batch=whole, sketches=sketches)
+    return replace(parts[-1], count=sum(part.count for part in parts), batch=whole)

@@ -23,6 +23,7 @@ from sparserob_rerun.recording.layout import Shown, layout
 from sparserob_rerun.search.climb import Climb
 from sparserob_rerun.search.explorer import Aim, Explorer
 from sparserob_rerun.search.landscape import Landscape
+from sparserob_rerun.search.projection import Projection
 from sparserob_rerun.search.search import SearchView
 from sparserob_rerun.search.terrain import Terrain
 from sparserob_rerun.search.way import Stage
@@ -67,7 +68,8 @@ class Recorder:
         self.timelines, self.rounds = Timelines(rr, stream), Rounds(rr, stream, inspection)
         problem = None if inspection is None else inspection.problem
         self.physics = Physics(rr, stream, inspection) if inspection is not None and problem is not None else None
-        self.terrain = Terrain(rr, stream)
+        unit = "" if problem is None or not problem.names.time else f", {problem.names.time},"
+        self.terrain = Terrain(rr, stream, unit)
         self.explorer = Explorer(self._landscape, inspection, opening.landscape, opening.waits)
         self.search = SearchView(rr, stream, self.timelines)
         self.climb, self.stages = Climb(rr, stream), list[Stage]()
@@ -85,12 +87,12 @@ class Recorder:
         self.say(f"run: {opening.title}")
         self._page("solving", [])
 
-    def receive(self, event: sr.Event, kept: np.ndarray | None = None) -> None:
-        """Log one event; of evaluated points only the coordinates ``kept`` have come along, or all of them."""
+    def receive(self, event: sr.Event, projection: Projection | None = None) -> None:
+        """Log one event; of evaluated points their ``projection`` has come along."""
         self.heard = time.monotonic()
         match event:
             case sr.EvaluationsFinished():
-                self._evaluations(event, np.arange(event.best_point.size) if kept is None else kept)
+                self._evaluations(event, projection or Projection())
             case sr.RoundFinished():
                 self._round(event)
             case sr.ProofProgress():
@@ -132,15 +134,15 @@ class Recorder:
             share = ", with the regulariser's share" if landscape.epsilon > 0.0 else ""
             self.draw("the landscape", self.terrain.mark, f"proven to be the highest: {self.exact:.6g}{share}")
 
-    def _evaluations(self, event: sr.EvaluationsFinished, kept: np.ndarray) -> None:
+    def _evaluations(self, event: sr.EvaluationsFinished, projection: Projection) -> None:
         if event.total == event.count:
             self.began = self.timelines.seconds
         if event.family:
             self.draw("the search for violations", self.search.separation, event, self.began)
             return
         stage = self._stage(event)
-        stage.add(event, kept)
-        self.draw("the search", self.search.show, event, stage, self.began, self._moving(event.block), kept)
+        stage.add(event, projection)
+        self.draw("the search", self.search.show, event, stage, self.began, self._moving(event.block), projection)
         self.timelines.move(stage.base + event.total, event.round, self.began + event.seconds)
         if event.best_value > self.best_value or event.total == event.count:
             self.say(f"evaluation {self.timelines.evaluation}: best g {event.best_value:.8g}", "TRACE")
@@ -164,7 +166,7 @@ class Recorder:
 
     def _best(self, stage: Stage, number: int) -> Aim:
         at = f"others as in the best tuple at evaluation {self.timelines.evaluation}"
-        return Aim(stage.best.reshape(-1, stage.block), stage.epsilon, stage.best_value, at, number)
+        return Aim(stage.best.reshape(-1, stage.block), stage.epsilon, stage.best_value, at, number, stage.pair)
 
     def _way(self) -> None:
         """Draw how far the search has come: the climb, and its way on the landscape."""

@@ -12,7 +12,7 @@ import numpy as np
 import sparserob_core as sr
 from sparserob_rerun.drawing.palette import Floats
 from sparserob_rerun.options import LandscapeOptions
-from sparserob_rerun.search.landscape import Choice, Landscape, coordinate
+from sparserob_rerun.search.landscape import Landscape, axes_of, deciding_pair, places_of
 
 SLICE = 0.02  # seconds of work between two looks at the queue
 LARGE = 0.02  # of the height of a landscape: a gain after which it is drawn anew
@@ -24,13 +24,14 @@ RESERVE = 0.25  # of the evaluations, for which landscapes stay coarse
 @dataclass(frozen=True, eq=False)
 class Aim:
     """A tuple ``(D, width)`` whose surroundings are worth a look, with the ``value`` that the search has for it.
-    ``round``: the round that it is of, 0 for none."""
+    ``round``: the round that it is of, 0 for none; ``pair``: which two indices decide most, where that is known."""
 
     slots: Floats
     epsilon: float
     value: float
     words: str
     round: int = 0
+    pair: tuple[int, ...] = ()
 
 
 @final
@@ -146,22 +147,24 @@ class Explorer:
         return not gain <= LARGE * (high - low) or time.monotonic() - self.since > STALE
 
     def _worked(self, aim: Aim) -> Iterator[bool]:
-        """Choose the coordinates, then fill the landscape; ``True`` where a level is complete."""
+        """Find the indices that decide, then fill the landscape; ``True`` where a level is complete."""
         assert self.inspection is not None and self.options is not None
         g = self.inspection.relaxed_value(len(aim.slots), aim.epsilon)
         known, middle = min(aim.slots.shape[1], g.slot.dimension), (g.slot.lower + g.slot.upper) / 2
         anchor = np.tile(middle, (len(aim.slots), 1))
         anchor[:, :known] = aim.slots[:, :known]
         anchor = np.clip(anchor, g.slot.lower, g.slot.upper)
-        if self.options.coordinates is not None:
-            one, other = (coordinate(name, g, len(anchor)) for name in self.options.coordinates)
-            pair = (one, other)
-        else:
-            choice = Choice(g, anchor)
-            yield from choice.look()
-            if choice.pair is None:
-                self.left, self.wrong = 0, "no landscape: fewer than two coordinates of the indices can move"
-                return
-            pair = choice.pair
-        self.landscape = Landscape(g, anchor, *pair, self.options.grid, aim.epsilon)
+        axes = axes_of(g, len(anchor), self.options.coordinates)
+        if axes is None:
+            self.left, self.wrong = 0, "no landscape: fewer than two coordinates of the indices can move"
+            return
+        known_pair = len(aim.pair) == 2 and max(aim.pair) < len(anchor)
+        if not known_pair:
+            g.at(anchor)
+            yield False
+        pair = (aim.pair[0], aim.pair[1]) if known_pair else deciding_pair(g, anchor)
+        if pair[0] == pair[1] and axes.orders:
+            self.left, self.wrong = 0, "no landscape: a tuple of one index has no second one"
+            return
+        self.landscape = Landscape(g, anchor, *places_of(axes, pair, anchor), self.options.grid, aim.epsilon, axes)
         yield from self.landscape.evaluate()

@@ -1,4 +1,5 @@
-"""The landscape of ``g`` over two coordinates of a tuple of indices, the others held where the best tuple has them.
+"""The landscape of ``g`` over where the two indices are that decide most, the others held where the best tuple has
+them.
 
 It is filled from coarse to fine by evaluations of its own, of another program with another solver, on lines that only
 the options and the tuple decide; two of these lines go through the tuple itself.
@@ -8,19 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import combinations
 from typing import TypeAlias, final
 
 import numpy as np
 
 import sparserob_core as sr
 from sparserob_rerun.drawing.palette import Floats
+from sparserob_rerun.search.projection import NEAR, Axes, two_of
 
 STRIDES = (8, 4, 2, 1)
 FLAT = 1e-9  # of g: smaller differences are the solver's
 CLOSE = 0.01  # of the distance of two lines of the grid
-PROBES = (0.06, 0.5, 0.94)  # where in its range a coordinate is tried
-MOST = 6  # coordinates that are tried
 
 Place: TypeAlias = tuple[int, int]
 """Of a coordinate of a tuple: ``(slot, coordinate)``."""
@@ -30,7 +29,8 @@ Place: TypeAlias = tuple[int, int]
 @dataclass(eq=False)
 class Landscape:
     """One slice through an ``anchor (D, width)``: ``values (a, b)`` over ``first`` and ``second``, coordinates
-    ``(slot, coordinate)``.
+    ``(slot, coordinate)``. Indices that are `NEAR` to one of these two stand for the same constraint and move with it;
+    of all that move the disturbance is at its worst.
 
     ``values[i, j]`` belongs to ``axes[0][i]`` and ``axes[1][j]``; NaN where nothing was evaluated, ``inf`` where the
     relaxed program is infeasible. ``axes[k][at[k]]`` is the anchor's coordinate. ``level`` is the stride of the finest
@@ -43,6 +43,7 @@ class Landscape:
     second: Place
     grid: int
     epsilon: float = 0.0
+    seen: Axes | None = None
     values: Floats = field(init=False)
     axes: tuple[Floats, Floats] = field(init=False)
     at: tuple[int, int] = field(init=False)
@@ -53,7 +54,17 @@ class Landscape:
         one, other = (self._axis(place) for place in (self.first, self.second))
         self.axes, self.at = (one[0], other[0]), (one[1], other[1])
         self._bases = (one[2], other[2])
+        self._open = np.array([kind == "disturbance" for kind in self.g.kinds])
+        heads = (self.first[0], self.second[0])
+        self._moving = [[k for k in range(len(self.anchor)) if self._beside(k, heads) == head] for head in heads]
         self.values = np.full((self.axes[0].size, self.axes[1].size), np.nan)
+
+    def _beside(self, slot: int, heads: tuple[int, int]) -> int:
+        """The head that an index is `NEAR` to, and moves with; -1 where there is none."""
+        widths = np.where(self.g.slot.upper > self.g.slot.lower, self.g.slot.upper - self.g.slot.lower, np.inf)
+        away = {head: (np.abs(self.anchor[slot] - self.anchor[head]) / widths)[~self._open].max() for head in heads}
+        nearest = slot if slot in heads else min(heads, key=lambda head: away[head])
+        return nearest if away[nearest] < NEAR else -1
 
     def _axis(self, place: Place) -> tuple[Floats, int, np.ndarray]:
         """The values along an axis, which of them is the anchor's, and which are those of the even grid; where one of
@@ -90,7 +101,11 @@ class Landscape:
 
     def _fill(self, i: int, j: int) -> None:
         slots = self.anchor.copy()
-        slots[self.first], slots[self.second] = self.axes[0][i], self.axes[1][j]
+        for place, moving, to in zip(
+            (self.first, self.second), self._moving, (self.axes[0][i], self.axes[1][j]), strict=True
+        ):
+            slots[moving, place[1]] = to
+            slots[np.ix_(np.array(moving), self._open)] = np.nan
         value = self.g.at(slots)
         self.values[i, j] = value if not np.isnan(value) else -np.inf
         self.spent += 1
@@ -138,98 +153,56 @@ class Landscape:
         return np.asarray(np.where(finite, mixed, nearest))
 
     def names(self) -> tuple[str, str]:
-        """The two coordinates in words: ``t of index 2``; just ``t`` where a tuple has a single index."""
-        single = len(self.anchor) == 1
-        one, other = (
-            self.g.names[c] if single else f"{self.g.names[c]} of index {slot + 1}"
-            for slot, c in (self.first, self.second)
-        )
-        return one, other
+        """The two coordinates in words: ``t of the first deciding index``; just ``t`` where a tuple has a single
+        index."""
+        (one, c), (other, k) = self.first, self.second
+        if len(self.anchor) == 1:
+            return self.g.names[c], self.g.names[k]
+        if c == k:
+            which = ("the earlier", "the later") if self.g.kinds[c] == "time" else ("the lower", "the upper")
+        else:
+            which = ("the one", "the one" if one == other else "the other")
+        return f"{self.g.names[c]} of {which[0]}", f"{self.g.names[k]} of {which[1]}"
 
 
-def coordinate(name: str, g: sr.RelaxedValue, count: int) -> Place:
-    """The place of a name such as ``t``, ``p1`` or ``t[3]`` (that of the third index); raises `InputError`."""
+def coordinate(name: str, g: sr.RelaxedValue) -> tuple[int, int]:
+    """The rank and the coordinate of a name such as ``t``, ``p1`` or ``t[2]``, that of the index that decides second;
+    raises `InputError`."""
     letter, bracket, rest = name.partition("[")
-    number = rest.rstrip("]") if bracket else "1"
-    if letter not in g.names or not number.isdigit() or not 1 <= int(number) <= count:
+    number = rest.removesuffix("]") if bracket else "1"
+    if letter not in g.names or number not in ("1", "2"):
         raise sr.InputError(
             f"landscape: coordinates: there is no {name!r}; expected one of {', '.join(g.names[:6])}"
-            f"{', ...' if len(g.names) > 6 else ''}, or such a name with the number of an index, t[1] to t[{count}]"
+            f"{', ...' if len(g.names) > 6 else ''}, of the index that decides most, or such a name with [2], of the "
+            "one that decides second"
         )
     return int(number) - 1, g.names.index(letter)
 
 
-@final
-class Choice:
-    """Finds the two coordinates of a tuple on which ``g`` depends most; ``pair`` is ``None`` until `look` is through,
-    and where fewer than two coordinates can move.
-
-    Only indices with a multiplier count: by complementarity the others can be left out of the relaxed program, and
-    ``g`` is the same wherever they are. Slopes alone do not decide, as they vanish at a maximum: each coordinate is
-    tried at a few values of its range. Where no single one matters, two that impose the same constraint may stand in
-    for one another: then pairs are tried.
-    """
-
-    def __init__(self, g: sr.RelaxedValue, anchor: Floats) -> None:
-        self.g, self.anchor = g, anchor
-        self.width = g.slot.upper - g.slot.lower
-        self.pair: tuple[Place, Place] | None = None
-
-    def look(self) -> Iterator[bool]:
-        """Choose; one evaluation at each step."""
-        moving = [k for k in range(self.g.slot.dimension) if self.width[k] > 0.0]
-        if len(moving) * len(self.anchor) < 2:
-            return
-        value = self.g.at(self.anchor)
-        yield False
-        tried, changes = self._candidates(moving), {}
-        for place in tried:
-            changes[place] = 0.0
-            for share in PROBES:
-                changes[place] = max(changes[place], _distance(self.g.at(self._moved(share, place)), value))
-                yield False
-        order = sorted(tried, key=lambda place: -changes[place])
-        least = FLAT * max(1.0, abs(value)) if np.isfinite(value) else 0.0
-        known = [place for place in order if changes[place] > least]
-        self.pair = (known[0], known[1]) if len(known) > 1 else self._fallback(order, known, moving)
-        if known:
-            return
-        best = least
-        for one, other in combinations(order[:5], 2):
-            for share in PROBES:
-                change = _distance(self.g.at(self._moved(share, one, other)), value)
-                yield False
-                if change > best:
-                    best, self.pair = change, (one, other)
-
-    def _candidates(self, moving: list[int]) -> list[Place]:
-        """Times and parameters of the indices with a multiplier, the largest first, and the other coordinates along
-        which ``g`` is steepest."""
-        weights, slopes = self.g.weights(), np.abs(self.g.gradient()) * self.width
-        heads = [int(slot) for slot in np.argsort(-weights, kind="stable") if weights[slot] > 0.0]
-        plain = [k for k in moving if self.g.kinds[k] not in ("disturbance", "direction")]
-        found = [(slot, k) for slot in heads for k in plain][:MOST]
-        rest = [
-            (slot, k)
-            for slot, k in zip(*np.unravel_index(np.argsort(-slopes, axis=None)[: 4 * MOST], slopes.shape), strict=True)
-            if slopes[slot, k] > 0.0 and self.width[k] > 0.0 and k not in plain
-        ]
-        return [*found, *((int(slot), int(k)) for slot, k in rest[: MOST // 2])]
-
-    def _fallback(self, order: list[Place], known: list[Place], moving: list[int]) -> tuple[Place, Place]:
-        """A pair where fewer than two coordinates matter by themselves: beside the one that does another of its own
-        index, or that of another index."""
-        every = [*known, *order, *((slot, k) for slot in range(len(self.anchor)) for k in moving)]
-        head = every[0]
-        beside = [place for place in every if place[0] == head[0] and place != head]
-        return head, (beside or [place for place in every if place != head])[0]
-
-    def _moved(self, share: float, *places: Place) -> Floats:
-        slots = self.anchor.copy()
-        for place in places:
-            slots[place] = self.g.slot.lower[place[1]] + share * self.width[place[1]]
-        return slots
+def axes_of(g: sr.RelaxedValue, count: int, named: tuple[str, str] | None) -> Axes | None:
+    """The axes of the map of tuples of ``count`` indices: those ``named``, or else the first coordinate of an index,
+    such as its time, of two of them, or two coordinates of the only one; ``None`` where fewer than two can move."""
+    if named is not None:
+        one, other = (coordinate(name, g) for name in named)
+        if one == other:
+            raise sr.InputError(f"landscape: coordinates: expected two, got {named[0]!r} twice")
+        return Axes((one[0], other[0]), (one[1], other[1]))
+    wide = g.slot.upper > g.slot.lower
+    moving = [k for k, kind in enumerate(g.kinds) if wide[k] and kind not in ("disturbance", "direction")]
+    moving = moving or [k for k, kind in enumerate(g.kinds) if wide[k] and kind == "direction"]
+    if not moving or len(moving) * count < 2:
+        return None
+    return Axes((0, 1), (moving[0], moving[0])) if count > 1 else Axes((0, 0), (moving[0], moving[1]))
 
 
-def _distance(one: float, other: float) -> float:
-    return abs(one - other) if np.isfinite(one) and np.isfinite(other) else (0.0 if one == other else np.inf)
+def places_of(axes: Axes, pair: tuple[int, int], anchor: Floats) -> tuple[Place, Place]:
+    """The places of the axes in a tuple ``(D, width)`` of which the indices ``pair`` decide most."""
+    one, other = ((pair[rank], c) for rank, c in zip(axes.ranks, axes.coordinates, strict=True))
+    return (other, one) if axes.orders and anchor[other] < anchor[one] else (one, other)
+
+
+def deciding_pair(g: sr.RelaxedValue, anchor: Floats) -> tuple[int, int]:
+    """The two indices that decide most at the tuple ``(D, width)`` at which g was evaluated last."""
+    plain = list(g.coordinates)
+    widths = g.slot.upper[plain] - g.slot.lower[plain]
+    return two_of(g.deciding(), anchor[:, plain], widths, (0, min(1, len(anchor) - 1)))

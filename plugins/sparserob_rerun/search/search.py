@@ -11,6 +11,7 @@ import sparserob_core as sr
 from sparserob_rerun.drawing import palette as ink
 from sparserob_rerun.drawing.palette import Colour, Floats
 from sparserob_rerun.drawing.timelines import Timelines
+from sparserob_rerun.search.projection import Projection
 from sparserob_rerun.search.way import Stage
 
 MOVES = (
@@ -19,7 +20,7 @@ MOVES = (
 LOGARITHMIC = ("temperature", "scale", "constant", "radius", "slope", "step", "spread")
 NOTES = {  # what a maximiser notes: the words for it, and its colour
     "temperature": ("log10 of the temperature", ink.VERMILLION),
-    "accepted": ("share of moves accepted (last 50)", ink.GREEN),
+    "accepted": ("share accepted of the last 50 moves that changed g", ink.GREEN),
     "scale": ("log10 of the size of a move, in widths of the box", ink.SKY),
     "move": ("what moves: 0 all anew, 1 one coordinate, 2 several, 3 an index", ink.PURPLE),
     "depth": ("depth of the opened cell", ink.SKY),
@@ -58,10 +59,15 @@ class SearchView:
         self.of: Stage | None = None
 
     def show(
-        self, event: sr.EvaluationsFinished, stage: Stage, began: float, moving: dict[int, str], kept: np.ndarray
+        self,
+        event: sr.EvaluationsFinished,
+        stage: Stage,
+        began: float,
+        moving: dict[int, str],
+        projection: Projection,
     ) -> None:
-        """Log a batch of a search that began ``began`` seconds after the run, of which the stage knows already; of the
-        points the coordinates ``kept`` are there."""
+        """Log a batch of a search that began ``began`` seconds after the run, of which the stage knows already; the
+        ``projection`` says what has moved."""
         batch = event.batch.trace
         count = batch.values.size
         if stage is not self.of:
@@ -84,7 +90,7 @@ class SearchView:
                 rows = self.rr.Scalars.columns(scalars=_shown(values))
                 self.stream.send_columns(f"search/g/{name}", at(np.arange(count)), rows)
         self._notes(event, stage, numbers, began)
-        self._moves(event, stage, numbers, moving, kept)
+        self._moves(event, stage, numbers, moving, projection.moves)
         self.timelines.move(stage.base + event.total, event.round, began + event.seconds)
 
     def exact(self, value: float, epsilon: float) -> None:
@@ -108,7 +114,12 @@ class SearchView:
             self.notes.add(name)
             words, colour = NOTES.get(name, (name, ink.GREY))
             where = np.clip(rows[:, 0].astype(int) + stage.base - numbers[0], 0, numbers.size - 1)
-            values = self._share(rows[:, 1]) if name == "accepted" else rows[:, 1]
+            values = rows[:, 1]
+            if name == "accepted":  # a proposal that leaves g as it is says nothing of a walk
+                counts = np.nan_to_num(event.batch.gains)[where] != 0.0
+                where, values = where[counts], self._share(values[counts])
+            if not values.size:
+                continue
             if name in LOGARITHMIC:
                 values = np.log10(np.where(values > 0.0, values, np.nan))
             path = f"search/notes/{name}"
@@ -134,26 +145,22 @@ class SearchView:
         return np.asarray((sums[ends] - sums[starts]) / (ends - starts))
 
     def _moves(
-        self, event: sr.EvaluationsFinished, stage: Stage, numbers: np.ndarray, moving: dict[int, str], kept: np.ndarray
+        self, event: sr.EvaluationsFinished, stage: Stage, numbers: np.ndarray, moving: dict[int, str], moves: Floats
     ) -> None:
-        """Where the coordinates went that moved, one series for each kind: to which time, to which parameter. Of a walk
-        the moves that it accepted."""
-        trace, moves = event.batch.trace, event.batch.moves
-        if not len(moves) or trace.points.shape[1:] != kept.shape or not kept.size:
-            return
-        moves = moves[~stage.refused[stage.values.size - trace.values.size :][moves[:, 0]]]
-        kinds = kept[moves[:, 1]] % event.block
+        """Where the coordinates went that moved ``(m, 3)``, one series for each kind: to which time or parameter. Of
+        a walk the moves that it accepted."""
+        rows = moves[:, 0].astype(int)
+        moves = moves[~stage.refused[stage.values.size - event.batch.trace.values.size :][rows]]
         for kind, name in moving.items():
-            mine = _few(moves[kinds == kind])
+            mine = _few(moves[moves[:, 1] == kind])
             if not len(mine):
                 continue
             self.moved.add(name)
 
-            def at(which: np.ndarray, rows: np.ndarray = mine) -> list[Any]:
-                return [self.rr.TimeColumn("evaluation", sequence=numbers[rows[which, 0]])]
+            def at(which: np.ndarray, rows: Floats = mine) -> list[Any]:
+                return [self.rr.TimeColumn("evaluation", sequence=numbers[rows[which, 0].astype(int)])]
 
-            values = trace.points[mine[:, 0], mine[:, 1]]
-            self._cloud(f"search/moves/{name}", at, values, (f"{name} of what moved", ink.PURPLE))
+            self._cloud(f"search/moves/{name}", at, mine[:, 2], (f"{name} of what moved", ink.PURPLE))
 
     def _line(self, path: str, words: str, colour: Colour, width: float = 1.5) -> None:
         if path not in self.known:

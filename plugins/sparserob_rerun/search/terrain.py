@@ -6,16 +6,17 @@ from typing import Any, final
 
 import numpy as np
 
-import sparserob_core as sr
 from sparserob_rerun.drawing import palette as ink
 from sparserob_rerun.drawing.canvas import Axes, Drawing
 from sparserob_rerun.drawing.palette import Floats
 from sparserob_rerun.search.explorer import Aim
-from sparserob_rerun.search.landscape import Landscape
+from sparserob_rerun.search.landscape import Landscape, places_of
 from sparserob_rerun.search.way import Shadow, Stage, shadow
 
 PIXELS, SIDE = 128, 384.0
 TRIED, LEG, LAST = 300, 400, 20  # points that stay visible, corners of the walk, and its last ones
+ROW = 25.0  # units between two lines of words: of a panel that is half as high as the screen, the height of a line
+VISIBLE = 1e-6  # of g: what two solvers make of one value differs by less, and what is seen by more
 LIFT = 0.015  # points stand this share of the height above the surface
 SHOWN = 60  # boxes of a sketch that are drawn
 
@@ -28,14 +29,16 @@ class Terrain:
     the tuple through which it is (``anchor (2,)``), ``value`` there, ``epsilon`` and ``level``, the stride of the grid.
     """
 
-    def __init__(self, rr: Any, stream: Any) -> None:
-        self.rr, self.stream = rr, stream
+    def __init__(self, rr: Any, stream: Any, unit: str = "") -> None:
+        """``unit``: of the time, as it is written behind its name."""
+        self.rr, self.stream, self.unit = rr, stream, unit
         self.known: Landscape | None = None
+        self.scale = (0.0, 1.0)
 
     def surface(self, landscape: Landscape, aim: Aim) -> None:
         """The values that are known, as an image with axes and as a mesh."""
         self.known = landscape
-        low, high = self._scale(landscape)
+        low, high = self.scale = self._scale(landscape, aim)
         shown = landscape.picture(PIXELS)
         colours = ink.sequential((np.where(np.isfinite(shown), shown, np.nan) - low) / (high - low))
         colours[shown == np.inf] = ink.FORBIDDEN
@@ -45,9 +48,14 @@ class Terrain:
         )
         (one, other), drawing, axes = landscape.names(), Drawing(), self._axes(landscape)
         weight = f"epsilon {landscape.epsilon:.3g}: " if landscape.epsilon > 0.0 else ""
-        drawing.frame(axes, f"{weight}{aim.words}")
-        drawing.text(axes.width / 2, axes.height + 34.0, f"across: {one}, up: {other}", ink.INK)
-        drawing.text(axes.width / 2, axes.height + 56.0, _said(landscape), ink.GREY)
+        drawing.frame(axes, "")
+        middle = axes.width / 2
+        drawing.text(middle, -ROW - 12.0, f"{weight}{aim.words}")
+        drawing.text(middle, -12.0, f"up: {other}{self.unit}", ink.GREY)
+        which = " of the two indices that decide most" if landscape.first[0] != landscape.second[0] else ""
+        drawing.text(middle, axes.height + ROW + 14.0, f"across: {one}{self.unit}{which}", ink.GREY)
+        drawing.text(middle, axes.height + 2 * ROW + 14.0, _said(landscape), ink.GREY)
+        drawing.text(middle, axes.height + 3 * ROW + 14.0, _own(landscape, aim), ink.ORANGE)
         drawing.log(self.rr, self.stream, "landscape/map/axes", layers=("frame",))
         self._anchor(landscape, axes)
         across, up, values = landscape.shown
@@ -75,9 +83,7 @@ class Terrain:
             self.rr.Points2D(
                 at,
                 colors=[ink.ORANGE],
-                labels=[f"best {landscape.value:.6g}"],
                 radii=self.rr.Radius.ui_points(6.0),
-                show_labels=True,
                 draw_order=60.0,
             ),
         )
@@ -87,26 +93,35 @@ class Terrain:
         landscape = self.known
         if landscape is None:
             return
-        wanted = np.array([slot * stage.block + k for slot, k in (landscape.first, landscape.second)])
-        path = shadow(stage, wanted)
+        assert landscape.seen is not None
+        path = shadow(stage, landscape.seen)
         if path is None or landscape.epsilon != _weight(stage.epsilon):
             for name in ("tried", "refused", "walk", "now", "sketch"):
                 self.stream.log(f"landscape/map/{name}", self.rr.Clear(recursive=True))
             return
         self._path(path, stage)
-        self._sketches(landscape, stage, wanted)
+        self._sketches(landscape, stage)
 
     def _path(self, path: Shadow, stage: Stage) -> None:
         assert self.known is not None
         axes, rr = self._axes(self.known), self.rr
         few = np.unique(np.linspace(max(0, len(path.points) - 4 * TRIED), len(path.points) - 1, TRIED).astype(int))
-        for name, which, colour, size in (
-            ("tried", ~path.refused[few], ink.TRIED, 1.8),
-            ("refused", path.refused[few], ink.REFUSED, 1.3),
+        own = stage.values[len(stage.values) - len(path.points) :][few]
+        shades = ink.sequential(np.clip((own - self.scale[0]) / (self.scale[1] - self.scale[0]), 0.0, 1.0))
+        shades[own == np.inf] = ink.FORBIDDEN
+        for name, which, rim, size in (
+            ("tried", ~path.refused[few], ink.TRIED, 2.6),
+            ("refused", path.refused[few], ink.REFUSED, 1.8),
         ):
-            points = path.points[few][which]
+            places = axes.at(path.points[few][which, 0], path.points[few][which, 1])
+            # a rim, by which dots of the map's colour are seen
+            rims = np.tile(np.array(rim, dtype=np.uint8), (len(places), 1))
+            radii = rr.Radius.ui_points(np.repeat([size + 0.9, size], len(places)))
             spots = rr.Points2D(
-                axes.at(points[:, 0], points[:, 1]), colors=[colour], radii=rr.Radius.ui_points(size), draw_order=40.0
+                np.concatenate([places, places]),
+                colors=np.concatenate([rims, shades[which]]),
+                radii=radii,
+                draw_order=40.0,
             )
             self.stream.log(f"landscape/map/{name}", spots)
         legs = [leg[-LEG:] for leg in path.legs]
@@ -120,58 +135,56 @@ class Terrain:
                 draw_order=45.0,
             ),
         )
-        marks = [axes.at(path.now[0], path.now[1])]
-        labels, colours, sizes = ["now"], [ink.INK], [4.0]
+        marks, colours, sizes = [axes.at(path.now[0], path.now[1])], [ink.INK], [4.0]
         for place in path.restarts[-6:]:
             marks.append(axes.at(place[0], place[1]))
-            labels.append("")
             colours.append(ink.PURPLE)
             sizes.append(3.5)
         landscape = self.known
         slots = stage.best.reshape(-1, stage.block) if stage.best.size else np.zeros((0, 1))
-        if slots.shape == landscape.anchor.shape and not np.array_equal(slots, landscape.anchor):
-            marks.append(axes.at(slots[landscape.first], slots[landscape.second]))
-            labels.append(f"since: {stage.best_value:.6g}, beside the slice")
+        if slots.shape == landscape.anchor.shape and not np.array_equal(slots, landscape.anchor) and stage.pair:
+            assert landscape.seen is not None
+            pair = (stage.pair[0], stage.pair[-1])
+            one, other = places_of(landscape.seen, pair, slots)
+            marks.append(axes.at(slots[one], slots[other]))
             colours.append(ink.HALF)
             sizes.append(4.5)
         self.stream.log(
             "landscape/map/now",
-            rr.Points2D(
-                np.concatenate(marks),
-                colors=colours,
-                labels=labels,
-                radii=rr.Radius.ui_points(sizes),
-                show_labels=True,
-                draw_order=61.0,
-            ),
+            rr.Points2D(np.concatenate(marks), colors=colours, radii=rr.Radius.ui_points(sizes), draw_order=61.0),
         )
 
-    def _sketches(self, landscape: Landscape, stage: Stage, wanted: np.ndarray) -> None:
-        """What a maximiser shows of itself, where it meets the slice; points fall onto it."""
+    def _sketches(self, landscape: Landscape, stage: Stage) -> None:
+        """What a maximiser shows of itself, over where the indices are that decide in the middle of each."""
         axes = self._axes(landscape)
         for role, sketch in stage.sketches.items():
             path = f"landscape/map/sketch/{''.join(c if c.isalnum() else '_' for c in role)}"
-            if sketch.lower.shape[1] != landscape.anchor.size:
+            assert landscape.seen is not None
+            corners = landscape.seen.outlines(stage.coordinates, sketch)
+            if corners is None or not sketch.count:
                 continue
+            lower, upper = corners
+            words = f"{role}: {min(len(lower), SHOWN)} of {sketch.count}" if sketch.count > SHOWN else role
             if sketch.points:
-                at = axes.at(sketch.lower[:, wanted[0]], sketch.lower[:, wanted[1]])
-                words = [role] + [""] * (len(at) - 1)
+                at = axes.at(lower[:, 0], lower[:, 1])
                 self.stream.log(
                     path,
                     self.rr.Points2D(
-                        at, colors=[ink.SKY], labels=words, radii=self.rr.Radius.ui_points(2.5), draw_order=47.0
+                        at,
+                        colors=[ink.SKY],
+                        labels=[role] + [""] * (len(at) - 1),
+                        radii=self.rr.Radius.ui_points(2.5),
+                        draw_order=47.0,
                     ),
                 )
                 continue
-            outlines = _outlines(sketch, landscape.anchor.ravel(), wanted)[:SHOWN]
-            words = [f"{role}: {len(outlines)} of {len(sketch.lower)} here"] if outlines else []
-            strips = [axes.at(line[:, 0], line[:, 1]) for line in outlines]
+            outlines = [axes.at(line[:, 0], line[:, 1]) for line in _outlines(lower, upper, sketch.rounded)[-SHOWN:]]
             self.stream.log(
                 path,
                 self.rr.LineStrips2D(
-                    strips,
+                    outlines,
                     colors=[ink.SKETCH],
-                    labels=words + [""] * (len(strips) - 1) if words else None,
+                    labels=[words] + [""] * (len(outlines) - 1),
                     radii=self.rr.Radius.ui_points(0.6),
                     draw_order=42.0,
                 ),
@@ -184,17 +197,19 @@ class Terrain:
             axes = self._axes(landscape)
             at = axes.at(landscape.axes[0][landscape.at[0]], landscape.axes[1][landscape.at[1]])
             drawing = Drawing()
-            drawing.dot(at, ink.PURPLE, 7.0)
-            beside = 30.0 if at[0, 1] < axes.height / 2 else -22.0
-            drawing.text(float(np.clip(at[0, 0], 0.3 * axes.width, 0.7 * axes.width)), float(at[0, 1]) + beside, words)
+            drawing.dot(at, ink.PURPLE, 9.0)
+            drawing.text(axes.width / 2, axes.height + 4 * ROW + 14.0, words, ink.PURPLE)
             drawing.log(self.rr, self.stream, "landscape/map/exact")
 
-    def _scale(self, landscape: Landscape) -> tuple[float, float]:
-        """What is dark and what is bright; one colour for a flat slice, which has no range."""
+    def _scale(self, landscape: Landscape, aim: Aim) -> tuple[float, float]:
+        """What is dark and what is bright; one colour for a flat slice, which has no range. The value that the search
+        has, which may lie below the map, has a colour of its own where half of them are left for the map."""
         low, high = landscape.limits
         if not np.isfinite(low):
             return 0.0, 1.0
-        return (low, high) if not landscape.flat and high > low else (low - 1.0, low + 1.0)
+        if landscape.flat or high <= low:
+            return low - 1.0, low + 1.0
+        return (max(min(low, aim.value), 2.0 * low - high) if np.isfinite(aim.value) else low), high
 
     def _axes(self, landscape: Landscape) -> Axes:
         ends = [(float(axis[0]), float(axis[-1])) for axis in landscape.axes]
@@ -272,26 +287,24 @@ def _said(landscape: Landscape) -> str:
     return said + ("; brown: no control meets the constraints" if nowhere else "")
 
 
+def _own(landscape: Landscape, aim: Aim) -> str:
+    """The value at the anchor, and how far below it that of the search is, whose disturbances need not be the worst."""
+    below = landscape.value - aim.value
+    if not below > VISIBLE * max(1.0, abs(landscape.value)):
+        return f"orange: the best tuple, g = {landscape.value:.6g}"
+    return f"orange: the best tuple, {landscape.value:.6g} here; its own g is {aim.value:.6g}, {below:.2g} less"
+
+
 def _weight(epsilon: float) -> float:
     return epsilon if np.isfinite(epsilon) else 0.0
 
 
-def _outlines(sketch: sr.Sketch, anchor: Floats, wanted: np.ndarray) -> list[Floats]:
-    """The outlines ``(k, 2)`` of the boxes or ellipsoids of a sketch where a slice through ``anchor (d,)`` meets
-    them."""
-    others = np.setdiff1d(np.arange(anchor.size), wanted)
-    middle, half = (sketch.lower + sketch.upper) / 2, (sketch.upper - sketch.lower) / 2
-    with np.errstate(divide="ignore", invalid="ignore"):
-        away = np.abs(anchor[others] - middle[:, others]) / half[:, others]
-    away = np.where(np.isnan(away), 0.0, away)  # a coordinate of one value
-    sizes = np.ones(len(middle))
-    if sketch.rounded:
-        sizes = np.sqrt(np.maximum(0.0, 1.0 - (away**2).sum(axis=1)))
-    meets = (sizes > 0.0) & (away <= 1.0 + 1e-9).all(axis=1)
+def _outlines(lower: Floats, upper: Floats, rounded: bool) -> list[Floats]:
+    """The outlines ``(k, 2)`` of boxes, or of the ellipses within them."""
     turn = np.linspace(0.0, 2.0 * np.pi, 33)
     unit = (
         np.column_stack([np.cos(turn), np.sin(turn)])
-        if sketch.rounded
+        if rounded
         else np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]])
     )
-    return [middle[k, wanted] + sizes[k] * half[k, wanted] * unit for k in np.flatnonzero(meets)]
+    return [(low + high) / 2 + (high - low) / 2 * unit for low, high in zip(lower, upper, strict=True)]

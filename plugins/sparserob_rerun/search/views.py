@@ -19,7 +19,7 @@ def landscape() -> Any:
     return view("/landscape/map", "Landscape of g around the best tuple, and the way of the search", EXTENT)
 
 
-EXTENT = (-50.0, 420.0, -38.0, 462.0)
+EXTENT = (-60.0, 420.0, -64.0, 512.0)
 
 
 def climb() -> Any:

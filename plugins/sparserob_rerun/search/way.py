@@ -10,8 +10,9 @@ import numpy as np
 
 import sparserob_core as sr
 from sparserob_rerun.drawing.palette import Floats
+from sparserob_rerun.search.projection import Axes, Outlines, Projection
 
-NUMBERS = 2_000_000  # coordinates of points that are remembered
+POINTS = 100_000  # tuples whose places are remembered; a tenth of it forgets a long walk, ten times of it takes 50 MB
 
 
 @final
@@ -19,21 +20,23 @@ class Stage:
     """One search: ``values (n,)`` of its evaluations, which are numbers ``base + 1, ...`` of the run.
 
     ``notes``: what the maximiser noted, one column ``(n,)`` for each name, NaN where it noted nothing.
-    ``points (m, c)``: the last of them, of the coordinates ``kept (c,)``.
+    ``places (m, 2, c)``: of the last of them where the two indices were that decided most, in the ``coordinates (c,)``
+    of an index; ``pair``: which they were in the best tuple, () where that is not known.
     """
 
     def __init__(self, number: int, epsilon: float, base: int) -> None:
         self.number, self.epsilon, self.base = number, epsilon, base
         self.values: Floats = np.zeros(0)
         self.notes: dict[str, Floats] = {}
-        self.kept = np.zeros(0, dtype=int)
-        self.points: Floats = np.zeros((0, 0))
+        self.coordinates: tuple[int, ...] = ()
+        self.places: Floats = np.zeros((0, 2, 0))
+        self.pair: tuple[int, ...] = ()
         self.best, self.best_value, self.block = np.zeros(0), -np.inf, 1
         self.lower_bound, self.budget = -np.inf, 0
-        self.sketches: dict[str, sr.Sketch] = {}
+        self.sketches: dict[str, Outlines] = {}
 
-    def add(self, event: sr.EvaluationsFinished, kept: np.ndarray) -> None:
-        """Remember a batch, of whose points the coordinates ``kept`` have come along."""
+    def add(self, event: sr.EvaluationsFinished, projection: Projection) -> None:
+        """Remember a batch, and what of its tuples is drawn on a map."""
         trace, before = event.batch.trace, self.values.size
         self.values = np.concatenate([self.values, trace.values])
         for name in {*self.notes, *trace.notes}:
@@ -44,13 +47,22 @@ class Stage:
             inside = (which >= 0) & (which < trace.values.size)
             column[before + which[inside]] = rows[inside, 1]
             self.notes[name] = column
-        self.best, self.best_value, self.block = event.best_point, event.best_value, event.block
+        if event.best_value != self.best_value:
+            top = int(np.argmax(trace.values)) if trace.values.size else -1
+            mine = 0 <= top < len(projection.slots) and trace.values[top] == event.best_value
+            self.pair = tuple(int(k) for k in projection.slots[top]) if mine else ()
+        if event.best_point.size:
+            self.best = event.best_point
+        self.best_value, self.block = event.best_value, event.block
         self.lower_bound, self.budget = event.lower_bound, event.budget
-        self.sketches.update(event.sketches)
-        if trace.points.shape[1:] == kept.shape and kept.size:
-            if self.kept.shape != kept.shape:
-                self.points, self.kept = np.zeros((0, kept.size)), kept
-            self.points = np.concatenate([self.points, trace.points])[-max(1, NUMBERS // kept.size) :]
+        self.sketches.update(projection.sketches)
+        if len(projection.places) == trace.values.size:
+            if self.coordinates != projection.coordinates or not self.places.size:
+                self.coordinates, self.places = projection.coordinates, projection.places
+            else:
+                self.places = np.concatenate([self.places, projection.places])[-POINTS:]
+        else:
+            self.coordinates, self.places = (), np.zeros((0, 2, 0))
 
     def note(self, name: str) -> Floats:
         """What was noted at each evaluation ``(n,)``; NaN where nothing was."""
@@ -103,11 +115,11 @@ class Shadow:
     now: Floats
 
 
-def shadow(stage: Stage, wanted: np.ndarray) -> Shadow | None:
-    """A stage on the coordinates ``wanted (2,)`` of its points; ``None`` where they have not come along."""
-    if not stage.points.size or not np.isin(wanted, stage.kept).all():
+def shadow(stage: Stage, axes: Axes) -> Shadow | None:
+    """A stage on the two ``axes`` of a map; ``None`` where its tuples have not come along."""
+    points = axes.of(stage.coordinates, stage.places)
+    if points is None or not len(points):
         return None
-    points = stage.points[:, np.searchsorted(stage.kept, wanted)]
     first = stage.values.size - len(points)
     legs, places, heated = [], [], stage.restarts
     if stage.walks:
@@ -115,7 +127,8 @@ def shadow(stage: Stage, wanted: np.ndarray) -> Shadow | None:
         for start, end in zip([0, *heated], [*heated, stage.values.size], strict=True):
             path = standing[start:end]
             path = path[path >= 0]
-            legs.append(points[path[np.append(True, np.diff(path) != 0)]] if path.size else np.zeros((0, 2)))
+            leg = points[path]
+            legs.append(leg[np.append(True, (np.diff(leg, axis=0) != 0.0).any(axis=1))] if len(leg) else leg)
         places = [leg[0] for leg in legs[1:] if len(leg)]
     else:  # an ascent is its evaluations
         ends = [max(0, start - first) for start in [0, *heated, stage.values.size]]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, final
@@ -13,6 +13,7 @@ import numpy as np
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, assemble, tools_of
 from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.events import DECIDING
 from sparserob_core.sip.methods.own_units import UsersUnits
 from sparserob_core.sip.program import TOLERANCE
 
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from sparserob_core.experiment.figures.clash import Strip
     from sparserob_core.experiment.figures.figure_data import FigureData
     from sparserob_core.sip.method import Method
-    from sparserob_core.sip.program import SemiInfiniteProgram
+    from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
     from sparserob_core.sip.result import Result
 
 CoordinateKind: TypeAlias = Literal["time", "parameter", "disturbance", "direction", "index"]
@@ -38,10 +39,11 @@ LETTERS: Mapping[str, str] = {
 @dataclass(frozen=True, eq=False)
 class RelaxedValue:
     """``g`` over tuples of indices: ``at`` maps ``slots (D, width)`` to a number, ``+inf`` where the relaxed program is
-    infeasible.
+    infeasible. NaN in the place of every coefficient of a disturbance stands for the worst one of each constraint.
 
     ``weights()`` are the multipliers of the constraints at every index ``(D,)`` in the last evaluation, ``gradient()``
-    the slopes ``(D, width)`` of ``g`` there, as far as it has some (`TupleValue.gradient`). ``slot`` is the box
+    the slopes ``(D, width)`` of ``g`` there, as far as it has some (`TupleValue.gradient`); ``deciding()`` are the
+    indices with the largest multipliers ``(4,)`` (`TupleValue.deciding`). ``slot`` is the box
     ``(width,)`` of one index, ``names`` and ``kinds`` say what its coordinates are: see `Inspection.names` and
     `Inspection.kinds`.
     """
@@ -49,9 +51,16 @@ class RelaxedValue:
     at: Callable[[Array], float]
     weights: Callable[[], Array]
     gradient: Callable[[], Array]
+    deciding: Callable[[], np.ndarray]
     slot: Box
     names: tuple[str, ...]
     kinds: tuple[CoordinateKind, ...]
+
+    @property
+    def coordinates(self) -> tuple[int, ...]:
+        """The coordinates of an index that can move and are no disturbance, such as its time."""
+        moves = self.slot.upper > self.slot.lower
+        return tuple(k for k, kind in enumerate(self.kinds) if moves[k] and kind != "disturbance")
 
 
 @final
@@ -146,6 +155,9 @@ class Inspection:
         # as methods see it: the weight epsilon is in the program's own units (decision 16)
         own = self.program.own_units
         program = users if own is None else imposed_program(own.program, formulation)
+        if self.literal:
+            open_ = np.array([kind == "disturbance" for kind in self.kinds(self.width)])
+            program = replace(program, families=[_with_the_worst(family, open_) for family in program.families])
         value = TupleValue(program, RelaxedProgram(program, tools.solver, tools.regulariser), count)
         value.epsilon = epsilon if tools.regulariser is not None and np.isfinite(epsilon) else 0.0
         width, cost = value.layout.slot.dimension, 1.0 if own is None else own.cost
@@ -163,6 +175,7 @@ class Inspection:
             lambda slots: cost * value.at(np.ravel(np.clip(slots / units, slot.lower, slot.upper))),
             weights,
             gradient,
+            lambda: value.deciding([value.imposed], DECIDING)[0],
             Box(slot.lower * units, slot.upper * units),
             self.names(width),
             self.kinds(width),
@@ -202,6 +215,25 @@ class Inspection:
     @cached_property
     def _experiment(self) -> Experiment:
         return self._built or assemble(self._loaded)
+
+
+def _with_the_worst(family: ConstraintFamily, coefficients: np.ndarray) -> ConstraintFamily:
+    """A literal family that takes NaN in the place of all ``coefficients (width,)`` of a disturbance for the worst one
+    of each row: those rows are then the reduced ones, at the other coordinates of the index."""
+    reduced, literal, mine = family.reduced, family.rows, coefficients[: family.index_set.dimension]
+    if reduced is None:  # no uncertainty acts on it
+        return family
+
+    def rows(indices: Array) -> tuple[Array, Array]:
+        at_worst = np.isnan(indices[:, mine]).any(axis=1)
+        if not at_worst.any():
+            return literal(indices)
+        G, h = reduced.rows(indices[:, ~mine])
+        if not at_worst.all():
+            G[~at_worst], h[~at_worst] = literal(indices[~at_worst])
+        return G, h
+
+    return replace(family, rows=rows)
 
 
 def _repeated(kind: CoordinateKind, count: int) -> list[CoordinateKind]:

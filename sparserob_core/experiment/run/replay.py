@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,17 +13,20 @@ from sparserob_core.control.constraints.explanation import Witness
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.directory.finished import UNFINISHED, StoredRun, stored_run
 from sparserob_core.experiment.run.events import Event, RunFinished, RunStarted
-from sparserob_core.experiment.run.inspection import Inspection
+from sparserob_core.experiment.run.inspection import Inspection, RelaxedValue
 from sparserob_core.experiment.run.viewer import recorded, recorder
 from sparserob_core.experiment.terminal.printing import printable
-from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.events import Batch, EvaluationsFinished
+from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.events import DECIDING, Batch, EvaluationsFinished
 from sparserob_core.sip.evidence import Proof
 from sparserob_core.sip.program import WorstConstraint
 from sparserob_core.sip.result import UNKNOWN_SCALE, Result, SearchTrace
 from sparserob_core.sip.scenario_bound import ScenarioBound
 
 BATCHES = 100  # of the evaluations of a run
+DECIDING_SECONDS = 10.0
+"""Seconds in which the tuples of one search are evaluated once more. In a tenth of it the walk of a search of some
+thousand evaluations would begin in its middle; ten times of it nobody waits for."""
 PATIENCE = 60.0  # seconds that the landscape may take
 
 
@@ -78,7 +82,7 @@ def events(inspection: Inspection, title: str, directory: Path | None, result: R
         quiet=True,
         inspection=inspection,
     )
-    searches = [] if result.trace is None else list(_searches(result.trace, inspection.width))
+    searches = [] if result.trace is None else list(_searches(result.trace, inspection))
     for entry in result.history:
         while searches and searches[0][0] <= entry.round:
             yield searches.pop(0)[1]
@@ -145,15 +149,37 @@ def _number(summary: Mapping[str, Any], name: str, missing: float = np.nan) -> f
     return missing if summary.get(name) is None else float(summary[name])
 
 
-def _searches(trace: SearchTrace, width: int) -> Iterator[tuple[int, EvaluationsFinished]]:
-    """Every search in batches, each with the number of its round; the tuples of indices of ``width`` coordinates as far
-    as they were kept."""
-    size = trace.points.shape[1]
+def _deciding(
+    g: RelaxedValue, points: Array, notes: Mapping[str, Array], seconds: float = DECIDING_SECONDS
+) -> np.ndarray:
+    """The indices ``(n, 4)`` that decide most in each tuple ``(n, D width)`` of a search, which no directory keeps: by
+    evaluating those once more that the walk went to, the last ones first, for some ``seconds``; -1 of the others."""
+    found = np.full((len(points), DECIDING), -1)
+    accepted = notes.get("accepted", np.ones(len(points))) > 0.0
+    end = time.monotonic() + seconds
+    for row in np.flatnonzero(accepted)[::-1]:
+        if time.monotonic() > end:
+            break
+        g.at(points[row].reshape(-1, g.slot.dimension))
+        found[row] = g.deciding()
+    return found
+
+
+def _searches(trace: SearchTrace, inspection: Inspection) -> Iterator[tuple[int, EvaluationsFinished]]:
+    """Every search in batches, each with the number of its round; the tuples of indices as far as they were kept."""
+    size, width = trace.points.shape[1], inspection.width
+    whole = bool(size) and size % width == 0 and inspection.program.spread is None
     for outer in np.unique(trace.outer):
         which = np.flatnonzero(trace.outer == outer)
         values, seconds = trace.value[which], trace.seconds[which] - trace.seconds[which[0]]
         points, notes = trace.points[which], {name: column[which] for name, column in trace.notes.items()}
         ranked = np.where(np.isnan(values), -np.inf, values)
+        domain, deciding = None, np.zeros((0, DECIDING), dtype=int)
+        coordinates: tuple[int, ...] = ()
+        if whole:
+            g = inspection.relaxed_value(size // width, float(trace.epsilon[which[0]]))
+            domain = Box(np.tile(g.slot.lower, size // width), np.tile(g.slot.upper, size // width))
+            coordinates, deciding = g.coordinates, _deciding(g, points, notes)
         best, done = np.maximum.accumulate(ranked), 0
         batches = min(which.size, max(1, BATCHES * which.size // trace.outer.size))
         walked = int((~trace.polished[which]).sum())
@@ -191,6 +217,9 @@ def _searches(trace: SearchTrace, width: int) -> Iterator[tuple[int, Evaluations
                     epsilon=float(trace.epsilon[which[0]]),
                     lower_bound=float(trace.bound[which[part[-1]]]),
                     batch=batch,
+                    domain=domain,
+                    coordinates=coordinates,
+                    deciding=deciding[part] if whole else deciding,
                 ),
             )
 

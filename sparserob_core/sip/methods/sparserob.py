@@ -20,7 +20,7 @@ from pydantic import Field, field_validator
 from sparserob_core.errors import InputError
 from sparserob_core.options import Options, part
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.events import EvaluationsFinished, forwarded
+from sparserob_core.sip.events import DECIDING, EvaluationsFinished, forwarded, frozen, ignore
 from sparserob_core.sip.evidence import Dual
 from sparserob_core.sip.method import GAP_TOLERANCE, Deadline, Method, Tools
 from sparserob_core.sip.methods.ledger import Answer, Ledger
@@ -151,7 +151,7 @@ def _searched(
     proven: list[float] = []
     g.epsilon = epsilon
     oracle = None if tools.rebuild is None else Oracle(tools.rebuild, method.formulation, g.layout.count)
-    batches = Batches(g, oracle, tools.executor, tools.budget)
+    batches = Batches(g, oracle, tools.executor, tools.budget, watched=tools.notify is not ignore)
 
     def tell(value: float, bound: Dual | None) -> None:
         if bound is not None:
@@ -162,7 +162,11 @@ def _searched(
         return batches.values(points, tell)
 
     def completed(event: EvaluationsFinished) -> EvaluationsFinished:
-        return replace(event, round=j + 1, epsilon=epsilon, lower_bound=ledger.lower)
+        deciding = frozen(g.deciding(batches.taken(event.count), DECIDING))
+        lower = ledger.lower
+        return replace(
+            event, round=j + 1, epsilon=epsilon, lower_bound=lower, coordinates=g.coordinates, deciding=deciding
+        )
 
     assert tools.maximiser is not None
     rules = Rules(method.sc2, method.slcr or Metropolis(), tools.polish)

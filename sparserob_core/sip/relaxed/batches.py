@@ -12,7 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -20,7 +20,7 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Dual
 from sparserob_core.sip.method import Deadline, OutOfTime, Rebuild
-from sparserob_core.sip.relaxed.relaxed import RelaxedProgram
+from sparserob_core.sip.relaxed.relaxed import Imposed, RelaxedProgram
 from sparserob_core.sip.relaxed.tuples import TupleValue, imposed_program
 
 CHUNK = 16
@@ -37,7 +37,8 @@ START = 5.0
 class Valued:
     """What a chunk gave: ``values (k,)``; ``duals``, the lower bound from the multipliers of each tuple whose value was
     the best so far in its chunk, by its place in it; and how many programs were solved, by how many ``calls`` of the
-    solver, and by whom. ``late``: why the time was over, if it was."""
+    solver, and by whom. ``imposed``: the rows that each rests on, with their multipliers. ``late``: why the time was
+    over, if it was."""
 
     values: Array
     duals: dict[int, Dual]
@@ -45,6 +46,7 @@ class Valued:
     calls: int
     solved_by: Mapping[str, int] = field(default_factory=dict)
     late: str = ""
+    imposed: Sequence[Imposed] = ()
 
 
 def value_chunk(g: TupleValue, points: Array, best: float) -> Valued:
@@ -53,14 +55,15 @@ def value_chunk(g: TupleValue, points: Array, best: float) -> Valued:
     g.forget()
     relaxed, duals = g.relaxed, dict[int, Dual]()
     solves, calls, known = relaxed.solves, relaxed.counted.calls, Counter(relaxed.solved_by)
-    values = np.empty(len(points))
+    values, imposed = np.empty(len(points)), list[Imposed]()
     for k, point in enumerate(points):
         values[k] = g.at(point)
+        imposed.append(replace(g.imposed, solution=None))
         if np.isfinite(values[k]) and values[k] > best:
             best = float(values[k])
             duals[k] = relaxed.lower_bound(g.rows(), g.solution)
     by = relaxed.solved_by - known
-    return Valued(values, duals, relaxed.solves - solves, relaxed.counted.calls - calls, dict(by))
+    return Valued(values, duals, relaxed.solves - solves, relaxed.counted.calls - calls, dict(by), imposed=imposed)
 
 
 @dataclass(frozen=True)
@@ -106,12 +109,15 @@ class Batches:
     ``executor`` where there are some and the work is worth it.
 
     ``budget``: evaluations that one search may still make, from which the work that is left is guessed. A worker that
-    fails costs nothing but its help: its chunks are evaluated here.
+    fails costs nothing but its help: its chunks are evaluated here. ``watched``: what each value rests on is kept, to
+    be `taken`.
     """
 
-    def __init__(self, g: TupleValue, oracle: Oracle | None, executor: Executor | None, budget: int) -> None:
-        self.g, self.oracle, self.executor, self.budget = g, oracle, executor, budget
-        self.sent = 0
+    def __init__(
+        self, g: TupleValue, oracle: Oracle | None, executor: Executor | None, budget: int, watched: bool = False
+    ) -> None:
+        self.g, self.oracle, self.executor, self.budget, self.watched = g, oracle, executor, budget, watched
+        self.sent, self.imposed = 0, list[Imposed]()
         self._best, self._started = -np.inf, False
 
     def values(self, points: Array, tell: Callable[[float, Dual | None], None]) -> Array:
@@ -136,9 +142,17 @@ class Batches:
         value = self.g.at(point)
         better = np.isfinite(value) and value > self._best
         bound = self.g.relaxed.lower_bound(self.g.rows(), self.g.solution) if better else None
-        return Valued(np.array([value]), {} if bound is None else {0: bound}, 0, 0)
+        imposed = [replace(self.g.imposed, solution=None)] if self.watched else []
+        return Valued(np.array([value]), {} if bound is None else {0: bound}, 0, 0, imposed=imposed)
+
+    def taken(self, count: int) -> list[Imposed]:
+        """The rows that the first ``count`` tuples rest on, of those that were not yet taken."""
+        first, self.imposed = self.imposed[:count], self.imposed[count:]
+        return first
 
     def _told(self, chunk: Valued, tell: Callable[[float, Dual | None], None]) -> Array:
+        if self.watched:
+            self.imposed += chunk.imposed
         for k, value in enumerate(chunk.values):
             better = np.isfinite(value) and value > self._best
             if better:

@@ -179,6 +179,45 @@ class TupleValue:
             coordinates[size:] = False
         return LinearBlocks(np.tile(coordinates, self.layout.count), self._acting, self._steepest)
 
+    @cached_property
+    def coordinates(self) -> tuple[int, ...]:
+        """The coordinates of an index that can move and are not `linear`: where it is, without what is then at its
+        worst in closed form."""
+        slot = self.layout.slot
+        moves = slot.upper > slot.lower
+        if self.linear is not None:
+            moves &= ~self.linear.coordinates[: self.block]
+        return tuple(int(c) for c in np.flatnonzero(moves))
+
+    def deciding(self, imposed: Sequence[Imposed], most: int) -> np.ndarray:
+        """The indices ``(k, most)`` of each of ``k`` tuples whose constraints have the largest multipliers, by the rows
+        that were ``imposed`` there; the largest first, -1 where fewer have one.
+
+        A constraint that stays as it is where the first of the `coordinates` moves, such as one at the end of the
+        horizon, does not count.
+        """
+        count, rows = len(self.slots), self._h.shape[1]
+        tuples = np.repeat(np.arange(len(imposed)), [one.positions.size for one in imposed])
+        positions = np.concatenate([np.zeros(0, dtype=int), *(one.positions for one in imposed)])
+        multipliers = np.concatenate([np.zeros(0), *(one.multipliers for one in imposed)])
+        slots, kinds = np.divmod(positions, rows)
+        weights = np.bincount(tuples * count + slots, multipliers * self._moving[kinds], len(imposed) * count)
+        weights = weights.reshape(len(imposed), count)
+        order = np.argsort(-weights, axis=1, kind="stable")[:, :most]
+        found = np.full((len(imposed), most), -1)
+        found[:, : order.shape[1]] = np.where(np.take_along_axis(weights, order, axis=1) > 0.0, order, -1)
+        return found
+
+    @cached_property
+    def _moving(self) -> np.ndarray:
+        """Which rows of an index ``(r,)`` move with the first of its `coordinates`, such as its time."""
+        moving = np.zeros(self._h.shape[1], dtype=bool)
+        for family, first, last in self._columns:
+            box = family.index_set
+            mine = [c for c in self.coordinates[:1] if c < box.dimension]
+            moving[first:last] = bool((box.upper[mine] > box.lower[mine]).any())
+        return moving
+
     def _acting(self) -> np.ndarray:
         """Which indices ``(D,)`` of the last tuple have a multiplier."""
         self._settle()

@@ -1,0 +1,110 @@
+"""Guards what a search does on the map: where the two indices are that decide most, in every formulation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import sparserob_core as sr
+from tests.support.places import CONFIGS
+
+pytest.importorskip("rerun", reason="a recording needs the extra rerun")
+
+
+class Heard(sr.Observer):
+    def __init__(self) -> None:
+        self.events = list[sr.EvaluationsFinished]()
+
+    def receive(self, event: sr.Event) -> None:
+        if isinstance(event, sr.EvaluationsFinished):
+            self.events.append(event)
+
+
+SMALL = {
+    "dictionaries.control.pieces": 20,
+    "dictionaries.disturbance.pieces": 20,
+    "method.indices": 5,
+    "method.sc2": None,
+    "maximiser": {"name": "simulated_annealing", "budget": 80},
+    "continuation": {"start": 0.1, "stop": 0.1},
+    "observers": [],
+}
+
+
+@pytest.mark.parametrize("config", ["experiment1_literal.yaml", "experiment1_reduced.yaml"])
+def test_every_evaluated_tuple_says_which_indices_have_the_largest_multipliers(config: str) -> None:
+    from sparserob_rerun.search.projection import Projection, Projector
+
+    heard = Heard()
+    sr.run(CONFIGS / config, SMALL, None, quiet=True, figures=False, observers=[heard])
+    g = _g(config)
+    projector, parts, tuples, values = Projector(), [], [], []
+    for event in heard.events:
+        assert event.coordinates == (0,) and event.deciding.shape == (event.count, 4)
+        small, projection = projector.small(event)
+        assert small.batch.trace.points.size == 0 and small.batch.trace.values.size == event.count
+        parts.append(projection)
+        points = np.concatenate(list(event.batch.points)).reshape(event.count, 5, -1)
+        for row, slots in enumerate(points):
+            values.append(g.at(slots))
+            assert event.deciding[row].tolist() == g.deciding().tolist()
+            tuples.append(slots)
+        assert np.abs(event.batch.trace.values - values[-event.count :]).max() < 1e-7
+    whole = Projection.joined(parts)
+    assert whole.places.shape == (80, 2, 1) and whole.coordinates == (0,)
+    rows = np.arange(80)
+    assert (whole.places[:, 0, 0] == np.array(tuples)[rows, whole.slots[:, 0], 0]).all()
+    assert (whole.places[:, 1, 0] == np.array(tuples)[rows, whole.slots[:, 1], 0]).all()
+    assert (whole.slots[:, 0] != whole.slots[:, 1]).all()
+    assert whole.moves[:, 0].max() < 80 and set(whole.moves[:, 1]) == {0.0}
+
+
+def _g(config: str) -> sr.RelaxedValue:
+    from sparserob_core.experiment.config.load import load_config
+
+    loaded = load_config(CONFIGS / config, {**SMALL})
+    return sr.Inspection(loaded).relaxed_value(5, 0.1)
+
+
+def batch_of(points: np.ndarray, deciding: list[list[int]], **more: object) -> sr.EvaluationsFinished:
+    """An event of tuples of three indices ``(t, w)`` in the unit box, of which ``w`` stays linear."""
+    count, box = len(points), sr.Box(np.zeros(6), np.ones(6))
+    batch = sr.Batch([points], [np.zeros(count)], [(count, 0.0)])
+    event = sr.EvaluationsFinished(count=count, total=count, best_value=0.0, domain=box, block=2, batch=batch)
+    return replace(event, coordinates=(0,), deciding=np.array(deciding), **more)  # type: ignore[arg-type]
+
+
+def test_cells_are_drawn_over_the_indices_that_decide_in_their_middle_and_walks_keep_the_earlier_one_across() -> None:
+    from sparserob_rerun.search.projection import Axes, Projector
+
+    points = np.array([[0.1, 0, 0.5, 0, 0.9, 0], [0.3, 1, 0.5, 1, 0.2, 1], [0.4, 0, 0.8, 1, 0.2, 0]])
+    deciding = [[2, 0, -1, -1], [1, -1, -1, -1], [0, 2, 1, -1]]
+    half = np.array([0.1 / 3, 1, 0.02, 1, 0.05, 1])
+    cells = sr.Sketch(points[[0, 2]] - half, points[[0, 2]] + half)
+    stranger = sr.Sketch(*(np.full((1, 6), 0.77),) * 2)
+    event = batch_of(points, deciding, sketches={"cells": cells, "stranger": stranger})
+    _, projection = Projector().small(event)
+    # the second tuple has one that decides; the other one is of the pair before
+    assert projection.slots.tolist() == [[2, 0], [1, 2], [0, 2]]
+    assert projection.places[:, :, 0].tolist() == [[0.9, 0.1], [0.5, 0.2], [0.4, 0.2]]
+    axes = Axes((0, 1), (0, 0))
+    points_on_map = axes.of((0,), projection.places)
+    assert points_on_map is not None and points_on_map.tolist() == [[0.1, 0.9], [0.2, 0.5], [0.2, 0.4]]
+    corners = axes.outlines((0,), projection.sketches["cells"])
+    assert corners is not None
+    np.testing.assert_allclose(corners[0], [[0.1 - 0.1 / 3, 0.85], [0.15, 0.4 - 0.1 / 3]])
+    np.testing.assert_allclose(corners[1], [[0.1 + 0.1 / 3, 0.95], [0.25, 0.4 + 0.1 / 3]])
+    assert projection.sketches["stranger"].count == 1 and projection.sketches["stranger"].points
+    assert axes.of((1,), projection.places) is None
+
+
+def test_an_index_beside_the_first_is_not_the_second() -> None:
+    from sparserob_rerun.search.projection import two_of
+
+    slots, widths = np.array([[0.5], [0.52], [0.9], [0.1]]), np.ones(1)
+    assert two_of([0, 1, 2, 3], slots, widths, (3, 2)) == (0, 2)
+    assert two_of([0, 1, -1, -1], slots, widths, (0, 3)) == (0, 3)
+    assert two_of([-1, -1, -1, -1], slots, widths, (3, 2)) == (3, 2)
+    assert two_of([0], slots[:1], widths, (0, 0)) == (0, 0)
