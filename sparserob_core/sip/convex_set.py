@@ -132,6 +132,13 @@ class ConvexSet(ABC):
         """An upper bound of the 2-norm of any point: that of the corner of the bounding box."""
         return float(np.linalg.norm(self.reach(np.eye(self.dimension))))
 
+    def is_same(self, other: object) -> bool:
+        """Whether another set is this one, or is of the same kind and holds the same numbers, bit by bit."""
+        fields = getattr(self, "__dataclass_fields__", None)
+        if other is self or fields is None or type(other) is not type(self):
+            return other is self
+        return all(_is_same(getattr(self, name), getattr(other, name)) for name in fields)
+
     @shaped
     def interior_point(self) -> Float[Array, " d"]:
         """A point ``(d,)`` of the set, away from its boundary where the set allows; here the mean of support points."""
@@ -653,3 +660,12 @@ def vertex_excess(
         gain = heights - np.take_along_axis(heights, best[:, None], axis=1) + steepness
         excess[part] = np.maximum(gain.max(axis=1), 0.0)
     return excess.reshape(centre.shape[:-1])
+
+
+def _is_same(mine: object, other: object) -> bool:
+    """Whether two fields of sets hold the same numbers."""
+    if isinstance(mine, ConvexSet):
+        return mine.is_same(other)
+    if isinstance(mine, np.ndarray) or isinstance(other, np.ndarray):
+        return np.array_equal(np.asarray(mine), np.asarray(other))
+    return bool(mine == other)

@@ -327,6 +327,46 @@ def test_a_known_piece_may_follow_an_uncertain_one() -> None:
         sr.SwitchedSystem([(1.0, sr.LinearSystem([[0.0]], [[1.0]], delay=0.1))])
 
 
+SETS = [
+    {"polytope": {"H": [[1, 1], [-1, 0], [0, -1]], "h": [0.1, 0.05, 0.05]}},
+    {"norm": {"p": 1, "radius": 0.1}},
+    pytest.param({"ellipsoid": {"shape": [[0.01, 0.004], [0.004, 0.01]]}}, marks=pytest.mark.slow),
+    pytest.param({"norm": {"p": 3, "radius": 0.1}}, marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize("parameters", SETS)
+def test_pieces_share_a_set_of_parameters_of_any_kind(parameters: dict[str, Any], tmp_path: Path) -> None:
+    plain = {"A": [["-0.5 + p1"]], "B": [["1 + p2"]]}
+    shared = {"parameters": {"names": ["p1", "p2"], **parameters}}
+    told = {"pieces": [{"until": t, **plain} for t in (0.7, 2.0)]}
+    problem = {"name": "linear", "horizon": 2.0, "initial_state": [1.0], "control": {"box": 1.0}}
+    costs = []
+    for name, system in (("plain", plain), ("pieces", told)):
+        whole = {**problem, "system": {**system, **shared}, "terminal": [{"box": 0.1}]}
+        config = {"problem": whole, "dictionaries": {"control": pieces(4)}, "observers": []}
+        outcome = sr.run(config, out=tmp_path / name, quiet=True, figures=False)
+        assert outcome.status == "certified"
+        costs.append(outcome.result.cost)
+    assert costs[0] > 0.2
+    assert costs[0] == pytest.approx(costs[1], rel=3e-7)
+    assert sr.check(tmp_path / "pieces").status == sr.check(tmp_path / "plain").status != "refuted"
+
+
+@pytest.mark.parametrize(
+    "parameters", [sr.Box([-0.1], [0.2]), sr.Ellipsoid([0.1], [[0.2]]), sr.NormBall(3, 0.3, centre=[0.1])]
+)
+def test_parameters_of_pieces_are_the_same_where_their_numbers_are(parameters: sr.ConvexSet) -> None:
+    def piece(shared: sr.ConvexSet) -> sr.LinearSystem:
+        return sr.LinearSystem(lambda p: np.array([[p[0]]]), [[1.0]], parameters=shared)
+
+    units = np.array([0.3])
+    again = [parameters.in_units(units) for _ in range(2)]
+    assert sr.SwitchedSystem([(1.0, piece(again[0])), (2.0, piece(again[1]))]).parameter_count == 1
+    with pytest.raises(sr.InputError, match="parameters of the other pieces"):
+        sr.SwitchedSystem([(1.0, piece(again[0])), (2.0, piece(parameters.in_units(1.001 * units)))])
+
+
 def test_the_other_methods_and_studies_know_switched_systems(tmp_path: Path) -> None:
     problem = {**SWITCHED, "disturbance": {"box": 0.02}}
     config = {"problem": problem, "dictionaries": {"control": pieces(10)}, "observers": []}

@@ -14,7 +14,7 @@ from sparserob_core.control.enclosures.taylor import TaylorModel, TaylorSpace
 from sparserob_core.control.problem.expression import ExpressionMatrix, beside
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.shapes import Float, shaped
-from sparserob_core.sip.convex_set import Array, Box, ConvexSet
+from sparserob_core.sip.convex_set import Array, ConvexSet
 
 Matrix: TypeAlias = npt.ArrayLike | Callable[..., object] | ExpressionMatrix
 _Entry: TypeAlias = Array | Callable[..., object] | ExpressionMatrix
@@ -504,13 +504,9 @@ def _check_alike(i: int, system: LinearSystem, first: LinearSystem) -> None:
                 got=f"{getattr(system, what)}",
             )
     mine, other = system.parameters, first.parameters
-    if mine is None or (mine is other and system.names == first.names):
+    if mine is None:
         return
-    same = isinstance(mine, Box) and isinstance(other, Box) and mine.dimension == other.dimension
-    axes = np.vstack([np.eye(mine.dimension), -np.eye(mine.dimension)])
-    if same and other is not None:
-        same = np.array_equal(mine.support(axes), other.support(axes))
-    if not same or system.names != first.names:
+    if not mine.is_same(other) or system.names != first.names:
         raise InputError(path=f"system.pieces.{i}", expected="the parameters of the other pieces", got="others")
 
 

@@ -19,7 +19,7 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram, FiniteSolution
 from sparserob_core.sip.inner.equalities import onto_equalities
 from sparserob_core.sip.inner.extended import extended_bound
-from sparserob_core.sip.inner.image import onto_stationary
+from sparserob_core.sip.inner.image import onto_stationary, within_bounds
 
 # Entries of a sum are evaluated with a relative error of at most this (Higham 2002, section 3.1, for sums of up to ~1e2
 # terms).
@@ -148,8 +148,7 @@ def measure(
     message: str = "",
 ) -> FiniteSolution:
     """Everything that can be checked about a claim, as a `FiniteSolution` that nobody has judged yet (``failed``)."""
-    if program.S is None:
-        x = np.minimum(np.maximum(x, program.lower), program.upper)
+    x = within_bounds(program, x)
     x = onto_equalities(program, x) if program.b.size else x
     y = _usable(program, y)
     value, residual = program.objective(x), program.residual(x)

@@ -7,6 +7,7 @@ import numpy as np
 from sparserob_core.shapes import Bool, Float, shaped
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import FiniteProgram
+from sparserob_core.sip.inner.image import within_bounds
 
 STEPS = 3
 ROUNDED = 2.0**-52  # of the numbers that are added up, what is left to rounding
@@ -36,7 +37,7 @@ def onto_equalities(program: FiniteProgram, x: Float[Array, " n"]) -> Float[Arra
         size = np.where(size > 0.0, size, 1.0)
         moved = x.copy()
         moved[free] += np.linalg.lstsq(rows / size[:, None], rest / size, rcond=RANK)[0]
-        moved = np.clip(moved, program.lower, program.upper) if program.S is None else moved
+        moved = within_bounds(program, moved)
         after = program.missed(moved)
         if not after < share:
             break

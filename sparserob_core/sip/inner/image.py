@@ -73,6 +73,29 @@ def onto_stationary(program: FiniteProgram, z: Float[Array, " k"], slope: Float[
     return moved if _stationary(S, moved, slope) else np.full_like(moved, np.nan)
 
 
+@shaped
+def within_bounds(program: FiniteProgram, x: Float[Array, " n"]) -> Float[Array, " n"]:
+    """The decision ``x (n,)`` with every entry that is an image by itself, or a multiple of one, moved into the bounds
+    of that image: an entry that may only be 0 is 0, and no dust that a solver left."""
+    if program.S is None:
+        return np.minimum(np.maximum(x, program.lower), program.upper)
+    rows, entries, factors = _factors.recall((program.S,), "alone", partial(_alone, program.S))
+    ends = program.lower[rows] / factors, program.upper[rows] / factors
+    moved = x.copy()  # several images may be of one entry
+    np.maximum.at(moved, entries, np.minimum(*ends))
+    np.minimum.at(moved, entries, np.maximum(*ends))
+    return moved
+
+
+def _alone(S: csc_array) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Array]:
+    """The images that are one entry times a factor: their numbers, those of the entries, and the factors, ``(a,)``."""
+    by_row = S.tocsr()
+    by_row.eliminate_zeros()
+    rows = np.flatnonzero(np.diff(by_row.indptr) == 1)
+    places = by_row.indptr[rows]
+    return rows, by_row.indices[places].astype(np.int64), np.asarray(by_row.data[places])
+
+
 def _stationary(S: csc_array, z: Array, slope: Array) -> bool:
     left, size = np.abs(S.T @ z + slope), np.abs(S).T @ np.abs(z) + np.abs(slope)
     return bool((left <= CANCELLED * size.max(initial=0.0)).all())

@@ -133,7 +133,8 @@ class Branching:
             amount, magnitude = farkas_margin(finite, y, mu, z)
             if amount > IMPOSSIBLE * max(1.0, magnitude):
                 size = float(y @ np.linalg.norm(finite.G, axis=1) + np.abs(mu) @ np.linalg.norm(finite.A, axis=1))
-                self.nodes[number] = Leaf(self._told(y / size, mu / size, z, amount), feasible=False)
+                z = None if z is None else z / size
+                self.nodes[number] = Leaf(self._told(finite, y / size, mu / size, z, amount, False), feasible=False)
                 self.parts[number] = replace(self.parts[number], bound=np.inf, x=None)
                 return np.inf
             return max(self.parts[number].bound, 0.0)
@@ -145,14 +146,18 @@ class Branching:
         bound += certain - self.relaxed.rounding(finite, y, mu, corner.x)
         part = self.parts[number]
         if bound > part.bound:
-            self.nodes[number] = Leaf(self._told(y, mu, z, bound))
+            self.nodes[number] = Leaf(self._told(finite, y, mu, z, bound))
         self.parts[number] = replace(part, bound=max(bound, part.bound), x=corner.x)
         return self.parts[number].bound
 
-    def _told(self, y: Array, mu: Array, z: Array | None, bound: float) -> Dual:
-        """Multipliers in the unit of the cost, as every program tells them."""
+    def _told(
+        self, finite: FiniteProgram, y: Array, mu: Array, z: Array | None, bound: float, priced: bool = True
+    ) -> Dual:
+        """Multipliers of the ``finite`` program of a part in the unit of the cost, as every program tells them. The
+        linear cost of a part is not that of the whole program: ``z`` is made to meet its own."""
         unit, z = self.program.cost_unit, np.zeros(self.program.finite.weights.size) if z is None else z
-        return self.relaxed.dual(self.rows, y / unit, mu / unit, z / unit, bound / unit)
+        of = replace(finite, q=finite.q / unit, weights=finite.weights / unit)
+        return self.relaxed.dual(self.rows, y / unit, mu / unit, z / unit, bound / unit, priced=priced, of=of)
 
     def _bounds(self, number: int) -> tuple[Array, Array, np.ndarray]:
         """The bounds of all images in one part, and which count there whatever their value."""

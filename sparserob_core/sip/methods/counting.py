@@ -156,17 +156,29 @@ def tidied(program: SemiInfiniteProgram, x: Array) -> Array:
     return moved if count(program, moved) < count(program, x) else x
 
 
-def met(program: SemiInfiniteProgram, x: Array) -> Array:
-    """The decision ``x (n,)`` with its equalities met to rounding, by those entries alone that are neither 0 nor at a
-    bound; ``x`` itself where there is nothing to meet, or the image is not the decision."""
+def met(program: SemiInfiniteProgram, x: Array, G: Array, h: Array) -> Array:
+    """The decision ``x (n,)`` with its equalities, and the rows ``G x = h (r,)`` that an earlier one was held by, met
+    to rounding, by those entries alone that are neither 0 nor at a bound; ``x`` itself where there is nothing to meet.
+    Where entries were moved to 0, this is what they gave to rows at their limit, taken over by the others."""
     base = program.finite
-    if not base.b.size or base.S is not None:
+    if not base.b.size + h.size or (base.S is not None and x.size > LARGE):
         return x
     reach = np.where(np.isfinite(base.upper - base.lower), base.upper - base.lower, 1.0)
-    free = (np.abs(x) > DUST * reach) & (x > base.lower + DUST * reach) & (x < base.upper - DUST * reach)
-    moved = x.copy()
+    image, free, kept = base.image(x), np.ones(x.size, dtype=bool), np.zeros((0, x.size))
+    ends = (image <= base.lower + DUST * reach) | (image >= base.upper - DUST * reach)
+    if base.S is None:
+        free = (np.abs(x) > DUST * reach) & ~ends
+    else:
+        still = ends | ((image == 0.0) & (prices_of(program) > 0.0))
+        rows = base.S[np.flatnonzero(still)].toarray()
+        alone = np.count_nonzero(rows, axis=1) == 1
+        free[np.abs(rows[alone]).argmax(axis=1)], kept = False, rows[~alone]
+    columns, moved = np.vstack([base.A, G, kept])[:, free], x.copy()
+    sizes = np.linalg.norm(columns, axis=1)
+    sizes = np.where(sizes > 0.0, sizes, 1.0)[:, None]
     for _ in range(REFINED):
-        moved[free] -= np.linalg.lstsq(base.A[:, free], base.excess(moved), rcond=None)[0]
+        missed = np.concatenate([base.excess(moved), G @ moved - h, kept @ (moved - x)])
+        moved[free] -= np.linalg.lstsq(columns / sizes, missed / sizes[:, 0], rcond=None)[0]
     return moved
 
 

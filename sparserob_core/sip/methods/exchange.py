@@ -116,14 +116,15 @@ class Exchange(Method, Options):
             kept = (answer, found) if np.isfinite(suggested) else kept
 
             # Exchange: impose them, drop what has been idle; tighten the rows that are violated though imposed.
-            if not last and (working.exchange(answer, violated, number) or working.tighten(violated)):
+            # Sharpen: nothing is violated but the bounds have not met, so do without the regulariser.
+            exchanged = not last and (working.exchange(answer, violated, number) or working.tighten(violated))
+            if exchanged or (not last and self.exact and ledger.wide(x) and working.sharpen(ledger, x)):
                 continue
 
             # Sparsify: where solvers leave dust, or any optimum will do, one with zeros; it may ask for more rows.
-            # Sharpen: nothing is violated but the bounds have not met, so do without the regulariser.
             answer, found, asked = _sparser(working, ledger, answer, found, number)
-            x, sharper = answer.solution.x, self.exact and ledger.wide(answer.solution.x)
-            if not last and (working.exchange(answer, asked, number) or (sharper and working.sharpen(ledger, x))):
+            x = answer.solution.x
+            if not last and working.exchange(answer, asked, number):
                 continue
 
             # Prove: over the whole continuum; a witness that the proof meets is one more index to impose.
@@ -328,13 +329,14 @@ def _sparser(
     program, x = ledger.program, answer.solution.x
     if program.activity is None or ledger.open(x) or (number > SPARSIFYING and answer.epsilon == 0.0):
         return answer, found, ()
-    candidates = [met(program, tidied(program, x))]
+    held = working.rows.G[answer.multipliers > 0.0]
+    candidates = [met(program, tidied(program, x), held, held @ x)]
     if answer.epsilon == 0.0 and program.finite.P is None and program.blocks is None:
         rows = working.rows
         norms = np.linalg.norm(rows.G, axis=1)
         plain = ledger.relaxed.finite(rows.G, rows.h - working.margin * norms, 0.0)
         corner = vertex(plain, answer.solution.y, answer.solution.mu)
-        candidates += [] if corner is None else [met(program, tidied(program, corner))]
+        candidates += [] if corner is None else [met(program, tidied(program, corner), held, held @ corner)]
     kept, violated, least = (answer, found), list[tuple[Array, np.ndarray, str]](), count(program, x)
     for other in candidates:
         if other is x or count(program, other) >= least or not _fits(ledger, other):

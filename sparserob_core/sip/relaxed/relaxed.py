@@ -262,13 +262,15 @@ class RelaxedProgram:
         bound: float,
         at: Float[Array, " n"] | None = None,
         priced: bool = True,
+        of: FiniteProgram | None = None,
     ) -> Dual:
         """Multipliers of a program with these rows (and of its fixed rows, which come first in ``y``), as a record;
         ``at``: where a bound's quadratic terms are replaced by their tangent; ``priced``: with the cost, not as a proof
-        of infeasibility."""
+        of infeasibility; ``of``: the program that they are multipliers of, where it has another cost or other
+        bounds."""
         own = y[y.size - rows.h.size :]
         if self.program.finite.S is not None:
-            plain = self.finite(rows.G, rows.h, 0.0)
+            plain = self.finite(rows.G, rows.h, 0.0) if of is None else of
             plain = homogeneous(plain) if not priced else plain if at is None else plain.tangent(at)
             z = onto_stationary(plain, z, plain.q + y @ plain.G + mu @ plain.A)
         cuts = tuple(replace(cut, multiplier=float(m)) for cut, m in zip(rows.cuts, own, strict=True) if m > 0.0)
