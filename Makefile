@@ -25,7 +25,7 @@ endef
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help install demo live paper test tests test-slow lint style types bench docs docs-pictures clean
+.PHONY: help install demo live paper test tests test-slow mutants lint style types bench docs docs-pictures clean
 
 help:
 	@echo "make demo        solve the repaired experiment 1, print the bounds, draw the figures"
@@ -33,6 +33,7 @@ help:
 	@echo "make paper       every experiment and figure of the paper, and docs/paper.md (a few minutes)"
 	@echo "make test        lint, types, import rules, tests: the first stage, about six minutes on two processors"
 	@echo "make test-slow   the second stage: larger instances of what the first one tests"
+	@echo "make mutants     300 small errors in what proves and checks (COUNT=20 SEED=1 for fewer): which do the tests notice? (hours)"
 	@echo "make bench       time the certified solve, and solvers and maximisers beside other people's"
 	@echo "make docs        write the reference and the schema anew, and build the site (minutes, the first time)"
 	@echo "make docs-pictures  the pictures of docs/gallery.md and docs/live.md anew (minutes; needs a Vulkan driver, no display)"
@@ -91,6 +92,10 @@ tests: $(INSTALLED)
 
 test-slow: $(INSTALLED)
 	$(BIN)/python -m pytest -m slow --numprocesses 2 --dist worksteal -p no:cacheprovider
+
+# COUNT, SEED, FOLDERS=checker,sip/proof, STAGE=folder (not the whole first stage for what survives), JOBS.
+mutants: $(INSTALLED)
+	$(BIN)/python -m tests.mutants COUNT=$(COUNT) SEED=$(SEED) FOLDERS=$(FOLDERS) STAGE=$(STAGE) JOBS=$(JOBS)
 
 bench: $(PEERS)
 	$(BIN)/python -m pytest -m benchmark tests/benchmarks

@@ -1,0 +1,120 @@
+"""Guards checker/arithmetic/series: exponentials of series hold the exact ones, and what is left out of them is
+bounded."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import scipy.linalg
+from flint import arb, arb_mat, ctx
+
+from sparserob_core.checker.arithmetic.jets import Monomials
+from sparserob_core.checker.arithmetic.series import Series, _tail, norm
+
+
+def matrix(values):
+    return arb_mat([[arb(float(v)) for v in row] for row in np.atleast_2d(values)])
+
+
+@pytest.mark.parametrize("size", [0.1, 0.2, 0.249, 0.25, 0.4])
+@pytest.mark.parametrize("terms", [0, 1, 4, 8])
+def test_what_the_exponential_leaves_out_is_at_most_its_tail_and_not_much_less(size, terms):
+    with ctx.workprec(200):
+        missing = arb(size).exp() - sum((arb(size) ** k / arb(k).fac() for k in range(terms + 1)), arb(0))
+        bound = _tail(arb(size), terms)
+        assert missing < bound
+        assert bound < 2.0 * missing
+        assert _tail(arb(0.99), 0) > arb(0.99).exp() - 1
+
+
+def test_the_exponential_of_a_number_that_depends_on_a_parameter_is_held_to_all_digits():
+    """``exp((a + b delta) s)`` has the coefficients ``e^(a s) (b s)^k / k!``."""
+    known = Monomials(1, 6)
+    for a, b in ((0.3, 0.1), (-2.0, 0.7), (5.0, -3.0), (-40.0, 2.0)):
+        for precision in (64, 96, 160):
+            with ctx.workprec(precision):
+                parts = [matrix([[a]]), matrix([[b]]), *[matrix([[0.0]])] * 5]
+                found = [part[0, 0] for part in Series(known, parts).exp().parts]
+            with ctx.workprec(600):
+                for k, ball in enumerate(found):
+                    truth = arb(a).exp() * arb(b) ** k / arb(k).fac()
+                    assert ball.contains(truth.mid())
+                    # squaring back is exact but for rounding: relative to the first coefficient
+                    assert float(ball.rad()) < 2.0 ** (40 - precision) * math.exp(max(a, 0.0) + abs(b))
+
+
+def test_the_exponential_of_a_matrix_that_depends_on_two_parameters_is_that_at_each_of_them():
+    rng, known = np.random.default_rng(1), Monomials(2, 9)
+    A = rng.normal(size=(known.size, 3, 3)) * 0.02 ** np.array([sum(e) for e in known.exponents])[:, None, None]
+    A[3:] = 0.0
+    with ctx.workprec(96):
+        found = Series(known, [matrix(a) for a in A]).exp()
+        values = np.array([[[float(x.mid()) for x in row] for row in part.tolist()] for part in found.parts])
+    for delta in rng.uniform(-1, 1, size=(10, 2)):
+        powers = np.prod(delta[None] ** np.array(known.exponents), axis=1)
+        truth = scipy.linalg.expm(np.einsum("m,mij->ij", powers, A))
+        assert np.abs(np.einsum("m,mij->ij", powers, values) - truth).max() < 1e-12
+
+
+def test_coefficients_in_variables_that_do_not_appear_have_no_tail():
+    known = Monomials(2, 2)
+    with ctx.workprec(64):
+        parts = [matrix([[0.1]]), matrix([[0.0]]), matrix([[0.2]]), *[matrix([[0.0]])] * 3]
+        exponents = known.exponents
+        assert exponents[2] == (1, 0)
+        for e, part in zip(exponents, Series(known, parts).exp().parts, strict=True):
+            assert part[0, 0].is_zero() == (e[1] > 0)
+
+
+def test_an_exponential_that_is_too_large_is_no_number():
+    known = Monomials(1, 1)
+    with ctx.workprec(64):
+        parts = Series(known, [matrix([[1e19]]), matrix([[1.0]])]).exp().parts
+        assert not any(part[0, 0].is_finite() for part in parts)
+        assert Series(known, [matrix([[-1e9]]), matrix([[1.0]])]).exp().parts[0][0, 0].is_finite()
+
+
+def test_the_state_and_its_integral_are_those_of_a_constant_input():
+    rng = np.random.default_rng(2)
+    A, B, time = rng.normal(size=(3, 3)), rng.normal(size=(3, 2)), 0.8
+    known = Monomials(1, 3)
+    with ctx.workprec(96):
+        zeros = [matrix(np.zeros((3, 3)))] * 3, [matrix(np.zeros((3, 2)))] * 3
+        Phi, Gamma = Series(known, [matrix(A), *zeros[0]]).held(Series(known, [matrix(B), *zeros[1]]), arb(time))
+        plain = Series(Monomials(0, 0), [matrix(A)]).held(Series(Monomials(0, 0), [matrix(B)]), arb(time))
+    for found in ((Phi, Gamma), plain):
+        values = [np.array([[float(x.mid()) for x in row] for row in one.parts[0].tolist()]) for one in found]
+        assert values[0] == pytest.approx(scipy.linalg.expm(A * time), abs=1e-12)
+        assert values[1] == pytest.approx(np.linalg.solve(A, values[0] - np.eye(3)) @ B, abs=1e-11)
+    assert all(x.contains(0) for part in (*Phi.parts[1:], *Gamma.parts[1:]) for x in part.entries())
+
+
+def test_products_and_sums_of_series_are_those_of_polynomials():
+    rng, known = np.random.default_rng(3), Monomials(2, 2)
+    A, B = rng.normal(size=(2, known.size, 2, 2))
+    A[1] = 0.0
+    with ctx.workprec(96):
+        left, right = (Series(known, [matrix(m) for m in one]) for one in (A, B))
+        product, total = left * right, left + right
+        scaled, applied = left.scaled(arb(-0.5)), left.applied(matrix(B[0]))
+        truth = np.zeros_like(A)
+        for i, j, k in known.products:
+            truth[k] += A[i] @ B[j]
+        for one, expected in ((product, truth), (total, A + B), (scaled, -A / 2), (applied, A @ B[0])):
+            values = np.array([[[float(x.mid()) for x in row] for row in part.tolist()] for part in one.parts])
+            assert values == pytest.approx(expected, abs=1e-14)
+        size = left.size()
+    sizes = [float(np.linalg.norm(a)) for a in A]
+    assert float(size.mid()) == pytest.approx(sum(sizes))
+    assert size.is_exact() or float(size.lower()) >= sum(sizes) * (1 - 1e-15)
+
+
+def test_the_norm_of_a_ball_matrix_holds_frobenius_norms():
+    values = np.array([[3.0, -4.0, 12.0], [0.0, 84.0, 1.0]])
+    with ctx.workprec(96):
+        assert abs(float(norm(matrix(values)).mid()) - np.linalg.norm(values)) < 1e-12
+        wide = arb_mat([[arb(1, 0.5), arb(0, 0.25)]])
+        assert norm(wide).contains(arb(1.5**2 + 0.25**2).sqrt().mid()) and norm(wide).contains(0.5)
+        assert norm(matrix(np.zeros((2, 2)))) == 0
