@@ -19,7 +19,6 @@ from sparserob_core.checker.arithmetic.balls import difference
 from sparserob_core.checker.arithmetic.bernstein import highest
 from sparserob_core.checker.arithmetic.jets import Monomials, expanded
 from sparserob_core.checker.arithmetic.series import Series
-from sparserob_core.checker.arithmetic.subdivision import fill
 from sparserob_core.checker.claims.cells import _to_blame
 from sparserob_core.checker.claims.duality import Duality
 from sparserob_core.checker.outcome import Broken, Unchecked
@@ -531,52 +530,6 @@ def test_a_singularity_on_a_cell_is_left_unchecked(text):
     )
     with ctx.workprec(96), pytest.raises(Unchecked):
         expanded(system, Monomials(1, 2), [arb(0.1, 0.2)], [0.2])
-
-
-def cells(rows):
-    return tuple(np.array(corner, dtype=float) for corner in zip(*rows, strict=True))
-
-
-def test_cells_that_fill_a_box_are_accepted():
-    low, high = np.zeros(2), np.array([1.0, 3.0])
-    fill(*cells([([0, 0], [1, 3])]), low, high)
-    fill(*cells([([0, 0], [0.3, 3]), ([0.3, 0], [1, 1]), ([0.3, 1], [1, 3])]), low, high)
-    fill(*cells([([0.5], [0.5])]), np.array([0.5]), np.array([0.5]))
-    fill(*cells([([-0.0, 0.5], [1, 0.5])]), np.array([0.0, 0.5]), np.array([1.0, 0.5]))
-
-
-@pytest.mark.parametrize(
-    "rows",
-    [
-        [([0, 0], [1, 1.5])],
-        [([0, 0], [0.5, 3]), ([np.nextafter(0.5, 1), 0], [1, 3])],
-        [([0, 0], [np.nextafter(0.5, 1), 3]), ([0.5, 0], [1, 3])],
-        [([0, 0], [1, 3]), ([0, 0], [1, 3])],
-        [([0, 0], [1, 3]), ([0.2, 0], [0.2, 3])],
-        [([0, 0], [1, 4])],
-        [([0, 0], [1, np.nan])],
-        [([0, 0], [np.inf, 3])],
-        [([1, 3], [0, 0])],
-        [([0, 0], [0, 3]), ([1, 0], [1, 3])],
-        [([0], [1])],
-    ],
-    ids=[
-        "half",
-        "a hole",
-        "an overlap",
-        "twice",
-        "flat inside",
-        "outside",
-        "nan",
-        "infinite",
-        "turned",
-        "flat only",
-        "narrow",
-    ],
-)
-def test_holes_and_overlaps_are_refused(rows):
-    with pytest.raises(Broken):
-        fill(*cells(rows), np.zeros(2), np.array([1.0, 3.0]))
 
 
 def test_the_remainder_is_as_small_as_the_last_coefficients_of_the_state():

@@ -71,5 +71,7 @@ def test_a_limit_just_above_the_highest_value_is_shown_and_one_just_below_never(
             assert highest(p, symmetric, np.zeros(1), limit)[0] <= limit
         for limit in (1.0 - 1e-9, 1.0 - 1e-4):
             assert highest(p, symmetric, np.zeros(1), limit)[0] >= 1.0
+        assert highest(p, symmetric, np.array([0.1]), 1.1 + 1e-6)[0] <= 1.1 + 1e-6
+        assert highest(p, symmetric, np.array([0.1]), 1.1 - 1e-6)[0] >= 1.1
     both = np.concatenate([one, one + np.array([[0.5, 0.0, 0.0]])])
     assert (highest(both, [False], np.zeros(2), 1.0 + 1e-6) <= 1.0 + 1e-6).tolist() == [True, False]

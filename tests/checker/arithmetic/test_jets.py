@@ -88,3 +88,15 @@ def test_a_small_power_of_what_is_not_positive_is_a_product_and_text_is_no_numbe
             p**1.5
         with pytest.raises(Unchecked):
             p + "1"
+
+
+def test_a_function_that_is_no_arithmetic_is_left_unchecked():
+    def rounded(p):
+        return np.array([[float(p[0])]])
+
+    system = LinearSystem(
+        lambda p: np.array([[p[0] * 1.0]]), np.array([[1.0]]), parameters=Box(np.array([0.6]), np.array([0.8]))
+    )
+    object.__setattr__(system, "A", rounded)
+    with ctx.workprec(96), pytest.raises(Unchecked):
+        expanded(system, Monomials(1, 2), [arb(0.7)], [0.1])

@@ -1,0 +1,238 @@
+"""Guards checker/reach, closed loops: heights hold the worst case of a loop that is stepped and measured elsewhere, and
+what a cell adds to its chord is what its curvature owes, in balls."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from flint import arb, ctx
+from scipy.linalg import expm
+
+from sparserob_core.checker.outcome import TOLERANCE, Broken
+from sparserob_core.checker.reach.closed_loop import ClosedLoop
+from sparserob_core.checker.reach.directions import Directions
+from sparserob_core.checker.reach.measurable import MeasurableLoop
+from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.polynomials import Enclosed
+from sparserob_core.control.sets.sets import Ellipsoid
+from tests.support.closed_loops import EXACT, LOOPS, MEASURABLE, gains
+
+H = np.array([[1.0, 0.0], [0.0, -1.0], [0.6, 0.8], [-1.0, 0.3]])
+
+
+@cache
+def made(name):
+    """The loop in balls, and the one that is stepped, with its control and gains."""
+    case = LOOPS[name]
+    v, M = gains(np.random.default_rng(3), case)
+    kind = MeasurableLoop if case.measurable else ClosedLoop
+    loop = kind(
+        case.system,
+        case.start.tolist(),
+        v,
+        M,
+        case.grid.tolist(),
+        case.breakpoints.tolist(),
+        case.changes[:-1].tolist(),
+        case.bound,
+        case.begun,
+    )
+    return case, loop, v, M
+
+
+def table(matrix):
+    return np.array([[float(x.mid()) for x in row] for row in matrix.tolist()])
+
+
+def places(case):
+    """Times with the pieces that they are in: ends, and within."""
+    for piece, (a, b) in enumerate(zip(case.grid[:-1], case.grid[1:], strict=True)):
+        for share in (0.0, 0.3, 0.85, 1.0):
+            yield piece, float(b) if share == 1.0 else float(a + share * (b - a))
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_the_state_in_balls_is_that_of_a_loop_that_measures(name):
+    case, loop, v, M = made(name)
+    times = np.array([time for _, time in places(case)])
+    states, _, controls = case.states(v, M, times)
+    with ctx.workprec(96):
+        for (piece, time), truth in zip(places(case), states, strict=True):
+            found = loop.state(piece, time)
+            assert table(found) == pytest.approx(truth, abs=1e-10)
+            assert max(float(x.rad()) for x in found.entries()) < 1e-22
+            heights = loop.highest(piece, time, H)
+            assert [float(h.mid()) for h in heights] == pytest.approx(case.height(H @ truth).tolist(), abs=1e-10)
+        for k, truth in enumerate(controls):
+            assert table(loop.acting(k)) == pytest.approx(truth, abs=1e-10)
+        assert (loop.radii >= case.radii).all()
+        assert loop.radii == pytest.approx(
+            np.concatenate([np.zeros(0), *(np.array(known(s).radius) + np.abs(m) for s, m in case.sets)]), rel=1e-9
+        )
+        assert [loop.on(piece) for piece in range(case.grid.size - 1)] == [
+            int(np.searchsorted(case.breakpoints, t)) - 1 for t in (case.grid[:-1] + case.grid[1:]) / 2
+        ]
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_what_a_cell_adds_is_an_eighth_of_its_square_times_the_curvature_of_all_that_deviates(name):
+    """No less than sampled second derivatives say, on long cells too; hardly more on short ones."""
+    case, loop, v, M = made(name)
+    rng = np.random.default_rng(2)
+    sizes = np.concatenate([[1.0], loop.radii])
+    with ctx.workprec(96):
+        for piece, (a, b) in enumerate(zip(case.grid[:-1].tolist(), case.grid[1:].tolist(), strict=True)):
+            for share in (1.0, 0.6, 0.1, 0.004):
+                low = float(a + rng.uniform(0.0, 1.0 - share) * (b - a))
+                high = float(b if share == 1.0 else low + share * (b - a))
+                bent = loop.bent(piece, low, high, H)
+                times = low + np.linspace(0.0, 1.0 - 1e-12, 31) * (high - low)
+                _, rates, _ = case.states(v, M, times)
+                owed = (high - low) ** 2 / 8.0 * (np.abs(H @ case.A @ rates).max(axis=0) @ sizes)
+                assert (bent >= owed * (1.0 - 1e-9)).all()
+                if np.linalg.norm(case.A, 2) * (high - low) < 0.05:
+                    assert (bent <= 1.1 * owed + 1e-12).all()
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_no_time_of_a_cell_is_above_its_chord_by_more_than_that(name):
+    case, loop, v, M = made(name)
+    rng = np.random.default_rng(5)
+    with ctx.workprec(96):
+        for piece, (a, b) in enumerate(zip(case.grid[:-1].tolist(), case.grid[1:].tolist(), strict=True)):
+            low, high = sorted(rng.uniform(a, b, size=2).tolist())
+            ends = np.array([[float(h.upper()) for h in loop.highest(piece, t, H)] for t in (low, high)])
+            share = np.linspace(0.0, 1.0 - 1e-12, 31)
+            states, _, _ = case.states(v, M, low + share * (high - low))
+            over = case.height(H @ states) - ((1.0 - share)[:, None] * ends[0] + share[:, None] * ends[1])
+            assert (over.max(axis=0) <= loop.bent(piece, low, high, H) + 1e-12).all()
+
+
+@pytest.mark.parametrize("name", MEASURABLE)
+def test_measurable_disturbances_reach_what_signals_that_jump_often_reach_and_little_more(name):
+    """A signal that jumps at given times only reaches less, by the square of how far these are apart."""
+    case, loop, v, M = made(name)
+    rng = np.random.default_rng(6)
+    with ctx.workprec(96):
+        for piece, (a, b) in enumerate(zip(case.grid[:-1].tolist(), case.grid[1:].tolist(), strict=True)):
+            for time in (a + (b - a) * 10 / case.fine, b) if piece in (0, case.grid.size - 2) else (b,):
+                truth = case.height(H @ case.states(v, M, np.array([time - 1e-13]))[0][0])
+                heights = loop.highest(piece, time, H)
+                assert all(float(h.upper()) >= t - 1e-9 for h, t in zip(heights, truth, strict=True))
+                assert all(float(h.lower()) <= t + 8.0 / case.fine**2 for h, t in zip(heights, truth, strict=True))
+                assert max(float(h.rad()) for h in heights) < 1e-10
+            low, high = sorted(rng.uniform(a, b, size=2).tolist())
+            bent = loop.bent(piece, low, high, H)
+            share = np.linspace(0.0, 1.0, 5)
+            values = np.array(
+                [[float(h.mid()) for h in loop.highest(piece, float(t), H)] for t in low + share * (high - low)]
+            )
+            over = values - ((1.0 - share)[:, None] * values[0] + share[:, None] * values[-1])
+            assert (over.max(axis=0) <= bent + 1e-12).all()
+            if np.linalg.norm(case.A, 2) * (high - low) < 0.5:
+                assert (bent <= 40.0 * (high - low) ** 2).all()
+
+
+@pytest.mark.parametrize("name", MEASURABLE)
+def test_the_integral_of_a_kernel_is_that_of_the_support_function(name):
+    """Against Gauss's rule on many parts, of which few hold a place where another corner becomes the best one."""
+    case, loop, *_ = made(name)
+    nodes, weights = np.polynomial.legendre.leggauss(3)
+    rng = np.random.default_rng(7)
+    a = rng.normal(size=(4, 2))
+    middle = case.bound.middle()
+    with ctx.workprec(96):
+        for piece in (0, len(case.grid) - 2):
+            length, kernel = float(case.grid[piece + 1] - case.grid[piece]), loop.kernel(piece)
+            for share in (1.0, 0.37):
+                found = kernel.most(Enclosed(a, np.zeros_like(a)), loop.sides, share)
+                wide = kernel.most(Enclosed(a, np.full_like(a, 1e-3)), loop.sides, share)
+                parts = 120
+                ends = np.linspace(0.0, share * length, parts + 1)
+                r = ((ends[:-1] + ends[1:])[:, None] / 2 + np.diff(ends)[:, None] / 2 * nodes).ravel()
+                w = (np.diff(ends)[:, None] / 2 * weights).ravel()
+                K = expm(case.A * r[:, None, None]) @ case.E
+                f = np.einsum("rdw,nd->nrw", K, a)
+                h = case.bound.support(f.reshape(-1, f.shape[2])).reshape(f.shape[:2]) - f @ middle
+                truth = h @ w
+                assert (np.abs(found.mid - truth) <= found.rad + 2e-5).all()
+                assert (found.rad < 1e-11).all()
+                for offset in 1e-3 * rng.uniform(-1, 1, size=(3, *a.shape)):
+                    moved = kernel.most(Enclosed(a + offset, np.zeros_like(a)), loop.sides, share)
+                    assert (moved.mid + moved.rad <= wide.mid + wide.rad + 1e-12).all()
+                    assert (moved.mid - moved.rad >= wide.mid - wide.rad - 1e-12).all()
+                assert (wide.rad < 0.1).all()
+            steep = kernel.steepest(a, loop.sides)
+            times = np.linspace(0.0, length, 60)
+            f = np.einsum("rdw,nd->nrw", expm(case.A * times[:, None, None]) @ case.E, a)
+            h = case.bound.support(f.reshape(-1, f.shape[2])).reshape(f.shape[:2]) - f @ middle
+            slopes = np.abs(np.diff(h, axis=1)).max(axis=1) / np.diff(times).min()
+            assert (slopes <= steep * (1 + 1e-9)).all()
+            assert (steep <= 40.0).all()
+
+
+@pytest.mark.parametrize("name", ["box", "ball and begun"])
+def test_a_curved_set_is_not_left_on_a_cell_by_more_than_the_corners_say(name):
+    """In any direction of the cell and at any time of it, in units of how far the set reaches."""
+    case, loop, v, M = made(name)
+    rng = np.random.default_rng(8)
+    source = Ellipsoid(np.array([0.1, -0.5]), np.array([[4.0, 1.0], [1.0, 40.0]]))
+    normals = np.array([[1.0, 0.2], [-0.3, 1.0]])
+    with ctx.workprec(96):
+        directions = Directions(loop, known(source), normals)
+        for piece, (a, b) in enumerate(zip(case.grid[:-1].tolist(), case.grid[1:].tolist(), strict=True)):
+            for width in (0.5, 0.02):
+                low = np.array([1.0, float(rng.uniform(-1, 1 - width))])
+                high = low + np.array([0.0, width])
+                start = float(a + rng.uniform(0, 0.5) * (b - a))
+                stop = start + width * (b - start)
+                over, slack, (late, wide) = directions.over(piece, start, stop, low, high)
+                times = start + np.linspace(0.0, 1.0 - 1e-12, 15) * (stop - start)
+                states, _, _ = case.states(v, M, times)
+                c = (low + np.linspace(0.0, 1.0, 15)[:, None] * (high - low)) @ normals
+                excess = case.height(np.einsum("rd,tdq->trq", c, states)) - source.support(c)
+                assert excess.max() <= over + 1e-12
+                assert (
+                    over <= excess.max() + late + 2.0 * wide + 2.0 * (stop - start) * 30.0 * width + 1e-9 or width > 0.1
+                )
+                assert 0.0 <= slack <= TOLERANCE * np.abs(c).sum() * 10.0
+                assert late >= 0.0 and wide >= 0.0
+
+
+def test_a_curved_set_that_is_left_for_certain_is_broken_and_one_that_moves_is_where_it_is():
+    case, loop, v, M = made("box")
+    states, _, _ = case.states(v, M, np.array([0.25, 0.3]))
+    reach = float(np.abs(case.height(np.vstack([np.eye(2), -np.eye(2)]) @ states)).max())
+    low, high = np.array([1.0, -0.2]), np.array([1.0, 0.2])
+    with ctx.workprec(96):
+        small = known(Ellipsoid(states[0][:, 0] * 0.0, 0.01 * np.eye(2)))
+        with pytest.raises(Broken):
+            Directions(loop, small, np.eye(2)).over(0, 0.25, 0.3, -high, -low)
+        with pytest.raises(Broken):
+            Directions(loop, small, -np.eye(2)).over(0, 0.25, 0.3, low, high)
+        still = known(Ellipsoid(np.zeros(2), (2.0 * reach) ** 2 * np.eye(2)))
+        plain, *_ = Directions(loop, still, np.eye(2)).over(0, 0.25, 0.3, low, high)
+        moved, *_ = Directions(loop, still, np.eye(2), about=lambda time: [arb(0.5), arb(0)]).over(
+            0, 0.25, 0.3, low, high
+        )
+        assert moved == pytest.approx(plain - 0.5, abs=1e-9)
+
+
+def test_an_excess_of_a_set_is_judged_in_the_unit_of_how_far_it_reaches():
+    """A disc that the state leaves by ``5e-9`` of its radius is left for certain, one by ``5e-10`` is not."""
+    case, loop, v, M = made("box")
+    state = case.states(v, M, np.array([0.25]))[0]
+    height = case.height(np.array([[-1.0, 0.0]]) @ state)[0, 0]
+    z = np.array([-1.0, 0.0])
+    with ctx.workprec(96):
+        for share, left in ((5e-9, True), (2e-9, True), (5e-10, False), (-1e-9, False)):
+            radius = float(height) / (1.0 + share)
+            directions = Directions(loop, known(Ellipsoid(np.zeros(2), radius**2 * np.eye(2))), np.eye(2))
+            if left:
+                with pytest.raises(Broken):
+                    directions.over(0, 0.25, 0.25, z, z)
+            else:
+                over, slack, _ = directions.over(0, 0.25, 0.25, z, z)
+                assert over <= slack

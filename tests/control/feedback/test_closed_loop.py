@@ -1,0 +1,186 @@
+"""Guards control/feedback/closed_loop: the state and its responses are those of the loop as it is defined, and their
+enclosures over cells of time are above every time in them, by no more than a curvature owes."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+import sparserob_core as sr
+from sparserob_core.control.transcription.transcribe import prepare
+from tests.support.closed_loops import EXACT, LOOPS, MEASURABLE, Loop
+
+H = np.array([[1.0, 0.0], [0.0, -1.0], [0.6, 0.8], [-1.0, 0.3]])
+
+
+@cache
+def made(name):
+    """The loop of the package, a decision, and the loop that is stepped here with the gains of that decision."""
+    case = LOOPS[name]
+    model = prepare(case.problem, *case.grids, policy=sr.AffinePolicy())
+    loop = model.feedback.loop
+    rng = np.random.default_rng(1)
+    x = np.zeros(model.program.n)
+    x[: loop.nominal_size] = rng.uniform(-1, 1, size=loop.nominal_size)
+    answers = loop.answers.variables
+    x[loop.nominal_size : loop.nominal_size + answers] = 0.2 * rng.normal(size=answers)
+    return case, loop, x
+
+
+@cache
+def stepped(name):
+    """Dense times, the state with its responses and their rates there, and the controls."""
+    case, loop, x = made(name)
+    times = np.unique(np.concatenate([np.linspace(0.0, 2.0, 401), case.grid]))
+    return times, *case.states(loop.nominal(x), loop.gains(x), times)
+
+
+def cells(case: Loop, widths=(1.0, 0.3, 0.01)):
+    """Cells of several widths, each within a piece of the grid."""
+    rng, found = np.random.default_rng(2), []
+    for start, stop in zip(case.grid[:-1], case.grid[1:], strict=True):
+        for share in widths:
+            low = start + rng.uniform(0.0, 1.0 - share) * (stop - start)
+            found.append((low, low + share * (stop - start)))
+    return np.array(found).T
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_the_state_and_every_response_are_those_of_a_loop_that_measures(name):
+    case, loop, x = made(name)
+    times, states, _, controls = stepped(name)
+    assert loop.states(x, times) == pytest.approx(states, abs=1e-9)
+    assert loop.controls(x) == pytest.approx(controls, abs=1e-9)
+    assert loop.values(x, times, H) == pytest.approx(case.height(H @ states), abs=1e-9)
+    deviation = loop.worst(x, float(times[250]), H[2])
+    along = H[2] @ states[250]
+    assert along[0] + along[1:] @ deviation == pytest.approx(case.height(along), abs=1e-9)
+    assert loop.spread.radii == pytest.approx(case.radii, rel=1e-12)
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_bounds_over_cells_are_above_every_time_in_them(name):
+    case, loop, x = made(name)
+    lower, upper = cells(case)
+    bounds, _ = loop.bounded(x, lower, upper, H)
+    assert (bounds == loop.bounds(x, lower, upper, H)).all()
+    times = lower[:, None] + np.linspace(0.0, 1.0 - 1e-12, 41) * (upper - lower)[:, None]
+    states = case.states(loop.nominal(x), loop.gains(x), times.ravel())[0]
+    heights = case.height(H @ states).reshape(*times.shape, -1)
+    assert (heights.max(axis=1) <= bounds + 1e-12).all()
+    narrow = (upper - lower) <= 0.0101
+    assert (bounds - heights.max(axis=1))[narrow].max() < 0.02
+    # at a point nothing is added but rounding
+    inside = (case.grid[:-1] + case.grid[1:]) / 2
+    points = loop.bounds(x, inside, inside, H)
+    states = case.states(loop.nominal(x), loop.gains(x), inside)[0]
+    assert points == pytest.approx(case.height(H @ states), abs=1e-10)
+    assert (points >= case.height(H @ states) - 1e-14).all()
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_what_a_cell_adds_to_its_chord_is_an_eighth_of_its_square_times_the_curvature(name):
+    """At least the largest second derivative of everything that deviates, sampled; at most little more on short
+    cells, and no less on cells on which the expansion does not converge at once."""
+    case, loop, x = made(name)
+    lower, upper = cells(case, (1.0, 0.6, 0.1, 0.005))
+    _, late = loop.bounded(x, lower, upper, H)
+    h = upper - lower
+    times = lower[:, None] + np.linspace(0.0, 1.0 - 1e-12, 41) * h[:, None]
+    rates = case.states(loop.nominal(x), loop.gains(x), times.ravel())[1]
+    second = np.abs(H @ case.A @ rates).reshape(*times.shape, len(H), -1).max(axis=1)
+    owed = (h**2 / 8.0)[:, None] * (second @ np.concatenate([[1.0], case.radii]))
+    assert (late >= owed * (1.0 - 1e-9)).all()
+    short = np.linalg.norm(case.A, 2) * h < 0.05
+    assert short.any()
+    assert (late[short] <= 1.1 * owed[short] + 1e-12).all()
+
+
+def test_a_bound_is_reached_where_the_curvature_is_constant():
+    """The double integrator between two breakpoints, in the direction in which both ends of a cell are level: a
+    parabola, whose peak is its chord and ``h^2/8`` of its acceleration."""
+    _, loop, x = made("begun")
+    x = x.copy()
+    x[loop.nominal_size :] = 0.0
+    x[: loop.nominal_size] = [-3.0, -2.0, -1.0]
+    for low, high in ((0.1, 0.6), (0.8, 1.2), (1.4, 1.9)):
+        times = np.linspace(low, high, 1001)
+        states = loop.states(x, times)[..., 0]
+        fall = (states[-1, 0] - states[0, 0]) / (states[-1, 1] - states[0, 1])
+        row = np.array([[1.0, -fall]])
+        still = loop.scaled(1e-12) if loop.scales else loop
+        (bound,) = still.bounds(x, np.array([low]), np.array([high]), row)[0]
+        assert states[0] @ row[0] == pytest.approx(states[-1] @ row[0])
+        assert bound == pytest.approx((states @ row[0]).max(), abs=1e-6)
+        assert bound >= (states @ row[0]).max() - 1e-13
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_what_stands_beside_the_state_is_added_at_both_ends(name):
+    case, loop, x = made(name)
+    lower, upper = cells(case, (0.7, 0.05))
+    rng, size = np.random.default_rng(4), 1 + loop.spread.size
+    whole = rng.normal(size=(2, lower.size, len(H), size))
+    for beside in (whole, whole[..., :1]):
+        bounds, late = loop.bounded(x, lower, upper, H, (beside[0], beside[1]))
+        share = np.linspace(0.0, 1.0 - 1e-12, 21)
+        times = lower[:, None] + share * (upper - lower)[:, None]
+        along = H @ case.states(loop.nominal(x), loop.gains(x), times.ravel())[0]
+        along = along.reshape(*times.shape, len(H), size)
+        more = beside[0][:, None] + share[:, None, None] * (beside[1] - beside[0])[:, None]
+        along[..., : more.shape[-1]] += more
+        heights = case.height(along)
+        assert (heights.max(axis=1) <= bounds + 1e-12).all()
+        assert (bounds <= np.maximum(heights[:, 0], heights[:, -1]) + late + 1e-9).all()
+        assert (late == loop.bounded(x, lower, upper, H)[1]).all()
+
+
+@pytest.mark.parametrize("name", MEASURABLE)
+def test_bounds_of_measurable_disturbances_are_above_those_that_jump_often_and_near_them(name):
+    case, loop, x = made(name)
+    times = np.concatenate([np.linspace(a, b, 5)[1:] for a, b in zip(case.grid[:-1], case.grid[1:], strict=True)])
+    states = case.states(loop.nominal(x), loop.gains(x), times - 1e-13)[0]
+    sampled = case.height(H @ states)
+    exact = loop.values(x, times, H)
+    # a signal that jumps at other times only reaches less, by the square of the distance of its jumps
+    assert (sampled <= exact + 1e-9).all()
+    assert (exact <= sampled + 5.0 / case.fine**2 + 1e-6).all()
+    lower, upper = cells(case)
+    bounds, _ = loop.bounded(x, lower, upper, H)
+    dense = lower[:, None] + np.linspace(1e-9, 1.0 - 1e-9, 21) * (upper - lower)[:, None]
+    heights = loop.values(x, dense.ravel(), H).reshape(*dense.shape, -1)
+    assert (heights.max(axis=1) <= bounds + 1e-12).all()
+    narrow = (upper - lower) <= 0.0101
+    assert (bounds - heights.max(axis=1))[narrow].max() < 0.02
+
+
+@pytest.mark.parametrize("name", MEASURABLE)
+def test_a_bound_of_what_a_piece_adds_is_above_its_chord_by_what_its_slope_owes(name):
+    """What a measurable disturbance adds within a piece is an integral whose integrand is Lipschitz."""
+    case, loop, _ = made(name)
+    lower, upper = cells(case, (1.0, 0.5, 0.1))
+    pieces = loop.functionals.response.grid.locate((lower + upper) / 2)
+    allowed = loop.measurable.allowance(lower, upper, H, pieces)
+    share = np.linspace(0.0, 1.0, 41)
+    for i, piece in enumerate(pieces):
+        times = lower[i] + share * (upper[i] - lower[i])
+        within = loop.measurable.within(times, H, np.full(times.size, piece))
+        over = within - ((1.0 - share)[:, None] * within[0] + share[:, None] * within[-1])
+        assert (over.max(axis=0) <= allowed[i] + 1e-15).all()
+        if np.linalg.norm(case.A, 2) * (upper[i] - lower[i]) < 1.0:
+            assert (allowed[i] <= 3.0 * (upper[i] - lower[i]) ** 2).all()
+
+
+def test_a_loop_whose_deviations_are_larger_is_that_loop_with_larger_sets():
+    _, loop, x = made("box")
+    times = np.linspace(0.0, 2.0, 9)
+    twice = loop.scaled(2.0)
+    assert loop.scales and not made("ball and begun")[1].scales
+    along = H @ loop.states(x, times)
+    assert twice.spread.radii == pytest.approx(2.0 * loop.spread.radii)
+    middle = along[..., 1:] @ loop.spread.middle
+    assert twice.spread.support(along[..., 1:]) == pytest.approx(
+        2.0 * loop.spread.support(along[..., 1:]) + 0.0 * middle
+    )

@@ -1,0 +1,186 @@
+"""Systems whose control answers what it measures, with random gains, and what their states do: stepped from breakpoint
+to breakpoint with matrix exponentials, the innovations measured as the policy defines them. Nothing of the package
+computes here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from scipy.linalg import expm
+
+import sparserob_core as sr
+from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.sets.sets import Box, ConvexSet, Ellipsoid, NormBall, Polytope
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """``x' = A x + B u + E w + c`` from ``start`` and a set of deviations ``begun``, under ``w`` in ``bound``, constant
+    between ``changes`` or ``measurable``; the control is constant between ``breakpoints``."""
+
+    A: np.ndarray
+    B: np.ndarray
+    E: np.ndarray
+    breakpoints: np.ndarray
+    changes: np.ndarray
+    start: np.ndarray
+    bound: ConvexSet | None = None
+    begun: ConvexSet | None = None
+    c: np.ndarray | None = None
+    measurable: bool = False
+    fine: int = 1
+    """Into how many parts a piece of the grid is cut here for a measurable disturbance."""
+
+    @property
+    def system(self) -> LinearSystem:
+        return LinearSystem(self.A, self.B, self.E, c=self.c)
+
+    @property
+    def problem(self) -> sr.OptimalControlProblem:
+        d, m = self.B.shape
+        return sr.OptimalControlProblem(
+            system=self.system,
+            horizon=float(self.breakpoints[-1]),
+            initial_state=self.start,
+            initial_set=self.begun,
+            control=Box(-9.0 * np.ones(m), 9.0 * np.ones(m)),
+            disturbance=self.bound,
+            disturbance_class="measurable" if self.measurable else "piecewise_constant",
+            terminal=[Box(-99.0 * np.ones(d), 99.0 * np.ones(d))],
+        )
+
+    @property
+    def grids(self) -> tuple[sr.Dictionary, sr.Dictionary]:
+        return sr.Dictionary.indicators(self.breakpoints), sr.Dictionary.indicators(self.changes)
+
+    @cached_property
+    def grid(self) -> np.ndarray:
+        """Every breakpoint."""
+        return np.unique(np.concatenate([self.breakpoints, self.changes]))
+
+    @cached_property
+    def jumps(self) -> np.ndarray:
+        """Where the disturbance is taken to jump."""
+        if not self.measurable:
+            return self.changes
+        return np.unique(np.concatenate([np.linspace(a, b, self.fine + 1) for a, b in pairwise(self.grid)]))
+
+    @cached_property
+    def sets(self) -> list[tuple[ConvexSet, np.ndarray]]:
+        """The set and the middle of every block of deviations."""
+        found = [] if self.bound is None else [(self.bound, self.bound.middle())] * (self.jumps.size - 1)
+        return found if self.begun is None else [*found, (self.begun, self.begun.middle())]
+
+    def _step(self, lengths: np.ndarray, X: np.ndarray, drive: np.ndarray) -> np.ndarray:
+        """``X`` after each of ``lengths (n,)`` under a constant drive, ``(n, d, 1 + Q)``."""
+        d = len(X)
+        table = np.block([[self.A, np.eye(d)], [np.zeros((d, 2 * d))]])
+        both = expm(table * np.atleast_1d(lengths)[:, None, None])
+        return both[:, :d, :d] @ X + both[:, :d, d:] @ drive
+
+    def states(self, v: np.ndarray, M: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The nominal state and every response at ``times (T,)``, ``(T, d, 1 + Q)``, what changes them then, of the
+        same shape, and the controls ``(K, m, 1 + Q)``."""
+        d, m = self.B.shape
+        width = 0 if self.bound is None else self.E.shape[1]
+        blocks = 0 if self.bound is None else self.jumps.size - 1
+        Q = blocks * width + (0 if self.begun is None else d)
+        middle = np.zeros(self.E.shape[1]) if self.bound is None else self.bound.middle()
+        X = np.zeros((d, 1 + Q))
+        X[:, 0] = self.start + (0.0 if self.begun is None else self.begun.middle())
+        if self.begun is not None:
+            X[:, 1 + blocks * width :] = np.eye(d)
+        still = self.E @ middle + (0.0 if self.c is None else np.asarray(self.c).ravel())
+        innovations = [np.hstack([np.zeros((d, 1)), X[:, 1:]])]
+        (found, rates), controls = np.zeros((2, times.size, d, 1 + Q)), []
+        marks = np.unique(np.concatenate([self.grid, self.jumps]))
+        for k, (begin, end) in enumerate(pairwise(self.breakpoints)):
+            U = np.zeros((m, 1 + Q))
+            U[:, 0] = v[:, k]
+            for j in range(k + 1):
+                U += M[k, j] @ innovations[j]
+            controls.append(U)
+            before = X
+            inside = marks[(marks >= begin) & (marks <= end)]
+            for a, b in pairwise(inside):
+                drive = self.B @ U
+                drive[:, 0] += still
+                if blocks:
+                    at = 1 + (np.searchsorted(self.jumps, (a + b) / 2) - 1) * width
+                    drive[:, at : at + width] += self.E
+                last = b == marks[-1]
+                here = np.flatnonzero((times >= a) & ((times <= b) if last else (times < b)))
+                after = self._step(np.append(times[here] - a, b - a), X, drive)
+                found[here], rates[here] = after[:-1], self.A @ after[:-1] + drive
+                X = after[-1]
+            guess = self.B @ U
+            guess[:, 0] += still
+            innovations.append(X - self._step(np.array([end - begin]), before, guess)[0])
+        return found, rates, np.array(controls)
+
+    def height(self, along: np.ndarray) -> np.ndarray:
+        """The largest ``a_0 + a'z`` over all deviations, for ``(..., 1 + Q)``."""
+        total, at = along[..., 0].copy(), 1
+        for shape, middle in self.sets:
+            block = along[..., at : at + shape.dimension]
+            total += shape.support(block.reshape(-1, shape.dimension)).reshape(total.shape) - block @ middle
+            at += shape.dimension
+        return total
+
+    @cached_property
+    def radii(self) -> np.ndarray:
+        """How far every entry of a deviation comes from its middle, ``(Q,)``."""
+        far = []
+        for shape, middle in self.sets:
+            axes = np.eye(shape.dimension)
+            far.append(np.maximum(shape.support(axes) - middle, shape.support(-axes) + middle))
+        return np.concatenate([np.zeros(0), *far])
+
+
+def gains(rng: np.random.Generator, loop: Loop, size: float = 0.4) -> tuple[np.ndarray, np.ndarray]:
+    """A random nominal control ``(m, K)`` and gains ``(K, K, m, d)`` that know the past only."""
+    d, m = loop.B.shape
+    K = loop.breakpoints.size - 1
+    M = size * rng.normal(size=(K, K, m, d))
+    M[np.triu_indices(K, 1)] = 0.0
+    return rng.uniform(-1, 1, size=(m, K)), M
+
+
+SLOW = np.array([[0.0, 1.0], [-2.0, -0.3]])
+FAST = np.array([[0.0, 5.0], [-5.0, -0.1]])
+FORCE = np.array([[0.0], [1.0]])
+GUST = np.array([[0.3, 0.0], [1.0, -0.5]])
+TRIANGLE = Polytope(np.array([[1.0, 1.0], [-1.0, 0.0], [0.0, -1.0]]), np.array([0.2, 0.1, 0.05]))
+LOOPS = {
+    "box": Loop(
+        SLOW, FORCE, GUST, np.array([0.0, 0.5, 0.7, 1.5, 2.0]), np.array([0.0, 0.4, 1.0, 2.0]), np.array([-1.0, 0.5]),
+        Box(np.array([-0.1, 0.0]), np.array([0.2, 0.1])),
+    ),
+    "ball and begun": Loop(
+        SLOW, np.eye(2), GUST, np.linspace(0.0, 2.0, 4), np.linspace(0.0, 2.0, 4), np.array([-1.0, 0.5]),
+        NormBall(p=2.0, radius=0.2, centre=np.array([0.1, 0.0])),
+        Ellipsoid(np.zeros(2), np.array([[0.02, 0.01], [0.01, 0.03]])), c=np.array([0.1, -9.81]),
+    ),
+    "fast": Loop(
+        FAST, FORCE, GUST, np.array([0.0, 1.0, 2.0]), np.array([0.0, 1.0, 2.0]), np.array([1.0, 0.0]), TRIANGLE,
+        Box(np.array([-0.1, -0.05]), np.array([0.05, 0.1])),
+    ),
+    "begun": Loop(
+        np.array([[0.0, 1.0], [0.0, 0.0]]), FORCE, FORCE, np.linspace(0.0, 2.0, 4), np.linspace(0.0, 2.0, 4),
+        np.array([-1.0, 0.5]), None, TRIANGLE,
+    ),
+    "measurable": Loop(
+        SLOW, FORCE, GUST, np.array([0.0, 0.5, 0.7, 1.5, 2.0]), np.array([0.0, 2.0]), np.array([-1.0, 0.5]),
+        Box(np.array([-0.1, 0.0]), np.array([0.2, 0.1])), Box(np.array([-0.1, -0.05]), np.array([0.05, 0.1])),
+        measurable=True, fine=20,
+    ),
+    "measurable in a triangle": Loop(
+        FAST, FORCE, GUST, np.array([0.0, 1.0, 2.0]), np.array([0.0, 2.0]), np.array([1.0, 0.0]), TRIANGLE,
+        measurable=True, fine=40,
+    ),
+}  # fmt: skip
+EXACT = [name for name, loop in LOOPS.items() if not loop.measurable]
+MEASURABLE = [name for name, loop in LOOPS.items() if loop.measurable]
