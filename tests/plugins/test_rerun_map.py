@@ -35,24 +35,23 @@ SMALL = {
 
 @pytest.mark.parametrize("config", ["experiment1_literal.yaml", "experiment1_reduced.yaml"])
 def test_every_evaluated_tuple_says_which_indices_have_the_largest_multipliers(config: str) -> None:
-    from sparserob_rerun.search.projection import Projection, Projector
+    from sparserob_rerun.recording.outlet import joined
+    from sparserob_rerun.search.projection import Projector
 
     heard = Heard()
     sr.run(CONFIGS / config, SMALL, None, quiet=True, figures=False, observers=[heard])
     g = _g(config)
-    projector, parts, tuples, values = Projector(), [], [], []
+    tuples, values = [], []
     for event in heard.events:
         assert event.coordinates == (0,) and event.deciding.shape == (event.count, 4)
-        small, projection = projector.small(event)
-        assert small.batch.trace.points.size == 0 and small.batch.trace.values.size == event.count
-        parts.append(projection)
         points = np.concatenate(list(event.batch.points)).reshape(event.count, 5, -1)
         for row, slots in enumerate(points):
             values.append(g.at(slots))
             assert event.deciding[row].tolist() == g.deciding().tolist()
             tuples.append(slots)
         assert np.abs(event.batch.trace.values - values[-event.count :]).max() < 1e-7
-    whole = Projection.joined(parts)
+    small, whole = Projector().small(joined(heard.events))
+    assert small.batch.trace.points.size == 0 and small.batch.trace.values.size == small.count == 80
     assert whole.places.shape == (80, 2, 1) and whole.coordinates == (0,)
     rows = np.arange(80)
     assert (whole.places[:, 0, 0] == np.array(tuples)[rows, whole.slots[:, 0], 0]).all()

@@ -13,18 +13,19 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.abc import MetaPathFinder
+from multiprocessing.connection import Connection
 from typing import Any, final
 
 import sparserob_core as sr
+from sparserob_rerun.recording.channel import Receiver
+from sparserob_rerun.recording.guard import ENDING, Guard, broken, within
 from sparserob_rerun.recording.layout import layout
 from sparserob_rerun.recording.recorder import Opening, Recorder, shown_of
-from sparserob_rerun.recording.sinks import Destinations, Started, open_sinks, servers, start
+from sparserob_rerun.recording.sinks import Destinations, Started, servers, sinks_of, start
 from sparserob_rerun.study.recorder import StudyOpening, StudyRecorder
 from sparserob_rerun.study.recorder import layout as study_layout
 
 IDLE = 0.5  # seconds between two looks at whether the run is still alive
-FLUSHED_EVERY = 1.0  # seconds
-FLUSHING = 5.0
 NICE = 5
 
 
@@ -48,12 +49,25 @@ class Account:
     addresses: list[str] = field(default_factory=list)
 
 
-def record(messages: Any, report: Any, opening: Opening | StudyOpening, chosen: Destinations, name: str) -> None:
-    """The whole life of the process. Nothing that it does can reach the run: neither its signals nor its failures."""
+def record(
+    pipe: Connection,
+    theirs: Connection | None,
+    room: Any,
+    report: Connection,
+    opening: Opening | StudyOpening,
+    chosen: Destinations,
+    name: str,
+) -> None:
+    """The whole life of the process. Nothing that it does can reach the run: neither its signals nor its failures.
+    ``theirs``: the run's end of the pipe, where this process has got a copy of it, with which it would keep itself
+    alive."""
+    if theirs is not None:
+        theirs.close()
+    messages = Receiver(pipe, room, os.getppid())
     _settle()
     account = Account()
     try:
-        account = Account(_record(messages, opening, chosen, name, os.getppid()))
+        account = _record(messages, opening, chosen, name)
     except Exception as error:  # noqa: BLE001  shown at the end, by the process that has a terminal
         account = Account(broke_off=f"the recording broke off: {type(error).__name__}: {error}")
     with suppress(OSError):
@@ -61,23 +75,30 @@ def record(messages: Any, report: Any, opening: Opening | StudyOpening, chosen: 
         report.close()
 
 
-def _record(messages: Any, opening: Opening | StudyOpening, chosen: Destinations, name: str, parent: int) -> list[str]:
-    started = start(chosen)
-    try:
-        return _recorded(messages, opening, chosen, name, parent, started)
-    finally:
+def _record(messages: Receiver, opening: Opening | StudyOpening, chosen: Destinations, name: str) -> Account:
+    started: Started = {}
+
+    def leave() -> None:
         for server in servers(chosen, started):
             server.terminate()
 
+    guard = Guard(chosen.save, lambda: messages.orphaned, leave)
+    try:
+        started.update(start(chosen))
+        return _recorded(messages, opening, chosen, name, started, guard)
+    finally:
+        leave()
+        guard.done()
+
 
 def _recorded(
-    messages: Any,
+    messages: Receiver,
     opening: Opening | StudyOpening,
     chosen: Destinations,
     name: str,
-    parent: int,
     started: Started,
-) -> list[str]:
+    guard: Guard,
+) -> Account:
     sys.meta_path.insert(0, _WithoutPandas())
     import rerun as rr
 
@@ -89,55 +110,52 @@ def _recorded(
         inspection = opening.answers()
         shown = shown_of(inspection, opening.landscape)
         begin, blueprint = partial(Recorder, rr, stream, opening, shown, inspection), layout(shown)
-    wrong = open_sinks(rr, stream, chosen, blueprint, started)
-    ending = Ending()
+    sinks, wrong = sinks_of(rr, chosen, started)
+    if sinks and not within(ENDING, partial(stream.set_sinks, *sinks, default_blueprint=blueprint)):
+        return Account(wrong, "nothing could be sent" if chosen.save is None else broken(chosen.save))
+    guard.open(stream, chosen.connect is None and not started)
+    ending, broke_off = Ending(), ""
     try:
         recorder = begin()
-        ending = _listen(messages, recorder, parent, wrong)
+        ending = _listen(messages, recorder, guard, wrong)
         if ending.dropped:
             recorder.say(f"{ending.dropped} events came faster than they could be recorded, and were dropped", "WARN")
         recorder.finish()
         wrong += recorder.broken.values()
-        stream.flush(timeout_sec=FLUSHING)
-    except RuntimeError as error:  # of the flush: a viewer that went away
-        wrong.append(f"not everything has arrived: {error}")
     finally:
-        stream.disconnect()
+        broke_off = guard.close()
         if servers(chosen, started):
-            _look_on(ending.keep, parent)
-    return wrong
+            _look_on(ending.keep, messages)
+    if guard.wrong and not broke_off:  # of the flush: a viewer that went away
+        wrong.append(f"not everything has arrived: {guard.wrong}")
+    return Account(wrong, broke_off)
 
 
-def _look_on(keep: float, parent: int) -> None:
+def _look_on(keep: float, messages: Receiver) -> None:
     """Let a browser look on for a while."""
     end = time.monotonic() + keep
-    while time.monotonic() < end and os.getppid() == parent:
+    while time.monotonic() < end and not messages.orphaned:
         time.sleep(IDLE)
 
 
-def _listen(messages: Any, recorder: Recorder | StudyRecorder, parent: int, wrong: list[str]) -> Ending:
-    """Log whatever comes until the run is over, or gone; an event that cannot be drawn is left out, and the first of
-    them is shown. What was logged is on the disk a second later."""
-    flushed = time.monotonic()
-    while True:
-        pause = min(IDLE, recorder.rest)
+def _listen(messages: Receiver, recorder: Recorder | StudyRecorder, guard: Guard, wrong: list[str]) -> Ending:
+    """Log whatever comes until the run is over, or gone, or nothing can be written any more; an event that cannot be
+    drawn is left out, and the first of them is shown."""
+    while not guard.lost:
         try:
-            message = messages.get(timeout=pause) if pause > 0.0 else messages.get_nowait()
+            message = messages.get(min(IDLE, recorder.rest))
         except queue.Empty:
             message = None
+        except EOFError:
+            return Ending()
         if isinstance(message, Ending):
             return message
-        if message is None and os.getppid() != parent:
-            return Ending()
         if message is not None:
-            recorder.behind = not messages.empty()
+            recorder.behind = not messages.empty
             _receive(message, recorder, wrong)
         if message is None or recorder.urgent:
             recorder.idle()
-        if time.monotonic() - flushed > FLUSHED_EVERY:
-            with suppress(RuntimeError):  # a viewer that went away is told of at the end
-                recorder.stream.flush(timeout_sec=FLUSHING)
-            flushed = time.monotonic()
+    return Ending()
 
 
 def _receive(message: Any, recorder: Recorder | StudyRecorder, wrong: list[str]) -> None:

@@ -16,14 +16,14 @@ from typing import Any, final
 import numpy as np
 
 import sparserob_core as sr
+from sparserob_rerun.recording.channel import Sender
 from sparserob_rerun.recording.desk import Account, Ending, record
 from sparserob_rerun.recording.recorder import Opening
 from sparserob_rerun.recording.sinks import Destinations
-from sparserob_rerun.search.projection import Projection, Projector
+from sparserob_rerun.search.projection import Projector
 from sparserob_rerun.study.recorder import StudyOpening
 
 CAPACITY = 512  # events that may wait
-COLLECTING = 0.4  # seconds for which evaluations are collected before they are sent
 LASTING = 10  # seconds that the last event may wait for its place in the queue
 CLOSING = 60.0  # seconds that the process may take to finish its files, beyond the patience of the landscape
 OVER = 600.0  # the same for a run that is over, and has nothing else to wait for
@@ -40,51 +40,34 @@ class Outlet:
         self.patience = 0.0 if landscape is None else landscape.patience
         self.file, self.incomplete = chosen.save, ""
         self.closing = OVER if opening.waits else CLOSING
-        self.dropped, self.dead = 0, False
-        self.pending: list[tuple[sr.EvaluationsFinished, Projection]] = []
-        self.since, self.projector = 0.0, Projector()
+        self.dropped, self.dead, self.projector = 0, False, Projector()
         self.waits = opening.waits
-        self.messages = context.Queue(capacity)
+        room, (reader, writer) = context.BoundedSemaphore(capacity), context.Pipe(duplex=False)
         self.report, theirs = context.Pipe(duplex=False)
         sent = opening
         if START != "fork" and isinstance(opening, Opening):
             sent = replace(opening, inspection=None)
         self.process = context.Process(
-            target=record, args=(self.messages, theirs, sent, chosen, uuid.uuid4().hex), daemon=True
+            target=record,
+            args=(reader, writer if START == "fork" else None, room, theirs, sent, chosen, uuid.uuid4().hex),
+            daemon=True,
         )
         with warnings.catch_warnings():
             # of a fork beside other threads: the child uses none of them
             warnings.simplefilter("ignore", DeprecationWarning)
             self.process.start()
-        theirs.close()
+        for end in (theirs, reader):
+            end.close()
+        self.sender = Sender(writer, room, follows, self._packed)
 
     def send(self, event: sr.Event) -> None:
         """Pass an event on, or drop it where too many are waiting already. Evaluations are collected for a moment."""
-        if isinstance(event, sr.EvaluationsFinished):
-            part = self.projector.small(event)
-            if self.pending and not follows(self.pending[-1][0], event):
-                self._flush()
-            if not self.pending:
-                self.since = time.monotonic()
-            self.pending.append(part)
-            if time.monotonic() - self.since < COLLECTING:
-                return
-            self._flush()
-        else:
-            self._flush()
-            self._put((event, None))
-
-    def _flush(self) -> None:
-        pending, self.pending = self.pending, []
-        if pending:
-            events, projections = zip(*pending, strict=True)
-            self._put((joined(events), Projection.joined(projections)))
-
-    def _put(self, message: tuple[sr.Event, Projection | None]) -> None:
-        last, tries = isinstance(message[0], sr.RunFinished | sr.SweepFinished), LASTING
-        while not self.dead:
+        if self.sender.add(event):
+            return
+        last, tries = isinstance(event, sr.RunFinished | sr.SweepFinished), LASTING
+        while not self.dead and not self.sender.broken:
             try:
-                self.messages.put(message, self.waits or last, 1.0)
+                self.sender.put(event, 1.0 if self.waits or last else 0.0)
                 return
             except queue.Full:
                 self.dead, tries = not self.process.is_alive(), tries - 1
@@ -92,11 +75,16 @@ class Outlet:
                     break
         self.dropped += 1
 
+    def _packed(self, events: list[Any]) -> Any:
+        """What is sent of successive events: of evaluated tuples only what is drawn."""
+        if isinstance(events[0], sr.EvaluationsFinished):
+            return self.projector.small(joined(events))
+        return events[0] if isinstance(events[0], Ending) else (events[0], None)
+
     def close(self, keep: float = 0.0) -> list[str]:
         """End the recording; returns what there is to complain about, and keeps in ``incomplete`` why the recording is
         not whole, if it is not. An interrupt ends the waiting, not more."""
         wrong = []
-        self._flush()
         try:
             wrong = self._closed(keep)
         except KeyboardInterrupt:
@@ -107,8 +95,8 @@ class Outlet:
             self.process.join(3.0)
             if self.process.is_alive():
                 self.process.kill()
-            self.messages.cancel_join_thread()
-            self.messages.close()
+            self.sender.close()
+        self.dropped += self.sender.lost
         if self.dropped and not self.incomplete:
             self.incomplete = f"{self.dropped} events came faster than they could be recorded, and were dropped"
         return [*([self.incomplete] if self.incomplete else []), *wrong]
@@ -117,9 +105,10 @@ class Outlet:
         end = time.monotonic() + self.patience + self.closing
         while self.process.is_alive() and time.monotonic() < end:
             with suppress(queue.Full):
-                self.messages.put(Ending(self.dropped, keep), timeout=0.2)
+                self.sender.put(Ending(self.dropped + self.sender.lost, keep), 0.2)
                 break
         while time.monotonic() < end + keep:
+            ended = not self.process.is_alive()  # before the look: its last word may come in between
             if self.report.poll(0.05):
                 with suppress(EOFError, OSError):
                     account = self.report.recv()
@@ -127,21 +116,27 @@ class Outlet:
                     if isinstance(account, Account):
                         self.incomplete = account.broke_off
                         return list(account.wrong)
-                break
+            elif not ended:
+                continue
+            break
         holds = f"; {self.file} holds what was recorded until then" if self.file is not None else ""
         why = "could not be finished in time" if self.process.is_alive() else "broke off: its process ended early"
         self.incomplete = f"the recording {why}{holds}"
         return []
 
 
-def follows(before: sr.EvaluationsFinished, event: sr.EvaluationsFinished) -> bool:
+def follows(before: Any, event: Any) -> bool:
     """Whether an event goes on where another one of the same search ended."""
+    if not isinstance(before, sr.EvaluationsFinished) or not isinstance(event, sr.EvaluationsFinished):
+        return False
     same = (event.family, event.round, event.phase) == (before.family, before.round, before.phase)
     return same and event.total - event.count == before.total
 
 
 def joined(parts: Sequence[sr.EvaluationsFinished]) -> sr.EvaluationsFinished:
     """Successive events of one search as one."""
+    if len(parts) == 1:
+        return parts[0]
     first, batches = parts[0].batch, [part.batch for part in parts]
     notes: dict[str, list[tuple[float, float]]] = {}
     for batch in batches:
@@ -151,4 +146,7 @@ def joined(parts: Sequence[sr.EvaluationsFinished]) -> sr.EvaluationsFinished:
     values = [np.concatenate(list(batch.values)) for batch in batches if len(batch.values)]
     moments = [moment for batch in batches for moment in batch.moments]
     whole = replace(first, points=points, values=values, moments=moments, notes=notes)
-    return replace(parts[-1], count=sum(part.count for part in parts), batch=whole)
+    sketches = {role: sketch for part in parts for role, sketch in part.sketches.items()}
+    deciding = np.concatenate([part.deciding for part in parts])
+    count = sum(part.count for part in parts)
+    return replace(parts[-1], count=count, batch=whole, sketches=sketches, deciding=deciding)

@@ -120,8 +120,8 @@ def servers(chosen: Destinations, started: Started) -> list[subprocess.Popen[byt
     return [process for port, process in started.items() if process is not None and port == chosen.serve]
 
 
-def open_sinks(rr: Any, stream: Any, chosen: Destinations, blueprint: Any, started: Started) -> list[str]:
-    """Send a stream to its destinations; returns what went wrong."""
+def sinks_of(rr: Any, chosen: Destinations, started: Started) -> tuple[list[Any], list[str]]:
+    """Where a stream is to be sent, and what went wrong."""
     sinks: list[Any] = [] if chosen.save is None else [rr.FileSink(str(chosen.save))]
     addresses, wrong = [] if chosen.connect is None else [chosen.connect], []
     for port, process in started.items():
@@ -130,9 +130,7 @@ def open_sinks(rr: Any, stream: Any, chosen: Destinations, blueprint: Any, start
         else:
             wrong.append("the viewer did not start")
     sinks += [rr.GrpcSink(f"rerun+http://{host}:{port}/proxy") for host, port in addresses]
-    if sinks:
-        stream.set_sinks(*sinks, default_blueprint=blueprint)
-    return wrong
+    return sinks, wrong
 
 
 def _unwritable(file: Path) -> str:

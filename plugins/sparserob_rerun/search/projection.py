@@ -53,23 +53,6 @@ class Projection:
     moves: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     sketches: Mapping[str, Outlines] = field(default_factory=dict)
 
-    @staticmethod
-    def joined(parts: Sequence[Projection]) -> Projection:
-        """Those of successive batches as one; of each role the last sketch counts."""
-        parts = [part for part in parts if len(part.slots)]
-        if not parts:
-            return Projection()
-        counts = np.cumsum([0, *(len(part.slots) for part in parts)])
-        shifts = np.outer(counts, [1.0, 0.0, 0.0])
-        moves = [part.moves + shift for shift, part in zip(shifts, parts, strict=False)]
-        return Projection(
-            parts[-1].coordinates,
-            np.concatenate([part.places for part in parts]),
-            np.concatenate([part.slots for part in parts]),
-            np.concatenate(moves),
-            {role: one for part in parts for role, one in part.sketches.items()},
-        )
-
 
 @final
 class Projector:

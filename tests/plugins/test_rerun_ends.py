@@ -1,0 +1,194 @@
+"""Guards the end of a recording: whoever dies, and whatever the disk does, the recorder ends, and the file is whole or
+is said not to be."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import resource
+import signal
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sparserob_core as sr
+from tests.support.recordings import read, texts
+
+pytest.importorskip("rerun", reason="a recording needs the extra rerun")
+pytest.importorskip("psutil", reason="a process that is gone is told from one that is not with psutil")
+
+from sparserob_rerun.recording.guard import broken
+from sparserob_rerun.recording.outlet import Outlet
+from sparserob_rerun.recording.recorder import Opening
+from sparserob_rerun.recording.sinks import Destinations
+
+pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the run is a fork of the test")
+
+ENDING = 2.0  # seconds that a recorder may take to end after its run was killed
+STARTING = 60.0  # seconds until the recorder has begun, on a busy machine
+FORK: Any = multiprocessing.get_context("fork")
+
+
+def opened(file: Path) -> Outlet:
+    return Outlet(Opening("a run", None, None, None), Destinations(file, None, False, None))
+
+
+def running(pid: int) -> bool:
+    import psutil
+
+    with suppress(psutil.NoSuchProcess):
+        return bool(psutil.Process(pid).status() != psutil.STATUS_ZOMBIE)
+    return False
+
+
+def proof(number: int) -> sr.ProofProgress:
+    return sr.ProofProgress(family=f"family{number}", cells=number, bound=0.5)
+
+
+def counts(file: Path, told: Connection) -> None:
+    """A run that sends an event every 50 ms, and tells when."""
+    outlet, number = opened(file), 0
+    told.send(outlet.process.pid)
+    while True:
+        outlet.send(proof(number))
+        told.send((number, time.monotonic()))
+        number += 1
+        time.sleep(0.05)
+
+
+def half(file: Path, told: Connection) -> None:
+    """A run that is killed in the middle of a message, and has another child that keeps the pipe open."""
+    outlet = opened(file)
+    beside = FORK.Process(target=time.sleep, args=(30.0,))
+    beside.start()
+    told.send(outlet.process.pid)
+    outlet.send(proof(0))
+    told.send((0, time.monotonic()))
+    time.sleep(0.7)
+    os.write(outlet.sender.pipe.fileno(), (1 << 20).to_bytes(4, "big") + b"not all of it")
+    told.send(beside.pid)
+    time.sleep(60.0)
+
+
+def started(run: Callable[[Path, Connection], None], file: Path) -> tuple[Any, Connection, int]:
+    """A run, what it tells, and the process that records it, which has begun to write."""
+    ours, theirs = FORK.Pipe(duplex=False)
+    process = FORK.Process(target=run, args=(file, theirs))
+    process.start()
+    recorder = ours.recv()
+    end = time.monotonic() + STARTING
+    while not (file.exists() and file.stat().st_size):
+        assert time.monotonic() < end and running(recorder)
+        time.sleep(0.02)
+    return process, ours, recorder
+
+
+def ended(recorder: int) -> float:
+    """Seconds until a process is gone."""
+    began = time.monotonic()
+    while running(recorder):
+        assert time.monotonic() - began < STARTING, "the recorder is still there"
+        time.sleep(0.02)
+    return time.monotonic() - began
+
+
+def slowness(seconds: float = 0.1) -> float:
+    """How many times as long as it takes by itself a computation takes here now."""
+    wall, own = time.perf_counter(), time.process_time()
+    while time.process_time() - own < seconds:
+        pass
+    return max(1.0, (time.perf_counter() - wall) / seconds)
+
+
+@pytest.mark.parametrize("after", [0.0, 1.5])
+def test_of_a_run_that_is_killed_everything_that_was_sent_a_second_before_is_in_a_whole_file(
+    after: float, tmp_path: Path
+) -> None:
+    file = tmp_path / "x.rrd"
+    run, told, recorder = started(counts, file)
+    time.sleep(after)
+    os.kill(run.pid, signal.SIGKILL)
+    killed = time.monotonic()
+    run.join()
+    assert ended(recorder) < ENDING * slowness()
+    sent = []
+    with suppress(EOFError):
+        while told.poll():
+            sent.append(told.recv())
+    before = [number for number, moment in sent if moment < killed - 1.0]
+    assert broken(file) == ""
+    log = "".join(texts(read(file)["/log"], "TextLog:text"))
+    assert all(f"family{number}: {number} cells" in log for number in before)
+    assert before or not after
+
+
+def test_half_a_message_and_a_pipe_that_others_hold_open_do_not_keep_a_recorder_alive(tmp_path: Path) -> None:
+    file = tmp_path / "x.rrd"
+    run, told, recorder = started(half, file)
+    told.recv()
+    beside = told.recv()
+    try:
+        os.kill(run.pid, signal.SIGKILL)
+        run.join()
+        assert ended(recorder) < ENDING * slowness()
+    finally:
+        os.kill(beside, signal.SIGKILL)
+    assert broken(file) == ""
+    assert any("family0: 0 cells" in line for line in texts(read(file)["/log"], "TextLog:text"))
+
+
+def test_a_recorder_that_is_killed_leaves_a_file_that_is_said_not_to_be_whole(tmp_path: Path) -> None:
+    outlet = opened(tmp_path / "x.rrd")
+    assert outlet.process.pid is not None
+    os.kill(outlet.process.pid, signal.SIGKILL)
+    outlet.process.join()
+    outlet.send(proof(0))
+    assert any("its process ended early" in line for line in outlet.close())
+    assert outlet.incomplete
+
+
+def fills(file: Path, told: Connection) -> None:
+    """A run whose recorder may write 80 000 bytes, and has more to write."""
+    resource.setrlimit(resource.RLIMIT_FSIZE, (80_000, resource.RLIM_INFINITY))
+    outlet, random = opened(file), np.random.default_rng(0)
+    for number in range(40):
+        outlet.send(sr.ProofProgress(family=random.bytes(2000).hex(), cells=number, bound=0.5))
+        time.sleep(0.02)
+    outlet.close()
+    told.send(outlet.incomplete)
+
+
+def test_a_disk_that_is_full_in_mid_run_leaves_no_recording_that_anybody_claims(tmp_path: Path) -> None:
+    file = tmp_path / "x.rrd"
+    ours, theirs = FORK.Pipe(duplex=False)
+    run = FORK.Process(target=fills, args=(file, theirs))
+    run.start()
+    assert ours.poll(STARTING)
+    assert f"{file} is not a complete recording" in ours.recv()
+    run.join()
+    assert broken(file)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device that is always full")
+def test_a_disk_that_is_full_from_the_first_byte_is_told_of_in_one_line() -> None:
+    outlet = opened(Path("/dev/full"))
+    lines = outlet.close()
+    assert len(lines) == 1 and "No space left on device" in lines[0]
+    assert outlet.incomplete == lines[0]
+
+
+def test_a_file_without_its_end_is_no_complete_recording(tmp_path: Path) -> None:
+    file = tmp_path / "x.rrd"
+    outlet = opened(file)
+    outlet.send(proof(0))
+    assert outlet.close() == [] and outlet.incomplete == "" and broken(file) == ""
+    file.write_bytes(file.read_bytes()[:-20])
+    assert "is not a complete recording" in broken(file)
+    assert "cannot be read" in broken(tmp_path / "none.rrd")
