@@ -52,6 +52,10 @@ class SimulatedAnnealing(sr.Maximiser, sr.Options):
     full: float = Field(default=0.15, ge=0.0)
     """Weight of moves of all coordinates; in a space of tuples, of one whole block."""
 
+    acting: float = Field(default=0.8, ge=0.0, le=1.0)
+    """Share of the moves that choose among the coordinates on which the value rests, where the objective knows them;
+    the others choose among all, so that what does not count yet has its turn."""
+
     coarse: float = Field(default=0.2, ge=0.0, le=1.0)
     """Share of the moves that keep the initial scale, to cross from basin to basin when the adapted scale is small; a
     coarse move of a block draws it anew."""
@@ -138,6 +142,8 @@ class _Walk:
         self.objective, self.rng, self.moves = objective, rng, moves
         self.point, self.value, self.number = objective.best_point, -np.inf, 0
         self.best, self.cycle = int(objective.evaluations == 1), 0
+        self.acting: np.ndarray | None = None
+        self.told = getattr(objective, "acting", None)  # an objective of somebody else may not have it
 
     def begin(self, points: np.ndarray) -> np.ndarray:
         """Evaluate the first points, and stand at the best that is known; returns their values."""
@@ -154,14 +160,14 @@ class _Walk:
         before = self.objective.evaluations
         values = self._sampled(points)
         top = int(np.argmax(values))
-        self.point, self.value, self.number = points[top], float(values[top]), before + top + 1
+        self.point, self.value, self.number, self.acting = points[top], float(values[top]), before + top + 1, None
 
     def go(self, cooling: Cooling) -> None:
         """One cycle of the walk."""
         objective = self.objective
         for k in range(cooling.length):
             temperature = cooling.temperature(k, objective.best_value - self.value)
-            candidate, record = self.moves.candidate(self.point), objective.best_value
+            candidate, record = self.moves.candidate(self.point, self.acting), objective.best_value
             found = float(objective.evaluate(candidate[np.newaxis])[0])
             if found > record:
                 self.best = objective.evaluations
@@ -170,6 +176,7 @@ class _Walk:
             self.moves.learn(accepted)
             if accepted:
                 self.point, self.value, self.number = candidate, found, objective.evaluations
+                self.acting = None if self.told is None else np.flatnonzero(self.told())
             objective.note(
                 temperature=temperature,
                 accepted=float(accepted),
@@ -188,6 +195,7 @@ class _Walk:
 
     def _to_best(self) -> None:
         self.point, self.value, self.number = self.objective.best_point, self.objective.best_value, self.best
+        self.acting = None
 
 
 @sr.hookimpl

@@ -50,6 +50,8 @@ class Moves:
         self.scale, self._moved = self.options.initial_scale, ""
         self.kind = UNIFORM
         self._place = 0
+        self.acting: np.ndarray | None = None
+        self._rests = True
 
     def uniform(self, count: int) -> np.ndarray:
         """``count`` points drawn uniformly from the box, ``(count, d)``."""
@@ -58,8 +60,13 @@ class Moves:
         points += self.lower
         return np.clip(points, self.lower, self.upper, out=points)
 
-    def candidate(self, current: np.ndarray) -> np.ndarray:
-        """A candidate ``(d,)`` for a walk that is at ``current (d,)``; only one array of this size is made."""
+    def candidate(self, current: np.ndarray, acting: np.ndarray | None = None) -> np.ndarray:
+        """A candidate ``(d,)`` for a walk that is at ``current (d,)``; only one array of this size is made.
+
+        ``acting``: the blocks on which the value there rests, by their numbers, as far as that is known; the share of
+        the moves that is theirs (``acting`` of the options) changes one of them.
+        """
+        self.acting, self._rests = acting, acting is None or not acting.size
         if next(self.uniforms) < self.options.exploration:
             self._moved, self.scale, self.kind = "", 1.0, UNIFORM
             return np.asarray(self.uniform(1)[0])
@@ -79,8 +86,9 @@ class Moves:
         return moved
 
     def learn(self, accepted: bool) -> None:
-        """Widen the steps of the kind that was taken last if it was accepted, narrow them if not."""
-        if self._moved and self.options.adapt != "none":
+        """Widen the steps of the kind that was taken last if it was accepted, narrow them if not. Of a move of what
+        the value does not rest on nothing is learnt: it would be accepted at any width."""
+        if self._moved and self._rests and self.options.adapt != "none":
             change = exp(self.options.adaptation * (float(accepted) - self.options.acceptance))
             if self._moved == "one":
                 self.scales[self._place] = min(LARGEST, max(SMALLEST, self.scales[self._place] * change))
@@ -119,7 +127,15 @@ class Moves:
                 self._shift_part(moved, part, self.factors[kind], coarse)
 
     def _random_coordinate(self) -> int:
-        return int(next(self.uniforms) * self.dimension)
+        if self.acting is None or not self.acting.size:
+            return int(next(self.uniforms) * self.dimension)
+        if next(self.uniforms) < self.options.acting:
+            self._rests = True
+            place = next(self.uniforms) * self.acting.size
+            return int(self.acting[int(place)]) * self.block + int(place % 1.0 * self.block)
+        at = int(next(self.uniforms) * self.dimension)
+        self._rests = self._rests or bool((self.acting == at // self.block).any())
+        return at
 
     def _shift(self, moved: np.ndarray, at: int, scale: float) -> None:
         """Move one coordinate, in place."""

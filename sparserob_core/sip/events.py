@@ -28,6 +28,11 @@ class Event:
 SKETCHED = 400
 """Points, boxes or ellipsoids in one sketch, at most."""
 
+UNCHANGED = 1e-10
+"""Relative change of a value that is rounding. Of 1 700 moves over literal tuples 250 changed g by less than 1e-12, for
+they moved a coordinate that does not enter the row, and all others by more than 1e-7; a thousandth of the limit, or a
+hundred times it, would tell them apart as well, more would hide the last steps of a walk."""
+
 Phase: TypeAlias = Literal["search", "polish"]
 """Who evaluates: the maximiser, or the local method that has the last share of its budget."""
 
@@ -140,10 +145,12 @@ def standing_before(accepted: np.ndarray) -> np.ndarray:
 
 def gains(values: Array, accepted: np.ndarray, stood: float = np.nan) -> Array:
     """By how much each of the ``values (k,)`` is above that where the walk stood, which was ``stood`` before the first;
-    0, too, from ``-inf`` to ``-inf``."""
+    exactly 0 from ``-inf`` to ``-inf``, and where the two differ by rounding only (`UNCHANGED`)."""
     before = standing_before(accepted)
     at = np.where(before < 0, stood, values[before])
-    return np.subtract(values, at, out=np.zeros(values.size), where=values != at)
+    gained = np.subtract(values, at, out=np.zeros(values.size), where=values != at)
+    gained[np.abs(gained) <= UNCHANGED * np.where(np.isfinite(at), np.abs(at), 0.0)] = 0.0
+    return gained
 
 
 @dataclass(frozen=True, eq=False)

@@ -71,6 +71,12 @@ class Objective(Protocol):
         """Whether `value_and_gradient` is offered."""
 
     @property
+    def acting(self) -> Callable[[], np.ndarray] | None:
+        """Which of the ``d / block`` blocks the value at the point that was evaluated last rests on, as truths: the
+        others may be moved a little, and as a rule far, without any change. ``None`` where that is not known. No
+        evaluation is spent."""
+
+    @property
     def linear(self) -> LinearBlocks | None:
         """In which coordinates its blocks are linear, and where they weigh most; ``None`` where they are not.
         `block_ascent` is what can be made of it."""

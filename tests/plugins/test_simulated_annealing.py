@@ -120,6 +120,111 @@ def test_in_a_space_of_tuples_a_move_changes_one_coordinate_or_one_block_or_up_t
     assert (blocks(one=1.0, few=0.0, full=0.0).sum(axis=(1, 2)) == 1).all()
 
 
+def resting_on(blocks, share, budget=3000, **options):
+    """How often a walk that never leaves its second point moves one coordinate of each of five blocks, where the value
+    rests on some of them."""
+    acting = np.isin(np.arange(5), blocks)
+    values = iter([0.0, 1.0])
+    target = Target(
+        lambda points: np.array([next(values, -1.0) for _ in points]), unit_box(20), block=4, acting=lambda: acting
+    )
+    options = {**STILL, "one": 1.0, "few": 0.0, "full": 0.0, "coarse": 0.0, **options}
+    points = maximise(
+        target,
+        SimulatedAnnealing(acting=share, **options),
+        budget,
+        np.random.default_rng(0),
+        Rules(selection=Improvement()),
+    ).trace.points
+    return (points[2:] != points[1]).reshape(-1, 5, 4).sum(axis=(0, 2)), points
+
+
+def test_moves_favour_what_the_value_rests_on_and_everything_else_keeps_its_turn():
+    counts, points = resting_on([1, 4], 0.8)
+    total = len(points) - 2
+    for block, count in enumerate(counts):
+        expected = total * (0.2 / 5 + (0.4 if block in (1, 4) else 0.0))
+        assert abs(count - expected) < LIMIT * np.sqrt(expected)
+    within = (points[2:] != points[1]).sum(axis=0).reshape(5, 4)
+    assert (np.abs(within - counts[:, np.newaxis] / 4) < LIMIT * np.sqrt(counts[:, np.newaxis] / 4)).all()
+
+
+def test_where_nothing_acts_or_nothing_is_known_all_coordinates_are_alike():
+    counts, _ = resting_on([], 0.8)
+    assert (np.abs(counts - counts.mean()) < LIMIT * np.sqrt(counts.mean())).all()
+    unknown = maximise(
+        Target(lambda p: -((p - 0.3) ** 2).sum(axis=1), unit_box(4)),
+        SimulatedAnnealing(),
+        200,
+        np.random.default_rng(0),
+    )
+    told = maximise(
+        Target(lambda p: -((p - 0.3) ** 2).sum(axis=1), unit_box(4)),
+        SimulatedAnnealing(acting=0.1),
+        200,
+        np.random.default_rng(0),
+    )
+    assert unknown.trace.points.tolist() == told.trace.points.tolist()  # not even another random number is drawn
+
+
+def test_the_acting_blocks_are_those_of_the_point_at_which_the_walk_stands():
+    """A maximum of blocks: only the highest one acts, and the walk is never told of a point that it refused."""
+    asked = []
+
+    def highest(points):
+        asked.append(points[-1].copy())
+        return points.reshape(len(points), 5, 4).sum(axis=2).max(axis=1)
+
+    def acting():
+        return np.arange(5) == asked[-1].reshape(5, 4).sum(axis=1).argmax()
+
+    target = Target(highest, unit_box(20), block=4, acting=acting)
+    options = {**STILL, "one": 1.0, "few": 0.0, "full": 0.0, "acting": 1.0}
+    trace = maximise(target, SimulatedAnnealing(**options), 400, np.random.default_rng(1)).trace
+    stood, first = trace.points[0], True
+    for point, (_, accepted) in zip(trace.points[1:], trace.notes["accepted"], strict=True):
+        moved = np.flatnonzero((point != stood).reshape(5, 4).any(axis=1))
+        assert first or moved.tolist() == [stood.reshape(5, 4).sum(axis=1).argmax()]
+        stood, first = (point, False) if accepted else (stood, first)
+
+
+def test_of_a_move_of_what_does_not_count_no_step_is_widened():
+    """The value rests on the first block only: the others may go anywhere, and that says nothing of the first."""
+    target = Target(
+        lambda points: -np.abs(points[:, :4] - 0.5).sum(axis=1),
+        unit_box(20),
+        block=4,
+        acting=lambda: np.arange(5) == 0,
+    )
+
+    def last_scale(acting):
+        options = {**STILL, "one": 1.0, "few": 0.0, "full": 0.0, "coarse": 0.0, "adapt": "global", "step": "gaussian"}
+        maximiser = SimulatedAnnealing(acting=acting, cooling_range=1e-6, **options)
+        return maximise(target, maximiser, 3000, np.random.default_rng(0)).trace.notes["scale"][-1, 1]
+
+    assert last_scale(1.0) < 0.01
+    assert last_scale(0.0) < 0.1  # 2 400 of 3 000 moves are accepted at any width
+
+
+def test_an_objective_of_somebody_else_need_not_know_what_acts():
+    class Plain:
+        """What an objective offered before ``acting``."""
+
+        def __init__(self, objective):
+            self._objective = objective
+
+        def __getattr__(self, name):
+            if name == "acting":
+                raise AttributeError(name)
+            return getattr(self._objective, name)
+
+    objective = CountedObjective(Target(corner, SQUARE), 50)
+    with pytest.raises(sr.SearchEnded):
+        SimulatedAnnealing().search(Plain(objective), np.random.default_rng(0))
+        objective.evaluate(objective.best_point[np.newaxis])
+    assert objective.evaluations == 50
+
+
 def test_only_the_uniform_share_changes_every_block():
     points = search(
         ever_lower(), unit_box(20), 2000, rules=Rules(selection=Improvement()), block=4, exploration=0.1, samples=1

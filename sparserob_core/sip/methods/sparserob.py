@@ -170,7 +170,7 @@ def _searched(
 
     assert tools.maximiser is not None
     rules = Rules(method.sc2, method.slcr or Metropolis(), tools.polish)
-    target = Target(values, g.domain, g.gradient, g.block, g.linear)
+    target = Target(values, g.domain, g.gradient, g.block, g.linear, g.acting)
     notify = forwarded(tools.notify, EvaluationsFinished, completed)
     report = maximise(target, tools.maximiser, tools.budget, tools.rng, rules, notify, point)
     parts.append(SearchTrace.of(j, epsilon, report.trace, np.array(proven[: report.evaluations]), began))

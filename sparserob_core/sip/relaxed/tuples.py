@@ -177,7 +177,7 @@ class TupleValue:
             size = family.index_set.dimension
             coordinates[:size] &= family.linear
             coordinates[size:] = False
-        return LinearBlocks(np.tile(coordinates, self.layout.count), self._acting, self._steepest)
+        return LinearBlocks(np.tile(coordinates, self.layout.count), self.acting, self._steepest)
 
     @cached_property
     def coordinates(self) -> tuple[int, ...]:
@@ -218,7 +218,7 @@ class TupleValue:
             moving[first:last] = bool((box.upper[mine] > box.lower[mine]).any())
         return moving
 
-    def _acting(self) -> np.ndarray:
+    def acting(self) -> np.ndarray:
         """Which indices ``(D,)`` of the last tuple have a multiplier."""
         self._settle()
         acts = np.zeros(self.layout.count, dtype=bool)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import final
 
@@ -60,11 +61,21 @@ class Moving:
         """See `Objective.differentiable`."""
         return self._objective.differentiable
 
+    @property
+    def _whole(self) -> bool:
+        """Whether the blocks are those of the full objective, as far as they can move."""
+        return self.domain.dimension // self.block == self._fixed.size // self._objective.block
+
+    @property
+    def acting(self) -> Callable[[], np.ndarray] | None:
+        """See `Objective.acting`."""
+        return self._objective.acting if self._whole else None
+
     @cached_property
     def linear(self) -> LinearBlocks | None:
         """See `Objective.linear`."""
         full = self._objective.linear
-        if full is None or self.domain.dimension // self.block != self._fixed.size // self._objective.block:
+        if full is None or not self._whole:
             return None
 
         def steepest(point: Array) -> Array:

@@ -29,8 +29,8 @@ class Target:
     """What is maximised: ``function`` maps points ``(k, d)`` of a bounded ``domain`` to ``k`` numbers.
 
     ``gradient`` maps the point ``(d,)`` that was evaluated last to the gradient ``(d,)`` there; ``None`` if there is
-    none. ``block`` consecutive coordinates belong together, and may be ``linear`` (`Objective`). Raises `InputError`
-    for an unbounded domain or blocks that do not fill it.
+    none. ``block`` consecutive coordinates belong together, may be ``linear``, and some of them may be known to be
+    ``acting`` (`Objective`). Raises `InputError` for an unbounded domain or blocks that do not fill it.
     """
 
     function: Function
@@ -38,6 +38,7 @@ class Target:
     gradient: Callable[[Array], Array] | None = None
     block: int = 1
     linear: LinearBlocks | None = None
+    acting: Callable[[], np.ndarray] | None = None
 
     def __post_init__(self) -> None:
         domain = self.domain
@@ -120,6 +121,11 @@ class CountedObjective:
     def differentiable(self) -> bool:
         """See `Objective.differentiable`."""
         return self.target.gradient is not None
+
+    @property
+    def acting(self) -> Callable[[], np.ndarray] | None:
+        """See `Objective.acting`."""
+        return self.target.acting
 
     @property
     def linear(self) -> LinearBlocks | None:

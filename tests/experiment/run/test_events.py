@@ -328,6 +328,12 @@ def test_from_nowhere_to_nowhere_nothing_is_gained() -> None:
     assert gains(values, accepted).tolist()[1:] == [0.0, np.inf, -np.inf, 1.0]
 
 
+def test_rounding_is_no_change_and_the_last_steps_of_a_walk_are() -> None:
+    values = 0.6 * np.array([1.0, 1.0 + 1e-12, 1.0 - 1e-12, 1.0 + 1e-8, -1.0])
+    assert np.sign(gains(values, np.zeros(5, dtype=bool), 0.6)).tolist() == [0, 0, 0, 1, -1]
+    assert (gains(1e-20 * values, np.zeros(5, dtype=bool), 0.6e-20)[3:] != 0.0).all()
+
+
 def test_events_tell_the_maximiser_from_the_polish_and_none_is_of_both() -> None:
     heard: list[sr.EvaluationsFinished] = []
     trace = sr.maximise(

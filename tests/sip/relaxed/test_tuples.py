@@ -151,6 +151,20 @@ def test_what_the_optimum_keeps_is_not_solved_again(tools):
 
 
 @pytest.mark.parametrize("formulation", ["reduced", "literal"])
+def test_without_what_does_not_act_the_value_is_the_same_and_without_what_does_it_is_less(tools, formulation):
+    program = oscillator(formulation)
+    g = value(program, tools, 5)
+    point = drawn(g, np.random.default_rng(4))
+    at, acts = g.at(point), g.acting()
+    assert 0 < acts.sum() < 5
+    slots = point.reshape(5, -1)
+    idle = np.flatnonzero(~acts)
+    assert value(program, tools, acts.sum()).at(slots[acts].ravel()) == pytest.approx(at, rel=1e-9)
+    if formulation == "literal":  # the terminal row of a reduced tuple is that of every index
+        assert value(program, tools, idle.size).at(slots[idle].ravel()) < at - 1e-6
+
+
+@pytest.mark.parametrize("formulation", ["reduced", "literal"])
 def test_the_gradient_is_that_of_central_differences(tools, formulation):
     rng, program, checked = np.random.default_rng(5), oscillator(formulation, 6), 0
     g = value(program, tools, 3, 0.3)

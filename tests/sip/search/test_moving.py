@@ -99,3 +99,17 @@ def test_what_is_no_upper_bound_is_refused_with_the_name_of_the_maximiser(answer
 
     with pytest.raises(sr.PluginError, match=f"maximiser Odd: search {words}"):
         maximise(Target(hill, BOX), Odd(), 9, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("even", [True, False])
+def test_which_blocks_act_is_handed_on_where_every_block_moves_alike(even):
+    class Asking(Probe):
+        def search(self, objective, rng):
+            self.acting = objective.acting
+            return super().search(objective, rng)
+
+    probe, acts = Asking(), np.array([True, False, True])
+    box = BOX if even else sr.Box(BOX.lower, [*BOX.upper[:-1], 2.0])
+    target = Target(hill, box, lambda p: p, block=3, acting=lambda: acts)
+    maximise(target, probe, 9, np.random.default_rng(0))
+    assert probe.acting() is acts if even else probe.acting is None
