@@ -6,6 +6,7 @@ SLIM      := $(VENV)/slim
 INSTALLED := $(VENV)/installed
 PEERS     := $(VENV)/peers
 WRITERS   := $(VENV)/writers
+PYTHONS   := python3.11 python3.12 python3.13 python3.14
 CANDIDATES := $(PYTHON) python3 python3.13 python3.12 python3.11
 DEMO      := configs/experiment1_repaired.yaml
 LIVE      := configs/experiment1_literal.yaml
@@ -25,7 +26,7 @@ endef
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help install demo live paper test tests test-slow mutants lint style types bench docs docs-pictures clean
+.PHONY: help install demo live paper test tests test-slow test-pythons mutants lint style types bench docs docs-pictures clean
 
 help:
 	@echo "make demo        solve the repaired experiment 1, print the bounds, draw the figures"
@@ -34,6 +35,7 @@ help:
 	@echo "make test        lint, types, import rules, tests: the first stage, about six minutes on two processors"
 	@echo "make test-slow   the second stage: larger instances of what the first one tests"
 	@echo "make mutants     300 small errors in what proves and checks (COUNT=20 SEED=1 for fewer): which do the tests notice? (hours)"
+	@echo "make test-pythons  the tests of the first stage on every Python from 3.11 to 3.14 that is found"
 	@echo "make bench       time the certified solve, and solvers and maximisers beside other people's"
 	@echo "make docs        write the reference and the schema anew, and build the site (minutes, the first time)"
 	@echo "make docs-pictures  the pictures of docs/gallery.md and docs/live.md anew (minutes; needs a Vulkan driver, no display)"
@@ -96,6 +98,20 @@ test-slow: $(INSTALLED)
 # COUNT, SEED, FOLDERS=checker,sip/proof, STAGE=folder (not the whole first stage for what survives), JOBS.
 mutants: $(INSTALLED)
 	$(BIN)/python -m tests.mutants COUNT=$(COUNT) SEED=$(SEED) FOLDERS=$(FOLDERS) STAGE=$(STAGE) JOBS=$(JOBS)
+# One environment for each interpreter, set up once; one on which a dependency cannot be installed is named and left out.
+test-pythons:
+	@tried=; status=0; for python in $(PYTHONS); do \
+	  $$python -c 'import venv, ensurepip' 2>/dev/null || continue; \
+	  place=$(VENV)/pythons/$$python; \
+	  if [ ! $$place/installed -nt pyproject.toml ]; then \
+	    $$python -m venv --clear $$place && $$place/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[all]' \
+	      || { echo "$$python: not every dependency can be installed there; left out" >&2; continue; }; \
+	    touch $$place/installed; \
+	  fi; \
+	  echo "$$python: $$($$place/bin/python --version)"; tried="$$tried $$python"; \
+	  $$place/bin/python -m pytest -q --numprocesses 2 --dist worksteal -p no:cacheprovider || status=$$?; \
+	done; \
+	if [ -z "$$tried" ]; then echo "none of $(PYTHONS) was found" >&2; exit 1; fi; exit $$status
 
 bench: $(PEERS)
 	$(BIN)/python -m pytest -m benchmark tests/benchmarks
