@@ -33,7 +33,7 @@ INSIDE, MOST_INSIDE = 3, 64  # times sampled inside every piece, beside its ends
 STENCIL = np.array([-1.0, 0.0, 1.0])
 SMOOTH = 0.1  # norm of A times the spacing of samples between which a parabola is a good guide
 CLIMBED = 10  # of them, those that parameters are climbed for
-KEPT = 12  # separated constraints per row and round
+KEPT = 64  # separated constraints per row and round
 FOUND_KEPT = 1  # decisions whose separation is remembered
 
 
@@ -269,30 +269,50 @@ class FlatConstraint(StateConstraint):
     def _worst(self, x: Float[Array, " n"]) -> Separation:
         values = self.on_lattice(x)
         positions = local_maxima(values, self.lattice[1], KEPT)
+        positions = np.concatenate([positions, self._along(values, positions)])
         heights, rows = values[tuple(positions.T)], positions[:, 1]
         indices = np.hstack([self.times[positions[:, 2], None], self.lattice[0][positions[:, 0]]])
+        found = heights
+        times, predicted = vertices(values, positions, self.times)
+        between = np.flatnonzero(times != indices[:, 0])  # the others are samples
+        if self.parameters.count or self.functionals.response.grid.pieces >= LONG:
+            # among many samples, those well below 0 are only told
+            promised = heights + 4.0 * (predicted - heights)
+            between = between[promised[between] >= min(0.0, heights.max(initial=-np.inf))]
+        if between.size:
+            at = np.hstack([times[between, None], indices[between, 1:]])
+            refined = self._refined(x, at, rows[between], predicted[between], found)
+            higher = refined[1] >= found[between]  # at a kink a parabola is no guide
+            between = between[higher]
+            indices[between, 0], found[between] = (part[higher] for part in refined)
         if self.parameters.count:
-            likely = np.argsort(-heights, kind="stable")[:CLIMBED]
+            likely = np.argsort(-found, kind="stable")[:CLIMBED]
             # a maximum at a breakpoint is a kink: it is climbed along, not across
-            indices, found = self._climbed(x, indices[likely], rows[likely])
-            rows = rows[likely]
-        else:
-            found = heights
-            times, predicted = vertices(values, positions, self.times)
-            between = np.flatnonzero(times != indices[:, 0])  # the others are samples
-            if self.functionals.response.grid.pieces >= LONG:  # among many samples, those well below 0 are only told
-                promised = heights + 4.0 * (predicted - heights)
-                between = between[promised[between] >= min(0.0, heights.max(initial=-np.inf))]
-            if between.size:
-                refined = self._refined(x, times[between], rows[between], predicted[between], found)
-                higher = refined[1] >= found[between]  # at a kink a parabola is no guide
-                between = between[higher]
-                indices[between, 0], found[between] = (part[higher] for part in refined)
+            indices[likely], found[likely] = self._climbed(x, indices[likely], rows[likely])
         order = np.argsort(-found, kind="stable")
         if self.gains is not None:  # where nothing jumps, both halves of the rows say the same
             pieces = self.commanded(indices[order, 0])
             order = order[(rows[order] < self.samples.proven) | (pieces[:, 0] != pieces[:, -1])]
         return Separation(indices[order], rows[order], found[order])
+
+    def _along(self, values: Array, maxima: np.ndarray) -> np.ndarray:
+        """Positions ``(k, 3)`` in ``values (v, r, times)`` along spans where a row is violated and none of its ``maxima
+        (j, 3)`` is near: the highest sample of every piece of the control, thinned evenly to `KEPT` a row.
+
+        A state that leaves a wall for good has one maximum, at the end. Imposed there alone, the wall would be left a
+        piece later in the next round, and rounds would grow with its length.
+        """
+        heights = values.max(axis=0)
+        pieces = np.searchsorted(self.functionals.dictionary.breakpoints, self.times)
+        found = [np.zeros((0, 3), dtype=int)]
+        for row, height in enumerate(heights):
+            near = pieces[maxima[maxima[:, 1] == row, 2]]
+            over = np.flatnonzero((height > 0.0) & ~np.isin(pieces, [near - 1, near, near + 1]))
+            over = over[np.lexsort((-height[over], pieces[over]))]
+            over = over[np.unique(pieces[over], return_index=True)[1]]
+            over = over[np.unique(np.linspace(0, over.size - 1, min(KEPT, over.size)).astype(int))]
+            found.append(np.stack([values[:, row, over].argmax(axis=0), np.full(over.size, row), over], axis=1))
+        return np.concatenate(found)
 
     @shaped
     def explain(self, index: Float[Array, " j"], row: int) -> Explanation:
@@ -392,23 +412,24 @@ class FlatConstraint(StateConstraint):
     def _refined(
         self,
         x: Float[Array, " n"],
-        times: Float[Array, " k"],
+        indices: Float[Array, "k j"],
         rows: Int[np.ndarray, " k"],
         predicted: Float[Array, " k"],
         heights: Float[Array, " q"],
     ) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
-        """Times ``(k,)`` near the vertices of parabolas, and the violations there: by parabolas through nearer and
-        nearer samples, as long as one may be the largest of all; where these are no guide, at a kink or beyond one, the
-        candidate is climbed from. ``predicted (k,)``, ``heights (q,)``: what the first parabolas say, and what is known
-        at samples."""
+        """Times ``(k,)`` near the vertices of parabolas, and the violations there with the parameters of ``indices``:
+        by parabolas through nearer and nearer samples, as long as one may be the largest of all, or a violation; where
+        these are no guide, at a kink or beyond one, the candidate is climbed from. ``predicted (k,)``, ``heights
+        (q,)``: what the first parabolas say, and what is known at samples."""
         spacing = float((self.times[1:] - self.times[:-1]).max())
-        middle, found, live = times.copy(), predicted.copy(), np.arange(times.size)
-        width = np.full(times.size, min(spacing / NEARER, (self.stop - self.start) / 2))
+        middle, found, live = indices[:, 0].copy(), predicted.copy(), np.arange(rows.size)
+        width = np.full(rows.size, min(spacing / NEARER, (self.stop - self.start) / 2))
         for look in range(LOOKS):
             far = width[live]
             at = np.minimum(np.maximum(middle[live], self.start + far), self.stop - far)
-            around = at[:, None] + far[:, None] * STENCIL
-            seen = self.violations(x, around.reshape(-1, 1), rows[live].repeat(3)).reshape(-1, 3)
+            around = indices[live].repeat(3, axis=0)
+            around[:, 0] = (at[:, None] + far[:, None] * STENCIL).ravel()
+            seen = self.violations(x, around, rows[live].repeat(3)).reshape(-1, 3)
             before, now, after = seen.T
             slope, bend = (after - before) / 2, 2 * now - before - after
             inside = np.abs(slope) < bend
@@ -418,7 +439,8 @@ class FlatConstraint(StateConstraint):
             if look == 0:
                 sure |= error <= SURE * size
             middle[live], found[live] = at, now
-            wanted = now + 4.0 * np.maximum(error, np.abs(slope)) >= max(float(found.max()), float(heights.max()))
+            highest = max(float(found.max()), float(heights.max()))
+            wanted = now + 4.0 * np.maximum(error, np.abs(slope)) >= min(0.0, highest)
             going = ~sure & wanted
             if not going.any():
                 live = live[going]
@@ -427,8 +449,8 @@ class FlatConstraint(StateConstraint):
             width[live] = np.where(inside, far / NEARER, far)
             live = live[going]
         kinks = live[np.argsort(-found[live], kind="stable")][:CLIMBED]
-        if kinks.size:
-            points, found[kinks] = self._climbed(x, times[kinks, None], rows[kinks])
+        if kinks.size and not self.parameters.count:
+            points, found[kinks] = self._climbed(x, indices[kinks], rows[kinks])
             middle[kinks] = points[:, 0]
         return middle, found
 

@@ -278,7 +278,7 @@ class Working:
             return
         multipliers = solution.y[solution.y.size - self.rows.h.size :]
         price = float(multipliers @ np.linalg.norm(self.rows.G, axis=1))
-        budget = 0.1 * ledger.tolerance * max(SMALL_COST * self.program.cost_scale, abs(solution.value))
+        budget = 0.4 * ledger.tolerance * max(SMALL_COST * self.program.cost_scale, abs(solution.value))
         reach = np.maximum(np.abs(self.program.finite.lower), np.abs(self.program.finite.upper))
         unit = min(1.0, float(np.where(np.isfinite(reach), reach, 1.0).max()))
         margin = float(
