@@ -98,6 +98,7 @@ test-slow: $(INSTALLED)
 # COUNT, SEED, FOLDERS=checker,sip/proof, STAGE=folder (not the whole first stage for what survives), JOBS.
 mutants: $(INSTALLED)
 	$(BIN)/python -m tests.mutants COUNT=$(COUNT) SEED=$(SEED) FOLDERS=$(FOLDERS) STAGE=$(STAGE) JOBS=$(JOBS)
+
 # One environment for each interpreter, set up once; one on which a dependency cannot be installed is named and left out.
 test-pythons:
 	@tried=; status=0; for python in $(PYTHONS); do \
