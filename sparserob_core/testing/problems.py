@@ -16,6 +16,7 @@ from sparserob_core.sip.program import ConstraintFamily, Explanation, SemiInfini
 from sparserob_core.testing.contract import Contract, broken, demand, same
 
 if TYPE_CHECKING:
+    from sparserob_core.control.policies.policy import Policy
     from sparserob_core.sip.program import Separation
 
 DECISIONS = 4  # decisions at which families are looked at
@@ -39,10 +40,12 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
     becomes of the control problem in dictionaries of 12 pieces, is looked at family by family: ``rows`` maps indices
     ``(k, d)`` to ``(G (k, r, n), h (k, r))``, one index like the other; and whatever a family offers beside them
     (gradient, worst, enclosure, cells, nominal, sample, literal, explain) has to agree with its rows. ``provable``:
-    whether a decision can be proven; set it to False for a problem that cannot.
+    whether a decision can be proven; set it to False for a problem that cannot. ``policy``: what the control may know,
+    such as an `AffinePolicy`; then rows hold for every deviation, and ``excess`` and ``uncertain`` have to agree.
     """
 
     provable = True
+    policy: Policy | None = None
 
     def built(self) -> OptimalControlProblem | SemiInfiniteProgram:
         """The problem; a broken contract where something else comes back, or something is raised."""
@@ -68,7 +71,7 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
         if isinstance(made, SemiInfiniteProgram):
             return made
         pieces = Dictionary(np.linspace(0.0, made.horizon, PIECES + 1), np.eye(PIECES))
-        return transcribe(made, control=pieces, disturbance=pieces)
+        return transcribe(made, control=pieces, disturbance=pieces, policy=self.policy)
 
     def families(self) -> Iterator[tuple[ConstraintFamily, list[Array]]]:
         """Every family, with decisions ``(n,)`` at which it is looked at."""
@@ -91,8 +94,12 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
         )
         for one, other in zip(first.families, second.families, strict=True):
             points = _points(one.index_set, np.random.default_rng(1), POINTS)
+            x = np.random.default_rng(2).random(first.n)
+            alike = same(one.violations(x, points), other.violations(x, points))
+            if one.uncertain is None:
+                alike = alike and all(same(a, b) for a, b in zip(one.rows(points), other.rows(points), strict=True))
             demand(
-                all(same(a, b) for a, b in zip(one.rows(points), other.rows(points), strict=True)),
+                alike,
                 f"two builds with the same options have different rows of {one.name}",
                 "let nothing but the options decide",
             )
@@ -118,6 +125,8 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
                 "the index set of a family is a bounded box: transform what runs to infinity",
             )
             points = _points(box, np.random.default_rng(3), POINTS)
+            if family.uncertain is not None:
+                continue
             G, h = _rows(family, points)
             demand(
                 G.shape == (len(points), h.shape[-1], n) and h.shape == (len(points), G.shape[1]),
@@ -138,6 +147,35 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
                     f"{family.name}: an index has other rows alone than among others",
                     "compute each row from its own index: no mean, maximum or order over the batch",
                 )
+
+    def test_rows_that_hold_for_every_deviation_are_violated_by_what_the_family_says(self) -> None:
+        spread = self.program().spread
+        for family, decisions in self.families():
+            if family.uncertain is None:
+                continue
+            demand(
+                spread is not None,
+                f"{family.name}: its rows hold for every deviation, and the program has no spread",
+                "give the program the `Spread` of its deviations",
+            )
+            assert spread is not None
+            for x in decisions:
+                points = _points(family.index_set, np.random.default_rng(13), 8)
+                every = _asked(family, "excess", lambda f=family, x=x, p=points: f.violations(x, p))
+                for point, together in zip(points, every, strict=True):
+                    alone = family.violations(x, point[None])[0]
+                    rows = _asked(family, "uncertain", lambda f=family, p=point: f.uncertain(p))
+                    told, size = rows.excess(x, spread), _size(family, x, point[None])
+                    demand(
+                        told.shape == alone.shape and np.abs(told - alone).max(initial=0.0) <= CLOSE * size,
+                        f"{family.name}: the rows are violated by {told[:3]} at {point}, and excess says {alone[:3]}",
+                        "`excess` is the violation of the rows of `uncertain` at the worst deviation of the spread",
+                    )
+                    demand(
+                        np.allclose(alone, together, rtol=1e-9, atol=1e-12 * size),
+                        f"{family.name}: an index has another violation alone than among others",
+                        "compute each violation from its own index: no mean, maximum or order over the batch",
+                    )
 
     def test_a_gradient_is_the_derivative_of_its_row(self) -> None:
         for family, decisions in self.families():
@@ -278,7 +316,7 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
 
     def test_other_forms_of_a_family_ask_for_no_more_than_it_does(self) -> None:
         for family, decisions in self.families():
-            if family.worst is None:
+            if family.worst is None or family.uncertain is not None:  # whose literal form has no rows of a decision
                 continue
             others = {"nominal": family.nominal, "literal": family.literal}
             if family.sample is not None:
@@ -326,7 +364,9 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
 
         made = self.built()
         control = {"name": "piecewise_constant", "pieces": PIECES}
-        given: dict[str, Any] = {"control": control} if isinstance(made, OptimalControlProblem) else {}
+        given: dict[str, Any] = {}
+        if isinstance(made, OptimalControlProblem):
+            given = {"control": control} | ({} if self.policy is None else {"policy": self.policy})
         try:
             result = solve(made, seconds=SECONDS, **given)
         except InputError as error:
@@ -374,7 +414,13 @@ def _rows(family: ConstraintFamily, points: Array) -> tuple[Array, Array]:
 
 
 def _size(family: ConstraintFamily, x: Array, points: Array) -> float:
-    """The largest sum of the terms of a row."""
+    """The largest sum of the terms of a row; of one that holds for every deviation, of its nominal ones and what these
+    make of it."""
+    if family.uncertain is not None:
+        few = points[:: 1 + len(points) // 8]
+        rows = [family.uncertain(point) for point in few]
+        sums = [float((abs(one.g) @ np.abs(x) + np.abs(one.h)).max(initial=0.0)) for one in rows]
+        return max(*sums, 0.0, float(np.abs(family.violations(x, few)).max(initial=0.0))) or 1.0
     G, h = family.rows(points)
     terms = np.abs(G) @ np.abs(x) + np.where(np.isfinite(h), np.abs(h), 0.0)
     return float(terms.max(initial=0.0)) or 1.0

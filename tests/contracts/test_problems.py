@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.testing import ProblemContract
+from sparserob_core.testing import ContractBroken, ProblemContract
 from tests.support.faults import fails
 
 REGISTRY = sr.load_registry()
@@ -96,6 +96,70 @@ class Square(sr.ProblemFactory):
 
 class TestSquare(ProblemContract):
     component = Square
+
+
+ANSWERED = {
+    **KNOWN,
+    "system": {"A": [[0, 1], [-2, -0.5]], "B": [[0], [1]]},
+    "initial_state": {"centre": [-0.5, 0.2], "box": [0.02, 0.01]},
+    "control_step": {"box": 0.8},
+    "control": {"box": 1.0},
+}
+
+
+class TestAnswered(ProblemContract):
+    """A problem whose control answers what it measures."""
+
+    policy = sr.AffinePolicy()
+
+    def create(self):
+        return REGISTRY.build("problem", "linear", ANSWERED)
+
+
+@pytest.mark.slow
+class TestMeasurable(TestAnswered):
+    """The same where the disturbance may jump at any time, between flat sets."""
+
+    def create(self):
+        flat = {"terminal": [{"box": 1.0}], "disturbance_class": "measurable"}
+        return REGISTRY.build("problem", "linear", {**ANSWERED, **flat})
+
+
+class Answering(sr.ProblemFactory):
+    """The program of such a problem, every family with other parts."""
+
+    @staticmethod
+    def parts(family):
+        return {}
+
+    def build(self):
+        problem = REGISTRY.build("problem", "linear", ANSWERED).build()
+        pieces = sr.Dictionary.indicators(np.linspace(0.0, 3.0, 4))
+        program = sr.transcribe(problem, control=pieces, disturbance=pieces, policy=sr.AffinePolicy())
+        return replace(program, families=[replace(one, **self.parts(one)) for one in program.families], twin=None)
+
+
+def test_families_whose_rows_hold_for_every_deviation_are_looked_at_too():
+    def lower(family):
+        enclosure = family.enclosure
+        return {"enclosure": lambda *q: replace(enclosure(*q), bounds=enclosure(*q).bounds - 1.0)}
+
+    def looser(family):
+        uncertain = family.uncertain
+        return {"uncertain": lambda index: replace(uncertain(index), h=uncertain(index).h + 1e-3)}
+
+    def careless(family):
+        excess = family.excess
+        return {"excess": lambda x, indices: excess(x, indices) - 1e-3 * (len(indices) > 1)}
+
+    agree = "test_rows_that_hold_for_every_deviation_are_violated_by_what_the_family_says"
+    for parts, test in (
+        (lower, "test_an_enclosure_is_never_below_the_violation_and_closes"),
+        (looser, agree),
+        (careless, agree),
+    ):
+        error = fails(ProblemContract, type("Wrong", (Answering,), {"parts": staticmethod(parts)}), test)
+        assert isinstance(error, ContractBroken)
 
 
 def flawed(name, **changes):
