@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from time import perf_counter
-from typing import Literal, TypeAlias, final
+from typing import Literal, TypeAlias, TypeVar, final
 
 TOLERANCE = 1e-9  # of a constraint's own unit: a violation of at most this counts as none
 EQUALITY = 1e-12  # of the numbers that are added up: what double precision leaves of an equality, at most
 RESOLVED = 2.0**-18  # of the numbers that are added up, the least unit: TOLERANCE of it is 17 units of rounding
 
+LOOKED = 1024  # items between two looks at the time: some ms; ten times as many may be late, a tenth costs time itself
+
+Item = TypeVar("Item")
 Verdict: TypeAlias = Literal["holds", "fails", "not checked"]
 
 
@@ -45,3 +49,13 @@ class Clock:
         """Raise `Unchecked` when the time is up."""
         if perf_counter() - self.started > self.seconds:
             raise Unchecked(f"the time limit of {self.seconds:g} s was reached")
+
+    def each(self, items: Iterable[Item]) -> Iterator[Item]:
+        """The items one by one, with a look at the time every `LOOKED` of them."""
+        for number, item in enumerate(items):
+            if number % LOOKED == 0:
+                self.check()
+            yield item
+
+
+NO_LIMIT = Clock()

@@ -7,6 +7,7 @@ import itertools
 import math
 from dataclasses import replace
 from fractions import Fraction
+from time import sleep
 from unittest.mock import patch
 
 import numpy as np
@@ -21,7 +22,7 @@ from sparserob_core.checker.arithmetic.jets import Monomials, expanded
 from sparserob_core.checker.arithmetic.series import Series
 from sparserob_core.checker.claims.cells import _to_blame
 from sparserob_core.checker.claims.duality import Duality
-from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.outcome import LOOKED, Broken, Clock, Unchecked
 from sparserob_core.checker.reach import disturbance_support
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import Flow, OwnUnits, balanced, flows, stacked
@@ -281,6 +282,17 @@ def test_what_initial_states_lose_while_they_switch_is_laid_to_what_it_depends_o
         assert (poly.turning > 0.2 * poly.kinks) if because else poly.turning == 0.0
         assert _to_blame(poly, 0.0, (0, 0.0, 0.5)) == because
         assert _to_blame(poly, 0.0, (0, 0.5, 0.5))
+
+
+def test_a_clock_looks_at_the_time_while_items_are_taken() -> None:
+    taken = []
+    with pytest.raises(Unchecked):
+        for item in Clock(0.02).each(itertools.count()):
+            taken.append(item)
+            sleep(1e-5)
+    assert taken
+    assert len(taken) % LOOKED == 0
+    assert [*Clock(60.0).each("abc")] == ["a", "b", "c"]
 
 
 def test_a_row_that_is_certainly_exceeded_is_looked_for_where_it_changes():

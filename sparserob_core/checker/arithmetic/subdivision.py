@@ -6,17 +6,18 @@ from fractions import Fraction
 
 import numpy as np
 
-from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.outcome import NO_LIMIT, Broken, Clock, Unchecked
 from sparserob_core.sip.convex_set import Array
 
 MOST_CELLS = 100_000
 
 
-def fill(lower: Array, upper: Array, low: Array, high: Array) -> None:
+def fill(lower: Array, upper: Array, low: Array, high: Array, clock: Clock = NO_LIMIT) -> None:
     """Raise `Broken` unless the cells ``[lower_i, upper_i]`` (``(k, d)``) fill the box ``[low, high]`` without overlap.
 
     Cells inside the box, disjoint but for their faces, with the box's volume between them, fill it. A coordinate in
-    which the box is a point is left out of the volume, and must be that point in every cell.
+    which the box is a point is left out of the volume, and must be that point in every cell. Raises `Unchecked` when
+    the time is up.
     """
     if (
         lower.ndim != 2
@@ -35,21 +36,29 @@ def fill(lower: Array, upper: Array, low: Array, high: Array) -> None:
             raise Broken(f"{lower.shape[0]} cells stand for a single point, expected one")
         return
     a, b = lower[:, thick], upper[:, thick]
-    if _overlap(a, b):
+    if _overlap(a, b, clock):
         raise Broken("two cells overlap")
-    missing = _volume(low[thick], high[thick]) - sum((_volume(x, y) for x, y in zip(a, b, strict=True)), Fraction(0))
+    missing = _volume(low[thick], high[thick])
+    if a.shape[1] == 1:  # in order, without overlap: what is left out lies between neighbours and before the first
+        order = np.lexsort((b[:, 0], a[:, 0]))
+        starts, stops = np.append(a[order, 0], high[thick]), np.append(low[thick], b[order, 0])
+        missing = sum((Fraction(x) - Fraction(y) for x, y in zip(starts, stops, strict=True) if x != y), Fraction(0))
+    else:
+        missing -= sum((_volume(x, y) for x, y in clock.each(zip(a, b, strict=True))), Fraction(0))
     if missing != 0:
         raise Broken(
             f"the cells leave a share of {float(missing / _volume(low[thick], high[thick])):.3g} of the index set out"
         )
 
 
-def _overlap(a: Array, b: Array) -> bool:
+def _overlap(a: Array, b: Array, clock: Clock) -> bool:
     """Whether two of the cells ``[a_i, b_i]`` share more than a face."""
     if a.shape[1] == 1:  # in order, only neighbours can; of two that begin at once, the shorter is first
         order = np.lexsort((b[:, 0], a[:, 0]))
         return bool((b[order[:-1], 0] > a[order[1:], 0]).any())
-    return any(bool(((a[i] < b[i + 1 :]) & (a[i + 1 :] < b[i])).all(axis=1).any()) for i in range(a.shape[0]))
+    return any(
+        bool(((a[i] < b[i + 1 :]) & (a[i + 1 :] < b[i])).all(axis=1).any()) for i in clock.each(range(a.shape[0]))
+    )
 
 
 def _volume(low: Array, high: Array) -> Fraction:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
@@ -117,17 +117,17 @@ class Case:
     @cached_property
     def grid(self) -> list[float]:
         """Every breakpoint of either dictionary, those of the control as late as it acts."""
-        ends = {float(self.control.breakpoints[-1]), float(self.disturbance.breakpoints[-1])}
+        self.clock.check()
+        ends = float(self.control.breakpoints[-1]), float(self.disturbance.breakpoints[-1])
         last = max(*ends, self.problem.horizon)
-        switches = self.problem.system.switches
-        inner = {float(t) for t in (*self.acting, *self.disturbance.breakpoints, *switches)} - ends
-        return sorted({t for t in inner if t < last} | {last})
+        every = np.unique([*self.acting, *self.disturbance.breakpoints.tolist(), *self.problem.system.switches])
+        return [*every[(every < last) & ~np.isin(every, ends)].tolist(), last]
 
     @cached_property
     def acting(self) -> list[float]:
         """When every piece of the control begins to act; from 0 on."""
-        delay = self.problem.system.delay
-        return sorted({0.0, *(float(t) + delay for t in self.control.breakpoints[:-1])})
+        later: list[float] = np.unique([0.0, *(self.control.breakpoints[:-1] + self.problem.system.delay)]).tolist()
+        return later
 
     @cached_property
     def theta(self) -> Array:
@@ -152,13 +152,13 @@ class Case:
 
         if self.control.is_indicators:
             values, alike = coefficients.T.tolist(), dict[tuple[float, ...], arb_mat]()
-            for value in map(tuple, values):
+            for value in self.clock.each(map(tuple, values)):
                 if value not in alike:
                     alike[value] = stacked([[arb(v)] for v in value])
             return [alike[tuple(value)] for value in values]
         columns, none = self.control.sparse.tocsc(), arb(0)
         found, made = [], dict[bytes, arb_mat]()
-        for start, stop in pairwise(columns.indptr.tolist()):
+        for start, stop in self.clock.each(pairwise(columns.indptr.tolist())):
             which, values = columns.indices[start:stop], columns.data[start:stop]
             key = coefficients[:, which].tobytes() + values.tobytes()
             if key not in made:
@@ -177,7 +177,7 @@ class Case:
         known = [stacked([[v] for v in balls([*before(self.problem)])])] if self.problem.system.delay > 0.0 else []
         inputs = [*known, *self.pieces]
         if constants:
-            inputs = [stacked([[v] for v in (*piece.entries(), *balls([1.0]))]) for piece in inputs]
+            inputs = [stacked([[v] for v in (*u.entries(), *balls([1.0]))]) for u in self.clock.each(inputs)]
         return Scene(
             self.grid,
             [inputs[k] for k in which],
@@ -208,7 +208,7 @@ class Case:
 
     @cached_property
     def price(self) -> Price:
-        return Price(self.problem, self.control)
+        return Price(self.problem, self.control, self.clock)
 
     @cached_property
     def rows(self) -> dict[tuple[object, ...], Row]:
@@ -235,9 +235,13 @@ def numbers(data: object, name: str) -> Array:
 
 def _numeric(data: object) -> bool:
     """Whether that is a number, or lists of them: text and truth values are none."""
-    if isinstance(data, list):
-        return all(_numeric(value) for value in data)
-    return isinstance(data, int | float) and not isinstance(data, bool)
+    level: list[object] = [data]
+    while level:
+        kinds = set(map(type, level))
+        if not all(issubclass(kind, int | float | list) and kind is not bool for kind in kinds):
+            return False
+        level = list(chain.from_iterable(value for value in level if isinstance(value, list)))
+    return True
 
 
 def number(data: Mapping[str, Any], name: str) -> float:

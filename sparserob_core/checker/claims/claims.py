@@ -232,11 +232,11 @@ def _weighted(case: Case, data: object) -> tuple[list[tuple[float, Row]], Any]:
             np.eye(case.problem.system.states)[state], case.problem.horizon, middle, arb(value), disturbed=False
         )
         rows.append((multiplier, row))
-    pieces = data.get("pieces")
-    if case.control.functions < case.control.pieces:
-        pieces, expected = numbers(pieces, "pieces"), (case.problem.system.controls, case.control.pieces)
-        if pieces.shape != expected:
-            raise Broken(f"multipliers of the control's pieces have shape {pieces.shape}, expected {expected}")
+    if case.control.functions >= case.control.pieces:  # every piece has a function of its own: nothing to share out
+        return rows, None
+    pieces, expected = numbers(data.get("pieces"), "pieces"), (case.problem.system.controls, case.control.pieces)
+    if pieces.shape != expected:
+        raise Broken(f"multipliers of the control's pieces have shape {pieces.shape}, expected {expected}")
     return rows, pieces
 
 

@@ -96,7 +96,7 @@ def covered(case: Case, window: Window, lower: Array, upper: Array) -> None:
         raise Broken(f"its cells are no pairs of corners with {1 + nu + b} coordinates")
     low, high = _extent(case, window, lower, upper)
     if not b:
-        fill(lower, upper, low, high)
+        fill(lower, upper, low, high, case.clock)
         return
     for axis in range(b):
         for sign in (-1.0, 1.0):
@@ -104,7 +104,7 @@ def covered(case: Case, window: Window, lower: Array, upper: Array) -> None:
             mine = (lower[:, face] == sign) & (upper[:, face] == sign)
             ends = (np.append(low, -np.ones(b)), np.append(high, np.ones(b)))
             ends[0][face] = ends[1][face] = sign
-            fill(lower[mine], upper[mine], *ends)
+            fill(lower[mine], upper[mine], *ends, case.clock)
 
 
 def _extent(case: Case, window: Window, lower: Array, upper: Array) -> tuple[Array, Array]:
@@ -133,14 +133,16 @@ def _work(case: Case, window: Window, normals: Array, lower: Array, upper: Array
     cuts = sorted({*case.grid, *window.cuts(case.control.breakpoints.tolist())})
     grid, every = np.array(case.grid), np.array(cuts)
     curved = None if flat is not None else Curved(window.seen, normals, units.sums)
-    keys = [(tuple(a[1:].tolist()), tuple(b[1:].tolist())) for a, b in zip(lower, upper, strict=True)]
+    pairs = case.clock.each(zip(lower, upper, strict=True))
+    keys = [(tuple(a[1:].tolist()), tuple(b[1:].tolist())) for a, b in pairs]
     order = sorted(range(len(keys)), key=lambda i: (keys[i], lower[i, 0]))
     work: list[Work] = []
     for (a, b), members in groupby(order, key=lambda i: keys[i]):
         case.clock.check()
         sides = Sides.cell(curved, np.array(a[nu:]), np.array(b[nu:])) if curved is not None else flat
         assert sides is not None
-        intervals = [part for i in members for part in cut(grid, every, float(lower[i, 0]), float(upper[i, 0]))]
+        parts = (cut(grid, every, float(lower[i, 0]), float(upper[i, 0])) for i in case.clock.each(members))
+        intervals = [part for found in parts for part in found]
         work.append(((a[:nu], b[:nu]), sides, intervals))
     return normals if curved is not None else basis, gains, work
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.arithmetic.series import norm
-from sparserob_core.checker.outcome import Broken, Unchecked
+from sparserob_core.checker.outcome import NO_LIMIT, Broken, Clock, Unchecked
 from sparserob_core.checker.reach.flow import Flow, flows, stacked
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.cost import Quadratic, nominal_point
@@ -46,24 +46,25 @@ class Price:
 
     problem: OptimalControlProblem
     control: Dictionary
-    _lengths: list[Fraction] = field(init=False, default_factory=list)
+    clock: Clock = NO_LIMIT
 
-    def __post_init__(self) -> None:
-        ends = [Fraction(float(t)) for t in self.control.breakpoints]
-        self._lengths.extend(b - a for a, b in pairwise(ends))
+    @cached_property
+    def _lengths(self) -> list[Fraction]:
+        ends = [Fraction(t) for t in self.clock.each(self.control.breakpoints.tolist())]
+        return [b - a for a, b in self.clock.each(pairwise(ends))]
 
     @property
     def is_quadratic(self) -> bool:
         return any(term is not None for term in self._terms)
 
-    @property
+    @cached_property
     def weights(self) -> list[arb]:
         """What a channel's absolute value costs per time ``(m,)``."""
         from flint import arb
 
         return [arb(self.problem.cost.l1) * w for w in balls(np.asarray(self.problem.weights))]
 
-    @property
+    @cached_property
     def blocks(self) -> list[list[int]]:
         """The channels that count together, those alone as groups of one."""
         groups: list[list[int]] = []
@@ -77,7 +78,7 @@ class Price:
         from flint import arb
 
         total = arb(0)
-        for length, piece in zip(self._lengths, pieces, strict=True):
+        for length, piece in self.clock.each(zip(self._lengths, pieces, strict=True)):
             total = total + _ball(length) * self._norms(piece.entries())
         return total + (self._quadratic(pieces).value if self.is_quadratic else arb(0))
 
@@ -94,7 +95,7 @@ class Price:
         """The tangent of the quadratic terms at a control ``(m, 1)`` on every piece."""
         found = self._quadratic(pieces)
         constant = found.value
-        for piece, slope in zip(pieces, found.slope, strict=True):
+        for piece, slope in self.clock.each(zip(pieces, found.slope, strict=True)):
             constant = constant - sum((g * u for g, u in zip(slope, piece.entries(), strict=True)), constant * 0)
         return Tangent(constant, found.slope)
 

@@ -63,13 +63,14 @@ class Dictionary:
         """One function for each piece, that is 1 on it and 0 elsewhere; or, with ``owner (K,)``, function ``owner[k]``
         is 1 on piece ``k``: whole numbers from 0 on, each of them at least once. Takes memory for ``K`` numbers."""
         times = _times(breakpoints)
-        owner = np.arange(times.size - 1) if owner is None else np.array(owner)
-        used = np.unique(owner)
+        if owner is None:
+            return cls._made(times, _owner=np.arange(times.size - 1))
+        owner = np.array(owner)
         if (
             owner.shape != (times.size - 1,)
             or owner.dtype.kind not in "iu"
-            or used[0] != 0
-            or used[-1] != used.size - 1
+            or not 0 <= owner.min() <= owner.max() < owner.size
+            or not np.bincount(owner).all()
         ):
             raise InputError(
                 f"owner must be {times.size - 1} whole numbers, all from 0 to the largest, got {_short(owner)}",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
@@ -17,8 +17,11 @@ from sparserob_core.experiment.directory.finished import read_json, stored_run
 from sparserob_core.sip.program import SemiInfiniteProgram
 
 if TYPE_CHECKING:
+    from sparserob_core.checker.claims.case import Case
     from sparserob_core.experiment.config.load import Loaded
 
+REPEATED = 16  # times that a number may be written, in characters: honest files need 7; what more allows takes memory
+SPARE = 2**20  # bytes of what is neither in certificate nor config, some kB; ten times as many are no matter either
 STATUS = {"holds": 0, "not checked": 1, "fails": 2}
 
 
@@ -72,9 +75,16 @@ def check(directory: str | Path, plugins: Iterable[str | Path] = (), seconds: fl
     answering = policy if isinstance(policy, AffinePolicy) else None
     case = Case(problem, control, disturbance, data, clock, *counting(loaded), answering)
     derived = derive(case, gap_tolerance(loaded))
-    files = compared(stored, loaded, case, summary)
+    files = compared(replace(stored, largest=_largest(path, case)), loaded, case, summary)
     claims = (_config(loaded, data, summary), *derived, *files.claims)
     return Check(loaded.config.title or path.name, claims, time.perf_counter() - started, files.not_compared)
+
+
+def _largest(directory: Path, case: Case) -> int:
+    """How many bytes the arrays of ``solution.npz`` may take: they hold what certificate and config say a few times
+    over (8 bytes for a number that has at least 3 characters), and the control on its pieces."""
+    said = sum((directory / name).stat().st_size for name in ("certificate.json", "config.yaml"))
+    return SPARE + REPEATED * (said + 8 * case.control.pieces * case.problem.system.controls)
 
 
 def _config(loaded: Loaded, data: Mapping[str, Any], summary: Mapping[str, Any]) -> Finding:

@@ -7,7 +7,9 @@ the plugin files that the user names himself (`read_config`), arrays are plain n
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+import re
+import sys
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -34,6 +36,11 @@ NUMBERS = ("cost", "value", "epsilon", "lower_bound", "upper_bound", "gap", "sec
 SAME = 1e-9  # of the largest number of an array, how far it may be from what follows from another
 LARGEST = 2**31
 """Bytes of arrays in one file, at most: no run writes as many, and a small file can pretend to hold any number."""
+LARGEST_TEXT = 2**27
+"""Bytes of one JSON file, at most: read, it takes 25 times as much memory where it is nothing but empty lists. The
+largest that runs write have some 10 million; with ten times as many a file could take all of a machine."""
+LARGE = re.compile(r"[eE]\+?[0-9]{3}|[0-9]{99}")
+"""Without one of these, a number with a point or an exponent is finite."""
 IMPOSED = {"multipliers": "f", "times": "f", "indices": "f", "rows": "i", "families": "U"}
 """What ``solution.npz`` says of every imposed constraint, and the kinds of numpy that say it."""
 SIMPLE = {"int": "iu", "float": "fiu", "str": "U", "bool": "b"}
@@ -45,10 +52,12 @@ SIMPLE = {"int": "iu", "float": "fiu", "str": "U", "bool": "b"}
 class StoredRun:
     """The files of a run directory, each read when it is first asked for.
 
-    Every property raises `InputError` that names the file when it is missing, cannot be read, or does not fit.
+    Every property raises `InputError` that names the file when it is missing, cannot be read, or does not fit, among
+    these where its arrays take more than ``largest`` bytes (`LARGEST` unless given).
     """
 
     directory: Path
+    largest: int | None = None
 
     @cached_property
     def summary(self) -> dict[str, Any]:
@@ -131,7 +140,7 @@ class StoredRun:
 
     def arrays(self, name: str) -> dict[str, Array]:
         """The arrays of one of its ``.npz`` files; none when there is no such file."""
-        return read_arrays(self.directory / name)
+        return read_arrays(self.directory / name, self.largest)
 
     def config(self, plugins: Iterable[str | Path] = ()) -> Loaded:
         """``config.yaml``, see `read_config`."""
@@ -272,15 +281,17 @@ def read_finished(
     return FinishedRun(stored, experiment, theta)
 
 
-def read_arrays(file: Path) -> dict[str, Array]:
-    """The arrays of an ``.npz`` file, none when there is no such file; raises `InputError` when it cannot be read."""
+def read_arrays(file: Path, largest: int | None = None) -> dict[str, Array]:
+    """The arrays of an ``.npz`` file, none when there is no such file; raises `InputError` when it cannot be read, or
+    takes more than ``largest`` bytes in all, `LARGEST` unless given."""
     if not file.is_file():
         return {}
     try:
         with ZipFile(file) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
-        if size > LARGEST:
-            raise InputError(f"{file}: cannot be read: expected arrays of at most {LARGEST} bytes in all, got {size}")
+        most = LARGEST if largest is None else largest
+        if size > most:
+            raise InputError(f"{file}: cannot be read: expected arrays of at most {most} bytes in all, got {size}")
         with np.load(file, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
     except InputError:
@@ -303,16 +314,57 @@ def read_arrays(file: Path) -> dict[str, Array]:
 
 
 def read_json(file: Path) -> dict[str, Any]:
-    """The contents of a JSON file; raises `InputError` when it cannot be read, or is no object."""
+    """The contents of a JSON file; raises `InputError` when it cannot be read, is too large or no object, or holds a
+    number that is not finite: a run writes null where there is none."""
     try:
-        data = json.loads(file.read_text(encoding="utf-8"))
+        data, odd = _read(file)
+    except InputError:
+        raise
     except OSError as error:
         raise InputError(f"{file}: cannot be read: {error.strerror}") from None
+    except MemoryError:
+        raise InputError(f"{file}: cannot be read: it takes more memory than there is") from None
     except (ValueError, RecursionError) as error:
         raise InputError(f"{file}: cannot be read: expected JSON: {error}") from None
     if not isinstance(data, dict):
         raise InputError(f"{file}: expected a JSON object, got {type(data).__name__}")
+    for place, value in _numbers(data) if odd else ():
+        if not abs(value) <= sys.float_info.max:
+            written = repr(value) if isinstance(value, float) else f"a whole number of {value.bit_length()} bits"
+            raise InputError(f"{file}: {place}: expected a finite number or null, got {written}")
     return data
+
+
+def _read(file: Path) -> tuple[object, bool]:
+    """What a JSON file says, and whether any of its numbers may be too large or none."""
+    size, odd = file.stat().st_size, list[str]()
+    if size > LARGEST_TEXT:
+        raise InputError(f"{file}: cannot be read: expected at most {LARGEST_TEXT} bytes, got {size}")
+    text = file.read_text(encoding="utf-8")
+
+    def whole(digits: str) -> int:
+        odd.extend([digits] if len(digits) > sys.float_info.max_10_exp else [])
+        return int(digits)
+
+    def constant(name: str) -> float:
+        odd.append(name)
+        return float(name)
+
+    data = json.loads(text, parse_int=whole, parse_constant=constant)
+    return data, bool(odd) or LARGE.search(text) is not None
+
+
+def _numbers(data: dict[str, Any]) -> Iterator[tuple[str, int | float]]:
+    """Every number of JSON, with the keys that lead to it."""
+    stack: list[tuple[str, Any]] = [("", data)]
+    while stack:
+        place, value = stack.pop()
+        if isinstance(value, dict):
+            stack += [(f"{place}.{key}" if place else key, entry) for key, entry in reversed(value.items())]
+        elif isinstance(value, list):
+            stack += [(f"{place}[{number}]", value[number]) for number in reversed(range(len(value)))]
+        elif isinstance(value, int | float):
+            yield place, value
 
 
 def read_summary(file: Path) -> dict[str, Any]:

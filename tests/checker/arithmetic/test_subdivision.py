@@ -2,12 +2,27 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
 from sparserob_core.checker.arithmetic import subdivision
 from sparserob_core.checker.arithmetic.subdivision import fill
 from sparserob_core.checker.outcome import Broken, Unchecked
+
+
+def test_times_in_any_order_fill_an_interval_unless_one_is_left_out():
+    ends = np.cumsum(np.random.default_rng(8).uniform(0.1, 1.0, size=7))
+    rows = [([a], [b]) for a, b in itertools.pairwise(ends)]
+    low, high = ends[:1], ends[-1:]
+    fill(*cells([*rows[::-1], ([ends[2]], [ends[2]])]), low, high)
+    for place in range(len(rows)):
+        with pytest.raises(Broken, match="leave a share"):
+            fill(*cells([*rows[:place], *rows[place + 1 :]]), low, high)
+    for wrong in ([ends[1]], [np.nextafter(ends[2], 9.0)]), ([np.nextafter(ends[1], 0.0)], [ends[2]]):
+        with pytest.raises(Broken):
+            fill(*cells([rows[0], wrong, *rows[2:]]), low, high)
 
 
 def cells(rows):

@@ -4,6 +4,7 @@ not fit is named."""
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import zipfile
 from collections.abc import Callable
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.experiment.directory.finished import StoredRun, read_arrays, read_finished
+from sparserob_core.experiment.directory.finished import StoredRun, read_arrays, read_finished, read_json
 from sparserob_core.experiment.figures.drawing import active_times
 from sparserob_core.experiment.run.drawing import draw_run
 from sparserob_core.experiment.run.inspection import Inspection
@@ -206,6 +207,26 @@ def test_a_small_file_that_pretends_to_hold_a_huge_array_is_refused(
     assert file.stat().st_size < 1000
     with pytest.raises(sr.InputError, match="expected arrays of at most"):
         read_arrays(file)
+
+
+@pytest.mark.parametrize("written", ["NaN", "-Infinity", "1e999", "-2.5E+308", "9" * 400, "9" * 400 + ".5"])
+def test_a_number_that_is_not_finite_is_refused_by_its_key(written: str, tmp_path: Path) -> None:
+    file = tmp_path / "x.json"
+    file.write_text(f'{{"a": {{"b": [1.5, 1e-300, 1.7e308, {"8" * 300}]}}, "c": "NaN"}}')
+    assert read_json(file)["c"] == "NaN"
+    file.write_text(f'{{"a": {{"b": [1.5, {{"c d": [[2, {written}]]}}]}}}}')
+    with pytest.raises(
+        sr.InputError, match=r"x\.json: a\.b\[1\]\.c d\[0\]\[1\]: expected a finite number or null, got"
+    ):
+        read_json(file)
+
+
+def test_a_file_that_is_too_large_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    file = tmp_path / "x.json"
+    file.write_text("{}")
+    os.truncate(file, 2**33)
+    with pytest.raises(sr.InputError, match="expected at most 134217728 bytes, got 8589934592"):
+        read_json(file)
 
 
 @pytest.mark.parametrize(

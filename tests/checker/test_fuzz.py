@@ -1,0 +1,136 @@
+"""Guards checker: whatever a file says, a verdict or an error of the input, never an exception, never a proof of more:
+every number, array and structure of every kind of certificate made wrong in every way."""
+
+from __future__ import annotations
+
+import copy
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sparserob_core as sr
+from sparserob_core.errors import InputError
+from tests.checker.test_check import CONFIGS, DECAY, SPRING, on
+from tests.support.fuzzing import NOT_FINITE, tampered
+
+PUSHED: dict[str, Any] = {
+    "name": "linear",
+    "system": {"A": [[0, 1], [-1, -0.1]], "B": [[0], [1]], "E": [[0], [1]]},
+    "horizon": 2.0,
+    "initial_state": [0.5, 0],
+    "control": {"box": 1.0},
+    "disturbance": {"box": [0.1]},
+    "path": [{"box": [0.9, None], "from": 0.5}],
+    "terminal": [{"box": [0.4, 0.5]}],
+}
+AFFINE = {"name": "affine", "cost": "peak"}
+KINDS: dict[str, dict[str, Any]] = {
+    "known": on(6, {**SPRING, "horizon": 2.0, "path": [{"box": [1.2, None], "from": 0.3}], "terminal": [{"box": 0.9}]}),
+    "parameter": on(6, DECAY),
+    "initial set": on(4, {**DECAY, "initial_state": {"centre": [2], "box": [0.05]}}),
+    "curved": CONFIGS["ellipsoidal"] | {"dictionaries": {"control": {"name": "piecewise_constant", "pieces": 6}}},
+    "infeasible": CONFIGS["infeasible"] | {"dictionaries": {"control": {"name": "piecewise_constant", "pieces": 4}}},
+    "refuted": on(8, SPRING, method={"name": "nominal"}),
+    "refuted parameter": on(6, DECAY, method={"name": "nominal"}),
+    "equality": CONFIGS["equality"],
+    "walsh": on(8, DECAY) | {"dictionaries": {"control": {"name": "walsh", "pieces": 8, "functions": 4}}},
+    "steps": on(6, {**DECAY, "control_step": {"box": 0.8}, "initial_control": [0.0]}),
+    "mixed": on(4, {**DECAY, "path": [{"mixed": {"H": [[1.0]], "G": [[0.3]], "h": [1.9]}, "from": 0.2}]}),
+    "quadratic": on(5, {**DECAY, "cost": {"l1": 1.0, "final": {"Q": [[0.3]]}}}),
+    "sparsest": on(5, DECAY, method={"name": "sparsest"}),
+    "feedback": on(4, PUSHED, policy=AFFINE),
+    "feedback, nominal cost": on(3, {**PUSHED, "control_step": {"box": 1.5}}, policy={"name": "affine"}),
+    "feedback, worst effort": on(
+        3,
+        {**PUSHED, "initial_state": {"centre": [0.5, 0], "box": [0.02, 0.02]}},
+        policy={"name": "affine", "cost": "worst"},
+    ),
+    "feedback, curved": on(3, {**PUSHED, "terminal": [{"norm": {"p": 2, "radius": 0.6}}], "path": []}, policy=AFFINE),
+    "feedback, measurable": on(3, {**PUSHED, "disturbance_class": "measurable", "path": []}, policy=AFFINE),
+    "feedback, infeasible": on(
+        3, {**PUSHED, "disturbance": {"box": [2.0]}, "terminal": [{"box": [0.05, 0.05]}]}, policy=AFFINE
+    ),
+}
+PARTS = 8
+SEED = 24
+
+
+@pytest.fixture(scope="module")
+def honest(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    made: dict[str, Path] = {}
+
+    def run(kind: str) -> Path:
+        if kind not in made:
+            made[kind] = tmp_path_factory.mktemp("honest") / "run"
+            sr.run(copy.deepcopy(KINDS[kind]), out=made[kind], quiet=True, figures=False)
+        return made[kind]
+
+    return run
+
+
+def judged(directory: Path) -> str:
+    """The status of a check; ``input`` where the input is at fault. Anything else is an error of the test."""
+    try:
+        return sr.check(directory, seconds=20).status
+    except InputError as error:
+        assert str(error)
+        return "input"
+
+
+def wrong(source: Path, target: Path, part: int, parts: int) -> list[str]:
+    """The numbers that are not finite and were not refused, of every ``parts``-th tampering."""
+    shutil.copytree(source, target)
+    assert judged(target) == "verified"
+    failures = []
+    for file in ("certificate.json", "result.json"):
+        text = (target / file).read_text()
+        for number, (name, place, data) in enumerate(tampered(json.loads(text), SEED)):
+            if number % parts != part:
+                continue
+            (target / file).write_text(json.dumps(data))
+            status = judged(target)
+            if name in NOT_FINITE and status != "input":
+                failures.append(f"{file} {'.'.join(map(str, place))}: {name}: {status}")
+        (target / file).write_text(text)
+    return failures
+
+
+@pytest.mark.parametrize("kind", ["parameter", "feedback"])
+def test_some_of_what_may_be_wrong_is_a_verdict_or_an_error_of_the_input(
+    kind: str, honest: Any, tmp_path: Path
+) -> None:
+    assert wrong(honest(kind), tmp_path / "copy", 7, 400) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", range(PARTS))
+@pytest.mark.parametrize("kind", KINDS)
+def test_whatever_is_wrong_is_a_verdict_or_an_error_of_the_input(
+    kind: str, part: int, honest: Any, tmp_path: Path
+) -> None:
+    assert wrong(honest(kind), tmp_path / "copy", part, PARTS) == []
+
+
+def test_a_number_that_is_not_finite_is_named(honest: Any, tmp_path: Path) -> None:
+    shutil.copytree(honest("parameter"), tmp_path / "copy")
+    file = tmp_path / "copy" / "certificate.json"
+    data = json.loads(file.read_text())
+    for written, said in (("NaN", "nan"), ("-Infinity", "-inf"), ("1e999", "inf"), ("7" * 400, "a whole number of")):
+        text = json.dumps(data | {"fewest_active": {"proof": {"control": {"tolerance": "HERE"}}}})
+        file.write_text(text.replace('"HERE"', written))
+        with pytest.raises(
+            InputError, match=r"fewest_active\.proof\.control\.tolerance: expected a finite number or null, got " + said
+        ):
+            sr.check(tmp_path / "copy")
+
+
+def test_the_same_seed_makes_the_same_tamperings(honest: Any) -> None:
+    data = json.loads((honest("parameter") / "certificate.json").read_text())
+    first, second = ([(name, place) for name, place, _ in tampered(data, SEED)] for _ in range(2))
+    assert first == second and len(first) > 500
+    changed = [repr(made) != repr(data) for _, _, made in tampered(data, SEED)]
+    assert np.mean(changed) > 0.9
