@@ -192,13 +192,39 @@ def test_the_signals_are_the_control_and_the_tube_of_the_figures(exchanged: sr.O
 def test_the_control_acts_just_where_the_push_of_the_active_constraints_leaves_the_band(exchanged: sr.Outcome) -> None:
     from sparserob_rerun.physics.switching import Switching
 
-    push = Switching(exchanged.program).push(exchanged.result.indices, None)
-    assert push is not None and exchanged.control is not None
-    acts = np.abs(exchanged.control) > 1e-6
+    view = sr.Inspection.read(exchanged.directory)
+    assert exchanged.control is not None
+    push = Switching(view).push(exchanged.result.indices, None)
+    _acts_beyond(push, exchanged.control)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("config", "changes"),
+    [
+        ("double_integrator_feedback.yaml", {}),
+        ("experiment1_scenario.yaml", {"dictionaries.control.pieces": 50, "dictionaries.disturbance.pieces": 50}),
+    ],
+)
+def test_of_policies_and_scenarios_too_the_push_says_why_the_control_switches(
+    config: str, changes: dict[str, object]
+) -> None:
+    from sparserob_rerun.physics.switching import Switching
+
+    outcome = sr.run(CONFIGS / config, changes, None, quiet=True, figures=False)
+    switching = Switching(inspection(config, changes))
+    cuts = outcome.result.dual.cuts if outcome.program.spread is not None else outcome.result.indices
+    assert outcome.result.decision is not None
+    _acts_beyond(switching.push(cuts, None), outcome.result.decision[: switching.pieces].reshape(1, -1))
+
+
+def _acts_beyond(push: np.ndarray | None, control: np.ndarray) -> None:
+    assert push is not None
+    acts = np.abs(control) > 1e-6
     assert acts.any() and not acts.all()
     assert (np.abs(push[acts]) > 1.0 - 1e-4).all()
     assert (np.abs(push[~acts]) < 1.0 + 1e-4).all()
-    assert (np.sign(push[acts]) == np.sign(exchanged.control[acts])).all()
+    assert (np.sign(push[acts]) == np.sign(control[acts])).all()
 
 
 def inspection(config: str = "experiment1_reduced.yaml", changes: dict[str, object] = SEARCH) -> sr.Inspection:

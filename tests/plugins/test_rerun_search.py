@@ -68,7 +68,10 @@ def test_the_landscape_follows_every_weight_and_goes_through_the_best_tuple_with
         j = int(np.flatnonzero(one["up"] == one["anchor"][1])[0])
         # the drawn best point has the value that the drawing shows there, and that the search has found
         assert values[i, j] == one["value"][0]
-        assert one["value"][0] == pytest.approx(one["sought"][0], abs=1e-9)
+        if "literal" in config:  # the disturbances of the two that decide are at their worst on the map
+            assert one["value"][0] >= one["sought"][0] - 1e-9
+        else:
+            assert one["value"][0] == pytest.approx(one["sought"][0], abs=1e-9)
         assert np.ptp(values[np.isfinite(values)]) > 1e-6
         mine = trace.epsilon == one["epsilon"][0]
         assert (np.abs(trace.value[mine] - one["sought"][0]) <= 1e-12 * max(1.0, abs(one["sought"][0]))).any()

@@ -33,13 +33,13 @@ class Physics:
 
     def __init__(self, rr: Any, stream: Any, view: sr.Inspection) -> None:
         self.rr, self.stream, self.view = rr, stream, view
-        self.switching = Switching(view.program)
+        self.switching = Switching(view)
         assert view.problem is not None
         self.problem = view.problem
 
-    def draw(self, decision: Floats, cuts: Sequence[sr.Cut], mu: Floats | None) -> None:
+    def draw(self, decision: Floats, cuts: Sequence[sr.Cut], mu: Floats | None, proven: Sequence[sr.Cut] = ()) -> None:
         """One decision with the constraints that carry a multiplier; ``mu`` are the multipliers of the equalities, if
-        they are known."""
+        they are known. ``proven``: those of a lower bound, which of a policy say the deviation, too."""
         from sparserob_rerun.physics.phase import draw_phase
 
         active = [cut for cut in cuts if cut.multiplier > 0.0]
@@ -47,6 +47,8 @@ class Physics:
         data = self.view.picture(decision, times)
         worst = self.view.worst_cases(decision)
         push = self.switching.push(active, mu)
+        if push is None and proven:
+            push = self.switching.push(proven, mu)
         for page in pages(self.problem):
             drawing = Drawing()
             for top, (kind, place) in enumerate(page.plots):
@@ -119,7 +121,8 @@ class Physics:
         if push is None or not push.any():
             drawing.frame(
                 axes,
-                f"why {name} switches: no constraint pushes, or its push is not known",
+                f"why {name} switches: "
+                + ("no constraint pushes" if push is not None else "known once the run is over"),
                 _time(data),
                 ticks_below=last,
             )
@@ -129,7 +132,9 @@ class Physics:
         axes = Axes(axes.left, axes.top, axes.width, axes.height, axes.x, (-reach, reach))
         drawing.frame(
             axes,
-            f"why {name} switches: it acts where the push of the constraints leaves the band",
+            f"how the constraints push the nominal {name}; 1 is what its largest size costs"
+            if self.switching.peak
+            else f"why {name} switches: it acts where the push of the constraints leaves the band",
             _time(data),
             ticks_below=last,
         )

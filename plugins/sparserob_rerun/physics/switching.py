@@ -19,18 +19,23 @@ class Switching:
 
     At an optimiser the control of a piece is zero where it lies between -1 and 1, and acts towards its sign beyond:
     stationarity, ``weights sign(S x) + S'^{-1} G'y = 0`` up to the regulariser. Known only where ``S`` is square and
-    regular, and every piece has a cost.
+    regular, and every piece has a cost. Of a policy it is that of the control that answers nothing; where the cost is
+    that of the largest size over all disturbances (``peak``), the band says what this size costs, and no more.
     """
 
-    def __init__(self, program: sr.SemiInfiniteProgram) -> None:
-        self.program = program
-        weights = np.asarray(program.finite.weights)
-        self.weights = weights
-        self.known = bool(weights.size == program.n and (weights > 0).all() and program.G is None)
+    def __init__(self, view: sr.Inspection) -> None:
+        self.program, self.row = view.program, view.row
+        program, weights = view.program, np.asarray(view.program.finite.weights)
+        priced = weights if program.spread is None else weights[weights > 0.0]
+        self.weights, self.pieces = priced, priced.size
+        self.peak = bool(program.spread is not None and (weights[: priced.size] == 0.0).any())
+        square = priced.size == (program.n if program.spread is None else program.image_size)
+        self.known = bool(square and priced.size and (priced > 0).all() and program.G is None)
         self.dense: Floats | None = None
         if self.known and program.finite.S is not None:
             self.dense = np.asarray(program.finite.S.toarray())
-            self.known = bool(np.linalg.matrix_rank(self.dense) == program.n)
+            whole = self.dense.shape == (self.pieces, self.pieces)
+            self.known = bool(whole and np.linalg.matrix_rank(self.dense) == self.pieces)
 
     def push(self, cuts: Sequence[sr.Cut], mu: Floats | None) -> Floats | None:
         """The switching function ``(m, K)`` under these constraints with their multipliers, or ``None`` where it is not
@@ -40,12 +45,14 @@ class Switching:
             return None
         total = np.zeros(program.n)
         for cut in cuts:
-            family = program.formulated(cut.family, cut.formulation)
-            if family is None:  # the number of a sample does not say which constraint it is
+            if program.family(cut.family).defines:  # it says what the price is
+                continue
+            row = self.row(cut)
+            if row is None:
                 return None
-            rows, _ = family.rows(np.asarray(cut.index)[np.newaxis])
-            total += cut.multiplier * rows[0, cut.row]
+            total += cut.multiplier * row
         if program.A is not None and mu is not None:
             total += mu @ np.atleast_2d(program.A)
+        total = total[: self.pieces]
         on_pieces = total if self.dense is None else np.linalg.solve(self.dense.T, total)
         return np.asarray(-on_pieces / self.weights).reshape(program.channels, -1)

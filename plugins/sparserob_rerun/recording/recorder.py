@@ -269,6 +269,8 @@ class Recorder:
             slots = slots_of(active(event.imposed, event.multipliers), self._formulation)
             if slots.size:
                 words = f"others as active in round {event.round}"
+                if event.simplified:
+                    words = "with all of the uncertainty, of which the method has a part"
                 self.explorer.aim(Aim(slots, event.epsilon, np.nan, words, event.round))
 
     def _finished(self, event: sr.RunFinished) -> None:
@@ -284,7 +286,8 @@ class Recorder:
                 self.draw("the bounds", self.rounds.picture.end, result.lower_bound, result.upper_bound)
             self.draw("what clashes", self._clash, result)
             if result.decision is not None and self.physics is not None:
-                self.draw("control and states", self.physics.draw, result.decision, result.indices, result.dual.mu)
+                known = (result.decision, result.indices, result.dual.mu, result.dual.cuts)
+                self.draw("control and states", self.physics.draw, *known)
                 self.draw("the signals", self.physics.signals, result.decision)
             if result.decision is not None:
                 told = told_by_result(result)
@@ -332,7 +335,8 @@ def shown_of(inspection: sr.Inspection | None, landscape: LandscapeOptions | Non
     if inspection is None:
         return Shown(None, 0, True, False)
     program, answers = inspection.program, inspection.problem is not None and inspection.program.spread is not None
-    return Shown(inspection.problem, len(program.families), inspection.searches, landscape is not None, answers=answers)
+    mapped = landscape is not None and program.spread is None
+    return Shown(inspection.problem, len(program.families), inspection.searches, mapped, answers=answers)
 
 
 def active(cuts: Any, multipliers: Floats) -> list[sr.Cut]:

@@ -14,6 +14,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, assemble, tools_of
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.events import DECIDING
+from sparserob_core.sip.methods.baselines import Scenario
 from sparserob_core.sip.methods.own_units import UsersUnits
 from sparserob_core.sip.program import TOLERANCE
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from sparserob_core.experiment.config.load import Loaded
     from sparserob_core.experiment.figures.clash import Strip
     from sparserob_core.experiment.figures.figure_data import FigureData
+    from sparserob_core.sip.evidence import Cut
     from sparserob_core.sip.method import Method
     from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
     from sparserob_core.sip.result import Result
@@ -131,6 +133,30 @@ class Inspection:
         program = self.program if own is None else own.program
         return TOLERANCE * program.family(family).row_unit(row)
 
+    def row(self, cut: Cut) -> Array | None:
+        """The left-hand side ``(n,)`` of a constraint that the method has imposed: of a sampled one at its sample, of a
+        policy's at its deviation; ``None`` where the cut does not say which deviation that is."""
+        family, index = self.program.family(cut.family), np.asarray(cut.index, dtype=float)
+        if family.uncertain is not None:
+            size = family.index_set.dimension
+            if index.size == size:
+                return None
+            rows = family.uncertain(index[:size])
+            part, factor = int(rows.part[cut.row]), float(rows.factor[cut.row])
+            return np.asarray(rows.g[[cut.row]].toarray()[0] + factor * (index[size:] @ rows.C[part]))
+        imposed = self._sampled.get(cut.family) if cut.formulation == "sampled" else family.formulated(cut.formulation)
+        return None if imposed is None else imposed.rows(index[np.newaxis])[0][0, cut.row]
+
+    @cached_property
+    def _sampled(self) -> Mapping[str, ConstraintFamily]:
+        """The families of the method ``scenario`` by name: those of its own samples."""
+        method = self._loaded.config.method
+        built: Method = self._loaded.registry.build("method", method.name, method.options)
+        if not isinstance(built, Scenario):
+            return {}
+        families = built.simplified(self.program, np.random.default_rng(self._loaded.config.seed)).families
+        return {family.name: family for family in families}
+
     def worst_cases(self, decision: Array) -> dict[str, Array]:
         """The worst parameter and disturbance of every state constraint at a decision, and the states that they cause,
         as ``adversary.npz`` has them: ``names (f,)``, ``violations (f,)``, ``times (f,)``, ``state_times (T,)``,
@@ -144,10 +170,13 @@ class Inspection:
         """``g(epsilon; .)`` over tuples of ``count`` indices in the method's formulation, by a relaxed program of its
         own.
 
-        Raises `InputError` when there is no constraint family."""
+        Raises `InputError` when there is no constraint family, and for a policy, whose rows are no rows of a linear
+        program before their deviations are known: one value takes as long as a round of the exchange."""
         from sparserob_core.sip.relaxed.relaxed import RelaxedProgram
         from sparserob_core.sip.relaxed.tuples import TupleValue, imposed_program
 
+        if self.program.spread is not None:
+            raise InputError("g of a policy is a robust program at every point; its rounds show what it comes to")
         formulation: Literal["literal", "reduced"] = "literal" if self.literal else "reduced"
         users, tools = imposed_program(self.program, formulation), tools_of(self._loaded)
         if not users.families:

@@ -57,17 +57,21 @@ class Scenario(Method, Options):
     """How many uncertainties are sampled."""
 
     def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
-        seed = int(tools.rng.integers(2**63))  # every family sees the same scenarios
-
-        def sampled(family: ConstraintFamily) -> ConstraintFamily | None:
-            return None if family.sample is None else family.sample(self.scenarios, np.random.default_rng(seed))
-
-        result = _judged(program, _simplified(program, "scenario", sampled), tools, self.tolerance, self.rounds)
+        result = _judged(program, self.simplified(program, tools.rng), tools, self.tolerance, self.rounds)
         if result.decision is None:
             return result
         bound = scenario_bound(self.scenarios, program.n, len(result.indices))
         message = f"{result.message}; {bound.sentence}" if result.status in ("refuted", "undecided") else result.message
         return replace(result, message=message, scenario_bound=bound)
+
+    def simplified(self, program: SemiInfiniteProgram, rng: np.random.Generator) -> SemiInfiniteProgram:
+        """The program with the scenarios only that are drawn by ``rng``; raises `InputError`."""
+        seed = int(rng.integers(2**63))  # every family sees the same scenarios
+
+        def sampled(family: ConstraintFamily) -> ConstraintFamily | None:
+            return None if family.sample is None else family.sample(self.scenarios, np.random.default_rng(seed))
+
+        return _simplified(program, "scenario", sampled)
 
 
 def _simplified(
