@@ -343,14 +343,14 @@ def test_a_flat_slice_says_so_and_has_no_range_of_its_own() -> None:
 
     landscape = mapped(Plain(lambda s: 0.632, [0, -1]), np.array([[0.5], [0.7]]))
     assert landscape.flat and landscape.limits == (0.632, 0.632)
-    assert _said(landscape) == "g does not depend on these two here: it is 0.632"
+    assert _said(landscape) == ["g does not depend on these two here: 0.632"]
     tilted = Landscape(Plain(lambda s: s[0, 0], [0, -1]), np.array([[0.5], [0.7]]), (0, 0), (1, 0), 8)  # type: ignore[arg-type]
     list(tilted.evaluate())
-    assert not tilted.flat and "from 0 (dark) to 1 (bright)" in _said(tilted)
+    assert not tilted.flat and _said(tilted) == ["g from 0 (dark) to 1 (bright)"]
     little: Any = Plain(lambda s: 0.67833 + 1e-6 * s[0, 0], [0, -1])
     slight = Landscape(little, np.array([[0.5], [0.7]]), (0, 0), (1, 0), 8)
     list(slight.evaluate())
-    assert _said(slight) == "g from 0.67833 (dark) to 0.678331 (bright)"
+    assert _said(slight) == ["g from 0.67833 (dark) to 0.678331 (bright)"]
 
 
 @pytest.mark.parametrize("place", [0.0, 1e-17, 1.0 / 7.0 + 1e-15, 0.5, 1.0])

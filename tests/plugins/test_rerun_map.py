@@ -107,3 +107,19 @@ def test_an_index_beside_the_first_is_not_the_second() -> None:
     assert two_of([0, 1, -1, -1], slots, widths, (0, 3)) == (0, 3)
     assert two_of([-1, -1, -1, -1], slots, widths, (3, 2)) == (3, 2)
     assert two_of([0], slots[:1], widths, (0, 0)) == (0, 0)
+
+
+def test_words_are_bright_and_lines_of_plots_legible_on_a_dark_and_on_a_light_ground() -> None:
+    from sparserob_rerun.drawing import palette as ink
+
+    def contrast(one: tuple[int, ...], other: tuple[int, ...]) -> float:
+        linear = [
+            sum(share * (part / 255.0) ** 2.2 for share, part in zip((0.2126, 0.7152, 0.0722), colour[:3], strict=True))
+            for colour in (one, other)
+        ]
+        return (max(linear) + 0.05) / (min(linear) + 0.05)
+
+    veil = (128, 128, 128)  # what the viewer writes on above a dark ground in its light theme
+    for colour in (ink.INK, ink.GREY, ink.ORANGE, ink.GREEN, ink.PURPLE, ink.VERMILLION, ink.SKY):
+        assert contrast(ink.worded(colour), veil) > 3.0
+        assert contrast(ink.legible(colour), (255, 255, 255)) > 3.0 < contrast(ink.legible(colour), (20, 20, 20))

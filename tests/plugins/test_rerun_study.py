@@ -157,14 +157,14 @@ def test_no_panel_of_a_study_is_empty(
 
 def test_the_map_has_every_status_with_its_colour_and_the_words_count_them(config: Path, tmp_path: Path) -> None:
     from sparserob_core.experiment.run.viewer import recorder
-    from sparserob_rerun.study.statuses import COLOURS
+    from sparserob_rerun.study.board import shaded
 
     file = tmp_path / "x.rrd"
     axes = ["seed=0,1,2", "method.status=certified,infeasible,undecided"]
     study = watched(config, axes, tmp_path / "study", recorder(file, False, None))
     cells = rows(read(file)["/study/map/cells"], "Boxes2D:colors", "Boxes2D:centers")
     colours = [int(one) for one in cells[-1]["Boxes2D:colors"]]
-    expected = [int.from_bytes(bytes(COLOURS[str(row["status"])]), "big") for row in study.table]
+    expected = [int.from_bytes(bytes(shaded(str(row["status"]))), "big") for row in study.table]
     assert colours == expected and len(set(colours)) == 3
     assert len({tuple(one) for one in cells[-1]["Boxes2D:centers"]}) == 9
     assert {"3 certified", "3 infeasible", "3 undecided"} <= set(labels(file, "map"))

@@ -12,10 +12,11 @@ from typing import Any, final
 
 import numpy as np
 
-from sparserob_rerun.drawing.palette import FAINT, GREY, GROUND, INK, Colour, Floats
+from sparserob_rerun.drawing.palette import FAINT, GREY, GROUND, INK, Colour, Floats, worded
 
 HATCHES = 60
 LOW = 150.0  # a plot that is lower has fewer ticks
+LETTER = 5.0  # half the width of a letter, in units of a drawing that is a little smaller than its panel
 LIFT = 9.0  # the viewer writes labels this far below their points
 
 
@@ -69,26 +70,37 @@ class Drawing:
         """Words centred at a pixel."""
         self.labels.append((np.array([x, y - LIFT]), words, colour))
 
-    def frame(self, axes: Axes, title: str, x_label: str = "", ticks_below: bool = True, decades: bool = False) -> None:
+    def frame(
+        self,
+        axes: Axes,
+        title: str,
+        x_label: str = "",
+        ticks_below: bool = True,
+        decades: bool = False,
+        room: float = 1.0,
+    ) -> None:
         """The box, ticks at round numbers, the name of what is plotted above it, and that of the axis at its end.
-        ``decades``: the values upwards are decimal logarithms."""
+        ``decades``: the values upwards are decimal logarithms; ``room``: how large words are in units of the drawing,
+        which is more in a panel that is small."""
         left, top, right, bottom = axes.left, axes.top, axes.left + axes.width, axes.top + axes.height
         self.line("frame", np.array([[left, top], [left, bottom], [right, bottom]]), GREY, 1.0)
         few = ticks(*axes.y, 3) if axes.height < LOW else np.zeros(0)
         for value in few if few.size > 1 else ticks(*axes.y):
             y = float(axes.at(axes.x[0], value)[0, 1])
             self.line("frame", np.array([[left - 5, y], [left, y]]), GREY, 1.0)
-            self.text(left - 24, y, f"1e{value:g}" if decades else f"{value:.6g}", GREY)
+            words = f"1e{value:g}" if decades else f"{value:.6g}"
+            self.text(left - room * (10 + LETTER * len(words)), y, words, GREY)
         for value in ticks(*axes.x):
             x = float(axes.at(value, axes.y[0])[0, 0])
             self.line("frame", np.array([[x, bottom], [x, bottom + 5]]), GREY, 1.0)
             if ticks_below:
-                self.text(x, bottom + 15, f"{value:g}", GREY)
+                self.text(x, bottom + 15 * room, f"{value:g}", GREY)
         if axes.y[0] < 0.0 < axes.y[1]:
             self.line("frame", axes.at(np.array(axes.x), np.zeros(2)), FAINT, 0.7)
-        self.text((left + right) / 2, top - 14, title)
+        if title:
+            self.text((left + right) / 2, top - 16 * room, title)
         if x_label:
-            self.text(right + 10 + 4 * len(x_label), bottom, x_label, GREY)
+            self.text(right + room * (10 + LETTER * len(x_label)), bottom, x_label, GREY)
 
     def band(self, layer: str, axes: Axes, x: Floats, lower: Floats, upper: Floats, colour: Colour) -> None:
         """The area between two curves, as upright strokes."""
@@ -135,7 +147,7 @@ class Drawing:
                 rr.Points2D(
                     np.array([place for place, _, _ in self.labels]),
                     labels=[words for _, words, _ in self.labels],
-                    colors=[colour for _, _, colour in self.labels],
+                    colors=[worded(colour) for _, _, colour in self.labels],
                     radii=rr.Radius.ui_points(0.0),
                     show_labels=True,
                     draw_order=90.0,

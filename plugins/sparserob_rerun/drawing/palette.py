@@ -51,6 +51,34 @@ _DIVERGING = np.array(
 )
 
 
+LEGIBLE = 0.22
+"""Luminance of the lines of a plot whose ground is the theme's: at 0.02 they are lost on a dark one, at 1 on a light
+one; here they have a contrast of 4.5 to the one and of 3.9 to the other (WCAG 2.1)."""
+BRIGHT = 0.8
+"""Luminance of words, which the viewer writes on a veil above our dark ground, a grey one of luminance 0.2 in its light
+theme: a tenth of it is lost there, and so is nearly everything below it; there is nothing above 1."""
+
+
+def _luminance(colour: Floats) -> float:
+    return float(np.array([0.2126, 0.7152, 0.0722]) @ (colour / 255.0) ** 2.2)
+
+
+def legible(colour: Colour) -> Colour:
+    """A colour for lines on a ground that may be dark or light: no brighter than `LEGIBLE`."""
+    parts = np.array(colour[:3], dtype=float)
+    red, green, blue = np.rint(parts * min(1.0, LEGIBLE / _luminance(parts)) ** (1.0 / 2.2)).astype(int).tolist()
+    return red, green, blue, colour[3]
+
+
+def worded(colour: Colour) -> Colour:
+    """A colour for words: mixed with so much white that it is `BRIGHT`."""
+    parts = np.array(colour[:3], dtype=float)
+    shares = np.linspace(0.0, 1.0, 101)
+    share = next(share for share in shares if _luminance(parts + share * (255.0 - parts)) >= BRIGHT)
+    red, green, blue = np.rint(parts + share * (255.0 - parts)).astype(int).tolist()
+    return red, green, blue, 255
+
+
 def sequential(values: Floats) -> npt.NDArray[np.uint8]:
     """Viridis: colours ``(..., 4)`` of values ``(...)`` between 0 and 1; NaN is transparent."""
     return _graded(values, _VIRIDIS)

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     import sparserob_core as sr
 
 LEFT, WIDTH, HEIGHT, GAP = 74.0, 640.0, 136.0, 52.0
-ONE = (0.0, LEFT + WIDTH + 60.0, -34.0, HEIGHT + 34.0)
-BOTH = (0.0, LEFT + WIDTH + 60.0, -34.0, 2 * HEIGHT + GAP + 34.0)
+ONE = (-20.0, LEFT + WIDTH + 90.0, -40.0, HEIGHT + 34.0)
+BOTH = (-20.0, LEFT + WIDTH + 90.0, -40.0, 2 * HEIGHT + GAP + 34.0)
 """Left, right, top and bottom of the bounds, and of both drawings."""
 VIEW = 1.5  # the view reaches down by this many times the size of the best bound; first bounds may be far below
 SMALLEST = 1e-12

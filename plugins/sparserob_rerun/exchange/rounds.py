@@ -16,9 +16,9 @@ from sparserob_rerun.drawing.palette import Floats
 from sparserob_rerun.exchange.bounds import Bounds
 
 INSTANTS, PARAMETERS = 97, 15
-FAMILIES = 4
+FAMILIES = 3  # that are drawn: of four plots above one another the words cover one another
 LATTICE = 27  # points at most for the coordinates that are not drawn
-LEFT, WIDTH, HEIGHT, GAP = 60.0, 640.0, 118.0, 60.0
+LEFT, WIDTH, HEIGHT, GAP = 60.0, 640.0, 112.0, 72.0
 SMALLEST = 1e-12
 SERIES = {
     "rounds/bounds": {"lower bound (proven)": ink.GREEN, "upper bound": ink.VERMILLION},
@@ -29,7 +29,12 @@ SERIES = {
 
 def extent(families: int) -> tuple[float, float, float, float]:
     """Left, right, top and bottom of the violation plots."""
-    return 0.0, LEFT + WIDTH + 44.0, -30.0, max(1, min(FAMILIES, families)) * (HEIGHT + GAP) + 8.0
+    return -30.0, LEFT + WIDTH + 60.0, -40.0, max(1, min(FAMILIES, families)) * (HEIGHT + GAP) + 8.0
+
+
+def shown_families(program: sr.SemiInfiniteProgram) -> list[sr.ConstraintFamily]:
+    """The families that constrain, without those that only say what the cost is."""
+    return [family for family in program.families if not family.defines]
 
 
 @final
@@ -51,7 +56,7 @@ class Rounds:
         self.rr, self.stream, self.inspection = rr, stream, inspection
         self.picture = Bounds(rr, stream)
         for path, series in SERIES.items():
-            names, colours = list(series), list(series.values())
+            names, colours = list(series), [ink.legible(colour) for colour in series.values()]
             stream.log(
                 path,
                 rr.SeriesLines(names=names, colors=colours, widths=[2.0] * len(names)),
@@ -76,7 +81,7 @@ class Rounds:
         what a search or a proof says of the worst of it, which a picture on a grid does not know."""
         if self.inspection is None:
             return
-        drawing, families, maps = Drawing(), self.inspection.program.families, 0
+        drawing, families, maps = Drawing(), shown_families(self.inspection.program), 0
         for place, family in enumerate(families[:FAMILIES]):
             across, along, field = violation_field(family, decision)
             last = place == min(len(families), FAMILIES) - 1

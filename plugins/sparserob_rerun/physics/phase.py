@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 SIDE = 420.0
 SLICES = 36
+ROOM = 2.0  # the panel is half as large as the drawing
 
 
 def draw_phase(rr: Any, stream: Any, data: sr.FigureData, worst: Mapping[str, Any]) -> None:
@@ -40,7 +41,10 @@ def _plane(data: sr.FigureData, worst: Mapping[str, Any]) -> Drawing:
     axes = Axes(60.0, 0.0, SIDE, SIDE, _limits(data, 0), _limits(data, 1))
     drawing = Drawing()
     drawing.frame(
-        axes, f"{data.names.state(1)} over {data.names.state(0)}: worst-case boxes along the way", data.names.state(0)
+        axes,
+        f"{data.names.state(1)} over {data.names.state(0)}: worst-case boxes along the way",
+        data.names.state(0),
+        room=ROOM,
     )
     for box in _slices(data):
         (a, b), (c, d) = box
@@ -51,7 +55,7 @@ def _plane(data: sr.FigureData, worst: Mapping[str, Any]) -> Drawing:
     drawing.line("curve", axes.at(data.state[0], data.state[1]), ink.SKY, 2.0)
     drawing.dot(axes.at(data.state[0, 0], data.state[1, 0]), ink.INK, 5.0)
     start = axes.at(data.state[0, 0], data.state[1, 0])[0]
-    drawing.text(float(start[0]), float(start[1]) - 14.0, "x(0)")
+    drawing.text(float(start[0]), float(start[1]) - 16.0 * ROOM, "x(0)")
     return drawing
 
 

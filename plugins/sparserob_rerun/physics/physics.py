@@ -24,7 +24,7 @@ LAYERS = ("hatch", "tube", "frame", "marks", "worst", "curve", "wall")
 
 def extent(count: int) -> tuple[float, float, float, float]:
     """Left, right, top and bottom of ``count`` plots above one another."""
-    return 0.0, LEFT + WIDTH + 44.0, -30.0, count * (HEIGHT + GAP) + 8.0
+    return -20.0, LEFT + WIDTH + 60.0, -36.0, count * (HEIGHT + GAP) + 8.0
 
 
 @final
@@ -43,7 +43,9 @@ class Physics:
         from sparserob_rerun.physics.phase import draw_phase
 
         active = [cut for cut in cuts if cut.multiplier > 0.0]
-        times = np.unique([cut.index[0] for cut in active])
+        # what only says how large the control is, at every piece, is no constraint that decides
+        shown = [cut for cut in active if not self.view.program.family(cut.family).defines]
+        times = np.unique([cut.index[0] for cut in shown])
         data = self.view.picture(decision, times)
         worst = self.view.worst_cases(decision)
         push = self.switching.push(active, mu)
@@ -75,7 +77,7 @@ class Physics:
         at = [rr.TimeColumn("t", duration=data.breakpoints[:-1])]
         channels, states = len(data.control), len(data.state)
         names = [data.names.control(channel) for channel in range(channels)]
-        colours = [SHADES[channel % len(SHADES)] for channel in range(channels)]
+        colours = [ink.legible(SHADES[channel % len(SHADES)]) for channel in range(channels)]
         self.stream.log(
             "signals/control",
             rr.SeriesLines(names=names, colors=colours, interpolation_mode="StepAfter"),
@@ -85,7 +87,7 @@ class Physics:
         self.stream.send_columns("signals/control", at, rows)
         at = [rr.TimeColumn("t", duration=data.times)]
         for state in range(states):
-            name, colour = data.names.state(state), SHADES[state % len(SHADES)]
+            name, colour = data.names.state(state), ink.legible(SHADES[state % len(SHADES)])
             pale = (*colour[:3], 110)
             self.stream.log(
                 f"signals/states/x{state + 1}",

@@ -99,7 +99,7 @@ def _log(rrb: Any, shown: Shown) -> Any:
 
 def _phase(rrb: Any, problem: sr.OptimalControlProblem) -> Any:
     if problem.system.states == 2:
-        return view("/physics/phase", "Phase plane", (-10.0, 520.0, -40.0, 470.0))
+        return view("/physics/phase", "Phase plane", (-30.0, 560.0, -64.0, 484.0))
     states = problem.system.states
     name = (
         "State space"
@@ -155,18 +155,20 @@ def _infeasible(rrb: Any, shown: Shown, clash: tuple[float, ...]) -> Any:
 
 
 def _bounds(rrb: Any) -> Any:
-    return view("/rounds/picture/bounds", "Bounds on the cost, round by round", bounds.ONE)
+    return view("/rounds/picture/bounds", "Bounds on the cost J (up), round by round (across)", bounds.ONE)
 
 
 def _violation(rrb: Any, shown: Shown) -> Any:
     return view(
-        "/violation/plots", "Violation along the indices: orange dots are new cuts", rounds.extent(shown.families)
+        "/violation/plots",
+        "Violation (up) along the indices (across): orange dots are new cuts",
+        rounds.extent(shown.families),
     )
 
 
 def _exchange(rrb: Any, shown: Shown) -> Any:
     counts = rrb.TimeSeriesView(
-        origin="/rounds/counts", name="Active indices and new cuts", plot_legend=rrb.Corner2D.LeftTop
+        origin="/rounds/counts", name="Numbers of active indices and of new cuts", plot_legend=rrb.Corner2D.LeftTop
     )
     both = view("/rounds/picture", "Bounds on the cost, the gap and the violation, round by round", bounds.BOTH)
     left = rrb.Vertical(both, counts, row_shares=[2, 1])

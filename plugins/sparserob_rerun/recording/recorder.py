@@ -15,7 +15,7 @@ import sparserob_core as sr
 from sparserob_rerun.drawing.palette import Floats
 from sparserob_rerun.drawing.timelines import Timelines
 from sparserob_rerun.exchange.clash import draw_clash, extent
-from sparserob_rerun.exchange.rounds import Rounds, told_by_result, told_by_round
+from sparserob_rerun.exchange.rounds import Rounds, shown_families, told_by_result, told_by_round
 from sparserob_rerun.options import LandscapeOptions
 from sparserob_rerun.physics.physics import Physics
 from sparserob_rerun.recording import words
@@ -68,7 +68,7 @@ class Recorder:
         self.timelines, self.rounds = Timelines(rr, stream), Rounds(rr, stream, inspection)
         problem = None if inspection is None else inspection.problem
         self.physics = Physics(rr, stream, inspection) if inspection is not None and problem is not None else None
-        unit = "" if problem is None or not problem.names.time else f", {problem.names.time},"
+        unit = "" if problem is None or not problem.names.time else f", in {problem.names.time}"
         self.terrain = Terrain(rr, stream, unit)
         self.explorer = Explorer(self._landscape, inspection, opening.landscape, opening.waits)
         self.search = SearchView(rr, stream, self.timelines)
@@ -165,7 +165,7 @@ class Recorder:
         return self.stages[-1]
 
     def _best(self, stage: Stage, number: int) -> Aim:
-        at = f"others as in the best tuple at evaluation {self.timelines.evaluation}"
+        at = f"through the best tuple of evaluation {self.timelines.evaluation}"
         return Aim(stage.best.reshape(-1, stage.block), stage.epsilon, stage.best_value, at, number, stage.pair)
 
     def _way(self) -> None:
@@ -336,7 +336,7 @@ def shown_of(inspection: sr.Inspection | None, landscape: LandscapeOptions | Non
         return Shown(None, 0, True, False)
     program, answers = inspection.program, inspection.problem is not None and inspection.program.spread is not None
     mapped = landscape is not None and program.spread is None
-    return Shown(inspection.problem, len(program.families), inspection.searches, mapped, answers=answers)
+    return Shown(inspection.problem, len(shown_families(program)), inspection.searches, mapped, answers=answers)
 
 
 def active(cuts: Any, multipliers: Floats) -> list[sr.Cut]:

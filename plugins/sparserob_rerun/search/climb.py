@@ -13,10 +13,10 @@ from sparserob_rerun.drawing.canvas import Axes, Drawing, ticks
 from sparserob_rerun.drawing.palette import Floats
 from sparserob_rerun.search.way import Stage
 
-WIDTH, HEIGHT, GAP = 1150.0, 300.0, 80.0
-EXTENT = (-70.0, WIDTH + 20.0, -62.0, HEIGHT + 62.0)
+WIDTH, HEIGHT, GAP = 1150.0, 300.0, 110.0
+EXTENT = (-100.0, WIDTH + 50.0, -92.0, HEIGHT + 92.0)
 CORNERS, POINTS = 500, 300  # of a curve, and of a cloud, in one panel
-MOST = 6  # panels beside one another; of more stages the last ones
+MOST = 4  # panels beside one another; of more stages the last ones
 
 
 @final
@@ -36,8 +36,8 @@ class Climb:
         for place, stage in enumerate(shown):
             self._panel(drawing, clouds, stage, (place * (width + GAP), width), exact)
         hidden = len(stages) - len(shown)
-        words = "across: evaluations of g" + (f"; {hidden} earlier searches are not shown" if hidden > 0 else "")
-        drawing.text(WIDTH / 2, HEIGHT + 36.0, words, ink.GREY)
+        if hidden > 0:
+            drawing.text(WIDTH / 2, HEIGHT + 70.0, f"{hidden} earlier searches are not shown", ink.GREY)
         drawing.log(
             self.rr, self.stream, "search/stages", layers=("frame", "restart", "bound", "exact", "best", "walk")
         )
@@ -72,7 +72,12 @@ class Climb:
             if level is not None and low <= level <= high:
                 drawing.line(layer, axes.at(np.array(axes.x), np.full(2, level)), colour, 2.0)
         if np.isfinite(stage.lower_bound) and not low <= stage.lower_bound <= high:
-            drawing.text(place[0] + place[1] / 2, HEIGHT - 12.0, f"proven ≥ {stage.lower_bound:.5g}", ink.GREEN)
+            drawing.text(place[0] + place[1] / 2, HEIGHT - 24.0, f"proven ≥ {stage.lower_bound:.5g}", ink.GREEN)
+        if 0 < stage.searched < count:  # then its last share of the budget
+            at = numbers[stage.searched - 1] + 0.5
+            drawing.dashed("restart", axes.at(np.full(2, at), np.array([low, high])), ink.GREEN)
+            x = float(axes.at(at, low)[0, 0])
+            drawing.text(min(x, place[0] + place[1] - 30.0), HEIGHT - 60.0, "polish", ink.GREEN)
         few = _corners(best)
         drawing.line("best", axes.at(numbers[few], best[few]), ink.ORANGE, 2.5)
         known = np.flatnonzero(~np.isnan(walk))
@@ -88,13 +93,13 @@ def _frame(drawing: Drawing, axes: Axes, stage: Stage, best: float) -> None:
     for value in ticks(*axes.y, 3):
         y = float(axes.at(axes.x[0], value)[0, 1])
         drawing.line("frame", np.array([[left - 5, y], [left, y]]), ink.GREY, 1.0)
-        drawing.text(left - 30.0, y, f"{value:.7g}", ink.GREY)
+        drawing.text(left - 48.0, y, f"{value:.7g}", ink.GREY)
     for value, x in ((axes.x[0], left + 8.0), (axes.x[1], right - 8.0)):
-        drawing.text(x, bottom + 15.0, f"{value:.0f}", ink.GREY)
+        drawing.text(x, bottom + 26.0, f"{value:.0f}", ink.GREY)
     middle = (left + right) / 2
     if np.isfinite(stage.epsilon) and stage.epsilon > 0.0:
-        drawing.text(middle, top - 32.0, f"epsilon {stage.epsilon:.3g}")
-    drawing.text(middle, top - 14.0, f"best {best:.6g}", ink.ORANGE)
+        drawing.text(middle, top - 62.0, f"epsilon {stage.epsilon:.3g}")
+    drawing.text(middle, top - 24.0, f"best {best:.6g}", ink.ORANGE)
 
 
 def _corners(values: Floats) -> np.ndarray:

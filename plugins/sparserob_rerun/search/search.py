@@ -165,7 +165,9 @@ class SearchView:
     def _line(self, path: str, words: str, colour: Colour, width: float = 1.5) -> None:
         if path not in self.known:
             self.known.add(path)
-            self.stream.log(path, self.rr.SeriesLines(names=[words], colors=[colour], widths=[width]), static=True)
+            self.stream.log(
+                path, self.rr.SeriesLines(names=[words], colors=[ink.legible(colour)], widths=[width]), static=True
+            )
 
     def _cloud(
         self, path: str, at: Callable[[np.ndarray], list[Any]], values: Floats, style: tuple[str, Colour]
@@ -177,7 +179,8 @@ class SearchView:
         if path not in self.known:
             self.known.add(path)
             words, colour = style
-            self.stream.log(path, self.rr.SeriesPoints(names=[words], colors=[colour], marker_sizes=[1.5]), static=True)
+            points = self.rr.SeriesPoints(names=[words], colors=[ink.legible(colour)], marker_sizes=[1.5])
+            self.stream.log(path, points, static=True)
         self.stream.send_columns(path, at(which), self.rr.Scalars.columns(scalars=values[which]))
 
 

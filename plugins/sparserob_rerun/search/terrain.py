@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from textwrap import wrap
 from typing import Any, final
 
 import numpy as np
@@ -15,7 +16,9 @@ from sparserob_rerun.search.way import Shadow, Stage, shadow
 
 PIXELS, SIDE = 128, 384.0
 TRIED, LEG, LAST = 300, 400, 20  # points that stay visible, corners of the walk, and its last ones
-ROW = 25.0  # units between two lines of words: of a panel that is half as high as the screen, the height of a line
+ROW = 36.0  # units between two lines of words: in a panel of a third of the screen a line is 25 units high
+BESIDE = 700.0  # where the words are: at the right of the map
+LETTERS = 46  # in a line; a word more does not fit there
 VISIBLE = 1e-6  # of g: what two solvers make of one value differs by less, and what is seen by more
 LIFT = 0.015  # points stand this share of the height above the surface
 SHOWN = 60  # boxes of a sketch that are drawn
@@ -47,15 +50,17 @@ class Terrain:
             "landscape/map/g", self.rr.Transform3D(scale=SIDE / PIXELS), self.rr.Image(np.ascontiguousarray(image))
         )
         (one, other), drawing, axes = landscape.names(), Drawing(), self._axes(landscape)
-        weight = f"epsilon {landscape.epsilon:.3g}: " if landscape.epsilon > 0.0 else ""
-        drawing.frame(axes, "")
-        middle = axes.width / 2
-        drawing.text(middle, -ROW - 12.0, f"{weight}{aim.words}")
-        drawing.text(middle, -12.0, f"up: {other}{self.unit}", ink.GREY)
-        which = " of the two indices that decide most" if landscape.first[0] != landscape.second[0] else ""
-        drawing.text(middle, axes.height + ROW + 14.0, f"across: {one}{self.unit}{which}", ink.GREY)
-        drawing.text(middle, axes.height + 2 * ROW + 14.0, _said(landscape), ink.GREY)
-        drawing.text(middle, axes.height + 3 * ROW + 14.0, _own(landscape, aim), ink.ORANGE)
+        drawing.frame(axes, "", room=1.4)
+        drawing.text(axes.width / 2, axes.height + 56.0, f"across: {one}{self.unit}", ink.GREY)
+        drawing.text(axes.width / 2, -34.0, f"up: {other}{self.unit}", ink.GREY)
+        two = landscape.first[0] != landscape.second[0]
+        weight = [f"epsilon {landscape.epsilon:.3g}"] if landscape.epsilon > 0.0 else []
+        both = ["over the two indices that decide most"] if two else []
+        said = [(words, ink.INK) for words in [*both, *weight, *_halves(aim.words)]]
+        said += [(words, ink.GREY) for words in _said(landscape)]
+        said += [(words, ink.ORANGE) for words in _own(landscape, aim)]
+        for line, (words, colour) in enumerate(said):
+            drawing.text(BESIDE, 30.0 + ROW * line, words, colour)
         drawing.log(self.rr, self.stream, "landscape/map/axes", layers=("frame",))
         self._anchor(landscape, axes)
         across, up, values = landscape.shown
@@ -156,7 +161,7 @@ class Terrain:
 
     def _sketches(self, landscape: Landscape, stage: Stage) -> None:
         """What a maximiser shows of itself, over where the indices are that decide in the middle of each."""
-        axes = self._axes(landscape)
+        axes, legend = self._axes(landscape), Drawing()
         for role, sketch in stage.sketches.items():
             path = f"landscape/map/sketch/{''.join(c if c.isalnum() else '_' for c in role)}"
             assert landscape.seen is not None
@@ -164,7 +169,10 @@ class Terrain:
             if corners is None or not sketch.count:
                 continue
             lower, upper = corners
-            words = f"{role}: {min(len(lower), SHOWN)} of {sketch.count}" if sketch.count > SHOWN else role
+            few = not sketch.points and sketch.count > SHOWN
+            words = f"white: {role}, {SHOWN} of {sketch.count}" if few else f"white: {role}"
+            words = f"blue: {role}" if sketch.points else words
+            legend.text(BESIDE, 30.0 + ROW * (8 + len(legend.labels)), words, ink.GREY)
             if sketch.points:
                 at = axes.at(lower[:, 0], lower[:, 1])
                 self.stream.log(
@@ -172,7 +180,6 @@ class Terrain:
                     self.rr.Points2D(
                         at,
                         colors=[ink.SKY],
-                        labels=[role] + [""] * (len(at) - 1),
                         radii=self.rr.Radius.ui_points(2.5),
                         draw_order=47.0,
                     ),
@@ -184,11 +191,15 @@ class Terrain:
                 self.rr.LineStrips2D(
                     outlines,
                     colors=[ink.SKETCH],
-                    labels=[words] + [""] * (len(outlines) - 1),
                     radii=self.rr.Radius.ui_points(0.6),
                     draw_order=42.0,
                 ),
             )
+
+        if stage.walks:
+            words = "white line and dot: the walk, and where it is now"
+            legend.text(BESIDE, 30.0 + ROW * (8 + len(legend.labels)), words, ink.GREY)
+        legend.log(self.rr, self.stream, "landscape/map/legend")
 
     def mark(self, words: str) -> None:
         """What is proven of the tuple through which the slice goes."""
@@ -198,7 +209,8 @@ class Terrain:
             at = axes.at(landscape.axes[0][landscape.at[0]], landscape.axes[1][landscape.at[1]])
             drawing = Drawing()
             drawing.dot(at, ink.PURPLE, 9.0)
-            drawing.text(axes.width / 2, axes.height + 4 * ROW + 14.0, words, ink.PURPLE)
+            for line, part in enumerate(_halves(words)):
+                drawing.text(BESIDE, 30.0 + ROW * (10 + line), part, ink.PURPLE)
             drawing.log(self.rr, self.stream, "landscape/map/exact")
 
     def _scale(self, landscape: Landscape, aim: Aim) -> tuple[float, float]:
@@ -259,7 +271,7 @@ class Terrain:
         corners = {
             (0.5, -0.12, 0.0): f"{names[0]}: {across[0]:.3g} to {across[-1]:.3g}",
             (-0.12, 0.5, 0.0): f"{names[1]}: {up[0]:.3g} to {up[-1]:.3g}",
-            (0.0, 0.0, 1.05): _said(landscape) if flat else f"g = {scale[1]:.4g}",
+            (0.0, 0.0, 1.05): ", ".join(_said(landscape)) if flat else f"g = {scale[1]:.4g}",
             (0.0, 0.0, -0.03): "" if flat else f"g = {scale[0]:.4g}",
         }
         self.stream.log(
@@ -274,25 +286,30 @@ class Terrain:
         )
 
 
-def _said(landscape: Landscape) -> str:
+def _said(landscape: Landscape) -> list[str]:
     """What the colours mean, or that there is nothing to see."""
     low, high = landscape.limits
     nowhere = bool((landscape.shown[2] == np.inf).any())
     if not np.isfinite(low):
-        return "no control meets the constraints anywhere here: g is infinite"
+        return ["no control meets the constraints anywhere", "here: g is infinite"]
     if landscape.flat or high == low:
-        return f"g does not depend on these two here: it is {low:.6g}"
+        return [f"g does not depend on these two here: {low:.6g}"]
     digits = int(np.clip(2 - np.floor(np.log10((high - low) / max(abs(low), abs(high)))), 5, 12))  # that differ
-    said = f"g from {low:.{digits}g} (dark) to {high:.{digits}g} (bright)"
-    return said + ("; brown: no control meets the constraints" if nowhere else "")
+    said = [f"g from {low:.{digits}g} (dark) to {high:.{digits}g} (bright)"]
+    return [*said, "brown: no control meets the constraints"] if nowhere else said
 
 
-def _own(landscape: Landscape, aim: Aim) -> str:
+def _own(landscape: Landscape, aim: Aim) -> list[str]:
     """The value at the anchor, and how far below it that of the search is, whose disturbances need not be the worst."""
-    below = landscape.value - aim.value
+    below, here = landscape.value - aim.value, f"orange: the best tuple, g = {landscape.value:.6g}"
     if not below > VISIBLE * max(1.0, abs(landscape.value)):
-        return f"orange: the best tuple, g = {landscape.value:.6g}"
-    return f"orange: the best tuple, {landscape.value:.6g} here; its own g is {aim.value:.6g}, {below:.2g} less"
+        return [here]
+    return [f"{here} on the map", f"its own g is {aim.value:.6g}, {below:.2g} below the map"]
+
+
+def _halves(words: str) -> list[str]:
+    """Words in lines of `LETTERS` at most."""
+    return wrap(words, LETTERS)
 
 
 def _weight(epsilon: float) -> float:

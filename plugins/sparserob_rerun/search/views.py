@@ -19,12 +19,12 @@ def landscape() -> Any:
     return view("/landscape/map", "Landscape of g around the best tuple, and the way of the search", EXTENT)
 
 
-EXTENT = (-60.0, 420.0, -64.0, 512.0)
+EXTENT = (-60.0, 1000.0, -64.0, 472.0)
 
 
 def climb() -> Any:
     """The climb, one panel for each weight epsilon."""
-    return view("/search/stages", "g over the evaluations, one panel for each epsilon", stages.EXTENT)
+    return view("/search/stages", "g (up) over the evaluations (across), one panel for each epsilon", stages.EXTENT)
 
 
 def series(rrb: Any, origin: str, name: str, contents: list[str] | None = None) -> Any:
@@ -60,7 +60,11 @@ def tab(rrb: Any, told: Collection[str], moved: Collection[str]) -> Any:
     where = [
         series(rrb, "/search/moves", f"Where it moves: {name}", [f"+ /search/moves/{name}"]) for name in sorted(moved)
     ]
-    left = rrb.Vertical(climb(), series(rrb, "/search/g", "g, with the share of the regulariser"), row_shares=[3, 2])
+    left = rrb.Vertical(
+        climb(),
+        series(rrb, "/search/g", "g, with the share of the regulariser, over the evaluations"),
+        row_shares=[3, 2],
+    )
     columns = [rrb.Vertical(*group) for group in (mine, where) if group]
     return rrb.Horizontal(left, *columns, column_shares=[5, 3, 3][: 1 + len(columns)], name="Search")
 

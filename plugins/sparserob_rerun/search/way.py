@@ -33,11 +33,14 @@ class Stage:
         self.pair: tuple[int, ...] = ()
         self.best, self.best_value, self.block = np.zeros(0), -np.inf, 1
         self.lower_bound, self.budget = -np.inf, 0
+        self.searched = 0  # evaluations before the polish, 0 where there was none yet
         self.sketches: dict[str, Outlines] = {}
 
     def add(self, event: sr.EvaluationsFinished, projection: Projection) -> None:
         """Remember a batch, and what of its tuples is drawn on a map."""
         trace, before = event.batch.trace, self.values.size
+        if event.phase == "polish" and not self.searched:
+            self.searched = before
         self.values = np.concatenate([self.values, trace.values])
         for name in {*self.notes, *trace.notes}:
             column = np.full(self.values.size, np.nan)

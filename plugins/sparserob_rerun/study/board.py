@@ -21,8 +21,11 @@ LEFT, WIDTH, HEIGHT = 150.0, 620.0, 330.0
 EXTENT = (0.0, LEFT + WIDTH + 40.0, -62.0, HEIGHT + 116.0)
 """Left, right, top and bottom of the map."""
 LETTER = 8.0  # pixels, about
+CLOSE = 16.0  # the same in a cell
+SHADE = 0.35  # of the colour of a status, for a cell: words are bright, and are to be read on it
 LINE = 22.0  # pixels between two labels above one another
 MARKED = 14.0  # pixels of a cell from which on it has room for a mark
+COSTED = 68.0  # pixels of a cell's width from which on its cost and gap fit into it
 LINES = 60  # of the table
 EMPTY: ink.Colour = (48, 52, 60, 255)
 DECADES = 3.0  # between costs from which on their axis is logarithmic
@@ -100,7 +103,7 @@ class Board:
         if self.kind == "line":
             self._line(drawing, rows, statuses)
         elif self.kind == "cells":
-            self._cells(drawing, statuses)
+            self._cells(drawing, rows, statuses)
         else:
             axes = self._axes(self.scales[1].limits)
             self._upwards(drawing, axes, self.scales[1])
@@ -147,8 +150,9 @@ class Board:
         key = scale.key + (", logarithmic" if scale.log else "")
         drawing.text(max(axes.left, LETTER * len(key) / 2), axes.top - 34, key, ink.GREY)
 
-    def _cells(self, drawing: Drawing, statuses: Sequence[str]) -> None:
-        """A cell for each pair of values, in rows and columns of equal width."""
+    def _cells(self, drawing: Drawing, rows: Mapping[int, Mapping[str, Any]], statuses: Sequence[str]) -> None:
+        """A cell for each pair of values, in rows and columns of equal width, with the cost and the gap where there is
+        room for them."""
         across, up = (len(scale.values) for scale in self.scales)
         axes = self._axes(self.scales[1].limits)
         half = np.array([axes.width / across, axes.height / up]) / 2.0 * 0.92
@@ -156,12 +160,18 @@ class Board:
         self.half = half - self.thick
         self._upwards(drawing, axes, self.scales[1])
         self.boxes = ([], [])
-        for values, status in zip(self.event.points, statuses, strict=True):
+        wide, high = (half * 2.0).tolist()
+        for place, (values, status) in enumerate(zip(self.event.points, statuses, strict=True)):
             at = axes.at(*self._at(values))[0]
             self.boxes[0].append(at)
-            self.boxes[1].append(EMPTY if status in ("waiting", "running") else COLOURS.get(status, ink.INK))
+            self.boxes[1].append(EMPTY if status in ("waiting", "running") else shaded(status))
+            told = _told(rows.get(place, {})) if status not in ("waiting", "running") else []
+            told = told[: int(high / CLOSE) - 1] if wide >= COSTED else []
             if half.min() * 2.0 >= MARKED and status != "waiting":
-                mark(drawing, at, status, None if status == "running" else ink.GROUND)
+                lift = np.array([0.0, 0.5 * CLOSE * len(told)])
+                mark(drawing, at - lift, status)
+                for line, words in enumerate(told):
+                    drawing.text(at[0], at[1] - lift[1] + CLOSE * (line + 1), words)
             elif status == "running":
                 drawing.dot(at[np.newaxis], ink.INK, 2.0)
 
@@ -204,6 +214,20 @@ class Board:
             else:
                 at = axes.at(x, axes.y[0])[0] - np.array([0.0, 8.0])
             mark(drawing, at, status)
+
+
+def shaded(status: str) -> ink.Colour:
+    """The colour of a cell with that status."""
+    red, green, blue = (round(SHADE * part) for part in COLOURS.get(status, ink.INK)[:3])
+    return red, green, blue, 255
+
+
+def _told(row: Mapping[str, Any]) -> list[str]:
+    """The cost of a point and its relative gap, as far as they are known, in a few digits."""
+    cost, gap = row.get("cost"), row.get("gap")
+    if not _known(cost):
+        return []
+    return [f"{cost:.4g}", *([f"gap {gap:.0e}".replace("e-0", "e-")] if _known(gap) else [])]
 
 
 def number(value: Any, unknown: str = "-") -> str:

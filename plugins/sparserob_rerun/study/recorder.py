@@ -288,7 +288,7 @@ def layout(opening: StudyOpening) -> Any:
     if Board(opening.event).kind == "table":
         first = rrb.TextDocumentView(origin="/study/table", name="The newest points of the study")
     else:
-        first = view("/study/map", "Status of every point", board.EXTENT)
+        first = view("/study/map", "Status, cost J and relative gap of every point", board.EXTENT)
     words = rrb.Vertical(
         rrb.TextDocumentView(origin="/study/state", name="What is known"),
         rrb.TextDocumentView(origin="/study/newest", name="Finished points, the newest first"),
