@@ -200,6 +200,12 @@ class FiniteProgram:
         return float(self.weights @ self._lengths(x) + np.abs(self.q) @ size) + quadratic + abs(self.constant)
 
     @shaped
+    def added(self, x: Float[Array, " n"]) -> float:
+        """The absolute values of the four terms of the cost at ``x``, added up."""
+        quadratic = 0.0 if self.P is None else 0.5 * float(x @ self._bent(x))
+        return float(self.weights @ self._lengths(x)) + abs(float(self.q @ x)) + abs(quadratic) + abs(self.constant)
+
+    @shaped
     def residual(self, x: Float[Array, " n"]) -> float:
         """The largest violation of bounds, rows and equalities at ``x``, each divided by its own scale (see
         `scaled_violation`)."""

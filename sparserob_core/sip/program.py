@@ -226,8 +226,8 @@ class SemiInfiniteProgram:
     ``twin`` makes the same program in its own units (`own_units`); ``cost_unit`` is what a cost of 1 is in the user's
     units, for a program in its own, and ``image_units (k,)`` what 1 of each entry of ``S x`` is.
     ``blocks (k,)``: images with the same number of at least 0 count together, with their weight times their Euclidean
-    norm; -1 is one that counts alone. ``largest``: the largest possible cost, where it is known, of which a gap is a
-    share (`cost_scale`).
+    norm; -1 is one that counts alone. ``largest``: the largest possible cost, where it is known
+    (`largest_cost`).
     ``spread``: the deviations for all of which the ``uncertain`` rows of its families hold;
     ``guide``: a program that is easier, whose decision begins with so many of the same entries: where a method may look
     for this one's optimum;
@@ -357,9 +357,9 @@ class SemiInfiniteProgram:
         return self.family(name).formulated(formulation)
 
     @cached_property
-    def cost_scale(self) -> float:
-        """The largest possible cost: that of the bounds, what a gap is relative to (`sip.result.relative_gap`). Where
-        an entry that costs something has no bound, a million of the largest coefficient, but at most a million."""
+    def largest_cost(self) -> float:
+        """The largest possible cost: that of the bounds. Where an entry that costs something has no bound, a million
+        of the largest coefficient, but at most a million. Nothing that is claimed depends on it."""
         if self.largest is not None:
             return self.largest
         program = self.finite
@@ -382,18 +382,26 @@ class SemiInfiniteProgram:
         """``J(x)``, recomputed from the data."""
         return self.finite.objective(x)
 
+    @shaped
+    def added(self, x: Float[Array, " n"]) -> float:
+        """What is added up to ``J(x)``: its absolute values, linear, quadratic and constant terms, each by its absolute
+        value. More than ``|J(x)|`` where they cancel, as where a state is to follow a reference."""
+        return self.finite.added(x)
+
 
 @dataclass(frozen=True, eq=False)
 class OwnUnits:
     """``program``: a program in its own units, every factor a power of two; ``decision (n,)``, ``image (k,)``,
     ``equalities (e,)``, ``cost``: what one of each is in the user's. Its families know their own
-    (`ConstraintFamily.row_units`). ``of``: all that the program is that it stands for."""
+    (`ConstraintFamily.row_units`). ``of``: all that the program is that it stands for. ``wider``: where these
+    units are for decisions that are small beside their bounds, makes the program in units for all decisions."""
 
     program: SemiInfiniteProgram
     decision: Array
     image: Array
     equalities: Array
     cost: float
+    wider: Callable[[], OwnUnits] | None = None
     of: tuple[object, ...] = field(default=(), repr=False)
 
 

@@ -30,8 +30,10 @@ MEANING: Mapping[Status, str] = {
 }
 
 
-SMALL_COST = 1e-6  # of the largest possible cost: a cost below this is judged as if it were this large
-UNKNOWN_SCALE = 1e6  # where the largest possible cost is not known, costs are judged as if 1 were a small one
+# A cost that is left of numbers that cancel is judged as if it were at least this share of them. With a tenth of it,
+# rounding (1e-16 of them, some hundred times) opens a gap of 1e-7; with ten times as much, seven digits of a cost that
+# is a hundred-thousandth of them are not asked for.
+SMALL_COST = 1e-6
 COLUMNS = ("outer", "epsilon", "value", "bound", "seconds")
 NOTE = "note_"
 POINTS = 500_000  # coordinates of tuples that a run keeps
@@ -136,13 +138,14 @@ class Result:
     ``cost`` is ``J`` of ``decision`` (no regulariser), ``value`` is ``J + epsilon rho``; ``lower_bound`` and
     ``upper_bound`` enclose the value of the *unregularised* semi-infinite program. ``lower_bound`` is proven in any
     case; ``upper_bound`` is the cost where ``status`` is certified or verified, and infinite where nothing is proven of
-    the decision. ``gap``: see `relative_gap`; ``cost_scale`` is the largest possible cost. ``dual``: the multipliers
-    behind ``lower_bound``, or behind infeasibility; ``proofs``: what was shown of every constraint family at the
-    decision. ``trace``: for a method that searches, every value of ``g``; ``scenario_bound``: for the scenario
-    approach, what its theory promises. ``stopped``: the limit or the interrupt that ended the method early, in words.
-    ``ray (n,)``: a direction along which the cost falls for ever, where one was found. ``missed``: the most by which
-    the decision misses an equality, relative to the numbers that are added up in it, where there are any; computed, not
-    proven, and at most `EQUALITY` where something is claimed. ``activity``: between what the least count of the
+    the decision. ``gap``: see `relative_gap`; ``cost_scale`` is what is added up to the cost
+    (`SemiInfiniteProgram.added`). ``dual``: the multipliers behind ``lower_bound``, or behind infeasibility;
+    ``proofs``: what was shown of every constraint family at the decision. ``trace``: for a method that searches, every
+    value of ``g``; ``scenario_bound``: for the scenario approach, what its theory promises. ``stopped``: the limit or
+    the interrupt that ended the method early, in words. ``ray (n,)``: a direction along which the cost falls for ever,
+    where one was found. ``missed``: the most by which the decision misses an equality, relative to the numbers that are
+    added up in it, where there are any; computed, not proven, and at most `EQUALITY` where something is claimed.
+    ``activity``: between what the least count of the
     program lies, where it has one. ``sparsest``: there where the cost is that count, not J.
     ``solved_by``: whose answers to relaxed programs were believed, and how many (`RelaxedProgram.solved_by`).
     """
@@ -166,7 +169,7 @@ class Result:
     scenario_bound: ScenarioBound | None = None
     infeasible: InfeasibleSubsystem | None = None
     seconds: float = 0.0
-    cost_scale: float = UNKNOWN_SCALE
+    cost_scale: float = 0.0
     stopped: str = ""
     ray: Array | None = None
     missed: float | None = None
@@ -197,9 +200,10 @@ class Result:
         return relative_gap(self.lower_bound, self.upper_bound, self.cost_scale)
 
 
-def relative_gap(lower: float, upper: float, largest: float = UNKNOWN_SCALE) -> float:
-    """``(upper - lower) / max(|upper|, 1e-6 largest)``, where ``largest`` is the largest possible cost: 0 when both are
-    equal, infinite when either bound is. Bounds that cross by no more than the proofs allow leave no gap."""
+def relative_gap(lower: float, upper: float, added: float = 0.0) -> float:
+    """``(upper - lower) / max(|upper|, |lower|)``: 0 when both are equal, infinite when either bound is. Bounds that
+    cross by no more than the proofs allow leave no gap. ``added``: the sum of the absolute numbers that were added up
+    to the cost, `SMALL_COST` of which the gap is relative to at least."""
     if not (np.isfinite(lower) and np.isfinite(upper)):
         return float("inf")
-    return 0.0 if upper <= lower else float((upper - lower) / max(SMALL_COST * largest, abs(upper)))
+    return 0.0 if upper <= lower else float((upper - lower) / max(abs(lower), abs(upper), SMALL_COST * added))

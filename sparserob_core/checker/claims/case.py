@@ -198,9 +198,16 @@ class Case:
         """What violations of a constraint are judged by."""
         if window not in self._units:
             self._units[window] = RowUnits(
-                self.problem, self.scene, window.shape, window.start, window.stop, window.reference
+                self.problem, self.scene, window.shape, window.start, window.stop, window.reference, self._acting
             )
         return self._units[window]
+
+    @property
+    def _acting(self) -> Array | None:
+        """How far each channel of the decision goes, ``(m,)``; not told of a policy, or where there is no decision."""
+        if self.policy is not None or self.certificate.get("decision") is None:
+            return None
+        return np.asarray(np.abs(self.control.control(self.theta)).max(axis=1))
 
     @cached_property
     def _units(self) -> dict[Window, RowUnits]:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 PRECISION = 96  # bits, where the numbers of a system are of one size
 MOST_PRECISION = 1024
 FIGURES = 1e-11  # relative to the larger of it and 1: how closely a written figure must agree with the one derived
-SMALL_COST = 1e-6  # of the largest possible cost: a cost below this is judged as if it were this large
+SMALL_COST = 1e-6  # of what is added up to a cost: a cost below this is judged as if it were this large
 SMALL_GAP = 1e-11  # what is subtracted from a lower bound for rounding may open a gap that was closed
 MOST_MULTIPLIERS = 100_000
 ASIDE = ("fewest active", "causal")  # claims that the status does not rest on
@@ -168,7 +168,7 @@ def _cost(case: Case) -> str:
     if case.counts:
         return _counted(case)
     derived = case.price.of(case.pieces) if case.policy is None else _feedback(case).cost()
-    _agrees("cost", number(case.certificate, "cost"), derived, SMALL_COST * case.price.largest)
+    _agrees("cost", number(case.certificate, "cost"), derived, SMALL_COST * added_up(case))
     return f"J = {float(derived.mid()):.12g}"
 
 
@@ -177,9 +177,9 @@ def _counted(case: Case) -> str:
     from flint import arb
 
     acted, total = activity.acted(case), activity.largest(case)
-    _agrees("cost", number(case.certificate, "cost"), arb(acted * total), SMALL_COST * total)
+    _agrees("cost", number(case.certificate, "cost"), arb(acted * total), 0.0)
     derived = case.price.of(case.pieces)
-    _agrees("J", number(case.certificate, "J"), derived, SMALL_COST * case.price.largest)
+    _agrees("J", number(case.certificate, "J"), derived, SMALL_COST * case.price.added(case.pieces))
     if case.letters is not None and not np.isin(case.control.control(case.theta), case.letters).all():
         raise Broken(f"the control takes other values than {list(case.letters)}")
     return f"it acts for {acted * total:.9g} of {total:.9g}, J = {float(derived.mid()):.12g}"
@@ -446,13 +446,20 @@ def _status(case: Case, status: str, tolerance: float | None, claims: list[Findi
 
 
 def relative_gap(case: Case, cost: float, lower: float) -> float:
-    """The gap relative to the cost, or to a millionth of the largest cost where that is more; 0 where the bounds
-    meet."""
-    return 0.0 if cost <= lower else (cost - lower) / (max(abs(cost), SMALL_COST * largest_cost(case)) or 1.0)
+    """The gap relative to the larger of the two bounds, or to a millionth of what is added up to the cost where that is
+    more; 0 where the bounds meet."""
+    return 0.0 if cost <= lower else (cost - lower) / max(abs(cost), abs(lower), SMALL_COST * added_up(case))
+
+
+def added_up(case: Case) -> float:
+    """What is added up to the cost that is claimed: the cost itself, but where the quadratic terms of one cancel."""
+    if case.counts or case.policy is not None or not case.price.is_quadratic:
+        return abs(number(case.certificate, "cost"))
+    return case.price.added(case.pieces)
 
 
 def largest_cost(case: Case) -> float:
-    """The largest cost that a control may have."""
+    """The largest cost that a control may have, of which earlier versions made the gap a share."""
     return activity.largest(case) if case.counts else case.price.largest
 
 

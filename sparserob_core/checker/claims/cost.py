@@ -99,6 +99,21 @@ class Price:
             constant = constant - sum((g * u for g, u in zip(slope, piece.entries(), strict=True)), constant * 0)
         return Tangent(constant, found.slope)
 
+    def added(self, pieces: Sequence[arb_mat]) -> float:
+        """The absolute values of what the program adds up to the cost of a control: its norms, and of the quadratic
+        terms the linear, the quadratic and the constant part."""
+        parts = zip(self._lengths, pieces, strict=True)
+        norms = sum((_ball(length) * self._norms(piece.entries()) for length, piece in parts), _ball(Fraction(0)))
+        if not self.is_quadratic:
+            return float(norms.mid())
+        found, still = self._quadratic(pieces), [piece * 0 for piece in pieces]
+        constant, linear = self._quadratic(still).value, -found.value
+        for piece, slope in zip(pieces, found.slope, strict=True):
+            linear = linear + sum((g * u for g, u in zip(slope, piece.entries(), strict=True)), linear * 0)
+        bent = linear + constant  # slope'u - value + constant = u'P u / 2
+        linear = found.value - constant - bent
+        return float((norms + abs(linear) + abs(bent) + abs(constant)).mid())
+
     @cached_property
     def largest(self) -> float:
         """What a gap is relative to: the largest cost of the absolute values, and the largest of the quadratic terms

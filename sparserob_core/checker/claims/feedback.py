@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 MOST_CELLS = 40_000  # cells of time examined for each constraint
 PEAK, CONTROL, RATE, EQUALS, STEP = "peak", "control", "rate", "equals", "control_step"
 WORST, EFFORT = "worst", "effort"
-FIGURES, SMALL_COST = 1e-11, 1e-6  # of an effort, and of the largest possible one: how closely it is known
+FIGURES = 1e-11  # of an effort: how closely it is known
 
 
 @final
@@ -154,7 +154,7 @@ class FeedbackClaims:
         assert case.policy is not None
         if case.policy.cost == WORST:
             written = arb(number(case.certificate, "cost"))
-            self._effort(written + FIGURES * abs(written).max(arb(SMALL_COST * case.price.largest)))
+            self._effort(written + FIGURES * abs(written))
             return written
         times = case.control.breakpoints
         for k in range(case.control.pieces):

@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 
 MOST_TIMES = 64  # at which a window is looked at
 MOST_HELD = 16_000_000  # numbers that tell what inputs do on every piece, at once
+# So many times as far as a control goes it is taken to go in the numbers that are added up, where its range is larger.
+# With a tenth of it, runs would be refused that were honest in the units of their whole range; with ten times as much,
+# a control of 1 in a range of 1e7 would forgive seven digits.
+BEYOND = 2.0**20
 MOST_AXES = 4  # of the parameters, at whose ends a window is looked at
 
 
@@ -32,7 +36,8 @@ MOST_AXES = 4  # of the parameters, at whose ends a window is looked at
 @dataclass(frozen=True, eq=False)
 class RowUnits:
     """The units of the constraint ``x(t) - r(t)`` in ``shape`` from ``start`` to ``stop``, or ``(x(t), u(t))`` in one
-    of more coordinates; ``reference (q, 1 + d)``: times and points of ``r``.
+    of more coordinates; ``reference (q, 1 + d)``: times and points of ``r``;
+    ``acting (m,)``: how far the control of a decision goes.
 
     That of a row ``c'x <= b`` is the smallest that is not zero of: how far ``c'x`` can reach over the window (any
     admissible control, the worst disturbance, any parameter), ``|b|``, and the width of the slab where the opposite row
@@ -47,6 +52,7 @@ class RowUnits:
     start: float
     stop: float
     reference: Array | None = None
+    acting: Array | None = None
 
     @cached_property
     def rows(self) -> Array:
@@ -152,6 +158,9 @@ class RowUnits:
                 high, low = high + convex.support(weights).sum(axis=0), low + convex.support(-weights).sum(axis=0)
                 axes = np.eye(convex.dimension)
                 far = np.maximum(np.abs(convex.support(axes)), np.abs(convex.support(-axes)))
+                if convex is self.problem.control and self.acting is not None:
+                    share = (self.acting / np.where(far > 0.0, far, np.inf)).max(initial=0.0)
+                    far = far * min(1.0, BEYOND * float(share))
                 sums = sums + (np.abs(weights) @ far).sum(axis=0)
         if self.reference is not None:
             at, (times, *points) = np.array(nodes)[places], self.reference.T

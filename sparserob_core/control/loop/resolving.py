@@ -27,7 +27,7 @@ from sparserob_core.sip.methods.exchange import Exchange, Violated
 from sparserob_core.sip.methods.own_units import solve_in_own_units
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.proof.branch_and_bound import prove
-from sparserob_core.sip.result import SMALL_COST, Result
+from sparserob_core.sip.result import Result, relative_gap
 
 PROVEN = ("certified", "verified")
 WHOLE = 10.0  # times what it takes to write a whole program down: a solution takes more
@@ -275,8 +275,9 @@ class Resolving:
             return None
         model, own, units = self._prepared(piece, state)
         found = tracking.solve(state / units.states)
-        scale = SMALL_COST * own.program.cost_scale
-        if found is None or found.cost - found.lower > self._method.tolerance * max(abs(found.cost), scale):
+        if found is None:
+            return None
+        if relative_gap(found.lower, found.cost, own.program.added(found.decision)) > self._method.tolerance:
             return None
         theirs = np.repeat(units.controls, own.control.functions)
         known = float(own.program.cost(plan.left(piece - plan.first, innovations).ravel() / theirs))

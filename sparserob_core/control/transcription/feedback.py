@@ -38,7 +38,12 @@ FINER = 2.0**-11  # of the numbers that are added up, the unit of an equality: i
 
 
 def with_feedback(
-    problem: OptimalControlProblem, model: Transcription, own: Transcription, units: Units, policy: AffinePolicy
+    problem: OptimalControlProblem,
+    model: Transcription,
+    own: Transcription,
+    units: Units,
+    policy: AffinePolicy,
+    wider: Callable[[], OwnUnits] | None = None,
 ) -> tuple[Transcription, Transcription]:
     """The program of a problem under a policy, from its transcription ``model`` without feedback and without terminal
     equalities, and the same in its ``own`` ``units``: the user's and the own one."""
@@ -78,7 +83,7 @@ def with_feedback(
             np.full(1, units.cost) if policy.cost == "worst" else np.repeat(units.controls, repeated),
         ]
     )[: scaled_program.n]
-    program = mine[0].mirrored(lambda _: OwnUnits(scaled_program, decision, decision, np.zeros(0), units.cost))
+    program = mine[0].mirrored(lambda _: OwnUnits(scaled_program, decision, decision, np.zeros(0), units.cost, wider))
     scaled_problem = units.of_problem(problem)
     return (
         replace(model, problem=problem, program=program, feedback=Feedback(policy, mine[1], in_users)),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from sparserob_core.control.constraints.state import StateConstraint
@@ -110,6 +112,19 @@ def row_units(constraint: StateConstraint, control: ConvexSet) -> Array:
     _, added = reaches(functionals, constraint.parameters, control, directions, times)
     added = added if moved is None else added + np.abs(directions) @ moved.size
     return np.maximum(1.0, power_of_two(np.array([RESOLVED * added.max()])))
+
+
+def shortfall(constraints: Sequence[StateConstraint]) -> float:
+    """Of constraints that are divided by their units, the smallest bound or width of a slab that is not 0, in the
+    row's unit, where that is below 1: the unit is then what double precision resolves of a control that goes as far as
+    it may. Else 1."""
+    least = 1.0
+    for one in constraints:
+        if one.sides is not None:
+            H, h = constraint_sides(one)
+            sizes = np.minimum(np.where(h != 0.0, np.abs(h), np.inf), np.where((w := _slabs(H, h)) > 0.0, w, np.inf))
+            least = min(least, float(sizes.min(initial=1.0)))
+    return least
 
 
 def constraint_sides(constraint: StateConstraint) -> tuple[Array, Array]:

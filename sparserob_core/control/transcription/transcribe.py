@@ -31,6 +31,7 @@ from sparserob_core.control.transcription.own_units import (
     reaches,
     rough_units,
     row_units,
+    shortfall,
     units_of_sides,
 )
 from sparserob_core.control.transcription.provable import hindrance
@@ -103,15 +104,26 @@ def prepare(
 
 
 def _answering(
-    problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary, policy: AffinePolicy
+    problem: OptimalControlProblem,
+    control: Dictionary,
+    disturbance: Dictionary,
+    policy: AffinePolicy,
+    wide: bool = False,
 ) -> tuple[Transcription, Transcription, Units]:
-    """A problem under a policy, in the user's units, in its own, and these."""
+    """A problem under a policy, in the user's units, in its own, and these (`in_own_units`)."""
     from sparserob_core.control.transcription.feedback import with_feedback
 
     ends = [end for end in problem.terminal if not isinstance(end, Equality)]
     model = _assembled(replace(problem, terminal=ends), control, disturbance, "reduced")
-    own, units = in_own_units(model)
-    return *with_feedback(problem, model, own, units, policy), units
+    own, units = in_own_units(model, wide)
+
+    def wider() -> OwnUnits:
+        found = _answering(problem, control, disturbance, policy, wide=True)[0].program.own_units
+        assert found is not None
+        return found
+
+    more = wider if not wide and _is_narrow(model, units) else None
+    return *with_feedback(problem, model, own, units, policy, more), units
 
 
 def _functionals(
@@ -136,11 +148,11 @@ def _assembled(
     control: Dictionary,
     disturbance: Dictionary,
     formulation: Formulation,
-    own: bool = False,
+    own: ConvexSet | None = None,
     like: Transcription | None = None,
 ) -> Transcription:
-    """The program in the units of the problem; every row divided by its ``own`` unit where that is asked for, or by
-    what it is divided by in another one that it is to be ``like``."""
+    """The program in the units of the problem; every row divided by the unit that it has where the control is in a set
+    of its ``own``, or by what it is divided by in another one that it is to be ``like``."""
     functionals, parameters = _functionals(problem, control, disturbance)
     constraints = _state_constraints(problem, functionals, parameters)
     A, b = _equalities(problem, functionals, parameters)
@@ -149,9 +161,9 @@ def _assembled(
         rows = like.rows
         pairs = zip(constraints, like.constraints, strict=True)
         constraints = tuple(one.divided(_shares(one, other)) for one, other in pairs)
-    elif own:
-        rows = _row_units(problem, functionals, A)
-        constraints = tuple(one.divided(row_units(one, problem.control)) for one in constraints)
+    elif own is not None:
+        rows = _row_units(problem if own is problem.control else replace(problem, control=own), functionals, A)
+        constraints = tuple(one.divided(row_units(one, own)) for one in constraints)
     S, lower, upper, weights = _image(problem, control, rows)
     if rows is not None:
         A, b = rows.equalities(A, b)
@@ -184,18 +196,45 @@ def _assembled(
     )
 
 
-def in_own_units(model: Transcription) -> tuple[Transcription, Units]:
+def in_own_units(model: Transcription, wide: bool = False) -> tuple[Transcription, Units]:
     """The same problem in its own units (decision 0016), every row divided by its own, and these units; its families
-    are explained in the user's."""
+    are explained in the user's.
+
+    Where a control may go so far that double precision does not resolve the walls beside it, the units are those of a
+    control that goes as far as that allows, ``wide`` asks for those of its whole range nonetheless.
+    """
     if model.feedback is not None:
         return _answering(model.problem, model.control, model.disturbance, model.feedback.policy)[1:]
-    problem, rough = model.problem, rough_units(model.problem)
-    dictionaries = (model.control, model.disturbance)
-    moved = rough.of_problem(problem)
+    controls = np.ones(model.problem.system.controls)
+    own, units = _scaled(model, controls)
+    short = shortfall(own.constraints)
+    if wide or short >= 1.0:
+        return own, units
+    share = float(np.exp2(np.floor(np.log2(short)))) / 2.0
+    ranged = _scaled(model, share * controls)
+    if shortfall(ranged[0].constraints) < 1.0:  # what is too fine is so without a control
+        return own, units
+    for channel in range(controls.size if controls.size > 1 else 0):
+        chosen = np.where(np.arange(controls.size) == channel, 1.0, ranged[1].controls / units.controls)
+        fewer = _scaled(model, chosen)
+        ranged = fewer if shortfall(fewer[0].constraints) >= 1.0 else ranged
+    return ranged
+
+
+def _scaled(model: Transcription, shares: Array) -> tuple[Transcription, Units]:
+    """The problem in the units that it has where every channel goes as far as the share ``(m,)`` of its range; the
+    range stays as it is."""
+    problem = model.problem
+    ranged = replace(problem, control=problem.control.in_units(1.0 / shares), control_step=None)
+    ranged = problem if (shares == 1.0).all() else ranged
+    rough, dictionaries = rough_units(ranged), (model.control, model.disturbance)
+    moved = rough.of_problem(ranged)
     known, _ = _functionals(moved, *(rough.of_dictionary(one) for one in dictionaries))
-    units = own_units(problem, rough, known, moved.control)
+    units = own_units(ranged, rough, known, moved.control)
     control, disturbance = (units.of_dictionary(one) for one in dictionaries)
-    own = _assembled(units.of_problem(problem), control, disturbance, model.formulation, own=True)
+    scaled = units.of_problem(problem)
+    far = scaled.control if ranged is problem else units.of_problem(ranged).control
+    own = _assembled(scaled, control, disturbance, model.formulation, own=far)
     families = [
         _told_by(family, theirs, row, units, own)
         for family, theirs, row in zip(
@@ -216,9 +255,9 @@ def like(own: Transcription, problem: OptimalControlProblem) -> SemiInfiniteProg
     return replace(program, families=families)
 
 
-def _in_own_units(model: Transcription) -> OwnUnits:
+def _in_own_units(model: Transcription, wide: bool = False) -> OwnUnits:
     """The program of the same problem in its own units, and the way back."""
-    own, units = in_own_units(model)
+    own, units = in_own_units(model, wide)
     rows = own.rows
     assert rows is not None
     theirs, ours = slanted(model.problem.control)[0], slanted(own.problem.control)[0]
@@ -232,7 +271,13 @@ def _in_own_units(model: Transcription) -> OwnUnits:
         image=image,
         equalities=_fixed(model.problem) @ units.states * rows.fixed,
         cost=units.cost,
+        wider=None if wide or not _is_narrow(model, units) else lambda: _in_own_units(model, wide=True),
     )
+
+
+def _is_narrow(model: Transcription, units: Units) -> bool:
+    """Whether units are those of a control that goes less far than it may."""
+    return bool((units.controls < rough_units(model.problem).controls).any())
 
 
 def _row_units(problem: OptimalControlProblem, functionals: WorstCase, A: Array) -> RowUnits:

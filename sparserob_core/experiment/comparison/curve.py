@@ -14,7 +14,7 @@ from sparserob_core.errors import ConfigError, InputError
 from sparserob_core.experiment.config.reader import read_source
 from sparserob_core.experiment.directory.finished import read_arrays, stored_run
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.result import UNKNOWN_SCALE, relative_gap
+from sparserob_core.sip.result import relative_gap
 
 WITHOUT_CURVE = frozenset({"failed", "infeasible"})
 SEARCH, ROUNDS = (
@@ -92,7 +92,7 @@ def read_curve(directory: Path) -> Curve:
         bound=bound,
         lower_bound=lower,
         upper_bound=upper,
-        gap=relative_gap(lower, upper, summary.get("cost_scale") or UNKNOWN_SCALE),
+        gap=relative_gap(lower, upper, summary.get("cost_scale") or 0.0),
         cost=_number(summary, "cost"),
         violation=_number(worst, "violation"),
         all_evaluations=spent,

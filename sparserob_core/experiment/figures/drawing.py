@@ -110,7 +110,7 @@ def _data(
         walls=list(_walls(problem)),
         active_times=active_times,
         history=history,
-        cost_scale=longest if counts else program.cost_scale,
+        cost_scale=program.added(decision) if decision.size == program.n and not counts else 0.0,
         counts=counts,
         cost_of="" if counts else problem.cost.words(),
         active_fraction=sparsity(control, dictionary.breakpoints).active_fraction,

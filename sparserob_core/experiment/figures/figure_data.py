@@ -13,7 +13,6 @@ from sparserob_core.errors import InputError
 from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import RoundFinished
-from sparserob_core.sip.result import UNKNOWN_SCALE
 
 MOST_STATES = 12  # drawn in one figure
 
@@ -58,7 +57,7 @@ class FigureData:
     ``times (T,)`` with the nominal ``state (d, T)`` and the worst case ``tube_lower``, ``tube_upper`` ``(d, T)`` over
     every disturbance and parameter; ``walls`` the path and terminal constraints on single components; ``active_times``
     the times of the imposed constraints that carry a multiplier; ``history`` the rounds of the method. ``tolerance`` is
-    the relative gap that was asked for, ``cost_scale`` the largest possible cost, ``cost_of`` what is
+    the relative gap that was asked for, ``cost_scale`` what is added up to the cost, ``cost_of`` what is
     added up to it, where that is not the L1 norm alone, ``counts`` whether cost means the time that the control acts,
     ``names`` what everything is called.
 
@@ -84,7 +83,7 @@ class FigureData:
     active_fraction: float | None = None
     cost: float | None = None
     tolerance: float | None = None
-    cost_scale: float = UNKNOWN_SCALE
+    cost_scale: float = 0.0
     cost_of: str = ""
     alone_lower: Array | None = None
     alone_upper: Array | None = None

@@ -20,7 +20,7 @@ from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.events import DECIDING, Batch, EvaluationsFinished
 from sparserob_core.sip.evidence import Proof
 from sparserob_core.sip.program import WorstConstraint
-from sparserob_core.sip.result import UNKNOWN_SCALE, Result, SearchTrace
+from sparserob_core.sip.result import Result, SearchTrace
 from sparserob_core.sip.scenario_bound import ScenarioBound
 
 BATCHES = 100  # of the evaluations of a run
@@ -105,7 +105,7 @@ def stored_result(run: StoredRun) -> Result:
             epsilon=_number(summary, "epsilon"),
             lower_bound=_number(summary, "lower_bound", -np.inf),
             upper_bound=_number(summary, "upper_bound", np.inf),
-            cost_scale=_number(summary, "cost_scale", UNKNOWN_SCALE),
+            cost_scale=_number(summary, "cost_scale", 0.0),
             stopped=str(summary.get("stopped") or ""),
             worst=_worst(summary["worst"], solution),
             proofs=[

@@ -43,7 +43,7 @@ MEANING = {
     "lower_bound": ("cost", "proven lower bound of the least cost"),
     "upper_bound": ("cost", "proven upper bound; empty unless the status is certified or verified"),
     "gap": ("1", "relative distance of the bounds"),
-    "cost_scale": ("cost", "the largest possible cost"),
+    "cost_scale": ("cost", "what is added up to the cost"),
     "worst.violation": ("constraint", "by how much the worst constraint is exceeded; negative: a margin"),
     "worst.constraint": ("", "which constraint that is"),
     "worst.time": ("time", "when"),

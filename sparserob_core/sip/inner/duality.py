@@ -89,12 +89,22 @@ def _proven(
     bound = _bound(terms, program)
     if bound > -np.inf:
         large = ROUND_OFF * terms.magnitude > NOTABLE * abs(bound)
-        return max(bound, extended_bound(program, y, mu)) if large else bound, y, mu, z
+        bound = max(bound, extended_bound(program, y, mu)) if large else bound
+        beyond = _overshot(terms, program, bound)
+        if beyond is not None:
+            shrunk = _shrunk_bound(program, y, mu, z, at, beyond)
+            if shrunk[0] > bound:
+                return shrunk
+        return bound, y, mu, z
     better = repaired(program, y, mu, z, at)
     if better is not None:
         bound = _bound(_terms(program, *better), program)
     if bound == -np.inf and not program.q.any() and program.blocks is None:
-        return _shrunk_bound(program, y, mu, z, at)
+        slope = _terms(program, y, mu, z, at).slope
+        beyond = np.isinf(program.lower) & (slope > program.weights) | np.isinf(program.upper) & (
+            slope < -program.weights
+        )
+        return _shrunk_bound(program, y, mu, z, at, beyond)
     return (bound, y, mu, z) if better is None else (bound, *better[:3])
 
 
@@ -184,7 +194,7 @@ def bent_minimisers(weights: Array, curvature: Array | float, slope: Array, lowe
 
 @shaped
 def _usable(program: FiniteProgram, y: Float[Array, " r"]) -> Float[Array, " r"]:
-    return np.where(np.isfinite(program.h), np.maximum(y, 0.0), 0.0)
+    return np.where(np.isfinite(program.h) & np.isfinite(y), np.maximum(y, 0.0), 0.0)
 
 
 @shaped
@@ -284,6 +294,21 @@ def _bound(terms: _Terms, program: FiniteProgram) -> float:
     return terms.constant + float(values.sum()) - ROUND_OFF * size
 
 
+def _overshot(terms: _Terms, program: FiniteProgram, bound: float) -> Bool[np.ndarray, " k"] | None:
+    """The entries whose slope is beyond their weight by a little, `NEAR` of it, where that costs a notable share of the
+    bound because their bounds are far away; ``None`` where there is none, or shrinking the multipliers is no way out
+    (`_shrunk_bound`)."""
+    if program.q.any() or program.P is not None or program.blocks is not None or not isfinite(bound):
+        return None
+    over = np.abs(terms.slope) - terms.weights
+    if not over.max(initial=0.0) > 0.0:
+        return None
+    near = (over > 0.0) & (over <= NEAR * terms.weights)
+    reach = np.where(terms.slope > 0.0, -program.lower, program.upper)[near]
+    lost = float(over[near] @ np.maximum(reach, 0.0)) if near.any() else 0.0
+    return near if lost > NOTABLE * abs(bound) else None
+
+
 @shaped
 def _shrunk_bound(
     program: FiniteProgram,
@@ -291,15 +316,13 @@ def _shrunk_bound(
     mu: Float[Array, " e"],
     z: Float[Array, " k"] | None,
     at: Float[Array, " n"] | None,
+    beyond: Bool[np.ndarray, " k"],
 ) -> tuple[float, Float[Array, " r"], Float[Array, " e"], Float[Array, " k"] | None]:
-    """`proving`: without a linear cost, multipliers may be scaled towards 0 until every unbounded entry's slope is
-    within its weight."""
+    """`proving`: without a linear cost, multipliers may be scaled towards 0 until the slope of every entry ``beyond``
+    its weight is within it: of those without a bound, or with one so far away that rounding of the slope costs more."""
     slope = _terms(program, y, mu, z, at).slope
-    unbounded = np.isinf(program.lower) & (slope > program.weights) | np.isinf(program.upper) & (
-        slope < -program.weights
-    )
     with np.errstate(invalid="ignore"):
-        factor = float((program.weights[unbounded] / np.abs(slope[unbounded])).min(initial=1.0)) * (1 - ROUND_OFF)
+        factor = float((program.weights[beyond] / np.abs(slope[beyond])).min(initial=1.0)) * (1 - ROUND_OFF)
     factor = factor if np.isfinite(factor) and np.isfinite(slope).all() else 0.0
     y, mu = factor * y, factor * mu
     z, at = (None if v is None else factor * v for v in (z, at))

@@ -58,13 +58,12 @@ def onto_stationary(program: FiniteProgram, z: Float[Array, " k"], slope: Float[
     unbounded_above, unbounded_below = np.isposinf(program.upper), np.isneginf(program.lower)
     held = (program.weights == 0) & unbounded_below & unbounded_above
     moved = z
-    for _ in range(HOLDS):
-        if _stationary(S, moved, slope):
-            break
-        z = np.where(held, np.clip(z, -program.weights, program.weights), z)
-        project = _factors.recall((S,), held.tobytes(), partial(_projection, S, ~held))
-        moved = z - project(S.T @ z + slope)
-        moved = moved - project(S.T @ moved + slope)
+    for number in range(HOLDS):
+        if number or not _stationary(S, moved, slope):
+            z = np.where(held, np.clip(z, -program.weights, program.weights), z)
+            project = _factors.recall((S,), held.tobytes(), partial(_projection, S, ~held))
+            moved = z - project(S.T @ z + slope)
+            moved = moved - project(S.T @ moved + slope)
         limit = program.weights + CANCELLED * float(np.abs(moved).max(initial=0.0))
         beyond = ~held & (unbounded_above & (moved > limit) | unbounded_below & (moved < -limit))
         if not beyond.any():

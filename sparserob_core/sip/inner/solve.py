@@ -74,13 +74,17 @@ class _Case:
             self.program, solution.value
         )
 
+    def _size(self, solution: FiniteSolution) -> float:
+        """What a gap is relative to where it is to be sharp."""
+        return max(abs(solution.value), self.small * self.program.added(solution.x))
+
     def judge(self, solution: FiniteSolution, name: str, by: str = "") -> FiniteSolution | None:
         """The solution, which is ``by`` somebody, as ``optimal`` if believed and sharp; otherwise keep it, or note why
         it is not believed."""
         if self.believes(solution):
             said, attempts = f"{name}: {solution.message}", tuple(self.attempts)
             found = replace(solution, status="optimal", attempts=attempts, message=said, by=by or solution.by)
-            if solution.gap <= 10 * self.tolerance * max(abs(solution.value), self.small):
+            if np.isinf(self.small) or solution.gap <= 10 * self.tolerance * self._size(solution):
                 return found
             if self.blunt is None or solution.gap < self.blunt.gap:
                 self.blunt = found
@@ -106,9 +110,10 @@ def solve_finite(
     ``optimal`` is believed when `FiniteProgram.residual` is at most ``tolerance`` and the gap to the proven lower bound
     at most ``10 tolerance`` times `cost_scale`; ``infeasible`` only with multipliers that prove it (Farkas 1902),
     whatever the solver says. ``guess``: a solution of a program with the same numbers of rows; a separable program is
-    then first tried by Newton's method. ``small``: a gap that is above ``10 tolerance`` times the value, and times
-    this, is worth more digits; whether they are found or not, what is believed stays ``optimal``. Raises `InputError`
-    when the program's shapes or numbers are at fault; a hard program is ``failed``, never an exception.
+    then first tried by Newton's method. ``small``: a gap that is above ``10 tolerance`` times the value, and times this
+    share of what is added up to it, is worth more digits; whether they are found or not, what is believed stays
+    ``optimal``. Raises `InputError` when the program's shapes or numbers are at fault; a hard program is ``failed``,
+    never an exception.
     """
     program.validate()
     found = _answer(_Case(program, solver, tolerance, small), guess)

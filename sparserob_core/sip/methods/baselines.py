@@ -102,7 +102,7 @@ def _judged(
     except KeyboardInterrupt as error:
         tools.deadline.interrupt(error)
     proofs = as_bad_as_found(prove(program, x, tools.notify, deadline=tools.deadline), found)
-    status, message = verdict(proofs, relative_gap(result.dual.bound, result.cost, program.cost_scale), tolerance)
+    status, message = verdict(proofs, relative_gap(result.dual.bound, result.cost, result.cost_scale), tolerance)
     proven = status in ("certified", "verified")
     wrong = alarm(simple, result.dual, x) if proven else ""
     stopped = tools.deadline.reason if result.stopped or status == "undecided" else ""

@@ -23,7 +23,7 @@ from sparserob_core.sip.finite import FiniteSolution
 from sparserob_core.sip.inner.vertex import MANY, vertex
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.methods.counting import count, met, tidied
-from sparserob_core.sip.methods.ledger import Answer, Found, Ledger, Prover
+from sparserob_core.sip.methods.ledger import THINNER, Answer, Found, Ledger, Prover
 from sparserob_core.sip.program import EQUALITY, TOLERANCE, ConstraintFamily, SemiInfiniteProgram, Separation
 from sparserob_core.sip.proof.branch_and_bound import prove
 from sparserob_core.sip.proof.verdict import worst_of
@@ -34,7 +34,6 @@ from sparserob_core.sip.separation.separation import separate
 IDLE_ROUNDS = 3  # rounds that a row may stay without a multiplier before it is dropped
 DROPPING_ROUNDS = 40  # rounds after which rows are only added, so that nothing can cycle
 ALLOWANCES = 4  # times that a proof is helped over rounding
-THINNER = 1e-3  # share of a margin that leaves nothing feasible, which is tried next
 SMALLEST_MARGIN, LARGEST_MARGIN = 1e-15, 1e-6  # in units of the decision's bounds, where those are below 1
 FASTEST = 0.125  # of a weight, what steps of the continuation that are taken at once may leave
 CRUDE = 1e-4  # residual and relative gap of a relaxed solution that a round can do with
@@ -118,7 +117,7 @@ class Exchange(Method, Options):
             # Exchange: impose them, drop what has been idle; tighten the rows that are violated though imposed.
             # Sharpen: nothing is violated but the bounds have not met, so do without the regulariser.
             exchanged = not last and (working.exchange(answer, violated, number) or working.tighten(violated))
-            if exchanged or (not last and self.exact and ledger.wide(x) and working.sharpen(ledger, x)):
+            if exchanged or (not last and self.exact and ledger.open(x) and working.sharpen(ledger, x)):
                 continue
 
             # Sparsify: where solvers leave dust, or any optimum will do, one with zeros; it may ask for more rows.
@@ -200,7 +199,7 @@ class Working:
         if self.epsilon == 0.0:
             return False
         plain = self.plain_bound(ledger)
-        if not ledger.wide(x) or not _usable(plain):
+        if not ledger.open(x) or not _usable(plain):
             return False
         self.epsilon, self.guess = 0.0, plain if self.program.n >= MANY else None
         return True
@@ -278,7 +277,8 @@ class Working:
             return
         multipliers = solution.y[solution.y.size - self.rows.h.size :]
         price = float(multipliers @ np.linalg.norm(self.rows.G, axis=1))
-        budget = 0.4 * ledger.tolerance * max(SMALL_COST * self.program.cost_scale, abs(solution.value))
+        size = max(SMALL_COST * self.program.added(solution.x), abs(self.program.cost(solution.x)))
+        budget = 0.4 * ledger.tolerance * size
         reach = np.maximum(np.abs(self.program.finite.lower), np.abs(self.program.finite.upper))
         unit = min(1.0, float(np.where(np.isfinite(reach), reach, 1.0).max()))
         margin = float(
@@ -327,11 +327,11 @@ def _sparser(
     """The answer with a decision of which fewer entries count, where there is one that violates nothing either; or the
     same answer and what a vertex of the relaxed program, where no regulariser chooses another optimum, violates."""
     program, x = ledger.program, answer.solution.x
-    if program.activity is None or ledger.open(x) or (number > SPARSIFYING and answer.epsilon == 0.0):
+    if program.activity is None or (number > SPARSIFYING and answer.epsilon == 0.0):
         return answer, found, ()
-    held = working.rows.G[answer.multipliers > 0.0]
-    candidates = [met(program, tidied(program, x), held, held @ x)]
-    if answer.epsilon == 0.0 and program.finite.P is None and program.blocks is None:
+    held, closed = working.rows.G[answer.multipliers > 0.0], not ledger.open(x)
+    candidates = [met(program, tidied(program, x), held, held @ x)]  # dust may be all that is between the bounds
+    if closed and answer.epsilon == 0.0 and program.finite.P is None and program.blocks is None:
         rows = working.rows
         norms = np.linalg.norm(rows.G, axis=1)
         plain = ledger.relaxed.finite(rows.G, rows.h - working.margin * norms, 0.0)

@@ -29,6 +29,7 @@ from sparserob_core.sip.result import MEANING, Result, Status, relative_gap
 
 ROUNDING = 1e-13  # of the terms of a cost, with which it is evaluated
 CRUDE = 1e-8  # of bounds, rows and equalities, relative to their scale, at a decision of which nothing is claimed
+THINNER = 1e-3  # share of a margin that leaves nothing feasible, which is tried next
 
 Prover: TypeAlias = Callable[[Array], Sequence[Proof]]
 Found: TypeAlias = Sequence[tuple[ConstraintFamily, Separation]]
@@ -87,18 +88,11 @@ class Ledger:
 
     def open(self, x: Array) -> bool:
         """Whether the gap between the lower bound and the cost of ``x (n,)`` is open."""
-        return self.gap(self.program.cost(x)) > self.tolerance
+        return self.gap(x) > self.tolerance
 
-    def wide(self, x: Array) -> bool:
-        """Whether the bounds are apart by more than the tolerance of the cost itself. Where bounds of the control that
-        no control comes near make the largest possible cost huge, a gap is closed that still is wide; it is worth a
-        relaxed program without the regulariser, though nothing depends on that."""
-        cost = self.program.cost(x)
-        return cost - self.lower > self.tolerance * abs(cost)
-
-    def gap(self, upper: float) -> float:
-        """The relative gap of the lower bound to an upper one."""
-        return relative_gap(self.lower, upper, self.program.cost_scale)
+    def gap(self, x: Array) -> float:
+        """The relative gap of the lower bound to the cost of ``x (n,)``."""
+        return relative_gap(self.lower, self.program.cost(x), self.program.added(x))
 
     def tell(self, number: int, answer: Answer, found: Found, upper: float, kept: int) -> None:
         """Tell of a round: its answer, what was found most violated at it, an upper bound that it suggests, and how
@@ -124,7 +118,7 @@ class Ledger:
             multipliers=frozen(answer.multipliers),
             added=added,
             dropped=dropped,
-            gap=self.gap(upper),
+            gap=self.gap(x) if np.isfinite(upper) else np.inf,
         )
         self.history.append(event)
         if np.isfinite(upper) or not self._suggested:
@@ -139,8 +133,8 @@ class Ledger:
     def judged(self, answer: Answer, worst: WorstConstraint, proofs: Sequence[Proof], ending: str = "") -> Result:
         """The result with the decision of ``answer``: what the proofs, the gap and the comparison of the bounds allow.
         ``ending``: why the method came to an end, where it was not by its own rules."""
-        x, cost = answer.solution.x, self.program.cost(answer.solution.x)
-        status, message = verdict(proofs, self.gap(cost), self.tolerance)
+        x = answer.solution.x
+        status, message = verdict(proofs, self.gap(x), self.tolerance)
         for what, missed, most in self._fixed(x, strictly=status in ("certified", "verified")):
             if missed > most:
                 status, message = "failed", f"the decision misses {what} by {missed:.1e} of what they compare; {ADVICE}"
@@ -169,7 +163,6 @@ class Ledger:
                 status="undecided",
                 message=f"{reason}, before there was a decision",
                 lower_bound=self.lower,
-                cost_scale=self.program.cost_scale,
                 counts=self._counts(0),
                 solved_by=dict(self.relaxed.solved_by),
                 dual=self.dual,
@@ -214,7 +207,7 @@ class Ledger:
             epsilon=answer.epsilon,
             lower_bound=min(lower, cost) if proven else lower,
             upper_bound=cost if proven else np.inf,
-            cost_scale=self.program.cost_scale,
+            cost_scale=self.program.added(answer.solution.x) if decided else 0.0,
             missed=self.program.finite.missed(answer.solution.x) if decided and self.program.finite.b.size else None,
             worst=worst,
             indices=cuts,

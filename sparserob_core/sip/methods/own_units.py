@@ -36,7 +36,10 @@ from sparserob_core.sip.program import (
     Separation,
     WorstConstraint,
 )
-from sparserob_core.sip.result import Result, SearchTrace
+from sparserob_core.sip.result import Result, SearchTrace, Status
+
+# Which of two results says more, the first of these that either has.
+ORDER: Sequence[Status] = ("certified", "infeasible", "verified", "refuted", "undecided", "failed")
 
 
 def solve_in_own_units(method: Method, program: SemiInfiniteProgram, tools: Tools) -> Result:
@@ -46,7 +49,13 @@ def solve_in_own_units(method: Method, program: SemiInfiniteProgram, tools: Tool
         return method.solve(program, tools)
     units, heard = UsersUnits(own), tools.notify
     notify: Notify = ignore if heard is ignore else lambda event: heard(units.event(event))
-    return units.result(method.solve(own.program, replace(tools, notify=notify)))
+    result = units.result(method.solve(own.program, replace(tools, notify=notify)))
+    if own.wider is None or result.status in ("certified", "infeasible") or result.stopped:
+        return result
+    # The units are for small decisions, and that was not the answer: those of all that the bounds allow may do better.
+    units = UsersUnits(own.wider())
+    second = units.result(method.solve(units.program, replace(tools, notify=notify)))
+    return second if ORDER.index(second.status) < ORDER.index(result.status) else result
 
 
 @final
@@ -67,7 +76,7 @@ class UsersUnits:
             value=own.value * self.cost,
             lower_bound=own.lower_bound * self.cost,
             upper_bound=own.upper_bound * self.cost,
-            cost_scale=(self.program.cost_scale if own.sparsest is None else own.cost_scale) * self.cost,
+            cost_scale=own.cost_scale * self.cost,
             ray=None if own.ray is None else own.ray * self.decision,
             worst=None if own.worst is None else self._witness(own.worst),
             indices=self._cuts(own.indices),

@@ -82,7 +82,7 @@ class Reweighted(Method, Options):
             or count(program, result.decision) >= count(program, first.decision)
         ):
             return first
-        gap = relative_gap(first.lower_bound, result.cost, program.cost_scale)
+        gap = relative_gap(first.lower_bound, result.cost, result.cost_scale)
         status, message = verdict(result.proofs, gap, self.tolerance)
         return replace(
             result,
@@ -91,7 +91,6 @@ class Reweighted(Method, Options):
             lower_bound=min(first.lower_bound, result.cost),
             dual=first.dual,
             history=first.history,
-            cost_scale=first.cost_scale,
             counts=first.counts,
             solved_by=first.solved_by,
             seconds=first.seconds + result.seconds,

@@ -20,7 +20,7 @@ from sparserob_core.sip.evidence import Cut, Dual, InfeasibleSubsystem, Proof
 from sparserob_core.sip.finite import HIGHS, INTERIOR, FiniteSolution
 from sparserob_core.sip.inner.central.interior import Interior
 from sparserob_core.sip.inner.counterpart import Counterpart, RobustAnswer, robust_bound
-from sparserob_core.sip.methods.ledger import Answer, Ledger, Prover
+from sparserob_core.sip.methods.ledger import THINNER, Answer, Ledger, Prover
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram, WorstConstraint
 from sparserob_core.sip.proof.verdict import NAMED, explained, worst_of
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
@@ -32,11 +32,13 @@ if TYPE_CHECKING:
 
 ALLOWED = TOLERANCE / 2  # a violation that the search may leave to the proof
 ROUNDING = 2.0**-46  # of the numbers of which a bound is made
-FIRST, LARGEST, SMALLEST = 1e-8, 1e-6, 2e-9  # margins by which rows are tightened, in their own units
+FIRST, LARGEST = 1e-8, 1e-6  # margins by which rows are tightened, in their own units
+# The least of them but 0, where a gap asks for it: a tenth of that is below what the simplex method leaves (1e-13 of
+# numbers of size 1), ten times as much is above what a gap of 1e-10 can pay for at a price of 10.
+SMALLEST = 1e-12
 SHARES = (0.1, 0.5, 1.0)  # of the way from the best decision known to the relaxed optimum, where rows are sought
 ENDED = 0.05  # seconds after the end of the time, when it is over for certain
 CUTS, GUIDED = 4, 30  # of them at each; rounds of a guide
-THINNER = 0.1  # share of a margin that leaves nothing feasible, which is tried next
 ROOM = 1e3  # units of the rows that they may have to spare
 SLACKENED = 200  # rounds of `least_slack` at most
 COARSE, SHARPER = 10.0, 0.1  # share of the cost to which the first round is solved, and how much closer the next ones
@@ -53,6 +55,7 @@ class Robust:
     cuts: list[Cut] = field(default_factory=list)
     known: set[tuple[str, bytes]] = field(default_factory=set)
     margin: float = FIRST
+    floor: float = SMALLEST
     slater: bool = True
     raw: Array = field(default_factory=lambda: np.zeros(0))
     best: Array = field(default_factory=lambda: np.zeros(0))
@@ -116,6 +119,10 @@ class Robust:
             self.cuts += [Cut(family.name, index, row) for row in range(rows.h.size)]
             added += 1
         return added
+
+    def widen(self) -> None:
+        """Tighten the rows by four times as much, and no less from now on."""
+        self.margin = self.floor = min(LARGEST, 4.0 * self.margin)
 
     def dual(self, answer: RobustAnswer, priced: bool) -> Dual:
         """What the multipliers of an answer prove, with the cuts that prove it."""
@@ -230,7 +237,7 @@ def _guided(working: Robust, ledger: Ledger) -> None:
     easier.by_simplex()
     for number in range(1, GUIDED + 1):
         tools.deadline.check()
-        answer = easier.solve(program.cost_scale, _left(tools))
+        answer = easier.solve(program.largest_cost, _left(tools))
         if not answer.solved:
             return
         x = np.clip(answer.x, guide.finite.lower, guide.finite.upper)
@@ -289,10 +296,10 @@ def _advanced(
     if wanted and (working.counterpart.sharpen(x) or added):
         return True
     if not feasible and working.slater and working.margin < LARGEST:
-        working.margin = min(LARGEST, 4.0 * working.margin)  # imposed and violated: by the solver's accuracy
+        working.widen()  # imposed and violated: by the solver's accuracy
         return True
-    if feasible and ledger.open(x) and working.margin > SMALLEST:
-        working.margin = max(SMALLEST, 0.2 * working.margin)
+    if feasible and ledger.open(x) and working.margin > working.floor:
+        working.margin = max(working.floor, 0.2 * working.margin)
         return True
     return False
 
@@ -307,7 +314,7 @@ def _learned(working: Robust, x: Array, proofs: Sequence[Proof]) -> bool:
     if again:
         return True
     if any(proof.verdict == "undecided" for proof in proofs) and working.slater and working.margin < LARGEST:
-        working.margin = min(LARGEST, 4.0 * working.margin)
+        working.widen()
         return True
     return False
 
@@ -316,7 +323,7 @@ def _solved(working: Robust, ledger: Ledger) -> Answer | Result:
     """The optimum of the counterpart with the rows tightened; where that leaves nothing, less and less so, and in the
     end the proof that nothing is feasible."""
     program, best = working.program, ledger.best
-    size = program.cost_scale if best is None else _size(program, best.solution.x)
+    size = program.largest_cost if best is None else _size(program, best.solution.x)
     while True:
         answer = working.solve(size, _left(ledger.tools))
         _count(working, ledger)
@@ -333,7 +340,7 @@ def _solved(working: Robust, ledger: Ledger) -> Answer | Result:
             working.by_simplex()
             continue
         if working.margin > 0.0:
-            working.margin = THINNER * working.margin if working.margin > SMALLEST * THINNER else 0.0
+            working.margin = THINNER * working.margin if THINNER * working.margin >= SMALLEST else 0.0
             working.slater = working.margin > 0.0
             if working.margin > 0.0:
                 continue
@@ -342,7 +349,7 @@ def _solved(working: Robust, ledger: Ledger) -> Answer | Result:
     price = working.price = float(answer.y.sum())
     budget = 0.4 * ledger.tolerance * _size(program, told.solution.x)
     if working.slater and price * working.margin > budget:
-        working.margin = max(SMALLEST, min(working.margin, budget / price))
+        working.margin = max(working.floor, min(working.margin, budget / price))
     return told
 
 
@@ -419,7 +426,7 @@ def _count(working: Robust, ledger: Ledger) -> None:
 
 
 def _size(program: SemiInfiniteProgram, x: Array) -> float:
-    return max(SMALL_COST * program.cost_scale, program.cost(x))
+    return max(SMALL_COST * program.added(x), abs(program.cost(x)))
 
 
 def _reason(program: SemiInfiniteProgram, dual: Dual) -> tuple[InfeasibleSubsystem, WorstConstraint | None]:

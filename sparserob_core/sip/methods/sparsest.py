@@ -262,7 +262,7 @@ class _Search:
         """Tell of better bounds, as a round like the last."""
         if self.told is None:
             return
-        unit, total = self.program.cost_unit, float(prices_of(self.program).sum())
+        unit = self.program.cost_unit
         decision = None if self.best is None else self.best.decision
         self.told = replace(
             self.told,
@@ -271,7 +271,7 @@ class _Search:
             upper_bound=self.least / unit,
             cost=self.least / unit,
             decision=self.told.decision if decision is None else decision,
-            gap=relative_gap(self.lower, self.least, total),
+            gap=relative_gap(self.lower, self.least),
             relaxed_programs=self.relaxed.solves,
         )
         self.rounds.append(self.told)
@@ -307,7 +307,6 @@ class _Search:
         """What is known, told as a result whose cost is the count."""
         assert self.tree is not None
         program, unit = self.program, self.program.cost_unit
-        total = float(prices_of(program).sum())
         ending = self.ending or self.tools.deadline.reason
         counts = {"relaxed_programs": self.relaxed.solves, "rounds": len(self.rounds), "nodes": len(self.tree.nodes)}
         letters = None if self.method.alphabet is None else tuple(self.method.alphabet)
@@ -324,10 +323,9 @@ class _Search:
                 sparsest=Sparsest(np.nan, None, None, tree, letters),
                 history=history,
                 seconds=seconds,
-                cost_scale=total / unit,
             )
         lower = min(self.tree.lower, self.least)
-        status, message = verdict(self.best.proofs, relative_gap(lower, self.least, total), self.method.tolerance)
+        status, message = verdict(self.best.proofs, relative_gap(lower, self.least), self.method.tolerance)
         plain = self.plain if self.plain is not None and self.plain.status in PROVEN else None
         beside = Sparsest(
             norm=self.best.cost,
@@ -353,14 +351,14 @@ class _Search:
             sparsest=beside,
             history=history,
             seconds=seconds,
-            cost_scale=total / unit,
+            cost_scale=self.least / unit,
         )
 
 
 def _none(program: SemiInfiniteProgram, result: Result, letters: Sequence[float]) -> Result:
     """The result where nothing is feasible, by one set of multipliers: a tree of one leaf."""
     tree = Sparsest(np.nan, None, None, (Leaf(result.dual, feasible=False),), letters or None)
-    return replace(result, sparsest=tree, cost_scale=float(prices_of(program).sum()) / program.cost_unit)
+    return replace(result, sparsest=tree, cost_scale=0.0)
 
 
 def _identity(size: int) -> object:

@@ -105,6 +105,6 @@ def falls_for_ever(ledger: Ledger, close: Close, prover: Prover, ray: Array) -> 
         value=cost,
         lower_bound=-np.inf,
         upper_bound=cost if status == "verified" else np.inf,
-        cost_scale=program.cost_scale,
+        cost_scale=program.added(result.decision),
         ray=ray,
     )

@@ -350,7 +350,7 @@ class RelaxedProgram:
     ) -> FiniteSolution:
         self.deadline.check()
         self.solves += 1
-        small = SMALL_COST * self.program.cost_scale if epsilon == 0.0 else np.inf  # the bounds are to meet there
+        small = SMALL_COST if epsilon == 0.0 else np.inf  # the bounds are to meet there
         finite = self.finite(G, h, epsilon)
         solution = solve_finite(finite, self.counted, tolerance=self.tolerance, guess=guess, small=small)
         self.solved_by[solution.by] += 1

@@ -1,12 +1,15 @@
-"""Guards sip/inner/image: decisions within the bounds of images of one entry."""
+"""Guards sip/inner/image: decisions within the bounds of images of one entry; multipliers of images are stationary, and
+none is beyond what an image without a bound allows."""
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import csc_array
+import pytest
+from scipy.sparse import csc_array, eye_array, vstack
 
 from sparserob_core.sip.finite import FiniteProgram
-from sparserob_core.sip.inner.image import within_bounds
+from sparserob_core.sip.inner.duality import dual_bound
+from sparserob_core.sip.inner.image import CANCELLED, onto_stationary, within_bounds
 
 
 def program(lower: list[float], upper: list[float], S: list[list[float]]) -> FiniteProgram:
@@ -27,3 +30,38 @@ def test_several_images_of_one_entry_bound_it_together() -> None:
     finite = program([-1.0, -3.0], [1.0, 0.5], [[1.0], [-1.0]])
     assert within_bounds(finite, np.array([-0.9])).tolist() == [-0.5]
     assert within_bounds(finite, np.array([2.0])).tolist() == [1.0]
+
+
+def slanted(seed: int, sides: int, q: np.ndarray | None = None) -> FiniteProgram:
+    """Entries in boxes, and ``sides`` sums of them that are bounded from above only; of no weight."""
+    rng = np.random.default_rng(seed)
+    n = 12
+    S = csc_array(vstack([eye_array(n), csc_array(rng.normal(size=(sides, n)))]))
+    lower = np.concatenate([np.full(n, -1.0), np.full(sides, -np.inf)])
+    weights = np.concatenate([np.full(n, 0.01), np.zeros(sides)])
+    none = np.zeros((0, n))
+    cost = rng.normal(size=n) if q is None else q
+    return FiniteProgram(cost, weights, lower, np.ones(n + sides), none, np.zeros(0), none, np.zeros(0), S=S)
+
+
+@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("dust", [0.0, 1e-16, 1e-14, 1e-9])
+def test_a_multiplier_near_its_limit_is_held_there_and_the_others_make_up_for_it(seed, dust):
+    program = slanted(seed, sides=15)
+    rng = np.random.default_rng(seed + 100)
+    z = np.concatenate([rng.normal(size=12), dust * np.abs(rng.normal(size=15))])
+    moved = onto_stationary(program, z, program.q)
+    assert np.abs(program.S.T @ moved + program.q).max() <= 1e-12
+    limit = CANCELLED * np.abs(moved).max()
+    assert moved[12:].min() >= -limit  # below it a side without a lower bound proves nothing
+    assert np.isfinite(dual_bound(program, np.zeros(0), np.zeros(0), z))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_what_is_stationary_already_but_beyond_its_limit_is_moved_too(seed):
+    program = slanted(seed, sides=5)
+    z = np.concatenate([np.zeros(12), -np.full(5, 1e-6)])
+    z[:12] = -(program.q + program.S[12:].T @ z[12:])
+    moved = onto_stationary(program, z, program.q)
+    assert np.abs(program.S.T @ moved + program.q).max() <= 1e-12
+    assert moved[12:].min() >= -CANCELLED * np.abs(moved).max()

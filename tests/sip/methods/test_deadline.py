@@ -303,18 +303,22 @@ def test_what_a_polytope_of_controls_can_give_is_told_exactly():
     assert "the control can raise x1(1) by at most 0.5, and 0.6 is needed" in result.message
 
 
-def test_the_gap_is_relative_to_the_cost_or_a_millionth_of_the_largest_possible_one():
-    assert relative_gap(0.0, 0.0, 5.0) == 0.0
-    assert relative_gap(1.0, 2.0, 5.0) == 0.5
-    assert relative_gap(-2e-6, 0.0, 2.0) == pytest.approx(1.0)
-    assert relative_gap(1e-9, 2e-9, 1e-8) == pytest.approx(0.5)
+def test_the_gap_is_relative_to_the_larger_bound_and_to_a_millionth_of_what_is_added_up():
+    assert relative_gap(0.0, 0.0) == 0.0
+    assert relative_gap(1.0, 2.0) == 0.5
+    assert relative_gap(-2.0, 1.0) == pytest.approx(1.5)
+    assert relative_gap(0.0, 1e-300) == pytest.approx(1.0)  # no cost is so small that bounds apart have met
+    assert relative_gap(2.0, 1.0) == 0.0
+    assert relative_gap(1e-9, 2e-9, 1e-3) == pytest.approx(0.5)
+    assert relative_gap(0.0, 1e-9, 1.0) == pytest.approx(1e-3)
     assert relative_gap(-np.inf, 1.0, 5.0) == np.inf
     assert relative_gap(1.0, np.inf, 5.0) == np.inf
 
 
 @pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
-def test_the_largest_possible_cost_is_that_of_the_bounds(unit):
+def test_what_is_added_up_to_a_cost_are_its_terms_and_the_largest_cost_is_that_of_the_bounds(unit):
     program = sr.SemiInfiniteProgram(n=2, weights=[unit, 0.0], q=[0.0, 2 * unit], lower=[-3.0, -1.0], upper=[1.0, 4.0])
-    assert program.cost_scale == pytest.approx(11.0 * unit)
-    quadratic = sr.SemiInfiniteProgram(n=1, P=[[2.0 * unit]], lower=-3.0, upper=1.0)
-    assert quadratic.cost_scale == pytest.approx(9.0 * unit)
+    assert program.largest_cost == pytest.approx(11.0 * unit)
+    assert program.added(np.array([-2.0, -1.0])) == pytest.approx(4.0 * unit)
+    quadratic = sr.SemiInfiniteProgram(n=1, P=[[2.0 * unit]], q=[-2.0 * unit], constant=unit, lower=-3.0, upper=1.0)
+    assert (quadratic.cost(np.ones(1)), quadratic.added(np.ones(1))) == pytest.approx((0.0, 4.0 * unit))

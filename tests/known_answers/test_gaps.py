@@ -1,0 +1,119 @@
+"""Guards the gap: it is that of the bounds, whatever the bounds of the control; where it is open nothing is certified,
+and what need not act costs exactly nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sparserob_core as sr
+from tests.support.independent import Problem, enclosed_value
+
+SPRING = np.array([[0.0, 1.0], [-2.0, -0.5]])
+TEN = sr.Dictionary.indicators(np.linspace(0.0, 5.0, 11))
+
+
+def spring(control: sr.ConvexSet, B: Any = ((0.0,), (1.0,)), **more: Any) -> sr.OptimalControlProblem:
+    """A spring that is pushed, from (-1, 1), with a wall from 0.3 on and a box at the end."""
+    stated = {
+        "system": sr.LinearSystem(SPRING, np.array(B)),
+        "horizon": 5.0,
+        "initial_state": [-1, 1],
+        "control": control,
+        "disturbance": sr.Box([-0.05, -0.05], [0.05, 0.05]),
+        "path": [sr.PathConstraint(sr.Box([-0.7, -np.inf], [0.7, np.inf]), start=0.3)],
+        "terminal": [sr.Box([-0.3, -0.3], [0.3, 0.3])],
+    }
+    return sr.OptimalControlProblem(**{**stated, **more})
+
+
+def box(*sizes: float) -> sr.Box:
+    return sr.Box([-size for size in sizes], list(sizes))
+
+
+TWO = ((0.0, 0.3), (1.0, 0.2))
+WIDE = {
+    "one channel": lambda far: spring(box(far)),
+    "two channels": lambda far: spring(box(far, far), TWO),
+    "one of two": lambda far: spring(box(1.0, far), TWO),
+    "one that is of little use": lambda far: spring(box(4.0, far), ((0.0, 0.0), (1.0, 1e-3))),
+    "a ball": lambda far: spring(sr.NormBall(2, far, dimension=2), TWO),
+    "steps": lambda far: spring(box(far), control_step=box(1.0)),
+    "a quadratic cost": lambda far: spring(box(far), cost=sr.Cost(control={"R": [[0.1]]})),
+    "a state that costs": lambda far: spring(box(far), cost=sr.Cost(state={"Q": np.eye(2)})),
+}
+
+
+@pytest.mark.parametrize("kind", WIDE)
+def test_bounds_of_the_control_that_are_far_away_change_nothing(kind):
+    near = sr.solve(WIDE[kind](10.0), control=TEN)
+    assert near.status == "certified"
+    for far in (1e9, 1e12):
+        found = sr.solve(WIDE[kind](far), control=TEN)
+        assert found.status == "certified", found.message
+        assert found.lower_bound <= near.upper_bound and near.lower_bound <= found.upper_bound
+        assert found.upper_bound == pytest.approx(near.upper_bound, rel=1e-6)
+
+
+@pytest.mark.parametrize("far", [1e8, 1e12])
+def test_a_wide_control_has_the_value_of_an_independent_linear_program(far):
+    fine = Problem(
+        A=SPRING,
+        B=np.array([[0.0], [1.0]]),
+        initial_state=np.array([-1.0, 1.0]),
+        horizon=5.0,
+        pieces=10,
+        control=np.array([1e3]),
+        weights=np.ones(1),
+        disturbance=np.array([0.05, 0.05]),
+        terminal=np.array([0.3, 0.3]),
+        path=[(np.array([0.7, np.inf]), 0.3, 5.0)],
+    )
+    least, most = enclosed_value(fine, per_piece=256)
+    found = sr.solve(spring(box(far)), control=TEN)
+    assert found.status == "certified"
+    assert least <= found.upper_bound * (1 + 1e-8) and found.lower_bound <= most * (1 + 1e-8)
+    assert most - least <= 1e-2 * most
+    proven = {proof.family: float(proof.units.max()) for proof in found.proofs}
+    assert max(proven.values()) <= 0.7  # a wall is judged by itself, not by how far the control may go
+
+
+@pytest.mark.parametrize("far", [1.0, 1e12])
+@pytest.mark.parametrize("policy", [None, "nominal", "peak", "worst"])
+def test_what_need_not_act_costs_exactly_nothing(far, policy):
+    still = spring(box(far), initial_state=[0.1, 0.0], path=[])
+    found = sr.solve(still, control=TEN, policy=sr.OpenLoop() if policy is None else sr.AffinePolicy(cost=policy))
+    assert (found.status, found.lower_bound, found.upper_bound, found.gap) == ("certified", 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("tolerance", [1e-7, 1e-9])
+def test_a_policy_of_one_state_is_certified_at_the_tolerance_that_is_asked_for(seed, tolerance):
+    rng = np.random.default_rng(seed)
+    edges = np.concatenate([[0.0], np.sort(rng.uniform(0.1, 1.1, 4)), [1.2]])
+    problem = sr.OptimalControlProblem(
+        system=sr.LinearSystem([[rng.uniform(-0.6, 0.6)]], [rng.uniform(0.8, 1.6, 2)], [[rng.uniform(0.8, 1.6)]]),
+        horizon=1.2,
+        initial_state=[1.1],
+        control=sr.Box([-0.5, -1.1], [0.9, 0.3]),
+        disturbance=sr.Box([-0.02], [0.04]),
+        terminal=[sr.Box([1.5], [1.6])],
+    )
+    cost = ("peak", "nominal")[seed % 2]
+    found = sr.solve(
+        problem, control=sr.Dictionary.indicators(edges), policy=sr.AffinePolicy(cost=cost), tolerance=tolerance
+    )
+    assert found.status == "certified", found.message
+    assert found.upper_bound - found.lower_bound <= tolerance * found.upper_bound
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_a_cost_far_below_the_largest_is_not_certified_by_the_largest(unit):
+    small = replace(spring(box(unit)), system=sr.LinearSystem(SPRING, [[0.0], [1.0 / unit]]))
+    barely = replace(small, initial_state=[0.7 / 0.9, 0.0], path=[], disturbance=None)
+    found = sr.solve(barely, control=TEN)
+    apart = found.upper_bound - found.lower_bound
+    assert (found.status == "certified") == (apart <= 1e-7 * found.upper_bound)
