@@ -316,3 +316,67 @@ def test_the_support_function_of_balls_of_norms_is_that_of_the_dual_norm():
             with ctx.workprec(96):
                 found = float(known(ball).support(balls(c)).mid())
             assert found == pytest.approx(c @ ball.centre + 1.3 * truth, rel=1e-6)
+
+
+@pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
+def test_a_row_of_a_curved_set_has_the_unit_of_its_reach_and_never_less_than_what_sums_resolve(size):
+    source = Ellipsoid(np.zeros(2), size**2 * np.eye(2))
+    z = np.array([1.0, 0.0])
+    with ctx.workprec(96):
+        for sums in (np.zeros(2), np.array([1e9 * size, 0.0])):
+            row = Curved(known(source), np.eye(2), sums).true(z)
+            assert row.unit == pytest.approx(max(size, RESOLVED * sums[0]))
+
+
+def test_what_is_allowed_is_rounded_down_whatever_is_added():
+    rng = np.random.default_rng(10)
+    for limit, unit in rng.normal(size=(300, 2)) * 10.0 ** rng.uniform(-3, 3, size=(300, 2)):
+        row = Bounded(np.ones(1), float(limit), abs(float(unit)))
+        assert Fraction(row.allowed) <= Fraction(row.limit) + Fraction(row.slack)
+
+
+def test_the_height_of_a_direction_is_told_from_below_in_balls():
+    """Where the least cost is bounded by a tilt of the slope, the tilt stays between what rising and falling cost."""
+    shape, rng = known(SETS["ellipsoid"]), np.random.default_rng(11)
+    u = points_of("ellipsoid", 2000)
+    with ctx.workprec(96):
+        for _ in range(30):
+            ups, downs, slope = rng.uniform(0, 2, size=2), rng.uniform(0, 2, size=2), 3.0 * rng.normal(size=2)
+            bound = shape.least(*([arb(v, 0.01) for v in vector] for vector in (ups, downs, slope)))
+            costs = np.maximum(u, 0.0) @ (ups - 0.01) + np.maximum(-u, 0.0) @ (downs - 0.01) + u @ slope
+            costs -= 0.01 * np.abs(u).sum(axis=1)
+            assert float(bound.lower()) <= costs.min() + 1e-12
+            assert float(bound.upper()) >= costs.min() - 4.0
+
+
+def test_a_ball_of_one_norm_in_many_dimensions_is_above_its_support_with_little_to_spare():
+    """Beyond a few dimensions corners of a range are not gone through: the triangle inequality stands for them."""
+    rng = np.random.default_rng(12)
+    for p, d in ((3.0, 9), (1.5, 12), (1.0, 11), (3.0, 8)):
+        source = NormBall(p=p, radius=1.3, centre=rng.normal(size=d))
+        value, spread = rng.normal(size=(30, d)), 0.02 * rng.uniform(size=(30, d))
+        with ctx.workprec(96):
+            w, excess = known(source).bound(value, spread)
+        for _ in range(20):
+            f = value + spread * rng.choice([-1.0, 1.0], size=(30, d))
+            assert (source.support(f) <= np.einsum("kd,kd->k", w, f) + excess + 1e-13).all()
+        assert (excess <= 2.0 * 1.3 * np.abs(spread).sum(axis=1) * 2.0 + 1e-10).all()
+        sharp = known(source).bound(value, np.zeros((30, d)))
+        assert (np.abs(np.einsum("kd,kd->k", sharp[0], value) + sharp[1] - source.support(value)) < 1e-11).all()
+
+
+def test_corners_of_a_zonotope_and_a_polytope_hold_in_exact_arithmetic():
+    """A facet's limit is drawn inwards by what its rounded normal is off, twice as far as the set reaches: no point
+    that it lets through is outside of the sum of segments."""
+    source = SETS["zonotope"]
+    with ctx.workprec(160):
+        shape = known(source)
+        for c, b in shape.facets:
+            assert b <= shape.support(balls(c))
+            assert float((shape.support(balls(c)) - b).upper()) < 1e-15
+        for k in range(1, 60):
+            turn = 2.0 * np.pi * k / 60
+            direction = np.array([np.cos(turn), np.sin(turn)])
+            edge = source.support_point(direction[None])[0]
+            inside = source.centre + (1 - 1e-15 * 64) * (edge - source.centre)
+            assert shape.holds(balls(inside))

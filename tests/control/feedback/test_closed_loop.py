@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.control.feedback.closed_loop import shared
 from sparserob_core.control.transcription.transcribe import prepare
 from tests.support.closed_loops import EXACT, LOOPS, MEASURABLE, Loop
 
@@ -184,3 +185,61 @@ def test_a_loop_whose_deviations_are_larger_is_that_loop_with_larger_sets():
     assert twice.spread.support(along[..., 1:]) == pytest.approx(
         2.0 * loop.spread.support(along[..., 1:]) + 0.0 * middle
     )
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_uncertain_rows_are_violated_by_the_worst_case_of_the_state_and_of_the_control_beside_it(name):
+    """Rows that look the same way or opposite ways share their answers."""
+    case, loop, x = made(name)
+    rng, rows = np.random.default_rng(5), np.vstack([H, 2.0 * H[:1], -H[:2]])
+    h = rng.normal(size=len(rows))
+    part, factor = shared(rows, loop.spread)
+    assert part[4] == part[0] and factor[4] == 2.0
+    assert (part[5] == part[0]) == loop.spread.is_symmetric
+    for p in range(part.max() + 1):
+        first = int(np.flatnonzero(part == p)[0])
+        assert (rows[part == p] == factor[part == p][:, None] * rows[first]).all()
+    for time in (0.0, 0.3, float(case.breakpoints[1]), 1.7, 2.0):
+        told = loop.state_rows(time, rows, h, part, factor).excess(x, loop.spread)
+        assert told == pytest.approx(loop.values(x, np.array([time]), rows)[0] - h, abs=1e-9)
+    m = case.B.shape[1]
+    G = rng.normal(size=(len(H), m))
+    every = loop.controls(x)
+    for k in range(case.breakpoints.size - 1):
+        u = loop.control_rows(k, G, h[: len(H)], None).excess(x, loop.spread)
+        assert u == pytest.approx(loop.height(G @ every[k]) - h[: len(H)], abs=1e-9)
+        time = float(case.breakpoints[k : k + 2].mean())
+        own = np.arange(len(H))
+        plain = loop.state_rows(time, H, h[: len(H)], own, np.ones(len(H)))
+        both = loop.with_control(plain, G, np.full(len(H), k)).excess(x, loop.spread)
+        along = H @ loop.states(x, np.array([time]))[0] + G @ every[k]
+        within = 0.0 if loop.measurable is None else loop.measurable.within(np.array([time]), H)[0]
+        assert both == pytest.approx(loop.height(along) + within - h[: len(H)], abs=1e-9)
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_the_signal_of_the_worst_deviation_takes_the_state_there(name):
+    """Stepped with the gains of the decision, from where the deviation begins, under the signal that has it."""
+    case, loop, x = made(name)
+    if case.bound is None:
+        return
+    for time, c in ((1.7, H[2]), (2.0, H[3])):
+        deviation = loop.worst(x, time, c)
+        ends, values = loop.signal(deviation, time, c)
+        assert values.shape == (case.E.shape[1], ends.size - 1)
+        assert all(case.bound.contains(w[None], 1e-9)[0] for w in values.T)
+        begun = loop.begun(deviation)
+        if case.begun is None:
+            assert (begun == case.start).all()
+        else:
+            assert case.begun.contains((begun - case.start)[None], 1e-9)[0]
+        driven = Loop(case.A, case.B, case.E, case.breakpoints, ends, begun, case.bound, None, case.c)
+        # innovations are counted from the middle of the initial states
+        gains, v = loop.gains(x), loop.nominal(x)
+        if case.begun is not None:
+            off = begun - loop.start
+            v = v + np.einsum("kmd,d->mk", gains[:, 0], off)
+        states = driven.states(v, gains, np.array([time - 1e-13]))[0][0]
+        w = np.concatenate([value - case.bound.middle() for value in values.T])
+        reached = c @ (states[:, 0] + states[:, 1:] @ w)
+        assert reached == pytest.approx(loop.values(x, np.array([time]), c[None])[0, 0], abs=1e-6)
