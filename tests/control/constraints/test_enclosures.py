@@ -1,5 +1,5 @@
-"""Guards control/constraints: every family bounds its violations on cells of every width, by little more on narrow ones,
-and its separation finds what samples find."""
+"""Guards control/constraints: every family bounds its violations on cells of every width, by little more on narrow
+ones, and its separation finds what samples find."""
 
 from __future__ import annotations
 
