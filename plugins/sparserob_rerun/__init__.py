@@ -24,9 +24,9 @@ class Rerun(sr.Observer, sr.Options):
     sweep, it shows the study: the status of every point, what runs, and the bounds.
 
     Destinations can be combined; with none of them, ``recording.rrd`` in the run's directory. A missing package, viewer
-    or listener is one warning, and the run goes on without. Everything happens in a process of its own, on one core and
-    with low priority; the solver hands over its events and goes on. When too many are waiting, the newest are dropped,
-    and their number is shown at the end.
+    or listener is one warning, and the run goes on without. Everything happens in a process of its own, on one core at
+    a time and for a share of it; the solver hands over its events and goes on. When too many are waiting, the newest
+    are dropped, and their number is shown at the end.
     """
 
     spawn: bool = False

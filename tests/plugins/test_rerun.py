@@ -49,7 +49,8 @@ def searched(tmp_path_factory: pytest.TempPathFactory) -> sr.Outcome:
 @pytest.fixture(scope="module")
 def exchanged(tmp_path_factory: pytest.TempPathFactory) -> sr.Outcome:
     """A recorded exchange that ends certified."""
-    return recorded(tmp_path_factory.mktemp("exchange") / "run", "experiment1_repaired.yaml", QUICK)
+    # it waits, so that a busy machine leaves out no picture
+    return recorded(tmp_path_factory.mktemp("exchange") / "run", "experiment1_repaired.yaml", QUICK, waits=True)
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from tests.support.recordings import read, texts
+from tests.support.recordings import read, slowness, texts
 
 pytest.importorskip("rerun", reason="a recording needs the extra rerun")
 pytest.importorskip("psutil", reason="a process that is gone is told from one that is not with psutil")
@@ -97,14 +97,6 @@ def ended(recorder: int) -> float:
         assert time.monotonic() - began < STARTING, "the recorder is still there"
         time.sleep(0.02)
     return time.monotonic() - began
-
-
-def slowness(seconds: float = 0.1) -> float:
-    """How many times as long as it takes by itself a computation takes here now."""
-    wall, own = time.perf_counter(), time.process_time()
-    while time.process_time() - own < seconds:
-        pass
-    return max(1.0, (time.perf_counter() - wall) / seconds)
 
 
 @pytest.mark.parametrize("after", [0.0, 1.5])

@@ -38,9 +38,8 @@ def slices(file: Path) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
     [("experiment1_reduced.yaml", 1500), ("experiment1_literal.yaml", 1500), ("experiment2_reduced.yaml", 1000)],
 )
 def test_the_landscape_follows_every_weight_and_goes_through_the_best_tuple_with_its_value(
-    config: str, budget: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    config: str, budget: int, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("sparserob_rerun.recording.desk.NICE", 0)
     changes = {
         "maximiser": {"name": "simulated_annealing", "budget": budget},
         "method.sc2": None,

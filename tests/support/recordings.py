@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 import warnings
 from collections import defaultdict
 from pathlib import Path
@@ -65,3 +66,11 @@ def walk_of(trace: sr.SearchTrace) -> np.ndarray:
     walk = np.full(trace.value.size, np.nan)
     walk[known] = trace.value[first[known] + stands[known].astype(int) - 1]
     return walk
+
+
+def slowness(seconds: float = 0.1) -> float:
+    """How many times as long as it takes by itself a computation takes here now."""
+    wall, own = time.perf_counter(), time.process_time()
+    while time.process_time() - own < seconds:
+        pass
+    return max(1.0, (time.perf_counter() - wall) / seconds)

@@ -3,6 +3,7 @@ it, so that neither side ever does."""
 
 from __future__ import annotations
 
+import math
 import os
 import queue
 import threading
@@ -97,11 +98,16 @@ class Sender:
                 due, group = self.waiting[0]
                 rest = due - time.monotonic()
                 alone = len(self.waiting) == 1 and not self.over
-                if alone and rest > 0.0 and isinstance(group[0], sr.EvaluationsFinished):
+                if alone and rest > 0.0 and _collects(group[0]):
                     self.changed.wait(rest)
                     continue
                 self.waiting.popleft()
                 return group
+
+
+def _collects(event: Any) -> bool:
+    """Whether more like it is worth waiting for: not at the beginning of a search, which has no landscape yet."""
+    return isinstance(event, sr.EvaluationsFinished) and event.total > event.count
 
 
 @final
@@ -113,6 +119,7 @@ class Receiver:
         self.pipe, self.room, self.parent = pipe, room, parent
         self.inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self.ended = False  # nothing comes out of the pipe any more
+        self.over = math.inf  # the moment at which the last event came, whatever is still to be read before it
         threading.Thread(target=self._read, name="reading", daemon=True).start()
 
     @property
@@ -144,7 +151,10 @@ class Receiver:
     def _read(self) -> None:
         while True:
             try:
-                self.inbox.put(self.pipe.recv())
+                message = self.pipe.recv()
+                if isinstance(message, tuple) and isinstance(message[0], sr.RunFinished | sr.SweepFinished):
+                    self.over = time.monotonic()
+                self.inbox.put(message)
             except (EOFError, OSError):
                 break
             except Exception:  # noqa: BLE001  a message that cannot be read is left out

@@ -26,7 +26,6 @@ from sparserob_rerun.study.recorder import StudyOpening, StudyRecorder
 from sparserob_rerun.study.recorder import layout as study_layout
 
 IDLE = 0.5  # seconds between two looks at whether the run is still alive
-NICE = 5
 
 
 @final
@@ -149,9 +148,10 @@ def _listen(messages: Receiver, recorder: Recorder | StudyRecorder, guard: Guard
         except EOFError:
             return Ending()
         if isinstance(message, Ending):
+            recorder.ended = messages.over
             return message
         if message is not None:
-            recorder.behind = not messages.empty
+            recorder.behind, recorder.ended = not messages.empty, messages.over
             _receive(message, recorder, wrong)
         if message is None or recorder.urgent:
             recorder.idle()
@@ -179,10 +179,12 @@ class _WithoutPandas(MetaPathFinder):
 
 
 def _settle() -> None:
-    """Ignore the signals of the terminal, take one core only, and step back for everybody else."""
+    """Ignore the signals of the terminal, and take no more than one core at a time: it is whichever is free, for where
+    all recorders take the same one, each waits for the others. Shares of processor time, not a low priority, hold the
+    work back: with one, the first picture waits for everybody else's work."""
+    from threadpoolctl import threadpool_limits
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(0))  # through `finally`, to the servers
-    with suppress(OSError, AttributeError):
-        os.nice(NICE)
-        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    threadpool_limits(limits=1)
     sys.stdin = None

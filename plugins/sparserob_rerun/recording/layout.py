@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     import sparserob_core as sr
 
 
+PHASE = (-30.0, 560.0, -64.0, 484.0)  # left, right, top and bottom of the phase plane
+
+
 @final
 @dataclass(frozen=True)
 class Shown:
@@ -99,7 +102,7 @@ def _log(rrb: Any, shown: Shown) -> Any:
 
 def _phase(rrb: Any, problem: sr.OptimalControlProblem) -> Any:
     if problem.system.states == 2:
-        return view("/physics/phase", "Phase plane", (-30.0, 560.0, -64.0, 484.0))
+        return view("/physics/phase", "Phase plane", PHASE)
     states = problem.system.states
     name = (
         "State space"

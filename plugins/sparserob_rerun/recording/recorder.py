@@ -20,6 +20,7 @@ from sparserob_rerun.options import LandscapeOptions
 from sparserob_rerun.physics.physics import Physics
 from sparserob_rerun.recording import words
 from sparserob_rerun.recording.layout import Shown, layout
+from sparserob_rerun.recording.waiting import BOUNDS, CLIMB, CONTROL, LANDSCAPE, VIOLATIONS, Waiting
 from sparserob_rerun.search.climb import Climb
 from sparserob_rerun.search.explorer import Aim, Explorer
 from sparserob_rerun.search.landscape import Landscape
@@ -29,10 +30,17 @@ from sparserob_rerun.search.terrain import Terrain
 from sparserob_rerun.search.way import Stage
 
 SEEN = 10  # evaluations between two pictures of the way
-PICTURE_EVERY, SPARE = 0.5, 20.0  # seconds between them, and how many times as long as one took
+PICTURE_EVERY, SPARE = 0.5, 20.0
+"""Seconds between them, and how many times the processor time of one. Ten times as many, and the climb stands still for
+seconds; a tenth, and pictures take as much of a processor as the search."""
 PICTURES = 60  # rounds whose physics is drawn; of later ones every tenth
 PROOF = "proof of"
-LATE = 8.0  # seconds behind the run from which on rounds have no pictures
+LATE = 8.0
+"""Seconds behind the run from which on rounds have no pictures. Ten times as many, and what is seen is of a minute ago;
+with a tenth a busy machine leaves out rounds."""
+CATCHING_UP = 1.0
+"""Seconds after the end of the run in which rounds that are still to be drawn have pictures. Ten times as many, and a
+run of two seconds takes twelve; a tenth, and the first rounds of a short run are not to be seen."""
 LINES = 24  # of the log that are on the first screen
 PROOFS = 12  # lines about the proof of one family
 SLOTS = 16  # active constraints at most that make the tuple of a method without one
@@ -74,16 +82,18 @@ class Recorder:
         self.search = SearchView(rr, stream, self.timelines)
         self.climb, self.stages = Climb(rr, stream), list[Stage]()
         self.shown, self.searches, self.began = shown, shown.searches, 0.0
-        self.best_value, self.unseen, self.behind = -np.inf, 0, False
+        self.best_value, self.unseen, self.behind, self.way = -np.inf, 0, False, False
         self.heard = self.next = time.monotonic()
+        self.ended = np.inf  # the moment at which the run was over, once it is
         self.patience = 0.0 if opening.landscape is None else opening.landscape.patience
         self.lower, self.upper, self.over = -np.inf, np.inf, -1.0
         self.exact: float | None = None
         self.proofs: dict[str, int] = {}
         self.broken: dict[str, str] = {}
         self.drawn, self.said = False, deque[str](maxlen=LINES)
-        stream.log("howto", rr.TextDocument(words.SIGNALS), static=True)
         self.timelines.move()
+        self.waiting = Waiting(rr, stream, shown)
+        stream.log("howto", rr.TextDocument(words.SIGNALS), static=True)
         self.say(f"run: {opening.title}")
         self._page("solving", [])
 
@@ -112,10 +122,12 @@ class Recorder:
             return
         try:
             task(*arguments)
+            if panel != LANDSCAPE:  # which has its first picture later
+                self.waiting.arrived(panel)
         except Exception as error:  # noqa: BLE001  a panel less is better than no recording
             self.broken[panel] = f"{panel} could not be drawn: {type(error).__name__}: {error}"
             self.say(f"{self.broken[panel]}; the rest goes on", "WARN")
-            if panel == "the landscape":
+            if panel == LANDSCAPE:
                 self.explorer.left = 0
 
     def say(self, line: str, level: str = "INFO") -> None:
@@ -132,7 +144,7 @@ class Recorder:
         landscape = self.terrain.known
         if landscape is not None and self.exact is not None and self.explorer.landscape is landscape:
             share = ", with the regulariser's share" if landscape.epsilon > 0.0 else ""
-            self.draw("the landscape", self.terrain.mark, f"proven to be the highest: {self.exact:.6g}{share}")
+            self.draw(LANDSCAPE, self.terrain.mark, f"proven to be the highest: {self.exact:.6g}{share}")
 
     def _evaluations(self, event: sr.EvaluationsFinished, projection: Projection) -> None:
         if event.total == event.count:
@@ -148,9 +160,9 @@ class Recorder:
             self.say(f"evaluation {self.timelines.evaluation}: best g {event.best_value:.8g}", "TRACE")
         self.best_value = event.best_value
         if event.best_point.size:
-            self.draw("the landscape", self.explorer.aim, self._best(stage, max(1, event.round)))
+            self.draw(LANDSCAPE, self.explorer.aim, self._best(stage, max(1, event.round)))
         self.unseen += event.count
-        if self.opening.waits or (self.unseen >= SEEN and not self.behind and time.monotonic() >= self.next):
+        if self.opening.waits or (self.pause == 0.0 and not self.behind):
             self._way()
 
     def _stage(self, event: sr.EvaluationsFinished) -> Stage:
@@ -170,11 +182,11 @@ class Recorder:
 
     def _way(self) -> None:
         """Draw how far the search has come: the climb, and its way on the landscape."""
-        self.unseen, began = 0, time.monotonic()
+        self.unseen, began = 0, time.thread_time()
         if not self.stages:
             return
-        stage = self.stages[-1]
-        self.draw("the climb", self.climb.draw, self.stages, self.exact)
+        stage, self.way = self.stages[-1], True
+        self.draw(CLIMB, self.climb.draw, self.stages, self.exact)
         self.draw("the way of the search", self.terrain.visit, stage)
         told, moved = frozenset(self.search.notes), frozenset(self.search.moved)
         if not (told <= self.shown.told and moved <= self.shown.moved):
@@ -187,14 +199,14 @@ class Recorder:
             line = f"search {max(1, stage.number)}: {weight}evaluation {done}{of}; best g {stage.best_value:.8g}"
             self.lower = max(self.lower, stage.lower_bound)
             self._page("solving", [line])
-        now = time.monotonic()
-        self.next = now + max(PICTURE_EVERY, SPARE * (now - began))
+        self.next = time.monotonic() + max(PICTURE_EVERY, SPARE * (time.thread_time() - began))
 
     def _landscape(self, landscape: Landscape, aim: Aim) -> None:
         """Draw a landscape at the moment at which it is there, and the way on it."""
         if not self.opening.waits:
             self.timelines.move(seconds=self.timelines.seconds + time.monotonic() - self.heard)
             self.heard = time.monotonic()
+        self.waiting.arrived(LANDSCAPE)
         self.terrain.surface(landscape, aim)
         if self.stages:
             self.terrain.visit(self.stages[-1])
@@ -207,13 +219,21 @@ class Recorder:
         return {k: name for k, (name, kind) in enumerate(named) if kind in ("time", "parameter", "index")}
 
     def idle(self) -> None:
-        """Work on the landscape for a moment."""
-        self.draw("the landscape", self.explorer.step)
+        """Draw what is due, and work on the landscape for a moment."""
+        if self.pause == 0.0:
+            self._way()
+        self.draw(LANDSCAPE, self.explorer.step)
+
+    @property
+    def pause(self) -> float:
+        """Seconds until the way of the search is to be drawn; infinite where there is nothing new."""
+        due = self.unseen >= SEEN or (self.unseen > 0 and not self.way)
+        return max(0.0, self.next - time.monotonic()) if due else np.inf
 
     @property
     def rest(self) -> float:
-        """Seconds until there is work on the landscape; infinite where there is none."""
-        return self.explorer.rest if self.explorer.busy else np.inf
+        """Seconds until there is work; infinite where there is none."""
+        return min(self.pause, self.explorer.rest if self.explorer.busy else np.inf)
 
     @property
     def urgent(self) -> bool:
@@ -225,11 +245,13 @@ class Recorder:
         tuple; one that broke off does not wait."""
         explorer = self.explorer
         if self.opening.landscape is not None and self.over >= 0.0:
-            shown = self.terrain.known is not None
-            seconds = self.patience - (0.5 * self.over if shown and not self.opening.waits else 0.0)
-            self.draw("the landscape", explorer.finish, seconds)
+            shown, waits = self.terrain.known is not None, self.opening.waits
+            # of a run that is shown again every landscape may take as long; another one wants to end
+            left = self.patience if waits else self.patience - max(0.0, time.monotonic() - self.ended)
+            self.draw(LANDSCAPE, explorer.finish, left - (0.5 * self.over if shown and not waits else 0.0))
             if explorer.waiting is not None or explorer.urgent:
-                self.draw("the landscape", explorer.finish, self.patience, 8)
+                left = self.patience if waits else self.patience - max(0.0, time.monotonic() - self.ended)
+                self.draw(LANDSCAPE, explorer.finish, left, 8)
             self.mark()
         if explorer.wrong:
             self.say(explorer.wrong, "WARN")
@@ -238,23 +260,25 @@ class Recorder:
         self.timelines.move(None if self.searches else event.relaxed_programs, event.round, event.seconds)
         self.lower = max(self.lower, event.lower_bound)
         self.upper = min(self.upper, np.inf if event.simplified else event.upper_bound)
-        self.draw("the bounds", self.rounds.bounds, event)
+        self.draw(BOUNDS, self.rounds.bounds, event)
         lines = words.round_lines(event, self.inspection)
         for line in lines:
             self.say(line, "INFO" if line is lines[0] else "DEBUG")
         self._page("solving", lines[:1])
-        self.draw("the landscape", self._aim, event)
+        self.draw(LANDSCAPE, self._aim, event)
         if event.decision is None or (event.round > PICTURES and event.round % 10) or self._late(event.seconds):
             return
         cuts, self.drawn = active(event.imposed, event.multipliers), True
         if self.physics is not None:
-            self.draw("control and states", self.physics.draw, event.decision, cuts, None)
+            self.draw(CONTROL, self.physics.draw, event.decision, cuts, None)
         told = told_by_round(event)
-        self.draw("the violations", self.rounds.violations, event.decision, cuts, event.added, told)
+        self.draw(VIOLATIONS, self.rounds.violations, event.decision, cuts, event.added, told)
 
     def _late(self, seconds: float) -> bool:
         """Whether the recording is so far behind the run that its pictures have to wait for the last one."""
-        return not self.opening.waits and time.monotonic() - self.opening.began - seconds > LATE
+        now = time.monotonic()
+        late = now - self.opening.began - seconds > LATE or now - self.ended > CATCHING_UP
+        return late and not self.opening.waits
 
     def _aim(self, event: sr.RoundFinished) -> None:
         """The tuple whose surroundings are worth a look after a round: the best of the search, or the constraints that
@@ -283,20 +307,20 @@ class Recorder:
         self._page(event.status, lines)  # before anything that takes time
         if result is not None:
             if event.status != "infeasible":
-                self.draw("the bounds", self.rounds.picture.end, result.lower_bound, result.upper_bound)
+                self.draw(BOUNDS, self.rounds.picture.end, result.lower_bound, result.upper_bound)
             self.draw("what clashes", self._clash, result)
             if result.decision is not None and self.physics is not None:
                 known = (result.decision, result.indices, result.dual.mu, result.dual.cuts)
-                self.draw("control and states", self.physics.draw, *known)
+                self.draw(CONTROL, self.physics.draw, *known)
                 self.draw("the signals", self.physics.signals, result.decision)
             if result.decision is not None:
                 told = told_by_result(result)
-                self.draw("the violations", self.rounds.violations, result.decision, result.indices, (), told)
+                self.draw(VIOLATIONS, self.rounds.violations, result.decision, result.indices, (), told)
             # a run that is shown again
             if self.explorer.landscape is None and self.explorer.waiting is None and result.indices:
                 slots = slots_of(list(result.indices), self._formulation)
                 self.draw(
-                    "the landscape",
+                    LANDSCAPE,
                     self.explorer.aim,
                     Aim(slots, result.epsilon, np.nan, "others as active at the end", self.timelines.round),
                 )

@@ -14,9 +14,19 @@ from sparserob_rerun.drawing.palette import Floats
 from sparserob_rerun.options import LandscapeOptions
 from sparserob_rerun.search.landscape import Landscape, axes_of, deciding_pair, places_of
 
-SLICE = 0.02  # seconds of work between two looks at the queue
-LARGE = 0.02  # of the height of a landscape: a gain after which it is drawn anew
-STALE = 10.0  # seconds after which any gain is enough
+SLICE = 0.02  # seconds of processor time between two looks at the queue
+LARGE = 0.02
+"""Of the height of a landscape: a gain after which it is drawn anew at once. Ten times as much, and the search is seen
+to be elsewhere than where it is; a tenth, and no landscape is ever refined."""
+SAME = 1e-3
+"""Of the same height: a smaller gain is not to be seen in the colours. Ten times as much, and landscapes that look
+different are seconds old; a tenth, and the last digits of a polished search begin them anew for ever."""
+STALE = 1.0
+"""Seconds after which any gain that is to be seen is enough. Ten times as many, and what is drawn is of ten seconds
+ago; with a tenth a landscape that a slow climb renews is never refined."""
+HELD = 0.8
+"""Seconds for which a new landscape may wait until it is as fine as the one that is shown, which is of the same weight
+and nearly as high. Ten times as many, and what is drawn is too old; a tenth, and fine drawings flicker."""
 RESERVE = 0.25  # of the evaluations, for which landscapes stay coarse
 
 
@@ -59,6 +69,8 @@ class Explorer:
         self.work: Iterator[bool] = iter(())
         self.began = self.since = time.monotonic()
         self.used, self.wrong = 0.0, ""
+        self.drawn: tuple[Aim, Landscape] | None = None
+        self.fresh = False  # a level is complete that was not drawn yet
 
     @property
     def busy(self) -> bool:
@@ -89,6 +101,7 @@ class Explorer:
         self.waiting = aim
         if now is not None and now.epsilon != aim.epsilon:
             self.aimed = self.landscape = None
+            self.fresh = False
 
     def step(self, hurry: bool = False) -> None:
         """Work for a moment, if the share allows it or in a ``hurry``."""
@@ -106,10 +119,12 @@ class Explorer:
         end = time.monotonic() + seconds
         while self.busy and time.monotonic() < end:
             if self.waiting is None and self.landscape is not None and 0 < self.landscape.level <= level:
-                return
+                break
             if self.waiting is not None and self._coarse:
-                self.aimed = None
+                self.aimed, self.fresh = None, False
             self.step(hurry=True)
+        if self.fresh:
+            self._draw()
 
     @property
     def _coarse(self) -> bool:
@@ -122,19 +137,40 @@ class Explorer:
     def _step(self) -> None:
         if self.waiting is not None and self._better(self.waiting):
             self.aimed, self.waiting, self.landscape = self.waiting, None, None
-            self.since, self.work = time.monotonic(), self._worked(self.aimed)
-        end = time.monotonic() + SLICE
-        while self.left > 0 and self.aimed is not None and not self._finished and time.monotonic() < end:
+            self.since, self.work, self.fresh = time.monotonic(), self._worked(self.aimed), False
+        if self.fresh and not self._held:
+            self._draw()
+            return
+        end = time.thread_time() + SLICE
+        while self.left > 0 and self.aimed is not None and not self._finished and time.thread_time() < end:
             spare = self.options is not None and self.left < RESERVE * self.options.evaluations
             if spare and self._coarse:
                 return
             self.left -= 1
             level = next(self.work, None)
             if level is None:
-                self.aimed = None
+                self.aimed, self.fresh = None, False
             elif level and self.landscape is not None and np.isfinite(self.landscape.values).any():
-                self.draw(self.landscape, self.aimed)
+                self.fresh = True
+            if self.fresh and not self._held:
+                self._draw()
                 return
+
+    def _draw(self) -> None:
+        assert self.landscape is not None and self.aimed is not None
+        self.fresh, self.drawn = False, (self.aimed, self.landscape)
+        self.draw(self.landscape, self.aimed)
+
+    @property
+    def _held(self) -> bool:
+        """Whether what is shown may stay for a moment, because what is new is coarser and hardly higher."""
+        if self.drawn is None or self.landscape is None or self.aimed is None:
+            return False
+        before, shown = self.drawn
+        if before.epsilon != self.aimed.epsilon or shown is self.landscape or shown.level >= self.landscape.level:
+            return False
+        gain = _gain(self.aimed, before, shown)
+        return gain <= SAME or (gain <= LARGE and time.monotonic() - self.since < HELD)
 
     def _better(self, waiting: Aim) -> bool:
         """Whether a tuple that is waiting is worth more than the landscape in work."""
@@ -142,9 +178,8 @@ class Explorer:
             return self.aimed is None or self._finished
         if not self._coarse:
             return False
-        low, high = self.landscape.limits
-        gain = waiting.value - self.aimed.value
-        return not gain <= LARGE * (high - low) or time.monotonic() - self.since > STALE
+        gain = _gain(waiting, self.aimed, self.landscape)
+        return not gain <= LARGE or (gain > SAME and time.monotonic() - self.since > STALE)
 
     def _worked(self, aim: Aim) -> Iterator[bool]:
         """Find the indices that decide, then fill the landscape; ``True`` where a level is complete."""
@@ -168,3 +203,11 @@ class Explorer:
             return
         self.landscape = Landscape(g, anchor, *places_of(axes, pair, anchor), self.options.grid, aim.epsilon, axes)
         yield from self.landscape.evaluate()
+
+
+def _gain(aim: Aim, before: Aim, landscape: Landscape) -> float:
+    """By how much a tuple has a higher value than the one before, of the height of its landscape; NaN where a value is
+    not known."""
+    low, high = landscape.limits
+    gain = aim.value - before.value
+    return gain / (high - low) if high > low else (np.inf if gain > 0.0 else gain)

@@ -21,8 +21,8 @@ from sparserob_rerun.study.statuses import mark, named, plainly, said
 
 LAYERS = ("curve", "frame", "bounds", "marks")
 PICTURE_EVERY, SHARE, RAREST, SPARE = 0.5, 0.005, 60.0, 20.0
-"""Seconds between two pictures; a share of the study's time, and these seconds at most; and how many times as long as
-one took."""
+"""Seconds between two pictures; a share of the study's time, and these seconds at most; and how many times the
+processor time of one."""
 LARGE = 1000.0  # points from which on pictures are rarer, for they are larger
 SHOWN = 8  # points whose bounds are drawn
 LETTERS, NAME = 300, 32  # of why a point failed, and of its name beside its bounds
@@ -46,7 +46,7 @@ class StudyOpening:
 class StudyRecorder:
     """Logs the events of one study to a stream that is already open."""
 
-    rest, urgent, behind = math.inf, False, False
+    rest, urgent, behind, ended = math.inf, False, False, math.inf
 
     def __init__(self, rr: Any, stream: Any, opening: StudyOpening) -> None:
         self.rr, self.stream, self.event = rr, stream, opening.event
@@ -129,7 +129,7 @@ class StudyRecorder:
 
     def _picture(self) -> None:
         """Everything anew, and the moment from which on the next one may come."""
-        began, self.rest = time.monotonic(), math.inf
+        spent, self.rest = time.thread_time(), math.inf
         for panel, task in (
             ("the map", self._map),
             ("the bounds", self._bounds),
@@ -142,9 +142,10 @@ class StudyRecorder:
                 except Exception as error:  # noqa: BLE001  a panel less is better than no recording
                     self.broken[panel] = f"{panel} could not be drawn: {type(error).__name__}: {error}"
                     self.say(f"{self.broken[panel]}; the rest goes on", "WARN")
-        now = time.monotonic()
+        spent = time.thread_time() - spent
         large = max(1.0, len(self.event.points) / LARGE)
-        self.next = now + max(PICTURE_EVERY, large * min(SHARE * self.seconds, RAREST), SPARE * (now - began))
+        pause = max(PICTURE_EVERY, large * min(SHARE * self.seconds, RAREST), SPARE * spent)
+        self.next = time.monotonic() + pause
 
     def _map(self) -> None:
         if self.board.kind == "table":

@@ -1,0 +1,52 @@
+"""What a panel says before there is anything in it."""
+
+from __future__ import annotations
+
+from typing import Any, final
+
+from sparserob_rerun.drawing import palette as ink
+from sparserob_rerun.drawing.canvas import Drawing
+from sparserob_rerun.exchange import bounds, rounds
+from sparserob_rerun.physics import physics
+from sparserob_rerun.physics.pages import pages
+from sparserob_rerun.recording.layout import PHASE, Shown
+from sparserob_rerun.search import climb, views
+
+CONTROL, LANDSCAPE, CLIMB = "control and states", "the landscape", "the climb"
+VIOLATIONS, BOUNDS = "the violations", "the bounds"
+
+
+@final
+class Waiting:
+    """Writes into every panel of a run that is still empty what it waits for, and takes the words away again when the
+    panel has a picture (`arrived`)."""
+
+    def __init__(self, rr: Any, stream: Any, shown: Shown) -> None:
+        self.rr, self.stream = rr, stream
+        self.places = dict[str, list[str]]()
+        first = "the first search ends" if shown.searches else "the first round ends"
+        if shown.problem is not None:
+            for page in pages(shown.problem):
+                words = f"the control and the states are drawn when {first}"
+                self._write(CONTROL, page.path, physics.extent(len(page.plots)), words)
+            if shown.problem.system.states == 2:
+                self._write(CONTROL, "physics/phase", PHASE, f"drawn when {first}")
+        if shown.landscape:
+            tuples = "the first tuple is evaluated" if shown.searches else "the first constraints are active"
+            self._write(LANDSCAPE, "landscape/map", views.EXTENT, f"the landscape of g is drawn when {tuples}")
+        if shown.searches:
+            self._write(CLIMB, "search/stages", climb.EXTENT, "the climb begins with the first evaluations of g")
+        self._write(VIOLATIONS, "violation/plots", rounds.extent(shown.families), f"drawn when {first}")
+        self._write(BOUNDS, "rounds/picture/bounds", bounds.ONE, f"no bound yet: {first} with the first one")
+
+    def arrived(self, panel: str) -> None:
+        """A panel has its first picture."""
+        for path in self.places.pop(panel, ()):
+            self.stream.log(path, self.rr.Clear(recursive=True))
+
+    def _write(self, panel: str, path: str, extent: tuple[float, float, float, float], words: str) -> None:
+        left, right, top, bottom = extent
+        drawing, place = Drawing(), f"{path.strip('/')}/waiting"
+        drawing.text((left + right) / 2, (top + bottom) / 2, words, ink.GREY)
+        drawing.log(self.rr, self.stream, place)
+        self.places.setdefault(panel, []).append(place)
