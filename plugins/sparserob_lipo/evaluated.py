@@ -27,7 +27,7 @@ class Evaluated:
         self.part = max(1, TESTED_NUMBERS // dimension)
         self._points = np.empty((self.capacity + 1, dimension))
         self._order = np.arange(self.capacity + 1)  # _points[_order[:count]] are sorted; the row _order[count] is free
-        self._values = np.empty(self.capacity + 1)
+        self._values, self._of_row = np.empty(self.capacity + 1), np.empty(self.capacity + 1)
         self.count, self.slope = 0, 0.0
 
     @property
@@ -41,16 +41,17 @@ class Evaluated:
         best: np.ndarray = self._points[self._order[self.count - 1]]
         return best
 
-    def balls(self, constant: float) -> tuple[np.ndarray, np.ndarray]:
-        """What the constant excludes: balls of centres ``(k, d)`` and radii ``(k,)``, the largest first."""
-        radii = (self.values[-1] - self.values) / constant
+    def balls(self, constant: float, most: int) -> tuple[np.ndarray, np.ndarray]:
+        """What the constant excludes: the ``most`` largest of the balls, of centres ``(k, d)`` and radii ``(k,)``, the
+        largest first."""
+        radii = (self.values[-1] - self.values[:most]) / constant
         several = int(np.searchsorted(-radii, 0.0))
         return self._points[self._order[:several]], radii[:several]
 
     def add(self, point: np.ndarray, value: float) -> None:
         """Remember a finite value; one pass over the points updates the slope."""
         count, row = self.count, self._order[self.count]
-        self._points[row] = point
+        self._points[row], self._of_row[row] = point, value
         if count:
             self.slope = max(self.slope, self._steepest(point, value))
         place = int(np.searchsorted(self._values[:count], value, side="right"))
@@ -127,11 +128,16 @@ class Evaluated:
         from scipy.spatial.distance import cdist
 
         steepest = 0.0
-        for start in range(0, self.count, self.part):
-            rows = self._order[start : min(self.count, start + self.part)]
+        used = self.count + (
+            self.count == self.capacity
+        )  # the free row, which holds the point itself, is among them then
+        for start in range(
+            0, used, self.part
+        ):  # in the order of the memory: to gather rows takes several times as long
+            rows = slice(start, min(used, start + self.part))
             distances = cdist(point[np.newaxis], self._points[rows])[0]
             apart = distances > 0
-            others = self._values[start : start + len(rows)][apart]
+            others = self._of_row[rows][apart]
             with np.errstate(over="ignore"):
                 rise = np.abs(others - value) - ROUNDED * np.maximum(np.abs(others), abs(value))
                 slopes = rise / distances[apart]

@@ -18,6 +18,7 @@ DRAWS_PER_HALVING: Final = 32  # candidates in boxes around the best point until
 MOST_HALVINGS: Final = 40  # a box of 1e-12 of the sides; much smaller ones would repeat the best point
 BLOCK_NUMBERS: Final = 2**17  # coordinates of the candidates that are drawn at once
 SHOWN_EVERY: Final = 16  # evaluations
+SHOWN: Final = 400  # balls, which is what a sketch keeps
 WORK: Final = 2**31  # differences of coordinates that the candidates of one evaluation may cost
 
 
@@ -72,7 +73,7 @@ class Walk:
         excluded; show now and then the largest of the balls that it excludes."""
         shown = self.objective.observed and self.objective.evaluations % SHOWN_EVERY == 0
         if shown and constant > 0.0 and self.evaluated.count:
-            centres, radii = self.evaluated.balls(constant)
+            centres, radii = self.evaluated.balls(constant, SHOWN)
             middles, reach = self.lower + self.scale * centres, radii[:, np.newaxis] * self.scale
             self.objective.sketch("excluded", middles - reach, middles + reach, rounded=True)
         self.objective.note(constant=constant, rejected=self.rejected / max(1, self.drawn))

@@ -63,7 +63,7 @@ class _Bound:
     @staticmethod
     def _cones(points: np.ndarray, squares: np.ndarray, heights: np.ndarray, candidates: np.ndarray) -> np.ndarray:
         """The cone of every point at every candidate ``(n, c)``: reductions along the first axis are the fast ones."""
-        cones = (-2.0 * points) @ candidates.T
+        cones = points @ (-2.0 * candidates).T
         cones += squares[:, np.newaxis]
         cones += np.einsum("ij,ij->i", candidates, candidates)
         np.sqrt(np.maximum(cones, 0.0, out=cones), out=cones)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import isqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,10 @@ ALWAYS = 60
 """Up to so many points all pairs are looked at again with every point, later each time their number has grown by a
 tenth."""
 LATEST = 2000
+PAIRS = 2**27
+"""Numbers of points squared times coordinates, up to which all pairs are looked at: `LATEST` points up to 33 coordinates,
+and 180 in four thousand. Ten times as many, and the looks alone take a minute there; a tenth, and from 4 coordinates on
+slopes are no longer the least of all pairs."""
 NEAR = 1e-4
 """Squared distance below which the program would pay with noise rather than with slope."""
 ROUNDS = 6
@@ -52,6 +57,7 @@ class Slopes:
         self._points, self._raw = np.empty((capacity, dimension)), np.empty(capacity)
         self.slope, self._noise = np.zeros(dimension), np.zeros(capacity)
         self.count, self.unit, self._fitted = 0, 0.0, 0
+        self._latest = min(LATEST, isqrt(PAIRS // dimension))
         self.active = Pairs(np.empty((0, dimension)), np.empty(0, dtype=int), np.empty(0))
 
     @property
@@ -95,7 +101,7 @@ class Slopes:
         self._rescale()
         if not self.unit:
             return
-        if self.count <= ALWAYS or self._fitted * 1.1 < self.count <= LATEST:
+        if self.count <= ALWAYS or self._fitted * 1.1 < self.count <= self._latest:
             self._fitted = self.count
             self._refit()
         else:
@@ -132,11 +138,13 @@ class Slopes:
         rise = heights[:last] - heights[last]
         counts = np.isfinite(self.raw[:last]) & (np.abs(rise) > NEGLIGIBLE)
         lower = np.where(rise > 0, last, np.arange(last))
-        pairs = Pairs((self.points[:last] - self.points[last]) ** 2, lower, rise**2).take(counts)
-        slope, noise = self.slope, self.noise.copy()
+        squares = self.points[:last] - self.points[last]
+        pairs = Pairs(np.square(squares, out=squares), lower, rise**2)
+        pairs = pairs if counts.all() else pairs.take(counts)
+        slope, noise, distances = self.slope, self.noise.copy(), pairs.squares.sum(axis=1)
         for _ in range(ROUNDS):
             reached = pairs.squares @ slope + noise[pairs.lower]
-            worst = _worst(reached / pairs.rise, pairs.squares.sum(axis=1))
+            worst = _worst(reached / pairs.rise, distances)
             if not worst.size:
                 break
             self.active = self.active.join(pairs.take(worst))
