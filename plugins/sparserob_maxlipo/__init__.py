@@ -20,9 +20,9 @@ SECONDARY = 6
 
 
 NUMBERS = 2**17
-"""Coordinates of the candidates of one global step: the number of candidates that a user asks for up to 131 coordinates.
-Ten times as many, and a step over thousands of coordinates takes a tenth of a second, though the highest candidate is
-there hardly better than any; a tenth, and from 13 coordinates on there are fewer than what was asked for."""
+"""Coordinates of the candidates of one global step: as many candidates as a user asks for up to 131 coordinates. Ten
+times as many, and a step over thousands of coordinates takes a tenth of a second, though the highest candidate is there
+hardly better than any; a tenth, and from 13 coordinates on there are fewer than what was asked for."""
 
 
 class MaxLIPO(sr.Maximiser, sr.Options):

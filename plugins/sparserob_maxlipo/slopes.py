@@ -18,8 +18,8 @@ ALWAYS = 60
 tenth."""
 LATEST = 2000
 PAIRS = 2**27
-"""Numbers of points squared times coordinates, up to which all pairs are looked at: `LATEST` points up to 33 coordinates,
-and 180 in four thousand. Ten times as many, and the looks alone take a minute there; a tenth, and from 4 coordinates on
+"""Points squared times coordinates, up to which all pairs are looked at: `LATEST` points up to 33 coordinates, and 180
+in four thousand. Ten times as many, and the looks alone take a minute there; a tenth, and from 4 coordinates on
 slopes are no longer the least of all pairs."""
 NEAR = 1e-4
 """Squared distance below which the program would pay with noise rather than with slope."""

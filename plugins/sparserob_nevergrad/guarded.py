@@ -25,10 +25,7 @@ class Guarded:
 
     def __init__(self, create: Any, dimension: int, budget: int, rng: np.random.Generator) -> None:
         seeds = [int(seed) for seed in rng.integers(2**31, size=3)]
-        self._numbers: tuple[Any, Any] = (
-            random.Random(seeds[0]).getstate(),
-            np.random.RandomState(seeds[1]).get_state(),
-        )
+        self._python, self._numpy = random.Random(seeds[0]).getstate(), np.random.MT19937(seeds[1])
         self._create, self._shape, self._budget, self._seed = create, (dimension,), budget, seeds[2]
         self._optimiser: Any = None
         self._asked: Any = None
@@ -81,7 +78,9 @@ class Guarded:
 
     @contextmanager
     def _guard(self) -> Iterator[None]:
-        outside = _exchanged(self._numbers)
+        outside = random.getstate(), np.random.get_bit_generator(), np.random.get_state(legacy=False)  # noqa: NPY002
+        random.setstate(self._python)
+        np.random.set_bit_generator(self._numpy)  # a tenth of the time that it takes to write its state
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -89,12 +88,8 @@ class Guarded:
         except Exception as error:
             raise Failed(f"{type(error).__name__}: {str(error).partition(chr(10))[0]}") from error
         finally:
-            self._numbers = _exchanged(outside)
-
-
-def _exchanged(numbers: tuple[Any, Any]) -> tuple[Any, Any]:
-    """Set the states of the global generators, of Python and of numpy; what they were."""
-    before = random.getstate(), np.random.get_state()  # noqa: NPY002
-    random.setstate(numbers[0])
-    np.random.set_state(numbers[1])  # noqa: NPY002
-    return before
+            self._python = random.getstate()
+            random.setstate(outside[0])
+            np.random.set_bit_generator(outside[1])
+            if outside[2]["has_gauss"]:  # the second number of a normal pair, which is not the generator's
+                np.random.set_state(outside[2])  # noqa: NPY002

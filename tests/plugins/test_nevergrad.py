@@ -138,9 +138,13 @@ def test_listing_the_plugins_does_not_import_the_package():
 def test_the_generator_alone_decides_the_search_and_the_global_random_numbers_are_left_alone():
     random.seed(1)
     np.random.seed(1)  # noqa: NPY002
+    np.random.standard_normal()  # noqa: NPY002  the second number of the pair waits
+    whole = np.random.get_bit_generator(), np.random.get_state()[2:]  # noqa: NPY002
     before = random.getstate(), np.random.get_state()[1].tolist()  # noqa: NPY002
     first = search(optimiser="CMA").trace.points
     assert (random.getstate(), np.random.get_state()[1].tolist()) == before  # noqa: NPY002
+    assert (np.random.get_bit_generator(), np.random.get_state()[2:]) == whole  # noqa: NPY002
+    assert whole[1][1] == 1
     np.random.seed(2)  # noqa: NPY002
     assert first.tolist() == search(optimiser="CMA").trace.points.tolist()
     assert first.tolist() != search(optimiser="CMA", seed=1).trace.points.tolist()
