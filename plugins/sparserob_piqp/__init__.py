@@ -11,7 +11,7 @@ import sparserob_core as sr
 
 
 class Piqp(sr.Solver, sr.Options):
-    """Fast on small and medium sparse programs, and precise; the default."""
+    """Fast on small and medium sparse programs, and precise; whom `auto` asks."""
 
     sparse: ClassVar[bool] = True
 
@@ -50,5 +50,5 @@ class Piqp(sr.Solver, sr.Options):
 def sparserob_solvers() -> Iterator[sr.SolverPlugin]:
     """Offer the solver."""
     yield sr.SolverPlugin(
-        name="piqp", factory=Piqp, summary="proximal interior point, sparse; fast and precise (default)"
+        name="piqp", factory=Piqp, summary="proximal interior point, sparse; fast and precise; whom auto asks"
     )

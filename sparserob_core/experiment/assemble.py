@@ -19,7 +19,7 @@ from sparserob_core.experiment.plugins.guards import guarded
 from sparserob_core.sip.method import Deadline, OutOfTime, Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.regulariser import Regulariser
-from sparserob_core.sip.solver import Solver
+from sparserob_core.sip.solver import AUTO, Auto, Solver, named
 
 if TYPE_CHECKING:
     from sparserob_core.control.transcription.record import Transcription
@@ -197,11 +197,21 @@ class Anew:
         return program if own is None else own.program, tools.solver, tools.regulariser
 
 
+def solver_of(loaded: Loaded) -> Solver:
+    """The solver of a checked config: one that is named answers every program, and `Auto` where it does not."""
+    name = loaded.config.solver.name
+    try:
+        solver: Solver = build(loaded, "solver", loaded.config.solver)
+    except InputError as error:
+        raise loaded.located(("solver",), error) from error
+    return solver if isinstance(solver, Auto) else named(solver, name, loaded.registry.build("solver", AUTO))
+
+
 def tools_of(loaded: Loaded) -> Tools:
     """The components and numbers that a method works with."""
     config = loaded.config
     return Tools(
-        solver=build(loaded, "solver", config.solver),
+        solver=solver_of(loaded),
         maximiser=build(loaded, "maximiser", config.maximiser),
         regulariser=None if config.regulariser is None else build(loaded, "regulariser", config.regulariser),
         continuation=config.continuation,

@@ -26,7 +26,8 @@ from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.regulariser import Regulariser
 from sparserob_core.sip.relaxed.relaxed import require_separable
 from sparserob_core.sip.result import Result
-from sparserob_core.sip.solver import Solver
+from sparserob_core.sip.solver import AUTO, Solver
+from sparserob_core.sip.solver import named as named_solver
 
 if TYPE_CHECKING:
     from typing import Unpack
@@ -80,7 +81,7 @@ def solve(
 def solve(
     problem: OptimalControlProblem | SemiInfiniteProgram,
     method: Choice | Method = "exchange",
-    solver: Choice | Solver = "piqp",
+    solver: Choice | Solver = "auto",
     maximiser: Choice | Maximiser = "direct",
     regulariser: Choice | Regulariser | None = "default",
     *,
@@ -98,6 +99,8 @@ def solve(
     """Solve a semi-infinite program, or an optimal control problem on dictionaries, as ``sparserob run`` does, without
     files.
 
+    ``solver``: one that is named answers every finite program; `Result.unanswered` says which it did not, and then
+    others did. ``auto`` is whoever is quickest.
     A component is a name, a mapping such as ``{"name": "exchange", "tolerance": 1e-9}``, or the component itself.
     ``tolerance`` is the relative gap, for a method that has such an option. ``control`` is by default 100 equal pieces,
     and ``disturbance`` one indicator function on each piece of the control; both are for control problems only, as is
@@ -119,7 +122,7 @@ def solve(
         regulariser = None if program.lengths is None else "ridge"
     steps = continuation if isinstance(continuation, Continuation) else _continuation(continuation or {})
     tools = Tools(
-        solver=component(registry, "solver", solver, Solver),
+        solver=_solver(registry, solver),
         maximiser=component(registry, "maximiser", maximiser, Maximiser),
         regulariser=None if regulariser is None else component(registry, "regulariser", regulariser, Regulariser),
         continuation=steps,
@@ -132,7 +135,7 @@ def solve(
     chosen: Method = component(registry, "method", _with_tolerance(registry, method, tolerance), Method)
     require_suited(chosen, program)
     require_separable(program, tools.solver, tools.regulariser)
-    result = solve_in_own_units(chosen, program, tools).with_solver(_named(solver))
+    result = solve_in_own_units(chosen, program, tools).accounted(tools.solver)
     if isinstance(model, SemiInfiniteProgram):
         return result
     from sparserob_core.control.studies.answer import ControlResult
@@ -298,6 +301,12 @@ def _named(choice: object) -> str:
     """What a component is called: the name in a choice, or its class."""
     named = choice.get("name") if isinstance(choice, Mapping) else choice
     return named if isinstance(named, str) else type(choice).__name__
+
+
+def _solver(registry: Registry, choice: object) -> Solver:
+    """The solver of a choice: one that is named answers every program, and `Auto` where it does not."""
+    solver: Solver = component(registry, "solver", choice, Solver)
+    return named_solver(solver, _named(choice), registry.build("solver", AUTO))
 
 
 def component(registry: Registry, kind: str, choice: object, expected: type[Any]) -> Any:

@@ -317,8 +317,9 @@ class FiniteSolution:
     ``gap = value - lower_bound``. ``directions``: those that norms of blocks were replaced by, the last time.
     ``infeasibility``: a proven lower bound of the smallest ``t`` for which
     ``G_i x <= h_i + t |G_i|`` and ``|A_i x - b_i| <= t |A_i|`` can be met within the bounds. ``attempts``: what was
-    tried and why it was not believed. ``by``: whose answer it is, one of `CLOSED_FORM`, `DUAL_NEWTON`, `HIGHS`,
-    `SOLVER` (the solver that was named) and `NOBODY`.
+    tried and why it was not believed. ``by``: whose answer it is, `CLOSED_FORM`, `DUAL_NEWTON`, `HIGHS`, `NOBODY` or
+    the name of the solver that was asked (`SOLVER`, where it has none). ``unanswered``: why it is not the answer of the
+    solver that was named.
     """
 
     status: Literal["optimal", "infeasible", "failed"]
@@ -335,6 +336,7 @@ class FiniteSolution:
     infeasibility: float = 0.0
     directions: Directions | None = None
     by: str = ""
+    unanswered: str = ""
 
 
 @final

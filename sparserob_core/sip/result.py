@@ -11,8 +11,8 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import RoundFinished, gains
 from sparserob_core.sip.evidence import NO_BOUND, Activity, Cut, Dual, InfeasibleSubsystem, Proof, Sparsest
-from sparserob_core.sip.finite import SOLVER
 from sparserob_core.sip.program import WorstConstraint
+from sparserob_core.sip.solver import Named, Solver, Unanswered
 
 if TYPE_CHECKING:
     from sparserob_core.sip.maximiser import Trace
@@ -148,6 +148,7 @@ class Result:
     ``activity``: between what the least count of the
     program lies, where it has one. ``sparsest``: there where the cost is that count, not J.
     ``solved_by``: whose answers to relaxed programs were believed, and how many (`RelaxedProgram.solved_by`).
+    ``unanswered``: which programs the solver that was named did not answer, and why.
     """
 
     status: Status
@@ -162,6 +163,7 @@ class Result:
     indices: Sequence[Cut] = ()
     counts: Mapping[str, int] = field(default_factory=dict)
     solved_by: Mapping[str, int] = field(default_factory=dict)
+    unanswered: Sequence[Unanswered] = ()
     history: Sequence[RoundFinished] = ()
     trace: SearchTrace | None = None
     dual: Dual = NO_BOUND
@@ -176,13 +178,13 @@ class Result:
     activity: Activity | None = None
     sparsest: Sparsest | None = None
 
-    def with_solver(self, name: str) -> Result:
-        """The same, where what the solver has solved counts under its name, be it nothing."""
-        if not self.solved_by:
+    def accounted(self, solver: Solver) -> Result:
+        """The same with the account of a solver that was `Named`: what it did not answer, and its calls, those of
+        programs beside the relaxed ones included."""
+        if not isinstance(solver, Named):
             return self
-        others = {one: count for one, count in self.solved_by.items() if one != SOLVER}
-        mine = self.solved_by.get(SOLVER, 0) + others.get(name, 0)
-        return replace(self, solved_by={**others, name: mine})
+        counts = {**self.counts, "solver_calls": solver.failures.calls}
+        return replace(self, unanswered=tuple(solver.failures), counts=counts)
 
     def __repr__(self) -> str:
         lines = [

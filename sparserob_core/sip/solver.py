@@ -1,14 +1,21 @@
-"""What an inner convex solver is asked, and what it claims; nothing of it is believed before `check`."""
+"""What an inner convex solver is asked, and what it claims; nothing of it is believed before `check`. Who answers the
+finite programs of a run: whoever is quickest (`Auto`), or the solver that was named (`Named`)."""
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
 
 import numpy as np
+from pydantic import Field, PrivateAttr, model_validator
 
+from sparserob_core.errors import InputError
+from sparserob_core.options import Options
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.finite import CLOSED_FORM, DUAL_NEWTON, HIGHS, SOLVER
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
@@ -17,6 +24,9 @@ if TYPE_CHECKING:
 # Of the numbers that are added up in a residual: 64 units of rounding (Higham 2002, section 3.1). Ten times less, and
 # an optimum to the last bit of numbers of a million is none; ten times more, and a digit that there is is given away.
 ROUNDING = 2.0**-46
+AUTO = "auto"  # the name of `Auto`
+SHORTCUTS = frozenset({CLOSED_FORM, DUAL_NEWTON, HIGHS})
+NUMBERS = re.compile(r"[-+]?\d[\d.]*(?:[eE][-+]?\d+)?")
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,3 +154,134 @@ class Solver(ABC):
         ``solved`` may still carry the last iterate: it is checked all the same. With ``infeasible``, ``z, y`` may carry
         the Farkas ray.
         """
+
+
+@dataclass(frozen=True)
+class Unanswered:
+    """How many programs of a ``kind`` the solver that was named did not answer, why, in the words of the first, and by
+    whom they were answered instead."""
+
+    kind: str
+    count: int
+    reason: str
+    by: str
+
+
+@final
+class Auto(Solver, Options):
+    """No solver by name: the optimum in closed form where no row is active, Newton's method on the dual from the last
+    solution, the simplex method for linear programs with thousands of entries; and ``general`` for what is left. All of
+    them are checked alike."""
+
+    sparse: ClassVar[bool] = True
+
+    general: Any = Field(default={"name": "piqp"}, json_schema_extra={"component": "solver"})
+    """The solver that is asked where none of these answers."""
+
+    _called: str = PrivateAttr(default=SOLVER)
+
+    @model_validator(mode="after")
+    def _named(self) -> Auto:
+        if isinstance(self.general, Mapping):
+            self._called = str(self.general.get("name"))
+        if self._called == AUTO or isinstance(self.general, Auto):
+            raise InputError(path="general", expected="a solver that answers by itself", got=AUTO)
+        return self
+
+    @property
+    def called(self) -> str:
+        """The name of the ``general`` solver."""
+        return self._called
+
+    def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
+        """See `Solver.solve`: the claim of the ``general`` solver."""
+        claim: Claim = self.general.solve(program, accuracy)
+        return claim
+
+
+@final
+class Failures:
+    """What the solver that was named did not answer, of how many ``calls`` in all: reasons that differ in their numbers
+    alone are one."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+        self._known: dict[tuple[str, str, str], Unanswered] = {}
+
+    def add(self, kind: str, reason: str, by: str, count: int = 1) -> None:
+        """Note that programs of a ``kind`` were answered by somebody else."""
+        key = (kind, NUMBERS.sub("#", reason), by)
+        known = self._known.get(key, Unanswered(kind, 0, reason, by))
+        self._known[key] = replace(known, count=known.count + count)
+
+    def __iter__(self) -> Iterator[Unanswered]:
+        return iter(tuple(self._known.values()))
+
+    def since(self, before: tuple[Unanswered, ...]) -> tuple[Unanswered, ...]:
+        """What was added to ``before``, an earlier ``tuple`` of the same."""
+        counts = {replace(one, count=0): one.count for one in before}
+        new = (replace(one, count=one.count - counts.get(replace(one, count=0), 0)) for one in self)
+        return tuple(one for one in new if one.count)
+
+
+@final
+class Named(Solver):
+    """A solver that was named: it answers every finite program. Where no answer of it is believed, ``instead`` is
+    asked, and ``failures`` says so."""
+
+    def __init__(self, solver: Solver, name: str, instead: Solver) -> None:
+        self.solver, self.name, self.instead, self.failures = solver, name, instead, Failures()
+
+    def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
+        """See `Solver.solve`."""
+        return self.solver.solve(program, accuracy)
+
+
+@final
+class Asked(Solver):
+    """A solver, and the account of what it is asked: the number of ``calls`` of it, and its ``failures``.
+
+    ``name``: whose its answers are. ``quick``: who may answer before it is asked (`CLOSED_FORM`, `DUAL_NEWTON` from the
+    last solution, `HIGHS`). ``instead``: who is asked where no answer of it is believed.
+    """
+
+    def __init__(
+        self,
+        solver: Solver,
+        name: str = SOLVER,
+        quick: frozenset[str] = SHORTCUTS,
+        instead: Asked | None = None,
+        failures: Failures | None = None,
+    ) -> None:
+        self.solver, self.name, self.quick, self.instead = solver, name, quick, instead
+        self.calls, self.failures = 0, Failures() if failures is None else failures
+
+    @staticmethod
+    def of(solver: Solver) -> Asked:
+        """What a solver is asked: of `Auto` and of one that nobody has named, only what it is needed for; of one that
+        was `Named`, everything. The dual Newton method starts from the last solution in any case."""
+        match solver:
+            case Asked():
+                return solver
+            case Named():
+                quick = frozenset({solver.name} & {DUAL_NEWTON})
+                return Asked(solver.solver, solver.name, quick, Asked.of(solver.instead), solver.failures)
+            case Auto():
+                return Asked(solver.general, solver.called)
+        return Asked(solver)
+
+    def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
+        """See `Solver.solve`."""
+        self.calls += 1
+        self.failures.calls += 1
+        return self.solver.solve(program, accuracy)
+
+
+def named(solver: Solver, name: str, instead: Solver) -> Solver:
+    """The solver as one that was `Named`; `Auto` is no solver by name."""
+    return solver if isinstance(solver, Auto | Named | Asked) else Named(solver, name, instead)
+
+
+def quickest(solver: Solver) -> Solver:
+    """Who answers instead of a solver that was `Named`, for what is drawn of a run and is no part of it."""
+    return solver.instead if isinstance(solver, Named) else solver

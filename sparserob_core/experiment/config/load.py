@@ -31,6 +31,13 @@ class Loaded:
     source: Source
     overrides: tuple[Override, ...] = ()
 
+    def place(self, path: Path) -> str | None:
+        """``file:line:column``, or the override, that gives the value at ``path``; ``None`` where its default holds."""
+        change = _override(self.source, self.overrides, Complaint(path, ""))
+        if change is not None:
+            return f"override {change.text}"
+        return None if _at(self.source.data, path) is None else self.source.where(path)
+
     def located(self, slot: Path, error: InputError) -> ConfigError:
         """The same error with the place of the key that it is about: what building the component at ``slot`` found
         wrong with its options."""

@@ -101,8 +101,8 @@ class RunConfig(Options):
     maximiser: Annotated[MaximiserEntry, Slot("maximiser", "direct")] = MaximiserEntry(name="direct")
     """The global search, wherever a family of constraints has no closed form of its own."""
 
-    solver: Annotated[Entry, Slot("solver", "piqp")] = Entry(name="piqp")
-    """The inner solver of quadratic programs."""
+    solver: Annotated[Entry, Slot("solver", "auto")] = Entry(name="auto")
+    """Who answers the finite programs: whoever is quickest (auto), or one that is named, which answers all of them."""
 
     executor: Annotated[Entry, Slot("executor", "serial")] = Entry(name="serial")
     """Where programs that do not depend on one another are solved."""

@@ -89,8 +89,11 @@ def _alternatives(field: dict[str, Any]) -> list[dict[str, Any]]:
     return [form for form in field.get("anyOf", [field]) if form.get("type") != "null"]
 
 
-def _choice(registry: Registry, kind: str, default: str | None, parts: dict[str, Any]) -> dict[str, Any]:
-    names = registry.names(kind)
+def _choice(
+    registry: Registry, kind: str, default: str | None, parts: dict[str, Any], but: str | None = None
+) -> dict[str, Any]:
+    """A component of a kind, by name or with its options; ``but``: one that cannot be meant, within its own options."""
+    names = [name for name in registry.names(kind) if name != but]
     entries = []
     for name in names:
         record = registry.get(kind, name)
@@ -98,7 +101,8 @@ def _choice(registry: Registry, kind: str, default: str | None, parts: dict[str,
         for key, part in ({} if record.open else components(record.options_type())).items():
             described = entry["properties"][key]
             described.pop("component")
-            described["anyOf"] = [*_choice(registry, part, None, parts)["anyOf"], {"type": "null"}]
+            others = _choice(registry, part, None, parts, but=name if part == kind else None)
+            described["anyOf"] = [*others["anyOf"], {"type": "null"}]
         parts.update({f"{kind}.{name}.{part}": value for part, value in entry.pop("$defs", {}).items()})
         entries.append(_named(entry, record, needs_name=name != default))
     return {"anyOf": [{"enum": names, "description": f"A {kind} with its default options."}, *entries]}

@@ -94,7 +94,7 @@ class Registry:
         model = record.options_type()
         given, wrong = dict(options), list[Complaint]()
         for key, part in parts(model).items():
-            entry = given.get(key)
+            entry = given.get(key, model.model_fields[key].default)
             if isinstance(entry, str | Mapping):
                 given[key], faults = self._spelt_out(part, entry)
                 wrong += [fault.under((key,)) for fault in faults]

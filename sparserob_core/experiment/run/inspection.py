@@ -174,6 +174,7 @@ class Inspection:
         program before their deviations are known: one value takes as long as a round of the exchange."""
         from sparserob_core.sip.relaxed.relaxed import RelaxedProgram
         from sparserob_core.sip.relaxed.tuples import TupleValue, imposed_program
+        from sparserob_core.sip.solver import quickest
 
         if self.program.spread is not None:
             raise InputError("g of a policy is a robust program at every point; its rounds show what it comes to")
@@ -187,7 +188,7 @@ class Inspection:
         if self.literal:
             open_ = np.array([kind == "disturbance" for kind in self.kinds(self.width)])
             program = replace(program, families=[_with_the_worst(family, open_) for family in program.families])
-        value = TupleValue(program, RelaxedProgram(program, tools.solver, tools.regulariser), count)
+        value = TupleValue(program, RelaxedProgram(program, quickest(tools.solver), tools.regulariser), count)
         value.epsilon = epsilon if tools.regulariser is not None and np.isfinite(epsilon) else 0.0
         width, cost = value.layout.slot.dimension, 1.0 if own is None else own.cost
         units = np.ones(width) if own is None else UsersUnits(own).tuple_units(width, width)

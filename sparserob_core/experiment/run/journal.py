@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, final
 
@@ -10,18 +10,21 @@ import numpy as np
 
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.studies.answer import ControlResult
-from sparserob_core.errors import SparseRobError
+from sparserob_core.errors import Path, SparseRobError, dotted
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment
+from sparserob_core.experiment.config.load import Loaded
+from sparserob_core.experiment.config.run_config import RunConfig
 from sparserob_core.experiment.directory.adversary import FILE as ADVERSARY
 from sparserob_core.experiment.directory.adversary import adversaries
 from sparserob_core.experiment.directory.artefacts import RunDirectory, trace_columns
 from sparserob_core.experiment.directory.certificate import certificate
 from sparserob_core.experiment.directory.record import arrays_of, control_of, summary_of, versions
 from sparserob_core.experiment.directory.rounds import round_arrays
-from sparserob_core.experiment.run.events import Event, Observer, RoundFinished
+from sparserob_core.experiment.run.events import EvaluationsFinished, Event, Observer, RoundFinished
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.result import Result
+from sparserob_core.sip.solver import AUTO
 
 
 @final
@@ -31,9 +34,11 @@ class Journal(Observer):
     def __init__(self, directory: RunDirectory, experiment: Experiment, origin: Mapping[str, Any]) -> None:
         self.directory, self.experiment, self.origin = directory, experiment, origin
         self.rounds: list[RoundFinished] = []
+        self.asked = False
 
     def receive(self, event: Event) -> None:
-        """Keep every round."""
+        """Keep every round, and whether the maximiser was asked."""
+        self.asked |= isinstance(event, EvaluationsFinished)
         if isinstance(event, RoundFinished):
             self.rounds.append(event)
 
@@ -46,6 +51,7 @@ class Journal(Observer):
             **summary_of(result, control, self._dictionary),
             **self._added_up(result),
             **self._causal(result),
+            "notes": list(_notes(self.experiment.loaded, result, self.asked)),
             "seed": config.seed,
             "versions": versions(),
             "config": config.digest(),
@@ -150,3 +156,42 @@ def gains_of(experiment: Experiment, result: Result) -> Array | None:
     """The gains ``(K, K, m, n)`` of a decision; ``None`` without feedback."""
     feedback = experiment.transcription.feedback if isinstance(experiment, ControlExperiment) else None
     return None if feedback is None or result.decision is None else feedback.loop.gains(np.asarray(result.decision))
+
+
+def _notes(loaded: Loaded, result: Result, asked: bool) -> Iterator[Mapping[str, str]]:
+    """Notes on the components that a config names, of a run: the key, its place and what is to be known, where one had
+    nothing to do, or a solver left programs to another. ``asked``: whether the maximiser was."""
+    yield from _on_solver(loaded, result)
+    if not result.history:
+        return  # it came to an end before anybody had something to do
+    if not asked:
+        said = "it was never asked: the worst cases of this problem are known in closed form, or nothing can be moved"
+        yield from _of(loaded, ("maximiser",), said)
+    weights = [event.epsilon for event in result.history]
+    searched = [] if result.trace is None else list(result.trace.epsilon)
+    if not any(weight > 0.0 for weight in (*weights, *searched, result.epsilon)):
+        yield from _of(loaded, ("regulariser",), "it had no effect: every program was solved without it (epsilon is 0)")
+
+
+def _on_solver(loaded: Loaded, result: Result) -> Iterator[Mapping[str, str]]:
+    name = loaded.config.solver.name
+    for missed in result.unanswered:
+        said = f"{name} did not answer {missed.count} of the {missed.kind} programs, {missed.by} did: {missed.reason}"
+        yield from _of(loaded, ("solver",), said)
+    if name != AUTO and not result.counts.get("solver_calls"):
+        yield from _of(loaded, ("solver",), f"{name} was not asked: this run came to its end without a finite program")
+
+
+def _of(loaded: Loaded, slot: Path, note: str) -> Iterator[Mapping[str, str]]:
+    """A note on a component, where the config or an override names it: where everything is written, as in the config
+    that a run leaves, what is not the default."""
+    place, written = loaded.place(slot), loaded.config.plain()
+    if set(written) <= set(loaded.source.data) and written[str(slot[0])]["name"] == _default(slot):
+        place = None
+    if place is not None:
+        yield {"key": dotted((*slot, "name")), "place": place, "note": note}
+
+
+def _default(slot: Path) -> str:
+    """The name of a component by default."""
+    return str(RunConfig.model_fields[str(slot[0])].default.name)

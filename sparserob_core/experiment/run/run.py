@@ -231,7 +231,7 @@ def _run(
             )
             try:
                 result = solve_in_own_units(method, experiment.program, _notifying(tools, broadcast))
-                result = result.with_solver(loaded.config.solver.name)
+                result = result.accounted(tools.solver)
             except KeyboardInterrupt as pressed:  # a method that does not return what it knows
                 deadline.interrupt(pressed)
                 result, complete = journal.known(_said(pressed), time.perf_counter() - started), False

@@ -68,6 +68,7 @@ def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("fewest active", _fewest(sparsity.get("fewest_active"))),
         ("switches", _number(sparsity["switches"], "d")),
         ("seconds", f"{_number(summary['seconds'], '.3f')} of the method, which solves and proves"),
+        *(("note", f"{note['place']}: {note['key']}: {note['note']}") for note in summary.get("notes") or ()),
     ]
     return [(name, value) for name, value in rows if value != "unknown" or name in KNOWN]
 
@@ -82,12 +83,10 @@ WHO = {
 
 
 def _solved_by(counts: Mapping[str, int] | None) -> str:
-    """Who solved the relaxed programs; of the solver that was named, also that it was not needed."""
+    """Who solved the relaxed programs, and how many."""
     if not counts:
         return "unknown"
-    parts = [f"{count} {WHO.get(name, f'by {name}')}" for name, count in counts.items() if count]
-    idle = [name for name, count in counts.items() if not count]
-    return ", ".join(parts) + "".join(f"; {name} was not needed" for name in idle)
+    return ", ".join(f"{count} {WHO.get(name, f'by {name}')}" for name, count in counts.items())
 
 
 def _fewest(known: Mapping[str, Any] | None) -> str:

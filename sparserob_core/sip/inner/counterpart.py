@@ -14,18 +14,25 @@ prove the same bound, and nothing but these cuts has to be believed.
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
+from sparserob_core.errors import PluginError, named
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.finite import FiniteProgram, Spread, UncertainRows
+from sparserob_core.sip.finite import HIGHS, FiniteProgram, Spread, UncertainRows
+from sparserob_core.sip.solver import Asked, QuadraticProgram
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 ACCURACY = 1e-10  # of rows and reduced costs: the least that HiGHS takes
+# Residuals of an answer of somebody else, in rows of length 1. Ten times more, and a row that was imposed is violated
+# by more than the margins by which rows are tightened (1e-8); ten times less, and it is more than was asked for.
+BELIEVED = 1e-9
+ROBUST = "feedback"  # what these programs are called where a solver fails on some
 INNER = 20  # steps of the simplex method that one of an interior point method takes as long as
 SAME = 1e-12  # points of a set that are closer are one
 DRAWN = (
@@ -68,7 +75,8 @@ class _Part:
 @final
 @dataclass(eq=False)
 class Counterpart:
-    """Uncertain rows over one program and one spread, to which rows are added; solved by HiGHS, from the last basis.
+    """Uncertain rows over one program and one spread, to which rows are added; solved by HiGHS, from the last basis, or
+    by who is ``asked``; ``answered``: whose answers there were, and how many.
 
     Its columns are the positive and the negative parts of the decision, a slack of all rows where it is ``elastic``
     (the only cost, at least ``lowest``), and what rows need beside them. Where it ``scales`` there is a factor instead,
@@ -82,13 +90,14 @@ class Counterpart:
     lowest: float = 0.0
     scales: bool = False
     highest: float = 0.0
-    calls: int = 0
+    asked: Asked | None = None
+    answered: Counter[str] = field(default_factory=Counter)
     blocks: list[UncertainRows] = field(default_factory=list)
     _imposed: list[tuple[np.ndarray, Array, list[_Part]]] = field(default_factory=list, repr=False)
     _margin: float = 0.0
 
     def __post_init__(self) -> None:
-        self._linear = Growing()
+        self._linear = Growing(self.asked)
         program, n = self.program, self.program.n
         low, high = program.lower, program.upper
         priced = not (self.elastic or self.scales)
@@ -209,13 +218,13 @@ class Counterpart:
     def solve(self, margin: float = 0.0, seconds: float = np.inf) -> RobustAnswer:
         """The optimum with every row tightened by ``margin``; where it is elastic, how far the rows must be relaxed so
         that they can be met. It is not solved where ``seconds`` do not suffice."""
-        self.calls += 1
         if margin != self._margin:
             self._margin = margin
             for where, limits, parts in self._imposed:
                 if parts:
                     self._linear.limit(where, limits - margin)
         solved, said, columns, rows = self._linear.solve(seconds)
+        self.answered[self._linear.by] += 1
         if not solved:
             none = np.zeros(0)
             return RobustAnswer(False, said, none, none, np.zeros((0, 0)), none)
@@ -315,11 +324,13 @@ class Counterpart:
 
 @final
 class Growing:
-    """A sparse linear program that grows, solved by HiGHS from where it was."""
+    """A sparse linear program that grows, solved by HiGHS from where it was, unless somebody else is ``asked``; ``by``:
+    whose the last answer was."""
 
-    def __init__(self) -> None:
+    def __init__(self, asked: Asked | None = None) -> None:
         import highspy
 
+        self.asked, self.by = asked, HIGHS
         self.highs: Any = highspy.Highs()
         self.columns = self.count = 0
         self.refused = False
@@ -365,6 +376,13 @@ class Growing:
 
         if self.refused:
             return False, "HiGHS: a row is refused", np.zeros(0), np.zeros(0)
+        why, self.by = "", HIGHS
+        if self.asked is not None:
+            answer = self._posed(self.asked)
+            if not isinstance(answer, str):
+                self.by = self.asked.name
+                return answer
+            why = answer
         if np.isfinite(seconds):
             self.highs.setOptionValue("time_limit", self.highs.getRunTime() + max(seconds, 0.0))
         steps = self._run()
@@ -377,8 +395,55 @@ class Growing:
         said = f"HiGHS: {self.highs.modelStatusToString(status)}"
         if status != highspy.HighsModelStatus.kOptimal:
             return False, said, np.zeros(0), np.zeros(0)
+        if self.asked is not None:
+            self.asked.failures.add(ROBUST, why, HIGHS)
         found = self.highs.getSolution()
         return True, said, np.array(found.col_value), -np.array(found.row_dual)
+
+    def _posed(self, asked: Asked) -> tuple[bool, str, Array, Array] | str:
+        """The answer of who is asked, from nothing, where it holds; in words why it does not."""
+        import highspy
+        from scipy.sparse import csc_array, csr_array, diags_array, vstack
+
+        program = self.highs.getLp()
+        matrix, (low, high) = program.a_matrix_, (np.array(program.row_lower_), np.array(program.row_upper_))
+        kind = csc_array if matrix.format_ == highspy.MatrixFormat.kColwise else csr_array
+        table = kind((matrix.value_, matrix.index_, matrix.start_), shape=(self.count, self.columns)).tocsr()
+        norms = np.sqrt(np.asarray(table.multiply(table).sum(axis=1)).reshape(-1))
+        norms[norms == 0.0] = 1.0
+        table = diags_array(1.0 / norms) @ table
+        cost = np.array(program.col_cost_)
+        kappa = float(np.abs(cost).max(initial=0.0)) or 1.0
+        equal = low == high
+        above, below = np.flatnonzero(np.isfinite(high) & ~equal), np.flatnonzero(np.isfinite(low) & ~equal)
+        fixed = np.flatnonzero(equal)
+        posed = QuadraticProgram(
+            csc_array((self.columns, self.columns)),
+            cost / kappa,
+            csc_array(vstack([table[above], -table[below]])),
+            np.concatenate([(high / norms)[above], -(low / norms)[below]]),
+            csc_array(table[fixed]),
+            (high / norms)[fixed],
+            np.array(program.col_lower_),
+            np.array(program.col_upper_),
+        )
+        said = ""
+        for accuracy in (ACCURACY, BELIEVED):  # the last digit that is asked for may cost the others
+            try:
+                claim = asked.solve(posed, accuracy)
+            except Exception as error:  # noqa: BLE001  a foreign solver may raise anything; its failure must not be ours
+                return str(error) if isinstance(error, PluginError) else f"the solver raised {named(error)}"
+            if claim.met(posed, BELIEVED):
+                break
+            missed = "; its rows, bounds, slopes or gap are missed by more than 1e-9"
+            said = said or f"{claim.message}{missed if claim.status == 'solved' else ''}"
+        else:
+            return said
+        multipliers = np.zeros(self.count)
+        multipliers[above] += claim.z[: above.size]
+        multipliers[below] -= claim.z[above.size :]
+        multipliers[fixed] = claim.y
+        return True, claim.message, np.clip(claim.x, posed.lower, posed.upper), kappa * multipliers / norms
 
     def _run(self) -> int:
         """Solve it; the steps that this took."""

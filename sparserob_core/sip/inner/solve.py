@@ -3,13 +3,14 @@
 The walk of `solve_finite`, each step only where the ones before gave no answer that is believed:
 
 1. `_contradiction`: bounds that cross, rows without entries that ask for the impossible.
-2. `_cheap`: the optimum without rows, and Newton's method from a guess (`polish`); no solver is called.
+2. `_cheap`: the optimum without rows, and Newton's method from a guess (`polish`), unless a solver was named.
 3. `_through`: the program in other variables, where that makes it easier (`change_of_variables`), solved by this walk.
 4. `_tried`: the program in the form that a solver takes (`standard_form`), form after form and accuracy after accuracy;
    every claim is polished, measured (`duality.measure`) and judged. Where the first is not believed, or not sharp
    enough, the solver is asked for more digits of it (`more_digits`). Where the solver says infeasible, or nothing is
    believed, the elastic program is asked how far the rows must be relaxed: its multipliers may prove infeasibility.
-5. `_failed`: the best of what was not believed, and what was wrong with it.
+5. `_failed`: the best of what was not believed, and what was wrong with it. Where a solver was named, the walk begins
+   anew without it (`solver.Asked.instead`).
 """
 
 from __future__ import annotations
@@ -25,7 +26,6 @@ from sparserob_core.sip.finite import (
     DUAL_NEWTON,
     HIGHS,
     NOBODY,
-    SOLVER,
     Blocks,
     Directions,
     FiniteProgram,
@@ -38,7 +38,7 @@ from sparserob_core.sip.inner.more_digits import refined
 from sparserob_core.sip.inner.norms import around, bent, near, of_the_rest, towards
 from sparserob_core.sip.inner.standard_form import Form, Recovered, standard_form
 from sparserob_core.sip.inner.vertex import many, sifted
-from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
+from sparserob_core.sip.solver import Asked, Claim, QuadraticProgram, Solver
 
 # The accuracy that a solver is asked for, in multiples of the tolerance, in each form, until it is believed.
 ATTEMPTS: tuple[tuple[Form, float], ...] = (("split", 0.1), ("epigraph", 0.1), ("split", 1e-3), ("split", 10.0))
@@ -58,16 +58,18 @@ ADVICE = "try another solver, or state the problem in units in which its numbers
 @dataclass
 class _Case:
     """One call of `solve_finite`: what was asked, the best unbelieved answer so far, why each was not believed, and the
-    best believed one that is not ``sharp``."""
+    best believed one that is not ``sharp``. ``crude``: what was wrong with the solver's own answer, where Newton's
+    method made it one that holds."""
 
     program: FiniteProgram
-    solver: Solver
+    solver: Asked
     tolerance: float
     small: float
     attempts: list[str] = field(default_factory=list)
     best: FiniteSolution | None = None
     blunt: FiniteSolution | None = None
     elastic: bool = False
+    crude: str = ""
 
     def believes(self, solution: FiniteSolution) -> bool:
         return solution.residual <= self.tolerance and solution.gap <= 10 * self.tolerance * cost_scale(
@@ -112,12 +114,21 @@ def solve_finite(
     whatever the solver says. ``guess``: a solution of a program with the same numbers of rows; a separable program is
     then first tried by Newton's method. ``small``: a gap that is above ``10 tolerance`` times the value, and times this
     share of what is added up to it, is worth more digits; whether they are found or not, what is believed stays
-    ``optimal``. Raises `InputError` when the program's shapes or numbers are at fault; a hard program is ``failed``,
-    never an exception.
+    ``optimal``. ``solver``: what may answer before it, and who does where it does not, `Asked` says. Raises
+    `InputError` when the program's shapes or numbers are at fault; a hard program is ``failed``, never an exception.
     """
     program.validate()
-    found = _answer(_Case(program, solver, tolerance, small), guess)
-    return found if found.by else replace(found, by=NOBODY if found.status == "failed" else SOLVER)
+    asked = Asked.of(solver)
+    case = _Case(program, asked, tolerance, small)
+    found = _answer(case, guess)
+    if asked.instead is not None and found.status == "failed":
+        other = solve_finite(program, asked.instead, tolerance=tolerance, guess=guess, small=small)
+        if other.status != "failed":
+            why = next(iter(found.attempts), found.message)
+            return replace(other, attempts=(*found.attempts, *other.attempts), unanswered=why)
+    if asked.instead is not None and found.by == DUAL_NEWTON != asked.name:
+        return replace(found, unanswered=case.crude)
+    return found if found.by else replace(found, by=NOBODY if found.status == "failed" else asked.name)
 
 
 def _answer(case: _Case, guess: FiniteSolution | None) -> FiniteSolution:
@@ -242,8 +253,9 @@ def _tried(case: _Case) -> FiniteSolution:
     for form, factor in attempts:
         claim, answer = _ask(case, program, form, factor * case.tolerance)
         proof = _proof(case, answer, "the solver's ray") if claim is not None and claim.status == "infeasible" else None
-        for solution in _candidates(case, answer) if proof is None else ():
-            believed = case.judge(solution, f"{form} form")
+        said = "" if claim is None else claim.message
+        for by, solution in _candidates(case, answer, said) if proof is None else ():
+            believed = case.judge(solution, f"{form} form", by)
             if believed is not None:
                 return believed
         if (form, factor) == attempts[0] and proof is None:
@@ -268,8 +280,8 @@ def _more_digits(case: _Case, claim: Claim | None) -> FiniteSolution | None:
         badness = np.inf
         try:
             for one in refined(qp, case.solver, start, factor * case.tolerance):
-                for solution in _candidates(case, recover(one)):
-                    believed = case.judge(solution, "with more digits")
+                for by, solution in _candidates(case, recover(one), one.message):
+                    believed = case.judge(solution, "with more digits", by)
                     if believed is not None:
                         return believed
                 before, badness = badness, min(badness, _badness(solution))
@@ -284,14 +296,17 @@ def _through(case: _Case, easier: NewVariables, guess: FiniteSolution | None) ->
     """The answer found in easier variables, checked in those of the program."""
     program = case.program
     start = guess if guess is None or guess.x.size != program.n else replace(guess, x=easier.to(guess.x))
-    found = solve_finite(easier.program, case.solver, tolerance=case.tolerance, guess=start, small=case.small)
+    inner = _Case(easier.program, case.solver, case.tolerance, case.small)
+    easier.program.validate()
+    found = _answer(inner, start)
+    case.crude = inner.crude
+    case.attempts += inner.attempts
     x = easier.back(found.x)
     if found.status == "infeasible":
         proof = _proof(case, (x, found.y, found.mu, None), "the program in other variables")
         return proof if proof is None else replace(proof, by=found.by)
     measured = measure(program, x, found.y, found.mu, easier.dual(found.z), found.message)
-    measured = replace(measured, by="" if found.by == NOBODY else found.by)
-    return case.judge(measured, "new variables") or case.blunt
+    return case.judge(replace(measured, by=found.by), "new variables") or case.blunt
 
 
 def cost_scale(program: FiniteProgram, value: float) -> float:
@@ -304,18 +319,18 @@ def cost_scale(program: FiniteProgram, value: float) -> float:
 
 def _cheap(case: _Case, guess: FiniteSolution | None) -> Iterator[tuple[str, FiniteSolution]]:
     """What needs no solver, and who it is by: the optimum without rows, the simplex method where few of many entries
-    matter to it, and Newton's method from a guess."""
-    program = case.program
-    if program.separable:
+    matter to it, and Newton's method from a guess; where a solver was named, nothing."""
+    program, quick = case.program, case.solver.quick
+    if CLOSED_FORM in quick and program.separable:
         x = minimisers(program.weights, program.curvature, program.q, program.lower, program.upper)
         if np.isfinite(x).all() and program.residual(x) <= case.tolerance:
             zero, none = np.zeros(program.h.size), np.zeros(program.b.size)
             yield CLOSED_FORM, measure(program, x, zero, none, message="no row is active")
-    if many(program):
+    if HIGHS in quick and many(program):
         corner = sifted(program, *((None, None) if guess is None else (guess.y, guess.mu)))
         if corner.status == "optimal":
             yield HIGHS, measure(program, corner.x, corner.y, corner.mu, message="simplex method")
-    if guess is not None:
+    if DUAL_NEWTON in quick and guess is not None:
         found = polish(program, guess.x, guess.y, guess.mu)
         if found is not None:
             yield DUAL_NEWTON, found
@@ -344,18 +359,20 @@ def _well_formed(claim: Claim, qp: QuadraticProgram) -> bool:
     return all(np.shape(got) == want.shape and bool(np.isfinite(got).all()) for got, want in pairs)
 
 
-def _candidates(case: _Case, answer: Recovered | None) -> Iterator[FiniteSolution]:
-    """A claim polished, where the structure allows, and as it is."""
+def _candidates(case: _Case, answer: Recovered | None, said: str) -> Iterator[tuple[str, FiniteSolution]]:
+    """A claim of a solver that ``said`` so, polished, where the structure allows, and as it is, and who each is by. The
+    polished one of a solver that was named is its own answer only where the claim would do."""
     if answer is None:
         return
     program, (x, y, mu, z) = case.program, answer
-    polished = polish(program, x, y, mu)
+    raw, polished = measure(program, x, y, mu, z, message=f"claimed ({said})"), polish(program, x, y, mu)
     if polished is not None:
-        yield polished
-        yield measure(
-            program, polished.x, *vertex_multipliers(program, polished.x, polished.y, polished.mu), message="its vertex"
-        )
-    yield measure(program, x, y, mu, z, message="claimed")
+        by = "" if case.solver.quick or case.believes(raw) else DUAL_NEWTON
+        case.crude = f"its answer {_short(raw)}; Newton's method went on from it" if by else ""
+        yield by, polished
+        vertex = vertex_multipliers(program, polished.x, polished.y, polished.mu)
+        yield by, measure(program, polished.x, *vertex, message="its vertex")
+    yield "", raw
 
 
 def _elastic_proof(case: _Case, known: FiniteSolution | None) -> FiniteSolution | None:
@@ -459,11 +476,14 @@ def _failed(case: _Case) -> FiniteSolution:
         best = measure(program, np.zeros(program.n), np.zeros(program.h.size), np.zeros(program.b.size))
         found = "; ".join(dict.fromkeys(case.attempts)) or "the solver gave no answer"
     else:
-        bound = "has no lower bound" if best.gap == np.inf else f"is {best.gap:.1e} above its lower bound"
-        found = (
-            f"of {len(case.attempts)} answers none holds: the best misses its rows by {best.residual:.1e} and {bound}"
-        )
+        found = f"of {len(case.attempts)} answers none holds: the best {_short(best)}"
     return replace(best, status="failed", message=f"{found}; {ADVICE}", attempts=tuple(case.attempts))
+
+
+def _short(solution: FiniteSolution) -> str:
+    """By how much an answer misses its rows, and its own lower bound."""
+    bound = "has no lower bound" if solution.gap == np.inf else f"is {solution.gap:.1e} above its lower bound"
+    return f"misses its rows by {solution.residual:.1e} and {bound}"
 
 
 def _badness(solution: FiniteSolution) -> float:

@@ -17,7 +17,7 @@ import numpy as np
 
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Cut, Dual, InfeasibleSubsystem, Proof
-from sparserob_core.sip.finite import HIGHS, INTERIOR, FiniteSolution
+from sparserob_core.sip.finite import INTERIOR, FiniteSolution
 from sparserob_core.sip.inner.central.interior import Interior
 from sparserob_core.sip.inner.counterpart import Counterpart, RobustAnswer, robust_bound
 from sparserob_core.sip.methods.ledger import THINNER, Answer, Ledger, Prover
@@ -26,6 +26,7 @@ from sparserob_core.sip.proof.verdict import NAMED, explained, worst_of
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
 from sparserob_core.sip.result import SMALL_COST, Result
 from sparserob_core.sip.separation.separation import separate
+from sparserob_core.sip.solver import Asked
 
 if TYPE_CHECKING:
     from sparserob_core.sip.method import Tools
@@ -62,27 +63,28 @@ class Robust:
     accuracy: float = COARSE
     price: float = 0.0
     calls: Counter[str] = field(default_factory=Counter)
+    asked: Asked | None = None
     shown: tuple[Array, Sequence[Proof]] | None = None
 
     @staticmethod
-    def start(program: SemiInfiniteProgram) -> Robust:
-        """What every family begins with."""
+    def start(program: SemiInfiniteProgram, asked: Asked | None = None) -> Robust:
+        """What every family begins with; ``asked``: who solves the counterparts, where a solver was named."""
         assert program.spread is not None
         central = Interior(program.finite, program.spread)
-        working = Robust(program, central)
+        working = Robust(program, central, asked=asked)
         for family in program.families:
             assert family.start is not None
             working.add(family, family.start)
-        if program.guide is not None or not central.fits():
+        if asked is not None or program.guide is not None or not central.fits():
             working.by_simplex()
         return working
 
     def by_simplex(self) -> None:
-        """From now on by the simplex method, which takes all there is."""
+        """From now on by the simplex method, which takes all there is, or by the solver that was named."""
         if isinstance(self.counterpart, Counterpart):
             return
         known = self.counterpart.blocks
-        self.counterpart = Counterpart(self.program.finite, self.counterpart.spread)
+        self.counterpart = Counterpart(self.program.finite, self.counterpart.spread, asked=self.asked)
         for block in known:
             self.counterpart.add(block)
 
@@ -93,8 +95,9 @@ class Robust:
             answer = self.counterpart.solve(self.margin, self.accuracy * size, seconds)
             self.calls[INTERIOR] += 1
         else:
+            before = Counter(self.counterpart.answered)
             answer = self.counterpart.solve(self.margin, seconds)
-            self.calls[HIGHS] += 1
+            self.calls += self.counterpart.answered - before
         return answer
 
     def sharper(self, violation: float, size: float, added: bool, tolerance: float) -> bool:
@@ -159,7 +162,8 @@ def robust_exchange(
     """Close the gap of a program with uncertain rows; ends as `Exchange.close` does."""
     relaxed = RelaxedProgram(program, tools.solver, None, deadline=tools.deadline)
     ledger = Ledger(program, relaxed, tools, tolerance)
-    working = Robust.start(program)
+    asked = relaxed.counted
+    working = Robust.start(program, None if asked.instead is None else asked)
     ledger.improve(working.at_rest)
     try:
         with tools.deadline.enforced():
@@ -233,7 +237,7 @@ def _guided(working: Robust, ledger: Ledger) -> None:
     if program.guide is None:
         return
     guide, shared = program.guide
-    easier = Robust.start(guide)
+    easier = Robust.start(guide, working.asked)
     easier.by_simplex()
     for number in range(1, GUIDED + 1):
         tools.deadline.check()
@@ -391,13 +395,13 @@ def _rows(working: Robust) -> Rows:
 def _infeasible(working: Robust, ledger: Ledger, said: str) -> Result:
     """``infeasible`` where multipliers prove it, else ``failed``."""
     program, none = working.program, np.zeros(0)
-    relaxing = Counterpart(program.finite, working.counterpart.spread, elastic=True)
+    relaxing = Counterpart(program.finite, working.counterpart.spread, elastic=True, asked=working.asked)
     for block in working.counterpart.blocks:
         relaxing.add(block)
     elastic = relaxing.solve()
     while elastic.solved and relaxing.sharpen(elastic.x):
         elastic = relaxing.solve()
-    working.calls[HIGHS] += relaxing.calls
+    working.calls += relaxing.answered
     _count(working, ledger)
     dual = working.refuted(elastic) if elastic.solved else None
     if dual is None:
@@ -421,7 +425,9 @@ def _refuted(working: Robust, ledger: Ledger, answer: RobustAnswer, dual: Dual) 
 
 
 def _count(working: Robust, ledger: Ledger) -> None:
-    ledger.relaxed.solves = ledger.relaxed.counted.calls = working.calls.total()
+    ledger.relaxed.solves = working.calls.total()
+    if working.asked is None:
+        ledger.relaxed.counted.calls = ledger.relaxed.solves
     ledger.relaxed.solved_by.update(working.calls - ledger.relaxed.solved_by)
 
 

@@ -22,6 +22,7 @@ from sparserob_core.sip.evidence import Dual
 from sparserob_core.sip.method import Deadline, OutOfTime, Rebuild
 from sparserob_core.sip.relaxed.relaxed import Imposed, RelaxedProgram
 from sparserob_core.sip.relaxed.tuples import TupleValue, imposed_program
+from sparserob_core.sip.solver import Unanswered
 
 CHUNK = 16
 """Tuples that are evaluated one after the other from nothing."""
@@ -37,14 +38,15 @@ START = 5.0
 class Valued:
     """What a chunk gave: ``values (k,)``; ``duals``, the lower bound from the multipliers of each tuple whose value was
     the best so far in its chunk, by its place in it; and how many programs were solved, by how many ``calls`` of the
-    solver, and by whom. ``imposed``: the rows that each rests on, with their multipliers. ``late``: why the time was
-    over, if it was."""
+    solver, by whom, and what the solver that was named did not answer. ``imposed``: the rows that each rests on, with
+    their multipliers. ``late``: why the time was over, if it was."""
 
     values: Array
     duals: dict[int, Dual]
     solves: int
     calls: int
     solved_by: Mapping[str, int] = field(default_factory=dict)
+    unanswered: Sequence[Unanswered] = ()
     late: str = ""
     imposed: Sequence[Imposed] = ()
 
@@ -55,6 +57,7 @@ def value_chunk(g: TupleValue, points: Array, best: float) -> Valued:
     g.forget()
     relaxed, duals = g.relaxed, dict[int, Dual]()
     solves, calls, known = relaxed.solves, relaxed.counted.calls, Counter(relaxed.solved_by)
+    missed = tuple(relaxed.counted.failures)
     values, imposed = np.empty(len(points)), list[Imposed]()
     for k, point in enumerate(points):
         values[k] = g.at(point)
@@ -63,7 +66,8 @@ def value_chunk(g: TupleValue, points: Array, best: float) -> Valued:
             best = float(values[k])
             duals[k] = relaxed.lower_bound(g.rows(), g.solution)
     by = relaxed.solved_by - known
-    return Valued(values, duals, relaxed.solves - solves, relaxed.counted.calls - calls, dict(by), imposed=imposed)
+    calls, missed = relaxed.counted.calls - calls, relaxed.counted.failures.since(missed)
+    return Valued(values, duals, relaxed.solves - solves, calls, dict(by), missed, imposed=imposed)
 
 
 @dataclass(frozen=True)
@@ -183,7 +187,10 @@ class Batches:
                 self.sent += len(chunk)
                 g.relaxed.solves += one.solves
                 g.relaxed.counted.calls += one.calls
+                g.relaxed.counted.failures.calls += one.calls
                 g.relaxed.solved_by.update(one.solved_by)
+                for missed in one.unanswered:
+                    g.relaxed.counted.failures.add(missed.kind, missed.reason, missed.by, missed.count)
                 found.append(one)
         except Exception:  # noqa: BLE001  whatever it was: what is missing is done here, or raised here
             self.executor = None

@@ -23,14 +23,14 @@ from sparserob_core.sip.method import Deadline
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.regulariser import ControlImage, Regulariser
 from sparserob_core.sip.result import SMALL_COST
-from sparserob_core.sip.solver import Claim, QuadraticProgram, Solver
+from sparserob_core.sip.solver import ROUNDING, Asked, Solver
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
 LAZY = 1e-9  # rows violated by less than this, relative to their norm, are not added
+RELAXED = "relaxed"  # what these programs are called where a solver fails on some
 ROUNDS = 200  # lazy additions at most within one evaluation
-ROUNDING = 2.0**-46  # of the numbers of which a row is made (Higham 2002, section 3.1): 64 units of rounding
 # of them, those that also drop the rows without a multiplier; later rows are only added, so that nothing can cycle
 DROPPING = 20
 
@@ -130,20 +130,10 @@ def _most_violated(excess: Float[Array, " r"], kinds: Int[np.ndarray, " r"]) -> 
     return np.asarray(order[np.flatnonzero(np.diff(kinds[order], prepend=-1))], dtype=int)
 
 
-class CountedSolver(Solver):
-    """A solver that counts its ``calls``: many relaxed programs are solved from the last one, without it."""
-
-    def __init__(self, solver: Solver) -> None:
-        self.solver, self.calls = solver, 0
-
-    def solve(self, program: QuadraticProgram, accuracy: float) -> Claim:
-        self.calls += 1
-        return self.solver.solve(program, accuracy)
-
-
 def require_separable(program: SemiInfiniteProgram, solver: Solver, regulariser: Regulariser | None) -> None:
     """Raise `InputError` where the solver is `DualNewton`, and the relaxed programs are not for it."""
-    if not isinstance(solver, DualNewton):
+    asked = Asked.of(solver)
+    if not isinstance(asked.solver, DualNewton):
         return
     if program.spread is not None:
         why = "under feedback rows hold for every deviation, which makes linear programs, and HiGHS solves these"
@@ -187,7 +177,9 @@ class RelaxedProgram:
     _programs: dict[float, FiniteProgram] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.counted = CountedSolver(self.solver)
+        self.counted = Asked.of(self.solver)
+        if self.counted.instead is not None:
+            self.solved_by[self.counted.name] += 0
         if self.regulariser is not None:
             from scipy.sparse import csc_array, eye_array
 
@@ -354,6 +346,8 @@ class RelaxedProgram:
         finite = self.finite(G, h, epsilon)
         solution = solve_finite(finite, self.counted, tolerance=self.tolerance, guess=guess, small=small)
         self.solved_by[solution.by] += 1
+        if solution.unanswered:
+            self.counted.failures.add(RELAXED, solution.unanswered, solution.by)
         return solution
 
     @shaped

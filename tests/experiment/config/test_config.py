@@ -254,7 +254,7 @@ def test_the_defaults_are_those_that_are_documented(config: Path) -> None:
     assert plain["dictionaries"]["control"]["pieces"] == 100
     assert plain["dictionaries"]["disturbance"] is None
     names = {key: plain[key]["name"] for key in ("regulariser", "method", "maximiser", "solver")}
-    assert names == {"regulariser": "ridge", "method": "exchange", "maximiser": "direct", "solver": "piqp"}
+    assert names == {"regulariser": "ridge", "method": "exchange", "maximiser": "direct", "solver": "auto"}
     assert [entry["name"] for entry in plain["observers"]] == ["progress"]
 
 

@@ -48,7 +48,7 @@ def test_the_framework_registers_its_own_components_like_anybody_else() -> None:
     registry = load()
     assert registry.names("method") == ["exchange", "nominal", "reweighted", "scenario", "sparserob", "sparsest"]
     assert registry.get("problem", "linear").plugin == "core"
-    assert registry.names("solver") == ["dual_newton"]
+    assert registry.names("solver") == ["auto", "dual_newton"]
 
 
 def test_every_installed_plugin_loads() -> None:

@@ -1,0 +1,165 @@
+"""Guards who answers in sip/solver.py: a solver that is named answers every finite program, of every method;
+where it does not, another one does, and whoever asks is told how often and why."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+
+import sparserob_core as sr
+from sparserob_core.sip.inner.counterpart import Growing
+from sparserob_core.sip.inner.solve import solve_finite
+from sparserob_core.sip.solver import Asked, Auto, Failures, Named
+from sparserob_core.testing.solvers import regularised, robust_terminal
+
+REGISTRY = sr.load_registry()
+PIQP = REGISTRY.build("solver", "piqp")
+AUTO = REGISTRY.build("solver", "auto")
+ROOT = Path(__file__).parents[2]
+
+
+class Spied(sr.Solver):
+    """PIQP, with the number of its ``calls``; every answer is ``changed``."""
+
+    def __init__(self, changed=lambda claim: claim) -> None:
+        self.calls, self.changed = 0, changed
+
+    def solve(self, program, accuracy):
+        self.calls += 1
+        return self.changed(PIQP.solve(program, accuracy))
+
+
+def refused(claim):
+    raise ArithmeticError("not today")
+
+
+def given_up(claim):
+    return sr.Claim("failed", claim.x * np.nan, claim.z, claim.y, claim.z_box, "no memory")
+
+
+def off(claim):
+    return replace(claim, x=np.round(claim.x, 3), z=np.round(claim.z, 3), y=np.round(claim.y, 3))
+
+
+def impossible(claim):
+    return replace(given_up(claim), status="infeasible", message="PRIMAL_INFEASIBLE")
+
+
+def problem(**more):
+    return sr.OptimalControlProblem(
+        system=sr.LinearSystem(A=[[0, 1], [0, 0]], B=[[0], [1]]),
+        horizon=5.0,
+        initial_state=[4, 0],
+        control=sr.Box([-1], [1]),
+        disturbance=sr.Box([-0.02, -0.02], [0.02, 0.02]),
+        terminal=[sr.Box([-0.5, -0.3], [0.5, 0.3])],
+        **more,
+    )
+
+
+def solved(solver, **more):
+    return sr.solve(problem(), control={"name": "piecewise_constant", "pieces": 10}, solver=solver, **more)
+
+
+WAYS = {
+    "exchange": {},
+    "sparserob": {"method": {"name": "sparserob", "indices": 2}, "budget": 5},
+    "sparsest": {"method": "sparsest"},
+    "scenario": {"method": {"name": "scenario", "scenarios": 20}},
+    "nominal": {"method": "nominal"},
+    "norms": {"regulariser": "smoothness"},
+    "haar": {"control": {"name": "haar", "pieces": 16}},
+    "feedback": {"policy": {"name": "affine"}},
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_solver_that_is_named_answers_every_program(way):
+    options = {"control": {"name": "piecewise_constant", "pieces": 10}, **WAYS[way]}
+    spied = Spied()
+    named, auto = sr.solve(problem(), solver=spied, **options), sr.solve(problem(), **options)
+    assert dict(named.solved_by) == {"Spied": named.counts["relaxed_programs"]}
+    assert spied.calls == named.counts["solver_calls"] >= max(1, named.counts["relaxed_programs"])
+    assert not named.unanswered
+    assert named.status == auto.status
+    assert named.lower_bound == pytest.approx(auto.lower_bound, abs=1e-6)
+    assert "Spied" not in auto.solved_by
+
+
+@pytest.mark.parametrize("policy", ["open_loop", "affine"])
+@pytest.mark.parametrize(
+    ("changed", "words"), [(refused, "ArithmeticError: not today"), (given_up, "no memory"), (impossible, "INFEASIBLE")]
+)
+def test_where_it_does_not_answer_another_one_does_and_the_reason_is_kept(changed, words, policy):
+    result = solved(Spied(changed), policy=policy)
+    assert result.status == "certified"
+    assert result.cost == pytest.approx(solved("auto", policy=policy).cost, rel=1e-6)
+    assert result.solved_by["Spied"] == 0
+    assert sum(result.solved_by.values()) == sum(one.count for one in result.unanswered)
+    assert {one.kind for one in result.unanswered} == {"relaxed" if policy == "open_loop" else "feedback"}
+    assert all(words in one.reason for one in result.unanswered)
+
+
+def test_an_answer_that_newton_s_method_had_to_mend_is_not_the_solver_s():
+    result = solved(Spied(off))
+    assert result.status == "certified"
+    mended = sum(one.count for one in result.unanswered if one.by == "dual_newton")
+    assert mended == result.solved_by["dual_newton"] > 0
+    assert any("misses its rows by" in one.reason for one in result.unanswered)
+    assert sum(result.solved_by.values()) == result.counts["relaxed_programs"]
+
+
+def test_the_solver_of_auto_is_asked_for_what_is_left_and_counts_under_its_name():
+    program = regularised(robust_terminal(), 1e-2)
+    first = solve_finite(program, REGISTRY.build("solver", "auto", {"general": "clarabel"}))
+    assert first.by == "clarabel"
+    assert solve_finite(program, AUTO, guess=first).by == "dual_newton"
+    assert solve_finite(program, Named(PIQP, "mine", AUTO), guess=first).by == "mine"
+    assert Asked.of(AUTO).instead is None
+
+
+@pytest.mark.parametrize("inner", ["auto", {"name": "auto"}])
+def test_auto_does_not_ask_itself(inner):
+    with pytest.raises(sr.InputError, match="general: expected a solver that answers by itself, got auto"):
+        REGISTRY.build("solver", "auto", {"general": inner})
+    with pytest.raises(sr.InputError, match="answers by itself"):
+        Auto(general=AUTO)
+
+
+def test_reasons_that_differ_in_numbers_alone_are_one_and_what_is_new_can_be_told():
+    failures = Failures()
+    failures.add("relaxed", "stopped after 12 steps, residual 1.5e-3", "piqp")
+    before = tuple(failures)
+    failures.add("relaxed", "stopped after 7 steps, residual 2e-09", "piqp")
+    failures.add("feedback", "stopped after 7 steps, residual 2e-09", "highs")
+    assert next((one.count, one.reason) for one in failures) == (2, "stopped after 12 steps, residual 1.5e-3")
+    assert [(one.kind, one.count) for one in failures.since(before)] == [("relaxed", 1), ("feedback", 1)]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_growing_program_has_the_same_answer_by_whoever_is_asked(seed):
+    rng = np.random.default_rng(seed)
+    n, r = 6, 5
+    table, inside = rng.normal(size=(r, n)) * 10.0 ** rng.integers(-2, 3, (r, 1)), rng.uniform(-1, 1, n)
+    cost, middle = 50.0 * rng.normal(size=n), table @ inside
+    low, high = middle - [0, 1, np.inf, 0.5, 0.1], middle + np.array([0, 0.2, 0.3, np.inf, 0.1])
+    asked = Asked.of(Named(PIQP, "mine", AUTO))
+    answers = []
+    for who in (None, asked):
+        growing = Growing(who)
+        growing.variables(np.full(n, -2.0), np.full(n, 2.0), cost)
+        row, column = np.nonzero(table)
+        growing.rows([(row, column, table[row, column])], low, high)
+        done, _, x, multipliers = growing.solve()
+        assert done
+        answers.append((x, multipliers))
+        assert growing.by == ("highs" if who is None else "mine")
+    np.testing.assert_allclose(answers[1][0], answers[0][0], atol=1e-6)
+    np.testing.assert_allclose(answers[1][1], answers[0][1], atol=1e-4 * np.abs(answers[0][1]).max())
+    rows = np.vstack([table[np.isfinite(high)], -table[np.isfinite(low)]])
+    sides = np.concatenate([high[np.isfinite(high)], -low[np.isfinite(low)]])
+    assert cost @ answers[1][0] == pytest.approx(linprog(cost, rows, sides, bounds=(-2.0, 2.0)).fun, abs=1e-6)
