@@ -6,7 +6,6 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
-from fractions import Fraction
 from time import sleep
 from unittest.mock import patch
 
@@ -16,7 +15,6 @@ import scipy.linalg
 from flint import arb, ctx
 
 import sparserob_core as sr
-from sparserob_core.checker.arithmetic.balls import difference
 from sparserob_core.checker.arithmetic.bernstein import highest
 from sparserob_core.checker.arithmetic.jets import Monomials, expanded
 from sparserob_core.checker.arithmetic.series import Series
@@ -323,14 +321,6 @@ def test_the_kernel_of_a_measurable_disturbance_is_as_sharp_in_any_units(factor)
 def test_a_drive_of_nothing_but_rounding_does_not_choose_the_units():
     A, speed = np.array([[0.0, 1.0], [-2.0, -0.5]]), np.array([np.nextafter(0.0, 1.0), 0.5])
     assert (balanced(A, 4.0, speed) == balanced(A, 4.0, np.array([0.0, 0.5]))).all()
-
-
-def test_a_difference_of_two_numbers_is_told_exactly():
-    rng = np.random.default_rng(6)
-    for a, b in rng.normal(size=(200, 2)) * 10.0 ** rng.integers(-12, 12, size=(200, 2)):
-        nearest, rest = difference(float(a), float(b))
-        assert Fraction(nearest) + Fraction(rest) == Fraction(float(a)) - Fraction(float(b))
-        assert nearest == float(a) - float(b)
 
 
 def test_ages_hold_wherever_one_looks_from_or_equal_pieces_are_not_taken_for_it():

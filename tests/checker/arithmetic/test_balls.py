@@ -7,7 +7,7 @@ from fractions import Fraction
 import numpy as np
 from flint import arb, ctx, fmpq
 
-from sparserob_core.checker.arithmetic.balls import above, balls, below, rational
+from sparserob_core.checker.arithmetic.balls import above, balls, below, difference, rational
 
 
 def ends(ball):
@@ -37,3 +37,11 @@ def test_an_exact_number_that_is_a_float_is_not_rounded_down():
     with ctx.workprec(96):
         assert Fraction(below(arb(0.1) + arb(2) ** -70)) < Fraction(0.1) + Fraction(1, 2**70)
     assert balls([0.1, -2.0]) == [arb(0.1), arb(-2)]
+
+
+def test_a_difference_of_two_numbers_is_told_exactly():
+    rng = np.random.default_rng(6)
+    for a, b in rng.normal(size=(200, 2)) * 10.0 ** rng.integers(-12, 12, size=(200, 2)):
+        nearest, rest = difference(float(a), float(b))
+        assert Fraction(nearest) + Fraction(rest) == Fraction(float(a)) - Fraction(float(b))
+        assert nearest == float(a) - float(b)

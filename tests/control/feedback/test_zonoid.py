@@ -5,9 +5,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from flint import arb, ctx
 from scipy.linalg import expm
 
-from sparserob_core.control.feedback.zonoid import Zonoid
+from sparserob_core.checker.reach.flow import OwnUnits, stacked
+from sparserob_core.checker.reach.measurable import Kernel, Side
+from sparserob_core.checker.sets.polynomials import Enclosed
+from sparserob_core.control.feedback.zonoid import Zonoid, _apart
 from sparserob_core.control.sets.sets import Box, Polytope
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
@@ -90,3 +94,41 @@ def test_a_direction_that_nothing_pushes_is_no_coordinate() -> None:
     found = Zonoid.of(-np.eye(2), np.ones((2, 1)), 1.0, Box([-0.2], [0.2]))
     assert found.dimension == 1
     assert Zonoid.of(SPRING, np.eye(2), 1.0, Box([0.5, 0.0], [0.5, 0.0])).dimension == 0
+
+
+def test_a_chord_less_a_parabola_is_the_whole_truth_of_convex_quadratics() -> None:
+    """``l, r`` at the ends of ``[-1, 1]`` and ``c u^2`` in between: not negative exactly where
+    ``(sqrt l + sqrt r)^2 >= 4 c``, or where the lowest point is outside."""
+    rng = np.random.default_rng(3)
+    c, low = rng.uniform(0.1, 2.0, size=(2, 400))
+    u, share = rng.uniform(-0.9, 0.9, size=400), rng.choice([-1e-6, 1e-6, 0.3, -0.3], size=400)
+    lowest = share * low
+    left, right = (c * (end - u) ** 2 + lowest for end in (-1.0, 1.0))
+    said = _apart(left, right, 4.0 * c, 0.0)
+    assert (said == (lowest >= 0.0)).all()
+    assert not _apart(np.array([-1e-9, 1.0]), np.array([1.0, -1e-9]), np.zeros(2), 0.0).any()
+    assert _apart(np.array([-1e-9]), np.array([1.0]), np.zeros(1), 1e-8).all()
+    straight = rng.uniform(0.0, 1.0, size=(2, 50))
+    assert _apart(*straight, np.zeros(50), 0.0).all()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_support_function_is_that_of_the_checker_to_all_digits(name: str) -> None:
+    """Whose enclosure is another algorithm, in balls: no quadrature is as good."""
+    A, E, length, bound = CASES[name]
+    found = Zonoid.of(A, E, length, bound)
+    a = np.random.default_rng(4).normal(size=(40, found.dimension))
+    with ctx.workprec(96):
+        balls = [stacked([[arb(float(v)) for v in row] for row in matrix]) for matrix in (A, E)]
+        kernel = Kernel.of(*balls, arb(length), OwnUnits.of(balls[0], length, np.abs(E).sum(axis=1)))
+        rows = a @ found.into
+        truth = kernel.most(Enclosed(rows, np.zeros_like(rows)), Side.of(bound))
+    sizes = np.abs(found.support(a)).max()
+    assert truth.rad.max() < 1e-10 * sizes
+    assert found.support(a) == pytest.approx(truth.mid, rel=1e-10, abs=1e-11 * sizes)
+    points = found.support_point(a)
+    assert np.einsum("kr,kr->k", points, a) == pytest.approx(truth.mid, rel=1e-10, abs=1e-11 * sizes)
+    for direction in a[:3]:
+        arc = found.best(direction)
+        reached = effect(A, E, length, arc.ends, arc.values) @ (direction @ found.into)
+        assert reached == pytest.approx(float(found.support(direction)), rel=1e-8)
