@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+from numpy.random import mtrand
 
 
 class Failed(Exception):
@@ -78,9 +79,9 @@ class Guarded:
 
     @contextmanager
     def _guard(self) -> Iterator[None]:
-        outside = random.getstate(), np.random.get_bit_generator(), np.random.get_state(legacy=False)  # noqa: NPY002
+        outside = random.getstate(), mtrand.get_bit_generator(), np.random.get_state(legacy=False)  # noqa: NPY002
         random.setstate(self._python)
-        np.random.set_bit_generator(self._numpy)  # a tenth of the time that it takes to write its state
+        mtrand.set_bit_generator(self._numpy)  # a tenth of the time that it takes to write its state
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -90,6 +91,6 @@ class Guarded:
         finally:
             self._python = random.getstate()
             random.setstate(outside[0])
-            np.random.set_bit_generator(outside[1])
+            mtrand.set_bit_generator(outside[1])
             if outside[2]["has_gauss"]:  # the second number of a normal pair, which is not the generator's
                 np.random.set_state(outside[2])  # noqa: NPY002

@@ -10,6 +10,7 @@ import threading
 
 import numpy as np
 import pytest
+from numpy.random import mtrand
 
 import sparserob_core as sr
 from sparserob_core.sip.search.search import CountedObjective, Target, maximise
@@ -139,11 +140,11 @@ def test_the_generator_alone_decides_the_search_and_the_global_random_numbers_ar
     random.seed(1)
     np.random.seed(1)  # noqa: NPY002
     np.random.standard_normal()  # noqa: NPY002  the second number of the pair waits
-    whole = np.random.get_bit_generator(), np.random.get_state()[2:]  # noqa: NPY002
+    whole = mtrand.get_bit_generator(), np.random.get_state()[2:]  # noqa: NPY002
     before = random.getstate(), np.random.get_state()[1].tolist()  # noqa: NPY002
     first = search(optimiser="CMA").trace.points
     assert (random.getstate(), np.random.get_state()[1].tolist()) == before  # noqa: NPY002
-    assert (np.random.get_bit_generator(), np.random.get_state()[2:]) == whole  # noqa: NPY002
+    assert (mtrand.get_bit_generator(), np.random.get_state()[2:]) == whole  # noqa: NPY002
     assert whole[1][1] == 1
     np.random.seed(2)  # noqa: NPY002
     assert first.tolist() == search(optimiser="CMA").trace.points.tolist()
