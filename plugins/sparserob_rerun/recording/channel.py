@@ -16,9 +16,9 @@ from typing import Any, final
 
 import sparserob_core as sr
 
-COLLECTING = 0.4
+COLLECTING = 0.5
 """Seconds for which the events of a search are collected before they are sent as one. Ten times as many, and what a run
-did in its last seconds is lost with it; a tenth, and the recorder logs ten times as many chunks."""
+did in its last seconds is lost with it; a tenth, and messages take a tenth of the search's processor time."""
 LOOK = 0.25
 """Seconds between two looks at whether the run is alive, and between two flushes. Ten times as many, and a recorder
 outlives a killed run by more than the two seconds that it has to finish, and what was sent a second ago is not in the

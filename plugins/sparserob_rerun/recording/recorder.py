@@ -41,6 +41,9 @@ with a tenth a busy machine leaves out rounds."""
 CATCHING_UP = 1.0
 """Seconds after the end of the run in which rounds that are still to be drawn have pictures. Ten times as many, and a
 run of two seconds takes twelve; a tenth, and the first rounds of a short run are not to be seen."""
+COARSE = 0.3
+"""Seconds of processor time that a run which is over leaves to a first, coarse landscape on any machine. Ten times as
+many, and a busy machine ends seconds later; a tenth, and it shows no landscape of a short run."""
 LINES = 24  # of the log that are on the first screen
 PROOFS = 12  # lines about the proof of one family
 SLOTS = 16  # active constraints at most that make the tuple of a method without one
@@ -251,7 +254,7 @@ class Recorder:
             self.draw(LANDSCAPE, explorer.finish, left - (0.5 * self.over if shown and not waits else 0.0))
             if explorer.waiting is not None or explorer.urgent:
                 left = self.patience if waits else self.patience - max(0.0, time.monotonic() - self.ended)
-                self.draw(LANDSCAPE, explorer.finish, left, 8)
+                self.draw(LANDSCAPE, explorer.finish, left, 8, COARSE)
             self.mark()
         if explorer.wrong:
             self.say(explorer.wrong, "WARN")

@@ -114,10 +114,11 @@ class Explorer:
             finally:
                 self.used += time.thread_time() - before
 
-    def finish(self, seconds: float, level: int = 1) -> None:
-        """Work for some seconds, until the landscape of the tuple that was asked for last has a level."""
-        end = time.monotonic() + seconds
-        while self.busy and time.monotonic() < end:
+    def finish(self, seconds: float, level: int = 1, work: float = 0.0) -> None:
+        """Work for some seconds, until the landscape of the tuple that was asked for last has a level; some seconds of
+        ``work`` of the processor are its own, however busy the machine is."""
+        end, granted = time.monotonic() + seconds, time.thread_time() + work
+        while self.busy and (time.monotonic() < end or time.thread_time() < granted):
             if self.waiting is None and self.landscape is not None and 0 < self.landscape.level <= level:
                 break
             if self.waiting is not None and self._coarse:
