@@ -15,12 +15,14 @@ import pytest
 from scipy.linalg import expm
 
 import sparserob_core as sr
+from sparserob_core.control.feedback.zonoid import Zonoid
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.experiment.check.check import check
 from tests.support.problems import pushed_spring
 
 SPRING = {**pushed_spring(0.25), "path": [{"box": [0.7, None], "from": 0.5}]}
 PIECES = 5
+FEW = {"control": {"name": "piecewise_constant", "pieces": 3}}
 POLICY = sr.AffinePolicy(causal_signals=0)
 
 
@@ -283,6 +285,22 @@ def test_what_is_not_built_is_refused_in_one_sentence(changed: dict[str, Any], s
         cost = changed.pop("cost", "nominal")
         run({**SPRING, **changed}, tmp_path / "run", cost)
     assert not (tmp_path / "run").exists()
+
+
+def test_what_a_bound_rests_on_is_composed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever rounds the bound, derives it, seeks another or writes it down takes the same signals."""
+    composed: list[bytes] = []
+    plain = Zonoid.signals
+
+    def counted(zonoid: Zonoid, points: np.ndarray) -> list[Any]:
+        composed.extend(point.tobytes() for point in points)
+        return plain(zonoid, points)
+
+    monkeypatch.setattr(Zonoid, "signals", counted)
+    outcome = run({**SPRING, "horizon": 2.0}, tmp_path / "run", "peak", dictionaries=FEW)
+    assert outcome.status == "certified"
+    assert len(composed) > 2
+    assert len(composed) == len(set(composed))
 
 
 def test_no_causal_policy_costs_less_than_signals_that_are_held_prove(certified: Path) -> None:

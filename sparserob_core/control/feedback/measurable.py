@@ -7,7 +7,8 @@ been answered yet, and what it adds to ``c'x(t)`` is the support function of a s
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import accumulate
 from typing import final
@@ -29,12 +30,13 @@ SEEN = 1e-7  # of the largest extent of a piece's set, one along which it is ans
 class MeasurablePieces:
     """What measurable disturbances do on every piece of a grid: a point of each of ``zonoids``, whose coordinates are
     those of the problem's own units; ``states (d,)`` and ``disturbances (mw,)`` are these in the units of
-    ``functionals``."""
+    ``functionals``. ``composed``: the signals that were found for points of the zonoids, in any units."""
 
     functionals: WorstCase
     zonoids: tuple[Zonoid, ...]
     states: Array
     disturbances: Array
+    composed: dict[tuple[int, bytes], Arc] = field(default_factory=dict, repr=False)
 
     def in_units_of(self, functionals: WorstCase, states: Array, disturbances: Array) -> MeasurablePieces:
         """The same of the same problem in other units."""
@@ -157,18 +159,25 @@ class MeasurablePieces:
         kept = np.diff(points) > 0.0
         return np.concatenate([points[:1], points[1:][kept]]), (self.middle + np.vstack(values)[kept]).T
 
+    def compose(self, deviations: Sequence[Array]) -> None:
+        """Find the signals on all pieces that have these deviations ``(Q,)``, all at once, and keep them."""
+        alike: dict[int, dict[bytes, tuple[int, Array]]] = {}
+        for deviation in deviations:
+            for piece, one in enumerate(self.zonoids):
+                point = deviation[self.at(piece)[0]]
+                if point.size and point.any() and (id(one), point.tobytes()) not in self.composed:
+                    alike.setdefault(id(one), {})[point.tobytes()] = (piece, point)
+        for key, points in alike.items():
+            piece = next(iter(points.values()))[0]
+            made = self.zonoids[piece].signals(np.stack([point for _, point in points.values()]))
+            self.composed.update({(key, point): arc for point, arc in zip(points, made, strict=True)})
+
     def _arcs(self, deviation: Array) -> list[Arc]:
         """The signals on all pieces that have a deviation ``(Q,)``."""
-        found = [Arc(np.ones(1), np.zeros((1, self.middle.size)))] * len(self.zonoids)
-        alike: dict[int, list[int]] = {}
-        for piece, one in enumerate(self.zonoids):
-            if deviation[self.at(piece)[0]].any():
-                alike.setdefault(id(one), []).append(piece)
-        for pieces in alike.values():
-            points = np.stack([deviation[self.at(piece)[0]] for piece in pieces])
-            for piece, made in zip(pieces, self.zonoids[pieces[0]].signals(points), strict=True):
-                found[piece] = made
-        return found
+        self.compose([deviation])
+        rest = Arc(np.ones(1), np.zeros((1, self.middle.size)))
+        points = [deviation[self.at(piece)[0]].tobytes() for piece in range(len(self.zonoids))]
+        return [self.composed.get((id(one), point), rest) for one, point in zip(self.zonoids, points, strict=True)]
 
     def _last(self, length: float) -> Zonoid:
         """What happens for a while before now, in the coordinates of the state."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, final
 
 import numpy as np
 
+from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -15,6 +16,7 @@ from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.response import Response
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.program import ConstraintFamily, Formulation, SemiInfiniteProgram
 
 if TYPE_CHECKING:
@@ -72,6 +74,25 @@ class Transcription:
     formulation: Formulation = "reduced"
     rows: RowUnits | None = None
     feedback: Feedback | None = None
+    _explained: dict[tuple[str, Formulation, int, bytes], TimedExplanation | None] = field(
+        default_factory=dict, init=False, repr=False
+    )
+
+    def explained(self, cuts: Sequence[Cut]) -> list[TimedExplanation | None]:
+        """The constraints of a result in numbers, one for each; ``None`` for one whose index does not say them, such as
+        the number of a sample. Made once: what a bound rests on is asked for by whoever rounds it, derives it, seeks
+        another, and writes it down, and a disturbance that does what a measurable one may takes long to compose."""
+        keys = [(cut.family, cut.formulation, cut.row, cut.index.tobytes()) for cut in cuts]
+        fresh = {key: cut for key, cut in zip(keys, cuts, strict=True) if key not in self._explained}
+        loop = None if self.feedback is None else self.feedback.loop
+        if loop is not None and loop.measurable is not None and fresh:
+            size = loop.measurable.size  # of the deviations, which end an index
+            loop.measurable.compose([cut.index[-size:] for cut in fresh.values() if cut.index.size > size > 0])
+        for key, cut in fresh.items():
+            family = self.program.formulated(cut.family, cut.formulation)
+            told = None if family is None else family.explanation(cut.index, cut.row)
+            self._explained[key] = told if isinstance(told, TimedExplanation) else None
+        return [self._explained[key] for key in keys]
 
     @property
     def response(self) -> Response:

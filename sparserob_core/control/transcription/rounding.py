@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.steps import Steps
@@ -46,16 +45,14 @@ def _added(model: Transcription, result: Result) -> float:
     """The sum over all rows with a multiplier of multiplier times the numbers that are added up to the row."""
     middle = np.zeros(0) if model.parameters.set is None else model.parameters.set.interior_point()
     rows, besides = [], 0.0
-    for cut in result.dual.cuts:
-        family = model.program.formulated(cut.family, cut.formulation)
+    for cut, said in zip(result.dual.cuts, model.explained(result.dual.cuts), strict=True):
         constraint = model.constraint(model.program.family(cut.family))
-        said = None if family is None or constraint is None else family.explanation(cut.index, cut.row)
-        if isinstance(said, TimedExplanation) and cut.multiplier > 0.0:
+        if said is not None and constraint is not None and cut.multiplier > 0.0:
             known = said.parameter is not None and said.parameter.size > 0
             rows.append((cut.multiplier, said.time, said.direction, said.parameter if known else middle))
             if said.gain is not None:
                 besides += cut.multiplier * float(np.abs(said.gain) @ _far(model.problem.control))
-            if constraint is not None and constraint.reference is not None:
+            if constraint.reference is not None:
                 besides += cut.multiplier * float(np.abs(said.direction) @ constraint.reference.size)
     fixed = [i for end in model.problem.terminal if isinstance(end, Equality) for i in end.fixed]
     axes = np.eye(model.problem.system.states)

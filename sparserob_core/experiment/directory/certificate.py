@@ -152,11 +152,8 @@ def _multipliers(experiment: ControlExperiment, dual: Dual) -> dict[str, Any] | 
     feedback a constraint is one at a disturbance, on its own pieces ``(mw, pieces)``."""
     problem, program, z = experiment.problem, experiment.program, dual.z
     steps = Steps.of(problem, experiment.control)
-    explained = [
-        (cut, said)
-        for cut in dual.cuts
-        if (said := _explained(program, cut.family, cut.formulation, cut.index, cut.row)) is not None
-    ]
+    pairs = zip(dual.cuts, experiment.transcription.explained(dual.cuts), strict=True)
+    explained = [(cut, said) for cut, said in pairs if said is not None]
     if len(explained) < len(dual.cuts) or dual.mu.size != program.finite.b.size:
         return None
     return {

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.studies.answer import ControlResult
@@ -68,10 +67,8 @@ def active(model: Transcription, result: Result) -> list[tuple[str, float, Array
     """Names, times and deviations of the constraints that the bound of a result rests on."""
     assert model.feedback is not None
     rest, found = model.feedback.loop.spread.middle, []
-    for cut in result.dual.cuts:
-        family = model.program.formulated(cut.family, cut.formulation)
-        said = None if family is None else family.explanation(cut.index, cut.row)
-        if isinstance(said, TimedExplanation):
+    for cut, said in zip(result.dual.cuts, model.explained(result.dual.cuts), strict=True):
+        if said is not None:
             signal = None if model.feedback.loop.measurable is not None else said.disturbance
             found.append((cut.family, said.time, None if signal is None else _from(rest, np.asarray(signal))))
     return found

@@ -20,6 +20,10 @@ from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.result import Result
 
 INWARDS = 1e-9  # of a bound, so that whoever derives it with another rounding does not find less
+ROUNDS, CELLS = 10, 64
+"""Rounds, and cells of a proof, that the other program may take where the run's own took fewer. Ten times fewer, and a
+vertex of a problem whose own control hardly moves is not proven; ten times more, and cells of parameters, which take
+long, are examined for longer than the run took."""
 ENDED, PROVEN = ("infeasible", "failed"), ("certified", "verified")
 
 
@@ -28,8 +32,10 @@ def with_activity(experiment: ControlExperiment, result: Result, tools: Tools) -
 
     Below by the lower bound of the cost where the convex cost below the count is a multiple of it, above by the control
     that is returned, where that is proven. Where it is no multiple, or that control no vertex, by a program of its own,
-    which begins with the constraints that the result rests on, and by a vertex of it. A run that was stopped solves
-    nothing more.
+    which begins with the constraints that the result rests on, and by a vertex of it. That takes no more rounds, and
+    proofs of no more cells, than the run itself, whatever there is to be gained: where it ends early, its lower bound
+    holds as far as it came, and the upper one is that of the run's own control. A run that was stopped solves nothing
+    more.
     """
     program, proven = experiment.program, result.status in PROVEN
     if result.status in ENDED or program.activity is None or result.decision is None:
@@ -98,7 +104,10 @@ def _other(experiment: ControlExperiment, result: Result, tools: Tools, most: fl
     if result.stopped or tools.deadline.passed:
         return None
     try:
-        method = LeastCount([*result.dual.cuts, *result.indices], most if np.isfinite(most) else 0.0)
+        known = [*result.dual.cuts, *result.indices]
+        beaten, rounds = most if np.isfinite(most) else 0.0, max(ROUNDS, len(result.history))
+        cells = {proof.family: max(CELLS, proof.cells) for proof in result.proofs}
+        method = LeastCount(known, beaten, rounds, cells)
         found = solve_in_own_units(method, experiment.program, tools)
     except KeyboardInterrupt as error:
         tools.deadline.interrupt(error)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import final
 
 import numpy as np
@@ -40,19 +40,22 @@ def multiple(program: SemiInfiniteProgram) -> float | None:
 class LeastCount(Method):
     """The lower bound of the count of every feasible decision, in the unit of the cost, and a decision that is a vertex
     of that program; proven only where it counts less than ``beaten``. ``start``: constraints to begin with, in the
-    user's units."""
+    user's units. ``rounds`` are taken, and ``cells`` of every family examined, at most: what is known then is the
+    answer."""
 
     start: Sequence[Cut] = ()
     beaten: float = 0.0
+    rounds: int = ROUNDS
+    cells: Mapping[str, int] = field(default_factory=dict)
 
     def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
         def prover(x: Array) -> Sequence[Proof]:
             fewer = count(program, x) < self.beaten * (1.0 - TOLERANCE)
-            return prove(program, x, ignore, deadline=tools.deadline) if fewer else ()
+            return prove(program, x, ignore, self.cells, tools.deadline) if fewer else ()
 
         below = counted_below(program)
         plain = replace(tools, notify=ignore, regulariser=None)
-        method = Exchange(tolerance=TOLERANCE, rounds=ROUNDS)
+        method = Exchange(tolerance=TOLERANCE, rounds=self.rounds)
         result = method.close(below.program, plain, prover, imposed(program, self.start))
         bound = max(result.dual.bound, 0.0) + below.certain / program.cost_unit
         z = result.dual.z  # of what the constraints ask of the image, so without the cost's linear part

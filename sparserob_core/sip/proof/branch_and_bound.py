@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -42,13 +42,17 @@ def prove(
     program: SemiInfiniteProgram,
     x: Array,
     notify: Notify = ignore,
-    cells: int = CELLS,
+    cells: int | Mapping[str, int] = CELLS,
     deadline: Deadline | None = None,
 ) -> tuple[Proof, ...]:
-    """Prove or refute every family at ``x (n,)``, one `Proof` each; past the deadline with one look at each."""
+    """Prove or refute every family at ``x (n,)``, one `Proof` each; past the deadline with one look at each.
+    ``cells`` may be examined of each at most, or as many as are told by the names of families."""
     time_left = deadline or Deadline()
+    budgets = {
+        family.name: cells if isinstance(cells, int) else cells.get(family.name, 0) for family in program.families
+    }
     proven = (family.reduced or family for family in program.families)
-    found = [(one, prove_family(one, x, notify, cells, time_left)) for one in proven]
+    found = [(one, prove_family(one, x, notify, budgets[one.name], time_left)) for one in proven]
     return tuple(replace(proof, formulation=one.formulation, unit=one.row_unit(proof.row)) for one, proof in found)
 
 
