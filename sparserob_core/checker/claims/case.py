@@ -45,6 +45,11 @@ class Case:
     policy: AffinePolicy | None = None
 
     @cached_property
+    def of_control(self) -> str:
+        """What the control's own set is called: ``rate`` where a constraint on the path is called ``control``."""
+        return "rate" if any(window.name == "control" for window in self.windows) else "control"
+
+    @cached_property
     def windows(self) -> list[Window]:
         """The state constraints, under the names that the certificate uses."""
         path = [entry for entry in self.problem.path if not isinstance(entry, ConvexSet)]

@@ -310,7 +310,7 @@ def _row(case: Case, entry: object) -> tuple[float, Row]:
     )
     if not y > 0:
         raise Broken(f"a multiplier of {name} is {y!r}, expected a positive number")
-    if name == "control" and not any(window.name == name for window in case.windows):
+    if name == case.of_control and not any(window.name == name for window in case.windows):
         _sized(direction, case.problem.system.controls, name)
         return y, case.duality.control_row(direction, time)
     if name == "control_step" and not any(window.name == name for window in case.windows):

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from flint import arb, arb_mat
 
 MOST_CELLS = 40_000  # cells of time examined for each constraint
-PEAK, CONTROL, RATE, EQUALS, STEP = "peak", "control", "rate", "equals", "control_step"
+PEAK, EQUALS, STEP = "peak", "equals", "control_step"
 WORST, EFFORT = "worst", "effort"
 FIGURES = 1e-11  # of an effort: how closely it is known
 
@@ -403,10 +403,10 @@ class FeedbackClaims:
         values = [row[0] + _along(row[1:], z) for row in state]
         return _dot(direction, values) - limit, case.units(window).slack(direction, limit)
 
-    @cached_property
+    @property
     def of_control(self) -> str:
-        """What the control's own set is called: ``rate`` where a path constraint is called ``control``."""
-        return RATE if any(window.name == CONTROL for window in self.case.windows) else CONTROL
+        """As `Case.of_control`."""
+        return self.case.of_control
 
     def multiplied(self, entries: Sequence[Any], priced: bool) -> arb:
         """The bound that multipliers of constraints at single disturbances prove, for every policy of the kind.

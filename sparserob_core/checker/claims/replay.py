@@ -53,7 +53,7 @@ def exceeded(case: Case, said: Mapping[str, object], begun: Array | None = None)
     that is known; from the worst initial state, or from ``begun (d,)``. `said` holds the names ``constraint``,
     ``time``, ``parameter`` and ``violation``. Raises `Broken` where these are none, `Unchecked` for a curved set."""
     name = str(said.get("constraint"))
-    of_control = {"control": case.problem.control, "control_step": case.problem.control_step}.get(name)
+    of_control = {case.of_control: case.problem.control, "control_step": case.problem.control_step}.get(name)
     if of_control is not None and known(of_control).facets is None:
         raise Unchecked("the worst direction of a curved set is not told")
     window, time = case.window(name), number(said, "time")

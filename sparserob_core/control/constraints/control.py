@@ -10,6 +10,7 @@ import numpy as np
 from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.control.constraints.local_maxima import climb
 from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.control.sets.directions import across, on_surface, sampled, unit
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.program import ConstraintFamily, Explanation, Separation
@@ -18,6 +19,14 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 CLIMBED = 16  # pieces, those furthest outside, whose direction is refined per round
+
+
+CONTROL, RATE = "control", "rate"
+
+
+def of_control(problem: OptimalControlProblem) -> str:
+    """What the control's own set is called: ``rate`` where a path constraint is called ``control``."""
+    return RATE if any(getattr(entry, "name", "") == CONTROL for entry in problem.path) else CONTROL
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,11 +49,11 @@ class ControlConstraint:
     words: str
 
     @staticmethod
-    def of_values(convex: ConvexSet, dictionary: Dictionary) -> ControlConstraint:
+    def of_values(convex: ConvexSet, dictionary: Dictionary, name: str = CONTROL) -> ControlConstraint:
         """``u(t)`` in the set on every piece."""
         ends = dictionary.breakpoints
         return ControlConstraint(
-            "control",
+            name,
             convex,
             dictionary.sparse,
             np.zeros((dictionary.pieces, convex.dimension)),

@@ -266,10 +266,11 @@ class FeedbackCurvedControl(Turning):
     """``u_k`` in a curved set on every piece for every disturbance."""
 
     convex: ConvexSet
+    called: str
 
     @property
     def name(self) -> str:
-        return "control"
+        return self.called
 
     @property
     def set(self) -> ConvexSet:

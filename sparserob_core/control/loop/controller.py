@@ -48,6 +48,8 @@ class Controller:
 
     def __init__(self, plan: Plan, resolving: Resolving | None = None) -> None:
         self._planned, self._resolving = plan, resolving
+        if resolving is not None:
+            resolving.prepare(plan)
         self.reset()
 
     @property

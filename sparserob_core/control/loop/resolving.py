@@ -151,8 +151,9 @@ class Resolving:
 
     A control that is fixed beforehand begins with the constraints that mattered at the last step, and keeps what does
     not depend on the state for the next loop. Under feedback the nominal control is chosen anew for the same gains,
-    which has no lower bound of its own, and then, where that is expected to end in time, the whole program. Raises
-    `InputError` for a problem of which nothing can be left.
+    which has no lower bound of its own, and then, where that is expected to end in time, the whole program. With a
+    limit everything that does not depend on the state is made by `prepare`, and nothing is begun that is expected to
+    take longer than the limit. Raises `InputError` for a problem of which nothing can be left.
     """
 
     def __init__(self, model: Transcription, tools: Tools, tolerance: float, seconds: float | None = None) -> None:
@@ -163,10 +164,32 @@ class Resolving:
         self._tracking: dict[int, Tracking | None] = {}
         self._retuning: list[Retuning] = []
         self._took, self._pieces = 0.0, model.control.pieces  # a whole program, and the pieces that it had
-        if model.feedback is not None and seconds is not None:
-            began = clock.perf_counter()
-            remaining(model, 0, np.asarray(model.problem.initial_state, dtype=float), None)
-            self._took = WHOLE * (clock.perf_counter() - began)
+        self._written = 0.0  # what it takes to write a whole program down, however few pieces are left
+
+    def prepare(self, plan: Plan) -> None:
+        """Make what steps with a limit are not to wait for, for the plan that loops begin with; nothing without a
+        limit."""
+        if self._seconds is None:
+            return
+        state, began = np.asarray(self._model.problem.initial_state, dtype=float), clock.perf_counter()
+        remaining(self._model, 0, state, None)
+        self._written = clock.perf_counter() - began
+        self._took = WHOLE * self._written
+        if self._model.feedback is not None:
+            retuning = Retuning(plan.known, plan.decision)
+            retuning.prepare(state)
+            self._retuning = [retuning]
+            return
+        if self._model.problem.control_step is None:
+            for piece in range(self._model.control.pieces):
+                if self._tracker(piece, state) is None and self._written > self._seconds:
+                    return  # those that are left are never begun
+
+    def _in_time(self, piece: int) -> bool:
+        """Whether a whole program from a piece on is expected to end within the limit."""
+        pieces = self._model.control.pieces - piece
+        needed = max(self._written, self._took * (pieces / self._pieces) ** 2)
+        return self._seconds is None or needed <= self._seconds
 
     def answer(
         self, plan: Plan, piece: int, state: Array, before: Array | None, innovations: Sequence[Array]
@@ -200,8 +223,7 @@ class Resolving:
     ) -> Solved:
         tools.deadline.check()
         tuned, pieces = self._tuned(plan, piece, state, innovations), self._model.control.pieces - piece
-        needed = self._took * (pieces / self._pieces) ** 2
-        if tuned.plan is not None and self._seconds is not None and needed > self._seconds:
+        if not self._in_time(piece):
             return tuned
         began, whole = clock.perf_counter(), Solved(None)
         with suppress(SparseRobError, OutOfTime):
@@ -220,6 +242,8 @@ class Resolving:
         """The same gains with the best nominal control for them, where `Retuning` knows such problems."""
         retuning = next((one for one in self._retuning if one.model is plan.known), None)
         if retuning is None:
+            if self._seconds is not None and self._written > self._seconds:
+                return Solved(None)
             retuning = Retuning(plan.known, plan.decision)
             self._retuning = [*self._retuning[:1], retuning]  # that of the plan that loops begin with, and the last
         begun = piece - plan.first
@@ -244,6 +268,24 @@ class Resolving:
         if quick is not None:
             return quick
         tools.deadline.check()
+        if not self._in_time(piece):
+            return Solved(None)
+        began = clock.perf_counter()
+        try:
+            return self._closed(plan, piece, state, before, innovations, tools)
+        finally:
+            self._took, self._pieces = clock.perf_counter() - began, self._model.control.pieces - piece
+
+    def _closed(
+        self,
+        plan: Plan,
+        piece: int,
+        state: Array,
+        before: Array | None,
+        innovations: Sequence[Array],
+        tools: Tools,
+    ) -> Solved:
+        """The program of what is left, closed by the exchange."""
         model, own, units = self._own(piece, state, before)
         program = own.program
         gap = float(self._model.control.breakpoints[piece] - self._model.control.breakpoints[plan.first])
@@ -267,10 +309,8 @@ class Resolving:
         """The answer of `Tracking` where it knows such problems and closes the gap."""
         if self._model.problem.control_step is not None:
             return None
-        if piece not in self._tracking:
-            own = self._prepared(piece, state)[1]
-            self._tracking[piece] = Tracking(own) if trackable(own) else None
-        tracking = self._tracking[piece]
+        late = self._seconds is not None and self._written > self._seconds and piece not in self._tracking
+        tracking = None if late else self._tracker(piece, state)
         if tracking is None:
             return None
         model, own, units = self._prepared(piece, state)
@@ -288,6 +328,13 @@ class Resolving:
             units.cost * found.lower,
             is_cheaper(found.cost, known),
         )
+
+    def _tracker(self, piece: int, state: Array) -> Tracking | None:
+        """What solves from a piece on, where it knows such problems."""
+        if piece not in self._tracking:
+            own = self._prepared(piece, state)[1]
+            self._tracking[piece] = Tracking(own) if trackable(own) else None
+        return self._tracking[piece]
 
     def _prepared(self, piece: int, state: Array) -> tuple[Transcription, Transcription, Units]:
         """What is left, from the first state that was asked for, in the user's units and in its own."""

@@ -60,6 +60,13 @@ class Retuning:
         self.model, self.decision = model, decision
         self._tracking: dict[int, Tracking | None] = {}
 
+    def prepare(self, state: Array) -> None:
+        """Make what belongs to every piece, as long as the problem is of the kind; the state ``(d,)`` changes
+        nothing."""
+        for piece in range(self.model.control.pieces):
+            if self._tracking.setdefault(piece, self._prepared(piece, state)) is None:
+                return
+
     def solve(self, piece: int, state: Array) -> Tracked | None:
         """The nominal control ``(m K',)`` that is left from ``piece`` on, with what the gains make of the past, from a
         measured ``state (d,)``; ``None`` where no answer is proven, or where the problem is not of the kind."""

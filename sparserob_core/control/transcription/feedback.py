@@ -8,6 +8,7 @@ from functools import reduce
 
 import numpy as np
 
+from sparserob_core.control.constraints.control import of_control
 from sparserob_core.control.constraints.effort import FeedbackEffort
 from sparserob_core.control.constraints.feedback import FeedbackConstraint, FeedbackControl, FeedbackSteps
 from sparserob_core.control.constraints.feedback_curved import FeedbackCurvedControl, of_state
@@ -32,7 +33,7 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.finite import Spread
 from sparserob_core.sip.program import ConstraintFamily, OwnUnits, SemiInfiniteProgram
 
-CONTROL, RATE, PEAK, EFFORT = "control", "rate", "peak", "effort"  # names of the families that are about the control
+PEAK, EFFORT = "peak", "effort"  # names of the families that are about the control
 EQUALS, STEP = "equals", "control_step"  # those of the terminal equalities, and of the control's steps
 FINER = 2.0**-11  # of the numbers that are added up, the unit of an equality: it is met to `EQUALITY` of them
 
@@ -122,19 +123,13 @@ def _fixed(
     return (np.vstack([H, -H]), np.append(h, -h)), (np.vstack([scaled, -scaled]), np.append(both, -both))
 
 
-def of_control(problem: OptimalControlProblem) -> str:
-    """What the control's own set is called: ``rate`` where a path constraint is called ``control``."""
-    return RATE if any(getattr(entry, "name", "") == CONTROL for entry in problem.path) else CONTROL
-
-
 def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dictionary, cost: str) -> None:
     """Raise `InputError` for what a policy is not built for, in one sentence."""
     disturbed = problem.disturbance is not None
     paths = [entry for entry in problem.path if isinstance(entry, PathConstraint | MixedConstraint)]
     sets = [entry.set for entry in paths] + [end for end in problem.terminal if not isinstance(end, Equality)]
     curved = [one.kind for one in (*sets, problem.control) if one.halfspaces() is None]
-    own = CONTROL if problem.control.halfspaces() is None else of_control(problem)
-    named = [entry.name for entry in paths if entry.name in (own, PEAK, EFFORT, EQUALS, STEP)]
+    named = [entry.name for entry in paths if entry.name in (of_control(problem), PEAK, EFFORT, EQUALS, STEP)]
     kind, bound = problem.disturbance_class, problem.disturbance
     measurable = bound is not None and kind == "measurable"
     ends = any(isinstance(end, Equality) for end in problem.terminal)
@@ -201,7 +196,7 @@ def _program(
         settled.append(equal.met)
     flat = problem.control.halfspaces()
     within = (
-        FeedbackCurvedControl(loop, problem.control)
+        FeedbackCurvedControl(loop, problem.control, of_control(problem))
         if flat is None
         else FeedbackControl(of_control(problem), loop, *flat)
     )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal, TypedDict
 
 import numpy as np
 
-from sparserob_core.control.constraints.control import ControlConstraint
+from sparserob_core.control.constraints.control import ControlConstraint, of_control
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.constraints.literal import LiteralConstraint
 from sparserob_core.control.constraints.sensitivity import Sensitivity
@@ -170,7 +170,7 @@ def _assembled(
         b = np.where(A.any(axis=1) | (np.abs(b) > TOLERANCE), b, 0.0)  # no control enters, and rounding is missing
     families = [family_of(constraint) for constraint in constraints]
     if problem.control.halfspaces() is None:
-        families.append(ControlConstraint.of_values(problem.control, control).family())
+        families.append(ControlConstraint.of_values(problem.control, control, of_control(problem)).family())
     step, first = problem.control_step, before(problem)
     if step is not None and step.halfspaces() is None and (control.pieces > 1 or first is not None):
         families.append(ControlConstraint.of_steps(step, control, first).family())

@@ -122,7 +122,7 @@ def _besides(name: str, data: object, read: set[str]) -> set[str]:
 def _of_a_curved_set_of_controls(case: Case, entry: object) -> bool:
     """Whether a multiplier is one of a control's own set or its steps', which no parameter changes, and yet has a
     parameter."""
-    if not isinstance(entry, Mapping) or entry.get("constraint") not in ("control", "control_step"):
+    if not isinstance(entry, Mapping) or entry.get("constraint") not in (case.of_control, "control_step"):
         return False
     own = not any(window.name == entry["constraint"] for window in case.windows)
     return own and bool(entry.get("parameter"))

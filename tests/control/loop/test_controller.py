@@ -8,8 +8,10 @@ import pytest
 from scipy.linalg import expm
 
 import sparserob_core as sr
+from sparserob_core.control.loop import resolving, retuning
 from sparserob_core.control.loop.remaining import remaining
 from sparserob_core.control.studies.adversary import find_adversary
+from sparserob_core.control.transcription.transcribe import in_own_units
 from sparserob_core.sip.proof.branch_and_bound import prove
 
 BASE = {
@@ -322,3 +324,42 @@ def test_a_disturbance_that_changes_within_its_own_piece_is_told() -> None:
             block[:2, :2], block[:2, 2] = A, B * u[0] + w
             state = (expm(block * 0.25) @ np.append(state, 1.0))[:2]
         assert controller.covered is covered
+
+
+POLYTOPE = {"polytope": {"H": [[1, 1], [-1, 0], [0, -1]], "h": [0.06, 0.05, 0.05]}}
+
+
+@pytest.mark.parametrize("disturbance", [{"box": [0.05, 0.05]}, {"norm": {"p": 1.5, "radius": 0.05}}, POLYTOPE])
+@pytest.mark.parametrize("policy", ["affine", "open_loop"])
+def test_with_a_limit_nothing_is_written_down_and_nothing_hopeless_begun_in_a_step(
+    policy: str, disturbance: dict, tmp_path, monkeypatch
+) -> None:
+    """Of every kind of disturbance, whether its gains can be kept or not: steps of a limit that nothing can keep only
+    apply what was made before."""
+    problem = {**BASE["problem"], "disturbance": disturbance}
+    few = {"control": {"name": "piecewise_constant", "pieces": 4}}
+    config = {**BASE, "problem": problem, "dictionaries": few, "policy": {"name": policy}}
+    outcome = sr.run(config, out=tmp_path / "run", quiet=True, figures=False)
+    assert outcome.status == "certified"
+    written, begun = [], []
+    for module in (resolving, retuning):
+        monkeypatch.setattr(module, "remaining", lambda *a, **k: (written.append(a[1]), remaining(*a, **k))[1])
+    monkeypatch.setattr(resolving, "in_own_units", lambda model: (begun.append(model), in_own_units(model))[1])
+    controller = sr.controller(outcome, True, seconds=1e-6)
+    assert written  # before the first step
+    written.clear()
+    begun.clear()
+    state = np.array(problem["initial_state"], dtype=float)
+    for _ in range(2):
+        controller.reset()
+        for time in controller.breakpoints[:-1]:
+            controller.step(float(time), state)
+    assert not written
+    assert not begun
+
+
+def test_a_limit_that_is_long_enough_is_used(plans, monkeypatch) -> None:
+    controller, written = sr.controller(plans["nominal"], True, seconds=1e6), []
+    monkeypatch.setattr(resolving, "remaining", lambda *a, **k: (written.append(a[1]), remaining(*a, **k))[1])
+    controller.step(0.0, np.array([-1.0, 1.0]))
+    assert written == [0]
