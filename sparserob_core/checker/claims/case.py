@@ -94,14 +94,13 @@ class Case:
 
     @property
     def measurable(self) -> bool:
-        """Whether a policy answers measurable disturbances."""
-        kind = self.problem.disturbance_class
-        return self.policy is not None and self.problem.disturbance is not None and kind == "measurable"
+        """Whether disturbances are measurable."""
+        return self.problem.disturbance is not None and self.problem.disturbance_class == "measurable"
 
     @cached_property
     def changes(self) -> list[float] | None:
         """Where the disturbance may jump; ``None`` when there is none. Other classes than piecewise constant ones are
-        not checked; of measurable ones that a policy answers, where those jump by which rows are measured."""
+        not checked; of measurable ones, where those jump by which rows are measured."""
         if self.problem.disturbance is None:
             return None
         if self.measurable:
@@ -109,7 +108,7 @@ class Case:
         jumps = np.flatnonzero(self.disturbance.changes) + 1
         if self.problem.disturbance_class != "piecewise_constant":
             raise Unchecked(
-                "the checker knows piecewise constant disturbances, not those of the class"
+                "the checker knows piecewise constant and measurable disturbances, not those of the class"
                 f" {self.problem.disturbance_class}"
             )
         if self.disturbance.functions != jumps.size + 1:

@@ -117,12 +117,17 @@ def _feedback(case: Case) -> FeedbackClaims:
     return feedback_of(case)
 
 
+def _looped(case: Case) -> bool:
+    """Whether the state is followed block by block of what deviates: under feedback, and measurable disturbances."""
+    return case.policy is not None or case.measurable
+
+
 def _kept(case: Case, window: Window) -> str:
-    return bounded(case, window) if case.policy is None else _feedback(case).bounded(window)
+    return _feedback(case).bounded(window) if _looped(case) else bounded(case, window)
 
 
 def _equalities(case: Case) -> str:
-    return equalities(case) if case.policy is None else _feedback(case).equalities()
+    return _feedback(case).equalities() if _looped(case) else equalities(case)
 
 
 def _control(case: Case) -> str:
@@ -279,9 +284,9 @@ def _other(case: Case, data: Mapping[str, Any]) -> Case:
     other = replace(case, certificate={**case.certificate, **said})
     _control(other)
     if case.equalities:
-        equalities(other)
+        _equalities(other)
     for window in other.windows:
-        bounded(other, window)
+        _kept(other, window)
     return other
 
 
@@ -327,7 +332,10 @@ def _row(case: Case, entry: object) -> tuple[float, Row]:
     if key in case.rows:
         return y, case.rows[key]
     c, gain = window.split(direction)
-    row = case.duality.row(c, time, parameter.tolist(), window.limit(direction, time))
+    limit = window.limit(direction, time)
+    row = case.duality.row(c, time, parameter.tolist(), limit, disturbed=not case.measurable)
+    if case.measurable:
+        row = replace(row, constant=_feedback(case).disturbed(c, time, limit))
     if window.is_mixed:
         piece = _piece(case, window, entry, time)
         row.slope[piece] = [a + balls([g])[0] for a, g in zip(row.slope[piece], gain, strict=True)]
@@ -478,8 +486,12 @@ def _witness(case: Case) -> str:
         raise Broken(f"t = {time!r} is not within {window.start:g} to {window.stop:g}")
     if case.problem.system.parameters is not None and not known(case.problem.system.parameters).contains(parameter):
         raise Broken(f"the parameter {parameter.tolist()} is not shown to be in its set")
-    state = reached(case, time, parameter, data.get("disturbance"), data.get("deviation"))
     height = window.limit(direction, time)
+    if case.measurable:  # the worst is no signal on pieces: how far all of them reach is enclosed instead
+        k = _piece(case, window, data, time) if window.is_mixed else None
+        over = _feedback(case).farthest(*window.split(direction), time, k) - height
+        return _exceeded(over, case.units(window).slack(direction, height), data)
+    state = reached(case, time, parameter, data.get("disturbance"), data.get("deviation"))
     if window.is_mixed:
         state = state + case.pieces[_piece(case, window, data, time)].entries()
     over = sum((balls([c])[0] * x for c, x in zip(direction, state, strict=True)), -height)

@@ -46,10 +46,12 @@ class FeedbackClaims:
 
     @cached_property
     def gains(self) -> Array:
-        """The gains; raises `Broken` where they answer what is not yet measured, or is forgotten."""
+        """The gains, none of a control that answers nothing; raises `Broken` where they answer what is not yet
+        measured, or is forgotten."""
         case, policy = self.case, self.case.policy
-        assert policy is not None
         K, m, d = case.control.pieces, case.problem.system.controls, case.problem.system.states
+        if policy is None:
+            return np.zeros((K, K, m, d))
         gains = numbers(case.certificate.get("gains"), "gains")
         if gains.shape != (K, K, m, d):
             raise Broken(f"the gains have shape {gains.shape}, expected {(K, K, m, d)}")
@@ -71,7 +73,11 @@ class FeedbackClaims:
         """The loop; where ``changes`` are given, under disturbances that jump there only."""
         case = self.case
         if not isinstance(case.problem.system, LinearSystem) or case.problem.system.parameter_count:
-            raise Unchecked("the checker knows feedback of known systems only")
+            raise Unchecked("the checker knows feedback and measurable disturbances of known systems only")
+        if case.policy is None and not (case.control.is_indicators and case.problem.system.delay == 0.0):
+            raise Unchecked(
+                "of measurable disturbances the checker knows controls of their own on every piece, undelayed"
+            )
         held = (changes or []) if case.measurable else (case.changes or [])
         return (MeasurableLoop if case.measurable and changes is None else ClosedLoop)(
             case.problem.system,
@@ -222,7 +228,7 @@ class FeedbackClaims:
         """The same for a curved set: cells of times and directions."""
         case = self.case
         if case.measurable:
-            raise Unchecked("the checker knows measurable disturbances with flat sets of states only, under feedback")
+            raise Unchecked("the checker knows measurable disturbances with flat sets of states only")
         lower, upper = numbers(entry.get("lower"), "lower"), numbers(entry.get("upper"), "upper")
         normals = normals_of(window, entry.get("normals"))
         covered(case, window, lower, upper)
@@ -407,6 +413,25 @@ class FeedbackClaims:
     def of_control(self) -> str:
         """As `Case.of_control`."""
         return self.case.of_control
+
+    def disturbed(self, direction: Array, time: float, limit: arb) -> arb:
+        """By how much ``c'x(t)`` exceeds a limit without any control, for the worst disturbance and initial state."""
+        loop, grid = self.at_rest, self.case.grid
+        piece = min(max(bisect_right(grid, time) - 1, 0), len(grid) - 2)
+        return loop.highest(piece, time, direction[None])[0] - limit
+
+    def farthest(self, c: Array, gain: Array, time: float, k: int | None) -> arb:
+        """The largest ``c'x(t) + gain'u``, ``u`` the control on piece ``k``, over all deviations."""
+        piece = min(max(bisect_right(self.case.grid, time) - 1, 0), len(self.case.grid) - 2)
+        beside = None if k is None else stacked([balls(gain)]) * self.loop.acting(k)
+        return self.loop.highest(piece, time, c[None], beside)[0]
+
+    @cached_property
+    def at_rest(self) -> ClosedLoop:
+        """The system without any control, under the disturbances of the problem."""
+        case, d = self.case, self.case.problem.system.states
+        K, m = case.control.pieces, case.problem.system.controls
+        return self._loop(np.zeros((m, K)), np.zeros((K, K, m, d)))
 
     def multiplied(self, entries: Sequence[Any], priced: bool) -> arb:
         """The bound that multipliers of constraints at single disturbances prove, for every policy of the kind.

@@ -6,12 +6,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from math import comb
 
 import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.comparison import block_norms, product
-from sparserob_core.control.enclosures.matrix_exponential import exponential
+from sparserob_core.control.enclosures.matrix_exponential import exponential, rounding
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.response import Response
 from sparserob_core.shapes import Float, Int, shaped
@@ -22,9 +23,13 @@ LEGENDRE = np.polynomial.legendre.Legendre.basis(5)
 NODES = np.concatenate([[-1.0], LEGENDRE.deriv().roots(), [1.0]])
 WEIGHTS = 1.0 / (15.0 * LEGENDRE(NODES) ** 2)
 ACCURACY = 1e-14  # of an integral over one interval, relative to the largest integrand times the horizon
-MISSED = 1e-12  # of a support function, the error of its quadrature that a proof allows for; estimated, not enclosed
+MISSED = 1e-12  # of a support function of a curved set, the error of its quadrature that a proof allows for: estimated
+ORDER = 12  # of the expansion that encloses a row; what is left of it on a short interval is 1e-14 of the row
+SHORT = 0.5  # time times speed that such an interval takes: twice as much leaves 1e-10, half as much doubles the work
 TINY = float(np.finfo(float).tiny)
 TABLES_KEPT = 4096  # directions and parameters whose integrals are remembered
+BEZIER = np.array([[comb(k, j) / comb(ORDER, j) for k in range(ORDER + 1)] for j in range(ORDER + 1)])
+"""From powers on ``[0, 1]`` to the coefficients of Bernstein's form, ``(ORDER + 1, ORDER + 1)``."""
 MOST_SHORT = 4096  # intervals that one is cut into before any is halved
 HALVINGS = 48  # of an interval across a kink of the integrand: what is left of it is below rounding
 
@@ -47,23 +52,53 @@ class MeasurableSupport:
         result = np.empty(times.size)
         for position, parameter in enumerate(unique):
             here = np.flatnonzero(which.reshape(-1) == position)
-            result[here] = self._at(times[here], directions[here], parameter)
+            result[here] = self._at(times[here], directions[here], parameter, self.is_enclosed).mean(axis=1)
         return result
+
+    @property
+    def is_enclosed(self) -> bool:
+        """Whether `enclosed` is close: the set is flat."""
+        return self.bound.halfspaces() is not None
+
+    @shaped
+    def enclosed(self, times: Float[Array, " k"], directions: Float[Array, "k d"]) -> Float[Array, "k 2"]:
+        """What ``sigma`` of a known system is at least and at most, ``(k, 2)``."""
+        bounds = self._at(times, directions, np.zeros(0), enclosed=True)
+        lost = rounding(self.response.grid.pieces) * np.abs(bounds).max(axis=1, initial=0.0)
+        return np.asarray(bounds + lost[:, None] * [-1.0, 1.0])
 
     @shaped
     def _at(
-        self, times: Float[Array, " k"], directions: Float[Array, "k d"], parameter: Float[Array, " nu"]
-    ) -> Float[Array, " k"]:
+        self,
+        times: Float[Array, " k"],
+        directions: Float[Array, "k d"],
+        parameter: Float[Array, " nu"],
+        enclosed: bool = False,
+    ) -> Float[Array, "k n"]:
+        """The integrals, or with ``enclosed`` their lower and upper bounds, as columns."""
         unique, which = np.unique(directions, axis=0, return_inverse=True)
         which = which.reshape(-1)
         A, _, E = self.response.system.modes[0].matrices(parameter[None])
-        tables = self._known(A[0], E[0], unique, parameter)
+        tables = self._known(A[0], E[0], unique, parameter, enclosed)
         grid = self.response.grid
         pieces = grid.locate(times)
         within = np.clip(times - grid.breakpoints[pieces], 0.0, None)
         starts = np.stack([tables[one][0][piece] for one, piece in zip(which, pieces, strict=True)])
         before = np.array([tables[one][1][piece] for one, piece in zip(which, pieces, strict=True)])
-        return np.asarray(before + self._integrals(A[0], E[0], starts, within, which))
+        return np.asarray(before + self._columns(A[0], E[0], starts, within, which, enclosed))
+
+    @shaped
+    def _columns(
+        self,
+        A: Float[Array, "d d"],
+        E: Float[Array, "d mw"],
+        starts: Float[Array, "l d"],
+        lengths: Float[Array, " l"],
+        member: Int[np.ndarray, " l"],
+        enclosed: bool,
+    ) -> Float[Array, "l n"]:
+        integrate = self._enclosures if enclosed else self._integrals
+        return np.asarray(integrate(A, E, starts, lengths, member).reshape(lengths.size, -1))
 
     @shaped
     def _known(
@@ -72,10 +107,11 @@ class MeasurableSupport:
         E: Float[Array, "d mw"],
         directions: Float[Array, "k d"],
         parameter: Float[Array, " nu"],
+        enclosed: bool,
     ) -> list[tuple[Array, Array]]:
-        """For each of ``directions (k, d)``: rows ``c'e^{A s}`` at the breakpoints ``(L+1, d)``, and the integral up to
-        them, ``(L+1,)``."""
-        keys = [direction.tobytes() + parameter.tobytes() for direction in directions]
+        """For each of ``directions (k, d)``: rows ``c'e^{A s}`` at the breakpoints ``(L+1, d)``, and the columns of
+        `_at` up to them, ``(L+1, n)``."""
+        keys = [direction.tobytes() + parameter.tobytes() + bytes([enclosed]) for direction in directions]
         new = np.array([place for place, key in enumerate(keys) if key not in self._tables], dtype=int)
         found: dict[bytes, tuple[Array, Array]] = {key: self._tables[key] for key in keys if key in self._tables}
         if new.size:
@@ -83,12 +119,63 @@ class MeasurableSupport:
             starts = np.einsum("ki,lij->klj", directions[new], _flows(A, breakpoints))
             lengths = np.tile(np.diff(breakpoints), new.size)
             owner = np.repeat(np.arange(new.size), breakpoints.size - 1)
-            integrals = self._integrals(A, E, starts[:, :-1].reshape(-1, A.shape[0]), lengths, owner)
-            total = np.cumsum(integrals.reshape(new.size, -1), axis=1)
+            columns = self._columns(A, E, starts[:, :-1].reshape(-1, A.shape[0]), lengths, owner, enclosed)
+            total = np.cumsum(columns.reshape(new.size, breakpoints.size - 1, -1), axis=1)
             for place, rows, sums in zip(new, starts, total, strict=True):
-                found[keys[place]] = (rows, np.concatenate([[0.0], sums]))
+                found[keys[place]] = (rows, np.concatenate([np.zeros((1, sums.shape[1])), sums]))
                 remember(self._tables, keys[place], found[keys[place]], TABLES_KEPT)
         return [found[key] for key in keys]
+
+    @shaped
+    def _enclosures(
+        self,
+        A: Float[Array, "d d"],
+        E: Float[Array, "d mw"],
+        starts: Float[Array, "l d"],
+        lengths: Float[Array, " l"],
+        member: Int[np.ndarray, " l"],
+    ) -> Float[Array, "l 2"]:
+        """Lower and upper bounds of `_integrals`, ``(l, 2)``.
+
+        On short intervals a row is a polynomial ``f`` with a rest. In Bernstein's form ``f`` is a convex combination of
+        its coefficients ``b_k`` with weights of equal integrals, and ``h`` is convex; so the integral is at most the
+        length times the mean of ``h(b_k)``, and at least that of ``w'b_k`` for any point ``w`` of the set. Both are
+        equal where one corner of the set is best for all; an interval where another takes over is halved.
+        """
+        total, speed = np.zeros((lengths.size, 2)), float(np.linalg.norm(A, 2))
+        fastest = min(speed, 4.0 * float(np.abs(np.linalg.eigvals(A)).max()))
+        count = int(np.clip(np.ceil(fastest * lengths.max(initial=0.0) / SHORT), 1, MOST_SHORT))
+        owner, offsets = np.repeat(np.arange(lengths.size), count), np.outer(lengths, np.arange(count) / count)
+        row = np.einsum("li,lqij->lqj", starts, _flows(A, offsets)).reshape(-1, A.shape[0])
+        lengths = lengths[owner] / count
+        terms, sizes, size = [row @ E], np.abs(row) @ np.abs(E), np.abs(row)
+        for order in range(1, ORDER + 1):
+            step = (lengths / order)[:, None]
+            row, size = step * (row @ A), step * (size @ np.abs(A))
+            terms.append(row @ E)
+            sizes = sizes + size @ np.abs(E)
+        far = self.bound.radius_bound
+        with np.errstate(over="ignore"):
+            growth = np.exp(speed * lengths) * lengths / (ORDER + 1)
+        operations = ORDER * (A.shape[0] + 4) + A.shape[0] + 4 * E.shape[1] + HALVINGS
+        lost = far * (np.linalg.norm(row @ A, axis=1) * growth * np.linalg.norm(E, 2))
+        lost = lengths * (lost + far * rounding(operations) * np.linalg.norm(sizes, axis=1)) * (1.0 + rounding(8))
+        np.add.at(total, owner, lost[:, None] * [-1.0, 1.0])
+        points = np.einsum("kj,jlw->lkw", BEZIER.T, np.array(terms))
+        largest = np.zeros(int(member.max(initial=0)) + 1)
+        np.maximum.at(largest, member[owner], far * np.linalg.norm(sizes, axis=1))
+        accuracy = ACCURACY * np.maximum(largest[member] * float(self.response.grid.breakpoints[-1]), TINY)
+        for turn in range(HALVINGS + 1):
+            best = self.bound.support_point(points[:, ORDER // 2])
+            low = (points @ best[:, :, None])[..., 0].mean(axis=1) * lengths
+            high = self.bound.support(points).mean(axis=1) * lengths
+            open_ = (high - low > accuracy[owner]) & (turn < HALVINGS)
+            np.add.at(total, owner[~open_], np.stack([low, high], axis=1)[~open_])
+            points, owner = _halved(points[open_]), np.tile(owner[open_], 2)
+            lengths = np.tile(lengths[open_] / 2, 2)
+            if not owner.size:
+                break
+        return total
 
     @shaped
     def _integrals(
@@ -137,6 +224,16 @@ class MeasurableSupport:
         return (values * WEIGHTS).sum(axis=1) * lengths / 2, np.abs(values).max(axis=1, initial=0.0)
 
 
+def _halved(points: Array) -> Array:
+    """Bernstein's coefficients ``(l, p + 1, w)`` on both halves of an interval, the first halves first: averages of
+    neighbours (de Casteljau)."""
+    left, right, row, last = np.empty_like(points), np.empty_like(points), points, points.shape[1] - 1
+    for order in range(last + 1):
+        left[:, order], right[:, last - order] = row[:, 0], row[:, -1]
+        row = (row[:, :-1] + row[:, 1:]) / 2
+    return np.concatenate([left, right])
+
+
 @shaped
 def _flows(A: Float[Array, "d d"], durations: Float[Array, " *k"]) -> Float[Array, "*k d d"]:
     """``e^{A r} (..., d, d)``; of equal durations once, since directions share their times."""
@@ -166,9 +263,11 @@ class MeasurableCellSupport:
     def at(
         self, times: Float[Array, " k"], ends: Float[Array, "k r 0"]
     ) -> tuple[Float[Array, "k r 1"], Float[Array, "k r"]]:
-        """The support function ``(k, r, 1)`` and what its quadrature is allowed to miss, ``(k, r)``;
-        ``ends (k, r, 0)``."""
+        """The support function ``(k, r, 1)`` and how far it may be from that, ``(k, r)``; ``ends (k, r, 0)``."""
         k, r = times.size, self.rows.shape[0]
+        if self.support.is_enclosed:
+            bounds = self.support.enclosed(np.repeat(times, r), np.tile(self.rows, (k, 1))).reshape(k, r, 2)
+            return bounds.mean(axis=2)[..., None], (bounds[..., 1] - bounds[..., 0]) / 2 * (1.0 + rounding(4))
         sigma = self.support(np.repeat(times, r), np.tile(self.rows, (k, 1)), np.zeros((k * r, 0))).reshape(k, r)
         return sigma[..., None], MISSED * np.abs(sigma)
 

@@ -101,7 +101,7 @@ def _unread(case: Case) -> set[str]:
             mixed = isinstance(entry, Mapping) and str(entry.get("constraint")) in pieced
             more = ({"piece"} if mixed else set()) | (set() if case.policy is None else {"disturbance"})
             more |= BEGUN if case.policy is not None and case.problem.initial_set is not None else set()
-            more |= {"changes"} if case.measurable else set()
+            more |= {"changes"} if case.measurable and case.policy is not None else set()
             left |= _besides("multipliers.constraints", entry, MULTIPLIER | more)
             left |= {"multipliers.constraints.parameter"} if _of_a_curved_set_of_controls(case, entry) else set()
     if "proof" in read and isinstance(proof, Mapping):
@@ -112,6 +112,7 @@ def _unread(case: Case) -> set[str]:
     known = WITNESS if case.problem.initial_set is None else WITNESS | BEGUN
     mixed = isinstance(witness, Mapping) and str(witness.get("constraint")) in pieced
     known = known | {"piece"} if mixed else known
+    known = known - {"disturbance", *BEGUN} if case.measurable and case.policy is None else known
     return left | (_besides("witness", witness, known) if "witness" in read else set())
 
 
@@ -289,9 +290,11 @@ def _attained(case: Case, said: Mapping[str, Any]) -> list[str]:
     from sparserob_core.checker.claims.case import numbers
     from sparserob_core.checker.claims.replay import exceeded
 
-    if case.policy is not None:
+    if case.policy is not None or case.measurable:
         from sparserob_core.checker.claims.feedback import feedback_of
 
+        if case.policy is None and case.problem.initial_set is not None:
+            raise Unchecked("the worst initial state is followed with disturbances that change at breakpoints only")
         found = [("", *feedback_of(case).exceeded(said))]
     else:
         found = [("", *exceeded(case, said))]

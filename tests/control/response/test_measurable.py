@@ -3,14 +3,20 @@ ones."""
 
 from __future__ import annotations
 
+import itertools
+from math import comb
+from unittest.mock import patch
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.linalg import expm
+from scipy.optimize import brentq
 
 from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.response import measurable
 from sparserob_core.control.sets.sets import Ellipsoid, NormBall, Polytope
 from sparserob_core.sip.convex_set import Box
 from tests.support.plants import indicators, random_system, uniform, worst_case
@@ -118,3 +124,74 @@ def test_times_and_parameters_may_be_mixed_freely():
         truth = by_quadrature(system, BOUNDS["box"], directions[k], times[k], parameters[k])
         assert abs(found[k] - truth) <= 1e-6 * max(1.0, truth)
     assert found[0] == 0.0
+
+
+FLAT = [name for name in BOUNDS if name != "ellipsoid"]
+
+
+def across_kinks(system, bound, direction, time):
+    """The integral of the support function over parts between which one corner of the set takes over from another, each
+    by Gauss and Legendre: to about ``1e-14``."""
+    A, _, E = (matrix[0] for matrix in system.matrices(np.zeros((1, 0))))
+    corners = np.unique(
+        bound.support_point(np.array([[np.cos(a), np.sin(a)] for a in np.linspace(0, 7, 4001)])), axis=0
+    )
+    nodes, weights = np.polynomial.legendre.leggauss(20)
+
+    def row(s):
+        return direction @ expm(A * s) @ E
+
+    grid = np.linspace(0.0, time, 201)
+    best = [int((corners @ row(s)).argmax()) for s in grid]
+    ends = [0.0]
+    for a, b, i, j in zip(grid[:-1], grid[1:], best[:-1], best[1:], strict=True):
+        if i != j:
+            ends.append(brentq(lambda s, i=i, j=j: (corners[i] - corners[j]) @ row(s), a, b, xtol=1e-15))
+    total = 0.0
+    for a, b in itertools.pairwise([*ends, time]):
+        middles = a + (b - a) * (nodes + 1) / 2
+        total += (b - a) / 2 * sum(w * (corners @ row(s)).max() for s, w in zip(middles, weights, strict=True))
+    return total
+
+
+@pytest.mark.parametrize("name", FLAT)
+@pytest.mark.parametrize("short", [0.5, 4.0])
+def test_bounds_of_the_support_of_a_flat_set_hold_it_and_are_close(name, short):
+    """On longer intervals what is left of the expansion is large, and the bounds must say so."""
+    for seed, speed in enumerate([1.0, 3.0, 12.0]):
+        rng = np.random.default_rng(seed)
+        system, direction, time = random_system(rng, speed=speed), rng.normal(size=2), rng.uniform(0.5, HORIZON)
+        functionals = worst_case(system, uniform(4, HORIZON), bound=BOUNDS[name], kind="measurable")
+        with patch.object(measurable, "SHORT", short):
+            ((low, high),) = functionals.measurable.enclosed(np.array([time]), direction[None])
+        truth = across_kinks(system, BOUNDS[name], direction, time)
+        assert low <= truth + 1e-14 * abs(truth)
+        assert truth <= high + 1e-14 * abs(truth)
+        if short < 1.0:
+            assert high - low <= 3e-11 * abs(truth)
+            assert functionals.offsets(np.array([time]), direction[None], np.zeros((1, 0)))[0] == (low + high) / 2
+        elif speed > 3.0:
+            assert high - low > 1e-9 * abs(truth)
+
+
+def test_bounds_across_a_root_are_those_of_the_modulus_of_a_sine():
+    system = LinearSystem([[0, 1], [-1, 0]], [[0.0], [1.0]], [[0.0], [1.0]])
+    support = worst_case(system, uniform(3, 5.0), bound=Box([-1.0], [1.0]), kind="measurable").measurable
+    bounds = support.enclosed(np.array([0.0, 2.0, 5.0]), np.tile([1.0, 0.0], (3, 1)))
+    truth = np.array([0.0, 1.0 - np.cos(2.0), 3.0 + np.cos(5.0)])
+    assert (bounds[:, 0] <= truth).all()
+    assert (truth <= bounds[:, 1]).all()
+    assert (bounds[:, 1] - bounds[:, 0] <= 4e-13).all()
+    assert bounds[0].tolist() == [0.0, 0.0]
+
+
+def test_the_halves_of_a_polynomial_are_itself():
+    points = np.random.default_rng(1).normal(size=(2, 5, 3))
+
+    def at(coefficients, u):
+        return sum(comb(4, k) * u**k * (1 - u) ** (4 - k) * coefficients[:, k] for k in range(5))
+
+    halves = measurable._halved(points)
+    for u in (0.0, 0.3, 1.0):
+        np.testing.assert_allclose(at(halves[:2], u), at(points, u / 2), atol=1e-14)
+        np.testing.assert_allclose(at(halves[2:], u), at(points, 0.5 + u / 2), atol=1e-14)
