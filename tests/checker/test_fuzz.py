@@ -106,6 +106,14 @@ def test_some_of_what_may_be_wrong_is_a_verdict_or_an_error_of_the_input(
     assert wrong(honest(kind), tmp_path / "copy", 7, 400) == []
 
 
+def test_a_decision_where_nothing_is_feasible_is_no_reason_to_fail(honest: Any, tmp_path: Path) -> None:
+    """What a result says of costs follows from the certificate's, which has none."""
+    shutil.copytree(honest("infeasible"), tmp_path / "copy")
+    file = tmp_path / "copy" / "certificate.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"decision": [[0.0] * 4]}))
+    assert judged(tmp_path / "copy") == "refuted"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("part", range(PARTS))
 @pytest.mark.parametrize("kind", KINDS)

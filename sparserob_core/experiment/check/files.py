@@ -172,6 +172,8 @@ def _result(loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Verdicts:
             verdict = compare(case, summary)
         except Unchecked:  # it rests on a set of a kind that the checker does not know
             verdict = None
+        except Broken as error:  # the certificate does not say what the figure follows from
+            verdict = [f"{name}: {error}"]
         if verdict is None:
             left += [name] if name in summary else []
         else:
