@@ -50,6 +50,8 @@ class Status:
         parts = [("bounds", _bounds(self.lower, self.upper, self.gap))] if self.round or self.searched else []
         if self.round is not None:
             parts += [("round", _round(self.round)), ("", _work(self.round))]
+            if math.isfinite(self.round.proven):
+                parts.append(("proven", f"a control of cost {_number(self.round.proven)}; a better one is sought"))
         if self.searched is not None:
             parts.append(("search", _search(self.searched)))
             notes = _notes(self.searched)

@@ -184,6 +184,7 @@ class RoundFinished(Event):
     ``gap``: the relative gap of the two bounds (`sip.result.relative_gap`).
     ``simplified``: it is a round on a program with some of the uncertainty only (methods ``nominal``, ``scenario``),
     whose ``upper_bound`` and ``violation`` say nothing of the program itself; its lower bound holds for both.
+    ``proven``: the cost of the cheapest decision that was proven so far to meet every constraint.
     """
 
     round: int
@@ -206,6 +207,7 @@ class RoundFinished(Event):
     dropped: Sequence[Cut] = field(default=(), repr=False)
     simplified: bool = False
     gap: float = np.inf
+    proven: float = np.inf
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

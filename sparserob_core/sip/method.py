@@ -107,6 +107,12 @@ class Deadline:
         return None if self.seconds is None else max(1e-3, self._ends - time.monotonic())
 
     @property
+    def used(self) -> float:
+        """The share of the time that is over, 1 at most; 0 where there is no limit."""
+        left = self._ends - time.monotonic()
+        return 0.0 if self.seconds is None else 1.0 - max(0.0, left) / self.seconds if self.seconds > 0.0 else 1.0
+
+    @property
     def passed(self) -> bool:
         """Whether the time is over."""
         return bool(self._interrupted) or time.monotonic() >= self._ends

@@ -56,10 +56,6 @@ class Landscape:
         self._bases = (one[2], other[2])
         self._open = np.array([kind == "disturbance" for kind in self.g.kinds])
         heads = (self.first[0], self.second[0])
-        plain = [k for k in range(self.g.slot.dimension) if not self._open[k] and k != self.first[1]]
-        alike = bool((self.anchor[heads[0], plain] == self.anchor[heads[1], plain]).all())
-        self._mirrored = self.first[1] == self.second[1] and alike  # g is the same where two indices change places
-        self._found: dict[tuple[float, ...], float] = {}
         self._moving = [[k for k in range(len(self.anchor)) if self._beside(k, heads) == head] for head in heads]
         self.values = np.full((self.axes[0].size, self.axes[1].size), np.nan)
 
@@ -67,8 +63,6 @@ class Landscape:
         """The head that an index is `NEAR` to, and moves with; -1 where there is none."""
         widths = np.where(self.g.slot.upper > self.g.slot.lower, self.g.slot.upper - self.g.slot.lower, np.inf)
         away = {head: (np.abs(self.anchor[slot] - self.anchor[head]) / widths)[~self._open].max() for head in heads}
-        if not self.g.interchangeable:
-            return slot if slot in heads else -1
         nearest = slot if slot in heads else min(heads, key=lambda head: away[head])
         return nearest if away[nearest] < NEAR else -1
 
@@ -112,13 +106,9 @@ class Landscape:
         ):
             slots[moving, place[1]] = to
             slots[np.ix_(np.array(moving), self._open)] = np.nan
-        at = (float(self.axes[0][i]), float(self.axes[1][j]))
-        key = tuple(sorted(at)) if self._mirrored else at
-        if key not in self._found:
-            self._found[key] = self.g.at(slots)
-            self.spent += 1
-        value = self._found[key]
+        value = self.g.at(slots)
         self.values[i, j] = value if not np.isnan(value) else -np.inf
+        self.spent += 1
 
     @property
     def value(self) -> float:

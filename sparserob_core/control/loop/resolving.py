@@ -24,9 +24,9 @@ from sparserob_core.sip.events import ignore
 from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.method import Deadline, OutOfTime, Tools
 from sparserob_core.sip.methods.exchange import Exchange, Violated
+from sparserob_core.sip.methods.ledger import prover_of
 from sparserob_core.sip.methods.own_units import solve_in_own_units
 from sparserob_core.sip.program import SemiInfiniteProgram
-from sparserob_core.sip.proof.branch_and_bound import prove
 from sparserob_core.sip.result import Result, relative_gap
 
 PROVEN = ("certified", "verified")
@@ -292,7 +292,7 @@ class Resolving:
         result = self._method.close(
             program,
             tools,
-            lambda x: prove(program, x, deadline=tools.deadline),
+            prover_of(program, replace(tools, notify=ignore)),
             shifted(plan.cuts, gap, program),
         )
         theirs = np.repeat(units.controls, own.control.functions)

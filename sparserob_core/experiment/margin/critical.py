@@ -15,6 +15,7 @@ from sparserob_core.experiment.run.events import StudyProgress
 from sparserob_core.sip.events import Notify
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.methods.exchange import Exchange
+from sparserob_core.sip.methods.ledger import unproven
 from sparserob_core.sip.methods.robust import largest_factor, least_slack
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.relaxed.parametric import ParametricProgram, extreme_program, slack_program
@@ -125,7 +126,7 @@ def _slack(programs: ParametricProgram, factor: float, tools: Tools) -> float:
             return least_slack(program, tools)
         bounds = _room(program)
         result = Exchange(tolerance=1e-9).close(
-            slack_program(program, *bounds), replace(tools, regulariser=None), lambda x: ()
+            slack_program(program, *bounds), replace(tools, regulariser=None), unproven
         )
     except InputError:
         if factor in (0.0, 1.0):

@@ -45,9 +45,8 @@ class RelaxedValue:
 
     ``weights()`` are the multipliers of the constraints at every index ``(D,)`` in the last evaluation, ``gradient()``
     the slopes ``(D, width)`` of ``g`` there, as far as it has some (`TupleValue.gradient`); ``deciding()`` are the
-    indices with the largest multipliers ``(4,)`` (`TupleValue.deciding`). ``interchangeable``: every index is imposed
-    as every other one, so that two beside one another say the same; those of a policy have a deviation each. ``slot``
-    is the box ``(width,)`` of one index, ``names`` and ``kinds`` say what its coordinates are: see `Inspection.names`,
+    indices with the largest multipliers ``(4,)`` (`TupleValue.deciding`). ``slot`` is the box
+    ``(width,)`` of one index, ``names`` and ``kinds`` say what its coordinates are: see `Inspection.names` and
     `Inspection.kinds`.
     """
 
@@ -58,7 +57,6 @@ class RelaxedValue:
     slot: Box
     names: tuple[str, ...]
     kinds: tuple[CoordinateKind, ...]
-    interchangeable: bool = True
 
     @property
     def coordinates(self) -> tuple[int, ...]:
@@ -172,14 +170,14 @@ class Inspection:
         """``g(epsilon; .)`` over tuples of ``count`` indices in the method's formulation, by a relaxed program of its
         own.
 
-        Of a policy the indices are literal, ``(t, w)`` with a deviation ``w``, and ``epsilon`` is 0. Raises
-        `InputError` when there is no constraint family."""
+        Raises `InputError` when there is no constraint family, and for a policy, whose rows are no rows of a linear
+        program before their deviations are known: one value takes as long as a round of the exchange."""
         from sparserob_core.sip.relaxed.relaxed import RelaxedProgram
         from sparserob_core.sip.relaxed.tuples import TupleValue, imposed_program
         from sparserob_core.sip.solver import quickest
 
         if self.program.spread is not None:
-            return self._policy_value()
+            raise InputError("g of a policy is a robust program at every point; its rounds show what it comes to")
         formulation: Literal["literal", "reduced"] = "literal" if self.literal else "reduced"
         users, tools = imposed_program(self.program, formulation), tools_of(self._loaded)
         if not users.families:
@@ -211,32 +209,6 @@ class Inspection:
             Box(slot.lower * units, slot.upper * units),
             self.names(width),
             self.kinds(width),
-        )
-
-    def _policy_value(self) -> RelaxedValue:
-        from sparserob_core.sip.relaxed.policy_value import PolicyValue
-
-        assert self.program.spread is not None
-        value, deviations = PolicyValue(self.program), self.program.spread.size
-        times = [family.index_set for family in self.program.families if not family.defines]
-        lower, upper = min(float(box.lower[0]) for box in times), max(float(box.upper[0]) for box in times)
-        kinds: tuple[CoordinateKind, ...] = ("time", *_repeated("disturbance", deviations))
-        far = np.full(deviations, 1.0 / TOLERANCE)  # no coefficient of a deviation is an axis: any box holds them
-
-        def deciding() -> np.ndarray:
-            weights = value.weights()
-            order = np.argsort(-weights, kind="stable")[:DECIDING]
-            return np.where(weights[order] > 0.0, order, -1)
-
-        return RelaxedValue(
-            value.at,
-            value.weights,
-            lambda: np.zeros((value.weights().size, 1 + deviations)),
-            deciding,
-            Box(np.concatenate([[lower], -far]), np.concatenate([[upper], far])),
-            ("t", *(f"w{k + 1}" for k in range(deviations))),
-            kinds,
-            interchangeable=False,
         )
 
     @property

@@ -14,7 +14,7 @@ from sparserob_core.options import Options
 from sparserob_core.sip.events import RoundFinished, forwarded
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.methods.exchange import Exchange
-from sparserob_core.sip.methods.ledger import alarm
+from sparserob_core.sip.methods.ledger import alarm, unproven
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram
 from sparserob_core.sip.proof.branch_and_bound import prove
 from sparserob_core.sip.proof.verdict import as_bad_as_found, verdict, witness, worst_of
@@ -93,7 +93,8 @@ def _judged(
     """Solve the simpler program, whose lower bound holds for the full one too, and say what its decision is worth in
     the full one."""
     notify = forwarded(tools.notify, RoundFinished, lambda event: replace(event, simplified=True))
-    result = Exchange(tolerance=tolerance, rounds=rounds).close(simple, replace(tools, notify=notify), lambda x: ())
+    method = Exchange(tolerance=tolerance, rounds=rounds)
+    result = method.close(simple, replace(tools, notify=notify), unproven)  # the full one is proven below
     if result.decision is None:
         return result
     x, found = result.decision, []

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, TypeAlias
+from typing import ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 from pydantic import Field
@@ -23,9 +23,8 @@ from sparserob_core.sip.finite import FiniteSolution
 from sparserob_core.sip.inner.vertex import MANY, vertex
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.methods.counting import count, met, tidied
-from sparserob_core.sip.methods.ledger import THINNER, Answer, Found, Ledger, Prover
+from sparserob_core.sip.methods.ledger import THINNER, Answer, Found, Ledger, Prover, prover_of
 from sparserob_core.sip.program import EQUALITY, TOLERANCE, ConstraintFamily, SemiInfiniteProgram, Separation
-from sparserob_core.sip.proof.branch_and_bound import prove
 from sparserob_core.sip.proof.verdict import worst_of
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows, rows_at
 from sparserob_core.sip.result import SMALL_COST, Result
@@ -39,6 +38,15 @@ FASTEST = 0.125  # of a weight, what steps of the continuation that are taken at
 CRUDE = 1e-4  # residual and relative gap of a relaxed solution that a round can do with
 SPARSIFYING = 60  # rounds after which no vertex is looked for any more
 ALLOWED = TOLERANCE / 2  # a violation that the search may leave to the proof
+# Cells for the first look at a decision. With a tenth of them, decisions of ordinary problems with parameters are
+# secured that are proven at once; with ten times as many, who rides a wall waits ten times longer for a first bound.
+GLANCE = 4096
+DUE = (0.4, 0.65, 0.85)  # shares of a limit after which a decision is secured, where none is proven yet
+SECURED = 6  # distances at which that is tried, each at least twice what the one before has left open
+# Of the cost, what the distance may cost at first. A tenth of it takes three times as many cells along a wall that is
+# ridden; ten times as much is a bound that nobody is content with.
+SPARED = 1e-3
+PAID = 2.0  # of what is left open, what the rows are tightened by: half of it is for what the new optimum violates
 
 Violated: TypeAlias = Sequence[tuple[Array, np.ndarray, str]]  # indices (k, d), rows (k,) and the name of a family
 
@@ -61,7 +69,7 @@ class Exchange(Method, Options):
     def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
         """`certified` when the gap is closed and every family is proven; infeasible, refuted or undecided otherwise,
         with the reason."""
-        return self.close(program, tools, lambda x: prove(program, x, tools.notify, deadline=tools.deadline))
+        return self.close(program, tools, prover_of(program, tools))
 
     def close(self, program: SemiInfiniteProgram, tools: Tools, prover: Prover, start: Violated = ()) -> Result:
         """Close the gap of ``program``; what is claimed of the decision is what ``prover`` proves of it. ``start``:
@@ -114,6 +122,9 @@ class Exchange(Method, Options):
 
             kept = (answer, found) if np.isfinite(suggested) else kept
 
+            # Secure: where time runs out, prove a decision that keeps away from the constraints while there is some.
+            _secure_in_time(working, ledger, prover, answer, found)
+
             # Exchange: impose them, drop what has been idle; tighten the rows that are violated though imposed.
             # Sharpen: nothing is violated but the bounds have not met, so do without the regulariser.
             exchanged = not last and (working.exchange(answer, violated, number) or working.tighten(violated))
@@ -129,7 +140,7 @@ class Exchange(Method, Options):
             # Prove: over the whole continuum; a witness that the proof meets is one more index to impose.
             if not self.exact:
                 working.plain_bound(ledger)
-            proofs = prover(x)
+            proofs = _proofs(working, ledger, prover, answer, found)
             # What rounding may do, where it alone keeps a proof open, is allowed for like the solver's accuracy.
             again = working.exchange(answer, _witnesses(program, proofs), number) or working.allow_for(proofs)
             if last or tools.deadline.passed or not again:
@@ -151,8 +162,8 @@ class Exchange(Method, Options):
 class Working:
     """The working set of the exchange: the imposed ``rows``, since how many rounds each is ``idle (r,)``, the weight
     ``epsilon``, the ``margin`` by which rows are tightened with the ``floor`` that it must not fall below and the
-    ``most`` that it may be, whether there is a ``slater`` point for it, how often rounding was ``allowed`` for, and a
-    solution with these rows as the next ``guess``."""
+    ``most`` that it may be, whether there is a ``slater`` point for it, how often rounding was ``allowed`` for, a
+    solution with these rows as the next ``guess``, and how often time has asked that a decision be ``secured``."""
 
     program: SemiInfiniteProgram
     rows: Rows
@@ -164,6 +175,7 @@ class Working:
     slater: bool = True
     allowed: int = 0
     guess: FiniteSolution | None = None
+    secured: int = 0
 
     @staticmethod
     def start(program: SemiInfiniteProgram, tools: Tools) -> Working:
@@ -288,11 +300,110 @@ class Working:
             self.margin = min(max(margin, self.floor), self.most)
 
 
+def _proofs(working: Working, ledger: Ledger, prover: Prover, answer: Answer, found: Found) -> Sequence[Proof]:
+    """What is proven of an answer: by one glance where that will do, else by a proof in full, before which there is a
+    decision that is proven."""
+    x = answer.solution.x
+    proofs = prover(x, GLANCE // 4 if ledger.tools.deadline.bounded else GLANCE)
+    if ledger.prove(answer, found, proofs) or not proofs:
+        return proofs
+    if not _is_secured(ledger):
+        _secure(working, ledger, prover, answer, _left_open(ledger.program, proofs))
+    if not any(proof.verdict == "refuted" for proof in proofs):
+        proofs = prover(x)
+        ledger.prove(answer, found, proofs)
+    return proofs
+
+
+def _secure_in_time(working: Working, ledger: Ledger, prover: Prover, answer: Answer, found: Found) -> None:
+    """Secure a decision at certain shares of a limit, though that of this round violates what was ``found``."""
+    due = working.secured < len(DUE) and ledger.tools.deadline.used >= DUE[working.secured]
+    if due and not _is_secured(ledger):
+        working.secured += 1
+        _secure(working, ledger, prover, answer, [_peak(family, separation) for family, separation in found])
+
+
+class Missed(NamedTuple):
+    """The largest violation of a family that was met, or that is not excluded, and its index ``(1, d)`` and row
+    ``(1,)``."""
+
+    violation: float
+    family: str
+    at: Array
+    row: np.ndarray
+
+
+def _secure(working: Working, ledger: Ledger, prover: Prover, answer: Answer, missed: Sequence[Missed]) -> None:
+    """Prove a decision that keeps away from the constraints, so that there is an upper bound while the proof of a
+    better one goes on: the optimum of the imposed rows, all of them tightened by as much as `SPARED` of the cost of
+    ``answer`` pays for and by more than what it ``missed``, and again by what that proof leaves open. Nothing is
+    claimed where nothing is that far from the constraints."""
+    program, x, margin = ledger.program, answer.solution.x, working.margin
+    price = float(answer.multipliers @ np.linalg.norm(working.rows.G, axis=1)) if working.rows.h.size else 0.0
+    margin += SPARED * abs(program.cost(x)) / max(price, np.finfo(float).tiny)
+    for _ in range(SECURED):
+        distances = (above / _size(rows_at(program, family, at, row)) for above, family, at, row in missed)
+        margin += PAID * max(distances, default=0.0)
+        if not np.isfinite(margin):
+            return
+        solution = ledger.relaxed.solve(working.rows, working.epsilon, margin)
+        if not _usable(solution):
+            return
+        farther = Answer(solution, working.rows, working.epsilon, solution.value)
+        found = separate(program, solution.x, ledger.tools, ALLOWED)
+        missed = [_peak(family, separation) for family, separation in found if separation.violations.max() > ALLOWED]
+        if missed:
+            continue
+        proofs = prover(solution.x, GLANCE)
+        if ledger.prove(farther, found, proofs) or not proofs:
+            return
+        missed = _left_open(program, proofs)
+
+
+def _is_secured(ledger: Ledger) -> bool:
+    """Whether a decision is proven that costs little more than what such a one must."""
+    return ledger.proven is not None and ledger.gap(ledger.proven[0].solution.x) <= PAID * SPARED
+
+
+def _size(row: Rows) -> float:
+    """The norm of one row."""
+    return max(float(np.linalg.norm(row.G)), np.finfo(float).tiny)
+
+
+def _peak(family: ConstraintFamily, separation: Separation) -> Missed:
+    """The largest violation that was found of a family."""
+    largest = max(0.0, float(separation.violations[0]))
+    return Missed(largest, family.name, separation.indices[:1], separation.rows[:1])
+
+
+def _left_open(program: SemiInfiniteProgram, proofs: Sequence[Proof]) -> list[Missed]:
+    """What proofs could not exclude, each with where the largest violation was met; infinite where that is of another
+    formulation than the imposed rows."""
+    return [
+        Missed(
+            proof.violation if proof.verdict == "refuted" else proof.bound,
+            proof.family,
+            proof.index[None],
+            np.array([proof.row]),
+        )
+        for proof in proofs
+        if proof.verdict != "proven"
+        and proof.index is not None
+        and proof.formulation == program.family(proof.family).formulation
+    ]
+
+
 def _or_earlier(
     ledger: Ledger, result: Result, answer: Answer, kept: tuple[Answer, Found] | None, prover: Prover
 ) -> Result:
-    """The result, or that of the last decision that seemed feasible, with an open gap, where only that is proven."""
-    if result.status not in ("refuted", "undecided") or kept is None or kept[0] is answer:
+    """The result, or that of a decision that is proven, or of the last one that seemed feasible, with an open gap,
+    where only that is proven."""
+    if result.status not in ("refuted", "undecided"):
+        return result
+    if ledger.proven is not None:
+        secured, found, proofs = ledger.proven
+        return ledger.judged(secured, worst_of(found), proofs, ledger.tools.deadline.reason)
+    if kept is None or kept[0] is answer:
         return result
     earlier = ledger.judged(kept[0], worst_of(kept[1]), prover(kept[0].solution.x))
     return earlier if earlier.status in ("certified", "verified") else result

@@ -15,7 +15,7 @@ from sparserob_core.sip.method import Method, Tools
 from sparserob_core.sip.methods.counting import DUST, count, counted_below, prices_of
 from sparserob_core.sip.methods.exchange import Exchange, Violated
 from sparserob_core.sip.program import SemiInfiniteProgram
-from sparserob_core.sip.proof.branch_and_bound import prove
+from sparserob_core.sip.proof.branch_and_bound import CELLS, prove
 from sparserob_core.sip.result import Result
 
 TOLERANCE, ROUNDS = 1e-6, 40  # of the bound, which is told in whole pieces or with six digits
@@ -49,9 +49,10 @@ class LeastCount(Method):
     cells: Mapping[str, int] = field(default_factory=dict)
 
     def solve(self, program: SemiInfiniteProgram, tools: Tools) -> Result:
-        def prover(x: Array) -> Sequence[Proof]:
+        def prover(x: Array, cells: int = CELLS) -> Sequence[Proof]:
             fewer = count(program, x) < self.beaten * (1.0 - TOLERANCE)
-            return prove(program, x, ignore, self.cells, tools.deadline) if fewer else ()
+            share = {name: min(cells, most) for name, most in self.cells.items()}
+            return prove(program, x, ignore, share, tools.deadline) if fewer else ()
 
         below = counted_below(program)
         plain = replace(tools, notify=ignore, regulariser=None)

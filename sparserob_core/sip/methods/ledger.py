@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
+from typing import Protocol, TypeAlias
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from sparserob_core.sip.program import (
     Separation,
     WorstConstraint,
 )
+from sparserob_core.sip.proof.branch_and_bound import CELLS, prove
 from sparserob_core.sip.proof.verdict import as_bad_as_found, infeasible_subsystem, verdict, witness, worst_of
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
 from sparserob_core.sip.result import MEANING, Result, Status, relative_gap
@@ -31,8 +32,28 @@ ROUNDING = 1e-13  # of the terms of a cost, with which it is evaluated
 CRUDE = 1e-8  # of bounds, rows and equalities, relative to their scale, at a decision of which nothing is claimed
 THINNER = 1e-3  # share of a margin that leaves nothing feasible, which is tried next
 
-Prover: TypeAlias = Callable[[Array], Sequence[Proof]]
+
+class Prover(Protocol):
+    """What is proven of a decision ``x (n,)`` with at most ``cells`` cells for every family."""
+
+    def __call__(self, x: Array, cells: int = CELLS) -> Sequence[Proof]: ...
+
+
 Found: TypeAlias = Sequence[tuple[ConstraintFamily, Separation]]
+
+
+def unproven(x: Array, cells: int = CELLS) -> Sequence[Proof]:
+    """The prover of a program of which only the bounds are wanted."""
+    return ()
+
+
+def prover_of(program: SemiInfiniteProgram, tools: Tools) -> Prover:
+    """The prover of every family of a program, which tells how it goes on and ends at the deadline of the tools."""
+
+    def prover(x: Array, cells: int = CELLS) -> Sequence[Proof]:
+        return prove(program, x, tools.notify, cells, tools.deadline)
+
+    return prover
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +82,8 @@ class Answer:
 @dataclass(eq=False)
 class Ledger:
     """What a method has learned of ``program``: ``dual``, the multipliers of the best lower bound; ``history``, the
-    rounds told; ``best``, the last answer that no search refuted, or else the last one.
+    rounds told; ``best``, the last answer that no search refuted, or else the last one; ``proven``, the cheapest answer
+    of which every family is proven, with the proofs, where there is one.
 
     ``tolerance``: the relative gap at which the bounds have met.
     """
@@ -74,6 +96,7 @@ class Ledger:
     dual: Dual = NO_BOUND
     history: list[RoundFinished] = field(default_factory=list)
     best: Answer | None = None
+    proven: tuple[Answer, Found, Sequence[Proof]] | None = None
     _found: Found = ()
     _suggested: bool = False
 
@@ -119,6 +142,7 @@ class Ledger:
             added=added,
             dropped=dropped,
             gap=self.gap(x) if np.isfinite(upper) else np.inf,
+            proven=np.inf if self.proven is None else self.program.cost(self.proven[0].solution.x),
         )
         self.history.append(event)
         if np.isfinite(upper) or not self._suggested:
@@ -129,6 +153,18 @@ class Ledger:
     def keep(self, answer: Answer, found: Found = ()) -> None:
         """The answer to return should the method be stopped now, with what was found most violated at it."""
         self.best, self._found = answer, found
+
+    def prove(self, answer: Answer, found: Found, proofs: Sequence[Proof]) -> bool:
+        """Keep an answer that these proofs show to be feasible, if it is the cheapest so far; ``False`` where they do
+        not show that."""
+        if len(proofs) != len(self.program.families) or any(proof.verdict != "proven" for proof in proofs):
+            return False
+        x = answer.solution.x
+        if any(missed > most for _, missed, most in self._fixed(x, strictly=True)):
+            return False
+        if self.proven is None or self.program.cost(x) < self.program.cost(self.proven[0].solution.x):
+            self.proven = answer, found, proofs
+        return True
 
     def judged(self, answer: Answer, worst: WorstConstraint, proofs: Sequence[Proof], ending: str = "") -> Result:
         """The result with the decision of ``answer``: what the proofs, the gap and the comparison of the bounds allow.
@@ -155,9 +191,12 @@ class Ledger:
         yield "its bounds", _beyond(self.program, x) if strictly else 0.0, TOLERANCE
 
     def stopped(self, error: KeyboardInterrupt, prover: Prover) -> Result:
-        """The result where time is over or a key was pressed: the best decision so far, with what one look at it
-        proves (a proof whose deadline has passed looks at every family once)."""
+        """The result where time is over or a key was pressed: the best decision that was proven, or else the best so
+        far, with what one look at it proves (a proof whose deadline has passed looks at every family once)."""
         reason = self.tools.deadline.interrupt(error)
+        if self.proven is not None:
+            answer, found, proofs = self.proven
+            return self.judged(answer, worst_of(found), proofs, reason)
         if self.best is None:
             return Result(
                 status="undecided",

@@ -124,6 +124,7 @@ class UsersUnits:
             cost=own.cost * self.cost,
             lower_bound=own.lower_bound * self.cost,
             upper_bound=own.upper_bound * self.cost,
+            proven=own.proven * self.cost,
             violation=own.violation * self._row_unit(own.worst_family, row),
             separations={name: self._separation(name, one) for name, one in own.separations.items()},
             imposed=self._cuts(own.imposed),

@@ -22,8 +22,8 @@ from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.methods.counting import DUST, count, prices_of
 from sparserob_core.sip.methods.exchange import Exchange
+from sparserob_core.sip.methods.ledger import prover_of, unproven
 from sparserob_core.sip.program import SemiInfiniteProgram
-from sparserob_core.sip.proof.branch_and_bound import prove
 from sparserob_core.sip.proof.verdict import verdict
 from sparserob_core.sip.result import Result, relative_gap
 
@@ -65,7 +65,7 @@ class Reweighted(Method, Options):
             if tools.deadline.passed:
                 break
             heavier = replace(program, weights=program.finite.weights * self._weights(program, x), twin=None)
-            found = exchange.close(heavier, plain, lambda u: (), imposed_cuts(known))
+            found = exchange.close(heavier, plain, unproven, imposed_cuts(known))
             if found.decision is None or found.status not in PROVEN:
                 break
             known = [*first.indices, *first.dual.cuts, *found.indices]
@@ -118,7 +118,7 @@ def on_support(
     off = ~acts & (prices > 0.0)
     lower, upper = np.where(off, 0.0, base.lower), np.where(off, 0.0, base.upper)
     narrow, quiet = replace(program, lower=lower, upper=upper, twin=None), replace(tools, notify=ignore)
-    return exchange.close(narrow, quiet, lambda u: prove(program, u, deadline=tools.deadline), imposed_cuts(known))
+    return exchange.close(narrow, quiet, prover_of(program, quiet), imposed_cuts(known))
 
 
 def imposed_cuts(cuts: Sequence[Cut]) -> list[tuple[Array, np.ndarray, str]]:

@@ -23,7 +23,7 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import DECIDING, EvaluationsFinished, forwarded, frozen, ignore
 from sparserob_core.sip.evidence import Dual
 from sparserob_core.sip.method import GAP_TOLERANCE, Deadline, Method, Tools
-from sparserob_core.sip.methods.ledger import Answer, Ledger
+from sparserob_core.sip.methods.ledger import Answer, Ledger, prover_of
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.proof.branch_and_bound import prove
 from sparserob_core.sip.proof.verdict import as_bad_as_found, worst_of
@@ -99,7 +99,7 @@ class SparseRob(Method, Options):
             with tools.deadline.enforced():
                 result = self._maximise(g, ledger, steps, parts)
         except KeyboardInterrupt as error:
-            result = ledger.stopped(error, lambda x: prove(program, x, tools.notify, deadline=tools.deadline))
+            result = ledger.stopped(error, prover_of(program, tools))
         trace = SearchTrace.joined(parts) if parts else None
         evaluations = 0 if trace is None else int(trace.value.size)
         counts = {**result.counts, "rounds": len(steps), "evaluations": evaluations}

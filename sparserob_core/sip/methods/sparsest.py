@@ -25,6 +25,7 @@ from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.methods.branching import Branching, proposed
 from sparserob_core.sip.methods.counting import DUST, count, counted_below, prices_of
 from sparserob_core.sip.methods.exchange import Exchange
+from sparserob_core.sip.methods.ledger import unproven
 from sparserob_core.sip.methods.reweighted import imposed_cuts, on_support
 from sparserob_core.sip.program import TOLERANCE, SemiInfiniteProgram
 from sparserob_core.sip.proof.branch_and_bound import prove
@@ -167,7 +168,7 @@ class _Search:
 
         tools = replace(self.tools, notify=forwarded(self.tools.notify, RoundFinished, heard), regulariser=None)
         method = Exchange(tolerance=self.method.tolerance, rounds=self.method.rounds)
-        result = method.close(below.program, tools, lambda x: (), imposed_cuts(self.rows.cuts))
+        result = method.close(below.program, tools, unproven, imposed_cuts(self.rows.cuts))
         if result.status == "infeasible":
             letters = tuple(self.method.alphabet or ())
             said = f"no control with values in {list(letters)}: {result.message}" if letters else result.message

@@ -17,7 +17,7 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.method import Tools
-from sparserob_core.sip.methods.ledger import Ledger, Prover
+from sparserob_core.sip.methods.ledger import Ledger, Prover, unproven
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
 from sparserob_core.sip.result import Result, Status
 
@@ -67,7 +67,7 @@ def bounding_rows(
     if np.isfinite(base.lower).all() and np.isfinite(base.upper).all() and base.S is None:
         return None, []
     steps = replace(tools, regulariser=None, notify=lambda event: None)
-    result = close(recession_program(program), steps, lambda x: ())
+    result = close(recession_program(program), steps, unproven)
     coefficient = max(float(np.abs(base.q).max(initial=0.0)), float(base.weights.max(initial=0.0)))
     if result.decision is not None and not result.stopped and result.cost < -FALLS * coefficient:
         return result.decision / np.abs(result.decision).max(), []

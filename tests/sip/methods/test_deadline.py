@@ -58,6 +58,38 @@ def test_a_proof_whose_time_is_over_looks_at_every_family_once():
     assert prove_family(slow_family(0.001), np.array([1.0]), deadline=over).verdict == "undecided"
 
 
+def blunt_program(asked=lambda x: None, excess=1e-4):
+    """The least ``x >= t`` for t in [0, 1], by an enclosure that is ``excess`` above what it encloses."""
+
+    def enclosure(x, lower, upper):
+        asked(x)
+        return Enclosure(upper[:, 0] - x[0] + excess, np.zeros(len(lower), dtype=int))
+
+    family = replace(slow_family(), enclosure=enclosure)
+    return sr.SemiInfiniteProgram(n=1, q=[1.0], lower=0.0, upper=9.0, families=[family])
+
+
+def test_a_decision_away_from_the_constraints_is_proven_where_the_optimum_cannot_be():
+    result = sr.solve(blunt_program(), method="exchange", solver="piqp")
+    assert result.status == "verified"
+    assert result.lower_bound <= 1.0 + 1e-9 and abs(result.lower_bound - 1.0) < 1e-6
+    assert 1.0 + 1e-4 <= result.upper_bound <= 1.01
+    assert result.cost == result.upper_bound == result.decision[0]
+
+
+def test_an_interrupt_returns_the_decision_that_was_proven_before():
+    looked = []
+
+    def asked(x):
+        looked.append(float(x[0]))
+        if x[0] < 1.0 + 5e-5 and max(looked) > 1.0 + 1e-4:  # the optimum, when the other has been proven
+            raise KeyboardInterrupt
+
+    result = sr.solve(blunt_program(asked), method="exchange", solver="piqp")
+    assert (result.status, result.stopped) == ("verified", "interrupted from the keyboard")
+    assert 1.0 + 1e-4 <= result.upper_bound <= 1.01
+
+
 def test_an_interrupt_of_a_proof_leaves_it_undecided_and_is_remembered():
     def pressed(x, lower, upper):
         raise KeyboardInterrupt
