@@ -236,3 +236,4 @@ def test_an_excess_of_a_set_is_judged_in_the_unit_of_how_far_it_reaches():
             else:
                 over, slack, _ = directions.over(0, 0.25, 0.25, z, z)
                 assert over <= slack
+                assert slack == pytest.approx(TOLERANCE * radius, rel=1e-6)
