@@ -231,6 +231,8 @@ class SemiInfiniteProgram:
     ``spread``: the deviations for all of which the ``uncertain`` rows of its families hold;
     ``guide``: a program that is easier, whose decision begins with so many of the same entries: where a method may look
     for this one's optimum;
+    ``among``: a program with the same constraints and another cost, whose decision begins with so many of the same
+    entries: which of the decisions that cost as little is to be returned;
     ``settle(x)``: a decision that meets the same constraints and costs no more, such as one whose bounds are no looser
     than they must be.
     """
@@ -258,6 +260,7 @@ class SemiInfiniteProgram:
     spread: Spread | None = None
     settle: Callable[[Array], Array] | None = None
     guide: tuple[SemiInfiniteProgram, int] | None = field(default=None, repr=False)
+    among: tuple[SemiInfiniteProgram, int] | None = field(default=None, repr=False)
     twin: Callable[[], OwnUnits] | None = field(default=None, repr=False)
     finite: FiniteProgram = field(init=False, repr=False)
 

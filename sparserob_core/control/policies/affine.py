@@ -27,6 +27,11 @@ class AffinePolicy(Policy, Options):
     any disturbance causes, which is 0 exactly where the control is off whatever happens; ``worst``: the largest
     weighted integral of ``|u_i(t)|`` that any disturbance causes, enclosed from both sides."""
 
+    among: Literal["peak"] | None = "peak"
+    """Of the policies that cost no more than the proven least by half of the method's tolerance: ``peak``, one with the
+    least weighted integral of the largest ``|u_i(t)|``, where gains and peaks are no more than 4000 numbers; null: any.
+    Without effect on other costs, which leave no such choice."""
+
     memory: float | None = Field(default=None, ge=0.0)
     """An innovation is answered for so long at most, in the time unit of the problem; everything by default."""
 

@@ -59,7 +59,7 @@ class InitialPlane:
         feedback = self.model.feedback
         if feedback is None or feedback.policy.cost == "nominal":
             return self
-        model = made_again(self.model, feedback.policy.model_copy(update={"cost": "nominal"}))
+        model = made_again(self.model, feedback.policy.model_copy(update={"cost": "nominal", "among": None}))
         return InitialPlane(model, self.states, self.centre, self.radius)
 
     def point(self, z: Array) -> Array:

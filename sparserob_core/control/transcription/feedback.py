@@ -208,7 +208,7 @@ def _program(
     low, high = np.repeat(low, pieces), np.repeat(high, pieces)
     weights, lower, upper = np.zeros(size), np.concatenate([low, -most]), np.concatenate([high, most])
     cost = problem.cost.l1 * np.kron(np.asarray(problem.weights, dtype=float), model.control.lengths)
-    guide, largest = None, None
+    guide, largest, among = None, None, None
     if policy.cost == "peak":
         both = np.vstack([axes, -axes])
         peaks = FeedbackControl(PEAK, loop, both, np.zeros(len(both)), first)
@@ -228,6 +228,9 @@ def _program(
         upper = np.append(upper, 2.0 * largest)
     else:
         weights[:nominal] = cost
+        if policy.among == "peak":
+            peak = policy.model_copy(update={"cost": "peak"})
+            among = (_program(model, peak, known, acting, fixed, steps)[0], first)
     program = SemiInfiniteProgram(
         n=size,
         families=families,
@@ -239,6 +242,7 @@ def _program(
         spread=loop.spread,
         settle=None if not settled else lambda x: reduce(lambda at, settle: settle(at), settled, x),
         guide=guide,
+        among=among,
         largest=largest,
     )
     return program, loop

@@ -81,7 +81,8 @@ class Counterpart:
     Its columns are the positive and the negative parts of the decision, a slack of all rows where it is ``elastic``
     (the only cost, at least ``lowest``), and what rows need beside them. Where it ``scales`` there is a factor instead,
     at most ``highest``, which is to be as large as possible: so many times as large are the deviations, and the
-    variables that answer them answer the deviations of the factor 1.
+    variables that answer them answer the deviations of the factor 1. ``ceiling``: weights ``(n,)``, and what the
+    weighted sum of absolute values of the decision may be at most.
     """
 
     program: FiniteProgram
@@ -90,6 +91,7 @@ class Counterpart:
     lowest: float = 0.0
     scales: bool = False
     highest: float = 0.0
+    ceiling: tuple[Array, float] | None = None
     asked: Asked | None = None
     answered: Counter[str] = field(default_factory=Counter)
     blocks: list[UncertainRows] = field(default_factory=list)
@@ -114,6 +116,12 @@ class Counterpart:
             row, column = np.nonzero(program.A)
             entries = _both(row, column, program.A[row, column], n)
             self._fixed = self._linear.rows([entries], program.b, program.b)
+
+        if self.ceiling is not None:
+            (weights, most), column = self.ceiling, np.flatnonzero(self.ceiling[0])
+            both = np.concatenate([column, column + n])
+            summed = (np.zeros(both.size, dtype=int), both, np.tile(weights[column], 2))
+            self._linear.rows([summed], np.full(1, -np.inf), np.full(1, most))
 
     def add(self, block: UncertainRows) -> None:
         """Impose rows from now on; exact ones as equations, unless they may be relaxed."""

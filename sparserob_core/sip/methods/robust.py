@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.events import ignore
 from sparserob_core.sip.evidence import Cut, Dual, InfeasibleSubsystem, Proof
 from sparserob_core.sip.finite import INTERIOR, FiniteSolution
 from sparserob_core.sip.inner.central.interior import Interior
@@ -40,6 +41,8 @@ SMALLEST = 1e-12
 SHARES = (0.1, 0.5, 1.0)  # of the way from the best decision known to the relaxed optimum, where rows are sought
 ENDED = 0.05  # seconds after the end of the time, when it is over for certain
 CUTS, GUIDED = 4, 30  # of them at each; rounds of a guide
+MANY = 4000  # variables of a second objective. With ten times as many the simplex method takes minutes where the first
+# objective takes seconds (100 pieces, two states: 10 000); with ten times fewer six states on twelve pieces go without.
 ROOM = 1e3  # units of the rows that they may have to spare
 SLACKENED = 200  # rounds of `least_slack` at most
 COARSE, SHARPER = 10.0, 0.1  # share of the cost to which the first round is solved, and how much closer the next ones
@@ -211,6 +214,11 @@ def _exchange(working: Robust, ledger: Ledger, prover: Prover, rounds: int) -> R
         if not last and _advanced(working, ledger, x, violated, feasible, worst_of(told).violation):
             continue
 
+        # Choose: of the decisions that cost as little, the one that the program likes best, where that is proven.
+        chosen = _chosen(working, ledger, answer, prover) if feasible and not ledger.open(x) else None
+        if chosen is not None:
+            return chosen
+
         # Prove: over the whole continuum; a witness that the proof meets is one more index to impose.
         proofs = prover(x)
         if not last and not tools.deadline.passed and _learned(working, x, proofs):
@@ -220,6 +228,46 @@ def _exchange(working: Robust, ledger: Ledger, prover: Prover, rounds: int) -> R
         ending = tools.deadline.reason if tools.deadline.passed else ending
         return ledger.judged(answer, worst_of(told), proofs, ending)
     raise AssertionError("the last round returns")
+
+
+def _chosen(working: Robust, ledger: Ledger, answer: Answer, prover: Prover) -> Result | None:
+    """The result with the decision that is best by the second objective of the program, `SemiInfiniteProgram.among`,
+    among those that cost at most the lower bound and half of the tolerance more: the same rows, and one more. ``None``
+    where there is none, or none was proven."""
+    program, tools = working.program, replace(ledger.tools, notify=ignore)
+    if program.among is None or program.spread is None or program.among[0].n > MANY:
+        return None
+    second, shared = program.among
+    weights = np.append(program.finite.weights[:shared], np.zeros(second.n - shared))
+    most = max(ledger.lower, 0.0) * (1.0 + 0.5 * ledger.tolerance)
+    counterpart = Counterpart(second.finite, program.spread, ceiling=(weights, most), asked=working.asked)
+    easier = Robust(second, counterpart, margin=working.margin, asked=working.asked)
+    for family in second.families:
+        known = [cut.index for cut in working.cuts if cut.family == family.name and not cut.row]
+        start = np.zeros((0, family.index_set.dimension)) if family.start is None else family.start
+        easier.add(family, np.array(known) if known else start)
+    for number in range(1, GUIDED + 1):
+        if tools.deadline.passed:
+            return None
+        found = easier.solve(second.largest_cost, _left(tools))
+        if not found.solved:
+            return None
+        x = np.clip(found.x, second.finite.lower, second.finite.upper)
+        x = x if second.settle is None else second.settle(x)
+        looked = separate(second, x, tools, ALLOWED, number)
+        new = [(family, one.indices[one.violations > ALLOWED]) for family, one in looked]
+        wrong = any(indices.size for _, indices in new)
+        if not (sum(easier.add(family, indices) for family, indices in new) or easier.counterpart.sharpen(x)):
+            break
+    working.calls += easier.calls
+    _count(working, ledger)
+    decision = x[:shared] if program.settle is None else program.settle(x[:shared])
+    if wrong or program.finite.residual(decision) > TOLERANCE or ledger.open(decision):
+        return None
+    proofs, met = prover(decision), separate(program, decision, tools, ALLOWED)
+    if any(one.verdict != "proven" for one in proofs):
+        return None
+    return ledger.judged(_at(working, answer, decision), worst_of(met), proofs, "")
 
 
 def _show(working: Robust, prover: Prover) -> None:
