@@ -8,7 +8,6 @@ from functools import cache
 import numpy as np
 import pytest
 from flint import arb, ctx
-from scipy.linalg import expm
 
 from sparserob_core.checker.outcome import TOLERANCE, Broken
 from sparserob_core.checker.reach.closed_loop import ClosedLoop
@@ -17,7 +16,7 @@ from sparserob_core.checker.reach.measurable import MeasurableLoop
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import Enclosed
 from sparserob_core.control.sets.sets import Ellipsoid
-from tests.support.closed_loops import EXACT, LOOPS, MEASURABLE, gains
+from tests.support.closed_loops import EXACT, LOOPS, MEASURABLE, exponentials, gains
 
 H = np.array([[1.0, 0.0], [0.0, -1.0], [0.6, 0.8], [-1.0, 0.3]])
 
@@ -153,7 +152,7 @@ def test_the_integral_of_a_kernel_is_that_of_the_support_function(name):
                 ends = np.linspace(0.0, share * length, parts + 1)
                 r = ((ends[:-1] + ends[1:])[:, None] / 2 + np.diff(ends)[:, None] / 2 * nodes).ravel()
                 w = (np.diff(ends)[:, None] / 2 * weights).ravel()
-                K = expm(case.A * r[:, None, None]) @ case.E
+                K = exponentials(case.A * r[:, None, None]) @ case.E
                 f = np.einsum("rdw,nd->nrw", K, a)
                 h = case.bound.support(f.reshape(-1, f.shape[2])).reshape(f.shape[:2]) - f @ middle
                 truth = h @ w
@@ -166,7 +165,7 @@ def test_the_integral_of_a_kernel_is_that_of_the_support_function(name):
                 assert (wide.rad < 0.1).all()
             steep = kernel.steepest(a, loop.sides)
             times = np.linspace(0.0, length, 60)
-            f = np.einsum("rdw,nd->nrw", expm(case.A * times[:, None, None]) @ case.E, a)
+            f = np.einsum("rdw,nd->nrw", exponentials(case.A * times[:, None, None]) @ case.E, a)
             h = case.bound.support(f.reshape(-1, f.shape[2])).reshape(f.shape[:2]) - f @ middle
             slopes = np.abs(np.diff(h, axis=1)).max(axis=1) / np.diff(times).min()
             assert (slopes <= steep * (1 + 1e-9)).all()

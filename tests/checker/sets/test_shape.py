@@ -380,3 +380,16 @@ def test_corners_of_a_zonotope_and_a_polytope_hold_in_exact_arithmetic():
             edge = source.support_point(direction[None])[0]
             inside = source.centre + (1 - 1e-15 * 64) * (edge - source.centre)
             assert shape.holds(balls(inside))
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_a_linear_bound_holds_where_a_range_is_many_times_as_wide_as_its_middle_is_far(name):
+    rng, shape = np.random.default_rng(13), SETS[name]
+    value, spread = 0.02 * rng.normal(size=(100, 2)), rng.uniform(0.5, 3.0, size=(100, 2))
+    value[:5] = 0.0
+    w, excess = known(shape).bound(value, spread)
+    for corner in [(1, 1), (1, -1), (-1, 1), (-1, -1), (1, 0), (0, 1), (-1, 0), (0, -1), (0, 0)]:
+        f = value + spread * np.array(corner)
+        assert (shape.support(f) <= np.einsum("kw,kw->k", w, f) + excess + 1e-14).all()
+    far = np.abs(points_of(name)).max()
+    assert (excess <= 8.0 * far * spread.sum(axis=1)).all()
