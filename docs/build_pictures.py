@@ -27,12 +27,7 @@ BLANK = 40_000  # bytes: a picture that is smaller shows an empty window
 STARTING, LOADING, DRAWING = 30.0, 9.0, 4.0  # seconds
 
 EXCHANGE = ["watch", "configs/experiment1_repaired.yaml"]
-SEARCH = [
-    "watch",
-    "configs/experiment1_reduced.yaml",
-    "maximiser={name: simulated_annealing, budget: 1500}",
-    "method.sc2=null",
-]
+SEARCH = ["watch", "configs/experiment1_literal.yaml", "maximiser.budget=2500"]
 FEEDBACK = ["watch", "configs/experiment1_feedback.yaml"]
 INFEASIBLE = ["watch", "configs/experiment2_repaired.yaml", "problem.path.0.from=1.0"]
 STUDY = ["sweep", "configs/double_integrator.yaml", "problem.horizon=3:6:7", "problem.control.box=0.6:1.6:6"]

@@ -242,7 +242,7 @@ def test_the_landscape_is_g_and_decided_by_its_anchor_alone() -> None:
     for _ in range(2):
         landscape = Landscape(inspection().relaxed_value(4, 0.01), anchor, (0, 0), (2, 0), 8, 0.01)
         levels = [complete for complete in landscape.evaluate() if complete]
-        assert len(levels) == 4 and landscape.spent == 81  # eight even lines and that of the anchor, across and up
+        assert len(levels) == 4 and landscape.spent == 53  # 36 pairs of eight even lines, and 17 on those of the anchor
         found.append(landscape.values)
     assert (found[0] == found[1]).all()
     fresh = inspection().relaxed_value(4, 0.01)
@@ -305,7 +305,7 @@ def mapped(g: Any, anchor: np.ndarray, size: int = 8) -> Any:
 def test_the_map_is_over_the_times_of_the_two_indices_that_decide_most_the_earlier_one_across() -> None:
     from sparserob_rerun.search.landscape import axes_of
 
-    anchor = np.array([[0.2, 0.5], [0.9, 0.5], [0.6, 0.5]])
+    anchor = np.array([[0.2, 0.5], [0.9, 0.5], [0.6, 0.4]])
     both = mapped(Plain(lambda s: s[0, 0] + 10 * s[2, 0], [2, 0, -1, -1], 2), anchor)
     assert (both.first, both.second) == ((0, 0), (2, 0)) and both.names() == ("t of the earlier", "t of the later")
     assert both.values[0, 0] == 0.0 and both.values[-1, 0] == 1.0 and both.values[0, -1] == 10.0

@@ -123,3 +123,30 @@ def test_words_are_bright_and_lines_of_plots_legible_on_a_dark_and_on_a_light_gr
     for colour in (ink.INK, ink.GREY, ink.ORANGE, ink.GREEN, ink.PURPLE, ink.VERMILLION, ink.SKY):
         assert contrast(ink.worded(colour), veil) > 3.0
         assert contrast(ink.legible(colour), (255, 255, 255)) > 3.0 < contrast(ink.legible(colour), (20, 20, 20))
+
+
+@pytest.mark.slow
+def test_the_map_of_a_policy_goes_through_its_proven_bound_and_nowhere_above_its_cost() -> None:
+    from sparserob_core.experiment.config.load import load_config
+    from sparserob_rerun.recording.recorder import slots_of
+    from sparserob_rerun.search.landscape import Landscape, axes_of, deciding_pair, places_of
+
+    config = CONFIGS / "experiment1_feedback.yaml"
+    result = sr.run(config, {}, None, quiet=True, figures=False).result
+    view = sr.Inspection(load_config(config))
+    slots = slots_of(list(result.dual.cuts), "literal", len(result.dual.cuts))
+    g = view.relaxed_value(len(slots), 0.0)
+    assert g.at(slots) == pytest.approx(result.lower_bound, rel=1e-7)
+    pair = deciding_pair(g, slots)
+    path = [cut.index[0] for cut in result.dual.cuts if cut.family == "path"]
+    assert slots[pair[0], 0] in path
+    axes = axes_of(g, len(slots), None)
+    assert axes is not None
+    landscape = Landscape(g, slots, *places_of(axes, pair, slots), 8)
+    for at in ((0.7, 0.7), (1.0, 4.0)):
+        moved = slots.copy()
+        for place, moving, to in zip((landscape.first, landscape.second), landscape._moving, at, strict=True):
+            moved[moving, place[1]] = to
+            moved[moving, 1:] = np.nan
+        assert g.at(moved) < result.lower_bound - 0.01
+    assert landscape.g.at(slots) <= result.cost + 1e-9

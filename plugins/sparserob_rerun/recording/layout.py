@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import sparserob_core as sr
 
 
-PHASE = (-30.0, 560.0, -64.0, 484.0)  # left, right, top and bottom of the phase plane
+PHASE = (-30.0, 560.0, -64.0, 506.0)  # left, right, top and bottom of the phase plane
 
 
 @final
@@ -72,7 +72,9 @@ def _columns(rrb: Any, shown: Shown) -> list[Any]:
         [search.climb(), *search.notes(rrb, shown.told)] if shown.searches else [_violation(rrb, shown), _bounds(rrb)]
     )
     middle = (
-        rrb.Vertical(search.landscape(), *numbers, row_shares=[5, 4, 2, 2][: 1 + len(numbers)])
+        rrb.Vertical(
+            search.landscape(shown.searches, shown.answers), *numbers, row_shares=[5, 4, 2, 2][: 1 + len(numbers)]
+        )
         if shown.landscape
         else rrb.Vertical(*numbers)
     )

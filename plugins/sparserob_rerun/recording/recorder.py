@@ -256,6 +256,10 @@ class Recorder:
                 left = self.patience if waits else self.patience - max(0.0, time.monotonic() - self.ended)
                 self.draw(LANDSCAPE, explorer.finish, left, 8, COARSE)
             self.mark()
+            if self.shown.answers and self.shown.landscape and self.terrain.known is None and self.shown.clash is None:
+                self.say("no landscape: landscape.patience is too short for the robust programs of a policy")
+                self.shown = replace(self.shown, landscape=False)
+                self.draw("the arrangement", self.stream.send_blueprint, layout(self.shown))
         if explorer.wrong:
             self.say(explorer.wrong, "WARN")
 
@@ -292,7 +296,7 @@ class Recorder:
                 began = time.monotonic()
                 self.explorer.finish(0.5 * self.patience, level=4)
                 self.patience -= time.monotonic() - began
-        elif not self.searches:
+        elif not self.searches and not self.shown.answers:
             slots = slots_of(active(event.imposed, event.multipliers), self._formulation)
             if slots.size:
                 words = f"others as active in round {event.round}"
@@ -321,7 +325,10 @@ class Recorder:
                 self.draw(VIOLATIONS, self.rounds.violations, result.decision, result.indices, (), told)
             # a run that is shown again
             if self.explorer.landscape is None and self.explorer.waiting is None and result.indices:
-                slots = slots_of(list(result.indices), self._formulation)
+                if self.shown.answers:  # the rows that prove the bound of a policy, each at its deviation
+                    slots = slots_of(list(result.dual.cuts), "literal", len(result.dual.cuts))
+                else:
+                    slots = slots_of(list(result.indices), self._formulation)
                 self.draw(
                     LANDSCAPE,
                     self.explorer.aim,
@@ -362,8 +369,8 @@ def shown_of(inspection: sr.Inspection | None, landscape: LandscapeOptions | Non
     if inspection is None:
         return Shown(None, 0, True, False)
     program, answers = inspection.program, inspection.problem is not None and inspection.program.spread is not None
-    mapped = landscape is not None and program.spread is None
-    return Shown(inspection.problem, len(shown_families(program)), inspection.searches, mapped, answers=answers)
+    families = len(shown_families(program))
+    return Shown(inspection.problem, families, inspection.searches, landscape is not None, answers=answers)
 
 
 def active(cuts: Any, multipliers: Floats) -> list[sr.Cut]:
@@ -371,9 +378,9 @@ def active(cuts: Any, multipliers: Floats) -> list[sr.Cut]:
     return [replace(cut, multiplier=float(m)) for cut, m in zip(cuts, multipliers, strict=True) if m > 0.0]
 
 
-def slots_of(cuts: list[sr.Cut], formulation: str) -> Floats:
-    """The distinct indices of cuts as a tuple ``(D, width)``, the one with the largest multiplier first; of an index of
-    another formulation the first coordinate only, the time, which all of them have."""
+def slots_of(cuts: list[sr.Cut], formulation: str, most: int = SLOTS) -> Floats:
+    """The distinct indices of cuts as a tuple ``(D, width)``, ``most`` of them, the one with the largest multiplier
+    first; of an index of another formulation the first coordinate only, the time, which all of them have."""
     ordered = sorted(cuts, key=lambda cut: -cut.multiplier)
     indices = [cut.index if cut.formulation == formulation else cut.index[:1] for cut in ordered]
     width = max(map(len, indices), default=0)
@@ -382,4 +389,4 @@ def slots_of(cuts: list[sr.Cut], formulation: str) -> Floats:
         slot = np.zeros(width)
         slot[: len(index)] = index
         found.setdefault(np.round(slot, 9).tobytes(), slot)
-    return np.array(list(found.values())[:SLOTS]).reshape(-1, width) if found else np.zeros((0, 0))
+    return np.array(list(found.values())[:most]).reshape(-1, width) if found else np.zeros((0, 0))

@@ -14,7 +14,7 @@ from sparserob_rerun.drawing.palette import Floats
 from sparserob_rerun.search.way import Stage
 
 WIDTH, HEIGHT, GAP = 1150.0, 300.0, 110.0
-EXTENT = (-100.0, WIDTH + 50.0, -92.0, HEIGHT + 92.0)
+EXTENT = (-100.0, WIDTH + 50.0, -92.0, HEIGHT + 104.0)
 CORNERS, POINTS = 500, 300  # of a curve, and of a cloud, in one panel
 MOST = 4  # panels beside one another; of more stages the last ones
 
@@ -37,7 +37,7 @@ class Climb:
             self._panel(drawing, clouds, stage, (place * (width + GAP), width), exact)
         hidden = len(stages) - len(shown)
         if hidden > 0:
-            drawing.text(WIDTH / 2, HEIGHT + 70.0, f"{hidden} earlier searches are not shown", ink.GREY)
+            drawing.text(WIDTH / 2, HEIGHT + 62.0, f"{hidden} earlier searches are not shown", ink.GREY)
         drawing.log(
             self.rr, self.stream, "search/stages", layers=("frame", "restart", "bound", "exact", "best", "walk")
         )

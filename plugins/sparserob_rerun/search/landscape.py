@@ -56,6 +56,10 @@ class Landscape:
         self._bases = (one[2], other[2])
         self._open = np.array([kind == "disturbance" for kind in self.g.kinds])
         heads = (self.first[0], self.second[0])
+        plain = [k for k in range(self.g.slot.dimension) if not self._open[k] and k != self.first[1]]
+        alike = bool((self.anchor[heads[0], plain] == self.anchor[heads[1], plain]).all())
+        self._mirrored = self.first[1] == self.second[1] and alike  # g is the same where two indices change places
+        self._found: dict[tuple[float, ...], float] = {}
         self._moving = [[k for k in range(len(self.anchor)) if self._beside(k, heads) == head] for head in heads]
         self.values = np.full((self.axes[0].size, self.axes[1].size), np.nan)
 
@@ -106,9 +110,13 @@ class Landscape:
         ):
             slots[moving, place[1]] = to
             slots[np.ix_(np.array(moving), self._open)] = np.nan
-        value = self.g.at(slots)
+        at = (float(self.axes[0][i]), float(self.axes[1][j]))
+        key = tuple(sorted(at)) if self._mirrored else at
+        if key not in self._found:
+            self._found[key] = self.g.at(slots)
+            self.spent += 1
+        value = self._found[key]
         self.values[i, j] = value if not np.isnan(value) else -np.inf
-        self.spent += 1
 
     @property
     def value(self) -> float:

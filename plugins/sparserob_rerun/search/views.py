@@ -14,9 +14,10 @@ FIRST = ("temperature", "depth", "constant", "radius", "spread", "slope")  # of 
 SHARES = ("accepted", "rejected")
 
 
-def landscape() -> Any:
-    """The landscape of g as a map."""
-    return view("/landscape/map", "Landscape of g around the best tuple, and the way of the search", EXTENT)
+def landscape(searches: bool, answers: bool) -> Any:
+    """The landscape of g as a map, of a control that ``answers`` what it measures at the end only."""
+    name = "Landscape of g around the best tuple" + (", and the way of the search" if searches else "")
+    return view("/landscape/map", f"{name}: when the run is over" if answers else name, EXTENT)
 
 
 EXTENT = (-60.0, 1000.0, -64.0, 472.0)

@@ -170,14 +170,14 @@ class Inspection:
         """``g(epsilon; .)`` over tuples of ``count`` indices in the method's formulation, by a relaxed program of its
         own.
 
-        Raises `InputError` when there is no constraint family, and for a policy, whose rows are no rows of a linear
-        program before their deviations are known: one value takes as long as a round of the exchange."""
+        Of a policy the indices are literal, ``(t, w)`` with a deviation ``w``, and ``epsilon`` is 0. Raises
+        `InputError` when there is no constraint family."""
         from sparserob_core.sip.relaxed.relaxed import RelaxedProgram
         from sparserob_core.sip.relaxed.tuples import TupleValue, imposed_program
         from sparserob_core.sip.solver import quickest
 
         if self.program.spread is not None:
-            raise InputError("g of a policy is a robust program at every point; its rounds show what it comes to")
+            return self._policy_value()
         formulation: Literal["literal", "reduced"] = "literal" if self.literal else "reduced"
         users, tools = imposed_program(self.program, formulation), tools_of(self._loaded)
         if not users.families:
@@ -209,6 +209,31 @@ class Inspection:
             Box(slot.lower * units, slot.upper * units),
             self.names(width),
             self.kinds(width),
+        )
+
+    def _policy_value(self) -> RelaxedValue:
+        from sparserob_core.sip.relaxed.policy_value import PolicyValue
+
+        assert self.program.spread is not None
+        value, deviations = PolicyValue(self.program), self.program.spread.size
+        times = [family.index_set for family in self.program.families if not family.defines]
+        lower, upper = min(float(box.lower[0]) for box in times), max(float(box.upper[0]) for box in times)
+        kinds: tuple[CoordinateKind, ...] = ("time", *_repeated("disturbance", deviations))
+        far = np.full(deviations, 1.0 / TOLERANCE)  # no coefficient of a deviation is an axis: any box holds them
+
+        def deciding() -> np.ndarray:
+            weights = value.weights()
+            order = np.argsort(-weights, kind="stable")[:DECIDING]
+            return np.where(weights[order] > 0.0, order, -1)
+
+        return RelaxedValue(
+            value.at,
+            value.weights,
+            lambda: np.zeros((value.weights().size, 1 + deviations)),
+            deciding,
+            Box(np.concatenate([[lower], -far]), np.concatenate([[upper], far])),
+            ("t", *(f"w{k + 1}" for k in range(deviations))),
+            kinds,
         )
 
     @property

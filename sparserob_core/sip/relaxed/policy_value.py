@@ -1,0 +1,101 @@
+"""``g`` of a program with uncertain rows over tuples of indices, each with the deviation at which it is imposed, or
+with all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeAlias, final
+
+import numpy as np
+
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.finite import UncertainRows
+from sparserob_core.sip.inner.counterpart import Counterpart
+from sparserob_core.sip.program import SemiInfiniteProgram
+
+Linear: TypeAlias = tuple[Array, Array, np.ndarray]
+"""Rows ``G (r, n)``, right-hand sides ``h (r,)``, and which of them ``(r,)`` move with their index."""
+
+
+@final
+class PolicyValue:
+    """The least cost where the rows of all families hold at the indices ``slots (D, d + Q)`` of a tuple: at the
+    deviation ``(Q,)`` that stands behind the index, or, where that is NaN, at every one.
+
+    A row at one deviation is linear in the decision. Lower bounds are proven by rows at the deviations that their
+    multipliers name (`robust_bound`): at such a tuple the value is that bound.
+    """
+
+    def __init__(self, program: SemiInfiniteProgram) -> None:
+        assert program.spread is not None
+        self.program, self.spread = program, program.spread
+        self.size = max(family.index_set.dimension for family in program.families)
+        # rows that stay where the index moves, and those that only say what the cost is, decide nothing
+        self._moves = [
+            bool(family.index_set.upper[0] > family.index_set.lower[0]) and not family.defines
+            for family in program.families
+        ]
+        self._known: dict[bytes, Linear] = {}
+        self._weights: Array = np.zeros(0)
+
+    def at(self, slots: Array) -> float:
+        """The value; ``inf`` where nothing meets the rows, NaN where the solver failed."""
+        counterpart = Counterpart(self.program.finite, self.spread)
+        plain = [self._at_deviation(slot) for slot in slots if not np.isnan(slot).any()]
+        order = [*np.flatnonzero(~np.isnan(slots).any(axis=1)), *np.flatnonzero(np.isnan(slots).any(axis=1))]
+        whose: list[np.ndarray] = []
+        if plain:
+            G, h, _ = (np.concatenate(part) for part in zip(*plain, strict=True))
+            counterpart.add(_plain(G, h, self.spread.size))
+            whose = [moves for _, _, moves in plain]
+        for slot in order[len(plain) :]:
+            blocks = self._rows(slots[slot])
+            for rows in blocks:
+                counterpart.add(rows)
+            whose.append(self._flags(blocks))
+        answer = counterpart.solve()
+        while answer.solved and counterpart.sharpen(answer.x):
+            answer = counterpart.solve()
+        if not answer.solved:
+            self._weights = np.zeros(len(slots))
+            return np.inf if "infeasible" in answer.said.lower() else np.nan
+        owner = np.repeat(order, [moves.size for moves in whose])
+        weights = np.bincount(owner, answer.y * np.concatenate(whose), len(slots))
+        self._weights = np.asarray(weights, dtype=float)
+        return self.program.cost(np.clip(answer.x, self.program.finite.lower, self.program.finite.upper))
+
+    def weights(self) -> Array:
+        """The multipliers ``(D,)`` of the rows at every index that move with it, in the last evaluation."""
+        return self._weights
+
+    def _flags(self, blocks: Sequence[UncertainRows]) -> np.ndarray:
+        """Which rows of all families ``(r,)`` move with their index."""
+        return np.concatenate([np.full(rows.h.size, moves) for rows, moves in zip(blocks, self._moves, strict=True)])
+
+    def _rows(self, slot: Array) -> list[UncertainRows]:
+        found = []
+        for family in self.program.families:
+            box = family.index_set
+            assert family.uncertain is not None
+            found.append(family.uncertain(np.clip(slot[: box.dimension], box.lower, box.upper)))
+        return found
+
+    def _at_deviation(self, slot: Array) -> Linear:
+        key = slot.tobytes()
+        if key not in self._known:
+            w, parts, blocks = slot[self.size :], [], self._rows(slot)
+            for rows in blocks:
+                turned = np.stack([w @ C for C in rows.C]) if rows.C else np.zeros((1, self.program.n))
+                G = rows.g.toarray() + rows.factor[:, np.newaxis] * turned[rows.part]
+                parts.append((G, rows.h - rows.factor * (rows.d @ w)[rows.part]))
+            G, h = (np.concatenate(part) for part in zip(*parts, strict=True))
+            self._known[key] = G, h, self._flags(blocks)
+        return self._known[key]
+
+
+def _plain(G: Array, h: Array, deviations: int) -> UncertainRows:
+    """Rows that no deviation changes."""
+    from scipy.sparse import csr_array
+
+    nothing, still = csr_array((deviations, G.shape[1])), np.zeros((1, deviations))
+    return UncertainRows(csr_array(G), h, np.zeros(h.size, dtype=int), np.zeros(h.size), (nothing,), still)
