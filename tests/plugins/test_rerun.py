@@ -283,7 +283,7 @@ class Plain:
         self.value, self.ranked = value, np.array(deciding)
         self.slot = sr.Box(np.zeros(width), np.ones(width))
         self.names, self.kinds = ("t", "p")[:width], ("time", "parameter")[:width]
-        self.coordinates = tuple(range(width))
+        self.coordinates, self.interchangeable = tuple(range(width)), True
 
     def at(self, slots: np.ndarray) -> float:
         return float(self.value(slots))

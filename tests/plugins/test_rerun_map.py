@@ -143,10 +143,12 @@ def test_the_map_of_a_policy_goes_through_its_proven_bound_and_nowhere_above_its
     axes = axes_of(g, len(slots), None)
     assert axes is not None
     landscape = Landscape(g, slots, *places_of(axes, pair, slots), 8)
-    for at in ((0.7, 0.7), (1.0, 4.0)):
+    for at, least, most in (
+        ((slots[landscape.first], slots[landscape.second]), result.lower_bound, result.cost),
+        ((0.7, 4.0), 0.0, result.lower_bound - 0.1),
+    ):
         moved = slots.copy()
         for place, moving, to in zip((landscape.first, landscape.second), landscape._moving, at, strict=True):
             moved[moving, place[1]] = to
             moved[moving, 1:] = np.nan
-        assert g.at(moved) < result.lower_bound - 0.01
-    assert landscape.g.at(slots) <= result.cost + 1e-9
+        assert least - 1e-6 <= g.at(moved) <= most + 1e-6

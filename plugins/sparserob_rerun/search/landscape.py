@@ -67,6 +67,8 @@ class Landscape:
         """The head that an index is `NEAR` to, and moves with; -1 where there is none."""
         widths = np.where(self.g.slot.upper > self.g.slot.lower, self.g.slot.upper - self.g.slot.lower, np.inf)
         away = {head: (np.abs(self.anchor[slot] - self.anchor[head]) / widths)[~self._open].max() for head in heads}
+        if not self.g.interchangeable:
+            return slot if slot in heads else -1
         nearest = slot if slot in heads else min(heads, key=lambda head: away[head])
         return nearest if away[nearest] < NEAR else -1
 

@@ -45,8 +45,9 @@ class RelaxedValue:
 
     ``weights()`` are the multipliers of the constraints at every index ``(D,)`` in the last evaluation, ``gradient()``
     the slopes ``(D, width)`` of ``g`` there, as far as it has some (`TupleValue.gradient`); ``deciding()`` are the
-    indices with the largest multipliers ``(4,)`` (`TupleValue.deciding`). ``slot`` is the box
-    ``(width,)`` of one index, ``names`` and ``kinds`` say what its coordinates are: see `Inspection.names` and
+    indices with the largest multipliers ``(4,)`` (`TupleValue.deciding`). ``interchangeable``: every index is imposed
+    as every other one, so that two beside one another say the same; those of a policy have a deviation each. ``slot``
+    is the box ``(width,)`` of one index, ``names`` and ``kinds`` say what its coordinates are: see `Inspection.names`,
     `Inspection.kinds`.
     """
 
@@ -57,6 +58,7 @@ class RelaxedValue:
     slot: Box
     names: tuple[str, ...]
     kinds: tuple[CoordinateKind, ...]
+    interchangeable: bool = True
 
     @property
     def coordinates(self) -> tuple[int, ...]:
@@ -234,6 +236,7 @@ class Inspection:
             Box(np.concatenate([[lower], -far]), np.concatenate([[upper], far])),
             ("t", *(f"w{k + 1}" for k in range(deviations))),
             kinds,
+            interchangeable=False,
         )
 
     @property
