@@ -545,20 +545,28 @@ def test_an_outcome_can_be_shown_with_all_that_it_knows(searched: sr.Outcome, tm
 
 
 def test_replay_and_watch_refuse_what_they_cannot_do(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    answered: sr.Outcome, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    config = str(CONFIGS / "experiment1_repaired.yaml")
+    config, kept = str(CONFIGS / "experiment1_repaired.yaml"), tmp_path / "kept.rrd"
+    kept.write_bytes(b"a recording of yesterday")
     for arguments, said in (
         (["replay", str(tmp_path / "none")], "expected the directory of a run, got nothing"),
         (["replay", str(tmp_path)], "got one without config.yaml"),
         (["watch", config, "--save", str(tmp_path)], "save: expected a file, got the directory"),
-        (["watch", config, "--save", "/proc/x/y.rrd"], "cannot be written to"),
+        (
+            ["watch", config, "--save", str(tmp_path / "no" / "y.rrd")],
+            "cannot be written to: No such file or directory",
+        ),
+        (["watch", config, "--save", str(kept)], f"save: expected a new file, or an empty one, got {kept}"),
+        (["replay", str(answered.directory), "--save", str(kept)], f"an empty one, got {kept}, which holds something"),
         (["watch", config], "--save FILE records for later"),
     ):
         assert command(*arguments) == 2
         assert said in capsys.readouterr().err
+    assert [one.name for one in tmp_path.iterdir()] == ["kept.rrd"]
+    assert kept.read_bytes() == b"a recording of yesterday"
 
 
 def free_port() -> int:

@@ -70,8 +70,10 @@ def _status(arguments: Sequence[str]) -> int:
         cause = error.__cause__ or error
         return _end(str(cause) or "interrupted from the keyboard", cause, INTERRUPTED)
     except click.ClickException as error:
-        error.show()
-        return 2
+        if not arguments:  # the help
+            error.show()
+            return 2
+        return _end(_usage(error), error, 2)
     except SparseRobError as error:
         if isinstance(error, OutputError):
             drop_output()
@@ -84,6 +86,15 @@ def _status(arguments: Sequence[str]) -> int:
     except Exception as error:  # noqa: BLE001  the last resort: a fault of the program is one line too
         said = named(error)
         return _end(f"internal error: {said}; {DEBUG}=1 shows where", error, 5)
+
+
+def _usage(error: click.ClickException) -> str:
+    """What is wrong with the command line, in one line, with the command that says what is right."""
+    said = " ".join(error.format_message().split()).rstrip(".")
+    context = error.ctx if isinstance(error, click.UsageError) else None
+    return f"{said[:1].lower()}{said[1:]}" + (
+        "" if context is None else f" (`{context.command_path} --help` says more)"
+    )
 
 
 def _end(message: str, error: BaseException, status: int) -> int:

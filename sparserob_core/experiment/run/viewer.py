@@ -49,12 +49,13 @@ def recorded(observer: Observer, save: str | Path | None) -> tuple[str, ...]:
 
 
 def _writable(file: Path) -> Path:
-    """The absolute path of a file that can be written."""
+    """The absolute path of a file that can be written, in a folder that is there; no recording is written over."""
     path = file.absolute()
     if path.is_dir():
         raise InputError(f"save: expected a file, got the directory {file}")
+    if path.is_file() and path.stat().st_size:
+        raise InputError(path="save", expected="a new file, or an empty one", got=f"{file}, which holds something")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("ab"):
             return path
     except OSError as error:

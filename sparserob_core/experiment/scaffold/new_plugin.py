@@ -29,7 +29,10 @@ def new_plugin(kind: str, name: str, out: str | Path = ".") -> Path:
     Nothing is overwritten. Raises `InputError` for an unknown kind, for a name that is no name, or is taken by an
     installed component, plugin or module, and for a folder that exists.
     """
-    record = record_type(kind.replace("-", "_"))
+    spelt = {one.replace("_", "-"): one for one in kinds()}
+    if kind.replace("_", "-") not in spelt:
+        raise InputError(path="kind", expected=f"one of {', '.join(spelt)}", got=repr(kind))
+    record = record_type(spelt[kind.replace("_", "-")])
     _check_name(record.kind, name)
     package = f"sparserob_{name}"
     folder = Path(out) / package.replace("_", "-")

@@ -76,6 +76,27 @@ def test_an_input_at_fault_is_status_2_one_message_and_no_traceback(
     assert not (config.parent / "runs").exists()
 
 
+@pytest.mark.parametrize(
+    ("arguments", "named", "more"),
+    [
+        (["runn"], "runn", "sparserob"),
+        (["new-plugin", "set"], "NAME", "sparserob new-plugin"),
+        (["run", "small.yaml", "--nope"], "--nope", "sparserob run"),
+        (["new-plugin", "set", "mine", "--out", "small.yaml"], "small.yaml", "sparserob new-plugin"),
+    ],
+)
+def test_a_command_line_at_fault_is_one_line_in_the_style_of_every_error(
+    config: Path, command: Command, arguments: list[str], named: str, more: str
+) -> None:
+    done = command(*arguments)
+    assert (done.returncode, done.stdout) == (2, "")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: ")
+    assert line.removeprefix("error: ")[0].islower()
+    assert named in line
+    assert line.endswith(f" (`{more} --help` says more)")
+
+
 def test_a_traceback_is_there_for_those_who_ask(config: Path, process: Command) -> None:
     assert "Traceback" in process("run", config, "problem.horizon=0", SPARSEROB_DEBUG="1").stderr
 

@@ -77,7 +77,7 @@ def test_a_package_passes_its_tests_as_it_is_written(tmp_path):
 @pytest.mark.parametrize(
     ("kind", "name", "words"),
     [
-        ("optimiser", "mine", r"kind: expected one of problem, set, .*, got 'optimiser'"),
+        ("optimiser", "mine", r"kind: expected one of problem, set, .*, outer-stop, inner-stop, .*, got 'optimiser'"),
         ("solver", "Mine", r"name: expected lower-case letters, digits and single underscores.*got 'Mine'"),
         ("solver", "2mine", "name: expected lower-case letters"),
         ("solver", "my-solver", "name: expected lower-case letters"),

@@ -32,7 +32,7 @@ from sparserob_core.experiment.terminal.printing import print_json, printable
 @click.option("--figures/--no-figures", default=False, help="Whether to draw every run too.", show_default=True)
 @click.option("--watch", is_flag=True, help="Show the study in the viewer of Rerun while it goes on.")
 @click.option(
-    "--save", type=click.Path(path_type=Path), help="Watch: record into this file, for a machine without a display."
+    "--save", type=click.Path(path_type=Path), help="Watch: record into this new file, for a machine without a display."
 )
 @click.option("--serve", is_flag=True, help="Watch: show it in a browser of this machine, until Ctrl-C.")
 @click.option("--connect", metavar="ADDRESS", help="Watch: send it to a viewer that listens there.")

@@ -15,7 +15,9 @@ from sparserob_core.experiment.terminal.printing import EXIT, printable
 @click.argument("config", type=click.Path(path_type=Path))
 @click.argument("overrides", nargs=-1, metavar="[KEY=VALUE]...")
 @click.option(
-    "--save", type=click.Path(path_type=Path), help="Record into this file instead, for a machine without a display."
+    "--save",
+    type=click.Path(path_type=Path),
+    help="Record into this new file instead, for a machine without a display.",
 )
 @click.option("--serve", is_flag=True, help="Show it in a browser of this machine, until Ctrl-C.")
 @click.option("--connect", metavar="ADDRESS", help="Send it to a viewer that listens there, such as 127.0.0.1:9876.")
