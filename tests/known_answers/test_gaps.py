@@ -47,7 +47,12 @@ WIDE = {
 }
 
 
-@pytest.mark.parametrize("kind", WIDE)
+LIGHT = ("a ball",)  # the others for the second stage
+
+
+@pytest.mark.parametrize(
+    "kind", [kind if kind in LIGHT else pytest.param(kind, marks=pytest.mark.slow) for kind in WIDE]
+)
 def test_bounds_of_the_control_that_are_far_away_change_nothing(kind):
     near = sr.solve(WIDE[kind](10.0), control=TEN)
     assert near.status == "certified"
@@ -87,6 +92,33 @@ def test_what_need_not_act_costs_exactly_nothing(far, policy):
     still = spring(box(far), initial_state=[0.1, 0.0], path=[])
     found = sr.solve(still, control=TEN, policy=sr.OpenLoop() if policy is None else sr.AffinePolicy(cost=policy))
     assert (found.status, found.lower_bound, found.upper_bound, found.gap) == ("certified", 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("pieces", ["piecewise_constant", "haar", "walsh", "a policy of innovations"])
+def test_a_run_in_which_nothing_need_be_done_writes_bounds_of_exactly_zero(pieces, tmp_path):
+    """Where an exact bound of 0 is rounded downwards once more, the gap is 1."""
+    policy = {"name": "affine", "cost": "peak"} if pieces.startswith("a policy") else None
+    name = "piecewise_constant" if policy else pieces
+    stated = {
+        "problem": {
+            "name": "linear",
+            "system": {"A": SPRING.tolist(), "B": [[0.0, 0.3], [1.0, 0.2]]},
+            "horizon": 3.7,
+            "initial_state": [0.1, -0.07],
+            "weights": [0.55, 1.82],
+            "control": {"box": [2e5, 9.9]},
+            "disturbance": {"ellipsoid": {"shape": [[1e-4, 2e-5], [2e-5, 3e-4]]}},
+            "terminal": [{"box": [None, 0.5]}],
+        },
+        "dictionaries": {
+            "control": {"name": name, "pieces": 8},
+            "disturbance": {"name": "piecewise_constant", "pieces": 8},
+        },
+        **({"policy": policy} if policy else {}),
+    }
+    result = sr.run(stated, out=tmp_path / "run", quiet=True, figures=False).result
+    assert (result.status, result.lower_bound, result.upper_bound, result.gap) == ("certified", 0.0, 0.0, 0.0)
+    assert [claim.verdict for claim in sr.check(tmp_path / "run").claims if claim.verdict != "holds"] == []
 
 
 @pytest.mark.parametrize("seed", range(8))

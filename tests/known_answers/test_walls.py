@@ -44,13 +44,20 @@ def least_heat(pieces: int) -> float:
     return float(found.fun)
 
 
-@pytest.mark.parametrize("uncertain", [False, True])
-def test_a_wall_that_is_ridden_all_day_takes_few_rounds_however_long_the_day(uncertain: bool) -> None:
-    for pieces in (16, 64):
-        result = sr.run(house(pieces, uncertain), quiet=True, figures=False).result
-        assert result.status == "certified"
-        assert abs(result.cost - least_heat(pieces)) <= 1e-6 * result.cost
-        assert result.counts["rounds"] <= 12
+@pytest.mark.parametrize(
+    ("pieces", "uncertain"),
+    [
+        (16, False),
+        (16, True),
+        pytest.param(64, False, marks=pytest.mark.slow),
+        pytest.param(64, True, marks=pytest.mark.slow),
+    ],
+)
+def test_a_wall_that_is_ridden_all_day_takes_few_rounds_however_long_the_day(pieces: int, uncertain: bool) -> None:
+    result = sr.run(house(pieces, uncertain), quiet=True, figures=False).result
+    assert result.status == "certified"
+    assert abs(result.cost - least_heat(pieces)) <= 1e-6 * result.cost
+    assert result.counts["rounds"] <= 12
 
 
 def heating() -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.arithmetic.balls import balls, below
 from sparserob_core.checker.claims import activity
 from sparserob_core.checker.claims.case import Case, listed, number, numbers
 from sparserob_core.checker.claims.constraints import bounded, equalities
@@ -68,7 +68,7 @@ def derived_bound(case: Case) -> float:
     from flint import ctx
 
     with ctx.workprec(_precision(case)):
-        return float(np.nextafter(float(_multiplied(case, priced=True).lower()), -np.inf))
+        return below(_multiplied(case, priced=True))
 
 
 def derived_causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> float:
@@ -79,7 +79,7 @@ def derived_causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> f
     from sparserob_core.checker.claims.causal import causal_bound
 
     with ctx.workprec(_precision(case)):
-        return float(np.nextafter(float(causal_bound(case, data, priced).lower()), -np.inf))
+        return below(causal_bound(case, data, priced))
 
 
 def _precision(case: Case) -> int:
@@ -272,8 +272,8 @@ def _fewest(case: Case, status: str) -> str:
         derived = activity.least(case, rows, pieces)
     if not 0.0 <= written <= derived + FIGURES or (proven and written > acted + FIGURES):
         raise Broken(f"lower is {written!r}, the multipliers prove {derived!r}")
-    below = f"no admissible control acts for a share of time below {written:.6g}"
-    return f"{below}, {'this' if other is case else 'another'} one for {acted:.6g}" if proven else below
+    least = f"no admissible control acts for a share of time below {written:.6g}"
+    return f"{least}, {'this' if other is case else 'another'} one for {acted:.6g}" if proven else least
 
 
 def _other(case: Case, data: Mapping[str, Any]) -> Case:

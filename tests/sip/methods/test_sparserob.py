@@ -120,6 +120,7 @@ def test_the_same_seed_gives_the_same_trace(tmp_path):
 
 
 def test_a_polish_is_written_down_and_read_back_and_replayed_as_one(tmp_path):
+    from sparserob_core.experiment.run.inspection import Inspection
     from sparserob_core.experiment.run.replay import BATCHES, _searches
 
     outcome = experiment1(
@@ -132,8 +133,7 @@ def test_a_polish_is_written_down_and_read_back_and_replayed_as_one(tmp_path):
         read = sr.SearchTrace.stored(columns)
     assert trace.polished.tolist() == read.polished.tolist()
     assert np.flatnonzero(~read.polished).tolist() == [*range(21), *range(30, 51)]
-    width = outcome.program.families[0].index_set.dimension
-    told = [event for _, event in _searches(read, width)]
+    told = [event for _, event in _searches(read, Inspection.read(outcome.directory))]
     for event in told:
         mine = read.polished[read.outer == event.round - 1][event.total - event.count : event.total]
         assert mine.tolist() == [event.phase == "polish"] * event.count

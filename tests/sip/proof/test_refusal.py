@@ -50,7 +50,9 @@ def met(family, x, rng):
     return most if family.worst is None else max(most, float(family.worst(x).violations[0]))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind", [kind if kind == "feedback" else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS]
+)
 def test_five_billionths_too_much_are_never_proven_and_a_little_room_is(kind):
     rng, made = np.random.default_rng(1), program(kind)
     names = [family.name for family in made.families]
