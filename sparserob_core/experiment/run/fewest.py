@@ -20,10 +20,11 @@ from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.result import Result
 
 INWARDS = 1e-9  # of a bound, so that whoever derives it with another rounding does not find less
-ROUNDS, CELLS = 10, 64
-"""Rounds, and cells of a proof, that the other program may take where the run's own took fewer. Ten times fewer, and a
-vertex of a problem whose own control hardly moves is not proven; ten times more, and cells of parameters, which take
-long, are examined for longer than the run took."""
+ROUNDS, CELLS = 30, 64
+"""Rounds, and cells of a proof, that the other program may take where the run's own took fewer. Of ten times fewer
+rounds, a control in a ball is not met (it takes some twenty tangents); of ten times fewer cells, a vertex of a problem
+whose own control hardly moves is not proven; of ten times more, cells of parameters, which take long, are examined for
+longer than the run took."""
 ENDED, PROVEN = ("infeasible", "failed"), ("certified", "verified")
 
 
