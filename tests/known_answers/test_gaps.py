@@ -11,6 +11,7 @@ import pytest
 
 import sparserob_core as sr
 from tests.support.independent import Problem, enclosed_value
+from tests.support.instances import config, instance
 
 SPRING = np.array([[0.0, 1.0], [-2.0, -0.5]])
 TEN = sr.Dictionary.indicators(np.linspace(0.0, 5.0, 11))
@@ -119,6 +120,14 @@ def test_a_run_in_which_nothing_need_be_done_writes_bounds_of_exactly_zero(piece
     result = sr.run(stated, out=tmp_path / "run", quiet=True, figures=False).result
     assert (result.status, result.lower_bound, result.upper_bound, result.gap) == ("certified", 0.0, 0.0, 0.0)
     assert [claim.verdict for claim in sr.check(tmp_path / "run").claims if claim.verdict != "holds"] == []
+
+
+@pytest.mark.parametrize("number", [700002, pytest.param(700125, marks=pytest.mark.slow)])
+def test_dust_in_coefficients_of_waves_is_put_to_exactly_zero(number):
+    """Least squares of images that are all dust left 1e-29, a cost of 1e-34 and so a gap of 1."""
+    result = sr.run(config(*instance(number)), quiet=True, figures=False).result
+    assert (result.status, result.lower_bound, result.upper_bound, result.gap) == ("certified", 0.0, 0.0, 0.0)
+    assert not result.decision.any()
 
 
 @pytest.mark.parametrize("seed", range(8))

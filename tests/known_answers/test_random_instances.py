@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
-from tests.support.instances import config, instance, largest_violation, truth
+from tests.support.instances import TOGETHER, config, instance, largest_violation, truth
 
 QUICK = 2
 COUNT = int(os.environ.get("SPARSEROB_INSTANCES", "300"))
 FIRST = int(os.environ.get("SPARSEROB_FIRST_INSTANCE", "300000"))
+ALL_AT_ONCE = range(TOGETHER, TOGETHER + COUNT // 10)
 # problems whose honest runs `check` once refused, or did not check: taken whatever the numbers are
 FOUND = (300270, 301955, 420593, 420815, 610056, 610151, 630416, 640058)
 
@@ -28,7 +29,7 @@ def numbers():
         *range(FIRST, FIRST + QUICK),
         *(
             pytest.param(seed, marks=pytest.mark.slow)
-            for seed in sorted({*FOUND, *range(FIRST + QUICK, FIRST + COUNT)})
+            for seed in sorted({*FOUND, *range(FIRST + QUICK, FIRST + COUNT), *ALL_AT_ONCE})
         ),
     ]
 

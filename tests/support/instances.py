@@ -769,10 +769,37 @@ def on_the_boundary(rng: np.random.Generator, share: float) -> Instance | None:
     return replace(problem, terminal=[end.scaled(float(answer.fun) * (1 + share))])
 
 
+TOGETHER = 1_000_000  # numbers of instances that may have every feature at once
+
+
+def together(seed: int) -> tuple[Instance, Units]:
+    """Initial states, another cost, what `in_time` and what `richer` draw, each or not, in one problem."""
+    rng = np.random.default_rng([seed, 5])
+    problem = drawn(rng)
+    has = rng.random(4) < 0.6
+    if has[0] and problem.ends_at is None:
+        problem = replace(problem, initial_set=shape(rng, rng.uniform(0.002, 0.05, len(problem.A)), bounded=True))
+    if has[1]:
+        problem = richer(rng, problem)
+    if has[2] and problem.ends_at is None:
+        timed = in_time(rng, problem)  # an initial control other than 0 is no step from 0
+        problem = timed if problem.step is None else replace(timed, late=0, before=None)
+    units = drawn_units(rng, problem)
+    if has[3]:
+        problem = replace(problem, charge=charge(rng, *problem.B.shape))
+        if problem.charge is not None and problem.charge.grouped:  # one weight and one unit for all of a group
+            m = len(problem.weights)
+            problem = replace(problem, weights=np.full(m, problem.weights[0]))
+            units = replace(units, controls=np.full(m, units.controls[0]))
+    return problem, units
+
+
 def instance(seed: int) -> tuple[Instance, Units]:
-    """Number ``seed``: every tenth one on the boundary, feasible or infeasible by 1e-6; every third of the others from
-    a set of initial states, every fourth with another cost than the L1 norm, and of the others every sixth with what
-    `in_time` draws."""
+    """Number ``seed``: from `TOGETHER` on what `together` draws. Before, every tenth one on the boundary, feasible or
+    infeasible by 1e-6; every third of the others from a set of initial states, every fourth with another cost than the
+    L1 norm, and of the others every sixth with what `in_time` draws."""
+    if seed >= TOGETHER:
+        return together(seed)
     rng = np.random.default_rng(seed)
     problem = on_the_boundary(rng, 1e-6 if seed % 20 else -1e-6) if seed % 10 == 0 else None
     problem = problem if problem is not None else drawn(rng)

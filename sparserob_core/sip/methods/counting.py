@@ -140,6 +140,8 @@ def tidied(program: SemiInfiniteProgram, x: Array) -> Array:
     near &= (base.lower <= 0.0) & (base.upper >= 0.0)
     if not (near & (image != 0.0)).any():
         return x
+    if (np.abs(image) <= DUST * reach).all():
+        return np.zeros_like(x)  # least squares would leave rounding, and a cost that is not exactly 0
     if base.S is None:
         return np.where(near, 0.0, x)
     if x.size > LARGE:
