@@ -148,6 +148,10 @@ from sparserob_core.sip.events import ProofProgress as ProofProgress
 from sparserob_core.sip.events import RoundFinished as RoundFinished
 from sparserob_core.experiment.run.inspection import Inspection as Inspection
 from sparserob_core.experiment.run.inspection import RelaxedValue as RelaxedValue
+from sparserob_core.experiment.run.landscape import Landscape as Landscape
+from sparserob_core.experiment.run.landscape import LandscapeAxes as LandscapeAxes
+from sparserob_core.experiment.run.landscape import deciding_pair as deciding_pair
+from sparserob_core.experiment.run.landscape import deciding_slots as deciding_slots
 from sparserob_core.experiment.figures.figure_data import FigureData as FigureData
 from sparserob_core.experiment.figures.figure_data import Wall as Wall
 from sparserob_core.experiment.figures.clash import Strip as Strip

@@ -235,12 +235,10 @@ def inspection(config: str = "experiment1_reduced.yaml", changes: dict[str, obje
 
 
 def test_the_landscape_is_g_and_decided_by_its_anchor_alone() -> None:
-    from sparserob_rerun.search.landscape import Landscape
-
     anchor = np.array([[0.5], [0.9], [3.0], [4.9]])
     found = []
     for _ in range(2):
-        landscape = Landscape(inspection().relaxed_value(4, 0.01), anchor, (0, 0), (2, 0), 8, 0.01)
+        landscape = sr.Landscape(inspection().relaxed_value(4, 0.01), anchor, (0, 0), (2, 0), 8, 0.01)
         levels = [complete for complete in landscape.evaluate() if complete]
         assert len(levels) == 4 and landscape.spent == 53  # 36 pairs of eight even lines, and 17 on those of the anchor
         found.append(landscape.values)
@@ -258,7 +256,7 @@ def test_the_landscape_is_g_and_decided_by_its_anchor_alone() -> None:
 
 
 def test_coordinates_of_the_landscape_are_named_as_in_the_config_or_refused_with_what_there_is() -> None:
-    from sparserob_rerun.search.landscape import coordinate
+    from sparserob_core.experiment.run.landscape import coordinate
 
     system = {
         "problem.system.A": [[0, 1], ["-2 + spring", "-0.5 + p2"]],
@@ -293,18 +291,14 @@ class Plain:
 
 
 def mapped(g: Any, anchor: np.ndarray, size: int = 8) -> Any:
-    from sparserob_rerun.search.landscape import Landscape, axes_of, deciding_pair, places_of
-
-    axes = axes_of(g, len(anchor), None)
+    axes = sr.LandscapeAxes.over(g, len(anchor), None)
     assert axes is not None
-    landscape = Landscape(g, anchor, *places_of(axes, deciding_pair(g, anchor), anchor), size, 0.0, axes)
+    landscape = sr.Landscape(g, anchor, *axes.places(sr.deciding_pair(g, anchor), anchor), size, 0.0, axes)
     list(landscape.evaluate())
     return landscape
 
 
 def test_the_map_is_over_the_times_of_the_two_indices_that_decide_most_the_earlier_one_across() -> None:
-    from sparserob_rerun.search.landscape import axes_of
-
     anchor = np.array([[0.2, 0.5], [0.9, 0.5], [0.6, 0.4]])
     both = mapped(Plain(lambda s: s[0, 0] + 10 * s[2, 0], [2, 0, -1, -1], 2), anchor)
     assert (both.first, both.second) == ((0, 0), (2, 0)) and both.names() == ("t of the earlier", "t of the later")
@@ -315,10 +309,13 @@ def test_the_map_is_over_the_times_of_the_two_indices_that_decide_most_the_earli
     twins = Plain(lambda s: -min((s[0, 0] - 0.2) ** 2, (s[2, 0] - 0.2) ** 2), [0, 2, 1, -1])
     map_of_twins = mapped(twins, np.array([[0.2], [0.9], [0.21]]))
     assert (map_of_twins.first, map_of_twins.second) == ((0, 0), (1, 0)) and not map_of_twins.flat
+    # at their distance: where the tuple is, the map has the tuple's value
+    apart = mapped(Plain(lambda s: s[0, 0] + s[2, 0], [0, 2, -1, -1]), np.array([[0.2], [0.9], [0.21]]))
+    assert apart.value == pytest.approx(0.2 + 0.21) and apart.limits == pytest.approx((0.01, 2.0))
     # of an index that is alone, two of its coordinates
-    alone = axes_of(Plain(lambda s: 1.0, [0], 2), 1, None)  # type: ignore[arg-type]
+    alone = sr.LandscapeAxes.over(Plain(lambda s: 1.0, [0], 2), 1, None)  # type: ignore[arg-type]
     assert alone is not None and alone.coordinates == (0, 1)
-    assert axes_of(Plain(lambda s: 1.0, [0]), 1, None) is None  # type: ignore[arg-type]
+    assert sr.LandscapeAxes.over(Plain(lambda s: 1.0, [0]), 1, None) is None  # type: ignore[arg-type]
 
 
 def test_of_what_moves_on_the_map_the_disturbance_is_at_its_worst_and_the_best_tuple_lies_below() -> None:
@@ -339,27 +336,24 @@ def test_of_what_moves_on_the_map_the_disturbance_is_at_its_worst_and_the_best_t
 
 
 def test_a_flat_slice_says_so_and_has_no_range_of_its_own() -> None:
-    from sparserob_rerun.search.landscape import Landscape
     from sparserob_rerun.search.terrain import _said
 
     landscape = mapped(Plain(lambda s: 0.632, [0, -1]), np.array([[0.5], [0.7]]))
     assert landscape.flat and landscape.limits == (0.632, 0.632)
     assert _said(landscape) == ["g does not depend on these two here: 0.632"]
-    tilted = Landscape(Plain(lambda s: s[0, 0], [0, -1]), np.array([[0.5], [0.7]]), (0, 0), (1, 0), 8)  # type: ignore[arg-type]
+    tilted = sr.Landscape(Plain(lambda s: s[0, 0], [0, -1]), np.array([[0.5], [0.7]]), (0, 0), (1, 0), 8)  # type: ignore[arg-type]
     list(tilted.evaluate())
     assert not tilted.flat and _said(tilted) == ["g from 0 (dark) to 1 (bright)"]
     little: Any = Plain(lambda s: 0.67833 + 1e-6 * s[0, 0], [0, -1])
-    slight = Landscape(little, np.array([[0.5], [0.7]]), (0, 0), (1, 0), 8)
+    slight = sr.Landscape(little, np.array([[0.5], [0.7]]), (0, 0), (1, 0), 8)
     list(slight.evaluate())
     assert _said(slight) == ["g from 0.67833 (dark) to 0.678331 (bright)"]
 
 
 @pytest.mark.parametrize("place", [0.0, 1e-17, 1.0 / 7.0 + 1e-15, 0.5, 1.0])
 def test_a_tuple_beside_a_line_of_the_grid_takes_its_place(place: float) -> None:
-    from sparserob_rerun.search.landscape import Landscape
-
     tilted: Any = Plain(lambda s: s[0, 0] + s[1, 0], [0, 1])
-    landscape = Landscape(tilted, np.array([[place], [0.3]]), (0, 0), (1, 0), 8)
+    landscape = sr.Landscape(tilted, np.array([[place], [0.3]]), (0, 0), (1, 0), 8)
     list(landscape.evaluate())
     assert landscape.axes[0][landscape.at[0]] == place and landscape.value == place + 0.3
     assert np.diff(landscape.axes[0]).min() > 1e-3

@@ -76,7 +76,7 @@ def batch_of(points: np.ndarray, deciding: list[list[int]], **more: object) -> s
 
 
 def test_cells_are_drawn_over_the_indices_that_decide_in_their_middle_and_walks_keep_the_earlier_one_across() -> None:
-    from sparserob_rerun.search.projection import Axes, Projector
+    from sparserob_rerun.search.projection import Projector, outlines_on
 
     points = np.array([[0.1, 0, 0.5, 0, 0.9, 0], [0.3, 1, 0.5, 1, 0.2, 1], [0.4, 0, 0.8, 1, 0.2, 0]])
     deciding = [[2, 0, -1, -1], [1, -1, -1, -1], [0, 2, 1, -1]]
@@ -88,10 +88,10 @@ def test_cells_are_drawn_over_the_indices_that_decide_in_their_middle_and_walks_
     # the second tuple has one that decides; the other one is of the pair before
     assert projection.slots.tolist() == [[2, 0], [1, 2], [0, 2]]
     assert projection.places[:, :, 0].tolist() == [[0.9, 0.1], [0.5, 0.2], [0.4, 0.2]]
-    axes = Axes((0, 1), (0, 0))
+    axes = sr.LandscapeAxes((0, 1), (0, 0))
     points_on_map = axes.of((0,), projection.places)
     assert points_on_map is not None and points_on_map.tolist() == [[0.1, 0.9], [0.2, 0.5], [0.2, 0.4]]
-    corners = axes.outlines((0,), projection.sketches["cells"])
+    corners = outlines_on(axes, (0,), projection.sketches["cells"])
     assert corners is not None
     np.testing.assert_allclose(corners[0], [[0.1 - 0.1 / 3, 0.85], [0.15, 0.4 - 0.1 / 3]])
     np.testing.assert_allclose(corners[1], [[0.1 + 0.1 / 3, 0.95], [0.25, 0.4 + 0.1 / 3]])
@@ -100,7 +100,7 @@ def test_cells_are_drawn_over_the_indices_that_decide_in_their_middle_and_walks_
 
 
 def test_an_index_beside_the_first_is_not_the_second() -> None:
-    from sparserob_rerun.search.projection import two_of
+    from sparserob_core.experiment.run.landscape import two_of
 
     slots, widths = np.array([[0.5], [0.52], [0.9], [0.1]]), np.ones(1)
     assert two_of([0, 1, 2, 3], slots, widths, (3, 2)) == (0, 2)
@@ -129,7 +129,6 @@ def test_words_are_bright_and_lines_of_plots_legible_on_a_dark_and_on_a_light_gr
 def test_the_map_of_a_policy_goes_through_its_proven_bound_and_nowhere_above_its_cost() -> None:
     from sparserob_core.experiment.config.load import load_config
     from sparserob_rerun.recording.recorder import slots_of
-    from sparserob_rerun.search.landscape import Landscape, axes_of, deciding_pair, places_of
 
     config = CONFIGS / "experiment1_feedback.yaml"
     result = sr.run(config, {}, None, quiet=True, figures=False).result
@@ -137,12 +136,12 @@ def test_the_map_of_a_policy_goes_through_its_proven_bound_and_nowhere_above_its
     slots = slots_of(list(result.dual.cuts), "literal", len(result.dual.cuts))
     g = view.relaxed_value(len(slots), 0.0)
     assert g.at(slots) == pytest.approx(result.lower_bound, rel=1e-7)
-    pair = deciding_pair(g, slots)
+    pair = sr.deciding_pair(g, slots)
     path = [cut.index[0] for cut in result.dual.cuts if cut.family == "path"]
     assert slots[pair[0], 0] in path
-    axes = axes_of(g, len(slots), None)
+    axes = sr.LandscapeAxes.over(g, len(slots))
     assert axes is not None
-    landscape = Landscape(g, slots, *places_of(axes, pair, slots), 8)
+    landscape = sr.Landscape(g, slots, *axes.places(pair, slots), 8)
     for at, least, most in (
         ((slots[landscape.first], slots[landscape.second]), result.lower_bound, result.cost),
         ((0.7, 4.0), 0.0, result.lower_bound - 0.1),

@@ -175,12 +175,10 @@ def test_what_was_recorded_is_in_the_file_two_seconds_later(tmp_path: Path) -> N
 def test_a_panel_that_fails_is_named_in_the_log_and_costs_nothing_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    from sparserob_rerun.search.landscape import Landscape
-
-    def broken(self: Landscape) -> object:
+    def broken(self: sr.Landscape) -> object:
         raise ValueError("cannot reshape array of size 4 into shape (2,1)")
 
-    monkeypatch.setattr(Landscape, "evaluate", broken)  # the process that records is a copy of this one
+    monkeypatch.setattr(sr.Landscape, "evaluate", broken)  # the process that records is a copy of this one
     changes = {
         "dictionaries.control.pieces": 20,
         "dictionaries.disturbance.pieces": 20,

@@ -23,7 +23,6 @@ from sparserob_rerun.recording.layout import Shown, layout
 from sparserob_rerun.recording.waiting import BOUNDS, CLIMB, CONTROL, LANDSCAPE, VIOLATIONS, Waiting
 from sparserob_rerun.search.climb import Climb
 from sparserob_rerun.search.explorer import Aim, Explorer
-from sparserob_rerun.search.landscape import Landscape
 from sparserob_rerun.search.projection import Projection
 from sparserob_rerun.search.search import SearchView
 from sparserob_rerun.search.terrain import Terrain
@@ -204,7 +203,7 @@ class Recorder:
             self._page("solving", [line])
         self.next = time.monotonic() + max(PICTURE_EVERY, SPARE * (time.thread_time() - began))
 
-    def _landscape(self, landscape: Landscape, aim: Aim) -> None:
+    def _landscape(self, landscape: sr.Landscape, aim: Aim) -> None:
         """Draw a landscape at the moment at which it is there, and the way on it."""
         if not self.opening.waits:
             self.timelines.move(seconds=self.timelines.seconds + time.monotonic() - self.heard)

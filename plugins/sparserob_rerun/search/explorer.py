@@ -12,7 +12,6 @@ import numpy as np
 import sparserob_core as sr
 from sparserob_rerun.drawing.palette import Floats
 from sparserob_rerun.options import LandscapeOptions
-from sparserob_rerun.search.landscape import Landscape, axes_of, deciding_pair, places_of
 
 SLICE = 0.02  # seconds of processor time between two looks at the queue
 LARGE = 0.02
@@ -55,7 +54,7 @@ class Explorer:
 
     def __init__(
         self,
-        draw: Callable[[Landscape, Aim], None],
+        draw: Callable[[sr.Landscape, Aim], None],
         inspection: sr.Inspection | None,
         options: LandscapeOptions | None,
         hurried: bool = False,
@@ -63,13 +62,13 @@ class Explorer:
         self.draw, self.inspection, self.options = draw, inspection, options
         self.left = 0 if options is None or inspection is None else options.evaluations
         self.share = 1.0 if hurried or options is None else options.share
-        self.landscape: Landscape | None = None
+        self.landscape: sr.Landscape | None = None
         self.aimed: Aim | None = None
         self.waiting: Aim | None = None
         self.work: Iterator[bool] = iter(())
         self.began = self.since = time.monotonic()
         self.used, self.wrong = 0.0, ""
-        self.drawn: tuple[Aim, Landscape] | None = None
+        self.drawn: tuple[Aim, sr.Landscape] | None = None
         self.fresh = False  # a level is complete that was not drawn yet
 
     @property
@@ -190,7 +189,7 @@ class Explorer:
         anchor = np.tile(middle, (len(aim.slots), 1))
         anchor[:, :known] = aim.slots[:, :known]
         anchor = np.clip(anchor, g.slot.lower, g.slot.upper)
-        axes = axes_of(g, len(anchor), self.options.coordinates)
+        axes = sr.LandscapeAxes.over(g, len(anchor), self.options.coordinates)
         if axes is None:
             self.left, self.wrong = 0, "no landscape: fewer than two coordinates of the indices can move"
             return
@@ -198,15 +197,15 @@ class Explorer:
         if not known_pair:
             g.at(anchor)
             yield False
-        pair = (aim.pair[0], aim.pair[1]) if known_pair else deciding_pair(g, anchor)
+        pair = (aim.pair[0], aim.pair[1]) if known_pair else sr.deciding_pair(g, anchor)
         if pair[0] == pair[1] and axes.orders:
             self.left, self.wrong = 0, "no landscape: a tuple of one index has no second one"
             return
-        self.landscape = Landscape(g, anchor, *places_of(axes, pair, anchor), self.options.grid, aim.epsilon, axes)
+        self.landscape = sr.Landscape(g, anchor, *axes.places(pair, anchor), self.options.grid, aim.epsilon, axes)
         yield from self.landscape.evaluate()
 
 
-def _gain(aim: Aim, before: Aim, landscape: Landscape) -> float:
+def _gain(aim: Aim, before: Aim, landscape: sr.Landscape) -> float:
     """By how much a tuple has a higher value than the one before, of the height of its landscape; NaN where a value is
     not known."""
     low, high = landscape.limits

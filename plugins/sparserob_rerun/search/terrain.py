@@ -7,11 +7,12 @@ from typing import Any, final
 
 import numpy as np
 
+import sparserob_core as sr
 from sparserob_rerun.drawing import palette as ink
 from sparserob_rerun.drawing.canvas import Axes, Drawing
 from sparserob_rerun.drawing.palette import Floats
 from sparserob_rerun.search.explorer import Aim
-from sparserob_rerun.search.landscape import Landscape, places_of
+from sparserob_rerun.search.projection import outlines_on
 from sparserob_rerun.search.way import Shadow, Stage, shadow
 
 PIXELS, SIDE = 128, 384.0
@@ -35,10 +36,10 @@ class Terrain:
     def __init__(self, rr: Any, stream: Any, unit: str = "") -> None:
         """``unit``: of the time, as it is written behind its name."""
         self.rr, self.stream, self.unit = rr, stream, unit
-        self.known: Landscape | None = None
+        self.known: sr.Landscape | None = None
         self.scale = (0.0, 1.0)
 
-    def surface(self, landscape: Landscape, aim: Aim) -> None:
+    def surface(self, landscape: sr.Landscape, aim: Aim) -> None:
         """The values that are known, as an image with axes and as a mesh."""
         self.known = landscape
         low, high = self.scale = self._scale(landscape, aim)
@@ -80,7 +81,7 @@ class Terrain:
         )
         self._mesh(landscape, (low, high))
 
-    def _anchor(self, landscape: Landscape, axes: Axes) -> None:
+    def _anchor(self, landscape: sr.Landscape, axes: Axes) -> None:
         """The tuple through which the slice goes, with the value that the slice has there."""
         at = axes.at(landscape.axes[0][landscape.at[0]], landscape.axes[1][landscape.at[1]])
         self.stream.log(
@@ -150,7 +151,7 @@ class Terrain:
         if slots.shape == landscape.anchor.shape and not np.array_equal(slots, landscape.anchor) and stage.pair:
             assert landscape.seen is not None
             pair = (stage.pair[0], stage.pair[-1])
-            one, other = places_of(landscape.seen, pair, slots)
+            one, other = landscape.seen.places(pair, slots)
             marks.append(axes.at(slots[one], slots[other]))
             colours.append(ink.HALF)
             sizes.append(4.5)
@@ -159,13 +160,13 @@ class Terrain:
             rr.Points2D(np.concatenate(marks), colors=colours, radii=rr.Radius.ui_points(sizes), draw_order=61.0),
         )
 
-    def _sketches(self, landscape: Landscape, stage: Stage) -> None:
+    def _sketches(self, landscape: sr.Landscape, stage: Stage) -> None:
         """What a maximiser shows of itself, over where the indices are that decide in the middle of each."""
         axes, legend = self._axes(landscape), Drawing()
         for role, sketch in stage.sketches.items():
             path = f"landscape/map/sketch/{''.join(c if c.isalnum() else '_' for c in role)}"
             assert landscape.seen is not None
-            corners = landscape.seen.outlines(stage.coordinates, sketch)
+            corners = outlines_on(landscape.seen, stage.coordinates, sketch)
             if corners is None or not sketch.count:
                 continue
             lower, upper = corners
@@ -213,7 +214,7 @@ class Terrain:
                 drawing.text(BESIDE, 30.0 + ROW * (10 + line), part, ink.PURPLE)
             drawing.log(self.rr, self.stream, "landscape/map/exact")
 
-    def _scale(self, landscape: Landscape, aim: Aim) -> tuple[float, float]:
+    def _scale(self, landscape: sr.Landscape, aim: Aim) -> tuple[float, float]:
         """What is dark and what is bright; one colour for a flat slice, which has no range. The value that the search
         has, which may lie below the map, has a colour of its own where half of them are left for the map."""
         low, high = landscape.limits
@@ -223,11 +224,11 @@ class Terrain:
             return low - 1.0, low + 1.0
         return (max(min(low, aim.value), 2.0 * low - high) if np.isfinite(aim.value) else low), high
 
-    def _axes(self, landscape: Landscape) -> Axes:
+    def _axes(self, landscape: sr.Landscape) -> Axes:
         ends = [(float(axis[0]), float(axis[-1])) for axis in landscape.axes]
         return Axes(0.0, 0.0, SIDE, SIDE, ends[0], ends[1])
 
-    def _mesh(self, landscape: Landscape, scale: tuple[float, float]) -> None:
+    def _mesh(self, landscape: sr.Landscape, scale: tuple[float, float]) -> None:
         across, up, shown = landscape.shown
         finite = np.isfinite(shown)
         heights = np.clip((np.where(finite, shown, scale[1]) - scale[0]) / (scale[1] - scale[0]), 0.0, 1.0)
@@ -286,7 +287,7 @@ class Terrain:
         )
 
 
-def _said(landscape: Landscape) -> list[str]:
+def _said(landscape: sr.Landscape) -> list[str]:
     """What the colours mean, or that there is nothing to see."""
     low, high = landscape.limits
     nowhere = bool((landscape.shown[2] == np.inf).any())
@@ -299,7 +300,7 @@ def _said(landscape: Landscape) -> list[str]:
     return [*said, "brown: no control meets the constraints"] if nowhere else said
 
 
-def _own(landscape: Landscape, aim: Aim) -> list[str]:
+def _own(landscape: sr.Landscape, aim: Aim) -> list[str]:
     """The value at the anchor, and how far below it that of the search is, whose disturbances need not be the worst."""
     below, here = landscape.value - aim.value, f"orange: the best tuple, g = {landscape.value:.6g}"
     if not below > VISIBLE * max(1.0, abs(landscape.value)):

@@ -10,7 +10,7 @@ import numpy as np
 
 import sparserob_core as sr
 from sparserob_rerun.drawing.palette import Floats
-from sparserob_rerun.search.projection import Axes, Outlines, Projection
+from sparserob_rerun.search.projection import Outlines, Projection
 
 POINTS = 100_000  # tuples whose places are remembered; a tenth of it forgets a long walk, ten times of it takes 50 MB
 
@@ -118,7 +118,7 @@ class Shadow:
     now: Floats
 
 
-def shadow(stage: Stage, axes: Axes) -> Shadow | None:
+def shadow(stage: Stage, axes: sr.LandscapeAxes) -> Shadow | None:
     """A stage on the two ``axes`` of a map; ``None`` where its tuples have not come along."""
     points = axes.of(stage.coordinates, stage.places)
     if points is None or not len(points):

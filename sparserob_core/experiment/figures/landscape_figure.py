@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+VISIBLE = 1e-6  # of g: what two solvers make of one value differs by less, and what is seen by more
 FLAT = 1e-9  # of the value: what varies by less does not vary
 MOST = 2000  # visited points that are drawn
 
@@ -25,11 +26,12 @@ MOST = 2000  # visited points that are drawn
 @final
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LandscapeData:
-    """A slice of ``g`` at the weight ``epsilon`` through a tuple of indices, over one of its coordinates or two.
+    """A slice of ``g`` at the weight ``epsilon`` through a tuple of indices, along its only coordinate or over two.
 
     ``axes``: the values of each, ``(k,)`` or ``(k,)`` and ``(l,)``, called ``names``; ``values (k,)`` or ``(k, l)``,
     ``inf`` where no decision meets the constraints. ``best`` is the place of the tuple ``(1 or 2,)``, where g has the
-    value ``best_value``. ``visited (n, 1 or 2)`` are the points that the search evaluated at this weight, in these
+    value ``best_value``; ``own_value`` is what the tuple itself has, whose disturbances need not be the worst.
+    ``visited (n, 1 or 2)`` are the points that the search evaluated at this weight, in these
     coordinates only, with their ``visited_values (n,)``; ``accepted (n,)``: which of them the walk accepted, 1 or 0,
     NaN where it says nothing.
     """
@@ -41,6 +43,7 @@ class LandscapeData:
     values: Array
     best: Array
     best_value: float
+    own_value: float
     visited: Array
     visited_values: Array
     accepted: Array = field(default_factory=lambda: np.empty(0))
@@ -87,6 +90,11 @@ def draw_landscape(data: LandscapeData) -> Figure:
 def _said(data: LandscapeData) -> str:
     if data.flat:
         return f"$g$ does not depend on {' and '.join(data.names)} here: it is {data.best_value:.6g}"
+    if data.best_value - data.own_value > VISIBLE * max(1.0, abs(data.best_value)):
+        on_the_map = (
+            f"its own $g$ is {data.own_value:.6g}, on the map, with the worst disturbances, {data.best_value:.6g}"
+        )
+        return f"all other coordinates as in the best tuple: {on_the_map}"
     return f"all other coordinates as in the best tuple, where $g$ = {data.best_value:.7g}"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TypeAlias
@@ -13,17 +14,32 @@ from sparserob_core.errors import InputError, SparseRobError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, assemble
 from sparserob_core.experiment.directory.adversary import adversaries
 from sparserob_core.experiment.directory.finished import read_finished, stored_run
-from sparserob_core.experiment.run.inspection import Inspection
-from sparserob_core.experiment.run.landscape import landscape_of
+from sparserob_core.experiment.figures.landscape_figure import LandscapeData, write_landscape
+from sparserob_core.experiment.run.events import StudyProgress
+from sparserob_core.experiment.run.inspection import Inspection, RelaxedValue
+from sparserob_core.experiment.run.landscape import (
+    Landscape,
+    LandscapeAxes,
+    deciding_again,
+    deciding_pair,
+    deciding_slots,
+    moving_of,
+)
 from sparserob_core.experiment.run.replay import stored_result
 from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
-from sparserob_core.sip.result import Result
+from sparserob_core.sip.result import Result, SearchTrace
 
 Drawing: TypeAlias = Callable[[], list[Path]]
 
 logger = logging.getLogger("sparserob")
+
+SECONDS = 2.0
+"""What the values of a landscape may take, after those of the coarsest grid, and what the tuples of the search may take
+that are evaluated once more. In a tenth of it the figure is coarse and the walk begins in its middle; ten times of it
+nobody waits for."""
+GRID = 65  # lines along each coordinate, of which the coarsest grid has every eighth
 
 
 def draw_run(directory: Path, plugins: Iterable[str | Path] = (), notify: Notify = ignore) -> list[Path]:
@@ -85,12 +101,100 @@ def drawings(
 
 
 def _landscape(experiment: Experiment, result: Result, directory: Path, notify: Notify) -> list[Path]:
-    from sparserob_core.experiment.figures.landscape_figure import write_landscape
-
     assert result.trace is not None
     inspection = Inspection(experiment.loaded, experiment)
     data = landscape_of(inspection, result.trace, printable(experiment.title), notify)
     return [] if data is None else write_landscape(directory / "figures", data)
+
+
+def landscape_of(
+    inspection: Inspection, trace: SearchTrace, title: str, notify: Notify = ignore
+) -> LandscapeData | None:
+    """The landscape through the best tuple of the last epsilon, over where the two indices are that decide most there,
+    or along the only coordinate that can move; ``None`` where no tuple with a finite value was kept, or nothing can
+    move.
+
+    It ends with the finest grid that is complete after `SECONDS`; ``notify`` receives `StudyProgress`.
+    """
+    mine = np.flatnonzero(trace.epsilon == trace.epsilon[-1]) if trace.epsilon.size else np.empty(0, dtype=int)
+    mine = mine[np.isfinite(trace.value[mine])]
+    if not mine.size or not trace.points.size:
+        return None
+    epsilon, top = float(trace.epsilon[-1]), int(mine[np.argmax(trace.value[mine])])
+    slot = inspection.relaxed_value(1, epsilon).slot
+    width, rest = slot.dimension, trace.points.shape[1] % slot.dimension
+    if rest or not np.isfinite(trace.points).all():
+        raise InputError(
+            f"evaluations: points: expected finite tuples of indices of {width} coordinates each, as the config says, "
+            f"got points of {trace.points.shape[1]}" + ("" if rest else ", not all finite")
+        )
+    count = trace.points.shape[1] // width
+    g, tuples = inspection.relaxed_value(count, epsilon), trace.points[mine].reshape(mine.size, count, width)
+    anchor = trace.points[top].reshape(count, width)
+    value, axes = g.at(anchor), LandscapeAxes.over(g, count)
+    accepted = trace.notes.get("accepted", np.full(trace.value.size, np.nan))[mine]
+    if axes is None:
+        if not moving_of(g):
+            return None
+        c = moving_of(g)[0]
+        across, along = _curve(g, anchor, c)
+        return LandscapeData(
+            title=title,
+            epsilon=epsilon,
+            axes=[across],
+            names=[g.names[c]],
+            values=along,
+            best=anchor[0, [c]],
+            best_value=value,
+            own_value=value,
+            visited=tuples[:, 0, [c]],
+            visited_values=trace.value[mine],
+            accepted=accepted,
+        )
+    pair = deciding_pair(g, anchor)
+    landscape = Landscape(g, anchor, *axes.places(pair, anchor), GRID, epsilon, axes)
+    _fill(landscape, notify)
+    notes = {name: column[mine] for name, column in trace.notes.items()}
+    plain, (across, up, values) = list(g.coordinates), landscape.shown
+    widths = (g.slot.upper - g.slot.lower)[plain]
+    slots = deciding_slots(deciding_again(g, trace.points[mine], notes, SECONDS), tuples[:, :, plain], widths, pair)
+    places = tuples[:, :, plain][np.arange(mine.size)[:, np.newaxis], slots]
+    visited = axes.of(tuple(plain), places)
+    assert visited is not None
+    return LandscapeData(
+        title=title,
+        epsilon=epsilon,
+        axes=[across, up],
+        names=landscape.names(),
+        values=values,
+        best=np.array([landscape.axes[k][landscape.at[k]] for k in (0, 1)]),
+        best_value=landscape.value,
+        own_value=value,
+        visited=visited,
+        visited_values=trace.value[mine],
+        accepted=accepted,
+    )
+
+
+def _fill(landscape: Landscape, notify: Notify) -> None:
+    """Evaluate a landscape to its finest grid, or to the one that is complete in time."""
+    began = time.monotonic()
+    for complete in landscape.evaluate():
+        if complete:
+            size = " x ".join(str(axis.size) for axis in landscape.shown[:2])
+            notify(StudyProgress(text=f"figures: the landscape of g on {size}"))
+        if landscape.level and time.monotonic() - began > SECONDS:
+            return
+
+
+def _curve(g: RelaxedValue, anchor: Array, c: int) -> tuple[Array, Array]:
+    """g of a tuple of one index along its coordinate ``c``, at `GRID` values and at its own."""
+    across = np.union1d(np.linspace(g.slot.lower[c], g.slot.upper[c], GRID), anchor[0, c])
+    slots, values = anchor.copy(), list[float]()
+    for to in across:
+        slots[0, c] = to
+        values.append(g.at(slots))
+    return across, np.nan_to_num(np.array(values), nan=-np.inf, posinf=np.inf, neginf=-np.inf)
 
 
 def drawn(

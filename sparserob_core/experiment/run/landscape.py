@@ -1,176 +1,289 @@
-"""The slice of g that the figure of a search shows: which coordinates, and how long its values may take."""
+"""The landscape of ``g`` over where the two indices are that decide most, the others held where the best tuple has
+them: which two these are in a tuple, the axes of the map, and its values.
+
+It is filled from coarse to fine by evaluations of its own, of another program with another solver, on lines that only
+the options and the tuple decide; two of these lines go through the tuple itself.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from itertools import product
-from typing import final
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TypeAlias, final
 
 import numpy as np
 
 from sparserob_core.errors import InputError
-from sparserob_core.experiment.figures.landscape_figure import LandscapeData
-from sparserob_core.experiment.run.events import StudyProgress
-from sparserob_core.experiment.run.inspection import Inspection, RelaxedValue
+from sparserob_core.experiment.run.inspection import RelaxedValue
 from sparserob_core.sip.convex_set import Array
-from sparserob_core.sip.events import Notify, ignore
-from sparserob_core.sip.result import SearchTrace
+from sparserob_core.sip.events import DECIDING
 
-SECONDS = 4.0
-"""What the values of a slice may take, after those of the coarsest grid."""
-GRIDS = (9, 17, 33, 65)
-"""Points along each coordinate; each grid holds the one before."""
-PROBES, CANDIDATES = 7, 12
+STRIDES = (8, 4, 2, 1)
+FLAT = 1e-9  # of g: smaller differences are the solver's
+CLOSE = 0.01  # of the distance of two lines of the grid
 
+Place: TypeAlias = tuple[int, int]
+"""Of a coordinate of a tuple: ``(slot, coordinate)``."""
 NEAR = 0.05
-"""Indices that are nearer to one another, in widths of the box, stand for one constraint and move together."""
+"""Indices that are nearer to one another, in widths of the box, stand for one constraint and move together. A tenth of
+it, and two that a search has put beside one another hide that g depends on them; ten times, and all of them are one."""
+
+
+@final
+@dataclass(eq=False)
+class Landscape:
+    """One slice through an ``anchor (D, width)``: ``values (a, b)`` over ``first`` and ``second``, coordinates
+    ``(slot, coordinate)``. Indices that are `NEAR` to one of these two stand for the same constraint and move with it;
+    of all that move the disturbance is at its worst.
+
+    ``values[i, j]`` belongs to ``axes[0][i]`` and ``axes[1][j]``; NaN where nothing was evaluated, ``inf`` where the
+    relaxed program is infeasible. ``axes[k][at[k]]`` is the anchor's coordinate. ``level`` is the stride of the finest
+    grid that is complete, 0 before the first.
+    """
+
+    g: RelaxedValue
+    anchor: Array
+    first: Place
+    second: Place
+    grid: int
+    epsilon: float = 0.0
+    seen: LandscapeAxes | None = None
+    values: Array = field(init=False)
+    axes: tuple[Array, Array] = field(init=False)
+    at: tuple[int, int] = field(init=False)
+    level: int = 0
+    spent: int = 0
+
+    def __post_init__(self) -> None:
+        one, other = (self._axis(place) for place in (self.first, self.second))
+        self.axes, self.at = (one[0], other[0]), (one[1], other[1])
+        self._bases = (one[2], other[2])
+        self._open = np.array([kind == "disturbance" for kind in self.g.kinds])
+        heads = (self.first[0], self.second[0])
+        self._moving = [[k for k in range(len(self.anchor)) if self._beside(k, heads) == head] for head in heads]
+        plain = [k for k in range(self.g.slot.dimension) if not self._open[k] and k != self.first[1]]
+        alike = bool((self.anchor[heads[0], plain] == self.anchor[heads[1], plain]).all())
+        alone = self._moving == [[head] for head in heads]
+        self._mirrored = self.first[1] == self.second[1] and alike and alone  # g is the same with the two exchanged
+        self._found: dict[tuple[float, ...], float] = {}
+        self.values = np.full((self.axes[0].size, self.axes[1].size), np.nan)
+
+    def _beside(self, slot: int, heads: tuple[int, int]) -> int:
+        """The head that an index is `NEAR` to, and moves with; -1 where there is none."""
+        widths = np.where(self.g.slot.upper > self.g.slot.lower, self.g.slot.upper - self.g.slot.lower, np.inf)
+        away = {head: (np.abs(self.anchor[slot] - self.anchor[head]) / widths)[~self._open].max() for head in heads}
+        if not self.g.interchangeable:
+            return slot if slot in heads else -1
+        nearest = slot if slot in heads else min(heads, key=lambda head: away[head])
+        return nearest if away[nearest] < NEAR else -1
+
+    def _axis(self, place: Place) -> tuple[Array, int, np.ndarray]:
+        """The values along an axis, which of them is the anchor's, and which are those of the even grid; where one of
+        these is close to the anchor, it moves there."""
+        even = np.linspace(self.g.slot.lower[place[1]], self.g.slot.upper[place[1]], self.grid)
+        nearest = int(np.abs(even - self.anchor[place]).argmin())
+        if abs(even[nearest] - self.anchor[place]) < CLOSE * (even[-1] - even[0]) / self.grid:
+            even[nearest] = self.anchor[place]
+        values = np.union1d(even, [self.anchor[place]])
+        return values, int(np.searchsorted(values, self.anchor[place])), np.searchsorted(values, even)
+
+    def lines(self, stride: int) -> tuple[np.ndarray, np.ndarray]:
+        """Which values of either axis belong to the grid of a stride: its ends and the anchor's always do."""
+        one, other = (
+            np.union1d(base[np.union1d(np.arange(0, self.grid, stride), [self.grid - 1])], [at])
+            for base, at in zip(self._bases, self.at, strict=True)
+        )
+        return one, other
+
+    def evaluate(self) -> Iterator[bool]:
+        """Evaluate one point at each step, the anchor first; ``True`` where a level has become complete."""
+        self._fill(*self.at)
+        yield False
+        for stride in STRIDES:
+            across, up = self.lines(stride)
+            for turn, i in enumerate(across):
+                # neighbours follow one another: the last optimum is a good start
+                for j in up if turn % 2 == 0 else up[::-1]:
+                    if np.isnan(self.values[i, j]):
+                        self._fill(int(i), int(j))
+                        yield False
+            self.level = stride
+            yield True
+
+    def _fill(self, i: int, j: int) -> None:
+        slots = self.anchor.copy()
+        for place, moving, to in zip(
+            (self.first, self.second), self._moving, (self.axes[0][i], self.axes[1][j]), strict=True
+        ):
+            # they keep their distance: at the anchor the tuple is the anchor's own, whose value none may lie below
+            c, shift = place[1], to - self.anchor[place]
+            slots[moving, c] = np.clip(self.anchor[moving, c] + shift, self.g.slot.lower[c], self.g.slot.upper[c])
+            slots[place] = to
+            slots[np.ix_(np.array(moving), self._open)] = np.nan
+        at = (float(self.axes[0][i]), float(self.axes[1][j]))
+        key = tuple(sorted(at)) if self._mirrored else at
+        if key not in self._found:
+            self._found[key] = self.g.at(slots)
+            self.spent += 1
+        value = self._found[key]
+        self.values[i, j] = value if not np.isnan(value) else -np.inf
+
+    @property
+    def value(self) -> float:
+        """``g`` at the anchor; NaN before the first evaluation."""
+        return float(self.values[self.at])
+
+    @property
+    def shown(self) -> tuple[Array, Array, Array]:
+        """The finest grid that is complete: its values along both axes, and those of ``g (a, b)`` there."""
+        across, up = self.lines(self.level or STRIDES[0])
+        return self.axes[0][across], self.axes[1][up], self.values[np.ix_(across, up)]
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """The least and the largest finite value that is shown; both NaN where there is none."""
+        values = self.shown[2]
+        known = values[np.isfinite(values)]
+        return (float(known.min()), float(known.max())) if known.size else (np.nan, np.nan)
+
+    @property
+    def flat(self) -> bool:
+        """Whether ``g`` is the same everywhere on the grid."""
+        low, high = self.limits
+        return bool(np.isfinite(self.shown[2]).all() and high - low <= FLAT * max(1.0, abs(high)))
+
+    def picture(self, size: int) -> Array:
+        """The values ``(size, size)`` on an even grid, between those that are known in straight lines; beside an
+        infinite value as the nearest of them."""
+        across, up, values = self.shown
+        shares = []
+        for axis in (across, up):
+            even = np.linspace(axis[0], axis[-1], size)
+            left = np.clip(np.searchsorted(axis, even, side="right") - 1, 0, axis.size - 2)
+            shares.append((left, (even - axis[left]) / (axis[left + 1] - axis[left])))
+        (i, s), (j, t) = shares
+        s, t = s[:, np.newaxis], t[np.newaxis, :]
+        corners = [values[np.ix_(i + di, j + dj)] for di, dj in ((0, 0), (1, 0), (0, 1), (1, 1))]
+        with np.errstate(invalid="ignore"):
+            mixed = (corners[0] * (1 - s) + corners[1] * s) * (1 - t) + (corners[2] * (1 - s) + corners[3] * s) * t
+        nearest = values[np.ix_(i + (s[:, 0] > 0.5), j + (t[0] > 0.5))]
+        finite = np.isfinite(corners[0]) & np.isfinite(corners[1]) & np.isfinite(corners[2]) & np.isfinite(corners[3])
+        return np.asarray(np.where(finite, mixed, nearest))
+
+    def names(self) -> tuple[str, str]:
+        """The two coordinates in words: ``t of the first deciding index``; just ``t`` where a tuple has a single
+        index."""
+        (one, c), (other, k) = self.first, self.second
+        if len(self.anchor) == 1:
+            return self.g.names[c], self.g.names[k]
+        if c == k:
+            which = ("the earlier", "the later") if self.g.kinds[c] == "time" else ("the lower", "the upper")
+        else:
+            which = ("the one", "the one" if one == other else "the other")
+        return f"{self.g.names[c]} of {which[0]}", f"{self.g.names[k]} of {which[1]}"
 
 
 @final
 @dataclass(frozen=True)
-class Place:
-    """One axis of a slice: the coordinate ``c`` of the indices ``slots``, which move together, the first as the axis
-    says."""
+class LandscapeAxes:
+    """The two axes of a map: each is a coordinate of an index, of that which decides most (``ranks`` 0) or of the other
+    (1). ``orders``: both are the same coordinate of two indices, of which the lesser is across."""
 
-    slots: tuple[int, ...]
-    c: int
+    ranks: tuple[int, int]
+    coordinates: tuple[int, int]
 
-    def at(self, anchor: Array) -> float:
-        """Where the tuple ``(D, width)`` has it."""
-        return float(anchor[self.slots[0], self.c])
+    @property
+    def orders(self) -> bool:
+        """Whether the axes are the same coordinate of two indices."""
+        return self.coordinates[0] == self.coordinates[1]
 
-    def moved(self, slots: Array, anchor: Array, g: RelaxedValue, to: float) -> None:
-        """Move it in ``slots``, which is changed; the others of its indices keep their distance, within the box."""
-        mine = list(self.slots)
-        shifted = anchor[mine, self.c] + (to - self.at(anchor))
-        slots[mine, self.c] = np.clip(shifted, g.slot.lower[self.c], g.slot.upper[self.c])
-        slots[mine[0], self.c] = to
+    @classmethod
+    def over(cls, g: RelaxedValue, count: int, named: tuple[str, str] | None = None) -> LandscapeAxes | None:
+        """The axes of the map of tuples of ``count`` indices: those ``named``, or else the first coordinate of an
+        index, such as its time, of two of them, or two coordinates of the only one; ``None`` where fewer than two can
+        move. Raises `InputError` for a name that there is not."""
+        if named is not None:
+            one, other = (coordinate(name, g) for name in named)
+            if one == other:
+                raise InputError(f"landscape: coordinates: expected two, got {named[0]!r} twice")
+            return cls((one[0], other[0]), (one[1], other[1]))
+        moving = moving_of(g)
+        if not moving or len(moving) * count < 2:
+            return None
+        return cls((0, 1), (moving[0], moving[0])) if count > 1 else cls((0, 0), (moving[0], moving[1]))
 
-    def name(self, g: RelaxedValue, count: int) -> str:
-        """In words: ``t of index 2``, ``t of indices 2, 5``; ``t`` where a tuple has a single index."""
-        if count == 1:
-            return g.names[self.c]
-        numbers = [str(slot + 1) for slot in sorted(self.slots)]
-        listed = ", ".join(numbers[:4]) + (", ..." if len(numbers) > 4 else "")
-        return f"{g.names[self.c]} of {'index' if len(numbers) == 1 else 'indices'} {listed}"
+    def places(self, pair: tuple[int, int], anchor: Array) -> tuple[Place, Place]:
+        """The places of the axes in a tuple ``(D, width)`` of which the indices ``pair`` decide most."""
+        one, other = ((pair[rank], c) for rank, c in zip(self.ranks, self.coordinates, strict=True))
+        return (other, one) if self.orders and anchor[other] < anchor[one] else (one, other)
 
-
-def landscape_of(
-    inspection: Inspection, trace: SearchTrace, title: str, notify: Notify = ignore
-) -> LandscapeData | None:
-    """The slice through the best tuple of the last epsilon, over the two coordinates that change g most there, or over
-    the only one that can move; ``None`` where no tuple with a finite value was kept, or nothing can move.
-
-    It ends with the finest of `GRIDS` that is complete after `SECONDS`; ``notify`` receives `StudyProgress`.
-    """
-    mine = np.flatnonzero(trace.epsilon == trace.epsilon[-1]) if trace.epsilon.size else np.empty(0, dtype=int)
-    mine = mine[np.isfinite(trace.value[mine])]
-    if not mine.size or not trace.points.size:
-        return None
-    epsilon, top = float(trace.epsilon[-1]), int(mine[np.argmax(trace.value[mine])])
-    slot = inspection.relaxed_value(1, epsilon).slot
-    width, rest = slot.dimension, trace.points.shape[1] % slot.dimension
-    if rest or not np.isfinite(trace.points).all():
-        raise InputError(
-            f"evaluations: points: expected finite tuples of indices of {width} coordinates each, as the config says, "
-            f"got points of {trace.points.shape[1]}" + ("" if rest else ", not all finite")
+    def of(self, told: tuple[int, ...], places: Array) -> Array | None:
+        """The points ``(n, 2)`` of places ``(n, 2, c)`` whose coordinates are those ``told (c,)``; ``None`` where these
+        have not come along."""
+        if not set(self.coordinates) <= set(told):
+            return None
+        points = np.stack(
+            [places[:, r, told.index(c)] for r, c in zip(self.ranks, self.coordinates, strict=True)], axis=-1
         )
-    g = inspection.relaxed_value(trace.points.shape[1] // width, epsilon)
-    anchor = trace.points[top].reshape(-1, width)
-    value = g.at(anchor)
-    places = chosen(g, anchor)
-    if not places:
-        return None
-    axes, values = _filled(g, anchor, places, notify)
-    columns = [place.slots[0] * width + place.c for place in places]
-    accepted = trace.notes.get("accepted", np.full(trace.value.size, np.nan))[mine]
-    return LandscapeData(
-        title=title,
-        epsilon=epsilon,
-        axes=axes,
-        names=[place.name(g, len(anchor)) for place in places],
-        values=values,
-        best=trace.points[top, columns],
-        best_value=value,
-        visited=trace.points[mine][:, columns],
-        visited_values=trace.value[mine],
-        accepted=accepted,
-    )
+        return np.sort(points, axis=1) if self.orders else points
 
 
-def chosen(g: RelaxedValue, anchor: Array) -> list[Place]:
-    """The coordinates of a tuple ``(D, width)``, two at most, along which g changes most when each alone goes through
-    its range; of the indices with the largest multipliers, those beside one another together, disturbances left out
-    where there is anything else; ``[]`` where nothing can move. g must have been evaluated at the tuple."""
-    moves = [c for c in range(g.slot.dimension) if g.slot.upper[c] > g.slot.lower[c]]
-    plain = [c for c in moves if g.kinds[c] != "disturbance"] or moves
-    candidates = [Place(slots, c) for slots in _neighbours(g, anchor, plain) for c in plain][:CANDIDATES]
-    spread = {place: _spread(g, anchor, place) for place in candidates}
-    return sorted(candidates, key=lambda place: -spread[place])[:2]
+def moving_of(g: RelaxedValue) -> list[int]:
+    """The coordinates of an index that a map may be over: those that can move, disturbances left out, and directions
+    where there is anything else."""
+    moving = [k for k in g.coordinates if g.kinds[k] != "direction"]
+    return moving or list(g.coordinates)
 
 
-def _neighbours(g: RelaxedValue, anchor: Array, plain: list[int]) -> list[tuple[int, ...]]:
-    """The indices of a tuple in groups that are near one another, those with the largest multipliers first."""
-    weights = g.weights()
-    order = [int(slot) for slot in np.argsort(-weights, kind="stable")]
-    scaled = anchor[:, plain] / (g.slot.upper - g.slot.lower)[plain]
-    groups: list[list[int]] = []
-    for slot in order:
-        near = next((group for group in groups if np.abs(scaled[group[0]] - scaled[slot]).max() < NEAR), None)
-        groups.append([slot]) if near is None else near.append(slot)
-    return [tuple(group) for group in sorted(groups, key=lambda group: -weights[group].sum())]
+def coordinate(name: str, g: RelaxedValue) -> tuple[int, int]:
+    """The rank and the coordinate of a name such as ``t``, ``p1`` or ``t[2]``, that of the index that decides second;
+    raises `InputError`."""
+    letter, bracket, rest = name.partition("[")
+    number = rest.removesuffix("]") if bracket else "1"
+    if letter not in g.names or number not in ("1", "2"):
+        raise InputError(
+            f"landscape: coordinates: there is no {name!r}; expected one of {', '.join(g.names[:6])}"
+            f"{', ...' if len(g.names) > 6 else ''}, of the index that decides most, or such a name with [2], of the "
+            "one that decides second"
+        )
+    return int(number) - 1, g.names.index(letter)
 
 
-def _spread(g: RelaxedValue, anchor: Array, place: Place) -> float:
-    """By how much g changes along a coordinate; infinite where some of it is infeasible."""
-    slots, values = anchor.copy(), [g.at(anchor)]
-    for one in np.linspace(g.slot.lower[place.c], g.slot.upper[place.c], PROBES):
-        place.moved(slots, anchor, g, float(one))
-        values.append(g.at(slots))
-    known = [value for value in values if not np.isnan(value)]
-    return max(known) - min(known) if np.isfinite(min(known, default=np.inf)) else 0.0
+def deciding_pair(g: RelaxedValue, anchor: Array) -> tuple[int, int]:
+    """The two indices that decide most at the tuple ``(D, width)`` at which g was evaluated last."""
+    plain = list(g.coordinates)
+    widths = g.slot.upper[plain] - g.slot.lower[plain]
+    return two_of(g.deciding(), anchor[:, plain], widths, (0, min(1, len(anchor) - 1)))
 
 
-def _filled(g: RelaxedValue, anchor: Array, places: list[Place], notify: Notify) -> tuple[list[Array], Array]:
-    """The finest grid that was complete in time, with its values; the tuple itself is a point of every grid."""
-    finest = [np.linspace(g.slot.lower[place.c], g.slot.upper[place.c], GRIDS[-1]) for place in places]
-    key, known = _key(anchor, places), dict[tuple[float, ...], float]()
-    slots, began = anchor.copy(), time.monotonic()
-    found: tuple[list[Array], Array] | None = None
-    for points in GRIDS:
-        stride = (GRIDS[-1] - 1) // (points - 1)
-        axes = [np.union1d(axis[::stride], place.at(anchor)) for axis, place in zip(finest, places, strict=True)]
-        for count, at in enumerate(_along(axes)):
-            if found is not None and time.monotonic() - began > SECONDS:
-                return found
-            if key(at) not in known:
-                for place, value in zip(places, at, strict=True):
-                    place.moved(slots, anchor, g, value)
-                found_here = g.at(slots)
-                known[key(at)] = -np.inf if np.isnan(found_here) else found_here
-            if count % axes[0].size == 0:
-                notify(StudyProgress(text=f"figures: the landscape of g on {' x '.join(str(a.size) for a in axes)}"))
-        values = [known[key(at)] for at in product(*axes)]
-        found = axes, np.array(values).reshape([axis.size for axis in axes])
-    assert found is not None
+def two_of(ranked: Sequence[int] | np.ndarray, slots: Array, widths: Array, others: Sequence[int]) -> tuple[int, int]:
+    """The two indices of a tuple ``(D, c)`` that decide most and do not stand for the same constraint: of those
+    ``ranked`` by their multipliers, -1 for none, then of the ``others``, then any; one twice where there is one."""
+    first, *rest = [int(k) for k in ranked if k >= 0] or [int(others[0])]
+    apart = [k for k in rest if np.abs((slots[k] - slots[first]) / widths).max() > NEAR]
+    second = next((k for k in (*apart, *others, *rest, *range(len(slots))) if k != first), first)
+    return first, int(second)
+
+
+def deciding_slots(deciding: np.ndarray, tuples: Array, widths: Array, pair: tuple[int, int]) -> np.ndarray:
+    """The two indices ``(n, 2)`` that decide most in each of the tuples ``(n, D, c)``, of which ``deciding (n, 4)``
+    ranks some, -1 for none; those of the tuple before, at first ``pair``, where fewer decide."""
+    found = np.empty((len(tuples), 2), dtype=int)
+    for row, (ranked, slots) in enumerate(zip(deciding, tuples, strict=True)):
+        found[row] = pair = two_of(ranked, slots, widths, pair)
     return found
 
 
-def _key(anchor: Array, places: list[Place]) -> Callable[[tuple[float, ...]], tuple[float, ...]]:
-    """By what a value is known: g is the same when two indices change places."""
-    if len(places) == 2 and places[0].c == places[1].c and all(len(place.slots) == 1 for place in places):
-        one, other = (np.delete(anchor[place.slots[0]], place.c) for place in places)
-        if np.array_equal(one, other):
-            return lambda at: tuple(sorted(at))
-    return lambda at: at
-
-
-def _along(axes: list[Array]) -> Iterator[tuple[float, ...]]:
-    """The points of a grid, each a neighbour of the one before, whose optimum is a good start."""
-    if len(axes) == 1:
-        yield from ((float(one),) for one in axes[0])
-        return
-    for turn, up in enumerate(axes[1]):
-        yield from ((float(across), float(up)) for across in (axes[0] if turn % 2 == 0 else axes[0][::-1]))
+def deciding_again(g: RelaxedValue, points: Array, notes: Mapping[str, Array], seconds: float) -> np.ndarray:
+    """The indices ``(n, 4)`` that decide most in each tuple ``(n, D width)`` of a search, which no directory keeps: by
+    evaluating those once more that the walk went to, the last ones first, for some ``seconds``; -1 of the others."""
+    found = np.full((len(points), DECIDING), -1)
+    accepted = notes.get("accepted", np.ones(len(points))) > 0.0
+    end = time.monotonic() + seconds
+    for row in np.flatnonzero(accepted)[::-1]:
+        if time.monotonic() > end:
+            break
+        g.at(points[row].reshape(-1, g.slot.dimension))
+        found[row] = g.deciding()
+    return found

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,8 @@ from sparserob_core.control.constraints.explanation import Witness
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.directory.finished import UNFINISHED, StoredRun, stored_run
 from sparserob_core.experiment.run.events import Event, RunFinished, RunStarted
-from sparserob_core.experiment.run.inspection import Inspection, RelaxedValue
+from sparserob_core.experiment.run.inspection import Inspection
+from sparserob_core.experiment.run.landscape import deciding_again
 from sparserob_core.experiment.run.viewer import recorded, recorder
 from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.convex_set import Array, Box
@@ -149,22 +149,6 @@ def _number(summary: Mapping[str, Any], name: str, missing: float = np.nan) -> f
     return missing if summary.get(name) is None else float(summary[name])
 
 
-def _deciding(
-    g: RelaxedValue, points: Array, notes: Mapping[str, Array], seconds: float = DECIDING_SECONDS
-) -> np.ndarray:
-    """The indices ``(n, 4)`` that decide most in each tuple ``(n, D width)`` of a search, which no directory keeps: by
-    evaluating those once more that the walk went to, the last ones first, for some ``seconds``; -1 of the others."""
-    found = np.full((len(points), DECIDING), -1)
-    accepted = notes.get("accepted", np.ones(len(points))) > 0.0
-    end = time.monotonic() + seconds
-    for row in np.flatnonzero(accepted)[::-1]:
-        if time.monotonic() > end:
-            break
-        g.at(points[row].reshape(-1, g.slot.dimension))
-        found[row] = g.deciding()
-    return found
-
-
 def _searches(trace: SearchTrace, inspection: Inspection) -> Iterator[tuple[int, EvaluationsFinished]]:
     """Every search in batches, each with the number of its round; the tuples of indices as far as they were kept."""
     size, width = trace.points.shape[1], inspection.width
@@ -179,7 +163,7 @@ def _searches(trace: SearchTrace, inspection: Inspection) -> Iterator[tuple[int,
         if whole:
             g = inspection.relaxed_value(size // width, float(trace.epsilon[which[0]]))
             domain = Box(np.tile(g.slot.lower, size // width), np.tile(g.slot.upper, size // width))
-            coordinates, deciding = g.coordinates, _deciding(g, points, notes)
+            coordinates, deciding = g.coordinates, deciding_again(g, points, notes, DECIDING_SECONDS)
         best, done = np.maximum.accumulate(ranked), 0
         batches = min(which.size, max(1, BATCHES * which.size // trace.outer.size))
         walked = int((~trace.polished[which]).sum())

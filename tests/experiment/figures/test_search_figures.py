@@ -99,6 +99,7 @@ def landscape(**changes: object) -> LandscapeData:
         values=np.add.outer(across, up),
         best=np.array([1.0, 4.0]),
         best_value=5.0,
+        own_value=5.0,
         visited=np.array([[0.0, 2.0], [0.5, 3.0], [1.0, 4.0]]),
         visited_values=np.array([2.0, 3.5, 5.0]),
         accepted=np.array([np.nan, 0.0, 1.0]),
@@ -117,6 +118,12 @@ def test_a_flat_slice_says_so_with_its_value() -> None:
     words = [text.get_text() for text in draw_landscape(landscape(values=np.full((5, 3), 5.0))).axes[0].texts]
     assert any("does not depend on t of index 1 and p of index 1 here: it is 5" in text for text in words)
     assert not any("does not depend" in text.get_text() for text in draw_landscape(landscape()).axes[0].texts)
+
+
+def test_a_tuple_below_the_map_is_told_with_both_values() -> None:
+    words = [text.get_text() for text in draw_landscape(landscape(own_value=4.5)).axes[0].texts]
+    assert any("4.5" in text and "5" in text.replace("4.5", "") for text in words)
+    assert not any("own" in text.get_text() for text in draw_landscape(landscape()).axes[0].texts)
 
 
 def test_what_no_control_meets_is_named(tmp_path: Path) -> None:

@@ -12,9 +12,8 @@ import pytest
 
 import sparserob_core as sr
 from sparserob_core.experiment.directory.finished import stored_run
-from sparserob_core.experiment.run import landscape
-from sparserob_core.experiment.run.drawing import draw_run, drawings, drawn
-from sparserob_core.experiment.run.landscape import Place, chosen, landscape_of
+from sparserob_core.experiment.run import drawing
+from sparserob_core.experiment.run.drawing import draw_run, drawings, drawn, landscape_of
 
 pytest.importorskip("matplotlib")
 
@@ -46,7 +45,7 @@ def searched(tmp_path_factory: pytest.TempPathFactory) -> sr.Outcome:
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     """No time but for the coarsest landscape."""
-    monkeypatch.setattr(landscape, "SECONDS", 0.0)
+    monkeypatch.setattr(drawing, "SECONDS", 0.0)
 
 
 def test_the_figures_of_a_search_are_drawn_from_its_directory(
@@ -97,32 +96,30 @@ def test_the_slice_varies_and_has_the_value_of_the_best_tuple_where_that_is(sear
     assert again == pytest.approx(data.visited_values[0], rel=1e-7)
 
 
-def test_indices_that_stand_for_the_same_constraint_move_together(searched: sr.Outcome) -> None:
+def test_indices_that_stand_for_the_same_constraint_move_together_at_their_distance(searched: sr.Outcome) -> None:
     trace = searched.result.trace
     assert trace is not None
     g = sr.Inspection.read(searched.directory).relaxed_value(3, 0.01)
     best = trace.points[np.argmax(np.where(trace.epsilon == trace.epsilon[-1], trace.value, -np.inf))].reshape(3, -1)
     g.at(best)
-    top = int(np.argmax(g.weights()))
-    twins = np.stack([best[top], best[top], best[top] + 0.01 * (g.slot.upper - g.slot.lower)])
-    twins = np.clip(twins, g.slot.lower, g.slot.upper)
-    value = g.at(twins)
-    places = chosen(g, twins)
-    assert all(len(place.slots) == 3 for place in places)
-    moved = twins.copy()
-    for to in np.linspace(g.slot.lower[places[0].c], g.slot.upper[places[0].c], 9):
-        places[0].moved(moved, twins, g, float(to))
-        assert ((moved >= g.slot.lower) & (moved <= g.slot.upper)).all()
-    places[0].moved(moved, twins, g, places[0].at(twins))
-    assert np.allclose(moved, twins) and g.at(moved) == pytest.approx(value, abs=1e-9)
-
-
-def test_a_place_is_named_as_its_indices_are_counted(searched: sr.Outcome) -> None:
-    g = sr.Inspection.read(searched.directory).relaxed_value(6, 0.01)
-    assert Place((1,), 0).name(g, 6) == "t of index 2"
-    assert Place((4, 1), 0).name(g, 6) == "t of indices 2, 5"
-    assert Place((4, 1, 0, 2, 3), 0).name(g, 6) == "t of indices 1, 2, 3, 4, ..."
-    assert Place((0,), 0).name(g, 1) == "t"
+    top, far = int(np.argmax(g.weights())), int(np.argmin(g.weights()))
+    beside = np.clip(best[top] - 0.01 * (g.slot.upper - g.slot.lower), g.slot.lower, g.slot.upper)
+    twins = np.stack([best[top], best[far], beside])
+    twins[1, 0] = g.slot.upper[0] if best[top, 0] < g.slot.upper[0] / 2 else g.slot.lower[0]
+    seen: list[np.ndarray] = []
+    kept = replace(g, at=lambda slots: seen.append(slots.copy()) or g.at(slots))
+    axes = sr.LandscapeAxes.over(g, 3)
+    assert axes is not None
+    landscape = sr.Landscape(kept, twins, *axes.places((0, 1), twins), 9, 0.01, axes)
+    list(landscape.evaluate())
+    assert landscape.value == pytest.approx(g.at(twins), abs=1e-9)
+    inside = [one for one in seen if g.slot.lower[0] + 0.1 < one[0, 0] < g.slot.upper[0] - 0.1]
+    assert len(inside) > 20
+    for one in seen:
+        assert ((one >= g.slot.lower) & (one <= g.slot.upper)).all()
+    for one in inside:
+        assert one[2, 0] - one[0, 0] == pytest.approx(twins[2, 0] - twins[0, 0], abs=1e-12)
+    assert (np.stack(seen)[:, :, 1:] == twins[:, 1:]).all()
 
 
 def test_tuples_of_another_size_are_refused_by_name(searched: sr.Outcome, tmp_path: Path) -> None:
