@@ -9,6 +9,7 @@ from typing import Literal, TypeAlias, final
 
 import numpy as np
 
+from sparserob_core.brief import brief
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.program import Formulation
 
@@ -23,6 +24,8 @@ class Cut:
     row: int
     multiplier: float = 0.0
     formulation: Formulation = "reduced"
+
+    __repr__ = brief
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +42,8 @@ class Dual:
     z: Array | None = None
     fixed: Array = field(default_factory=lambda: np.zeros(0))
     at: Array | None = None
+
+    __repr__ = brief
 
 
 NO_BOUND = Dual(-np.inf, (), np.zeros(0))
@@ -64,6 +69,8 @@ class InfeasibleSubsystem:
     demand: str = ""
     decides: str = "decision"
     irreducible: bool = True
+
+    __repr__ = brief
 
     def sentence(self, amounts: bool = True) -> str:
         """All of it for people; without ``amounts`` where the units of the rows mean nothing to them."""
@@ -112,6 +119,8 @@ class Proof:
     units: Array | None = None
     share: float | None = None
 
+    __repr__ = brief
+
 
 @dataclass(frozen=True, eq=False)
 class Leaf:
@@ -149,6 +158,8 @@ class Sparsest:
     plain_count: float | None
     tree: Tree
     letters: Sequence[float] | None = None
+
+    __repr__ = brief
 
 
 @dataclass(frozen=True, eq=False)

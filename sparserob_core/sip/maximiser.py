@@ -9,6 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
+from sparserob_core.brief import brief
 from sparserob_core.errors import SparseRobError
 from sparserob_core.sip.convex_set import Array, Box
 
@@ -159,6 +160,8 @@ class Trace:
     notes: Mapping[str, Array] = field(default_factory=dict)
     searched: int | None = None
 
+    __repr__ = brief
+
 
 @dataclass(frozen=True, eq=False)
 class Report:
@@ -175,3 +178,5 @@ class Report:
     trace: Trace
     stopped: str
     interrupted: bool = False
+
+    __repr__ = brief

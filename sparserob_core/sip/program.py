@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias, final
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.brief import brief
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import Float, read_only, sealed, shaped
 from sparserob_core.sip.convex_set import Array, Box, as_bound
@@ -66,6 +67,8 @@ class WorstConstraint:
     index: Array
     row: int = 0
     formulation: Formulation = "reduced"
+
+    __repr__ = brief
 
 
 @dataclass(frozen=True, eq=False)

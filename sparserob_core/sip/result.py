@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
+from sparserob_core.brief import brief
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import RoundFinished, gains
 from sparserob_core.sip.evidence import NO_BOUND, Activity, Cut, Dual, InfeasibleSubsystem, Proof, Sparsest
@@ -58,6 +59,8 @@ class SearchTrace:
     points: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
     notes: Mapping[str, Array] = field(default_factory=dict, repr=False)
     polished: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool), repr=False)
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         if not self.polished.size:

@@ -7,6 +7,7 @@ from typing import ClassVar, final
 
 import numpy as np
 
+from sparserob_core.brief import brief
 from sparserob_core.control.problem.names import UNNAMED, Names
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.sip.convex_set import Array
@@ -25,6 +26,8 @@ class Witness(WorstConstraint):
     parameter: Array | None = None
     disturbance: Array | None = field(default=None, repr=False)
     initial_state: Array | None = None
+
+    __repr__ = brief
 
 
 @final

@@ -9,6 +9,7 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.brief import brief
 from sparserob_core.control.loop.resolving import Plan, Resolving
 from sparserob_core.control.studies.measuring import Measuring
 from sparserob_core.errors import InputError
@@ -31,6 +32,8 @@ class Step:
     covered: bool
     cost: float = np.nan
     lower_bound: float = np.nan
+
+    __repr__ = brief
 
 
 @final

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sparserob_core.brief import brief
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.matrix_exponential import transitions
 from sparserob_core.control.response.disturbance import DisturbanceModel
@@ -46,6 +47,8 @@ class Adversary:
     disturbance: Array | None
     initial_state: Array
     deviation: Array | None = None
+
+    __repr__ = brief
 
 
 def find_adversary(constraint: StateConstraint, decision: Array, feedback: Feedback | None = None) -> Adversary | None:

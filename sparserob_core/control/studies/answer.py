@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.brief import brief
 from sparserob_core.control.policies.policy import Policy
 from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
@@ -59,6 +60,8 @@ class Tube:
     nominal: Array
     lower: Array
     upper: Array
+
+    __repr__ = brief
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)

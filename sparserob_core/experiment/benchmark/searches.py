@@ -8,6 +8,7 @@ from typing import Any, final
 
 import numpy as np
 
+from sparserob_core.brief import brief
 from sparserob_core.experiment.benchmark.landscapes import Landscape
 from sparserob_core.experiment.comparison.curve import spent_until
 from sparserob_core.experiment.comparison.profiles import Profiles
@@ -27,6 +28,8 @@ class Search:
     """CPU time that the maximiser itself took: that of the search without the function's."""
     point: Array = field(repr=False)
 
+    __repr__ = brief
+
     def needed(self, target: float) -> float:
         """Evaluations until a value; infinite where it was not reached."""
         return spent_until(target, self.best, np.arange(1.0, self.best.size + 1.0))
@@ -42,6 +45,8 @@ class Benchmark:
     searches: Sequence[Search]
     targets: Sequence[float]
     budget: int
+
+    __repr__ = brief
 
     def expected_running_time(self, landscape: int, contender: str) -> float:
         """All evaluations of a contender on a landscape, up to the target or the end, divided by the searches that

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
+from sparserob_core.brief import brief
 from sparserob_core.checker.outcome import Clock, Finding
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.check.files import compared
@@ -36,6 +37,8 @@ class Check:
     claims: tuple[Finding, ...]
     seconds: float
     not_compared: tuple[str, ...] = ()
+
+    __repr__ = brief
 
     @property
     def status(self) -> str:

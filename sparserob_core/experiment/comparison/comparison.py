@@ -8,6 +8,7 @@ from typing import final
 
 import numpy as np
 
+from sparserob_core.brief import brief
 from sparserob_core.experiment.comparison.curve import Curve
 
 
@@ -22,6 +23,8 @@ class Comparison:
     exact: float = np.nan
     certified: int | None = None
     undrawn: str = ""
+
+    __repr__ = brief
     """Why there is no figure, where one was asked for."""
 
     @property

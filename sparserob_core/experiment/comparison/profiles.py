@@ -9,6 +9,7 @@ from typing import Any, Literal, final
 
 import numpy as np
 
+from sparserob_core.brief import brief
 from sparserob_core.sip.convex_set import Array
 
 Measure = Literal["evaluations", "seconds"]
@@ -28,6 +29,8 @@ class Instance:
     exact: float
     certified: bool
     unit: float
+
+    __repr__ = brief
 
 
 @final
@@ -54,6 +57,8 @@ class Profiles:
     undrawn: str = ""
     """Why there is no figure, where one was asked for."""
     _cache: dict[float, Array] = field(default_factory=dict, repr=False)
+
+    __repr__ = brief
 
     def quantile(self, share: float) -> Array:
         """The least times ``(P, S)`` within which that share of the seeds had solved the problem."""

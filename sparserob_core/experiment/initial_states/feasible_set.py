@@ -9,6 +9,7 @@ from typing import Any, Literal, final
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.brief import brief
 from sparserob_core.control.problem.names import UNNAMED, Names
 from sparserob_core.control.studies.polygon_approximation import inside, polygon_area
 from sparserob_core.errors import InputError
@@ -61,6 +62,8 @@ class InitialStates:
     remarks: Sequence[str] = ()
     programs: int = 0
     seconds: float = 0.0
+
+    __repr__ = brief
 
     @property
     def names(self) -> tuple[str, str]:

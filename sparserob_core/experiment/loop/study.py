@@ -9,6 +9,7 @@ from typing import Any, final
 
 import numpy as np
 
+from sparserob_core.brief import brief
 from sparserob_core.sip.convex_set import Array
 
 
@@ -43,6 +44,8 @@ class ClosedLoops:
     paths: Sequence[tuple[str, Array]] = field(repr=False)
     controls: Sequence[tuple[str, Array]] = field(repr=False)
     undrawn: str = ""
+
+    __repr__ = brief
     """Why there is no figure, where one was asked for."""
 
     @property

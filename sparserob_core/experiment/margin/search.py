@@ -10,6 +10,7 @@ from typing import Literal, TypeAlias, final
 
 import numpy as np
 
+from sparserob_core.brief import brief
 from sparserob_core.control.studies.causal import Ended
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.margin.critical import Critical, critical_factor
@@ -92,6 +93,8 @@ class Margin:
     covered: tuple[tuple[float, float], ...] = ()
     causal_upper: float = np.nan
     causal_ended: Ended | None = None
+
+    __repr__ = brief
 
 
 @final

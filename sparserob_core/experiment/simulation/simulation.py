@@ -9,6 +9,7 @@ from typing import Any, final
 
 import numpy as np
 
+from sparserob_core.brief import brief
 from sparserob_core.sip.convex_set import Array
 
 CONFIDENCE = 0.95
@@ -48,6 +49,8 @@ class ConstraintShare:
     worst_time: float
     worst_parameter: Sequence[float]
 
+    __repr__ = brief
+
     @property
     def share(self) -> float:
         """The share of the trajectories that violate it."""
@@ -82,6 +85,8 @@ class Simulation:
     upper: Array = field(repr=False)
     seconds: float
     undrawn: str = ""
+
+    __repr__ = brief
     """Why there is no figure, where one was asked for."""
 
     @property

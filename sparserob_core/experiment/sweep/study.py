@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, final, overload
 
+from sparserob_core.brief import brief
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import assemble
 from sparserob_core.experiment.config.load import load_config
@@ -44,6 +45,8 @@ class Study:
     arrangement: Arrangement = "grid"
     stopped: str = ""
     remarks: Sequence[str] = ()
+
+    __repr__ = brief
 
     @property
     def outcomes(self) -> Outcomes:
