@@ -180,14 +180,15 @@ def maximise(
     after that time. ``callback(points, values)`` is called after every batch of evaluations, ``notify`` with
     `EvaluationsFinished` at least after every twentieth of the budget; what one of them raises is told in a warning,
     and it is not called again. Further keywords are the maximiser's options.
-    Raises `InputError` when an argument is at fault, and `EvaluationError` when ``f`` fails.
+    Raises `InputError` when an argument is at fault, and `EvaluationError` when ``f`` fails, returns
+    complex numbers, or nothing but NaN.
     """
     from sparserob_core.sip.search.search import Rules, Target
     from sparserob_core.sip.search.search import maximise as search
 
     chosen, share = _chosen(box, name, options, polish)
     limit = as_seconds(seconds)
-    return search(
+    report = search(
         Target(f if callback is None else _told(f, _careful("callback", callback)), box, gradient),
         chosen,
         whole("budget", budget, 1),
@@ -196,6 +197,15 @@ def maximise(
         notify if notify is ignore else _careful("notify", notify),
         _placed(start, box),
     )
+    if report.missing and report.missing == report.evaluations and not report.interrupted:
+        from sparserob_core.sip.maximiser import EvaluationError
+
+        raise EvaluationError(
+            f"the function gave NaN at each of the {report.missing} points that were asked for; expected real numbers, "
+            "and NaN or -inf only where there is none",
+            report,
+        )
+    return report
 
 
 def ask_tell(

@@ -138,8 +138,8 @@ class Maximiser(ABC):
 
 
 class EvaluationError(SparseRobError):
-    """The function that is maximised raised, or did not return one number per point; ``report`` holds what was found
-    before."""
+    """The function that is maximised raised, or did not return one real number per point, or NaN at all of them;
+    ``report`` holds what was found before."""
 
     def __init__(self, message: str, report: Report) -> None:
         super().__init__(message)
@@ -168,7 +168,8 @@ class Report:
     """The outcome of a search: the best evaluated value and where, and a proven ``upper_bound`` of the maximum
     (``inf``: none).
 
-    ``stopped`` says why the search ended; ``best_point`` is NaN ``(d,)`` when nothing was evaluated.
+    ``stopped`` says why the search ended; ``missing`` evaluations gave NaN, which counts as ``-inf``;
+    ``best_point`` is NaN ``(d,)`` when nothing was evaluated.
     """
 
     best_value: float
@@ -178,5 +179,6 @@ class Report:
     trace: Trace
     stopped: str
     interrupted: bool = False
+    missing: int = 0
 
     __repr__ = brief

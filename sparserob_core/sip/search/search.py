@@ -95,6 +95,7 @@ class CountedObjective:
         self.rules: Rules | None = rules or Rules()
         self.best_value, self.best_point = -np.inf, np.full(self.domain.dimension, np.nan)
         self.evaluations = 0
+        self.missing = 0  # evaluations that gave NaN
         self.searched: int | None = None
         self.ended: SearchEnded | EvaluationError | None = None
         self._keeps = self.domain.dimension * self.budget <= KEPT_NUMBERS
@@ -212,7 +213,9 @@ class CountedObjective:
         seconds = np.repeat([moment for _, moment in self._seconds], [count for count, _ in self._seconds])
         notes = {name: np.array(rows) for name, rows in self._notes.items()}
         trace = Trace(points, values, np.maximum.accumulate(values), seconds, notes, self.searched)
-        return Report(self.best_value, self.best_point, self.evaluations, upper_bound, trace, stopped)
+        return Report(
+            self.best_value, self.best_point, self.evaluations, upper_bound, trace, stopped, missing=self.missing
+        )
 
     def notify_observers(self) -> None:
         """Send what was evaluated since the last event."""
@@ -253,12 +256,16 @@ class CountedObjective:
         missing = np.isnan(values)
         if missing.any():
             values[missing] = -np.inf
+            self.missing += int(missing.sum())
         return values
 
     def _called(self, function: Function, argument: Array, shape: tuple[int, ...]) -> Array:
         """What the user's function returns, of the right shape; whatever it raises ends the search."""
         try:
-            values = np.asarray(function(argument), dtype=float)
+            returned = np.asarray(function(argument))
+            if np.iscomplexobj(returned):
+                raise ValueError(f"expected real numbers, got complex ones, such as {returned.flat[:1].tolist()}")
+            values = np.asarray(returned, dtype=float)
             if values.shape != shape:
                 raise ValueError(f"expected {shape[0]} numbers, got an array of shape {values.shape}")
         except KeyboardInterrupt:

@@ -107,6 +107,25 @@ def test_a_function_that_does_not_return_one_number_per_point_is_named_as_the_fa
         search(Asking(2), answer)
 
 
+@pytest.mark.parametrize("answer", [lambda points: points[:, 0] + 0j, lambda points: [1j] * len(points)])
+def test_complex_values_are_refused_with_what_was_expected(answer):
+    with pytest.raises(sr.EvaluationError, match="expected real numbers, got complex ones"):
+        search(Asking(2), answer)
+
+
+def test_a_function_that_is_nowhere_a_number_is_refused_and_one_that_is_once_is_not():
+    def found(function):
+        return sr.maximise(function, SQUARE, Asking(3, 3), budget=6, polish=0.0)
+
+    with pytest.raises(sr.EvaluationError, match="NaN at each of the 6 points that were asked for; expected") as caught:
+        found(lambda points: points[:, 0] * np.nan)
+    assert caught.value.report.evaluations == caught.value.report.missing == 6
+    once = found(lambda points: [np.nan, 7.0, np.nan])
+    assert (once.best_value, once.missing) == (7.0, 4)
+    nowhere = found(lambda points: np.full(3, -np.inf))
+    assert (nowhere.best_value, nowhere.missing) == (-np.inf, 0)
+
+
 def test_the_error_of_a_failing_function_carries_the_best_point_so_far():
     def failing(points):
         if len(points) == 3:
