@@ -341,6 +341,8 @@ def test_a_flat_slice_says_so_and_has_no_range_of_its_own() -> None:
     landscape = mapped(Plain(lambda s: 0.632, [0, -1]), np.array([[0.5], [0.7]]))
     assert landscape.flat and landscape.limits == (0.632, 0.632)
     assert _said(landscape) == ["g does not depend on these two here: 0.632"]
+    landscape.level = 2
+    assert _said(landscape) == ["g is 0.632 on all lines of this coarse grid"]
     tilted = sr.Landscape(Plain(lambda s: s[0, 0], [0, -1]), np.array([[0.5], [0.7]]), (0, 0), (1, 0), 8)  # type: ignore[arg-type]
     list(tilted.evaluate())
     assert not tilted.flat and _said(tilted) == ["g from 0 (dark) to 1 (bright)"]
@@ -535,6 +537,8 @@ def test_an_outcome_can_be_shown_with_all_that_it_knows(searched: sr.Outcome, tm
         walk[np.isfinite(walk)] == walk_of(searched.result.trace)[np.isfinite(walk_of(searched.result.trace))]
     ).all()
     assert {"/landscape/map/walk", "/search/notes/temperature", "/search/moves/t"} <= set(found)
+    # the cursor of every timeline goes over where the search has moved
+    assert {"evaluation", "round", "time"} <= set(found["/search/moves/t"][-1].to_record_batch().schema.names)
     assert sum(chunk.num_rows for chunk in found["/physics/plots/curve"]) == len(searched.result.history) + 1
 
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -151,3 +154,25 @@ def test_the_map_of_a_policy_goes_through_its_proven_bound_and_nowhere_above_its
             moved[moving, place[1]] = to
             moved[moving, 1:] = np.nan
         assert least - 1e-6 <= g.at(moved) <= most + 1e-6
+
+
+def test_where_nothing_is_seen_on_a_coarse_grid_a_finer_one_comes_before_that_of_a_better_tuple() -> None:
+    from sparserob_rerun.options import LandscapeOptions
+    from sparserob_rerun.search.explorer import Aim, Explorer
+
+    def levels(value: Callable[[np.ndarray], float]) -> list[tuple[int, float]]:
+        box = sr.Box(np.zeros(1), np.ones(1))
+        g: Any = SimpleNamespace(at=value, slot=box, names=("t",), kinds=("time",), coordinates=(0,))
+        g.deciding, g.interchangeable = (lambda: np.array([0, 1, -1, -1])), True
+        view: Any = SimpleNamespace(relaxed_value=lambda count, epsilon: g)
+        drawn: list[tuple[int, float]] = []
+        explorer = Explorer(lambda shown, aim: drawn.append((shown.level, aim.value)), view, LandscapeOptions())
+        explorer.aim(Aim(np.array([[0.2], [0.7]]), 0.1, 1.0, ""))
+        while len(drawn) < 4:
+            explorer.step(hurry=True)
+            if len(drawn) == 1:
+                explorer.aim(Aim(np.array([[0.3], [0.8]]), 0.1, 2.0, ""))
+        return drawn
+
+    assert levels(lambda slots: 3.0) == [(8, 1.0), (4, 1.0), (2, 1.0), (8, 2.0)]
+    assert levels(lambda slots: 3.0 + slots[0, 0])[1] == (8, 2.0)

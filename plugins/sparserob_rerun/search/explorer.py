@@ -23,6 +23,9 @@ different are seconds old; a tenth, and the last digits of a polished search beg
 STALE = 1.0
 """Seconds after which any gain that is to be seen is enough. Ten times as many, and what is drawn is of ten seconds
 ago; with a tenth a landscape that a slow climb renews is never refined."""
+BETWEEN = 2
+"""The stride to which a landscape is refined on which g is the same everywhere, before another one is begun of the same
+weight. On four times as coarse a grid what matters lies between two lines; on the finest, flat ones are seconds old."""
 HELD = 0.8
 """Seconds for which a new landscape may wait until it is as fine as the one that is shown, which is of the same weight
 and nearly as high. Ten times as many, and what is drawn is too old; a tenth, and fine drawings flicker."""
@@ -177,6 +180,8 @@ class Explorer:
         if self.aimed is None or self._finished or self.landscape is None:
             return self.aimed is None or self._finished
         if not self._coarse:
+            return False
+        if self.landscape.flat and self.landscape.level > BETWEEN:
             return False
         gain = _gain(waiting, self.aimed, self.landscape)
         return not gain <= LARGE or (gain > SAME and time.monotonic() - self.since > STALE)

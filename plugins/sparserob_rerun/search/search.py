@@ -90,7 +90,7 @@ class SearchView:
                 rows = self.rr.Scalars.columns(scalars=_shown(values))
                 self.stream.send_columns(f"search/g/{name}", at(np.arange(count)), rows)
         self._notes(event, stage, numbers, began)
-        self._moves(event, stage, numbers, moving, projection.moves)
+        self._moves(event, stage, numbers, began, moving, projection.moves)
         self.timelines.move(stage.base + event.total, event.round, began + event.seconds)
 
     def exact(self, value: float, epsilon: float) -> None:
@@ -145,7 +145,13 @@ class SearchView:
         return np.asarray((sums[ends] - sums[starts]) / (ends - starts))
 
     def _moves(
-        self, event: sr.EvaluationsFinished, stage: Stage, numbers: np.ndarray, moving: dict[int, str], moves: Floats
+        self,
+        event: sr.EvaluationsFinished,
+        stage: Stage,
+        numbers: np.ndarray,
+        began: float,
+        moving: dict[int, str],
+        moves: Floats,
     ) -> None:
         """Where the coordinates went that moved ``(m, 3)``, one series for each kind: to which time or parameter. Of
         a walk the moves that it accepted."""
@@ -158,7 +164,8 @@ class SearchView:
             self.moved.add(name)
 
             def at(which: np.ndarray, rows: Floats = mine) -> list[Any]:
-                return [self.rr.TimeColumn("evaluation", sequence=numbers[rows[which, 0].astype(int)])]
+                these = rows[which, 0].astype(int)
+                return self.timelines.columns(numbers[these], began + event.batch.trace.seconds[these], event.round)
 
             self._cloud(f"search/moves/{name}", at, mine[:, 2], (f"{name} of what moved", ink.PURPLE))
 

@@ -294,6 +294,8 @@ def _said(landscape: sr.Landscape) -> list[str]:
     if not np.isfinite(low):
         return ["no control meets the constraints anywhere", "here: g is infinite"]
     if landscape.flat or high == low:
+        if landscape.level > 1:  # what lies between the lines is not known yet
+            return [f"g is {low:.6g} on all lines of this coarse grid"]
         return [f"g does not depend on these two here: {low:.6g}"]
     digits = int(np.clip(2 - np.floor(np.log10((high - low) / max(abs(low), abs(high)))), 5, 12))  # that differ
     said = [f"g from {low:.{digits}g} (dark) to {high:.{digits}g} (bright)"]
