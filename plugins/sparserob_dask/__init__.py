@@ -40,7 +40,8 @@ class Dask(sr.ExecutorFactory, sr.Options):
     reach."""
 
     timeout: float = Field(default=60.0, gt=0.0)
-    """Seconds to wait until dask has begun, and as many until a worker is there."""
+    """Seconds to wait until dask has begun, and as many until a worker is there. What is waited for is said after two
+    seconds."""
 
     @model_validator(mode="after")
     def _one_cluster(self) -> Dask:
@@ -59,7 +60,7 @@ class Dask(sr.ExecutorFactory, sr.Options):
             from sparserob_dask.cluster import connected, started
         except ModuleNotFoundError as error:
             raise sr.UnknownPluginError(
-                f"executor 'dask' needs the package {error.name}: pip install 'sparserob[dask]'"
+                "executor 'dask' needs the package distributed: pip install 'sparserob[dask]'"
             ) from error
         with sr.one_thread():  # here, too: what this process adds up, it adds up as the workers do
             if self.address is not None:

@@ -26,6 +26,7 @@ import sparserob_core as sr
 Arguments = ParamSpec("Arguments")
 Answer = TypeVar("Answer")
 
+SILENT = 2.0  # seconds; ten times less, and every cluster that begins is told; ten times more, and it seems to hang
 LOUD = 50  # logging.CRITICAL: what dask has to say about workers that are ended on purpose is not for users
 SETTINGS = {
     "distributed.scheduler.allowed-failures": 0,  # whoever submits decides whether to try again
@@ -38,9 +39,14 @@ SETTINGS = {
 def started(workers: int | None, host: str, timeout: float) -> Iterator[Executor]:
     """A cluster of this machine, which ends with the context."""
     with _event_loop(timeout) as loop:
-        with dask.config.set(SETTINGS), sr.without_script():
+        count = workers or sr.processors()
+        with (
+            _telling(f"for its {count} workers on {host} to begin", timeout),
+            dask.config.set(SETTINGS),
+            sr.without_script(),
+        ):
             cluster = LocalCluster(
-                n_workers=workers or sr.processors(),
+                n_workers=count,
                 threads_per_worker=1,
                 host=host,
                 dashboard_address=f"{host}:0",
@@ -105,14 +111,16 @@ def _event_loop(timeout: float) -> Iterator[IOLoop]:
 def _connected(address: str, timeout: float, loop: IOLoop, breaks: bool) -> Iterator[Executor]:
     """The same; ``breaks``: whether a worker that dies ends the executor."""
     try:
-        client = _Client(address, timeout=timeout, set_as_default=False, loop=loop)
+        with _telling(f"for the scheduler at {address} to answer", timeout):
+            client = _Client(address, timeout=timeout, set_as_default=False, loop=loop)
     except (OSError, TimeoutError, ValueError) as error:
         raise sr.InputError(
             path="executor.address", expected="the address of a dask scheduler that answers", got=f"{address} ({error})"
         ) from error
     try:
         try:
-            client.wait_for_workers(1, timeout=timeout)
+            with _telling(f"for a worker at {address}: dask worker {address}", timeout):
+                client.wait_for_workers(1, timeout=timeout)
         except TimeoutError:
             raise sr.InputError(
                 f"executor dask: no worker at {address} within {timeout:g} s; start some with `dask worker {address}`"
@@ -130,6 +138,18 @@ def _connected(address: str, timeout: float, loop: IOLoop, breaks: bool) -> Iter
         executor.shutdown()
     finally:
         client.close(timeout=timeout)
+
+
+@contextmanager
+def _telling(what: str, timeout: float) -> Iterator[None]:
+    """Say on the standard error stream what is waited for, if it lasts."""
+    timer = threading.Timer(SILENT, sys.stderr.write, [f"dask: waiting up to {timeout:g} s {what}\n"])
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 @final

@@ -28,7 +28,7 @@ def test_a_missing_package_is_named_with_the_extra_that_brings_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     monkeypatch.setitem(sys.modules, "cloudpickle", None)
     with (
-        pytest.raises(sr.UnknownPluginError, match=r"needs the package \w+: pip install 'sparserob\[dask\]'"),
+        pytest.raises(sr.UnknownPluginError, match=r"needs the package distributed: pip install 'sparserob\[dask\]'"),
         opened(),
     ):
         pass
@@ -59,6 +59,42 @@ def test_a_scheduler_that_does_not_answer_is_an_error_of_the_input(address):
 
     left = [one.status for one in gc.get_objects() if isinstance(one, Client)]
     assert set(left) <= {"closed"}, "the garbage collector would close it, and wait for locks of whatever it interrupts"
+
+
+def test_what_is_waited_for_is_told_once_it_lasts(monkeypatch, capfd):
+    pytest.importorskip("distributed")
+    from sparserob_dask import cluster
+
+    class Client:
+        """Answers at once; its workers never come."""
+
+        def __init__(self, address, **options):
+            pass
+
+        def wait_for_workers(self, count, timeout):
+            time.sleep(timeout)
+            raise TimeoutError
+
+        def close(self, timeout):
+            pass
+
+    monkeypatch.setattr(cluster, "SILENT", 0.05)
+    monkeypatch.setattr(cluster, "_Client", Client)
+    with pytest.raises(sr.InputError, match="no worker at tcp://here:1"), opened(address="tcp://here:1", timeout=0.5):
+        pass
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line == "dask: waiting up to 0.5 s for a worker at tcp://here:1: dask worker tcp://here:1"
+    time.sleep(0.1)
+    assert not capfd.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_does_not_answer_is_named_after_two_seconds(capfd):
+    pytest.importorskip("distributed")
+    address = "tcp://127.0.0.1:1"
+    with pytest.raises(sr.InputError, match="a dask scheduler that answers"), opened(address=address, timeout=3.0):
+        pass
+    assert f"dask: waiting up to 3 s for the scheduler at {address} to answer" in capfd.readouterr().err.splitlines()
 
 
 @pytest.mark.slow

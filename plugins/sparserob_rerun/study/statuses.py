@@ -66,7 +66,9 @@ def said(value: Any) -> str:
 
 
 def named(axes: Sequence[str], values: Sequence[Any]) -> str:
-    """A point in words: the last step of each key and its value."""
+    """A point in words: the last step of each key and its value; of a study without axes there is only one."""
+    if not axes:
+        return "the only point"
     steps = [[step for step in key.split(".") if step != "name"] for key in axes]
     return ", ".join(
         f"{(step or [key])[-1]} {said(value)}" for key, step, value in zip(axes, steps, values, strict=True)

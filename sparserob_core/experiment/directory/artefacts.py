@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+import platform
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from io import BytesIO
 from pathlib import Path
@@ -72,7 +73,7 @@ def create_directory(out: str | Path | None, name: str, digest: str, again: str 
     """
     path = Path(out) if out is not None else _stamped(name, digest)
     lock = Lock(path)
-    try:
+    with _faults_of(path):
         path.mkdir(parents=True, exist_ok=True)
         _require_empty(path, unless=(lock.file.name, again))
         lock.acquire()
@@ -81,19 +82,49 @@ def create_directory(out: str | Path | None, name: str, digest: str, again: str 
         except InputError:
             lock.release()
             raise
+    return RunDirectory(path, lock)
+
+
+def share_directory(out: str | Path, first: str, text: str) -> RunDirectory:
+    """Make a directory that several processes fill at once, each with files of its own, or join the others: ``out``,
+    which must be new or empty, or hold the file ``first``. Who comes first writes ``text`` into it, whole; that of
+    somebody else is left as it is. It is not locked.
+
+    Raises `InputError` when it is neither, or when it cannot be written to.
+    """
+    path = Path(out)
+    with _faults_of(path):
+        path.mkdir(parents=True, exist_ok=True)
+        _require_empty(path, unless=(first,))
+        temporary = path / f".{first}.{platform.node()}.{os.getpid()}.tmp"
+        try:
+            temporary.write_text(text, encoding="utf-8", newline="")
+            with suppress(FileExistsError):
+                (path / first).hardlink_to(temporary)  # whole, and never in the place of another one: no rename is both
+        finally:
+            temporary.unlink(missing_ok=True)
+    return RunDirectory(path)
+
+
+@contextmanager
+def _faults_of(path: Path) -> Iterator[None]:
+    """What the system refuses about a directory, as `InputError`."""
+    try:
+        yield
     except (FileExistsError, NotADirectoryError) as error:
         raise InputError(f"{path}: expected a directory, got a file") from error
     except OSError as error:
         raise InputError(f"{path}: cannot be written to: {error.strerror}") from error
-    return RunDirectory(path, lock)
 
 
 def _require_empty(path: Path, unless: Sequence[str] = ()) -> None:
     """Raise `InputError` when there are files but those of a lock, unless one of these is among them: of a lock the
-    owner is to be named, and what can be gone on with may hold anything."""
-    if any(name and (path / name).exists() for name in unless):
-        return
-    if any(not file.name.startswith(LOCK) for file in path.iterdir()):
+    owner is to be named, and what can be gone on with may hold anything. Files that are just being written under the
+    name of one of these are no others."""
+    passing = (LOCK, *(f".{name}." for name in unless if name))
+    # listed before one of these is looked for: who fills the directory at the same moment writes that one first
+    others = any(not file.name.startswith(passing) for file in path.iterdir())
+    if others and not any(name and (path / name).exists() for name in unless):
         raise InputError(f"{path}: expected a new or an empty directory, got one that holds files")
 
 

@@ -102,7 +102,7 @@ def remarks_of(study: Study) -> Iterator[str]:
     failed = [row for row in study.table if row["status"] == "failed"]
     for row in failed[:NAMED]:
         values = ", ".join(f"{axis.key}={value_text(row[axis.key])}" for axis in study.axes)
-        yield f"failed: {values}: {row.get('message')}"
+        yield f"failed: {f'{values}: ' if values else ''}{row.get('message')}"
     if len(failed) > NAMED:
         yield f"and {len(failed) - NAMED} more that failed; the column message says why"
     cut = sum(bool(row.get("stopped")) for row in study.table)

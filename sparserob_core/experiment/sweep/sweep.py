@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import re
 import shutil
 import time
@@ -10,7 +11,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Future
 from contextlib import contextmanager, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, final
@@ -20,7 +21,7 @@ from sparserob_core.errors import InputError, SparseRobError, named
 from sparserob_core.experiment.assemble import build
 from sparserob_core.experiment.config.load import load_config
 from sparserob_core.experiment.config.plain import value_text
-from sparserob_core.experiment.directory.artefacts import RunDirectory, create_directory, finite
+from sparserob_core.experiment.directory.artefacts import RunDirectory, create_directory, finite, share_directory
 from sparserob_core.experiment.directory.finished import UNFINISHED, read_summary
 from sparserob_core.experiment.directory.lock import is_dead, owner_of
 from sparserob_core.experiment.directory.provenance import git_revision
@@ -46,6 +47,52 @@ STILLBORN = 3  # executors whose workers die before any of them has begun a poin
 LETTERS = 60  # of the name of a run directory, before its hash
 DIGITS = 12  # of the hash there
 PARTIAL = ".partial"
+BEGUN_BY = re.compile(rf"-[0-9a-f]{{{DIGITS}}}\.(.*)\.(\d+){re.escape(PARTIAL)}")
+"""The end of the name of a run that is not over: the host and the process that have begun it."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """A study before it is run: every point of the ``plan``, the name of its run directory, and the hashes of those
+    that are to be run (``left``)."""
+
+    plan: Plan
+    points: Sequence[Point]
+    names: Mapping[str, str]
+    left: frozenset[str]
+
+    def summary(self) -> dict[str, Any]:
+        """The study as plain data."""
+        keys = [axis.key for axis in self.plan.axes]
+        return {
+            "title": str(self.plan.base.data["title"]),
+            "axes": keys,
+            "points": [
+                {
+                    "point": number,
+                    "values": dict(zip(keys, point.values, strict=True)),
+                    "finished": point.hash not in self.left,
+                    "run": self.names[point.hash],
+                    "hash": point.hash,
+                }
+                for number, point in enumerate(self.points)
+            ],
+        }
+
+    def shown(self) -> tuple[list[str], list[list[str]]]:
+        """The points for a terminal: column names, and one row per point."""
+        keys = [axis.key for axis in self.plan.axes]
+        rows = [
+            [
+                str(number),
+                *map(value_text, point.values),
+                "to run" if point.hash in self.left else "finished",
+                self.names[point.hash],
+            ]
+            for number, point in enumerate(self.points)
+        ]
+        return ["point", *keys, "state", "run"], rows
 
 
 def sweep(
@@ -55,6 +102,7 @@ def sweep(
     *,
     points: Arrangement | None = None,
     number: int | None = None,
+    point: int | None = None,
     executor: str | Mapping[str, Any] | None = None,
     out: str | Path | None = None,
     figures: bool = False,
@@ -74,21 +122,28 @@ def sweep(
     In ``out`` (``runs/NAME-sweep/STAMP-HASH`` unless given) a study of the same base is gone on with: what is finished
     there, by the hash of its config, is not run again; what failed or ended at a time limit is. A point that fails is a
     row with the reason. An interrupt abandons what is running: the study has the rows that are known by then.
+    ``point``: run only this one, a number from 0 in the order of the table, here and without an executor, into the
+    directory of the study, which any number of processes may fill at once; none of them writes the table, which
+    follows when the study is gone on with. The study there must be equal to the last value.
+
     Raises `InputError` before anything is run when an axis, a point's config or the directory is at fault.
     """
-    if isinstance(config, str | Path) and Path(config).is_dir():
-        directory = Path(config)
-        if not (directory / FILE).is_file():
-            raise InputError(f"{directory}: expected the directory of a study, got one without {FILE}")
-        config, out = directory / FILE, directory if out is None else out
+    config, out = _found(config, out)
     plan = make_plan(config, axes, overrides, points=points, number=_number(points, number))
-    if not plan.axes:
-        raise InputError(path="axes", expected="at least one, for example seed=0:19:20", got="none")
+    if point is not None:
+        _check_one(out, executor)
     checked = plan.checked(notify)
-    factory = _executors(checked[0], executor)
+    factory = _executors(checked[0], executor if point is None else "serial")
+    if point is not None:
+        checked = [_one_of(checked, point)]
     broadcast = Broadcast([(type(observer).__name__, observer) for observer in observers])
     walk = None
     try:
+        if point is not None and out is not None:
+            made = share_directory(out, FILE, plan.written())
+            _require_same_study(made.path, plan)
+            walk = _Walk(plan, checked, made, figures, notify, broadcast, alone=True)
+            return walk.run(factory)
         with create_directory(out, f"{plan.name}-sweep", checked[0].hash[:8], again=FILE) as made:
             _require_same_base(made.path, plan)
             made.write_text(FILE, plan.written())
@@ -102,6 +157,56 @@ def sweep(
         if walk is not None:
             with suppress(KeyboardInterrupt):  # it ends the observers; the study is over
                 broadcast(walk.ending())  # the directory is free by then, for a page may stay for hours
+
+
+def outline(
+    config: str | Path | Mapping[str, Any],
+    axes: Mapping[str, object] | Sequence[str] | None = None,
+    *,
+    points: Arrangement | None = None,
+    number: int | None = None,
+    executor: str | Mapping[str, Any] | None = None,
+    out: str | Path | None = None,
+    notify: Notify = ignore,
+) -> Outline:
+    """What `sweep` would run with the same arguments; nothing is written. Raises `InputError` as it does."""
+    config, out = _found(config, out)
+    plan = make_plan(config, axes, points=points, number=_number(points, number))
+    checked = plan.checked(notify)
+    _executors(checked[0], executor)
+    directory = None if out is None else Path(out)
+    if directory is not None:
+        _require_same_base(directory, plan)
+    walk = _Walk(plan, checked, RunDirectory(directory or Path()), False, notify, Broadcast([]))
+    left = walk.left() if directory is not None else walk.by_hash
+    return Outline(plan, checked, walk.names, frozenset(left))
+
+
+def _found(
+    config: str | Path | Mapping[str, Any], out: str | Path | None
+) -> tuple[str | Path | Mapping[str, Any], str | Path | None]:
+    """The config, and where its study is: of the directory of a study its own file, and that directory."""
+    if not isinstance(config, str | Path) or not Path(config).is_dir():
+        return config, out
+    directory = Path(config)
+    if not (directory / FILE).is_file():
+        raise InputError(f"{directory}: expected the directory of a study, got one without {FILE}")
+    return directory / FILE, directory if out is None else out
+
+
+def _check_one(out: str | Path | None, executor: str | Mapping[str, Any] | None) -> None:
+    """Raise `InputError` for what makes no sense beside the number of a point."""
+    if out is None:
+        raise InputError(path="point", expected="the directory of the study beside it (out)", got="none")
+    if executor is not None:
+        raise InputError(path="executor", expected="none beside a point, which is run here", got=repr(executor))
+
+
+def _one_of(points: Sequence[Point], number: int) -> Point:
+    """A point by its number; of equal configs the first one, which names the run."""
+    if not is_whole(number, 0) or number >= len(points):
+        raise InputError(path="point", expected=f"a whole number from 0 to {len(points) - 1}", got=repr(number))
+    return next(point for point in points if point.hash == points[number].hash)
 
 
 def _number(points: Arrangement | None, number: int | None) -> int | None:
@@ -132,9 +237,25 @@ def _require_same_base(directory: Path, plan: Plan) -> None:
             )
 
 
+def _require_same_study(directory: Path, plan: Plan) -> None:
+    """Raise `InputError` when the study there is another one: the number of a point would mean something else."""
+    _require_same_base(directory, plan)
+    there, here = ({axis.key: axis for axis in one.changes} for one in (read_plan(directory / FILE), plan))
+    if read_plan(directory / FILE).written() != plan.written():
+        raise InputError(
+            f"{directory / FILE}: expected the same study, got {_axes_text(there)} there and {_axes_text(here)} here, "
+            "or another title or arrangement; a point of what stands there: --resume DIR --point N"
+        )
+
+
+def _axes_text(changes: Mapping[str, Axis]) -> str:
+    return " ".join(f"{key}={value_text(axis.written)}" for key, axis in changes.items()) or "no axes"
+
+
 @final
 class _Walk:
-    """One call of `sweep`: the points by their hash, and what is known of each."""
+    """One call of `sweep`: the points by their hash, and what is known of each. ``alone``: of one point, beside others
+    that do the same; the table is not its own."""
 
     def __init__(
         self,
@@ -144,7 +265,9 @@ class _Walk:
         figures: bool,
         notify: Notify,
         broadcast: Broadcast,
+        alone: bool = False,
     ) -> None:
+        self.alone = alone
         self.plan, self.points, self.made, self.figures, self.notify = plan, points, made, figures, notify
         self.broadcast, self.parallel, self.stopped, self.pressed = broadcast, True, "", False
         self.places: dict[str, list[int]] = {}
@@ -164,7 +287,7 @@ class _Walk:
     def run(self, factory: ExecutorFactory) -> Study:
         """Everything that is not finished; then the table."""
         self._clear()
-        waiting = self._left()
+        waiting = self.left()
         self.pending = set(waiting)
         self.done = sum(self.copies[digest] for digest in self.answers if digest not in self.pending)
         self._write()
@@ -212,7 +335,7 @@ class _Walk:
         known = [digest for digest in self.answers if digest not in but and digest in self.places]
         return {place: self._row(self.points[place]) for digest in known for place in self.places[digest]}
 
-    def _left(self) -> list[str]:
+    def left(self) -> list[str]:
         """The hashes of the points that are to be run; of the others the answers are read."""
         self._read(dict.fromkeys(point.hash for point in self.points))
         left = []
@@ -320,7 +443,7 @@ class _Walk:
         )
 
     def _partial(self, digest: str) -> Path:
-        return self.directory / RUNS / f".{self.names[digest]}.{os.getpid()}{PARTIAL}"
+        return self.directory / RUNS / f".{self.names[digest]}.{platform.node()}.{os.getpid()}{PARTIAL}"
 
     def _rows(self) -> list[Row]:
         rows = [self._row(point) for point in self.points if point.hash in self.answers]
@@ -334,6 +457,8 @@ class _Walk:
 
     def _write(self) -> None:
         """The table as it is known now."""
+        if self.alone:
+            return
         began, keys, rows = time.monotonic(), [axis.key for axis in self.plan.axes], self._rows()
         self.made.write_text(TABLE, table_text(keys, rows))
         self.made.write_text(COLUMNS, columns_text(keys, rows))
@@ -343,8 +468,10 @@ class _Walk:
         """Remove what dead processes, and this one, have left of runs."""
         for name in _directories(self.directory / RUNS, hidden=True):
             path = self.directory / RUNS / name
-            owner = owner_of(path)
-            if owner[0] in (0, os.getpid()) or is_dead(*owner):
+            begun = BEGUN_BY.search(name)
+            # a run is without a lock before its first file and after its last one: who has begun it is asked as well
+            owners = [owner_of(path), *([(int(begun[2]), begun[1])] if begun else [])]
+            if all(not owner[0] or owner == (os.getpid(), platform.node()) or is_dead(*owner) for owner in owners):
                 shutil.rmtree(path, ignore_errors=True)
 
     def _tell(self, digest: str, open_ones: Mapping[Future[Answer], str] | None = None) -> None:
@@ -374,7 +501,7 @@ def run_name(axes: Sequence[Axis], point: Point) -> str:
         steps = [str(step) for step in axis.path if step != "name"]
         parts.append(f"{steps[-1] if steps else axis.key}={value_text(value)}")
     text = re.sub(r"[^A-Za-z0-9=.,+_-]+", "-", re.sub(r"[][(){}]|(?<=,)\s", "", "_".join(parts)))
-    return f"{text[:LETTERS].strip('-.,')}-{point.hash[:DIGITS]}"
+    return f"{text[:LETTERS].strip('-.,') or 'point'}-{point.hash[:DIGITS]}"
 
 
 @contextmanager

@@ -7,6 +7,8 @@ import csv
 import io
 import json
 import multiprocessing
+import os
+import platform
 import shutil
 import signal
 import subprocess
@@ -222,6 +224,112 @@ def test_the_first_run_of_a_process_has_imported_everything_when_its_clock_start
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == ["[]", "[]"]
+
+
+def test_one_point_is_a_study(counting: Path, tmp_path: Path) -> None:
+    study = sr.sweep(counting, {"method.number": [3]}, out=tmp_path / "out")
+    assert (study.points, list(study.axes), [row["cost"] for row in study.table]) == (1, [], [cost_of(3)])
+    assert study.table[0]["run"].startswith("point-")
+    assert [row["cost"] for row in read_study(tmp_path / "out").table] == [cost_of(3)]
+    wider = sr.sweep(tmp_path / "out", {"method.number": [3, 4]})
+    assert costs(wider) == {3: cost_of(3), 4: cost_of(4)}
+    assert calls(counting) == {3: 1, 4: 1}
+
+
+def test_a_config_without_changes_is_a_study_of_one_point_too(counting: Path, command: Command, tmp_path: Path) -> None:
+    (tmp_path / "fail0").touch()
+    done = command("sweep", counting, "--out", "out")
+    assert done.returncode == 5
+    assert "1 of 1 points: 1 failed" in done.stdout
+    (failed,) = read_table(tmp_path / "out")
+    assert failed["status"] == "failed" and f"\nfailed: {failed['message']}\n" in done.stdout
+
+
+def test_what_would_be_run_is_told_and_nothing_is_written(counting: Path, command: Command, tmp_path: Path) -> None:
+    arguments = ("sweep", counting, "method.number=1:3:3", "seed=0,1", "--dry-run")
+    before = sorted(tmp_path.rglob("*"))
+    done = command(*arguments, "--out", "out", "--json")
+    assert done.returncode == 0, done.stderr
+    assert [path for path in sorted(tmp_path.rglob("*")) if "__pycache__" not in str(path)] == before
+    data = json.loads(done.stdout)
+    study = sr.sweep(counting, {"method.number": "1:3:3", "seed": "0,1"}, out=tmp_path / "out")
+    keys = ["method.number", "seed"]
+    assert data["axes"] == keys
+    assert [(row["point"], row["values"], row["finished"], row["run"], row["hash"]) for row in data["points"]] == [
+        (place, {key: row[key] for key in keys}, False, row["run"], row["hash"])
+        for place, row in enumerate(study.table)
+    ]
+    shutil.rmtree(tmp_path / "out" / "runs" / study.table[4]["run"])
+    left = sorted(tmp_path.rglob("*"))
+    lines = command("sweep", "--resume", "out", "--dry-run").stdout.splitlines()
+    assert [line.split()[3] for line in lines[2:8]] == ["finished"] * 4 + ["to", "finished"]
+    assert lines[-1].startswith("6 points, 5 finished")
+    assert sorted(tmp_path.rglob("*")) == left
+
+
+def one_point(counting: Path, out: Path, number: int) -> int:
+    """Run one point in this process; returns how many rows it has."""
+    return len(sr.sweep(counting, {"method.number": "1:4:4", "method.wait": 0.05}, point=number, out=out).table)
+
+
+def test_processes_that_run_a_point_each_fill_one_study(counting: Path, tmp_path: Path) -> None:
+    out, whole = tmp_path / "out", {"method.number": "1:4:4", "method.wait": 0.05}
+    alone = timeless(sr.sweep(counting, whole, out=tmp_path / "other").directory)  # the forks have all imports by then
+    with ProcessPoolExecutor(4, mp_context=multiprocessing.get_context("fork")) as pool:
+        assert list(pool.map(one_point, [counting] * 4, [out] * 4, range(4))) == [1] * 4
+    assert {path.name for path in out.iterdir()} == {"sweep.yaml", "runs"}
+    study = sr.sweep(out)
+    assert calls(counting) == dict.fromkeys(range(1, 5), 2)
+    assert {path.name for path in (out / "runs").iterdir()} == {row["run"] for row in study.table}
+    assert timeless(out) == alone
+
+
+def test_a_point_that_is_finished_is_not_run_again_and_one_that_failed_is(counting: Path, tmp_path: Path) -> None:
+    axes, out = {"method.number": [1, 2]}, tmp_path / "out"
+    (tmp_path / "fail2").touch()
+    assert [sr.sweep(counting, axes, point=place, out=out).failed for place in (0, 1, 0)] == [0, 1, 0]
+    (tmp_path / "fail2").unlink()
+    assert costs(sr.sweep(out, point=1)) == {2: cost_of(2)}
+    assert costs(sr.sweep(out)) == {1: cost_of(1), 2: cost_of(2)}
+    assert calls(counting) == {1: 1, 2: 2}
+
+
+def test_of_equal_configs_any_number_names_one_run(counting: Path, tmp_path: Path) -> None:
+    axes, out = {"method.number": [1], "solver": ["piqp", {"name": "piqp", "max_iterations": 250}]}, tmp_path / "out"
+    names = {sr.sweep(counting, axes, point=place, out=out).table[0]["run"] for place in (1, 0)}
+    same = sr.sweep(counting, axes, out=tmp_path / "whole")
+    assert names == {row["run"] for row in same.table}
+
+
+@pytest.mark.parametrize(
+    "other", [{"method.number": [1, 2, 3]}, {"method.number": [2, 1]}, {"method.number": [1, 2], "seed": [4]}]
+)
+def test_a_point_of_another_study_is_refused_and_changes_nothing(
+    counting: Path, tmp_path: Path, other: dict[str, Any]
+) -> None:
+    out = tmp_path / "out"
+    sr.sweep(counting, {"method.number": [1, 2]}, point=0, out=out)
+    before, ran = (out / "sweep.yaml").read_bytes(), calls(counting)
+    with pytest.raises(sr.InputError, match="expected the same study"):
+        sr.sweep(counting, other, point=0, out=out)
+    assert ((out / "sweep.yaml").read_bytes(), calls(counting)) == (before, ran)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "letter.txt").write_text("mine")
+    with pytest.raises(sr.InputError, match="expected a new or an empty directory"):
+        sr.sweep(counting, other, point=0, out=tmp_path / "full")
+    assert [path.name for path in (tmp_path / "full").iterdir()] == ["letter.txt"]
+
+
+def test_runs_that_others_have_under_way_are_left_to_them(counting: Path, tmp_path: Path) -> None:
+    study = sr.sweep(counting, {"method.number": [1, 2]}, out=tmp_path / "out")
+    run, here = study.table[0]["run"], platform.node()
+    with subprocess.Popen([sys.executable, "-c", ""]) as dead:
+        dead.wait()
+    living = {f".{run}.{here}.{os.getppid()}.partial", f".{run}.{here}-elsewhere.{os.getpid()}.partial"}
+    for name in {*living, f".{run}.{here}.{dead.pid}.partial", f".{run}.{here}.{os.getpid()}.partial+"}:
+        (tmp_path / "out" / "runs" / name).mkdir()  # as it is before the first file and after the last one
+    sr.sweep(tmp_path / "out")
+    assert {path.name for path in (tmp_path / "out" / "runs").glob(".*")} == living
 
 
 def test_points_with_one_config_are_run_once(counting: Path, tmp_path: Path) -> None:
@@ -519,8 +627,12 @@ def test_the_directory_of_a_run_has_a_name_for_readers(counting: Path, tmp_path:
     ("arguments", "said"),
     [
         (["sweep"], "expected either CONFIG or --resume DIR, got neither"),
-        (["sweep", "counting.yaml"], "axes: expected at least one, for example seed=0:19:20, got none"),
-        (["sweep", "counting.yaml", "seed=1"], "axes: expected at least one"),
+        (["sweep", "counting.yaml", "seed=0,1", "--point", "0"], "point: expected the directory of the study beside"),
+        (["sweep", "counting.yaml", "seed=0,1", "--out", "x", "--point", "2"], "expected a whole number from 0 to 1"),
+        (["sweep", "counting.yaml", "seed=0,1", "--out", "x", "--point", "-1"], "expected a whole number from 0 to 1"),
+        (["sweep", "counting.yaml", "--out", "x", "--point", "0", "--executor", "serial"], "executor: expected none"),
+        (["sweep", "counting.yaml", "--dry-run", "--point", "0"], "--dry-run: expected neither --point nor a viewer"),
+        (["sweep", "counting.yaml", "--dry-run", "--executor", "nosuch"], "no executor is named 'nosuch'"),
         (["sweep", "counting.yaml", "--resume", "x"], "expected either CONFIG or --resume DIR, got both"),
         (["sweep", "--resume", "nowhere"], "nowhere"),
         (["sweep", "--resume", "x", "--out", "y"], "--out: a study that is resumed stays in its directory"),

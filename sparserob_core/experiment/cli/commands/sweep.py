@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
 from sparserob_core.experiment.terminal.printing import print_json, printable
+
+if TYPE_CHECKING:
+    from sparserob_core.experiment.sweep.sweep import Outline
 
 
 @click.command()
@@ -18,6 +22,14 @@ from sparserob_core.experiment.terminal.printing import print_json, printable
 @click.option("--zip", "zipped", is_flag=True, help="Take the first values of all axes together, then the second, ...")
 @click.option("--random", type=int, metavar="N", help="Draw N points at random; ranges are written start:stop.")
 @click.option("--sobol", type=int, metavar="N", help="Draw N points along a scrambled sequence of Sobol.")
+@click.option("--dry-run", is_flag=True, help="Print the points and whether they are finished; write nothing.")
+@click.option(
+    "--point",
+    type=int,
+    metavar="N",
+    help="Run only this point, from 0 as --dry-run counts them, into the study's directory; other processes may run "
+    "others there meanwhile. The table follows with --resume.",
+)
 @click.option(
     "--executor",
     metavar="NAME",
@@ -44,6 +56,8 @@ def sweep(
     zipped: bool,
     random: int | None,
     sobol: int | None,
+    dry_run: bool,
+    point: int | None,
     executor: str | None,
     out: Path | None,
     resume: Path | None,
@@ -70,6 +84,7 @@ def sweep(
     from sparserob_core.experiment.config.reader import read_value
     from sparserob_core.experiment.run.viewer import recorded, recorder
     from sparserob_core.experiment.sweep.study import remarks_of, shown
+    from sparserob_core.experiment.sweep.sweep import outline
     from sparserob_core.experiment.sweep.sweep import sweep as run_study
     from sparserob_core.experiment.terminal.table import print_table
     from sparserob_core.sip.events import ignore
@@ -86,26 +101,48 @@ def sweep(
         raise InputError(
             "expected one of --zip, --random and --sobol, got " + " and ".join(f"--{one}" for one in chosen)
         )
-    watching = [recorder(save, serve, connect)] if watch or serve or save is not None or connect is not None else []
-    with LiveTable() as live:
-        study = run_study(
-            config if config is not None else resume,  # type: ignore[arg-type]
-            axes,
-            points=chosen[0] if chosen else None,  # type: ignore[arg-type]
-            number=random if random is not None else sobol,
-            executor=None if executor is None else read_value(executor),  # type: ignore[arg-type]
-            out=out,
-            figures=figures,
-            notify=ignore if quiet else live.receive,
-            observers=watching,
-        )
+    watched = watch or serve or save is not None or connect is not None
+    if dry_run and (watched or point is not None):
+        raise InputError("--dry-run: expected neither --point nor a viewer beside it, for nothing is run")
+    watching = [recorder(save, serve, connect)] if watched else []
+    live = LiveTable()
+    asked: dict[str, Any] = {
+        "config": config if config is not None else resume,
+        "axes": axes,
+        "points": chosen[0] if chosen else None,
+        "number": random if random is not None else sobol,
+        "executor": None if executor is None else read_value(executor),
+        "out": out,
+        "notify": ignore if quiet else live.receive,
+    }
+    if dry_run:
+        with live:
+            planned = outline(**asked)
+        _print_outline(planned, quiet, as_json)
+        return 0
+    with live:
+        study = run_study(**asked, point=point, figures=figures, observers=watching)
     study = replace(study, remarks=(*study.remarks, *(line for one in watching for line in recorded(one, save))))
     if as_json:
         print_json({**study.summary(), "table": study.table})
     elif not quiet:
         print_table(study.title, *shown(study))
-        for remark in (*remarks_of(study), f"written to {study.directory}"):
+        whole = "" if point is None else f"; the table of all points: sparserob sweep --resume {study.directory}"
+        for remark in (*remarks_of(study), f"written to {study.directory}{whole}"):
             click.echo(printable(remark))
     status = 5 if study.failed else 0
     # the Ctrl-C that ends a page has cut nothing short
     return status if serve and not study.stopped else status_unless_interrupted(status)
+
+
+def _print_outline(planned: Outline, quiet: bool, as_json: bool) -> None:
+    """Print the points of a study that is not run."""
+    from sparserob_core.experiment.terminal.table import print_table
+
+    data = planned.summary()
+    if as_json:
+        print_json(data)
+    elif not quiet:
+        print_table(data["title"], *planned.shown())
+        ended = sum(row["finished"] for row in data["points"])
+        click.echo(f"{len(data['points'])} points, {ended} finished; nothing was run or written")
