@@ -44,7 +44,7 @@ RUNS: dict[str, tuple[list[str], dict[str, str]]] = {
 def main() -> int:
     """Make every picture anew; returns the exit status."""
     if find_spec("rerun") is None or find_spec("rerun_cli") is None:
-        click.echo("rerun-sdk is not installed; `pip install 'sparserob[rerun]'` brings it", err=True)
+        click.echo("rerun-sdk is not installed; `pip install rerun-sdk` brings it", err=True)
         return 2
     with tempfile.TemporaryDirectory() as place:
         for name, (arguments, tabs) in RUNS.items():

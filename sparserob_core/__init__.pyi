@@ -75,6 +75,7 @@ from sparserob_core.errors import SolverError as SolverError
 from sparserob_core.errors import SparseRobError as SparseRobError
 from sparserob_core.errors import TimeLimitError as TimeLimitError
 from sparserob_core.errors import UnknownPluginError as UnknownPluginError
+from sparserob_core.errors import not_installed as not_installed
 
 # To write a component, and to register it.
 from sparserob_core.options import Options as Options

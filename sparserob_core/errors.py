@@ -29,6 +29,23 @@ def named(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}".removesuffix(": ")
 
 
+def not_installed(package: str, project: str | None = None) -> str:
+    """A package that is missing, with what brings it, as half a sentence: ``matplotlib is not installed; `pip install
+    'matplotlib>=3.9'` brings it``. ``project``: what pip knows it by, the same unless given, ``""`` where pip cannot
+    bring it. The bound of its version is the one that this distribution states, where it states one."""
+    from importlib.metadata import PackageNotFoundError, requires
+
+    brings = package if project is None else project
+    if not brings:
+        return f"{package} is not installed"
+    try:
+        stated = [line.partition(";")[0].strip() for line in requires("sparserob") or ()]
+    except PackageNotFoundError:  # the source is on the path, and no distribution
+        stated = []
+    wanted = next((line for line in stated if line.startswith(tuple(brings + mark for mark in "><=!~"))), brings)
+    return f"{package} is not installed; `pip install '{wanted}'` brings it"
+
+
 class SparseRobError(Exception):
     """Base class. ``exit_status`` is what the command line returns for it."""
 

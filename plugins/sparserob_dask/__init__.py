@@ -15,7 +15,7 @@ class Dask(sr.ExecutorFactory, sr.Options):
     """The workers of a dask cluster (Rocklin 2015): of one that runs already, on this machine or on many, or of one
     that is started here for as long as it is needed.
 
-    An optional extra: ``pip install 'sparserob[dask]'``. The address of dask's dashboard is written to the standard
+    An optional extra: ``pip install distributed``. The address of dask's dashboard is written to the standard
     error stream. A cluster that is started here listens on the loopback interface only unless ``host`` says otherwise:
     whoever can reach it can run anything on it. Its workers have one thread of linear algebra each and leave Ctrl-C to
     this process; one that dies breaks the executor. Workers of a cluster that was there before need the same version of
@@ -59,9 +59,7 @@ class Dask(sr.ExecutorFactory, sr.Options):
         try:
             from sparserob_dask.cluster import connected, started
         except ModuleNotFoundError as error:
-            raise sr.UnknownPluginError(
-                "executor 'dask' needs the package distributed: pip install 'sparserob[dask]'"
-            ) from error
+            raise sr.UnknownPluginError(f"executor 'dask': {sr.not_installed('distributed')}") from error
         with sr.one_thread():  # here, too: what this process adds up, it adds up as the workers do
             if self.address is not None:
                 with connected(self.address, self.timeout) as executor:

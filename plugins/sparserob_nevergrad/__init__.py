@@ -19,7 +19,7 @@ class Nevergrad(sr.Maximiser, sr.Options):
     """Any optimiser of nevergrad's registry (Rapin and Teytaud 2018): evolution strategies, differential evolution,
     particle swarms, and portfolios of them such as NGOpt, which chooses by dimension and budget.
 
-    An optional extra: ``pip install 'sparserob[nevergrad]'``. It works in the unit box, one point at a time, with its
+    An optional extra: ``pip install nevergrad``. It works in the unit box, one point at a time, with its
     random numbers drawn from the generator of the search and the global ones left as they were. Some of nevergrad's
     portfolios are not repeatable all the same: NGOpt in three dimensions or more may run ``cma.fmin2``, which takes its
     seed from the clock. Where the function has no value it is given the loss 1e20. What an optimiser guarantees, and in
@@ -129,9 +129,7 @@ def _registry() -> Any:
             warnings.simplefilter("ignore")
             from nevergrad.optimization import metamodel, registry
     except ImportError as error:
-        raise sr.UnknownPluginError(
-            "nevergrad: the package is not installed; `pip install 'sparserob[nevergrad]'` brings it"
-        ) from error
+        raise sr.UnknownPluginError(f"nevergrad: {sr.not_installed('nevergrad')}") from error
     # It calls float() with an array of one number, which numpy 2.4 and later refuse, and so fails in NGOpt.
     metamodel.float = _number
     return registry
@@ -149,5 +147,5 @@ def sparserob_maximisers() -> Iterator[sr.MaximiserPlugin]:
         name="nevergrad",
         factory=Nevergrad,
         summary="any optimiser of nevergrad (extra)",
-        needs=("nevergrad", "sparserob[nevergrad]"),
+        needs=("nevergrad", "nevergrad"),
     )

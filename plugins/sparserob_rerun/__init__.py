@@ -20,7 +20,7 @@ logger = logging.getLogger("sparserob")
 
 
 class Rerun(sr.Observer, sr.Options):
-    """A recording for the viewer of Rerun (rerun.io), an optional extra: ``pip install 'sparserob[rerun]'``. Given to a
+    """A recording for the viewer of Rerun (rerun.io), an optional extra: ``pip install rerun-sdk``. Given to a
     sweep, it shows the study: the status of every point, what runs, and the bounds.
 
     Destinations can be combined; with none of them, ``recording.rrd`` in the run's directory. A missing package, viewer

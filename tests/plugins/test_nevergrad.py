@@ -114,7 +114,7 @@ def test_a_missing_package_is_found_before_anything_is_solved_or_written(monkeyp
         "method": "sparserob",
         "maximiser": "nevergrad",
     }
-    with pytest.raises(sr.PluginError, match=r"nevergrad is not installed; `pip install 'sparserob\[nevergrad\]'`"):
+    with pytest.raises(sr.PluginError, match=r"nevergrad is not installed; `pip install 'nevergrad>=1.0.12'`"):
         sr.run(config, out=tmp_path / "out", quiet=True)
     assert not (tmp_path / "out").exists()
 
@@ -123,7 +123,7 @@ def test_a_missing_package_is_one_sentence_that_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "nevergrad.optimization", None)
     with pytest.raises(
         sr.PluginError,
-        match=r"nevergrad: the package is not installed; `pip install 'sparserob\[nevergrad\]'` brings it",
+        match=r"nevergrad: nevergrad is not installed; `pip install 'nevergrad>=1.0.12'` brings it",
     ):
         search()
 

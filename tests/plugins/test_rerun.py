@@ -432,7 +432,7 @@ def test_a_missing_package_is_one_warning_with_the_way_to_install_it(
     monkeypatch.setattr(sparserob_rerun.recording.sinks, "find_spec", lambda name: None)
     assert recorded(tmp_path / "run", "experiment1_repaired.yaml", QUICK).status == "certified"
     assert [record.getMessage() for record in caplog.records] == [
-        "rerun: rerun-sdk is not installed; `pip install 'sparserob[rerun]'` brings it"
+        "rerun: rerun-sdk is not installed; `pip install 'rerun-sdk>=0.41'` brings it"
     ]
     assert not (tmp_path / "run" / "recording.rrd").exists()
 

@@ -13,6 +13,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeAlias, final
 
+import sparserob_core as sr
+
 PORT, WEB_PORT = 9876, 9090
 STARTING = 15.0  # seconds that a viewer may take until it listens
 MEMORY = "25%"  # of the machine's, for a viewer that is started
@@ -47,9 +49,7 @@ def look(save: Path | None, connect: str | None, spawn: bool, serve: bool) -> De
     """Which of the wishes can be fulfilled; every other is a sentence in ``missing``."""
     missing = []
     if find_spec("rerun") is None or find_spec("rerun_bindings") is None:
-        return Destinations(
-            None, None, False, None, ("rerun-sdk is not installed; `pip install 'sparserob[rerun]'` brings it",)
-        )
+        return Destinations(None, None, False, None, (sr.not_installed("rerun-sdk"),))
     if save is not None and (reason := _unwritable(save)):
         missing.append(f"{save}: cannot be written to: {reason}")
         save = None

@@ -10,7 +10,7 @@ from typing import Any, final
 
 import numpy as np
 
-from sparserob_core.errors import InputError
+from sparserob_core.errors import InputError, not_installed
 from sparserob_core.experiment.benchmark import functions
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.search.search import Target
@@ -82,7 +82,7 @@ def _standard(name: str, function: Callable[[Array], Array], box: Box, number: i
 def bbob(instance: int = 1) -> Iterator[Landscape]:
     """The 24 functions of BBOB (Hansen, Finck, Ros and Auger 2009), negated, in dimensions 2 and 5, by ioh."""
     if find_spec("ioh") is None:
-        raise InputError("suite: bbob needs ioh, which is not installed; `pip install 'sparserob[bench]'` brings it")
+        raise InputError(f"suite: bbob needs a package: {not_installed('ioh')}")
     import ioh
 
     for number in range(1, 25):

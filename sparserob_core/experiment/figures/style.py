@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sparserob_core.errors import InputError, SparseRobError
+from sparserob_core.errors import InputError, SparseRobError, not_installed
 from sparserob_core.experiment.directory.artefacts import write_whole
 from sparserob_core.sip.convex_set import Array
 
@@ -113,7 +113,7 @@ def missing_matplotlib() -> str:
     from importlib.util import find_spec
 
     there = find_spec("matplotlib") is not None
-    return "" if there else "no figure: matplotlib is not installed; `pip install 'sparserob[figures]'` brings it"
+    return "" if there else f"no figure: {not_installed('matplotlib')}"
 
 
 def require_matplotlib() -> None:

@@ -9,7 +9,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import ClassVar
 
-from sparserob_core.errors import PluginError, UnknownPluginError
+from sparserob_core.errors import PluginError, UnknownPluginError, not_installed
 from sparserob_core.experiment.plugins.attribution import asked, attributed
 from sparserob_core.options import Options
 
@@ -27,7 +27,7 @@ class Plugin:
     ``summary``  one line for ``sparserob plugins``;
     ``plugin``   who registered it, and ``source``, its file or distribution (both filled in by the registry);
     ``needs``    a module that may be missing, and what pip is to install then, such as
-                 ``("nevergrad", "sparserob[nevergrad]")``, or ``""`` where pip cannot; it is looked for where the
+                 ``("rerun", "rerun-sdk")``, or ``""`` where pip cannot; it is looked for where the
                  component is built, before anything is solved;
     ``open``     its options, or further ones, are those of the package that it needs, which is imported to ask for
                  them: schema and reference leave them open.
@@ -84,7 +84,7 @@ class Plugin:
         if self.needs is None or find_spec(self.needs[0]) is not None:
             return ""
         package, brings = self.needs
-        return f"{self}: {package} is not installed" + (f"; `pip install '{brings}'` brings it" if brings else "")
+        return f"{self}: {not_installed(package, brings)}"
 
     def _refuse_missing(self) -> None:
         if self.missing:

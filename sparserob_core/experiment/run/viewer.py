@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sparserob_core.errors import InputError
+from sparserob_core.errors import InputError, not_installed
 from sparserob_core.experiment.plugins.registry import load_own_registry
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ def recorder(save: str | Path | None, serve: bool, connect: str | None, patience
     """The observer that records to a viewer, to a browser, to a listener or into a file. ``patience``: of a run that is
     over, the seconds that its landscapes may take. Raises `InputError` where that cannot be had."""
     if find_spec("rerun_bindings") is None:
-        raise InputError("rerun: rerun-sdk is not installed; `pip install 'sparserob[rerun]'` brings it")
+        raise InputError(f"rerun: {not_installed('rerun-sdk')}")
     spawn = save is None and not serve and connect is None
     if (
         spawn

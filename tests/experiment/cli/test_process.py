@@ -409,7 +409,7 @@ def test_a_missing_matplotlib_is_a_note_beside_the_result(
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     file = tmp_path / "margin.yaml"
     file.write_text(MARGIN)
-    note = "no figure: matplotlib is not installed; `pip install 'sparserob[figures]'` brings it"
+    note = "no figure: matplotlib is not installed; `pip install 'matplotlib>=3.9'` brings it"
     done = command("run", file, "--out", "out")
     assert (done.returncode, note in done.stdout) == (0, True), done.stdout + done.stderr
     done = command(*command_line)
@@ -427,7 +427,7 @@ def test_a_study_without_matplotlib_has_a_note_and_its_own_status(
     file.write_text(MARGIN)
     done = command(study[0], file, *study[1:], "--out", "out")
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "no figure: matplotlib is not installed; `pip install 'sparserob[figures]'` brings it" in done.stdout
+    assert "no figure: matplotlib is not installed; `pip install 'matplotlib>=3.9'` brings it" in done.stdout
 
 
 def test_modules_that_scipy_looks_at_are_imported_only_when_something_of_them_is_used() -> None:

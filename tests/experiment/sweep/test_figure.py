@@ -139,5 +139,5 @@ def test_a_study_without_matplotlib_has_a_remark_and_everything_else(
 
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     found = sr.sweep(config, {"seed": [0, 1]}, out=tmp_path / "out")
-    assert found.remarks == ("no figure: matplotlib is not installed; `pip install 'sparserob[figures]'` brings it",)
+    assert found.remarks == ("no figure: matplotlib is not installed; `pip install 'matplotlib>=3.9'` brings it",)
     assert (tmp_path / "out" / "table.csv").is_file()

@@ -22,7 +22,7 @@ from sparserob_core.experiment.cli.shell.options import plugins_option
 def replay(directory: Path, save: Path | None, serve: bool, connect: str | None, plugins: tuple[Path, ...]) -> int:
     """Show the finished run RUN in the viewer of Rerun; nothing is solved again.
 
-    An optional extra: pip install 'sparserob[rerun]'. The controls of all rounds come from RUN/rounds.npz; the searches
+    An optional extra: pip install rerun-sdk. The controls of all rounds come from RUN/rounds.npz; the searches
     for violated constraints are only in a recording that was made during the run.
     """
     from sparserob_core.experiment.run.replay import replay as replay_run

@@ -75,7 +75,7 @@ def sweep(
     log:start:stop:count (continuation.stop=log:1e-6:1:13); commas inside brackets do not split. One value changes the
     config for all points. CONFIG may also be a study's file, with the keys base and axes. What is finished in the
     directory is not run again; a point that fails is a row that says why. With --watch, or --save, --serve or
-    --connect, as those of sparserob watch, it is shown as it goes on: an optional extra, sparserob[rerun].
+    --connect, as those of sparserob watch, it is shown as it goes on: an optional extra (pip install rerun-sdk).
 
     Exit status: 0 every point has an answer, whatever it is; 2 the input is at fault, 5 a point failed, 130
     interrupted.

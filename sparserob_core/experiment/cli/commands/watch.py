@@ -38,7 +38,7 @@ def watch(
 ) -> int:
     """Run the experiment that CONFIG describes, and watch it in the viewer of Rerun while it runs.
 
-    An optional extra: pip install 'sparserob[rerun]'. The result is that of sparserob run, and so is the exit status.
+    An optional extra: pip install rerun-sdk. The result is that of sparserob run, and so is the exit status.
     """
     from sparserob_core.experiment.directory.artefacts import finite
     from sparserob_core.experiment.run.watch import watch as watch_run

@@ -1,0 +1,37 @@
+"""Guards `sparserob_core.not_installed`: what is printed of a missing package is a command that works everywhere."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+
+import pytest
+
+import sparserob_core as sr
+from tests.support.places import ROOT
+
+EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
+
+
+@pytest.mark.parametrize(
+    ("extra", "project"),
+    [("rerun", "rerun-sdk"), ("figures", "matplotlib"), ("dask", "distributed"), ("nevergrad", "nevergrad")],
+)
+def test_a_missing_package_is_named_with_the_bound_that_the_distribution_states(extra: str, project: str) -> None:
+    (stated,) = EXTRAS[extra]
+    assert stated.startswith(f"{project}>=")
+    assert sr.not_installed(project) == f"{project} is not installed; `pip install '{stated}'` brings it"
+
+
+def test_what_the_distribution_does_not_state_has_no_bound_and_what_pip_cannot_bring_no_command() -> None:
+    assert sr.not_installed("gurobipy") == "gurobipy is not installed; `pip install 'gurobipy'` brings it"
+    assert sr.not_installed("rerun", "rerun-sdk").startswith("rerun is not installed; `pip install 'rerun-sdk>=")
+    assert sr.not_installed("mine", "") == "mine is not installed"
+
+
+def test_no_message_asks_an_index_for_an_extra_of_this_package() -> None:
+    sources = [one for folder in ("sparserob_core", "plugins", "docs") for one in (ROOT / folder).rglob("*.py")]
+    assert len(sources) > 100
+    assert [
+        str(one) for one in sources if re.search(r"install '?sparserob\[\w+\]'?[`\"')]", one.read_text("utf-8"))
+    ] == []
