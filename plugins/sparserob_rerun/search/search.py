@@ -22,7 +22,7 @@ NOTES = {  # what a maximiser notes: the words for it, and its colour
     "temperature": ("log10 of the temperature", ink.VERMILLION),
     "accepted": ("share accepted of the last 50 moves that changed g", ink.GREEN),
     "scale": ("log10 of the size of a move, in widths of the box", ink.SKY),
-    "move": ("what moves: 0 all anew, 1 one coordinate, 2 several, 3 an index", ink.PURPLE),
+    "move": ("moves: 0 all, 1 one coordinate, 2 some, 3 index", ink.PURPLE),
     "depth": ("depth of the opened cell", ink.SKY),
     "openings": ("cells opened", ink.GREEN),
     "hmax": ("deepest cells allowed", ink.GREY),
