@@ -139,6 +139,6 @@ def test_a_number_that_is_not_finite_is_named(honest: Any, tmp_path: Path) -> No
 def test_the_same_seed_makes_the_same_tamperings(honest: Any) -> None:
     data = json.loads((honest("parameter") / "certificate.json").read_text())
     first, second = ([(name, place) for name, place, _ in tampered(data, SEED)] for _ in range(2))
-    assert first == second and len(first) > 500
+    assert first == second and len(first) > 400
     changed = [repr(made) != repr(data) for _, _, made in tampered(data, SEED)]
     assert np.mean(changed) > 0.9

@@ -10,6 +10,7 @@ import pytest
 from scipy.special import roots_jacobi
 
 import sparserob_core as sr
+from sparserob_core.sip.solver import Auto
 
 SOLVERS = ["piqp", *(pytest.param(name, marks=pytest.mark.slow) for name in ("proxqp", "clarabel"))]
 
@@ -437,7 +438,7 @@ def test_a_failure_says_once_what_is_wrong_and_what_to_do():
             return sr.Claim("failed", np.zeros(n), np.zeros(r), np.zeros(e), np.zeros(n), "nothing found")
 
     image = {"S": [[1.0, 1.0], [1.0, -1.0], [1.0, 0.0]], "weights": 1.0, "lower": -2.0, "upper": 2.0}
-    result = sr.solve(disc(0.5, q=[-3.0, 1.0], **image), solver=Silent())
+    result = sr.solve(disc(0.5, q=[-3.0, 1.0], **image), solver=Auto(general=Silent()))  # whom nobody stands in for
     assert result.status == "failed"
     assert "try another solver" in result.message
     parts = result.message.split("; ")

@@ -41,6 +41,9 @@ ALLOWED = TOLERANCE / 2  # a violation that the search may leave to the proof
 # Cells for the first look at a decision. With a tenth of them, decisions of ordinary problems with parameters are
 # secured that are proven at once; with ten times as many, who rides a wall waits ten times longer for a first bound.
 GLANCE = 4096
+# Active rows at which a margin may cost a quarter of the tolerated gap. With ten times as many, a day on a wall takes
+# twice as many cells; with a tenth of them, costs of ordinary problems are 2e-8 of themselves above the least.
+MANY_ACTIVE = 32
 DUE = (0.4, 0.65, 0.85)  # shares of a limit after which a decision is secured, where none is proven yet
 SECURED = 6  # distances at which that is tried, each at least twice what the one before has left open
 # Of the cost, what the distance may cost at first. A tenth of it takes three times as many cells along a wall that is
@@ -284,13 +287,15 @@ class Working:
         return fresh
 
     def _set_margin(self, ledger: Ledger, solution: FiniteSolution) -> None:
-        """Tighten the rows as much as a tenth of the tolerated gap pays for."""
+        """Tighten the rows as much as a tenth of the tolerated gap pays for, and up to four tenths where many are
+        active at once: a wall that is ridden takes cells all along it, the fewer the farther the control keeps away."""
         if not self.slater or not self.rows.h.size:
             return
         multipliers = solution.y[solution.y.size - self.rows.h.size :]
         price = float(multipliers @ np.linalg.norm(self.rows.G, axis=1))
         size = max(SMALL_COST * self.program.added(solution.x), abs(self.program.cost(solution.x)))
-        budget = 0.4 * ledger.tolerance * size
+        active = int((multipliers > 0.0).sum())
+        budget = (0.1 + 0.3 * active / (active + MANY_ACTIVE)) * ledger.tolerance * size
         reach = np.maximum(np.abs(self.program.finite.lower), np.abs(self.program.finite.upper))
         unit = min(1.0, float(np.where(np.isfinite(reach), reach, 1.0).max()))
         margin = float(
@@ -307,8 +312,9 @@ def _proofs(working: Working, ledger: Ledger, prover: Prover, answer: Answer, fo
     proofs = prover(x, GLANCE // 4 if ledger.tools.deadline.bounded else GLANCE)
     if ledger.prove(answer, found, proofs) or not proofs:
         return proofs
-    if not _is_secured(ledger):
-        _secure(working, ledger, prover, answer, _left_open(ledger.program, proofs))
+    missed = _left_open(ledger.program, proofs)
+    if missed and not _is_secured(ledger):
+        _secure(working, ledger, prover, answer, missed)
     if not any(proof.verdict == "refuted" for proof in proofs):
         proofs = prover(x)
         ledger.prove(answer, found, proofs)
@@ -339,12 +345,13 @@ def _secure(working: Working, ledger: Ledger, prover: Prover, answer: Answer, mi
     ``answer`` pays for and by more than what it ``missed``, and again by what that proof leaves open. Nothing is
     claimed where nothing is that far from the constraints."""
     program, x, margin = ledger.program, answer.solution.x, working.margin
-    price = float(answer.multipliers @ np.linalg.norm(working.rows.G, axis=1)) if working.rows.h.size else 0.0
+    sizes = np.linalg.norm(working.rows.G, axis=1)
+    price, largest = float(answer.multipliers @ sizes), float(sizes.max(initial=0.0))
     margin += SPARED * abs(program.cost(x)) / max(price, np.finfo(float).tiny)
     for _ in range(SECURED):
         distances = (above / _size(rows_at(program, family, at, row)) for above, family, at, row in missed)
         margin += PAID * max(distances, default=0.0)
-        if not np.isfinite(margin):
+        if not np.isfinite(PAID * float(margin) * largest):  # in Python's numbers, which overflow in silence
             return
         solution = ledger.relaxed.solve(working.rows, working.epsilon, margin)
         if not _usable(solution):
@@ -358,6 +365,8 @@ def _secure(working: Working, ledger: Ledger, prover: Prover, answer: Answer, mi
         if ledger.prove(farther, found, proofs) or not proofs:
             return
         missed = _left_open(program, proofs)
+        if not missed:
+            return
 
 
 def _is_secured(ledger: Ledger) -> bool:
@@ -377,9 +386,9 @@ def _peak(family: ConstraintFamily, separation: Separation) -> Missed:
 
 
 def _left_open(program: SemiInfiniteProgram, proofs: Sequence[Proof]) -> list[Missed]:
-    """What proofs could not exclude, each with where the largest violation was met; infinite where that is of another
-    formulation than the imposed rows."""
-    return [
+    """What proofs could not exclude, each with where the largest violation was met; nothing where one of them excludes
+    nothing at all, or speaks of another formulation than the imposed rows: then no distance would help it."""
+    missed = [
         Missed(
             proof.violation if proof.verdict == "refuted" else proof.bound,
             proof.family,
@@ -391,6 +400,8 @@ def _left_open(program: SemiInfiniteProgram, proofs: Sequence[Proof]) -> list[Mi
         and proof.index is not None
         and proof.formulation == program.family(proof.family).formulation
     ]
+    complete = len(missed) == sum(proof.verdict != "proven" for proof in proofs)
+    return missed if complete and all(np.isfinite(one.violation) for one in missed) else []
 
 
 def _or_earlier(

@@ -364,7 +364,7 @@ def test_a_curved_set_under_a_parameter_and_a_disturbance_is_proven_with_few_cel
     program = sr.transcribe(problem, uniform(20, 3.0))
     decisions = []
 
-    def undecided(x):
+    def undecided(x, cells=0):
         decisions.append(x)
         return [Proof("terminal", "undecided", np.inf)]
 
