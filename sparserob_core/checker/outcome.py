@@ -53,7 +53,7 @@ class Clock:
     def each(self, items: Iterable[Item]) -> Iterator[Item]:
         """The items one by one, with a look at the time after every `LOOKED` of them: fewer take no time."""
         for number, item in enumerate(items):
-            if number % LOOKED == LOOKED - 1:
+            if number and number % LOOKED == 0:
                 self.check()
             yield item
 

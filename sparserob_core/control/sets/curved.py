@@ -95,7 +95,11 @@ class Ellipsoid(ConvexSet):
     def violation(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
         """Distance to the ellipsoid outside; inside, ``(gauge - 1) * shortest half-axis``, which is at least minus the
         depth."""
-        squares, axes = np.linalg.eigh(self.shape)
+        # Half-axes from the factor: of its square, rounding leaves the shortest of very uneven ones without a sign. One
+        # that is shorter than rounding of the longest is no shorter than that.
+        axes, lengths, _ = np.linalg.svd(self.factor)
+        lengths = np.maximum(lengths, np.finfo(float).eps * lengths.max())
+        axes, squares = axes[:, ::-1], lengths[::-1] ** 2
         z = np.abs((np.asarray(points, dtype=float) - self.centre) @ axes)
         gauge = np.sqrt((z**2 / squares).sum(axis=-1))
         # The multiplier of the projection: |shape^(1/2) z / (shape + multiplier)| decreases to 1.

@@ -241,3 +241,15 @@ def test_the_support_of_a_polytope_without_known_vertices_is_bounded_from_the_du
     monkeypatch.setattr(scipy.optimize, "linprog", early)
     assert (polytope.support(directions) >= true * (1.0 - 1e-12)).all()
     assert polytope.support(directions) == pytest.approx(true, rel=1e-6)
+
+
+def test_an_ellipsoid_in_units_far_apart_still_tells_inside_from_outside() -> None:
+    """Of its matrix rounding leaves an eigenvalue below 0, of its factor nothing."""
+    turned = np.array([[1.0, 0.9], [0.9, 1.0]])
+    for unit in 10.0 ** np.arange(-6, 7, 2):
+        units = np.diag([1.0 / unit, unit])
+        ellipsoid = Ellipsoid([0.0, 0.0], units @ turned @ units)
+        rim = ellipsoid.factor @ np.array([[1.0, 0.0, 0.6], [0.0, 1.0, -0.8]])
+        assert np.isfinite(ellipsoid.violation(rim.T)).all()
+        assert (ellipsoid.violation(0.5 * rim.T) < 0.0).all()
+        assert (ellipsoid.violation(2.0 * rim.T) > 0.0).all()

@@ -342,12 +342,12 @@ def test_a_picture_that_cannot_be_written_or_drawn_is_an_error_of_the_input(runs
         compare([runs.rounds("b", status="failed")], tmp_path / "picture.png")
 
 
-def test_a_missing_matplotlib_is_named_with_the_extra_that_brings_it(
+def test_a_missing_matplotlib_is_named_with_the_line_that_brings_it(
     runs: Runs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     comparison = compare([runs.rounds("a")])
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(sr.InputError, match=r"sparserob\[figures\]"):
+    with pytest.raises(sr.InputError, match=r"pip install .matplotlib"):
         write_comparison(tmp_path / "picture.png", comparison)
 
 

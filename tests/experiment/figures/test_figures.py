@@ -129,11 +129,11 @@ def test_a_control_that_does_not_fit_its_pieces_is_refused(data: FigureData) -> 
         replace(data, control=np.zeros((1, 3)))
 
 
-def test_a_missing_matplotlib_is_named_with_the_extra_that_brings_it(
+def test_a_missing_matplotlib_is_named_with_the_line_that_brings_it(
     data: FigureData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(InputError, match=r"sparserob\[figures\]"):
+    with pytest.raises(InputError, match=r"pip install .matplotlib"):
         write_figures(tmp_path, data)
 
 
