@@ -141,6 +141,7 @@ def test_every_maximiser_takes_part_in_every_experiment_and_none_claims_too_much
     wrong = []
     for maximiser in sr.load_registry().names("maximiser"):
         search = {"maximiser": {"name": maximiser, "budget": 24}, "continuation.stop": 0.1, "method.indices": 6}
+        search |= {"method.regu": {"name": "geometric", "factor": 0.1}}  # two weights
         result = run(maximiser, search)
         bounded = 0.0 < result.lower_bound <= exact + 1e-8 and result.counts["evaluations"] <= 2 * 24
         if result.status == "refuted":

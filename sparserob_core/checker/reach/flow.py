@@ -277,7 +277,7 @@ def balanced(A: Array, horizon: float, speed: Array) -> Array:
             scaled = np.exp2(exponents)
             row, column = (rates[i] * scaled).max() / scaled[i], (rates[:, i] / scaled).max() * scaled[i]
             if row > 0.0 and column > 0.0:
-                exponents[i] += np.log2(row / column) / 2
+                exponents[i] += (np.log2(row) - np.log2(column)) / 2  # apart: their quotient may overflow
     return np.asarray(np.exp2(np.clip(np.round(exponents[:-1] - exponents[-1]), -500, 500)), dtype=float)
 
 

@@ -206,7 +206,7 @@ def _round_bound(centre: Array, S: Array, value: Array, spread: Array) -> tuple[
     safe = np.where(size > 0, size, 1.0)
     w = centre + np.where(size[:, None] > 0, value @ S / safe[:, None], 0.0)
     off = spread @ np.sqrt(np.diag(S)) * OUTWARD
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # what overflows is lost altogether
         excess = np.where(off < 0.5 * size, off**2 / (2.0 * (size - off)), 2.0 * off + np.where(size > 0, 0.0, off))
     short = np.sqrt(square + lost) - size + lost / safe
     return w, (excess + short) * OUTWARD + 1e-14 * (size + off + np.abs(value) @ np.abs(centre))
