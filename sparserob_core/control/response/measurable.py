@@ -142,8 +142,14 @@ class MeasurableSupport:
         length times the mean of ``h(b_k)``, and at least that of ``w'b_k`` for any point ``w`` of the set. Both are
         equal where one corner of the set is best for all; an interval where another takes over is halved.
         """
+        from scipy.linalg import matrix_balance
+
+        # In units of the states in which the matrix is small, powers of two: what is left is bounded by its norm.
+        A, (units, _) = matrix_balance(A, permute=False, separate=True)
+        starts, E = starts * units, E / units[:, None]
         total, speed = np.zeros((lengths.size, 2)), float(np.linalg.norm(A, 2))
-        fastest = min(speed, 4.0 * float(np.abs(np.linalg.eigvals(A)).max()))
+        # not by the norm alone, which of a matrix far from normal is much larger than what its flow does
+        fastest = min(speed, max(4.0 * float(np.abs(np.linalg.eigvals(A)).max()), speed / 16.0))
         count = int(np.clip(np.ceil(fastest * lengths.max(initial=0.0) / SHORT), 1, MOST_SHORT))
         owner, offsets = np.repeat(np.arange(lengths.size), count), np.outer(lengths, np.arange(count) / count)
         row = np.einsum("li,lqij->lqj", starts, _flows(A, offsets)).reshape(-1, A.shape[0])

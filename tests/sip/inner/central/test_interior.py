@@ -153,7 +153,7 @@ def test_a_policy_found_in_the_middle_is_certified_and_checked(
     config = {
         "problem": {**SPRING, "disturbance": {"box": [w, w]}},
         "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 20}},
-        "policy": {"name": "affine", "cost": cost},
+        "policy": {"name": "affine", "cost": cost, "among": None},
         "observers": [],
     }
     outcome = sr.run(config, out=tmp_path / "run", quiet=True, figures=False)
