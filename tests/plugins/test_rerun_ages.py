@@ -3,6 +3,7 @@ idle but for it, and beside four loops that never end."""
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
@@ -26,6 +27,7 @@ FIRST, LANDSCAPE, AGE, OTHER, FINE = 1.0, 2.0, 3.0, 1.0, 25
 """The design: seconds until the first picture of a panel, and until the first landscape; the age of a landscape, and
 how long it may be of another epsilon; lines of its grid. On a busy machine three times the seconds."""
 BUSY = 3.0
+BESIDE = "PYTEST_XDIST_WORKER" in os.environ  # other tests run on the second processor: the machine is a busy one
 LASTING, LONGEST = 30.0, 90.0  # seconds of a recording; as many more as the machine has other things to do, and at most
 ENDING = 3.0  # seconds by the clock that the view may add to a short exchange
 PANELS = (
@@ -96,7 +98,7 @@ def test_what_is_seen_of_a_search_is_of_this_moment(
             observers=[clock],
         )
     # a machine that is busy with other things gives the recorder as little as the run
-    factor = max(BUSY if busy else 1.0, clock.slowness)
+    factor = max(BUSY if busy or BESIDE else 1.0, clock.slowness)
     found = read(tmp_path / "run" / "recording.rrd")
     start = clock.heard[0][0]
     first = {
@@ -132,7 +134,7 @@ def test_what_is_seen_of_a_search_is_of_this_moment(
     assert logged[0] - times[0] < LANDSCAPE * factor
     assert age < AGE * factor
     assert other < OTHER * factor
-    if finest < FINE and clock.slowness > 2.0:  # a fine grid is promised where nothing else runs
+    if finest < FINE and (BESIDE or clock.slowness > 2.0):  # a fine grid is promised where nothing else runs
         pytest.skip(
             f"SKIPPED LOUDLY: the grid had {finest} lines on a machine that is {clock.slowness:.0f} times as slow as"
             " alone; what the design promises of a busy one is for three times"
@@ -157,7 +159,7 @@ def test_a_short_exchange_is_hardly_longer_with_the_view(busy: int, tmp_path: Pa
         wall = time.perf_counter() - began
     ending = clock.heard[-1][1]
     assert isinstance(ending, sr.RunFinished)
-    assert wall - ending.seconds < ENDING * max(BUSY if busy else 1.0, clock.slowness)
+    assert wall - ending.seconds < ENDING * max(BUSY if busy or BESIDE else 1.0, clock.slowness)
     found = read(tmp_path / "run" / "recording.rrd")
     assert {"/physics/plots/curve", "/landscape/map/g", "/verdict"} <= set(found)
     assert outcome.status == "certified"
