@@ -96,12 +96,15 @@ class Ellipsoid(ConvexSet):
         """Distance to the ellipsoid outside; inside, ``(gauge - 1) * shortest half-axis``, which is at least minus the
         depth."""
         # Half-axes from the factor: of its square, rounding leaves the shortest of very uneven ones without a sign. One
-        # that is shorter than rounding of the longest is no shorter than that.
+        # that is shorter than rounding of the longest is no shorter than that, which moves the projection only.
         axes, lengths, _ = np.linalg.svd(self.factor)
         lengths = np.maximum(lengths, np.finfo(float).eps * lengths.max())
         axes, squares = axes[:, ::-1], lengths[::-1] ** 2
         z = np.abs((np.asarray(points, dtype=float) - self.centre) @ axes)
-        gauge = np.sqrt((z**2 / squares).sum(axis=-1))
+        # Inside or outside by substitution in the triangular factor, which units of any kind leave as it is. A point of
+        # gauge g > 1 is at least (g - 1) * shortest half-axis away, for the set holds a ball of that radius.
+        gauge = self.gauge(points)
+        depth = (gauge - 1.0) / np.linalg.norm(np.linalg.solve(self.factor, np.eye(self.dimension)), ord=2)
         # The multiplier of the projection: |shape^(1/2) z / (shape + multiplier)| decreases to 1.
         _, high = bisect(
             lambda multiplier: (squares * (z / (squares + multiplier[..., None])) ** 2).sum(axis=-1) <= 1.0,
@@ -109,7 +112,7 @@ class Ellipsoid(ConvexSet):
             np.sqrt(squares[-1]) * np.linalg.norm(z, axis=-1),
         )
         distance = np.linalg.norm(z * (high[..., None] / (squares + high[..., None])), axis=-1)
-        excess: Array = np.where(gauge > 1.0, distance, (gauge - 1.0) * np.sqrt(squares[0]))
+        excess: Array = np.where(gauge > 1.0, np.maximum(distance, depth), depth)
         return excess
 
     @shaped
