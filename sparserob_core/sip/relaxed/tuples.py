@@ -267,7 +267,7 @@ class TupleValue:
 
     def _move(self, slots: Array) -> np.ndarray:
         """Bring the rows up to date with the indices ``(count, width)``; returns which of them changed."""
-        changed = np.flatnonzero((slots != self.slots).any(axis=1))
+        changed = np.flatnonzero(_moved(self.slots, slots))
         if not changed.size:
             return changed
         before, fresh, old = self._before, changed, self.slots[changed]
@@ -284,11 +284,11 @@ class TupleValue:
 
     def _build(self, fresh: np.ndarray, old: Array, wanted: Array) -> None:
         """The rows of some indices ``fresh (k,)`` that go from ``old`` to ``wanted (k, width)``."""
-        new = np.isnan(old).any(axis=1)
+        new = np.isnan(old).all(axis=1)
         for family, first, last in self._columns:
             # an index may move where the point at which it imposes a family does not, as at the end of the horizon
             indices = self.layout.indices(family, wanted)
-            moves = new | (self.layout.indices(family, old) != indices).any(axis=1)
+            moves = new | _moved(self.layout.indices(family, old), indices)
             if moves.any():
                 moved = fresh[moves]
                 G, self._h[moved, first:last] = self._family_rows(family, indices[moves])
@@ -319,8 +319,14 @@ class _Before:
     def find(self, changed: np.ndarray, slots: Array) -> tuple[np.ndarray, np.ndarray]:
         """Which of the indices ``changed`` return to what they were ``(k,)``, and where that is kept."""
         place = np.minimum(self.changed.searchsorted(changed), self.changed.size - 1)
-        back = (self.changed[place] == changed) & (self.slots[place] == slots).all(axis=1)
+        back = (self.changed[place] == changed) & ~_moved(self.slots[place], slots)
         return back, place[back]
+
+
+def _moved(old: Array, new: Array) -> np.ndarray:
+    """Which indices ``(k,)`` differ from what they were; a coordinate that was and is left open (NaN) does not."""
+    moved: np.ndarray = ((old != new) & ~(np.isnan(old) & np.isnan(new))).any(axis=1)
+    return moved
 
 
 def _nothing(n: int) -> FiniteSolution:

@@ -116,6 +116,29 @@ def test_only_the_rows_of_changed_indices_are_built(tools):
         assert built == expected
 
 
+def test_an_index_whose_disturbance_stays_open_is_built_again_only_where_its_time_moves(tools):
+    from sparserob_core.experiment.run.inspection import _with_the_worst
+
+    program, built = oscillator("literal"), []
+    open_ = np.arange(25) > 0
+    worst = [_with_the_worst(family, open_) for family in program.families]
+
+    def watched(family):
+        return replace(family, rows=lambda indices: built.append((family.name, len(indices))) or family.rows(indices))
+
+    g, rng = value(replace(program, families=[watched(f) for f in worst]), tools, 6), np.random.default_rng(8)
+    point = drawn(g, rng).reshape(6, 25)
+    point[:3, 1:] = np.nan
+    g.at(point.ravel())
+    other = point.copy()
+    other[1, 0] /= 2
+    built.clear()
+    g.at(other.ravel())
+    assert built == [("path", 1)]
+    fresh = value(replace(program, families=worst), tools, 6)
+    assert g.at(other.ravel()) == pytest.approx(fresh.at(other.ravel()), rel=1e-9)
+
+
 def test_a_family_that_an_index_imposes_where_it_did_before_is_not_built_again(tools):
     program, built = oscillator("reduced"), []
 
