@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict, overload
 
 import numpy as np
@@ -217,21 +218,32 @@ def ask_tell(
     *,
     start: Array | None = None,
     state: Mapping[str, Any] | None = None,
+    minimise: bool = False,
+    integer: Sequence[int] = (),
+    logarithmic: Sequence[int] = (),
     **options: object,
 ) -> AskTell:
     """A search for the maximum of a function that somebody else evaluates: a simulator, a queue, a laboratory.
 
-    The arguments are those of `maximise`, but for the function. ``state``: what `AskTell.state` gave, with the same
-    arguments; what was told is told again, and the search goes on with the points that it would have asked for. Raises
-    `InputError` when an argument is at fault.
+    The arguments are those of `maximise`, but for the function. ``minimise``: for its minimum. ``integer``: the
+    coordinates that are whole numbers; a point that has a value is then not asked for again. ``logarithmic``: those
+    that are searched by their logarithms. ``state``: what `AskTell.state` gave, with the same arguments, or with a
+    larger budget; what was told is told again, and the search goes on with the points that it would have asked for.
+    With a larger budget it is the search that had this budget from its beginning: values that it does not ask for are
+    kept beside it. Raises `InputError` when an argument is at fault.
     """
     from sparserob_core.sip.search.ask_tell import AskTell
+    from sparserob_core.sip.search.ranges import Ranges
     from sparserob_core.sip.search.search import Rules, Target
     from sparserob_core.sip.search.search import maximise as search
 
     chosen, share = _chosen(box, name, options, polish)
     first, rules = _placed(start, box), Rules(polish=share)
     number, calls = whole("seed", seed, 0), whole("budget", budget, 1)
+    Target(lambda points: points, box)  # a box without bounds is refused here
+    if not isinstance(minimise, bool):
+        raise InputError(f"minimise: expected true or false, got {minimise!r}")
+    ranges = Ranges(box, integer, logarithmic)
     entry: object = {"name": name, **options} if isinstance(name, str) else name
     about = {
         "maximiser": dict(entry) if isinstance(entry, Mapping) else type(entry).__name__,
@@ -241,13 +253,32 @@ def ask_tell(
         "lower": box.lower.tolist(),
         "upper": box.upper.tolist(),
         "start": None if first is None else first.tolist(),
+        "minimise": minimise,
+        "integer": list(ranges.integer),
+        "logarithmic": list(ranges.logarithmic),
     }
-    Target(lambda points: points, box)  # a box without bounds is refused here
+    begin = None if first is None else ranges.hidden(first)
 
     def run(function: Callable[[Array], Array]) -> Report:
-        return search(Target(function, box), chosen, calls, np.random.default_rng(number), rules, start=first)
+        return search(
+            Target(function, ranges.searched), chosen, calls, np.random.default_rng(number), rules, start=begin
+        )
 
-    return AskTell(box, run, about, state)
+    keywords: dict[str, Any] = dict(options)
+    again = partial(
+        ask_tell,
+        box,
+        name,
+        budget,
+        seed,
+        polish,
+        start=start,
+        minimise=minimise,
+        integer=integer,
+        logarithmic=logarithmic,
+        **keywords,
+    )
+    return AskTell(ranges, run, about, state, again)
 
 
 def _chosen(

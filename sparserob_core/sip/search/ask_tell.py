@@ -1,7 +1,9 @@
 """A search whose function is evaluated by somebody else: points are asked for, values are told.
 
 The maximiser runs in a thread, and never at the same time as whoever asks: `AskTell.ask` waits until it wants values or
-has ended, and it waits until they are told. So every maximiser can be asked, as it is.
+has ended, and it waits until they are told. So every maximiser can be asked, as it is. A thread cannot be written to a
+file; but a search is repeatable, so what was told is all there is to keep: another thread, told the same, comes to
+the same point.
 """
 
 from __future__ import annotations
@@ -9,7 +11,10 @@ from __future__ import annotations
 import threading
 import time
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
 from queue import SimpleQueue
 from types import TracebackType
 from typing import Any, Self, TypeAlias, final
@@ -20,12 +25,15 @@ from sparserob_core.arguments import is_whole
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.maximiser import EvaluationError, Report, Trace
+from sparserob_core.sip.search.ranges import Ranges
 
 Search: TypeAlias = Callable[[Callable[[Array], Array]], Report]
+Key: TypeAlias = tuple[float, ...]
 
 FORMAT = 1
 WORDS = {np.inf: "inf", -np.inf: "-inf"}
-GRACE = 5.0  # seconds that a maximiser may take to end
+GRACE = 5.0  # seconds that a maximiser may take to end; a tenth may be less than one of its steps in many coordinates
+LATER = {"minimise": False, "integer": [], "logarithmic": []}  # keys that states of version 0.1 do not have
 
 
 class Closed(Exception):
@@ -37,11 +45,12 @@ class _Other:
     """The side of the maximiser: what it wants, and what it is answered. It knows nothing of `AskTell`, so that one
     that is forgotten ends its thread."""
 
-    def __init__(self, search: Search, told: Sequence[tuple[Array, float]]) -> None:
-        self._search, self._told = search, list(told)
-        self.wanted: SimpleQueue[tuple[Array, Array] | Report | BaseException] = SimpleQueue()
+    def __init__(self, search: Search) -> None:
+        self._search = search
+        self.wanted: SimpleQueue[Array | Report | BaseException] = SimpleQueue()
         self.answers: SimpleQueue[Array | None] = SimpleQueue()
         self.thread = threading.Thread(target=self._run, name="sparserob maximiser", daemon=True)
+        self.thread.start()
 
     def close(self) -> None:
         """End the thread, whatever it waits for."""
@@ -51,27 +60,13 @@ class _Other:
 
     def _run(self) -> None:
         try:
-            report = self._search(self._values)
-            if self._told:
-                raise InputError(f"state: the search has ended {len(self._told)} values before those that were told")
-            self.wanted.put(report)
+            self.wanted.put(self._search(self._values))
         except BaseException as error:  # noqa: BLE001  it is raised where somebody asks
             ours = isinstance(error, EvaluationError) and isinstance(error.__cause__, InputError)
             self.wanted.put(error.__cause__ or error if ours else error)
 
     def _values(self, points: Array) -> Array:
-        known = self._told[: len(points)]
-        del self._told[: len(points)]
-        for asked, (told, _) in zip(points, known, strict=False):
-            if asked.tolist() != told.tolist():
-                raise InputError(
-                    f"state: the search asks for {asked.tolist()} where {told.tolist()} was told; it is another "
-                    "maximiser, another version, or one that is not repeatable"
-                )
-        values = np.array([value for _, value in known], dtype=float)
-        if len(values) == len(points):
-            return values
-        self.wanted.put((points.copy(), values))
+        self.wanted.put(points.copy())
         answer = self.answers.get()
         if answer is None:
             raise Closed("the search was closed")
@@ -79,34 +74,75 @@ class _Other:
 
 
 @final
+class _Values:
+    """Values that were told and not yet used, by their points. A value is used once, in the order in which it was
+    told, so that a point that is asked for twice is evaluated twice; ``repeats``: it answers as often as its point is
+    asked for."""
+
+    def __init__(self, repeats: bool) -> None:
+        self._repeats = repeats
+        self._numbers: dict[Key, deque[int]] = {}
+        self._last: dict[Key, int] = {}
+        self.unused: dict[int, None] = {}  # numbers of values, in the order in which they were told
+
+    def add(self, key: Key, number: int) -> None:
+        """Take note of a value by its number."""
+        self._numbers.setdefault(key, deque()).append(number)
+        self.unused[number] = None
+
+    def use(self, key: Key) -> int | None:
+        """The number of a value at a point; ``None`` where there is none."""
+        waiting = self._numbers.get(key)
+        if waiting:
+            self._last[key] = waiting.popleft()
+            self.unused.pop(self._last[key], None)
+            return self._last[key]
+        return self._last.get(key) if self._repeats else None
+
+
+@final
 class AskTell:
     """A search by hand: ``points = search.ask()``, ``search.tell(points, values)``, until ``search.done``.
 
     ``ask`` gives the same points until they are told, in another process too: `state` is plain data, from which
-    `sparserob_core.ask_tell` goes on. A search that is no longer wanted is closed with `close`, by leaving a ``with``
-    block, or by being forgotten. Not to be shared between threads.
+    `sparserob_core.ask_tell` goes on, with a larger budget too; pickled, and taken out again, it goes on likewise. For
+    several workers, ``ask(1, fresh=True)`` gives what nobody was given. Values are told in any order, and in part.
+    A search that is no longer wanted is closed with `close`, by leaving a ``with`` block, or by being forgotten. Its
+    methods may be called from several threads.
     """
 
-    def __init__(self, domain: Box, search: Search, about: Mapping[str, Any], state: Mapping[str, Any] | None) -> None:
-        self.domain, self._about = domain, dict(about)
+    def __init__(
+        self,
+        ranges: Ranges,
+        search: Search,
+        about: Mapping[str, Any],
+        state: Mapping[str, Any] | None,
+        again: Callable[..., AskTell],
+    ) -> None:
+        self.domain, self._ranges, self._about, self._again = ranges.domain, ranges, dict(about), again
+        self._sign = -1.0 if self._about["minimise"] else 1.0
+        self._search, self._lock = search, threading.RLock()
         self._points: list[Array] = []
         self._values: list[float] = []
         self._seconds: list[float] = []
         self._started = time.monotonic()
-        for point, value in [] if state is None else _told(state, self._about, domain):
+        self._known = _Values(repeats=bool(ranges.integer))
+        told, self._owed = ([], []) if state is None else _told(state, self._about, self.domain)
+        for point, value in told:
             self._take(point, value)
-        self._batch: Array | None = None
-        self._answered: list[float] = []
-        self._asked = 0
+        self._batch: list[Key] | None = None  # what the search waits for, and the values of it that are known
+        self._answers: list[float | None] = []
+        self._ahead: list[Key] = []  # given to idle workers, before the search wants it
+        self._given: Counter[Key] = Counter()  # given to somebody, and not told
         self._end: Report | BaseException | None = None
-        self._other = _Other(search, list(zip(self._points, self._values, strict=True)))
-        self._other.thread.start()
+        self._other = _Other(search)
         self._finalizer = weakref.finalize(self, self._other.close)
 
     @property
     def done(self) -> bool:
         """Whether the search has ended: nothing is left to ask for. Raises what the maximiser has raised."""
-        return self._waiting() is None
+        with self._lock:
+            return self._waiting() is None
 
     @property
     def evaluations(self) -> int:
@@ -115,75 +151,98 @@ class AskTell:
 
     @property
     def best_value(self) -> float:
-        """The best value so far; ``-inf`` before the first one. NaN counts as ``-inf``."""
-        return float(self._usable().max(initial=-np.inf))
+        """The best value so far, the least one with ``minimise``; ``-inf`` (``inf``) before the first one. NaN is never
+        the best."""
+        return self._sign * float(self._usable().max(initial=-np.inf))
 
     @property
     def best_point(self) -> Array:
         """The best point so far ``(d,)``; NaN before the first value."""
         return self._points[int(self._usable().argmax())].copy() if self._values else self.domain.lower * np.nan
 
-    def ask(self, k: int | None = None) -> Array:
+    def ask(self, k: int | None = None, fresh: bool = False) -> Array:
         """The points ``(j, d)`` whose values come next, ``k`` at most; ``(0, d)`` when the search has ended.
 
         There are fewer than ``k`` where the maximiser must know values before it goes on; most want one point at a
-        time. Raises `InputError` for a ``k`` below 1, and what the maximiser has raised.
+        time. ``fresh``: only points that nobody was given, one unless ``k`` says more, for several workers. Where the
+        search has none left, these are the ones that it would want next if those that are out had the worst value so
+        far (the constant liar of Ginsbourger, Le Riche and Carraro 2010); their values come on top of the budget where
+        the search does not ask for them. Raises `InputError` for a ``k`` below 1, and what the maximiser has raised.
         """
         if k is not None and not is_whole(k, 1):
             raise InputError(f"ask: expected a number of points of at least 1, got {k!r}")
-        waiting = self._waiting()
-        if waiting is None:
-            return np.empty((0, self.domain.dimension))
-        self._asked = len(waiting) if k is None else min(int(k), len(waiting))
-        return waiting[: self._asked].copy()
+        with self._lock:
+            waiting = self._waiting()
+            if waiting is None:
+                return np.empty((0, self.domain.dimension))
+            if fresh:
+                keys = self._fresh(waiting, 1 if k is None else int(k))
+            else:
+                keys = waiting if k is None else waiting[: int(k)]
+                self._given |= Counter(keys)
+            return np.array(keys, dtype=float).reshape(-1, self.domain.dimension)
 
     def tell(self, points: Array, values: Array) -> None:
-        """The values ``(j,)`` at the points ``(j, d)`` of the last `ask`, all of them and in their order; NaN and
-        ``-inf`` where there is none.
+        """The values ``(j,)`` at points ``(j, d)`` that were asked for, in any order, and all of them or some; NaN and
+        ``-inf`` where there is none. A single point ``(d,)`` has a number.
 
-        Raises `InputError` for other points, or when nothing was asked; nothing is taken then.
+        Raises `InputError` for points that were not asked for, or were told already; nothing is taken then.
         """
-        if not self._asked or self._batch is None:
-            raise InputError("tell: nothing was asked since the last tell")
         try:
-            given, told = np.array(points, dtype=float), np.array(values, dtype=float)
+            given, told = np.atleast_2d(np.array(points, dtype=float)), np.atleast_1d(np.array(values, dtype=float))
         except (TypeError, ValueError):
             raise InputError(f"tell: expected points and numbers, got {_short(points)} and {_short(values)}") from None
-        wanted = self._batch[len(self._answered) :][: self._asked]
-        if given.shape != wanted.shape or told.shape != (len(wanted),):
+        if given.ndim != 2 or given.shape[1] != self.domain.dimension or told.shape != (len(given),):
             raise InputError(
-                f"tell: expected the {len(wanted)} points of the last ask, shape {wanted.shape}, and as many values, "
+                f"tell: expected points of shape (j, {self.domain.dimension}), and as many values, "
                 f"got shapes {given.shape} and {told.shape}"
             )
-        if not np.array_equal(given, wanted):
-            row = int(np.argmax((given != wanted).any(axis=1)))
-            raise InputError(
-                f"tell: expected the points of the last ask in their order, got {given[row].tolist()} "
-                f"where {wanted[row].tolist()} was asked"
-            )
-        for point, value in zip(wanted, told.tolist(), strict=True):
-            self._take(point, value)
-        self._answered += told.tolist()
-        self._asked = 0
-        if len(self._answered) == len(self._batch):
-            answer, self._batch = np.array(self._answered), None
-            self._other.answers.put(answer)
+        keys = _keys(given)
+        with self._lock:
+            for key, count in Counter(keys).items():
+                if count > self._given[key]:
+                    raise InputError(
+                        f"tell: expected points that were asked for and have no value yet, got {list(key)}"
+                    )
+            for key, value in zip(keys, told.tolist(), strict=True):
+                self._given -= Counter((key,))
+                if key in self._ahead:
+                    self._ahead.remove(key)
+                self._take(np.array(key), value)
+            self._answer()
 
     def report(self) -> Report:
-        """The report of the search; before its end, what is known by now. Raises what the maximiser has raised."""
-        return self._end if self.done and isinstance(self._end, Report) else self._so_far("the search has not ended")
+        """The report of the search; before its end, what is known by now. A search maximises: with ``minimise`` its
+        values have the other sign. Raises what the maximiser has raised."""
+        if not (self.done and isinstance(self._end, Report)):
+            return self._so_far("the search has not ended")
+        if self._ranges.plain:
+            return self._end
+        trace = replace(self._end.trace, points=self._ranges.shown(self._end.trace.points))
+        best = self._ranges.shown(self._end.best_point[np.newaxis])[0]
+        return replace(self._end, best_point=best, trace=trace)
 
     def state(self) -> dict[str, Any]:
-        """Everything told so far, as plain data that JSON can hold; what was asked and not told is asked again."""
-        numbers = [WORDS.get(value, None if np.isnan(value) else value) for value in self._values]
-        return {"format": FORMAT, **self._about, "points": [one.tolist() for one in self._points], "values": numbers}
+        """Everything told so far, as plain data that JSON can hold; what was asked and not told is asked again.
+        ``aside``: the numbers of the values that the search has not asked for by itself."""
+        with self._lock:
+            numbers = [WORDS.get(value, None if np.isnan(value) else value) for value in self._values]
+            rows = {"points": [point.tolist() for point in self._points], "values": numbers}
+            owed = set(self._owed)
+            aside = [number for number in self._known.unused if number not in owed]
+            return {"format": FORMAT, **self._about, **rows, **({"aside": aside} if aside else {})}
 
     def close(self) -> None:
         """End the search, if it has not; what was told can still be read."""
         self._finalizer()
-        if self._end is None:
-            self._end = self._so_far("the search was closed")
-        self._batch = None
+        with self._lock:
+            if self._end is None:
+                self._end = self._so_far("the search was closed")
+            self._batch = None
+
+    def __reduce__(self) -> tuple[Callable[..., AskTell], tuple[object, ...]]:
+        closed = not self._finalizer.alive and isinstance(self._end, Report)
+        return _taken_out, (self._again, self.state(), closed)
 
     def __enter__(self) -> Self:
         return self
@@ -193,19 +252,86 @@ class AskTell:
     ) -> None:
         self.close()
 
-    def _waiting(self) -> Array | None:
+    def _waiting(self) -> list[Key] | None:
         """The points of the batch that have no value yet; ``None`` when the search has ended."""
-        if self._end is None and self._batch is None:
-            said = self._other.wanted.get()
-            if isinstance(said, tuple):
-                self._batch, self._answered = said[0], said[1].tolist()
+        while self._end is None and self._batch is None:
+            wanted = self._other.wanted.get()
+            if isinstance(wanted, np.ndarray):
+                self._batch = _keys(self._ranges.shown(wanted))
+                self._answers = [None] * len(self._batch)
             else:
-                self._end = said
+                self._end = wanted
+            self._answer()
         if isinstance(self._end, BaseException):
             raise self._end
-        return None if self._batch is None else self._batch[len(self._answered) :]
+        if self._batch is None:
+            return None
+        waiting = [key for key, value in zip(self._batch, self._answers, strict=True) if value is None]
+        return list(dict.fromkeys(waiting)) if self._ranges.integer else waiting
+
+    def _answer(self) -> None:
+        """Give the search the values that it waits for, where all of them are known."""
+        for row, key in enumerate(self._batch or ()):
+            if self._answers[row] is None and (number := self._known.use(key)) is not None:
+                self._answers[row] = self._sign * self._values[number]
+        missing = [key for key, value in zip(self._batch or (), self._answers, strict=False) if value is None]
+        if missing or self._batch is None:
+            self._demand_owed(missing)
+        if self._batch is not None and not missing:
+            values, self._batch = np.array(self._answers, dtype=float), None
+            self._other.answers.put(values)
+
+    def _demand_owed(self, missing: list[Key]) -> None:
+        """Refuse a state that holds what the search has asked for, and does not ask for now."""
+        owed = [number for number in self._owed if number in self._known.unused]
+        self._owed = []
+        if not owed or isinstance(self._end, BaseException):
+            return
+        if missing:
+            wrong = f"the search asks for {list(missing[0])} where {self._points[owed[0]].tolist()} was told; "
+        else:
+            wrong = f"the search has ended {len(owed)} values before those that were told; "
+        self._end = InputError(f"state: {wrong}it is another maximiser, another version, or one that is not repeatable")
+
+    def _fresh(self, waiting: list[Key], k: int) -> list[Key]:
+        """Points ``k`` at most that nobody was given: of those that the search waits for, then of those that it would
+        want next."""
+        out = Counter(self._given)
+        keys: list[Key] = []
+        for key in waiting:
+            if out[key]:
+                out[key] -= 1
+            elif len(keys) < k:
+                keys.append(key)
+        self._given += Counter(keys)
+        while len(keys) < k and (more := self._wanted_next(waiting)[: k - len(keys)]):
+            keys += more
+            self._ahead += more
+            self._given += Counter(more)
+        return keys
+
+    def _wanted_next(self, waiting: list[Key]) -> list[Key]:
+        """What another search, told everything and that all points that are out have the worst value so far, wants."""
+        usable = self._usable()
+        worst = float(usable[np.isfinite(usable)].min(initial=np.inf))
+        lie = worst if np.isfinite(worst) else -np.inf
+        known, out = _Values(repeats=bool(self._ranges.integer)), {*waiting, *self._ahead}
+        for number, point in enumerate(self._points):
+            known.add(_keys(point[np.newaxis])[0], number)
+        with _searching(self._search) as other:
+            while isinstance(wanted := other.wanted.get(), np.ndarray):
+                keys = _keys(self._ranges.shown(wanted))
+                numbers = [known.use(key) for key in keys]
+                new = [key for key, number in zip(keys, numbers, strict=True) if number is None and key not in out]
+                if new:
+                    return list(dict.fromkeys(new))
+                other.answers.put(
+                    np.array([lie if number is None else self._sign * self._values[number] for number in numbers])
+                )
+        return []
 
     def _take(self, point: Array, value: float) -> None:
+        self._known.add(_keys(point[np.newaxis])[0], len(self._values))
         self._points.append(np.array(point))
         self._values.append(value)
         self._seconds.append(time.monotonic() - self._started)
@@ -214,34 +340,66 @@ class AskTell:
         points = np.array(self._points).reshape(-1, self.domain.dimension)
         values = self._usable()
         trace = Trace(points, values, np.maximum.accumulate(values), np.array(self._seconds))
-        return Report(self.best_value, self.best_point, self.evaluations, np.inf, trace, stopped)
+        best = float(values.max(initial=-np.inf))
+        return Report(best, self.best_point, self.evaluations, np.inf, trace, stopped)
 
     def _usable(self) -> Array:
-        values = np.array(self._values, dtype=float)
+        """The values as those of a maximisation ``(n,)``; NaN is ``-inf``."""
+        values = self._sign * np.array(self._values, dtype=float)
         return np.where(np.isnan(values), -np.inf, values)
 
 
-def _told(state: object, about: Mapping[str, Any], domain: Box) -> list[tuple[Array, float]]:
-    """The points and values of a state; raises `InputError` where it is malformed, or of another search."""
+def _taken_out(again: Callable[..., AskTell], state: Mapping[str, Any], closed: bool) -> AskTell:
+    """A search that was pickled."""
+    search = again(state=state)
+    if closed:
+        search.close()
+    return search
+
+
+@contextmanager
+def _searching(search: Search) -> Iterator[_Other]:
+    other = _Other(search)
+    try:
+        yield other
+    finally:
+        other.close()
+
+
+def _keys(points: Array) -> list[Key]:
+    """Points as what can be looked up."""
+    return [tuple(point) for point in points.tolist()]
+
+
+def _told(state: object, about: Mapping[str, Any], domain: Box) -> tuple[list[tuple[Array, float]], Iterable[int]]:
+    """The points and values of a state, and the numbers of those that the search must ask for again; raises
+    `InputError` where it is malformed, or of another search."""
     if not isinstance(state, Mapping) or state.get("format") != FORMAT:
         raise InputError(path="state", expected=f"what `state()` gave, format {FORMAT}", got=_short(state))
     for key, ours in about.items():
-        if key not in state or state[key] != ours:
-            raise InputError(path=f"state.{key}", expected=f"{_short(ours)}, as given", got=_short(state.get(key)))
-    points, values = state.get("points"), state.get("values")
+        theirs = state.get(key, LATER.get(key))
+        if key == "budget" and is_whole(theirs, 1) and theirs <= ours:
+            continue
+        if theirs != ours:
+            least = "at most " if key == "budget" else ""
+            raise InputError(path=f"state.{key}", expected=f"{least}{_short(ours)}, as given", got=_short(theirs))
+    points, values, aside = state.get("points"), state.get("values"), state.get("aside", [])
     if not isinstance(points, list) or not isinstance(values, list) or len(points) != len(values):
         raise InputError(path="state.points", expected="a list of points, and a value for each", got=_short(points))
-    found = []
+    if not isinstance(aside, list) or not all(is_whole(number, 0) and number < len(points) for number in aside):
+        raise InputError(path="state.aside", expected="numbers of points", got=_short(aside))
+    told = []
     for row, (point, value) in enumerate(zip(points, values, strict=True)):
         try:
-            place = np.array(point, dtype=float)
+            position = np.array(point, dtype=float)
             number = float("nan" if value is None else value)
         except (TypeError, ValueError):
             raise InputError(path=f"state.values.{row}", expected="a point and a number", got=_short(value)) from None
-        if place.shape != domain.lower.shape or not ((place >= domain.lower) & (place <= domain.upper)).all():
+        if position.shape != domain.lower.shape or not ((position >= domain.lower) & (position <= domain.upper)).all():
             raise InputError(path=f"state.points.{row}", expected="a point of the domain", got=_short(point))
-        found.append((place, number))
-    return found
+        told.append((position, number))
+    same = state.get("budget") == about["budget"]
+    return told, [number for number in range(len(told)) if number not in set(aside)] if same else []
 
 
 def _short(value: object) -> str:

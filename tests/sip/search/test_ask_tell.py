@@ -1,10 +1,11 @@
 """Guards sip/search/ask_tell.py: a search by hand asks what the same search asks of a function, goes on from its
-state in another process, refuses what was not asked, and leaves no thread behind."""
+state in another process, serves several workers, refuses what was not asked, and leaves no thread behind."""
 
 from __future__ import annotations
 
 import gc
 import json
+import pickle
 import subprocess
 import sys
 import threading
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.sip.search.ranges import Ranges
 
 BOX = sr.Box([-2.0, -1.0], [1.0, 3.0])
 NAMES = ["sequool", "simulated_annealing", "maxlipo", "direct", "gradient_ascent", "random_search", "dual_annealing"]
@@ -122,18 +124,14 @@ def test_an_infinite_value_ends_it():
 
 def test_what_was_not_asked_is_refused_and_nothing_is_taken():
     search = sr.ask_tell(BOX, "random_search", budget=30)
-    with pytest.raises(sr.InputError, match="tell: nothing was asked since the last tell"):
+    with pytest.raises(sr.InputError, match="tell: expected points that were asked for and have no value yet"):
         search.tell(np.zeros((1, 2)), np.zeros(1))
     points = search.ask(3)
     for wrong, values, words in (
-        (
-            points[:2],
-            np.zeros(2),
-            r"expected the 3 points of the last ask, shape \(3, 2\), and as many values, got shapes",
-        ),
         (points, np.zeros(2), r"got shapes \(3, 2\) and \(2,\)"),
-        (points[::-1], np.zeros(3), "expected the points of the last ask in their order, got "),
-        (points + 0.1, np.zeros(3), "in their order"),
+        (points[:, :1], np.zeros(3), r"expected points of shape \(j, 2\), and as many values, got shapes \(3, 1\)"),
+        (points + 0.1, np.zeros(3), "expected points that were asked for and have no value yet, got "),
+        (points[[0, 1, 0]], np.zeros(3), "expected points that were asked for and have no value yet, got "),
         (points, ["many", "few", "none"], "tell: expected points and numbers, got "),
         (points, None, "as many values"),
     ):
@@ -143,7 +141,7 @@ def test_what_was_not_asked_is_refused_and_nothing_is_taken():
     assert search.ask(3).tolist() == points.tolist()
     search.tell(points, bowl(points))
     assert search.evaluations == 3
-    with pytest.raises(sr.InputError, match="nothing was asked"):
+    with pytest.raises(sr.InputError, match="have no value yet"):
         search.tell(points, bowl(points))
     for bad in (0, -1, True, 1.5):
         with pytest.raises(sr.InputError, match="expected a number of points of at least 1"):
@@ -151,12 +149,199 @@ def test_what_was_not_asked_is_refused_and_nothing_is_taken():
     search.close()
 
 
+@pytest.mark.parametrize("name", ["random_search", "sequool", "direct"])
+def test_values_may_be_told_in_any_order_and_in_part(name):
+    straight = sr.ask_tell(BOX, name, budget=40, seed=3)
+    by_hand(straight)
+    search, order = sr.ask_tell(BOX, name, budget=40, seed=3), np.random.default_rng(0)
+    while not search.done:
+        points = order.permutation(search.ask(7))
+        part = points[: 1 + len(points) // 2]
+        search.tell(part, bowl(part))
+    assert search.report().trace.points.tolist() == straight.report().trace.points.tolist()
+    assert search.best_value == straight.best_value
+    assert search.evaluations == straight.evaluations
+
+
+def test_a_single_point_is_told_with_a_number():
+    with sr.ask_tell(BOX, "simulated_annealing", budget=10) as search:
+        point = search.ask()[0]
+        search.tell(point, 2.5)
+        assert (search.best_value, search.best_point.tolist()) == (2.5, point.tolist())
+
+
+@pytest.mark.parametrize("name", ["simulated_annealing", "maxlipo", "direct", "random_search"])
+def test_workers_are_given_different_points_and_the_search_stays_the_same(name):
+    alone = sr.ask_tell(BOX, name, budget=30, seed=5)
+    by_hand(alone)
+    search, workers, rounds = sr.ask_tell(BOX, name, budget=30, seed=5), list[np.ndarray](), 0
+    while not search.done:
+        while len(workers) < 3 and len(point := search.ask(fresh=True)):
+            workers.append(point[0])
+        assert len({tuple(point) for point in workers}) == len(workers), "no two evaluate the same"
+        late = workers.pop(rounds % len(workers))
+        search.tell(late, bowl(late[np.newaxis])[0])
+        rounds += 1
+    assert search.report().trace.points.tolist() == alone.report().trace.points.tolist()
+    assert search.evaluations >= alone.evaluations
+    assert search.best_value >= alone.best_value, "what others have found beside it counts"
+    for point in workers:
+        search.tell(point, bowl(point[np.newaxis])[0])
+
+
+def test_a_worker_that_is_lost_is_made_up_for():
+    with sr.ask_tell(BOX, "simulated_annealing", budget=10) as search:
+        lost = search.ask(fresh=True)
+        assert search.ask(fresh=True).tolist() != lost.tolist()
+        assert search.ask().tolist() == lost.tolist(), "asked plainly, it gives what the search waits for"
+
+
+def test_what_idle_workers_evaluated_is_kept_in_the_state():
+    with sr.ask_tell(BOX, "simulated_annealing", budget=20, seed=1) as search:
+        waited, ahead = search.ask(fresh=True), search.ask(2, fresh=True)
+        assert len(ahead) == 2
+        search.tell(ahead, np.array([5.0, 4.0]))
+        state = json.loads(json.dumps(search.state()))
+    assert state["aside"] == [0, 1]
+    with sr.ask_tell(BOX, "simulated_annealing", budget=20, seed=1, state=state) as again:
+        assert again.ask().tolist() == waited.tolist()
+        assert (again.best_value, again.evaluations) == (5.0, 2)
+
+
+@pytest.mark.parametrize("name", ["random_search", "direct", "maxlipo", "simulated_annealing", "sequool"])
+def test_a_larger_budget_is_the_search_that_had_it_from_its_beginning(name):
+    short = sr.ask_tell(BOX, name, budget=20, seed=2, polish=0)
+    by_hand(short)
+    longer = sr.ask_tell(BOX, name, budget=45, seed=2, polish=0, state=json.loads(json.dumps(short.state())))
+    assert longer.best_value == short.best_value
+    by_hand(longer)
+    whole = sr.ask_tell(BOX, name, budget=45, seed=2, polish=0)
+    by_hand(whole)
+    assert longer.report().trace.points.tolist() == whole.report().trace.points.tolist()
+    aside = len(longer.state().get("aside", []))
+    assert longer.evaluations == whole.evaluations + aside
+    if name in ("random_search", "direct", "maxlipo"):  # whose points do not depend on the budget
+        assert aside == 0
+    with pytest.raises(sr.InputError, match=r"state\.budget: expected at most 20, as given, got 45"):
+        sr.ask_tell(BOX, name, budget=20, seed=2, polish=0, state=longer.state())
+
+
+def test_minimising_is_maximising_with_the_other_sign():
+    up = sr.ask_tell(BOX, "sequool", budget=30)
+    by_hand(up)
+    down = sr.ask_tell(BOX, "sequool", budget=30, minimise=True)
+    assert down.best_value == np.inf
+    by_hand(down, lambda points: -bowl(points))
+    assert down.report().trace.points.tolist() == up.report().trace.points.tolist()
+    assert (down.best_value, down.best_point.tolist()) == (-up.best_value, up.best_point.tolist())
+    assert down.report().best_value == up.best_value
+    with pytest.raises(sr.InputError, match=r"state\.minimise: expected False, as given, got True"):
+        sr.ask_tell(BOX, "sequool", budget=30, state=down.state())
+
+
+MIXED = sr.Box([1.0, 1e-6, 2.0, 1.0], [4.0, 1e2, 2.0, 1000.0])
+RANGES = {"integer": [0, 2, 3], "logarithmic": [1, 3]}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_whole_and_logarithmic_ranges_are_kept_and_filled(name):
+    search = sr.ask_tell(MIXED, name, budget=200, seed=1, **RANGES, start=[[2.0, 1e-3, 2.0, 10.0]])
+    assert search.ask(1).tolist()[0] == pytest.approx([2.0, 1e-3, 2.0, 10.0], rel=1e-12)
+    asked: list[list[float]] = []
+
+    def function(points):
+        asked.extend(points.tolist())
+        return -((points[:, 0] - 3.0) ** 2) - (np.log10(points[:, 1]) + 4.0) ** 2 - np.log10(points[:, 3] / 50.0) ** 2
+
+    by_hand(search, function)
+    points = np.array(asked)
+    assert ((points >= MIXED.lower) & (points <= MIXED.upper)).all()
+    assert (points[:, [0, 2, 3]] == np.round(points[:, [0, 2, 3]])).all()
+    assert len({tuple(point) for point in asked}) == len(asked) == search.evaluations, "no point is evaluated twice"
+    assert set(points[:, 0]) >= {2.0, 3.0}
+    assert search.best_point[0] == 3.0
+    assert search.best_value > -0.6
+    assert search.report().best_point.tolist() == search.best_point.tolist()
+
+
+def test_every_whole_number_and_every_decade_of_a_range_are_as_long():
+    ranges = Ranges(sr.Box([0.0, 1e-4], [3.0, 1e4]), integer=[0], logarithmic=[1])
+    box, even = ranges.searched, (np.arange(4000) + 0.5) / 4000
+    points = ranges.shown(box.lower + even[:, np.newaxis] * (box.upper - box.lower))
+    assert np.bincount(points[:, 0].astype(int)).tolist() == [1000] * 4, "the ends of a range as its middle"
+    decades = np.floor(np.log10(points[:, 1])).astype(int) + 4
+    assert np.bincount(decades).tolist() == [500] * 8
+    assert ranges.shown(ranges.hidden(points)) == pytest.approx(points, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("ranges", "words"),
+    [
+        ({"integer": [4]}, "integer: expected coordinates, whole numbers from 0 to 3, got"),
+        ({"integer": [1]}, r"integer.1: expected whole bounds, got \[1e-06, 100.0\]"),
+        ({"logarithmic": "1"}, "logarithmic: expected coordinates"),
+        ({"logarithmic": [-1]}, "logarithmic: expected coordinates"),
+        ({"minimise": 1}, "minimise: expected true or false, got 1"),
+    ],
+)
+def test_ranges_that_there_are_not_are_refused_by_their_key(ranges, words):
+    with pytest.raises(sr.InputError, match=words):
+        sr.ask_tell(MIXED, "sequool", **ranges)
+    with pytest.raises(sr.InputError, match=r"logarithmic\.0: expected a positive lower bound, got 0.0"):
+        sr.ask_tell(sr.Box([0.0], [1.0]), "sequool", logarithmic=[0])
+
+
+@pytest.mark.parametrize("name", ["simulated_annealing", "maxlipo", "random_search"])
+def test_a_search_is_pickled_and_goes_on(name):
+    arguments = {"box": MIXED, "name": name, "budget": 40, "seed": 2, "minimise": True, **RANGES}
+    whole = sr.ask_tell(**arguments)
+    by_hand(whole, lambda points: points[:, 0] * points[:, 1])
+    search = sr.ask_tell(**arguments)
+    by_hand(search, lambda points: points[:, 0] * points[:, 1], k=3, until=11)
+    again = pickle.loads(pickle.dumps(search))
+    assert again.ask(2).tolist() == search.ask(2).tolist()
+    assert (again.evaluations, again.best_value) == (search.evaluations, search.best_value)
+    by_hand(again, lambda points: points[:, 0] * points[:, 1])
+    assert again.report().trace.points.tolist() == whole.report().trace.points.tolist()
+    search.close()
+    assert pickle.loads(pickle.dumps(search)).done, "what is closed stays closed"
+
+
+def test_a_state_of_an_earlier_version_is_taken_up():
+    with sr.ask_tell(BOX, "sequool", budget=30) as search:
+        by_hand(search, until=5)
+        state, next_points = search.state(), search.ask()
+    for key in ("minimise", "integer", "logarithmic"):
+        del state[key]
+    with sr.ask_tell(BOX, "sequool", budget=30, state=state) as again:
+        assert again.ask().tolist() == next_points.tolist()
+
+
+def test_threads_share_a_search():
+    search = sr.ask_tell(BOX, "simulated_annealing", budget=40, seed=1)
+
+    def worker():
+        while not search.done:
+            points = search.ask(fresh=True)
+            if len(points):
+                search.tell(points, bowl(points))
+
+    threads = [threading.Thread(target=worker) for _ in range(3)]
+    for one in threads:
+        one.start()
+    for one in threads:
+        one.join(30.0)
+    assert search.done
+    assert search.best_value == max(bowl(np.array(search.state()["points"])))
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         ({"seed": 3}, "state.seed: expected 2, as given, got 3"),
-        ({"budget": 99}, "state.budget"),
+        ({"budget": 99}, "state.budget: expected at most 30, as given, got 99"),
         ({"upper": [1.0, 4.0]}, "state.upper"),
+        ({"aside": [0]}, "state.aside: expected numbers of points"),
         ({"format": 7}, "expected what `state\\(\\)` gave, format 1"),
         ({"points": [[0.0, 0.0]]}, "state.points: expected a list of points, and a value for each"),
         ({"points": [[0.0, 9.0]], "values": [1.0]}, "state.points.0: expected a point of the domain"),
