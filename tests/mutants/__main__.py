@@ -2,8 +2,8 @@
 
 ``python -m tests.mutants [COUNT=300] [SEED=1] [FOLDERS=checker,sip/proof] [STAGE=folder|first] [JOBS=1] [SKIP=0]``
 
-Each mutant stands in a copy of the tree, never in the tree itself. The tests of its own folder are put to it, those of
-the files that call its function before the others; what survives these meets the whole first stage. Time is that of the
+Each mutant stands in a copy of the tree, never in the tree itself. The tests of its own folder that call its function
+are put to it, the shortest first; what survives these meets the whole first stage. Time is that of the
 processor, so that a busy machine kills nothing.
 """
 
@@ -43,6 +43,9 @@ COPIED = (
 )
 # the text of the tree, and this tool: they say nothing of the mathematics
 NOT_ASKED = ("--ignore=tests/rules", "--ignore=tests/mutants")
+
+
+KEPT = ROOT / ".mutants"  # what unchanged tests said, for as long as the tree does not change
 
 
 @dataclass
@@ -113,7 +116,7 @@ def main(arguments: list[str]) -> int:
         for number in range(int(options["JOBS"])):
             copies.put(copied(Path(scratch) / str(number)))
         first = copies.get()
-        costs = {name: baseline(first, [f"tests/{name}"]) for name in {folder_of(one, folders) for one in chosen}}
+        costs = {name: baseline(first, [f"tests/{name}"], KEPT) for name in {folder_of(one, folders) for one in chosen}}
         copies.put(first)
 
         def judged(mutant: Mutant) -> tuple[Mutant, Verdict, Verdict | None]:

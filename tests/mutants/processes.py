@@ -1,9 +1,11 @@
-"""Tests in processes of their own: what they cost and which functions each file of them calls; and whether they notice
-a mutant."""
+"""Tests in processes of their own: what each costs and which functions it calls; and whether they notice a mutant."""
 
 from __future__ import annotations
 
 import contextlib
+import functools
+import gc
+import hashlib
 import importlib
 import json
 import os
@@ -12,10 +14,12 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Generator
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from tests.mutants.sites import Mutant
 
@@ -36,33 +40,52 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Baseline:
-    """Seconds of the processor for unchanged tests, and which files of tests call a function: by path and line."""
+    """Unchanged tests: seconds of the processor for all of them, those of each, and by whom a function is called. Tests
+    go by their name, functions by path and line."""
 
     seconds: float
+    each: dict[str, float]
     callers: dict[str, list[str]]
 
+    def asked(self, mutant: Mutant) -> list[str]:
+        """The tests that call the function of a mutant, those first that can say no for the least time: the files in
+        the order of what they take, and so within each. What is not in a function is called by who calls any of the
+        file."""
+        names = [name for name in self.callers if name.startswith(f"{mutant.path}:")]
+        if mutant.function:
+            names = [name for name in names if name == f"{mutant.path}:{mutant.function}"]
+        tests = {test for name in names for test in self.callers[name]}
+        files = dict.fromkeys((_file(test) for test in tests), 0.0)
+        for test in tests:
+            files[_file(test)] += self.each[test]
+        return sorted(tests, key=lambda test: (files[_file(test)], _file(test), self.each[test], test))
 
-def baseline(copy: Path, targets: list[str]) -> Baseline:
-    """Run tests on the unchanged tree, and raise `RuntimeError` where one fails."""
-    report = copy / "baseline.json"
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    code = _in_a_process(copy, lambda: _pytest(targets, [_Callers(copy, report)]), 10 * FIRST_STAGE)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+
+def baseline(copy: Path, targets: list[str], kept: Path) -> Baseline:
+    """Run tests on the unchanged tree, and raise `RuntimeError` where one fails. What they said is ``kept`` in a folder
+    for as long as no source file of the tree changes."""
+    digest = hashlib.sha256(repr(targets).encode())
+    for file in sorted(copy.rglob("*.py")):
+        digest.update(str(file.relative_to(copy)).encode() + file.read_bytes())
+    report = kept / f"{digest.hexdigest()[:16]}.json"
+    if report.exists():
+        return Baseline(**json.loads(report.read_text()))
+    code = _in_a_process(copy, lambda: _pytest(targets, [_Callers(copy, copy / "baseline.json")]), 10 * FIRST_STAGE)
     if code not in (0, 5):
         raise RuntimeError(f"the tests of {targets} fail without any mutant:\n{_tail(copy)}")
-    callers = json.loads(report.read_text()) if report.exists() else {}
-    return Baseline(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, callers)
+    answer = Baseline(**json.loads((copy / "baseline.json").read_text()))
+    kept.mkdir(exist_ok=True)
+    report.write_text(json.dumps(asdict(answer)))
+    return answer
 
 
 def tested(copy: Path, mutant: Mutant, targets: list[str], cost: Baseline | None) -> Verdict:
     """Whether tests notice a mutant in a copy of the tree. Where it is known who calls its function, nobody else is
     asked."""
+    plugins = list[Any]()
     if cost is not None:
-        # what is not in a function is called by who calls any function of the file
-        names = [name for name in cost.callers if name.startswith(f"{mutant.path}:")]
-        if mutant.function:
-            names = [name for name in names if name == f"{mutant.path}:{mutant.function}"]
-        targets = sorted({file for name in names for file in cost.callers[name]}, key=lambda file: _fit(file, mutant))
+        order = cost.asked(mutant)
+        targets, plugins = list(dict.fromkeys(map(_file, order))), [_Chosen(order)]
         if not targets:
             return Verdict(False, "no test calls it", 0.0)
     limit = FIRST_STAGE if cost is None else max(AT_LEAST, int(PATIENCE * cost.seconds))
@@ -70,7 +93,7 @@ def tested(copy: Path, mutant: Mutant, targets: list[str], cost: Baseline | None
     source = file.read_bytes()
     try:
         _written(file, mutant.applied(source))
-        code = _in_a_process(copy, lambda: _pytest(["-x", *targets], []), limit)
+        code = _in_a_process(copy, lambda: _pytest(["-x", *targets], plugins), limit)
     finally:
         _written(file, source)
     seconds = time.perf_counter() - started
@@ -79,9 +102,8 @@ def tested(copy: Path, mutant: Mutant, targets: list[str], cost: Baseline | None
     return Verdict(True, "no end" if code < 0 else _failed(copy), seconds)
 
 
-def _fit(file: str, mutant: Mutant) -> tuple[bool, str]:
-    """First the test of the same name."""
-    return Path(mutant.path).stem not in Path(file).stem, file
+def _file(test: str) -> str:
+    return test.split("::", maxsplit=1)[0]
 
 
 def _written(file: Path, data: bytes) -> None:
@@ -91,8 +113,6 @@ def _written(file: Path, data: bytes) -> None:
 
 
 def _pytest(arguments: list[str], plugins: list[Any]) -> int:
-    import pytest
-
     return int(pytest.main(["-q", "-p", "no:cacheprovider", "--tb=line", *arguments], plugins=plugins))
 
 
@@ -152,25 +172,64 @@ def _failed(copy: Path) -> str:
     return names[0] if names else "no test could be run"
 
 
+class _Chosen:
+    """A plugin of pytest that runs so many tests and no other, in this order."""
+
+    def __init__(self, order: list[str]) -> None:
+        self.place = {test: place for place, test in enumerate(order)}
+
+    def pytest_collection_modifyitems(self, items: list[Any]) -> None:
+        items[:] = sorted(
+            (item for item in items if item.nodeid in self.place), key=lambda item: self.place[item.nodeid]
+        )
+
+
 class _Callers:
-    """A plugin of pytest that notes which functions of the tree each file of tests calls."""
+    """A plugin of pytest that notes which functions of the tree each test calls, and how long it takes.
+
+    Whatever is remembered by `functools` is forgotten before each test, or the second one that needs an answer would
+    seem not to ask for it; fixtures that several tests share are called by all of their file.
+    """
 
     def __init__(self, copy: Path, report: Path) -> None:
-        self.root, self.report, self.callers = f"{copy}/", report, dict[str, set[str]]()
-        self.file = ""
+        self.root, self.report = f"{copy}/", report
+        self.callers, self.each = dict[str, set[str]](), dict[str, float]()
+        self.asking, self.started = "", 0.0
 
     def pytest_runtest_logstart(self, nodeid: str) -> None:
-        self.file = nodeid.split("::", maxsplit=1)[0]
+        for thing in gc.get_objects():
+            if isinstance(thing, functools._lru_cache_wrapper):
+                thing.cache_clear()
+        self.asking, self.started = nodeid, time.process_time()
         sys.settrace(self._called)
 
-    def pytest_runtest_logfinish(self) -> None:
+    def pytest_runtest_logfinish(self, nodeid: str) -> None:
         sys.settrace(None)
+        self.each[nodeid] = time.process_time() - self.started
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_fixture_setup(self, fixturedef: Any) -> Generator[None, object, object]:
+        test = self.asking
+        if fixturedef.scope != "function":
+            self.asking = _file(test)
+        try:
+            return (yield)
+        finally:
+            self.asking = test
 
     def pytest_sessionfinish(self) -> None:
-        self.report.write_text(json.dumps({name: sorted(files) for name, files in self.callers.items()}))
+        beside = dict[str, list[str]]()
+        for test in self.each:
+            beside.setdefault(_file(test), []).append(test)
+        callers = {
+            name: sorted({test for caller in callers for test in beside.get(caller, [caller])})
+            for name, callers in self.callers.items()
+        }
+        seconds = sum(self.each.values())
+        self.report.write_text(json.dumps({"seconds": seconds, "each": self.each, "callers": callers}))
 
     def _called(self, frame: Any, event: str, argument: object) -> None:
         code = frame.f_code
         if code.co_filename.startswith(self.root):
             name = f"{code.co_filename[len(self.root) :]}:{code.co_firstlineno}"
-            self.callers.setdefault(name, set()).add(self.file)
+            self.callers.setdefault(name, set()).add(self.asking)

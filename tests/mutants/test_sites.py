@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 
 from tests.mutants.__main__ import FOLDERS, drawn
+from tests.mutants.processes import Baseline
 from tests.mutants.sites import KINDS, mutants
 
 SOURCE = b'''"""Text with 2 + 2."""
@@ -65,3 +66,18 @@ def test_a_draw_can_be_repeated_and_goes_through_every_folder_in_order():
     places = [next(i for i, name in enumerate(folders) if f"/{name}/" in mutant.path) for mutant in first]
     assert places == sorted(places)
     assert set(places) == {0, 1}
+
+
+def test_a_mutant_is_put_to_the_tests_that_call_its_function_the_cheapest_file_first():
+    inside, outside = (
+        next(mutant for mutant in mutants("a.py", SOURCE) if mutant.before == text) for text in ("<=", "4")
+    )
+    each = {"t/a.py::slow": 9.0, "t/a.py::quick": 1.0, "t/b.py::one": 5.0, "t/c.py::no": 0.1}
+    callers = {
+        "a.py:3": ["t/a.py::slow", "t/a.py::quick", "t/b.py::one"],
+        "a.py:9": ["t/c.py::no"],
+        "b.py:3": ["t/d.py"],
+    }
+    baseline = Baseline(15.1, each, callers)
+    assert baseline.asked(inside) == ["t/b.py::one", "t/a.py::quick", "t/a.py::slow"]
+    assert baseline.asked(outside) == ["t/c.py::no", *baseline.asked(inside)]

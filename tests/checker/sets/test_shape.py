@@ -4,6 +4,7 @@ samples."""
 from __future__ import annotations
 
 import math
+import operator
 from fractions import Fraction
 
 import numpy as np
@@ -363,6 +364,12 @@ def test_a_ball_of_one_norm_in_many_dimensions_is_above_its_support_with_little_
         assert (excess <= 2.0 * 1.3 * np.abs(spread).sum(axis=1) * 2.0 + 1e-10).all()
         sharp = known(source).bound(value, np.zeros((30, d)))
         assert (np.abs(np.einsum("kd,kd->k", sharp[0], value) + sharp[1] - source.support(value)) < 1e-11).all()
+        # seen from where the direction is nearly 0, the opposite corner of the range is the worst
+        w, excess = known(source).bound(1e-9 * value, spread)
+        f = 1e-9 * value + np.where(w >= source.centre, -spread, spread)
+        gap = source.support(f) - np.einsum("kd,kd->k", w, f)
+        assert (gap <= excess + 1e-15).all()
+        assert d <= 8 or (excess <= gap + 1e-6).all()
 
 
 def test_corners_of_a_zonotope_and_a_polytope_hold_in_exact_arithmetic():
@@ -393,3 +400,80 @@ def test_a_linear_bound_holds_where_a_range_is_many_times_as_wide_as_its_middle_
         assert (shape.support(f) <= np.einsum("kw,kw->k", w, f) + excess + 1e-14).all()
     far = np.abs(points_of(name)).max()
     assert (excess <= 8.0 * far * spread.sum(axis=1)).all()
+
+
+def exactly(shape, value, w):
+    """``h(f) - w'f`` for rows of numbers, from below, beyond double precision."""
+    with ctx.workprec(200):
+        return np.array(
+            [
+                float((shape.support(balls(f)) - sum(map(operator.mul, balls(x), balls(f)), arb(0))).lower())
+                for f, x in zip(value, w, strict=True)
+            ]
+        )
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_at_a_point_a_linear_bound_is_sharp_and_rounding_does_not_put_it_below_the_support(name):
+    """Compared beyond double precision, with numbers of any size beside each other: what is lost is rounding."""
+    rng, shape = np.random.default_rng(14), known(SETS[name])
+    value = rng.normal(size=(250, 2)) * 10.0 ** rng.uniform(-5, 5, size=(250, 2))
+    for spread in (np.zeros_like(value), 1e-17 * np.abs(value)):
+        w, excess = shape.bound(value, spread)
+        above = exactly(shape, value, w)
+        assert (above <= excess).all()
+        assert (excess <= 5e-13 * np.abs(value).sum(axis=1)).all()
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_corners_of_a_range_stay_below_a_linear_bound_to_the_last_bit(name):
+    rng, shape = np.random.default_rng(15), known(SETS[name])
+    value = rng.normal(size=(60, 2)) * 10.0 ** rng.uniform(-3, 3, size=(60, 2))
+    spread = np.abs(value) * 10.0 ** rng.uniform(-16, 0.5, size=(60, 2))
+    w, excess = shape.bound(value, spread)
+    for corner in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        with np.errstate(invalid="ignore"):
+            f = value + np.array(corner) * spread
+        within = (
+            np.abs(
+                [[Fraction(a) - Fraction(b) for a, b in zip(*pair, strict=True)] for pair in zip(f, value, strict=True)]
+            )
+            <= spread
+        ).all(axis=1)
+        above = exactly(shape, f, w)
+        assert (above <= excess)[within].all()
+
+
+def test_half_a_line_has_a_support_on_one_side_only():
+    shape = known(Box(np.array([-np.inf, 0.25]), np.array([1.0, np.inf])))
+    assert shape.support(balls([2.0, -3.0])) == 2 * 1 - 3 * arb(0.25)
+    assert shape.support(balls([0.0, 0.0])) == 0
+    for direction in ([-1.0, 0.0], [0.0, 1.0], [2.0, 1e-300]):
+        with pytest.raises(Broken):
+            shape.support(balls(direction))
+
+
+def test_a_point_that_is_known_to_a_ball_is_as_far_out_as_the_ball_may_be():
+    shape = known(NormBall(p=2.0, radius=2.0, centre=np.zeros(2)))
+    with ctx.workprec(96):
+        over, where = shape.excess([arb(2.0, 0.5), arb(0.0)])
+        assert (over, where) == (pytest.approx(0.25), "it")
+        assert shape.excess([arb(1.0, 0.5), arb(0.0)])[0] == 0.0
+        with pytest.raises(Unchecked):
+            shape.excess([arb(0.0, np.inf), arb(0.0)])
+        over, where = known(Box(-np.ones(2), np.ones(2))).excess([arb(0.0), arb(1.0, 0.5)])
+        assert (over, where) == (pytest.approx(0.5), "u2")
+
+
+def test_a_kind_of_set_without_an_answer_says_so():
+    flat, segment = known(SETS["triangle"]), known(sr.Zonotope(np.zeros(2), np.array([[1.0, 1.0]])))
+    for question in (
+        lambda: flat.centre,
+        lambda: flat.gauge(balls([1.0, 0.0])),
+        lambda: flat.far(balls([1.0, 0.0])),
+        lambda: known(SETS["ellipsoid"]).shares(np.ones(2)),
+        lambda: segment.holds(balls([0.0, 0.0])),
+    ):
+        with pytest.raises(Unchecked):
+            question()
+    assert flat.round is None
