@@ -6,6 +6,7 @@ The rate ``v = u'`` becomes the control of the augmented state ``(x, u)``, and i
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import final
 
 import numpy as np
@@ -40,7 +41,7 @@ class MinimumAttention(sr.LinearKeys):
         d, m = plain.states, plain.controls
         path = [_extended_window(item, m) for item in self.windows(d)]
         ends = [_extended(end, m) for end in self.ends(d)]
-        return sr.OptimalControlProblem(
+        free = sr.OptimalControlProblem(
             system=self._augmented(d, m),
             horizon=self.horizon,
             initial_state=self.initial(d) + self._initial_control(m),
@@ -52,13 +53,12 @@ class MinimumAttention(sr.LinearKeys):
             path=[*path, *self._bounds(d, m)],
             terminal=[*ends, sr.Equality(np.append(np.full(d, np.nan), np.zeros(m)))],
             names=_names(self.names.build().fitting(d, m, plain.disturbances), d, m),
-            cost=self._cost(d, m),
         )
+        return replace(free, cost=self._cost(d, m, np.asarray(free.weights)))
 
-    def _cost(self, d: int, m: int) -> sr.Cost:
+    def _cost(self, d: int, m: int, weights: sr.Array) -> sr.Cost:
         """The cost of the augmented problem: absolute values and norms are those of the rate, quadratic terms those of
         the state and of the control, which is a part of it."""
-        weights = np.broadcast_to(1.0 if self.weights is None else self.weights, m)
         try:
             plain = self.cost.build(d).checked(d, m, weights)
         except sr.InputError as error:

@@ -55,7 +55,7 @@ def least(case: Case, rows: Rows, pieces: Sequence[Sequence[float]] | None) -> f
 
     total, slopes = case.duality.summed(rows, pieces)
     ranges = _ranges(case)
-    counts = [[arb(float(c)) * length for c in np.asarray(case.problem.weights)] for length in _lengths(case)]
+    counts = [[arb(float(c)) * length for c in case.price.counts] for length in _lengths(case)]
     for count, slope in zip(counts, slopes, strict=True):
         case.clock.check()
         total = total + _least(case, ranges, count, slope)
@@ -64,13 +64,14 @@ def least(case: Case, rows: Rows, pieces: Sequence[Sequence[float]] | None) -> f
 
 def least_of_cost(case: Case, cost: arb) -> float:
     """The share below which no admissible control acts, where none costs less than ``cost``: a vector of channels that
-    is not 0 costs at most its weight times the longest that it can be."""
+    is not 0 costs at most its highest weight times the longest that it can be."""
     from flint import arb
 
+    counts, highest = case.price.counts, case.price.highest
     factors = [
-        arb(len(block)) / (arb(case.problem.cost.l1) * _longest(case, block))
+        arb(len(block)) * arb(float(counts[c])) / (arb(case.problem.cost.l1) * arb(float(highest[c])) * longest)
         for block in case.price.blocks
-        if _longest(case, block) > 0
+        if (longest := _longest(case, block)) > 0 and highest[c := block[0]] > 0.0
     ]
     if not factors:
         return 0.0
@@ -142,7 +143,7 @@ def _lengths(case: Case) -> list[arb]:
 
 def _counts(case: Case) -> np.ndarray:
     """What every piece of every channel counts, ``(m, K)``."""
-    return np.asarray(np.outer(np.asarray(case.problem.weights, dtype=float), np.diff(case.control.breakpoints)))
+    return np.asarray(np.outer(case.price.counts, np.diff(case.control.breakpoints)))
 
 
 def largest(case: Case) -> float:
@@ -204,7 +205,7 @@ def _leaf(case: Case, feasible: bool, parts: Mapping[tuple[int, int], Part], row
     total, slopes = case.duality.summed(rows, None)
     for k, (length, slope) in enumerate(zip(_lengths(case), slopes, strict=True)):
         here = [parts.get((c, k), ANY) for c in range(len(slope))]
-        counts = [arb(float(c)) * length if feasible else arb(0) for c in np.asarray(case.problem.weights)]
+        counts = [arb(float(c)) * length if feasible else arb(0) for c in case.price.counts]
         total = total + _least_of_part(case, here, counts, slope)
     if not feasible:
         if not total > 0:

@@ -153,9 +153,8 @@ def _of_piece(case: Case, k: int, groups: dict[bytes, list[arb]], counts: dict[b
     from flint import arb
 
     assert case.policy is not None
-    m, times, control = case.problem.system.controls, case.control.breakpoints, case.problem.control
-    length = arb(float(times[k + 1])) - arb(float(times[k]))
-    prices = [w * length if priced else arb(0) for w in case.price.weights]
+    m, control = case.problem.system.controls, case.problem.control
+    prices = case.price.costs[k] if priced else [arb(0)] * m
     total, zero = arb(0), [arb(0)] * m
     shares = dict.fromkeys(groups, zero) | {key: [part * price for price in prices] for key, part in counts.items()}
     if priced and case.policy.cost == PEAK:

@@ -58,11 +58,40 @@ class Price:
         return any(term is not None for term in self._terms)
 
     @cached_property
-    def weights(self) -> list[arb]:
-        """What a channel's absolute value costs per time ``(m,)``."""
+    def costs(self) -> list[list[arb]]:
+        """What a channel's absolute value costs on every piece, ``(K, m)``: its weights, integrated."""
         from flint import arb
 
-        return [arb(self.problem.cost.l1) * w for w in balls(np.asarray(self.problem.weights))]
+        l1, ends = arb(float(self.problem.cost.l1)), [Fraction(t) for t in self.control.breakpoints.tolist()]
+        times = [Fraction(t) for t in self._changes[0]]
+        rows = [balls(row) for row in self._changes[1]]
+        found, first = [], 0
+        for begin, end in self.clock.each(pairwise(ends)):
+            while first + 1 < len(times) and times[first + 1] <= begin:
+                first += 1
+            total, now, row = [arb(0)] * len(rows[0]), begin, first
+            while now < end:
+                until = min(end, times[row + 1]) if row + 1 < len(times) else end
+                total = [one + w * _ball(until - now) for one, w in zip(total, rows[row], strict=True)]
+                now, row = until, row + 1
+            found.append([l1 * one for one in total])
+        return found
+
+    @cached_property
+    def counts(self) -> np.ndarray:
+        """What a channel counts per time that it acts ``(m,)``: its weight, and 1 where weights change with time."""
+        return self._changes[1][0] if np.asarray(self.problem.weights).ndim == 1 else np.ones(self._changes[1].shape[1])
+
+    @property
+    def highest(self) -> np.ndarray:
+        """The highest of all weights of every channel ``(m,)``."""
+        return np.asarray(self._changes[1].max(axis=0))
+
+    @cached_property
+    def _changes(self) -> tuple[list[float], np.ndarray]:
+        """The times from which weights count, and these ``(r, m)``."""
+        rows = np.asarray(self.problem.weights, dtype=float)
+        return ([0.0], rows[None]) if rows.ndim == 1 else (rows[:, 0].tolist(), rows[:, 1:])
 
     @cached_property
     def blocks(self) -> list[list[int]]:
@@ -78,17 +107,17 @@ class Price:
         from flint import arb
 
         total = arb(0)
-        for length, piece in self.clock.each(zip(self._lengths, pieces, strict=True)):
-            total = total + _ball(length) * self._norms(piece.entries())
+        for costs, piece in self.clock.each(zip(self.costs, pieces, strict=True)):
+            total = total + self._norms(costs, piece.entries())
         return total + (self._quadratic(pieces).value if self.is_quadratic else arb(0))
 
-    def _norms(self, u: Sequence[arb]) -> arb:
+    def _norms(self, costs: Sequence[arb], u: Sequence[arb]) -> arb:
         from flint import arb
 
         found = arb(0)
         for block in self.blocks:
             size = abs(u[block[0]]) if len(block) == 1 else norm(stacked([[u[c]] for c in block]))
-            found = found + self.weights[block[0]] * size
+            found = found + costs[block[0]] * size
         return found
 
     def tangent(self, pieces: Sequence[arb_mat]) -> Tangent:
@@ -102,8 +131,8 @@ class Price:
     def added(self, pieces: Sequence[arb_mat]) -> float:
         """The absolute values of what the program adds up to the cost of a control: its norms, and of the quadratic
         terms the linear, the quadratic and the constant part."""
-        parts = zip(self._lengths, pieces, strict=True)
-        norms = sum((_ball(length) * self._norms(piece.entries()) for length, piece in parts), _ball(Fraction(0)))
+        parts = zip(self.costs, pieces, strict=True)
+        norms = sum((self._norms(costs, piece.entries()) for costs, piece in parts), _ball(Fraction(0)))
         if not self.is_quadratic:
             return float(norms.mid())
         found, still = self._quadratic(pieces), [piece * 0 for piece in pieces]
@@ -118,13 +147,14 @@ class Price:
     def largest(self) -> float:
         """What a gap is relative to: the largest cost of the absolute values, and the largest of the quadratic terms
         at a control that stays 0, or stays at one end of one channel."""
-        m, horizon = self.problem.system.controls, self.problem.horizon
+        m = self.problem.system.controls
         axes = np.eye(m)
         ends = [
             [float(known(self.problem.control).support(balls(s * axis)).mid()) for s in (1.0, -1.0)] for axis in axes
         ]
         reach = [max(abs(high), abs(low)) for high, low in ends]
-        total = self.problem.cost.l1 * float(np.dot(np.asarray(self.problem.weights), reach)) * horizon
+        lasting = np.diff([*self._changes[0], self.problem.horizon])
+        total = float(self.problem.cost.l1) * float(lasting @ self._changes[1] @ np.asarray(reach))
         if not self.is_quadratic:
             return total
         still = [np.zeros(m)] + [s * r * axis for axis, r in zip(axes, reach, strict=True) for s in (1.0, -1.0)]

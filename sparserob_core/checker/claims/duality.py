@@ -162,15 +162,9 @@ class Duality:
         every piece."""
         tangent = None if price is None or touched is None or not price.is_quadratic else price.tangent(touched)
         constant, slopes = self.summed(rows, pieces, tangent)
-        m = self.problem.system.controls
-        weights = [_exact(0.0)] * m if price is None else price.weights
         groups = [] if price is None else [block for block in price.blocks if len(block) > 1]
-        lengths = [
-            _exact(b) - _exact(a)
-            for a, b in zip(self.control.breakpoints[:-1], self.control.breakpoints[1:], strict=True)
-        ]
-        for k, (length, slope) in enumerate(zip(lengths, slopes, strict=True)):
-            costs = [w * length for w in weights]
+        free = [[_exact(0.0)] * self.problem.system.controls] * len(slopes)
+        for k, (costs, slope) in enumerate(zip(free if price is None else price.costs, slopes, strict=True)):
             if groups and touched is not None:
                 constant = constant + self._least_of_groups(costs, slope, groups, touched[k].entries())
             else:

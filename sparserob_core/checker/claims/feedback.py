@@ -162,17 +162,15 @@ class FeedbackClaims:
             written = arb(number(case.certificate, "cost"))
             self._effort(written + FIGURES * abs(written))
             return written
-        times = case.control.breakpoints
-        for k in range(case.control.pieces):
-            length = arb(float(times[k + 1])) - arb(float(times[k]))
-            for i, w in enumerate(case.price.weights):
+        for k, costs in enumerate(case.price.costs):
+            for i, price in enumerate(costs):
                 u = arb(float(case.theta[i, k]))
                 if case.policy.cost == PEAK:
                     row = self.loop.effects[k][i]
                     height = (u + self.loop.support(row)).max(-u + self.loop.support([-x for x in row]))
                 else:
                     height = abs(u)
-                total = total + length * w * height
+                total = total + price * height
         return total
 
     def _effort(self, limit: arb) -> None:
@@ -180,12 +178,11 @@ class FeedbackClaims:
         from flint import arb
 
         case, loop = self.case, self.loop
-        times, a, A = case.control.breakpoints, [], []
-        for k in range(case.control.pieces):
-            length = arb(float(times[k + 1])) - arb(float(times[k]))
-            for i, w in enumerate(case.price.weights):
-                a.append(length * w * arb(float(case.theta[i, k])))
-                A.append([length * w * x for x in loop.effects[k][i]])
+        a, A = [], []
+        for k, costs in enumerate(case.price.costs):
+            for i, price in enumerate(costs):
+                a.append(price * arb(float(case.theta[i, k])))
+                A.append([price * x for x in loop.effects[k][i]])
         reach = [
             float(known(shape).support(balls([float(b == axis) for b in range(shape.dimension)])).mid()) - about[axis]
             for shape, about in loop.sets
@@ -450,10 +447,8 @@ class FeedbackClaims:
         total = sum((row.multiplier * row.constant for row in rows), arb(0))
         slope = [[sum((r.multiplier * r.nominal[k][i] for r in rows if not r.nominal[k][i].is_zero()), arb(0))
                   for i in range(m)] for k in range(K)]  # fmt: skip
-        times, peaks, most = case.control.breakpoints, case.policy.cost == PEAK, arb(0)
-        for k in range(K):
-            length = arb(float(times[k + 1])) - arb(float(times[k]))
-            asked_of = [w * length for w in case.price.weights]
+        peaks, most = case.policy.cost == PEAK, arb(0)
+        for k, asked_of in enumerate(case.price.costs):
             prices = asked_of if priced else [arb(0)] * m
             if case.policy.cost == WORST:
                 most = most + sum((p * _reach(case.problem.control, i) for i, p in enumerate(asked_of)), arb(0))
@@ -745,10 +740,10 @@ class _Row:
             raise Broken(f"{EFFORT}: expected {m * K} numbers from -1 to 1")
         from flint import arb
 
-        times, nominal = case.control.breakpoints, []
-        for k in range(K):
-            length = arb(float(times[k + 1])) - arb(float(times[k]))
-            nominal.append([length * w * arb(float(shares[i * K + k])) for i, w in enumerate(case.price.weights)])
+        nominal = [
+            [price * arb(float(shares[i * K + k])) for i, price in enumerate(costs)]
+            for k, costs in enumerate(case.price.costs)
+        ]
         return _Row(y, arb(0), nominal, _seen(loop, z, d), None, of_effort=True)
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.prices import weights_between
 from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
 from sparserob_core.control.response.response import SAME_TIME
@@ -51,6 +52,7 @@ def remaining(
     horizon = control.horizon
     left = replace(
         problem,
+        weights=weights_between(problem.weights, begin, horizon),
         system=_system(problem, begin, horizon),
         horizon=horizon,
         initial_state=state,

@@ -129,8 +129,7 @@ class Plan:
             acting = feedback.loop.entries[grid.breakpoints[1:] > begin]  # (L', mw, Q): which deviations act later
             effects[:, :, np.abs(acting).sum(axis=(0, 1)) == 0.0] = 0.0
             size = np.maximum(nominal.T + spread.support(effects), -nominal.T + spread.support(-effects)).T
-        weights = problem.cost.l1 * np.asarray(problem.weights)
-        return float(weights @ size @ self.known.control.lengths[piece:])
+        return float((problem.prices(self.known.control.breakpoints)[:, piece:] * size).sum())
 
 
 @final

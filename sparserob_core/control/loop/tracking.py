@@ -126,9 +126,7 @@ class Tracking:
             low, high = low + below.ravel(), high - above.ravel()
         self.limited = bool((low <= 0.0).all() and (high >= 0.0).all())
         self.sizes = np.abs(self.nodes) @ np.maximum(-low, high) + np.abs(self.fixed)
-        priced = np.asarray(problem.cost.l1 * np.asarray(problem.weights), dtype=float)
-        weights: Array = np.asarray(np.kron(priced, own.control.lengths), dtype=float)
-        self.limits: tuple[Array, Array, Array] = (weights, low, high)
+        self.limits: tuple[Array, Array, Array] = (problem.prices(own.control.breakpoints).ravel(), low, high)
         factors = [1.0]
         self.rates = [self.H @ self.A]
         for order in range(1, TERMS):

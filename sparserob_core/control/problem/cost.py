@@ -10,6 +10,7 @@ from typing import Literal, TypeAlias, final
 import numpy as np
 import numpy.typing as npt
 
+from sparserob_core.control.problem.prices import by_time
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import sealed
 from sparserob_core.sip.convex_set import Array, ConvexSet
@@ -159,10 +160,12 @@ def _groups(given: object, controls: int, weights: Array) -> tuple[tuple[int, ..
         )
     found = tuple(tuple(int(channel) for channel in group) for group in groups)
     for group in found:
-        own = np.asarray(weights)[np.array(group) - 1]
+        own = by_time(weights)[1].T[np.array(group) - 1]
         if (own != own[0]).any():
             raise InputError(
-                path="group", expected="equal weights within a group", got=f"{own.tolist()} for {list(group)}"
+                path="group",
+                expected="equal weights within a group",
+                got=f"{np.squeeze(own, axis=-1 if own.shape[1] == 1 else ()).tolist()} for {list(group)}",
             )
     return found
 

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from sparserob_core.control.problem.cost import Cost
 from sparserob_core.control.problem.names import UNNAMED, Names
+from sparserob_core.control.problem.prices import checked_weights, counted, integrals
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
 from sparserob_core.control.sets.sets import Equality, Polytope
 from sparserob_core.errors import InputError
@@ -90,9 +91,12 @@ class OptimalControlProblem:
     ``initial_set``: the bounded set of deviations from ``initial_state``, or ``None``; it holds 0. The state begins
     anywhere in ``initial_state + initial_set``, and every constraint holds from there.
 
-    After construction ``weights`` is ``(m,)``, ``path`` and ``terminal`` are tuples, every window has its ``stop``, and
-    constraints that restrict nothing are gone. An initial state outside a path set is legal: that problem is
-    infeasible. Raises `InputError`.
+    ``weights``: a positive number, one for each control, or rows of a time and the weights from then on, which are not
+    negative: prices, or a supply that is free for a while. The first time is 0.
+
+    After construction ``weights`` is ``(m,)``, or ``(r, 1 + m)`` of rows, ``path`` and ``terminal`` are tuples, every
+    window has its ``stop``, and constraints that restrict nothing are gone. An initial state outside a path set is
+    legal: that problem is infeasible. Raises `InputError`.
     """
 
     system: LinearSystem | SwitchedSystem
@@ -128,7 +132,7 @@ class OptimalControlProblem:
             self._check_pieces(self.system)
         self._set("initial_state", self._state())
         self._set("initial_set", self._deviations())
-        self._set("weights", self._weights())
+        self._set("weights", checked_weights(self.weights, self.system.controls, self.horizon))
         self._set("initial_control", self._control_before())
         self._set("cost", self._costs())
         _checked_set("control", self.control, self.system.controls, "controls", bounded=True)
@@ -192,14 +196,16 @@ class OptimalControlProblem:
             )
         return bound if size > 0.0 else None
 
-    def _weights(self) -> Array:
-        m = self.system.controls
-        weights = as_bound("weights", 1.0 if self.weights is None else self.weights, m)
-        if not ((weights > 0.0) & np.isfinite(weights)).all():
-            raise InputError(
-                path="weights", expected=f"{m} positive numbers, one per control", got=f"{weights.tolist()}"
-            )
-        return weights
+    def prices(self, breakpoints: Array) -> Array:
+        """What an absolute value of 1 of each control costs on every piece between ``breakpoints (K + 1,)``,
+        ``(m, K)``: the weights, integrated exactly, times the factor of the L1 norm."""
+        return float(self.cost.l1) * integrals(self.weights, breakpoints)
+
+    @property
+    def counts(self) -> Array:
+        """What each control counts per time that it acts, ``(m,)``: its weight, or 1 where weights change with
+        time."""
+        return counted(self.weights)
 
     def _costs(self) -> Cost:
         if not isinstance(self.cost, Cost):

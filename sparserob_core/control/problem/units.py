@@ -8,6 +8,7 @@ from typing import final
 import numpy as np
 
 from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.prices import in_units
 from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
 from sparserob_core.control.problem.system import System
 from sparserob_core.sip.convex_set import Array, ConvexSet
@@ -49,7 +50,7 @@ class Units:
             initial_state=np.asarray(problem.initial_state) / self.states,
             initial_set=None if problem.initial_set is None else problem.initial_set.in_units(self.states),
             control=problem.control.in_units(self.controls),
-            weights=np.asarray(problem.weights) * self.controls * self.time / self.cost,
+            weights=in_units(problem.weights, self.controls * self.time / self.cost, self.time),
             disturbance=None if problem.disturbance is None else problem.disturbance.in_units(self.disturbances),
             disturbance_class=problem.disturbance_class,
             path=[self._window(entry) for entry in problem.path if not isinstance(entry, ConvexSet)],

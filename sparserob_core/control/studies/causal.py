@@ -134,7 +134,7 @@ class CausalSearch:
         """A tree of the nominal signal and those that the policy's bound rests on."""
         problem, feedback = self.model.problem, self.model.feedback
         assert feedback is not None
-        prices = problem.cost.l1 * np.outer(np.asarray(problem.weights, dtype=float), self.model.control.lengths)
+        prices = problem.prices(self.model.control.breakpoints)
         seen = np.searchsorted(self.starts, self.model.control.breakpoints[:-1])
         width = self.spread.size // max(1, self.starts.size)
         worst = extreme(self.spread, self.sampled.N)

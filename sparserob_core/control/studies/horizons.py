@@ -18,6 +18,7 @@ import numpy as np
 from sparserob_core.control.enclosures.matrix_exponential import rounding
 from sparserob_core.control.enclosures.polynomial import polynomial_bound
 from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.prices import weights_between
 from sparserob_core.control.problem.problem import SHORTEST, OptimalControlProblem, PathConstraint
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System
 from sparserob_core.control.problem.units import Units
@@ -92,7 +93,9 @@ def at_horizon(problem: OptimalControlProblem, horizon: float) -> OptimalControl
         lasts = horizon - entry.start > SHORTEST * horizon
         if lasts or (entry.start <= horizon and isinstance(entry, PathConstraint)):
             windows.append(replace(entry, stop=None))
-    return replace(problem, horizon=horizon, path=windows, system=_until(problem.system, horizon))
+    weights = weights_between(problem.weights, 0.0, horizon)
+    system = _until(problem.system, horizon)
+    return replace(problem, horizon=horizon, path=windows, system=system, weights=weights)
 
 
 def _until(system: System, horizon: float) -> System:

@@ -207,7 +207,7 @@ def _program(
     most = (high - low)[known.channel] / loop.spread.chords[known.entry]
     low, high = np.repeat(low, pieces), np.repeat(high, pieces)
     weights, lower, upper = np.zeros(size), np.concatenate([low, -most]), np.concatenate([high, most])
-    cost = problem.cost.l1 * np.kron(np.asarray(problem.weights, dtype=float), model.control.lengths)
+    cost = problem.prices(model.control.breakpoints).ravel()
     guide, largest, among = None, None, None
     if policy.cost == "peak":
         both = np.vstack([axes, -axes])

@@ -82,7 +82,7 @@ def _control_units(problem: OptimalControlProblem) -> Array:
 def _cost_per_time(problem: OptimalControlProblem, states: Array, time: float) -> float:
     """The largest cost per time, where states are as large as their units or their references."""
     size = extent(problem.control)
-    total = problem.cost.l1 * float((np.asarray(problem.weights) * size).sum())
+    total = float((problem.prices(np.array([0.0, problem.horizon]))[:, 0] * size).sum()) / problem.horizon
     state, control, final = problem.cost.terms
     for term, reach, over in ((state, states, 1.0), (control, size, 1.0), (final, states, time)):
         if term is not None:

@@ -189,7 +189,7 @@ def _assembled(
         b=b if b.size else None,
         channels=problem.system.controls,
         lengths=np.tile(control.lengths, problem.system.controls),
-        activity=np.kron(np.asarray(problem.weights, dtype=float), control.lengths),
+        activity=np.outer(problem.counts, control.lengths).ravel(),
     )
     return Transcription(
         problem, control, disturbance, functionals, parameters, constraints, program, formulation, rows
@@ -462,8 +462,7 @@ def _image(
         np.repeat(-bound.support(-axes), dictionary.pieces),
         np.repeat(bound.support(axes), dictionary.pieces),
     )
-    priced = np.asarray(problem.cost.l1 * np.asarray(problem.weights), dtype=float)
-    weights: Array = np.kron(priced, dictionary.lengths)
+    weights = problem.prices(dictionary.breakpoints).ravel()
     values = csc_array(dictionary.sparse.T)
     H, h = slanted(bound)
     H, h = (H, h) if rows is None else (H / rows.sides[:, None], h / rows.sides)
@@ -519,7 +518,8 @@ def _quadratic(problem: OptimalControlProblem, dictionary: Dictionary) -> Quadra
     on_pieces = quadratic_cost(problem, dictionary.breakpoints)
     terms, axes = on_pieces.on(dictionary), np.eye(problem.system.controls)
     reach = problem.control.reach(axes)
-    largest = problem.cost.l1 * float(np.asarray(problem.weights) @ reach) * problem.horizon + on_pieces.largest(reach)
+    prices = problem.prices(np.array([0.0, problem.horizon]))[:, 0]
+    largest = float(prices @ reach) + on_pieces.largest(reach)
     return {"P": terms.P, "q": terms.q, "constant": terms.constant, "largest": largest}
 
 

@@ -32,6 +32,23 @@ Number: TypeAlias = Annotated[float, Tag("number")]
 Numbers: TypeAlias = Annotated[list[float], Tag("list")]
 FreeNumbers: TypeAlias = Annotated[list[float | None], Tag("list")]
 OneOrMore: TypeAlias = Annotated[Number | Numbers, one_of("a number or a list of numbers", number=NUMBER, list=LIST)]
+
+
+def _in_time(value: object) -> str | None:
+    """Rows of numbers, where any entry of a list is one."""
+    if isinstance(value, list | tuple):
+        return "rows" if any(isinstance(row, list | tuple) for row in value) else "list"
+    return "number" if isinstance(value, NUMBER) and not isinstance(value, bool) else None
+
+
+NumbersInTime: TypeAlias = Annotated[
+    Number | Numbers | Annotated[list[list[float]], Tag("rows")],
+    Discriminator(
+        _in_time,
+        custom_error_type="kind",
+        custom_error_message="expected a number, a list of numbers, or rows of a time and the numbers from then on",
+    ),
+]
 OneOrMoreFree: TypeAlias = Annotated[
     Number | FreeNumbers, one_of("a number or a list of numbers, null where free", number=NUMBER, list=LIST)
 ]

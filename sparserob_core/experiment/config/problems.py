@@ -27,6 +27,7 @@ from sparserob_core.experiment.config.option_kinds import (
     NUMBER,
     Number,
     Numbers,
+    NumbersInTime,
     OneOrMore,
     Sparse,
     broadcast,
@@ -347,8 +348,9 @@ class LinearKeys(ProblemFactory, Options):
     """State at time 0, one number per state; a number serves every state. Or a set of states: a ``centre`` and any set
     of deviations from it, such as ``{centre: [-1, 1], box: 0.05}``."""
 
-    weights: OneOrMore | None = None
-    """Weight of every control in the cost, positive; 1 unless given."""
+    weights: NumbersInTime | None = None
+    """Weight of every control in the cost, positive; 1 unless given. Or rows of a time and the weights from then on,
+    which are not negative, such as ``[[0, 1], [12, 2]]`` of one control; the first time is 0."""
 
     cost: CostOptions = Field(default_factory=CostOptions)
     """What is minimised; the integral of the weighted absolute values of the control unless given."""

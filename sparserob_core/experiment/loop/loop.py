@@ -207,9 +207,8 @@ def _count(one: StateConstraint, model: Transcription, times: Array, theta: Arra
 
 def _paid(model: Transcription, control: Array) -> float:
     """The first term of the cost of a control ``(m, K)``."""
-    problem, lengths = model.problem, model.control.lengths
-    weights, blocks = np.asarray(problem.weights), problem.cost.blocks
-    if blocks:
-        sizes = sum(weights[block[0]] * np.linalg.norm(control[list(block)], axis=0) for block in blocks)
-        return float(problem.cost.l1 * (sizes @ lengths))
-    return float(problem.cost.l1 * (weights @ np.abs(control) @ lengths))
+    problem, prices = model.problem, model.problem.prices(model.control.breakpoints)
+    sizes = np.abs(control)
+    for block in problem.cost.blocks:
+        sizes[list(block)] = np.linalg.norm(control[list(block)], axis=0) / len(block)
+    return float((prices * sizes).sum())

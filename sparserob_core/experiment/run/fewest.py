@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sparserob_core.control.problem.prices import by_time
 from sparserob_core.control.sets.curved import NormBall
 from sparserob_core.control.sets.sets import ConvexSet
 from sparserob_core.control.transcription.rounding import rounded_down
@@ -72,7 +73,7 @@ def _admissible(program: SemiInfiniteProgram, other: Result, most: float) -> boo
 
 def _factor(experiment: ControlExperiment) -> float | None:
     """The count is at least this times the cost; with vectors of channels that act together by the longest that each
-    can be, for ``[u != 0] >= |u| / max |u|``. ``None`` where the cost says nothing."""
+    can be, at the highest of its weights, for ``[u != 0] >= |u| / max |u|``. ``None`` where the cost says nothing."""
     program, cost = experiment.program, experiment.problem.cost
     if program.finite.blocks is None or cost.is_quadratic or not cost.l1:
         return multiple(program)
@@ -80,7 +81,12 @@ def _factor(experiment: ControlExperiment) -> float | None:
     taken = {channel for block in cost.blocks for channel in block}
     groups = [*cost.blocks, *((channel,) for channel in range(channels) if channel not in taken)]
     lengths = [longest(experiment.problem.control, group) for group in groups]
-    shares = [len(group) / (cost.l1 * size) for group, size in zip(groups, lengths, strict=True) if size > 0.0]
+    counts, highest = experiment.problem.counts, by_time(experiment.problem.weights)[1].max(axis=0)
+    shares = [
+        len(group) * float(counts[group[0]]) / (cost.l1 * float(highest[group[0]]) * size)
+        for group, size in zip(groups, lengths, strict=True)
+        if size > 0.0 and highest[group[0]] > 0.0
+    ]
     return min(shares) * (1.0 - INWARDS) if shares else None
 
 
