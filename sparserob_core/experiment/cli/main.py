@@ -6,7 +6,8 @@ from __future__ import annotations
 import gc
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import wraps
 from typing import Any
 
 import click
@@ -35,7 +36,7 @@ from sparserob_core.experiment.cli.shell.process import (
     open_streams,
     spare_imports,
 )
-from sparserob_core.experiment.terminal.printing import printable
+from sparserob_core.experiment.terminal.printing import own_output, printable
 
 DEBUG = "SPARSEROB_DEBUG"
 # Allocations between two searches for cycles: at first nearly all are of modules, which stay.
@@ -106,7 +107,14 @@ def _end(message: str, error: BaseException, status: int) -> int:
 
 
 class Commands(click.Group):
-    """The group of all commands. A reader that has stopped reading is met here, before click would end with 1."""
+    """The group of all commands. A reader that has stopped reading is met here, before click would end with 1; what
+    components print while a command runs goes to the standard error stream."""
+
+    def add_command(self, cmd: click.Command, name: str | None = None) -> None:
+        """Add a command, whose output is its own."""
+        if cmd.callback is not None:
+            cmd.callback = _with_own_output(cmd.callback)
+        super().add_command(cmd, name)
 
     def invoke(self, ctx: click.Context) -> Any:
         """The command's exit status."""
@@ -115,6 +123,15 @@ class Commands(click.Group):
         except BrokenPipeError:
             drop_output()
             return 0
+
+
+def _with_own_output(command: Callable[..., Any]) -> Callable[..., Any]:
+    @wraps(command)
+    def called(*arguments: Any, **options: Any) -> Any:
+        with own_output():
+            return command(*arguments, **options)
+
+    return called
 
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})

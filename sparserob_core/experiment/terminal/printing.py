@@ -1,8 +1,15 @@
-"""How the commands print and end: text without control characters, JSON, exit statuses."""
+"""How the commands print and end: text without control characters, JSON, exit statuses.
+
+The standard output belongs to the command: what it says goes through here, and what anybody else prints meanwhile (a
+plugin, a library) goes to the standard error stream, so that a result stays what a program can read.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
+from typing import Any, TextIO, cast, final
 
 import click
 
@@ -15,8 +22,36 @@ def printable(text: str) -> str:
     return "".join(one if one == "\n" or one.isprintable() else one.encode("unicode_escape").decode() for one in text)
 
 
+@final
+class _Others:
+    """The standard output of everybody but the command: the standard error stream."""
+
+    def __init__(self, own: TextIO) -> None:
+        self.own = own
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(sys.stderr, name)
+
+
+@contextmanager
+def own_output() -> Iterator[None]:
+    """Meanwhile the standard output takes what is said by `say`, `print_json` and tables, and nothing else."""
+    with redirect_stdout(cast("TextIO", _Others(output()))):
+        yield
+
+
+def output() -> TextIO:
+    """The standard output of the command."""
+    return sys.stdout.own if isinstance(sys.stdout, _Others) else sys.stdout
+
+
+def say(text: str) -> None:
+    """Print a line."""
+    click.echo(text, file=output())
+
+
 def print_json(data: Any) -> None:
     """Print plain data as JSON."""
     import json
 
-    click.echo(json.dumps(data, indent=2))
+    say(json.dumps(data, indent=2))

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sparserob_core.experiment.terminal.printing import printable
+from sparserob_core.experiment.terminal.printing import output, printable
 
 KNOWN = {"lower bound", "upper bound", "relative gap"}
 """Rows that are shown even where the value is unknown."""
@@ -14,7 +13,7 @@ KNOWN = {"lower bound", "upper bound", "relative gap"}
 
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Print rows under column names; empty ``columns`` make a list of keys and values."""
-    show = _draw if sys.stdout.isatty() else _write
+    show = _draw if output().isatty() else _write
     show(printable(title), columns, [[printable(cell).replace("\n", " ") for cell in row] for row in rows])
 
 
@@ -29,7 +28,7 @@ def _draw(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> 
         table.add_column(columns[position] if columns else "", overflow="fold", style="bold" if position == 0 else "")
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
-    Console().print(table)
+    Console(file=output()).print(table)
 
 
 def _write(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
@@ -42,7 +41,7 @@ def _write(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) ->
             for line in lines
         ),
     ]
-    sys.stdout.write("\n".join(text) + "\n")
+    output().write("\n".join(text) + "\n")
 
 
 def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from sparserob_core.experiment.terminal.printing import say
+
 
 @click.command()
 @click.argument("name", required=False)
@@ -36,5 +38,5 @@ def examples(name: str | None, out: Path) -> int:
         raise InputError(f"{file}: expected no file of that name, which would be overwritten") from None
     except OSError as error:
         raise InputError(f"{file}: cannot be written: {error.strerror}") from None
-    click.echo(f"written to {file}; next: sparserob run {file}")
+    say(f"written to {file}; next: sparserob run {file}")
     return 0

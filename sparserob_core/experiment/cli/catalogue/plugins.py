@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from sparserob_core.experiment.terminal.printing import say
+
 if TYPE_CHECKING:
     from sparserob_core.experiment.plugins.components import Registry
 
@@ -33,7 +35,7 @@ def plugins(name: str | None, files: tuple[Path, ...]) -> int:
     print_table("Components", ("kind", "name", "plugin", "from", "what it is"), rows)
     for record in found:
         if record.missing:
-            click.echo(record.missing)
+            say(record.missing)
     for failure in registry.failures:
         click.echo(str(failure), err=True)
     return 0
@@ -76,5 +78,5 @@ def new_plugin(kind: str, name: str, out: str) -> int:
     from sparserob_core.experiment.scaffold.new_plugin import new_plugin as write
 
     folder = write(kind, name, out)
-    click.echo(f"written to {folder}; next: cd {folder} && pip install -e '.[test]' && pytest")
+    say(f"written to {folder}; next: cd {folder} && pip install -e '.[test]' && pytest")
     return 0

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from sparserob_core.experiment.cli.shell.options import json_option, plugins_option
-from sparserob_core.experiment.terminal.printing import EXIT, print_json
+from sparserob_core.experiment.terminal.printing import EXIT, print_json, say
 
 
 @click.command()
@@ -52,6 +52,6 @@ def check(directory: Path, as_json: bool, plugins: tuple[Path, ...], seconds: fl
             found.title, ("claim", "verdict", "what was derived"), [(c.name, c.verdict, c.text) for c in found.claims]
         )
         every = "every claim holds; " if found.status == "verified" else ""
-        click.echo(f"not compared: {'; '.join(found.not_compared) or 'nothing'}")
-        click.echo(f"{found.status}: {every}in {found.seconds:.2f} s")
+        say(f"not compared: {'; '.join(found.not_compared) or 'nothing'}")
+        say(f"{found.status}: {every}in {found.seconds:.2f} s")
     return EXIT[found.status]

@@ -11,7 +11,7 @@ import click
 
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.cli.shell.options import json_option
-from sparserob_core.experiment.terminal.printing import print_json, printable
+from sparserob_core.experiment.terminal.printing import print_json, printable, say
 
 
 @click.command()
@@ -63,9 +63,9 @@ def compare(runs: tuple[Path, ...], out: Path, accuracy: float | None, measure: 
         if number == 0 or len(rows) <= LISTED:
             print_table((found.title or "Comparison") if number == 0 else "", columns, rows)
     for line in found.remarks() if isinstance(found, Profiles) else comparison_remarks(found):
-        click.echo(printable(line))
+        say(printable(line))
     if not found.undrawn:
-        click.echo(f"written to {out}")
+        say(f"written to {out}")
     return 0
 
 
@@ -130,9 +130,9 @@ def benchmark(
     for title, (columns, rows) in ((found.profiles.title, found.table()), ("", found.times_table())):
         print_table(title, columns, rows)
     for remark in found.remarks():
-        click.echo(printable(remark))
+        say(printable(remark))
     if out is not None:
-        click.echo(f"written to {out}")
+        say(f"written to {out}")
     return 0
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from sparserob_core.experiment.cli.shell.options import plugins_option
+from sparserob_core.experiment.terminal.printing import say
 
 
 @click.command()
@@ -23,5 +24,5 @@ def figures(directory: Path, plugins: tuple[Path, ...]) -> int:
     with LiveLine() as line:
         files = draw_run(directory, plugins, line.receive)
     for file in files:
-        click.echo(str(file))
+        say(str(file))
     return 0

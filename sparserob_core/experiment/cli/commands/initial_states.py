@@ -9,7 +9,7 @@ import click
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.cli.shell.options import json_option
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
-from sparserob_core.experiment.terminal.printing import EXIT, print_json, printable
+from sparserob_core.experiment.terminal.printing import EXIT, print_json, printable, say
 
 
 @click.command("initial-states")
@@ -96,7 +96,7 @@ def initial_states(
     else:
         print_table(found.title, (), found.rows())
         for remark in (*found.remarks, *([f"written to {out}"] if out is not None else [])):
-            click.echo(printable(remark))
+            say(printable(remark))
     return status_unless_interrupted(EXIT[found.status])
 
 

@@ -8,7 +8,7 @@ import click
 
 from sparserob_core.experiment.cli.shell.options import figures_option, json_option, plugins_option, seed_option
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
-from sparserob_core.experiment.terminal.printing import EXIT, print_json, printable
+from sparserob_core.experiment.terminal.printing import EXIT, print_json, printable, say
 
 
 @click.command()
@@ -85,5 +85,5 @@ def loop(
     else:
         print_table(f"{found.title}: closed loop", *found.table())
         for remark in (*found.remarks(), f"written to {directory / 'loop.json'}"):
-            click.echo(printable(remark))
+            say(printable(remark))
     return status_unless_interrupted(4 if found.contradicts else 0)

@@ -8,7 +8,7 @@ import click
 
 from sparserob_core.experiment.cli.shell.options import json_option
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
-from sparserob_core.experiment.terminal.printing import print_json, printable
+from sparserob_core.experiment.terminal.printing import print_json, printable, say
 
 EXIT = {"certified": 0, "unbounded": 0, "infeasible": 3, "undecided": 4}
 
@@ -74,5 +74,5 @@ def margin(
             columns = ("horizon", "status", "lower bound", "upper bound")
             print_table("Cost against the horizon", columns, curve_rows(found))
         for remark in (*found.remarks, f"written to {found.directory}"):
-            click.echo(printable(remark))
+            say(printable(remark))
     return status_unless_interrupted(EXIT[found.status])

@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from sparserob_core.experiment.cli.shell.options import plugins_option
+from sparserob_core.experiment.terminal.printing import say
 
 
 @click.command()
@@ -27,5 +28,5 @@ def replay(directory: Path, save: Path | None, serve: bool, connect: str | None,
     """
     from sparserob_core.experiment.run.replay import replay as replay_run
 
-    replay_run(directory, save=save, serve=serve, connect=connect, plugins=plugins, remark=click.echo)
+    replay_run(directory, save=save, serve=serve, connect=connect, plugins=plugins, remark=say)
     return 0

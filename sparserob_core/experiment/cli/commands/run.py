@@ -8,7 +8,7 @@ import click
 
 from sparserob_core.experiment.cli.shell.options import figures_option, json_option
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
-from sparserob_core.experiment.terminal.printing import EXIT, print_json, printable
+from sparserob_core.experiment.terminal.printing import EXIT, print_json, printable, say
 
 
 @click.command()
@@ -40,5 +40,5 @@ def run(config: Path, overrides: tuple[str, ...], out: Path | None, quiet: bool,
     elif not quiet:
         print_table(outcome.experiment.title, (), result_rows(finite(outcome.summary)))
         for line in (*outcome.remarks, f"written to {outcome.directory}"):
-            click.echo(printable(line))
+            say(printable(line))
     return status_unless_interrupted(EXIT[outcome.status])

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from sparserob_core.experiment.cli.shell.options import json_option, plugins_option, seed_option
-from sparserob_core.experiment.terminal.printing import print_json, printable
+from sparserob_core.experiment.terminal.printing import print_json, printable, say
 
 
 @click.command()
@@ -64,5 +64,5 @@ def simulate(
             *([] if out is None or found.undrawn else [f"drawn into {out}"]),
             f"written to {found.directory / f'simulation-{found.law}.json'}",
         ):
-            click.echo(printable(remark))
+            say(printable(remark))
     return 4 if found.contradicts else 0

@@ -10,7 +10,7 @@ import click
 
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
-from sparserob_core.experiment.terminal.printing import print_json, printable
+from sparserob_core.experiment.terminal.printing import print_json, printable, say
 
 if TYPE_CHECKING:
     from sparserob_core.experiment.sweep.sweep import Outline
@@ -129,7 +129,7 @@ def sweep(
         print_table(study.title, *shown(study))
         whole = "" if point is None else f"; the table of all points: sparserob sweep --resume {study.directory}"
         for remark in (*remarks_of(study), f"written to {study.directory}{whole}"):
-            click.echo(printable(remark))
+            say(printable(remark))
     status = 5 if study.failed else 0
     # the Ctrl-C that ends a page has cut nothing short
     return status if serve and not study.stopped else status_unless_interrupted(status)
@@ -145,4 +145,4 @@ def _print_outline(planned: Outline, quiet: bool, as_json: bool) -> None:
     elif not quiet:
         print_table(data["title"], *planned.shown())
         ended = sum(row["finished"] for row in data["points"])
-        click.echo(f"{len(data['points'])} points, {ended} finished; nothing was run or written")
+        say(f"{len(data['points'])} points, {ended} finished; nothing was run or written")

@@ -8,7 +8,7 @@ import click
 
 from sparserob_core.experiment.cli.shell.options import figures_option
 from sparserob_core.experiment.cli.shell.process import status_unless_interrupted
-from sparserob_core.experiment.terminal.printing import EXIT, printable
+from sparserob_core.experiment.terminal.printing import EXIT, printable, say
 
 
 @click.command()
@@ -47,5 +47,5 @@ def watch(
     outcome = watch_run(config, overrides, out, save=save, serve=serve, connect=connect, figures=figures)
     print_table(outcome.experiment.title, (), result_rows(finite(outcome.summary)))
     for line in (f"written to {outcome.directory}", *outcome.remarks):
-        click.echo(printable(line))
+        say(printable(line))
     return EXIT[outcome.status] if serve else status_unless_interrupted(EXIT[outcome.status])

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from importlib.util import LazyLoader, find_spec, module_from_spec
 from types import FrameType
-from typing import final
+from typing import Any, final
 
 from sparserob_core.errors import SparseRobError
 
@@ -87,7 +87,12 @@ def _as_output_error() -> Iterator[None]:
 
 def open_streams() -> None:
     """Give standard streams that are closed a descriptor, so that no file of a run gets theirs. What is written to a
-    closed output is an error; messages to a closed error stream are lost."""
+    closed output is an error; messages to a closed error stream are lost.
+
+    The command's output gets a descriptor of its own. That of the standard output is from now on the one of the error
+    stream: there goes what compiled libraries print, and workers, who inherit it, and whatever is printed at the end of
+    the process.
+    """
     for descriptor, mode in ((0, os.O_RDONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
         try:
             os.fstat(descriptor)
@@ -96,37 +101,61 @@ def open_streams() -> None:
     if sys.stderr is None:
         sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115
     if sys.stdout is None:
-        sys.stdout = Output(open(1, "wb", closefd=False))  # noqa: SIM115
+        sys.stdout = Output(open(_own_descriptor(), "wb"))  # noqa: SIM115
     elif type(sys.stdout) is io.TextIOWrapper:
         sys.stdout = _rewrapped(sys.stdout, Output)
         # A title may hold what a narrow locale has no letters for: it is written out, as it is on the error stream.
         sys.stdout.reconfigure(errors="backslashreplace")
 
 
+def _own_descriptor() -> int:
+    """Another descriptor of what the standard output is; the standard output itself becomes the error stream."""
+    own = os.dup(1)
+    os.dup2(2, 1)
+    return own
+
+
 def hand_back_output() -> None:
     """Give the interpreter back a standard output of its own kind: it flushes that once more when the names of this
-    module are gone (Python 3.13), so that an `Output` could no longer do so."""
+    module are gone (Python 3.13), so that an `Output` could no longer do so. What is printed to it from now on goes to
+    the error stream, for the command has said everything."""
     if not isinstance(sys.stdout, Output):
         return
     try:
         sys.stdout.flush()
     except (BrokenPipeError, OutputError):  # said before, or nobody reads
         drop_output()
-    sys.stdout = _rewrapped(sys.stdout, io.TextIOWrapper)
+    if _descriptor(sys.stdout) is None:
+        sys.stdout = _rewrapped(sys.stdout, io.TextIOWrapper)
+        return
+    encoding = sys.stdout.encoding
+    sys.stdout.close()
+    sys.stdout = open(1, "w", encoding=encoding, errors="backslashreplace", closefd=False)  # noqa: SIM115
 
 
 def _rewrapped(stream: io.TextIOWrapper, kind: type[io.TextIOWrapper]) -> io.TextIOWrapper:
-    """Another text stream over the buffer of this one, which it takes over."""
+    """Another text stream over the buffer of this one, which it takes over; an `Output` over the standard output gets a
+    descriptor of its own."""
     encoding, errors = stream.encoding, stream.errors
     line_buffering, write_through = stream.line_buffering, stream.write_through
-    return kind(
-        stream.detach(), encoding=encoding, errors=errors, line_buffering=line_buffering, write_through=write_through
-    )
+    buffer = stream.detach()
+    if kind is Output and _descriptor(buffer) == 1:
+        buffer.flush()
+        buffer = open(_own_descriptor(), "wb")  # noqa: SIM115
+    return kind(buffer, encoding=encoding, errors=errors, line_buffering=line_buffering, write_through=write_through)
 
 
 def drop_output() -> None:
     """Let what is still to be written to the standard output go nowhere."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    own = _descriptor(sys.stdout)
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1 if own is None else own)
+
+
+def _descriptor(stream: Any) -> int | None:
+    try:
+        return int(stream.fileno())
+    except (OSError, ValueError):  # it has none
+        return None
 
 
 def _interrupted(number: int, frame: FrameType | None) -> None:
