@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import errno
 import io
 import os
@@ -90,8 +91,7 @@ def open_streams() -> None:
     closed output is an error; messages to a closed error stream are lost.
 
     The command's output gets a descriptor of its own. That of the standard output is from now on the one of the error
-    stream: there goes what compiled libraries print, and workers, who inherit it, and whatever is printed at the end of
-    the process.
+    stream: there goes what compiled libraries print, and workers, who inherit it.
     """
     for descriptor, mode in ((0, os.O_RDONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
         try:
@@ -117,8 +117,8 @@ def _own_descriptor() -> int:
 
 def hand_back_output() -> None:
     """Give the interpreter back a standard output of its own kind: it flushes that once more when the names of this
-    module are gone (Python 3.13), so that an `Output` could no longer do so. What is printed to it from now on goes to
-    the error stream, for the command has said everything."""
+    module are gone (Python 3.13), so that an `Output` could no longer do so. What is printed at the end of the process
+    goes to the error stream, for the command has said everything."""
     if not isinstance(sys.stdout, Output):
         return
     try:
@@ -129,8 +129,16 @@ def hand_back_output() -> None:
         sys.stdout = _rewrapped(sys.stdout, io.TextIOWrapper)
         return
     encoding = sys.stdout.encoding
+    os.dup2(sys.stdout.fileno(), 1)
     sys.stdout.close()
+    atexit.register(_leave_output)  # called before whatever components have registered
     sys.stdout = open(1, "w", encoding=encoding, errors="backslashreplace", closefd=False)  # noqa: SIM115
+
+
+def _leave_output() -> None:
+    with suppress(OSError, ValueError):  # nobody reads it any more, or it is closed
+        sys.stdout.flush()
+    os.dup2(2, 1)
 
 
 def _rewrapped(stream: io.TextIOWrapper, kind: type[io.TextIOWrapper]) -> io.TextIOWrapper:
