@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
 from abc import ABC
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import redirect_stdout
+from functools import wraps
 from importlib import import_module
 from typing import Any, ClassVar, Generic, NoReturn, TypeVar
 
@@ -36,6 +39,22 @@ def same(first: Any, second: Any) -> bool:
     return bool(np.array_equal(np.asarray(first), np.asarray(second), equal_nan=True))
 
 
+def without_output(test: Callable[..., None]) -> Callable[..., None]:
+    """The same test, which fails too where the component prints: the standard output belongs to whoever runs it."""
+
+    @wraps(test)
+    def watched(*arguments: Any, **keywords: Any) -> None:
+        with redirect_stdout(io.StringIO()) as output:
+            test(*arguments, **keywords)
+        demand(
+            not output.getvalue(),
+            f"it prints to the standard output, which belongs to the result: {output.getvalue()[:60]!r}",
+            "use the module `logging`, or `print(..., file=sys.stderr)` while you look for a fault",
+        )
+
+    return watched
+
+
 class Contract(ABC, Generic[Component]):
     """What every component of a kind must keep: subclass the contract of the kind in a test module as
     ``class TestMine(...)``, and say with the class attribute ``component`` what is tested.
@@ -44,7 +63,8 @@ class Contract(ABC, Generic[Component]):
     ``functools.partial`` of the class with its options); or what a config would say of an installed one: its name, or
     a mapping with its name and its options. A subclass may override `create` instead.
 
-    pytest then runs every test of the contract. A test that fails says what is wrong, and how to mend it.
+    pytest then runs every test of the contract. A test that fails says what is wrong, and how to mend it. So does a
+    component that prints, in whichever test it does so.
     """
 
     component: ClassVar[Any] = None
@@ -54,6 +74,9 @@ class Contract(ABC, Generic[Component]):
         super().__init_subclass__()
         if kind is not None:
             cls.kind = kind
+            for name, test in [*vars(cls).items()]:
+                if name.startswith("test_"):
+                    setattr(cls, name, without_output(test))
 
     def create(self) -> Component:
         """A new component, as ``component`` says; raises `TypeError` where it says nothing of use."""
@@ -80,6 +103,7 @@ class Contract(ABC, Generic[Component]):
         module, _, name = record_type(self.kind).component.partition(":")
         return (getattr(import_module(module), name),)
 
+    @without_output
     def test_every_option_is_documented(self) -> None:
         made = self.create()
         if isinstance(made, Options):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import time
 from collections.abc import Callable
 
 import numpy as np
@@ -20,6 +21,16 @@ ODD_BOXES = (
     ([1.0], [1.0 + 1e-12]),
     ([-1e-9] * 3, [1e-9] * 3),
 )
+FIRST_POINT = 0.25
+"""Seconds until a search has to ask for its first value, the best of `TRIES`, for a method begins one in every
+iteration: ten times as long would let a second pass, and a tenth is what a loaded machine takes now and then."""
+
+TRIES = 3
+
+
+def slope(points: Array) -> Array:
+    """Rises with every coordinate; the maximum is a corner."""
+    return np.asarray(points.sum(axis=1), dtype=float)
 
 
 def ripples(points: Array) -> Array:
@@ -278,6 +289,39 @@ class MaximiserContract(Contract[Maximiser], kind="maximiser"):
             f"with a gradient the search is worse than without one: {report.best_value:.3g} of a maximum of 0",
             "the gradient points uphill: go along it, not against it, and stay in the box",
         )
+
+    def test_it_goes_up_rather_than_down(self) -> None:
+        up = self.search(slope, budget=200).trace.values
+        down = -self.search(lambda points: -slope(points), budget=200).trace.values
+        demand(
+            up.mean() >= down.mean(),
+            f"on a slope it looks at lower points, of mean {up.mean():.3g}, than on the slope turned round, of mean "
+            f"{down.mean():.3g}: it minimises",
+            "values are maximised: a larger one is the better one; a library that minimises gets `-values`",
+        )
+
+    def test_the_first_point_comes_at_once(self) -> None:
+        delays: list[float] = []
+        while len(delays) < TRIES and min(delays, default=np.inf) > FIRST_POINT:
+            delays.append(self.delay())
+        demand(
+            min(delays) <= FIRST_POINT,
+            f"{min(delays):.2f} s go by before the first value is asked for",
+            "a search is begun anew in every iteration of a method: load what is slow once, and model nothing before "
+            "there are values",
+        )
+
+    def delay(self) -> float:
+        """Seconds of one search until the first value is asked for."""
+        first: list[float] = []
+
+        def timed(points: Array) -> Array:
+            first.append(time.perf_counter())
+            return bowl(points)
+
+        maximiser, began = self.create(), time.perf_counter()
+        maximise(Target(timed, PLANE), maximiser, 1, np.random.default_rng(0))
+        return first[0] - began
 
     def test_a_tuple_of_many_indices_is_searched_within_the_budget(self) -> None:
         count, width = 400, 3

@@ -340,30 +340,33 @@ WAITS = "test_the_end_waits_for_what_was_submitted"
 DIES = "test_a_worker_that_dies_breaks_the_executor_and_hangs_nobody"
 
 
+FAULTS = [
+    (losing, ONCE),
+    (losing, ORDER),
+    (swallowing, ERRORS),
+    (twice, ONCE),
+    (retrying, "test_what_fails_is_not_tried_again"),
+    (remembering, ONCE),
+    (renaming, ERRORS),
+    (traceless, ERRORS),
+    (rounding, AS_THEY_ARE),
+    (forgetting_keywords, AS_THEY_ARE),
+    (calling_what_is_cancelled, CANCELLED),
+    (telling_twice, "test_who_waits_is_told_once"),
+    (Reordering, ORDER),
+    (Hasty, WAITS),
+    (Dropping, WAITS),
+    (Endless, "test_nothing_can_be_submitted_after_the_end"),
+    (Leaking, "test_it_can_be_opened_again_and_leaves_no_thread"),
+    (Unforgiving, "test_an_error_of_the_caller_passes_and_abandons_what_is_running"),
+    (Once, "test_it_can_be_opened_again_and_leaves_no_thread"),
+    (ManyThreads, "test_linear_algebra_has_one_thread"),
+]
+
+
 @pytest.mark.parametrize(
     ("factory", "test"),
-    [
-        (losing, ONCE),
-        (losing, ORDER),
-        (swallowing, ERRORS),
-        (twice, ONCE),
-        (retrying, "test_what_fails_is_not_tried_again"),
-        (remembering, ONCE),
-        (renaming, ERRORS),
-        (traceless, ERRORS),
-        (rounding, AS_THEY_ARE),
-        (forgetting_keywords, AS_THEY_ARE),
-        (calling_what_is_cancelled, CANCELLED),
-        (telling_twice, "test_who_waits_is_told_once"),
-        (Reordering, ORDER),
-        (Hasty, WAITS),
-        (Dropping, WAITS),
-        (Endless, "test_nothing_can_be_submitted_after_the_end"),
-        (Leaking, "test_it_can_be_opened_again_and_leaves_no_thread"),
-        (Unforgiving, "test_an_error_of_the_caller_passes_and_abandons_what_is_running"),
-        (Once, "test_it_can_be_opened_again_and_leaves_no_thread"),
-        (ManyThreads, "test_linear_algebra_has_one_thread"),
-    ],
+    FAULTS,
     ids=lambda value: value if isinstance(value, str) else value.__name__,
 )
 def test_an_executor_that_is_bad_on_purpose_fails(factory, test):

@@ -197,7 +197,31 @@ class Clocked(Uniform):
         return super().search(objective, rng)
 
 
+class Minimising(Uniform):
+    """Walks downhill from the middle: on a small box even that comes near to a top."""
+
+    def search(self, objective, rng):
+        lower, upper = objective.domain.lower, objective.domain.upper
+        point, value = (lower + upper) / 2, np.inf
+        while objective.remaining:
+            step = np.clip(point + 0.3 * rng.normal(size=len(lower)) * (upper - lower), lower, upper)
+            reached = float(objective.evaluate(step[np.newaxis])[0])
+            if reached <= value:
+                point, value = step, reached
+        return np.inf
+
+
+class Late(Uniform):
+    """Thinks for a while before its first point."""
+
+    def search(self, objective, rng):
+        time.sleep(0.3)
+        return super().search(objective, rng)
+
+
 FAULTS = {
+    Minimising: "test_it_goes_up_rather_than_down",
+    Late: "test_the_first_point_comes_at_once",
     Unseeded: "test_the_same_seed_gives_the_same_points",
     Remembering: "test_the_same_seed_gives_the_same_points",
     Clocked: "test_the_same_seed_gives_the_same_points",
