@@ -26,7 +26,7 @@ endef
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help install demo live paper test tests test-slow test-pythons mutants lint style types bench docs docs-pictures clean
+.PHONY: help install demo live paper test tests test-slow test-pythons mutants lint style types bench dist docs docs-pictures clean
 
 help:
 	@echo "make demo        solve the repaired experiment 1, print the bounds, draw the figures"
@@ -37,6 +37,7 @@ help:
 	@echo "make mutants     300 small errors in what proves and checks (COUNT=20 SEED=1 for fewer): which do the tests notice? (hours)"
 	@echo "make test-pythons  the tests of the first stage on every Python from 3.11 to 3.14 that is found"
 	@echo "make bench       time the certified solve, and solvers and maximisers beside other people's"
+	@echo "make dist        sdist and wheel in dist/, tried in an environment of their own"
 	@echo "make docs        write the reference and the schema anew, and build the site (minutes, the first time)"
 	@echo "make docs-pictures  the pictures of docs/gallery.md and docs/live.md anew (minutes; needs a Vulkan driver, no display)"
 	@echo "make install     set up $(VENV) with everything, whatever is there of it"
@@ -116,6 +117,15 @@ test-pythons:
 
 bench: $(PEERS)
 	$(BIN)/python -m pytest -m benchmark tests/benchmarks
+
+# The wheel is built from the unpacked sdist, so that what is missing in this is missing in that.
+dist: $(INSTALLED)
+	@rm -rf dist
+	$(BIN)/python -m hatchling build -d dist -t sdist
+	@mkdir dist/unpacked && tar -xzf dist/*.tar.gz -C dist/unpacked --strip-components 1
+	cd dist/unpacked && $(CURDIR)/$(BIN)/python -m hatchling build -d .. -t wheel
+	@rm -rf dist/unpacked
+	DIST=dist $(BIN)/python -m pytest -q -m slow -p no:cacheprovider tests/rules/test_distribution.py
 
 # The site, every warning an error; pictures and notebooks are kept in .docs_cache until what they show has changed.
 docs: $(WRITERS)
