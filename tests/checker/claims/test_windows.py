@@ -1,0 +1,494 @@
+"""Guards checker/claims of constraints on the state, of costs and of whole certificates, by plants whose worst is known
+by hand.
+
+``x' = u + w``, ``x(0) = 1``, two pieces of length 1, ``u = (0.5, -0.5)``, ``|w| <= 0.25``: at most 1.75, at 1.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from flint import arb, ctx
+
+import sparserob_core as sr
+from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.claims import claims, constraints, replay
+from sparserob_core.checker.claims.case import Case
+from sparserob_core.checker.claims.cost import _integrated, _semidefinite
+from sparserob_core.checker.outcome import Broken, Finding, Unchecked
+from sparserob_core.checker.reach.flow import stacked
+from sparserob_core.control.policies.affine import AffinePolicy
+from sparserob_core.control.problem.cost import Quadratic
+from sparserob_core.control.problem.expression import parse_matrix
+from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.sets.sets import Box, Ellipsoid, NormBall
+
+TOO_MUCH, NOTHING = 5e-9, 3e-10
+ONE = np.ones((1, 1))
+
+
+def proof(*cells):
+    lower, upper = zip(*cells, strict=True)
+    return {"tolerance": 1e-9, "lower": list(lower), "upper": list(upper)}
+
+
+WHOLE, END = proof(([0.0], [2.0])), proof(([2.0], [2.0]))
+
+
+def case_of(wall=None, decision=((0.5, -0.5),), certificate=None, policy=None, **more):
+    problem = sr.OptimalControlProblem(
+        **{
+            "system": LinearSystem(np.zeros((1, 1)), ONE, E=ONE),
+            "horizon": 2.0,
+            "initial_state": [1.0],
+            "control": Box([-1.0], [1.0]),
+            "disturbance": Box([-0.25], [0.25]),
+            "path": [] if wall is None else [wall if isinstance(wall, sr.PathConstraint) else sr.PathConstraint(wall)],
+            **more,
+        }
+    )
+    grid = sr.Dictionary.indicators([0.0, 1.0, 2.0])
+    said = {
+        "decision": np.array(decision).tolist(),
+        "status": "verified",
+        "proof": {"path": WHOLE, "terminal": END},
+        **(certificate or {}),
+    }
+    return Case(problem, grid, grid, said, policy=policy)
+
+
+@pytest.fixture(autouse=True)
+def precision():
+    with ctx.workprec(96):
+        yield
+
+
+def kept(case):
+    return constraints.bounded(case, case.windows[0])
+
+
+def below(size):
+    return Box([-9.0], [size])
+
+
+def test_a_wall_holds_up_to_where_the_worst_disturbance_takes_the_state():
+    assert "margin" in kept(case_of(below(1.8)))
+    assert "kept to" in kept(case_of(below(1.75 / (1 + NOTHING))))
+    for size in (1.75 / (1 + TOO_MUCH), 1.7):
+        with pytest.raises(Broken, match="exceeded"):
+            kept(case_of(below(size)))
+    # the same below, and at the end
+    assert kept(case_of(Box([-0.5], [9.0]), decision=((-0.5, -0.5),)))
+    with pytest.raises(Broken):
+        kept(case_of(Box([-0.5 * (1 - 3 * TOO_MUCH)], [9.0]), decision=((-0.5, -0.5),)))
+    assert kept(case_of(terminal=[below(1.5 / (1 + NOTHING))]))
+    with pytest.raises(Broken, match="t = 2"):
+        kept(case_of(terminal=[below(1.5 / (1 + TOO_MUCH))]))
+    # only within its window
+    assert kept(
+        case_of(sr.PathConstraint(below(1.3), 0.0, 0.4), certificate={"proof": {"path": proof(([0.0], [0.4]))}})
+    )
+    with pytest.raises(Broken):
+        kept(case_of(sr.PathConstraint(below(1.29), 0.0, 0.4), certificate={"proof": {"path": proof(([0.0], [0.4]))}}))
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        {},
+        {"path": {**WHOLE, "tolerance": 1.1e-9}},
+        {"path": {**WHOLE, "tolerance": 0.0}},
+        {"path": {**WHOLE, "tolerance": -1e-9}},
+        {"path": proof(([0.0], [1.999999]))},
+        {"path": proof(([1e-9], [2.0]))},
+        {"path": proof(([0.0], [1.0]), ([1.1], [2.0]))},
+        {"path": proof(([0.0, 0.0], [2.0, 1.0]))},
+        {"path": proof(([0.0], [2.0]), ([0.0], [2.0]))},
+        {"terminal": WHOLE},
+        "nothing",
+    ],
+)
+def test_cells_that_leave_a_time_out_prove_nothing(said):
+    with pytest.raises(Broken):
+        kept(case_of(below(9.0), certificate={"proof": said}))
+    assert kept(case_of(below(9.0), certificate={"proof": {"path": proof(([1.0], [2.0]), ([0.0], [1.0]))}}))
+    with pytest.raises(Unchecked):
+        kept(case_of(below(9.0), certificate={"proof": {}, "status": "undecided"}))
+
+
+def test_a_wall_that_moves_is_where_it_is_at_every_time():
+    """Above a reference that rises from 0 to 1 until 1 and falls to 0.5: the state is at most 1, 0.75 and 1 above."""
+    moving = np.array([[0.0, 0.0], [1.0, 1.0], [2.0, 0.5]])
+    for size, met in ((1.0 + 1e-8, True), (1.0 - 1e-8, False)):
+        case = case_of(sr.PathConstraint(below(size), relative_to=moving))
+        if met:
+            assert kept(case)
+        else:
+            with pytest.raises(Broken):
+                kept(case)
+    window = case_of(sr.PathConstraint(below(1.0), relative_to=moving)).windows[0]
+    offset, slope = window.moved(0.5, 0.75)
+    assert (float(offset[0].mid()), float(slope[0].mid())) == (0.5, 1.0)
+    offset, slope = window.moved(1.5, 1.5)
+    assert (float(offset[0].mid()), float(slope[0].mid())) == (0.75, -0.5)
+    assert float(window.limit(np.ones(1), 1.5).mid()) == 1.75
+    assert float(window.limit(-np.ones(1), 1.5).mid()) == 9.0 - 0.75
+    assert window.cuts([0.0, 1.0]) == [0.0, 1.0, 2.0]
+    assert not window.is_mixed
+    for time, value in ((-1.0, 0.0), (2.0, 0.5), (3.0, 0.5)):
+        assert float(window.moved(time, time)[0][0].mid()) == value
+
+
+def mixed(size, start=0.0, stop=None):
+    """``x + u <= size``: at most 1.75 + 0.5 at the end of the first piece."""
+    return sr.MixedConstraint(ONE, ONE, [size], start, stop)
+
+
+def test_a_constraint_on_state_and_control_sees_both_values_where_the_control_jumps():
+    for size, met in ((2.25 + 1e-8, True), (2.25 - 2e-8, False), (1.8, False)):
+        case = case_of(path=[mixed(size)])
+        if met:
+            assert kept(case)
+        else:
+            with pytest.raises(Broken):
+                kept(case)
+    case = case_of(path=[mixed(2.0)])
+    window = case.windows[0]
+    assert window.is_mixed and window.cuts([0.0, 1.0]) == [0.0, 1.0]
+    over, slack = replay.exceeded(case, {"constraint": "path", "time": 1.0, "parameter": [], "violation": 0.0})
+    assert sorted(over) == pytest.approx([1.75 - 0.5 - 2.0, 0.25])
+    assert 1e-9 <= slack <= 1e-8
+    for piece, time in ((0, 0.0), (0, 1.0), (1, 1.0), (1, 2.0)):
+        window.meets([0.0, 1.0, 2.0], piece, time)
+    for piece, time in ((0, 1.1), (1, 0.9), (2, 2.0), (-1, 0.0)):
+        with pytest.raises(Broken):
+            window.meets([0.0, 1.0, 2.0], piece, time)
+    # a window that begins where a piece ends has nothing of it
+    late = case_of(path=[mixed(2.0, 1.0, 2.0)], certificate={"proof": {"path": proof(([1.0], [2.0]))}}).windows[0]
+    late.meets([0.0, 1.0, 2.0], 1, 1.0)
+    with pytest.raises(Broken):
+        late.meets([0.0, 1.0, 2.0], 0, 1.0)
+
+
+def uncertain(parameters, text="p1", names=("p1",), **more):
+    system = LinearSystem(parse_matrix("A", [[text]], names), ONE, parameters=parameters, names=names)
+    return {"system": system, "disturbance": None, "decision": ((0.0, 0.0),), **more}
+
+
+def test_the_worst_parameter_of_a_box_is_at_its_corner():
+    """``x' = p x`` with ``|p| <= 1/2``: at most ``e`` at 2."""
+    cells = {"proof": {"path": proof(([0.0, -0.5], [2.0, 0.5]))}}
+    plant = uncertain(Box([-0.5], [0.5]))
+    assert kept(case_of(below(math.e * (1 + 1e-9)), certificate=cells, **plant))
+    for size in (math.e * (1 - 1e-3), 2.0):
+        with pytest.raises((Broken, Unchecked)):
+            kept(case_of(below(size), certificate=cells, **plant))
+    for wrong in (
+        proof(([0.0, -0.5], [2.0, 0.4])),
+        proof(([0.0, -0.4], [2.0, 0.5])),
+        proof(([0.0, -0.5], [2.0, 0.0]), ([0.0, 0.1], [2.0, 0.5])),
+        WHOLE,
+    ):
+        with pytest.raises(Broken):
+            kept(case_of(below(99.0), certificate={"proof": {"path": wrong}}, **plant))
+
+
+def test_a_set_of_parameters_that_is_no_box_is_filled_and_its_corners_are_not_in_it():
+    """``x' = (p1 + p2) x`` on a disc of radius 1/2: at most ``e^sqrt(2)``, in the corners of the square ``e^2``."""
+    plant = uncertain(NormBall(2.0, 0.5, dimension=2), "p1 + p2", ("p1", "p2"))
+    square = {"proof": {"path": proof(([0.0, -0.5, -0.5], [2.0, 0.5, 0.5]))}}
+    worst = math.exp(math.sqrt(2.0))
+    assert kept(case_of(below(worst * 1.01), certificate=square, **plant))
+    with pytest.raises((Broken, Unchecked)):
+        kept(case_of(below(0.5 * worst), certificate=square, **plant))
+    for low, high in (([-0.49, -0.5], [0.5, 0.5]), ([-0.5, -0.5], [0.5, 0.499])):
+        with pytest.raises(Broken, match="leave out"):
+            cells = {"proof": {"path": proof(([0.0, *low], [2.0, *high]))}}
+            kept(case_of(below(99.0), certificate=cells, **plant))
+
+
+def test_directions_of_a_curved_wall_must_span_and_fill_the_faces():
+    faces = [([0.0, s], [2.0, s]) for s in (-1.0, 1.0)]
+    assert kept(case_of(Ellipsoid([0.0], [[1.76**2]]), certificate={"proof": {"path": proof(*faces)}}))
+    wall = Ellipsoid([0.0], [[9.0]])
+    with pytest.raises(Broken):
+        kept(case_of(wall, certificate={"proof": {"path": proof(faces[0])}}))
+    window = case_of(wall).windows[0]
+    assert (constraints.normals_of(window, None) == [[1.0]]).all()
+    assert (constraints.normals_of(window, [[2.0]]) == [[2.0]]).all()
+    for wrong in ([[0.0]], [[1.0, 0.0]], [1.0]):
+        with pytest.raises(Broken):
+            constraints.normals_of(window, wrong)
+
+
+def test_times_are_cut_where_the_grid_is():
+    grid, cuts = np.array([0.0, 1.0, 2.0]), np.array([0.0, 0.5, 1.0, 2.0])
+    assert constraints.cut(grid, cuts, 0.25, 1.5) == [(0, 0.25, 0.5), (0, 0.5, 1.0), (1, 1.0, 1.5)]
+    assert constraints.cut(grid, cuts, 1.0, 2.0) == [(1, 1.0, 2.0)]
+    assert constraints.cut(grid, cuts, 2.0, 2.0) == [(1, 2.0, 2.0)]
+    assert constraints.cut(grid, cuts, 0.5, 0.5) == [(0, 0.5, 0.5)]
+
+
+def test_a_witness_leads_to_what_it_says():
+    wall = below(1.5)
+    data = {
+        "constraint": "path", "time": 1.0, "direction": [1.0], "parameter": [], "disturbance": [[0.25, 0.0]],
+        "violation": 0.25,
+    }  # fmt: skip
+    assert "exceeded by 0.25 at t = 1" in claims._witness(case_of(wall, certificate={"witness": data}))
+    assert float(replay.reached(case_of(wall), 2.0, np.zeros(0), [[0.25, -0.1]])[0].mid()) == pytest.approx(1.15)
+    assert float(replay.reached(case_of(wall), 0.5, np.zeros(0), [[0.2, -0.1]])[0].mid()) == pytest.approx(1.35)
+    for wrong in (
+        {"violation": 0.25 + 1e-6},
+        {"violation": 0.25 - 1e-6},
+        {"disturbance": [[0.25 + 1e-15, 0.0]]},
+        {"disturbance": [[0.25]]},
+        {"disturbance": [[0.0, 0.0], [0.0, 0.0]]},
+        {"disturbance": [[0.0, 0.0]], "violation": 0.0},
+        {"disturbance": [[1.2e-9, 0.0]], "violation": 1.2e-9},
+        {"time": 2.1},
+        {"time": -0.1},
+        {"direction": [1.0, 0.0]},
+        {"parameter": [0.0]},
+        {"constraint": "nobody"},
+    ):
+        with pytest.raises((Broken, Unchecked)):
+            claims._witness(case_of(wall, certificate={"witness": {**data, **wrong}}))
+    little = {**data, "disturbance": [[1e-8, 0.0]], "violation": 1e-8}
+    assert claims._witness(case_of(wall, certificate={"witness": little}))
+    with pytest.raises(Unchecked):
+        claims._witness(case_of(wall))
+    begun = case_of(
+        wall, certificate={"witness": {**data, "deviation": [0.1], "violation": 0.35}}, initial_set=Box([-0.1], [0.1])
+    )
+    assert claims._witness(begun)
+    for wrong in ([0.1 + 1e-15], [0.0, 0.0], None):
+        with pytest.raises(Broken):
+            said = {"witness": {**data, "deviation": wrong, "violation": 0.35}}
+            claims._witness(case_of(wall, certificate=said, initial_set=Box([-0.1], [0.1])))
+
+
+def test_how_much_a_row_is_exceeded_is_told_at_its_time():
+    case = case_of(Box([-1.0], [1.5]))
+    over, slack = replay.exceeded(case, {"constraint": "path", "time": 1.0, "parameter": [], "violation": 0.0})
+    assert sorted(over) == pytest.approx([-1.25 - 1.0, 0.25])
+    assert slack == pytest.approx(1.5e-9, rel=0.7)
+    assert max(replay.exceeded(case, {"constraint": "path", "time": 2.0, "parameter": [], "violation": 0})[0]) == (
+        pytest.approx(0.0)
+    )
+    begun = case_of(Box([-1.0], [1.5]), initial_set=Box([-0.1], [0.1]))
+    said = {"constraint": "path", "time": 1.0, "parameter": [], "violation": 0.0}
+    assert max(replay.exceeded(begun, said)[0]) == pytest.approx(0.35)
+    assert max(replay.exceeded(begun, said, np.array([1.05]))[0]) == pytest.approx(0.3)
+    for wrong in ({"time": 2.1}, {"parameter": [1.0]}, {"constraint": "nobody"}, {"violation": "much"}):
+        with pytest.raises(Broken):
+            replay.exceeded(case, {**said, **wrong})
+
+
+def finding(name, verdict):
+    return Finding(name, verdict, "")
+
+
+def test_a_status_follows_from_the_claims_under_it():
+    every = [finding(name, "holds") for name in ("control", "cost", "lower bound", "path", "causal")]
+
+    def status(said, tolerance=1e-6, lower=1.0 - 1e-7, gap_tolerance: Any = 1e-6, found=every):
+        written = {"cost": 1.0, "lower_bound": lower, "gap_tolerance": gap_tolerance}
+        return claims._status(case_of(certificate=written), said, tolerance, found)
+
+    assert "bounds meet" in status("certified")
+    assert "gap" in status("verified", lower=0.0)
+    assert status("undecided", found=[finding("path", "fails")])
+    for more in ({"lower": 1.0 - 2e-6}, {"tolerance": 1e-5}, {"gap_tolerance": None}, {"tolerance": None}):
+        with pytest.raises(Broken):
+            status("certified", **more)
+    for name, certified, verified in (
+        ("path", False, False),
+        ("control", False, False),
+        ("cost", False, True),
+        ("lower bound", False, True),
+        ("causal", True, True),
+    ):
+        for verdict in ("fails", "not checked"):
+            changed = [finding(one.name, verdict if one.name == name else one.verdict) for one in every]
+            for said, follows in (("certified", certified), ("verified", verified)):
+                if follows or (verdict == "fails" and name in ("cost", "lower bound")):
+                    assert status(said, found=changed)
+                else:
+                    with pytest.raises(Broken if verdict == "fails" else Unchecked):
+                        status(said, found=changed)
+    case = case_of(certificate={"cost": 2.0})
+    assert claims.relative_gap(case, 2.0, 1.0) == 0.5
+    assert claims.relative_gap(case, 1.0, 2.0) == 0.0
+    assert claims.relative_gap(case, 0.0, 0.0) == 0.0
+    assert claims.relative_gap(case_of(certificate={"cost": -1.0}), -1.0, -4.0) == 0.75
+
+
+def test_infeasibility_needs_a_sum_that_is_positive():
+    """``x(2) <= -1.1`` and ``|u| <= 1``: at best -1 + 0.5."""
+    entry = {"constraint": "terminal", "time": 2.0, "direction": [1.0], "parameter": [], "multiplier": 1.0}
+
+    def judged(goal, **more):
+        said = {"multipliers": {"constraints": [entry], "equalities": [], "pieces": None}, "status": "infeasible"}
+        return claims._infeasible(case_of(certificate={**said, **more}, terminal=[Box([-9.0], [goal])]))
+
+    assert "at least 0.1" in judged(-0.6)
+    for goal in (-0.5, -0.4):
+        with pytest.raises(Broken):
+            judged(goal)
+    with pytest.raises(Broken):
+        judged(-0.6, multipliers=None, tree={"nodes": [], "constraints": []})
+
+
+def causal(cost="nominal", lower=None, priced=True, signals=((UP := (0.25, 0.25)),), rows=((0, 1.0),), **more):
+    """``x(2) <= 0.7`` asks ``u_0 + u_1 <= -0.3 - w_0 - w_1``."""
+    said = {
+        "lower_bound": lower,
+        "signals": [[list(signal)] for signal in signals],
+        "multipliers": [
+            {"constraint": "terminal", "time": 2.0, "direction": [1.0], "signal": which, "multiplier": y}
+            for which, y in rows
+        ],
+        **more,
+    }
+    case = case_of(certificate={"causal": said}, policy=AffinePolicy(cost=cost), terminal=[Box([-9.0], [0.7])])
+    from sparserob_core.checker.claims.causal import causal_bound
+
+    return case, float(causal_bound(case, said, priced).mid())
+
+
+def test_a_bound_against_every_causal_policy_is_by_hand():
+    """What is asked at 1 may depend on ``w_0``: under ``(1/4, 1/4)`` the second piece has no price of the nominal
+    cost."""
+    assert causal(signals=((0.0, 0.25),))[1] == pytest.approx(0.55)
+    assert causal()[1] == pytest.approx(0.8 - 1.0)
+    assert causal("peak")[1] == pytest.approx(0.8, abs=1e-9)
+    assert causal("worst", shares=[1.0])[1] == pytest.approx(0.8)
+    assert causal("worst", shares=[0.5])[1] == pytest.approx(0.8 - 0.5 - 0.5)
+    assert causal(priced=False)[1] == pytest.approx(0.8 - 2.0)
+    # two signals that part at 1: the first piece is the same for both
+    two = {"signals": ((0.25, 0.25), (-0.25, 0.25)), "rows": ((0, 0.5), (1, 0.5))}
+    assert causal("peak", **two)[1] == pytest.approx(0.55, abs=1e-9)
+    assert causal("worst", shares=[0.5, 0.5], **two)[1] == pytest.approx(0.55)
+    assert causal("worst", shares=[1.0, 0.0], **two)[1] == pytest.approx(0.55 - 0.5)
+    assert causal(**two)[1] == pytest.approx(0.55 - 0.5 - 0.5)
+    for wrong in ([1.5], [-0.1], [0.4, 0.4]):
+        with pytest.raises(Broken):
+            causal("worst", shares=wrong)
+    with pytest.raises(Broken):
+        causal("worst", shares=[0.5, 0.5 + 1e-12], **two)
+    for wrong in ({"signals": ((0.26, 0.0),)}, {"signals": ((0.1,),)}, {"rows": ((1, 1.0),)}, {"rows": ((-1, 1.0),)},
+                  {"rows": ((0, 0.0),)}, {"rows": ((0, -1.0),)}, {"rows": ((True, 1.0),)}):  # fmt: skip
+        with pytest.raises(Broken):
+            causal(**wrong)
+    case, _ = causal("peak", lower=0.79)
+    assert "0.79" in claims._causal(case)
+    for lower, cost in ((0.8 + 1e-9, "peak"), (None, "peak"), (1.0, "nominal")):
+        with pytest.raises(Broken):
+            claims._causal(causal(cost, lower=lower)[0])
+    hopeless = causal("peak", rows=((0, 1.0),), priced=False)[0]
+    weak = replace(hopeless, problem=replace(hopeless.problem, control=Box([-0.3], [0.3])))
+    assert "no causal policy exists" in claims._causal(weak)
+
+
+def test_quadratic_costs_are_integrals_by_hand():
+    """``x' = u`` from 1 under ``(-1, 0.5)``: ``1 - t``, then ``s / 2``."""
+    cost = sr.Cost(l1=0.5, state={"Q": [[2.0]]}, control={"R": [[3.0]]}, final={"Q": [[4.0]], "reference": [1.0]})
+    case = case_of(decision=((-1.0, 0.5),), disturbance=None, system=LinearSystem(np.zeros((1, 1)), ONE), cost=cost)
+    state, control, final = 2.0 * (1 / 3 + 1 / 12), 3.0 * 1.25, 4.0 * 0.25
+    value = case.price.of(case.pieces)
+    assert float(value.mid()) == pytest.approx(0.5 * 1.5 + state + control + final)
+    assert float(value.rad()) < 1e-18
+    # the tangent touches at its control and lies below elsewhere, with the slopes of differences
+    tangent = case.price.tangent(case.pieces)
+
+    def quadratic(u):
+        pieces = [stacked([[x] for x in balls([v])]) for v in u]
+        return float((case.price.of(pieces) - case.price._norms(balls([1.0])) * sum(abs(v) for v in u)).mid())
+
+    def line(u):
+        parts = (g[0] * arb(v) for g, v in zip(tangent.slope, u, strict=True))
+        return float(sum(parts, tangent.constant).mid())
+
+    assert line((-1.0, 0.5)) == pytest.approx(state + control + final)
+    for u in np.random.default_rng(1).uniform(-2, 2, size=(20, 2)):
+        assert line(u) <= quadratic(u) + 1e-12
+    h = 1e-4
+    for i, slope in enumerate(tangent.slope):
+        ahead, behind = ([(-1.0, 0.5)[j] + s * h * (i == j) for j in range(2)] for s in (1, -1))
+        assert float(slope[0].mid()) == pytest.approx((quadratic(ahead) - quadratic(behind)) / (2 * h), rel=1e-7)
+    # what is added up: u'P u / 2 of the control, the linear part beside it, and what stays without any
+    constant = 2.0 * 2.0
+    bent = 3.0 * 1.25 + 2.0 * (1 / 3 + (1 - 0.5 + 1 / 12)) + 4.0 * 0.25
+    linear = (state + control + final) - constant - bent
+    assert case.price.added(case.pieces) == pytest.approx(0.75 + constant + bent + abs(linear))
+    with pytest.raises(Broken, match="tangent"):
+        claims._touched(case, {"tangent": [[0.0]]})
+    assert len(claims._touched(case, {"tangent": [[0.0, 0.0]]})) == 2
+    assert claims._touched(case_of(), {}) is None
+
+
+def test_the_length_of_a_group_counts_once():
+    two = {
+        "system": LinearSystem(np.zeros((2, 2)), np.eye(2)), "initial_state": [0.0, 0.0], "disturbance": None,
+        "control": Box([-5.0] * 2, [5.0] * 2), "decision": ((3.0, 0.0), (4.0, 1.0)), "weights": [2.0, 2.0],
+    }  # fmt: skip
+    for group, value in ((None, 2.0 * 8.0), ("all", 2.0 * 6.0), ([[1, 2]], 2.0 * 6.0), ([[2]], 2.0 * 8.0)):
+        case = case_of(cost=sr.Cost(group=group), **two)
+        assert float(case.price.of(case.pieces).mid()) == pytest.approx(value)
+    assert float(case_of(cost=sr.Cost(l1=0.5), **two).price.weights[0].mid()) == 1.0
+
+
+def test_a_matrix_is_positive_semidefinite_in_rational_numbers():
+    for Q, well in (
+        ([[1.0, 1.0], [1.0, 1.0]], True),
+        ([[1.0, 1.0], [1.0, 1.0 - 2e-16]], False),
+        ([[0.0, 0.0], [0.0, 1.0]], True),
+        ([[0.0, 1e-300], [1e-300, 1.0]], False),
+        ([[1.0, 0.0], [1e-300, 1.0]], False),
+        ([[-1e-300]], False),
+        ([[4.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 0.0]], True),
+        ([[4.0, 2.0, 1.0], [2.0, 1.0, 0.0], [1.0, 0.0, 9.0]], False),
+    ):
+        assert _semidefinite(Quadratic(np.array(Q), np.zeros(len(Q)))) is well
+
+
+def test_an_integral_of_a_flow_is_the_closed_form_however_often_it_is_doubled():
+    """``int_0^h e^{-2 a t} dt = (1 - e^{-2 a h}) / (2 a)``."""
+    from fractions import Fraction
+
+    for a, h in ((0.3, 1.0), (3.0, 2.0), (40.0, 1.5)):
+        flow, weight = _integrated(stacked([balls([-a])]), stacked([balls([1.0])]), Fraction(h))
+        assert float(flow[0, 0].mid()) == pytest.approx(math.exp(-a * h))
+        assert float(weight[0, 0].mid()) == pytest.approx((1 - math.exp(-2 * a * h)) / (2 * a))
+        assert (2 * a * weight[0, 0] + (-2 * arb(a) * arb(h)).exp() - 1).contains(0)
+    with pytest.raises(Unchecked):
+        _integrated(stacked([balls([1e70])]), stacked([balls([1.0])]), Fraction(1))
+
+
+def test_the_unit_of_a_row_is_the_smallest_of_its_width_its_limit_and_how_far_it_can_reach():
+    """With ``|u| <= 1`` and ``|w| <= 0.25`` the state reaches from -1.5 to 3.5 by 2."""
+    for wall, unit in (
+        (Box([-9.0], [2.0]), [2.0, 3.5]),
+        (Box([-9.0], [9.0]), [3.5, 3.5]),
+        (Box([1.9], [2.0]), [0.1, 0.1]),
+        (Box([-np.inf], [0.5]), [0.5]),
+    ):
+        case = case_of(wall)
+        assert case.units(case.windows[0]).rows == pytest.approx(unit)
+    early = case_of(sr.PathConstraint(Box([-9.0], [9.0]), 0.0, 1.0))
+    assert early.units(early.windows[0]).rows == pytest.approx([2.25, 2.25])
+    assert early.units(early.windows[0]).sums == pytest.approx([2.25])
+    ball = case_of(NormBall(2.0, 3.0, centre=[0.5]))
+    window = ball.windows[0]
+    assert ball.units(window).slack(np.array([2.0]), window.limit(np.array([2.0]), 0.0)) == pytest.approx(
+        6e-9 if window.seen.facets is None else 2e-9 * 2.5, rel=0.5
+    )
+    flat = case_of(Box([-9.0], [2.0]))
+    slack = flat.units(flat.windows[0]).slack
+    assert slack(np.array([1.0]), arb(2)) == pytest.approx(2e-9)
+    assert slack(np.array([-2.0]), arb(18)) == pytest.approx(7e-9)
