@@ -49,7 +49,7 @@ def bounded(case: Case, window: Window) -> str:
     if not 0 < tolerance <= TOLERANCE * (1.0 + 1e-12):
         raise Broken(f"a violation of {tolerance:g} is to count as none, of its own unit at most {TOLERANCE:g} may")
     lower, upper = numbers(entry.get("lower"), "lower"), numbers(entry.get("upper"), "upper")
-    if lower.shape == (0, 0):
+    if not lower.size:
         raise Unchecked("the certificate holds no cells for a constraint that was not proven on cells")
     normals = normals_of(window, entry.get("normals"))
     covered(case, window, lower, upper)
