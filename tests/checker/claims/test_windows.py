@@ -415,7 +415,7 @@ def test_quadratic_costs_are_integrals_by_hand():
 
     def quadratic(u):
         pieces = [stacked([[x] for x in balls([v])]) for v in u]
-        return float((case.price.of(pieces) - case.price._norms(balls([1.0])) * sum(abs(v) for v in u)).mid())
+        return float((case.price.of(pieces) - balls([0.5])[0] * sum(abs(v) for v in u)).mid())
 
     def line(u):
         parts = (g[0] * arb(v) for g, v in zip(tangent.slope, u, strict=True))
@@ -447,7 +447,12 @@ def test_the_length_of_a_group_counts_once():
     for group, value in ((None, 2.0 * 8.0), ("all", 2.0 * 6.0), ([[1, 2]], 2.0 * 6.0), ([[2]], 2.0 * 8.0)):
         case = case_of(cost=sr.Cost(group=group), **two)
         assert float(case.price.of(case.pieces).mid()) == pytest.approx(value)
-    assert float(case_of(cost=sr.Cost(l1=0.5), **two).price.weights[0].mid()) == 1.0
+    assert float(case_of(cost=sr.Cost(l1=0.5), **two).price.costs[0][0].mid()) == 1.0
+    # weights that change within a piece are integrated over it: 1 until 1/2, then 3
+    stepped = case_of(cost=sr.Cost(l1=0.5), **{**two, "weights": [[0.0, 1.0, 1.0], [0.5, 3.0, 2.0]]})
+    assert [[float(x.mid()) for x in row] for row in stepped.price.costs] == [[1.0, 0.75], [1.5, 1.0]]
+    assert stepped.price.highest.tolist() == [3.0, 2.0]
+    assert stepped.price.counts.tolist() == [1.0, 1.0]
 
 
 def test_a_matrix_is_positive_semidefinite_in_rational_numbers():
