@@ -76,7 +76,7 @@ class _Steps:
 
     def __init__(self, objective: sr.Objective, rng: np.random.Generator) -> None:
         self.objective, self.rng, self.dimension = objective, rng, objective.domain.dimension
-        self.blocks = np.arange(self.dimension) // objective.block
+        _, self.blocks = np.unique(np.arange(self.dimension) // objective.block, return_inverse=True)
         self.slopes, self.ceiling = Slopes(self.dimension, objective.remaining + 1), Ceiling()
         self.ascents, self.reach = Ascents(self.slopes), 0.1
 
@@ -128,15 +128,18 @@ class _Steps:
         else:
             count = min(candidates, max(10, NUMBERS // self.dimension))
             point = self.ceiling.highest(seen, self.rng.random((count, self.dimension)))
-        self.ascents.note_global(point, self.evaluate(point))
+        value = self.evaluate(point)
+        if self.dimension <= MODELLED:
+            self.ascents.note_global(point, value)
 
     def _change_blocks(self) -> None:
         """Beyond what can be modelled: a step of one or few blocks from the best point, adapted to success."""
         seen, rng = self.slopes, self.rng
-        _, position = np.unique(self.blocks, return_inverse=True)
-        trials = np.repeat(seen.top[np.newaxis], 32, axis=0)
+        trials, blocks = np.repeat(seen.top[np.newaxis], 32, axis=0), int(self.blocks[-1]) + 1
         for trial in trials:
-            changed = np.isin(position, rng.integers(position[-1] + 1, size=rng.integers(1, 4)))
+            moved = np.zeros(blocks, dtype=bool)
+            moved[rng.integers(blocks, size=rng.integers(1, 4))] = True
+            changed = moved[self.blocks]
             trial[changed] += self.reach * rng.standard_cauchy(int(changed.sum()))
         trials = 1.0 - np.abs(1.0 - np.abs(trials) % 2.0)
         best = seen.best

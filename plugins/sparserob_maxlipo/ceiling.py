@@ -17,13 +17,18 @@ class Ceiling:
 
     def __init__(self) -> None:
         self._decided = np.zeros(0)
+        self._slope, self._squares = np.zeros(0), np.zeros(0)
 
     def highest(self, seen: Slopes, candidates: np.ndarray) -> np.ndarray:
         """The candidate with the highest bound, the first of equals."""
         self._decided = np.concatenate([0.9 * self._decided, np.ones(seen.count - self._decided.size)])
-        bound = _Bound(seen)
+        bound = _Bound(seen, self._lengths(seen))
         if seen.count <= FRONT:
             return np.asarray(candidates[bound.above(candidates, np.arange(seen.count)).argmax()])
+        if len(candidates) <= BATCH:  # all of which would be asked
+            heights, deciding = bound.at(candidates)
+            np.add.at(self._decided, deciding, 1.0)
+            return np.asarray(candidates[heights.argmax()])
         above = bound.above(candidates, np.argpartition(-self._decided, FRONT - 1)[:FRONT])
         order = np.argsort(-above, kind="stable")
         best, chosen = -np.inf, int(order[0])
@@ -37,35 +42,40 @@ class Ceiling:
                 best, chosen = float(heights.max()), int(part[heights.argmax()])
         return np.asarray(candidates[chosen])
 
+    def _lengths(self, seen: Slopes) -> np.ndarray:
+        """``sum_j s_j x_ij^2`` of every point ``(n,)``; of the new points only, while the slopes are the same."""
+        known = self._squares.size if np.array_equal(self._slope, seen.slope) else 0
+        fresh = np.einsum("ij,ij->i", seen.points[known:] * seen.slope, seen.points[known:])
+        self._slope, self._squares = seen.slope.copy(), np.concatenate([self._squares[:known], fresh])
+        return self._squares
+
 
 class _Bound:
-    """``U`` in units, less the best value."""
+    """``U`` in units, less the best value. ``lengths (n,)``: ``sum_j s_j x_ij^2``."""
 
-    def __init__(self, seen: Slopes) -> None:
-        self.root = np.sqrt(seen.slope)
-        self.scaled, self.heights = seen.points * self.root, seen.heights
-        self.squares = np.einsum("ij,ij->i", self.scaled, self.scaled) + seen.noise
+    def __init__(self, seen: Slopes, lengths: np.ndarray) -> None:
+        self.slope, self.points, self.heights = seen.slope, seen.points, seen.heights
+        self.squares = lengths + seen.noise
 
     def above(self, candidates: np.ndarray, which: np.ndarray) -> np.ndarray:
         """The least of the cones ``which`` at candidates ``(c, d)``: an upper bound of ``U``."""
-        return np.asarray(
-            self._cones(self.scaled[which], self.squares[which], self.heights[which], candidates * self.root).min(
-                axis=0
-            )
-        )
+        cones = self._cones(self.points[which], self.squares[which], self.heights[which], candidates)
+        return np.asarray(cones.min(axis=0))
 
     def at(self, candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """``U`` at candidates ``(c, d)``, and which point decides it."""
-        cones = self._cones(self.scaled, self.squares, self.heights, candidates * self.root)
+        cones = self._cones(self.points, self.squares, self.heights, candidates)
         deciding = cones.argmin(axis=0)
         return cones[deciding, np.arange(len(candidates))], deciding
 
-    @staticmethod
-    def _cones(points: np.ndarray, squares: np.ndarray, heights: np.ndarray, candidates: np.ndarray) -> np.ndarray:
+    def _cones(
+        self, points: np.ndarray, squares: np.ndarray, heights: np.ndarray, candidates: np.ndarray
+    ) -> np.ndarray:
         """The cone of every point at every candidate ``(n, c)``: reductions along the first axis are the fast ones."""
-        cones = points @ (-2.0 * candidates).T
+        weighted = candidates * self.slope  # the candidates are few, and are scaled in the place of the points
+        cones = points @ (-2.0 * weighted).T
         cones += squares[:, np.newaxis]
-        cones += np.einsum("ij,ij->i", candidates, candidates)
+        cones += np.einsum("ij,ij->i", weighted, candidates)
         np.sqrt(np.maximum(cones, 0.0, out=cones), out=cones)
         cones += heights[:, np.newaxis]
         return np.asarray(cones)

@@ -141,17 +141,19 @@ class Slopes:
         squares = self.points[:last] - self.points[last]
         pairs = Pairs(np.square(squares, out=squares), lower, rise**2)
         pairs = pairs if counts.all() else pairs.take(counts)
-        slope, noise, distances = self.slope, self.noise.copy(), pairs.squares.sum(axis=1)
+        slope, noise = self.slope, self.noise.copy()
         for _ in range(ROUNDS):
-            reached = pairs.squares @ slope + noise[pairs.lower]
-            worst = _worst(reached / pairs.rise, distances)
+            plain = pairs.squares @ slope
+            reached = plain + noise[pairs.lower]
+            worst = _worst(reached / pairs.rise, pairs.squares)
             if not worst.size:
                 break
             self.active = self.active.join(pairs.take(worst))
             fitted, noisy = self._solve()
             slope, noise = np.maximum(slope, fitted), np.maximum(noise, noisy)
-        missing = pairs.rise - pairs.squares @ slope
-        np.maximum.at(noise, pairs.lower, missing)
+        else:
+            plain = pairs.squares @ slope
+        np.maximum.at(noise, pairs.lower, pairs.rise - plain)
         self.slope, self._noise[: self.count] = slope, noise
 
     def _all_pairs(self, heights: np.ndarray, slope: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, Pairs]:
@@ -170,7 +172,7 @@ class Slopes:
             ratios = np.where(counts, reached, np.inf) / np.where(counts, rise, 1.0)
             partner[low], ratio[low] = ratios.argmin(axis=1), ratios.min(axis=1)
         squares = (points - points[partner]) ** 2
-        worst = _worst(ratio, squares.sum(axis=1))
+        worst = _worst(ratio, squares)
         spread = np.zeros(self.count)
         spread[order] = missing
         return spread, Pairs(squares, order, (heights - heights[partner]) ** 2).take(worst)
@@ -208,7 +210,8 @@ def _squares(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def _worst(ratio: np.ndarray, squares: np.ndarray) -> np.ndarray:
-    """The handful of pairs that are satisfied least, of those that are not near: near ones cost less as noise than as
-    slope."""
-    short = np.flatnonzero((ratio < SHORTFALL) & (squares > NEAR))
+    """The handful of pairs, of ``squares (m, d)``, that are satisfied least, of those that are not near: near ones cost
+    less as noise than as slope."""
+    short = np.flatnonzero(ratio < SHORTFALL)
+    short = short[squares[short].sum(axis=1) > NEAR]
     return np.asarray(short[np.argsort(ratio[short], kind="stable")[:AT_ONCE]])

@@ -3,7 +3,9 @@ numbers."""
 
 from __future__ import annotations
 
+import ctypes
 import random
+import sys
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -11,6 +13,10 @@ from typing import Any
 
 import numpy as np
 from numpy.random import mtrand
+
+WORDS = 4 * (624 + 1)
+"""Bytes of a Mersenne Twister in memory, Python's and numpy's: its words and the place among them. To write them out
+as numbers takes both as long as an optimiser takes for a step, and is done where they have changed."""
 
 
 class Failed(Exception):
@@ -26,10 +32,12 @@ class Guarded:
 
     def __init__(self, create: Any, dimension: int, budget: int, rng: np.random.Generator) -> None:
         seeds = [int(seed) for seed in rng.integers(2**31, size=3)]
-        self._python, self._numpy = random.Random(seeds[0]).getstate(), np.random.MT19937(seeds[1])
+        self._python, self._numpy = _PythonState(random.Random(seeds[0]).getstate()), np.random.MT19937(seeds[1])
+        self._outside = _PythonState()
         self._create, self._shape, self._budget, self._seed = create, (dimension,), budget, seeds[2]
         self._optimiser: Any = None
         self._asked: Any = None
+        self._whole: tuple[Any, bytes] | None = None  # the global generator, last seen with no number waiting
 
     def learn(self, told: Sequence[tuple[np.ndarray, float]]) -> None:
         """Create the optimiser, and tell it of points and losses from before; it is shown the best where it takes none
@@ -79,9 +87,10 @@ class Guarded:
 
     @contextmanager
     def _guard(self) -> Iterator[None]:
-        outside = random.getstate(), mtrand.get_bit_generator(), np.random.get_state(legacy=False)  # noqa: NPY002
-        random.setstate(self._python)
-        mtrand.set_bit_generator(self._numpy)  # a tenth of the time that it takes to write its state
+        generator, waiting = mtrand.get_bit_generator(), self._waiting()
+        outside = self._outside.read()
+        self._python.install()
+        mtrand.set_bit_generator(self._numpy)  # a hundredth of the time that it takes to write its state
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -89,8 +98,53 @@ class Guarded:
         except Exception as error:
             raise Failed(f"{type(error).__name__}: {str(error).partition(chr(10))[0]}") from error
         finally:
-            self._python = random.getstate()
-            random.setstate(outside[0])
-            mtrand.set_bit_generator(outside[1])
-            if outside[2]["has_gauss"]:  # the second number of a normal pair, which is not the generator's
-                np.random.set_state(outside[2])  # noqa: NPY002
+            self._python.read()
+            outside.install()
+            mtrand.set_bit_generator(generator)
+            if waiting is not None:
+                np.random.set_state(waiting)  # noqa: NPY002
+
+    def _waiting(self) -> dict[str, Any] | None:
+        """The state of numpy's global random numbers where the second number of a normal pair waits in it, which is not
+        the generator's and is lost when that is exchanged. It is not asked for while the generator stands where it was
+        when no number waited, for drawing a pair moves it."""
+        generator = mtrand.get_bit_generator()
+        words = None
+        if type(generator) is np.random.MT19937:
+            words = ctypes.string_at(generator.ctypes.state_address, WORDS)
+            if self._whole is not None and self._whole[0] is generator and self._whole[1] == words:
+                return None
+        state: dict[str, Any] = np.random.get_state(legacy=False)  # noqa: NPY002
+        self._whole = None if state["has_gauss"] or words is None else (generator, words)
+        return state if state["has_gauss"] else None
+
+
+class _PythonState:
+    """A state of Python's global random numbers, written out only where it differs from what was written or installed
+    last."""
+
+    def __init__(self, state: Any = None) -> None:
+        self._state, self._mark = state, b""
+
+    def read(self) -> _PythonState:
+        """Take over the present state; returns itself."""
+        mark = _mark()
+        if not mark or mark != self._mark:
+            self._state, self._mark = random.getstate(), mark
+        return self
+
+    def install(self) -> None:
+        """Make it the present state."""
+        random.setstate(self._state)
+        self._mark = _mark()
+
+
+def _mark() -> bytes:
+    """The memory of Python's global generator, by which one state is told from another; empty where an object's
+    identity is no address. Its second number of a normal pair stands beside it."""
+    if sys.implementation.name != "cpython":
+        return b""
+    draw: Any = random.random
+    shared = draw.__self__
+    head = object.__basicsize__  # which counts references
+    return ctypes.string_at(id(shared) + head, WORDS) + repr(getattr(shared, "gauss_next", None)).encode()

@@ -68,8 +68,8 @@ class Rerun(sr.Observer, sr.Options):
         """See `sparserob_core.Observer`."""
         if isinstance(event, sr.RunStarted | sr.SweepStarted):
             self._begin(event)
-        elif self._outlet is not None:
-            self._outlet.send(event)
+        elif (outlet := self._outlet) is not None:  # one look: pydantic takes longer for it than the rest
+            outlet.send(event)
             if isinstance(event, sr.RunFinished | sr.SweepFinished):
                 self._pressed = event.pressed
                 if self.serve and self.keep and not event.pressed:

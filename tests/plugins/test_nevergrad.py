@@ -15,6 +15,7 @@ from numpy.random import mtrand
 import sparserob_core as sr
 from sparserob_core.sip.search.search import CountedObjective, Target, maximise
 from sparserob_nevergrad import Nevergrad
+from sparserob_nevergrad.guarded import Guarded
 
 pytest.importorskip("nevergrad")
 
@@ -149,6 +150,27 @@ def test_the_generator_alone_decides_the_search_and_the_global_random_numbers_ar
     np.random.seed(2)  # noqa: NPY002
     assert first.tolist() == search(optimiser="CMA").trace.points.tolist()
     assert first.tolist() != search(optimiser="CMA", seed=1).trace.points.tolist()
+
+
+def test_a_number_of_a_normal_pair_that_waits_is_there_after_every_step_whoever_draws_between_them():
+    """One draw, none, or two between two steps: the next ones are those of a generator that nobody exchanged."""
+    guarded = Guarded(None, 1, 1, np.random.default_rng(0))
+    draws = (1, 0, 1, 2, 0, 0, 3, 1, 0, 1, 0, 624, 624, 1)
+    random.seed(5)
+    np.random.seed(5)  # noqa: NPY002
+    alone = np.random.standard_normal(sum(draws)).tolist(), [random.gauss() for _ in range(sum(draws))]  # noqa: NPY002
+    random.seed(5)
+    np.random.seed(5)  # noqa: NPY002
+    drawn, inside = ([], []), []
+    for step, count in enumerate(draws):
+        with guarded._guard():
+            np.random.standard_normal(1)  # noqa: NPY002
+            inside += [random.gauss() for _ in range(step % 3)]
+        drawn[0].extend(np.random.standard_normal(count))  # noqa: NPY002
+        drawn[1].extend(random.gauss() for _ in range(count))
+    assert drawn == alone
+    own = random.Random(int(np.random.default_rng(0).integers(2**31, size=3)[0]))
+    assert inside == [own.gauss() for _ in inside]
 
 
 def test_an_optimiser_that_raises_is_explained_and_the_fallback_is_told_all_that_was_evaluated(registry):

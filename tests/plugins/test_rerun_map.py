@@ -112,6 +112,21 @@ def test_an_index_beside_the_first_is_not_the_second() -> None:
     assert two_of([0], slots[:1], widths, (0, 0)) == (0, 0)
 
 
+def test_the_pairs_of_many_tuples_are_those_of_one_after_the_other() -> None:
+    from sparserob_core.experiment.run.landscape import two_of
+
+    rng, widths = np.random.default_rng(0), np.array([1.0, 2.0])
+    tuples = np.round(rng.random((300, 5, 2)) * widths, 1)
+    deciding = np.argsort(rng.random((300, 5)), axis=1)[:, :4]
+    deciding[np.arange(4) >= rng.integers(5, size=(300, 1))] = -1
+    pair, alone = (1, 3), []
+    for ranked, slots in zip(deciding, tuples, strict=True):
+        alone.append(pair := two_of(ranked, slots, widths, pair))
+    assert sr.deciding_slots(deciding, tuples, widths, (1, 3)).tolist() == [list(pair) for pair in alone]
+    one, none = np.zeros((2, 1, 2)), np.array([[0, -1, -1, -1], [-1, -1, -1, -1]])
+    assert sr.deciding_slots(none, one, widths, (0, 0)).tolist() == [[0, 0], [0, 0]]
+
+
 def test_words_are_bright_and_lines_of_plots_legible_on_a_dark_and_on_a_light_ground() -> None:
     from sparserob_rerun.drawing import palette as ink
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from typing import final
 
 import numpy as np
@@ -74,9 +75,8 @@ class Projector:
         tuples = plain.reshape(count, -1, width)
         slots = sr.deciding_slots(event.deciding, tuples, (upper - lower)[:width], self.pair)
         self.pair = (int(slots[-1, 0]), int(slots[-1, 1]))
-        for key, pair in zip(_keys(plain, lower, upper), slots, strict=True):
-            self.known[int(key)] = (int(pair[0]), int(pair[1]))
-        for key in list(self.known)[: max(0, len(self.known) - REMEMBERED)]:
+        self.known.update(zip(_keys(plain, lower, upper).tolist(), map(tuple, slots.tolist()), strict=True))
+        for key in list(islice(self.known, max(0, len(self.known) - REMEMBERED))):
             del self.known[key]
         thin = replace(batch, points=[plain], origin=None if batch.origin is None else batch.origin[columns.ravel()])
         rows, moved = thin.moves.T

@@ -269,10 +269,20 @@ def two_of(ranked: Sequence[int] | np.ndarray, slots: Array, widths: Array, othe
 def deciding_slots(deciding: np.ndarray, tuples: Array, widths: Array, pair: tuple[int, int]) -> np.ndarray:
     """The two indices ``(n, 2)`` that decide most in each of the tuples ``(n, D, c)``, of which ``deciding (n, 4)``
     ranks some, -1 for none; those of the tuple before, at first ``pair``, where fewer decide."""
-    found = np.empty((len(tuples), 2), dtype=int)
-    for row, (ranked, slots) in enumerate(zip(deciding, tuples, strict=True)):
-        found[row] = pair = two_of(ranked, slots, widths, pair)
-    return found
+    rows, first = np.arange(len(tuples)), deciding[:, 0]
+    heads = tuples[rows, first]  # of a row in which nothing decides it is any index, and not used
+    apart = np.abs((tuples[rows[:, np.newaxis], deciding] - heads[:, np.newaxis]) / widths).max(axis=2) > NEAR
+    apart &= deciding >= 0
+    second = np.where(apart.any(axis=1), deciding[rows, apart.argmax(axis=1)], -1)
+    found = list[tuple[int, int]]()
+    for row, (most, next_most) in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
+        if most >= 0 and next_most < 0:  # one decides alone, beside those that stand for the same constraint
+            next_most = next((k for k in pair if k != most), -1)
+        if most >= 0 and next_most < 0:
+            most, next_most = two_of(deciding[row], tuples[row], widths, pair)
+        pair = (most, next_most) if most >= 0 else pair
+        found.append(pair)
+    return np.array(found, dtype=int).reshape(-1, 2)
 
 
 def deciding_again(g: RelaxedValue, points: Array, notes: Mapping[str, Array], seconds: float) -> np.ndarray:
