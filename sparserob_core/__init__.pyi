@@ -35,8 +35,9 @@ from sparserob_core.sip.program import Separation as Separation
 # To solve it, to judge the answer, and what comes back.
 from sparserob_core.experiment.solve import ask_tell as ask_tell
 from sparserob_core.experiment.solve import maximise as maximise
-from sparserob_core.experiment.solve import solve as solve
-from sparserob_core.experiment.run.run import Outcome as Outcome
+from sparserob_core.experiment.run.solve import solve as solve
+from sparserob_core.experiment.run.outcome import Outcome as Outcome
+from sparserob_core.experiment.run.outcome import SolvedProblem as SolvedProblem
 from sparserob_core.experiment.run.run import run as run
 from sparserob_core.experiment.check.check import Check as Check
 from sparserob_core.experiment.check.check import check as check

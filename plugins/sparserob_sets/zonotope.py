@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import final
+from collections.abc import Mapping
+from typing import Any, final
 
 import numpy as np
 from pydantic import Field
@@ -29,3 +30,11 @@ class ZonotopeFactory(sr.SetFactory, sr.Options):
         if len(centre) != dimension:
             raise sr.InputError(f"centre: expected {dimension} numbers, got {len(centre)}")
         return sr.Zonotope(np.array(centre), np.array(self.generators))
+
+    @staticmethod
+    def options_of(convex: sr.ConvexSet) -> Mapping[str, Any] | None:
+        """The options that build a zonotope; the centre only where it is not the origin."""
+        if not isinstance(convex, sr.Zonotope):
+            return None
+        centre = {"centre": convex.centre.tolist()} if convex.centre.any() else {}
+        return {"generators": convex.generators.tolist(), **centre}

@@ -1,4 +1,5 @@
-"""The two things a Python user does without a config: solve a problem, maximise a function."""
+"""What a Python user does without a config and without a problem: maximise a function; and what stands for a
+component there."""
 
 from __future__ import annotations
 
@@ -6,154 +7,28 @@ import logging
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict, overload
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
 from sparserob_core.arguments import share, whole
-from sparserob_core.control.policies.policy import Policy
 from sparserob_core.control.problem.dictionary import Dictionary, DictionaryFactory
-from sparserob_core.control.problem.problem import OptimalControlProblem
 from sparserob_core.errors import InputError, named
 from sparserob_core.experiment.plugins.components import Registry
 from sparserob_core.experiment.plugins.guards import guarded, origin_of
 from sparserob_core.experiment.plugins.registry import load_registry
 from sparserob_core.sip.convex_set import Array, Box
-from sparserob_core.sip.events import Event, ignore
+from sparserob_core.sip.events import ignore
 from sparserob_core.sip.maximiser import Maximiser, Report
-from sparserob_core.sip.method import GAP_TOLERANCE, Continuation, Deadline, Method, Tools, as_seconds, require_suited
-from sparserob_core.sip.methods.own_units import solve_in_own_units
-from sparserob_core.sip.program import SemiInfiniteProgram
-from sparserob_core.sip.regulariser import Regulariser
-from sparserob_core.sip.relaxed.relaxed import require_separable
-from sparserob_core.sip.result import Result
-from sparserob_core.sip.solver import AUTO, Solver
-from sparserob_core.sip.solver import named as named_solver
+from sparserob_core.sip.method import as_seconds
 
 if TYPE_CHECKING:
-    from typing import Unpack
-
-    from sparserob_core.control.studies.answer import ControlResult
-    from sparserob_core.control.transcription.record import Transcription
     from sparserob_core.sip.events import Notify
     from sparserob_core.sip.search.ask_tell import AskTell
 
 Choice: TypeAlias = str | Mapping[str, Any]
 logger = logging.getLogger("sparserob")
 PIECES = {"name": "piecewise_constant", "pieces": 100}
-
-
-class Keywords(TypedDict, total=False):
-    """The keywords of `solve` that are no components."""
-
-    tolerance: float | None
-    seed: int
-    control: Choice | DictionaryFactory | Dictionary | None
-    disturbance: Choice | DictionaryFactory | Dictionary | None
-    continuation: Continuation | Mapping[str, float] | None
-    budget: int
-    polish: float
-    seconds: float | None
-    notify: Notify
-
-
-@overload
-def solve(
-    problem: OptimalControlProblem,
-    method: Choice | Method = ...,
-    solver: Choice | Solver = ...,
-    maximiser: Choice | Maximiser = ...,
-    regulariser: Choice | Regulariser | None = ...,
-    **keywords: Unpack[Keywords],
-) -> ControlResult: ...
-
-
-@overload
-def solve(
-    problem: SemiInfiniteProgram,
-    method: Choice | Method = ...,
-    solver: Choice | Solver = ...,
-    maximiser: Choice | Maximiser = ...,
-    regulariser: Choice | Regulariser | None = ...,
-    **keywords: Unpack[Keywords],
-) -> Result: ...
-
-
-def solve(
-    problem: OptimalControlProblem | SemiInfiniteProgram,
-    method: Choice | Method = "exchange",
-    solver: Choice | Solver = "auto",
-    maximiser: Choice | Maximiser = "direct",
-    regulariser: Choice | Regulariser | None = "default",
-    *,
-    tolerance: float | None = GAP_TOLERANCE,
-    seed: int = 0,
-    control: Choice | DictionaryFactory | Dictionary | None = None,
-    disturbance: Choice | DictionaryFactory | Dictionary | None = None,
-    policy: Choice | Policy = "open_loop",
-    continuation: Continuation | Mapping[str, float] | None = None,
-    budget: int = 2000,
-    polish: float | None = None,
-    seconds: float | None = None,
-    notify: Notify = ignore,
-) -> Result:
-    """Solve a semi-infinite program, or an optimal control problem on dictionaries, as ``sparserob run`` does, without
-    files.
-
-    ``solver``: one that is named answers every finite program; `Result.unanswered` says which it did not, and then
-    others did. ``auto`` is whoever is quickest.
-    A component is a name, a mapping such as ``{"name": "exchange", "tolerance": 1e-9}``, or the component itself.
-    ``tolerance`` is the relative gap, for a method that has such an option. ``control`` is by default 100 equal pieces,
-    and ``disturbance`` one indicator function on each piece of the control; both are for control problems only, as is
-    the ``policy``, such as `AffinePolicy`: under feedback the decision begins with the nominal control.
-    ``regulariser`` is by default the ridge for control problems, whose optimisers are to be unique, and none for other
-    programs, so that ``value`` is the cost. ``budget``: evaluations per search of the maximiser, of which the share
-    ``polish`` goes to a local method at its end, unless given as in a config: the maximiser's own share over literal
-    tuples, nothing elsewhere. ``seconds``: the time after which it returns what it knows, as it does
-    at an interrupt from the keyboard; ``Result.stopped`` then says so; where no control can ever be certified it is 30
-    unless given. The result of a control problem knows its control, tube and worst cases as functions of time
-    (`ControlResult`). Raises `InputError` when an argument is at fault.
-    """
-    deadline, registry = Deadline(as_seconds(seconds)), load_registry()
-    if isinstance(problem, OptimalControlProblem):
-        deadline = _announced(problem, deadline)
-    model = _stated(registry, problem, control, disturbance, policy)
-    program = model if isinstance(model, SemiInfiniteProgram) else model.program
-    if regulariser == "default":
-        regulariser = None if program.lengths is None else "ridge"
-    steps = continuation if isinstance(continuation, Continuation) else _continuation(continuation or {})
-    tools = Tools(
-        solver=_solver(registry, solver),
-        maximiser=component(registry, "maximiser", maximiser, Maximiser),
-        regulariser=None if regulariser is None else component(registry, "regulariser", regulariser, Regulariser),
-        continuation=steps,
-        budget=whole("budget", budget, 1),
-        polish=None if polish is None else share("polish", polish),
-        rng=np.random.default_rng(whole("seed", seed, 0)),
-        notify=_heard(notify),
-        deadline=deadline,
-    )
-    chosen: Method = component(registry, "method", _with_tolerance(registry, method, tolerance), Method)
-    require_suited(chosen, program)
-    require_separable(program, tools.solver, tools.regulariser)
-    result = solve_in_own_units(chosen, program, tools).accounted(tools.solver)
-    if isinstance(model, SemiInfiniteProgram):
-        return result
-    from sparserob_core.control.studies.answer import ControlResult
-
-    return ControlResult.of(result, model)
-
-
-def _announced(problem: OptimalControlProblem, deadline: Deadline) -> Deadline:
-    """Warn at once where no control of a problem can ever be certified, before anything is solved; the search for a
-    witness then has an end."""
-    from sparserob_core.control.transcription.provable import SECONDS, announced, unprovable
-
-    why = unprovable(problem)
-    if why is None:
-        return deadline
-    logger.warning("no control of this problem can be certified: %s", announced(why, deadline.bounded))
-    return deadline if deadline.bounded else Deadline(SECONDS)
 
 
 def maximise(
@@ -190,12 +65,12 @@ def maximise(
     chosen, share = _chosen(box, name, options, polish)
     limit = as_seconds(seconds)
     report = search(
-        Target(f if callback is None else _told(f, _careful("callback", callback)), box, gradient),
+        Target(f if callback is None else _told(f, careful("callback", callback)), box, gradient),
         chosen,
         whole("budget", budget, 1),
         np.random.default_rng(whole("seed", seed, 0)),
         Rules(polish=share, seconds=np.inf if limit is None else limit),
-        notify if notify is ignore else _careful("notify", notify),
+        notify if notify is ignore else careful("notify", notify),
         _placed(start, box),
     )
     if report.missing and report.missing == report.evaluations and not report.interrupted:
@@ -321,7 +196,7 @@ def _told(f: Callable[[Array], object], callback: Callable[..., None]) -> Callab
     return watched
 
 
-def _careful(name: str, listener: Callable[..., object]) -> Callable[..., None]:
+def careful(name: str, listener: Callable[..., object]) -> Callable[..., None]:
     """The listener until it raises for the first time, which is told in a warning; a search outlives it."""
     deaf = False
 
@@ -336,18 +211,6 @@ def _careful(name: str, listener: Callable[..., object]) -> Callable[..., None]:
             warnings.warn(f"{name} raised {named(error)}; it is not called again", stacklevel=2)
 
     return heard
-
-
-def _named(choice: object) -> str:
-    """What a component is called: the name in a choice, or its class."""
-    named = choice.get("name") if isinstance(choice, Mapping) else choice
-    return named if isinstance(named, str) else type(choice).__name__
-
-
-def _solver(registry: Registry, choice: object) -> Solver:
-    """The solver of a choice: one that is named answers every program, and `Auto` where it does not."""
-    solver: Solver = component(registry, "solver", choice, Solver)
-    return named_solver(solver, _named(choice), registry.build("solver", AUTO))
 
 
 def component(registry: Registry, kind: str, choice: object, expected: type[Any]) -> Any:
@@ -373,57 +236,3 @@ def dictionary(registry: Registry, choice: object, horizon: float) -> Dictionary
 def indicators(on: Dictionary) -> Dictionary:
     """One indicator function on each piece of another dictionary."""
     return Dictionary.indicators(on.breakpoints)
-
-
-def _stated(
-    registry: Registry, problem: object, control: object, disturbance: object, policy: object
-) -> SemiInfiniteProgram | Transcription:
-    chosen: Policy = component(registry, "policy", policy, Policy)
-    if isinstance(problem, SemiInfiniteProgram):
-        if control is not None or disturbance is not None or chosen.knows:
-            raise InputError(
-                "control, disturbance, policy: these are for an OptimalControlProblem, got a SemiInfiniteProgram"
-            )
-        return problem
-    if not isinstance(problem, OptimalControlProblem):
-        raise InputError(
-            f"problem: expected an OptimalControlProblem or a SemiInfiniteProgram, got {type(problem).__name__}"
-        )
-    from sparserob_core.control.transcription.transcribe import prepare
-
-    controls = dictionary(registry, PIECES if control is None else control, problem.horizon)
-    disturbances = indicators(controls) if disturbance is None else dictionary(registry, disturbance, problem.horizon)
-    return prepare(problem, controls, disturbances, policy=chosen)
-
-
-def _continuation(given: Mapping[str, float]) -> Continuation:
-    from pydantic import ValidationError
-
-    from sparserob_core.experiment.plugins.messages import complaints
-
-    try:
-        return Continuation.model_validate(dict(given))
-    except ValidationError as error:
-        raise InputError("\n".join(f"continuation.{item}" for item in complaints(error, Continuation, given))) from None
-
-
-def _with_tolerance(registry: Registry, method: object, tolerance: float | None) -> object:
-    if isinstance(method, Method) or tolerance is None:
-        return method
-    entry = {"name": method} if isinstance(method, str) else method
-    if not isinstance(entry, Mapping) or not isinstance(entry.get("name"), str):
-        return entry
-    takes_it = "tolerance" in registry.get("method", entry["name"]).options_type().model_fields
-    return {"tolerance": tolerance, **entry} if takes_it else entry
-
-
-def _heard(notify: Notify) -> Callable[[Any], None]:
-    if notify is ignore:
-        return ignore
-    heard = _careful("notify", notify)
-
-    def pass_on(event: object) -> None:
-        if isinstance(event, Event):
-            heard(event)
-
-    return pass_on

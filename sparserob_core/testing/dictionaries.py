@@ -139,7 +139,7 @@ class DictionaryContract(Contract[DictionaryFactory], kind="dictionary"):
     def test_a_control_can_be_written_in_it(self) -> None:
         from sparserob_core.control.problem.problem import OptimalControlProblem
         from sparserob_core.control.problem.system import LinearSystem
-        from sparserob_core.experiment.solve import solve
+        from sparserob_core.experiment.run.solve import solve
         from sparserob_core.sip.convex_set import Box
 
         horizon = self.horizons[0]

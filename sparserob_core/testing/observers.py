@@ -25,7 +25,8 @@ from sparserob_core.experiment.run.events import (
     SweepProgress,
     SweepStarted,
 )
-from sparserob_core.experiment.run.run import Outcome, run
+from sparserob_core.experiment.run.outcome import Outcome
+from sparserob_core.experiment.run.run import run
 from sparserob_core.sip.convex_set import Box
 from sparserob_core.sip.events import Batch, EvaluationsFinished, ProofProgress, RoundFinished
 from sparserob_core.sip.program import SemiInfiniteProgram

@@ -360,7 +360,7 @@ class ProblemContract(Contract[ProblemFactory], kind="problem"):
         )
 
     def test_it_is_solved_or_says_why_not(self) -> None:
-        from sparserob_core.experiment.solve import solve
+        from sparserob_core.experiment.run.solve import solve
 
         made = self.built()
         control = {"name": "piecewise_constant", "pieces": PIECES}

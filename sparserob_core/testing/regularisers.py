@@ -135,7 +135,7 @@ class RegulariserContract(Contract[Regulariser], kind="regulariser"):
             )
 
     def test_the_cost_that_is_reached_is_that_without_it(self) -> None:
-        from sparserob_core.experiment.solve import solve
+        from sparserob_core.experiment.run.solve import solve
 
         result = solve(two_thrusters(), regulariser=self.create())
         demand(

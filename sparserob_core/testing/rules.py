@@ -107,7 +107,7 @@ class ScheduleContract(Contract[Schedule], kind="schedule"):
         )
 
     def test_a_method_comes_to_its_end_with_it(self) -> None:
-        from sparserob_core.experiment.solve import solve
+        from sparserob_core.experiment.run.solve import solve
         from sparserob_core.sip.methods.sparserob import SparseRob
         from sparserob_core.sip.rules import Iterations
         from sparserob_core.testing.methods import dipping

@@ -12,7 +12,7 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.brief import LINES, WIDTH, brief
 
-OF_THEIR_OWN = {"Outcome", "Result", "ControlResult", "Signal"}  # guarded beside them
+OF_THEIR_OWN = {"Outcome", "Result", "ControlResult", "SolvedProblem", "Signal"}  # guarded beside them
 
 
 def results() -> list[str]:

@@ -56,7 +56,7 @@ class LinearSystem:
                 raise InputError(f"{name} must have {d} rows, as A has, got shape {self._shape(name)}", path="system")
         if self.c is not None:
             self._check_drift(d)
-        self.matrices(self._probes())
+        self.matrices(self.probes)
 
     @staticmethod
     def from_statespace(
@@ -224,7 +224,7 @@ class LinearSystem:
             rows, columns = self._shape("c")
             got = f"{rows}" if columns == 1 else f"shape {(rows, columns)}"
             raise InputError(path="system.c", expected=f"{d} numbers, one per state", got=got)
-        self._values("c", self._probes())
+        self._values("c", self.probes)
 
     def _matrix(self, name: str, value: object) -> _Entry:
         if isinstance(value, ExpressionMatrix):
@@ -268,7 +268,7 @@ class LinearSystem:
     def _probed_shape(self, name: str) -> tuple[int, int]:
         cache: dict[str, tuple[int, int]] = self.__dict__.setdefault("_shapes", {})
         if name not in cache:
-            value = np.asarray(self._called(name, self._probes()[0]))
+            value = np.asarray(self._called(name, self.probes[0]))
             if value.ndim != 2 or value.size == 0:
                 raise InputError(
                     f"the function {name} must return a matrix, rows by columns, got {_seen(value)}", path="system"
@@ -276,7 +276,8 @@ class LinearSystem:
             cache[name] = (value.shape[0], value.shape[1])
         return cache[name]
 
-    def _probes(self) -> Array:
+    @property
+    def probes(self) -> Array:
         """A few parameters ``(k, nu)`` at which a system is tried out: a middle one and support points."""
         if self.parameters is None:
             return np.empty((1, 0))

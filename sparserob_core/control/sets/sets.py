@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -44,6 +44,12 @@ class SetFactory(ABC):
     @abstractmethod
     def build(self, dimension: int) -> ConvexSet:
         """The set in ``dimension`` coordinates; raises `InputError` when the options do not describe one."""
+
+    @staticmethod
+    def options_of(convex: ConvexSet) -> Mapping[str, Any] | None:
+        """The options that build this set, as a config writes them; ``None`` for a set of another kind, and unless a
+        kind says otherwise: then a problem with such a set is solved from Python, and cannot be saved."""
+        return None
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,7 @@ from sparserob_core.sip.program import SemiInfiniteProgram
 if TYPE_CHECKING:
     from sparserob_core.checker.claims.case import Case
     from sparserob_core.experiment.config.load import Loaded
+    from sparserob_core.experiment.run.given import GivenRun
 
 REPEATED = 16  # times that a number may be written, in characters: honest files need 7; what more allows takes memory
 SPARE = 2**20  # bytes of what is neither in certificate nor config, some kB; ten times as many are no matter either
@@ -46,8 +47,8 @@ class Check:
         return ("verified", "undecided", "refuted")[worst]
 
 
-def check(directory: str | Path, plugins: Iterable[str | Path] = (), seconds: float = math.inf) -> Check:
-    """Verify the run in ``directory``: its certificate against its config in ball arithmetic, ``result.json`` and
+def check(directory: GivenRun, plugins: Iterable[str | Path] = (), seconds: float = math.inf) -> Check:
+    """Verify a finished run (`as_run`): its certificate against its config in ball arithmetic, ``result.json`` and
     ``solution.npz`` against both.
 
     Nothing is solved, and nothing of what solved it is used. ``plugins``: files that offer the problem or a dictionary
@@ -62,7 +63,7 @@ def check(directory: str | Path, plugins: Iterable[str | Path] = (), seconds: fl
 
     if type(seconds) not in (int, float) or not seconds > 0:
         raise InputError(path="seconds", expected="a positive number", got=repr(seconds))
-    started, clock, stored = time.perf_counter(), Clock(float(seconds)), stored_run(directory)
+    started, clock, stored = time.perf_counter(), Clock(float(seconds)), stored_run(_place(directory))
     path = stored.directory
     if not (path / "certificate.json").is_file():
         raise InputError(f"{path}: expected the directory of a finished run, got one without certificate.json")
@@ -81,6 +82,15 @@ def check(directory: str | Path, plugins: Iterable[str | Path] = (), seconds: fl
     files = compared(replace(stored, largest=_largest(path, case)), loaded, case, summary)
     claims = (_config(loaded, data, summary), *derived, *files.claims)
     return Check(loaded.config.title or path.name, claims, time.perf_counter() - started, files.not_compared)
+
+
+def _place(run: GivenRun) -> Path:
+    """The directory of a run; what knows runs is imported only where one was given, as a check is of a directory."""
+    if isinstance(run, str | Path):
+        return Path(run)
+    from sparserob_core.experiment.run.given import as_run
+
+    return as_run(run)[0]
 
 
 def _largest(directory: Path, case: Case) -> int:

@@ -20,18 +20,19 @@ from sparserob_core.experiment.comparison.profiles_figure import write_profiles
 from sparserob_core.experiment.comparison.studies import ACCURACY, SLACK, is_study, read_profiles
 from sparserob_core.experiment.config.plain import difference, value_text
 from sparserob_core.experiment.figures.style import missing_matplotlib, require_writable
+from sparserob_core.experiment.run.given import GivenRun, as_run
 
 SHARES = (0.1, 0.01, 0.001)
 
 
 def compare(
-    runs: Sequence[str | Path],
+    runs: Sequence[GivenRun],
     out: str | Path | None = None,
     *,
     accuracy: float = ACCURACY,
     measure: Measure | None = None,
 ) -> Comparison | Profiles:
-    """Read run directories, or studies, and draw them into the picture ``out`` (.png, .pdf or .svg) when it is given:
+    """Read runs (`as_run`), or studies, and draw them into the picture ``out`` (.png, .pdf or .svg) when it is given:
     what ``sparserob compare`` does.
 
     Runs of one problem give a `Comparison`. Studies (what ``sparserob sweep`` leaves) give `Profiles` of their
@@ -47,7 +48,7 @@ def compare(
         raise InputError(f"runs: expected a list of at least one run directory, got {runs!r}")
     if out is not None:
         require_writable(Path(out))
-    places = [Path(run) for run in runs]
+    places = [as_run(run)[0] for run in runs]
     studies = [place for place in places if is_study(place)]
     if studies and len(studies) < len(places):
         other = next(place for place in places if place not in studies)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 LARGEST = 1_000_000  # bytes of a config; large data belongs in a plugin that makes it
 MOST_VALUES = 200_000  # values of a config, where an alias counts as all that it stands for
 
-__all__ = ["Source", "read_source", "read_value", "write_yaml"]
+__all__ = ["Source", "read_source", "read_value", "require_readable", "write_yaml"]
 
 
 @final
@@ -83,6 +83,16 @@ def read_source(config: str | File | Mapping[str, Any] | Source) -> Source:
             f"{file}: expected at most {MOST_VALUES} values, aliases counted as what they stand for, got more"
         )
     return Source(str(file), file.resolve().parent, data, "" if file.suffix == ".toml" else text)
+
+
+def require_readable(data: Mapping[str, Any], text: str) -> None:
+    """Raise `ConfigError` where a config, written as ``text``, is larger than what is read back."""
+    size, values = len(text.encode()), _counted(data, {})
+    if size > LARGEST or values > MOST_VALUES:
+        raise ConfigError(
+            f"the problem cannot be written: expected at most {LARGEST} bytes and {MOST_VALUES} values, got {size} and"
+            f" {values}"
+        )
 
 
 def read_value(text: str) -> object:

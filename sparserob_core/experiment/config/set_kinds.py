@@ -3,12 +3,13 @@ them."""
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal, TypeAlias, final
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias, final
 
 import numpy as np
 from pydantic import Field, Tag, model_validator
 
-from sparserob_core.control.sets.sets import Box, Ellipsoid, NormBall, Polytope, SetFactory
+from sparserob_core.control.sets.sets import Box, ConvexSet, Ellipsoid, NormBall, Polytope, SetFactory
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.config.option_kinds import (
     LIST,
@@ -23,6 +24,7 @@ from sparserob_core.experiment.config.option_kinds import (
     one_of,
 )
 from sparserob_core.options import Options
+from sparserob_core.sip.convex_set import Array
 
 HalfWidths: TypeAlias = Annotated[
     Number | FreeNumbers,
@@ -66,6 +68,14 @@ class BoxFactory(SetFactory, Sparse):
             )
         return Box(-half, half)
 
+    @staticmethod
+    def options_of(convex: ConvexSet) -> Mapping[str, Any] | None:
+        if not isinstance(convex, Box):
+            return None
+        if np.array_equal(convex.lower, -convex.upper):
+            return {"half_widths": _or_free(convex.upper)}
+        return {"lower": _or_free(convex.lower), "upper": _or_free(convex.upper)}
+
 
 @final
 class PolytopeFactory(SetFactory, Options):
@@ -84,6 +94,10 @@ class PolytopeFactory(SetFactory, Options):
                 f"every row of H must have {dimension} numbers, got rows of {[len(row) for row in self.H]}"
             )
         return Polytope(np.array(self.H), np.array(self.h))
+
+    @staticmethod
+    def options_of(convex: ConvexSet) -> Mapping[str, Any] | None:
+        return {"H": convex.H.tolist(), "h": convex.h.tolist()} if isinstance(convex, Polytope) else None
 
 
 @final
@@ -115,6 +129,10 @@ class EllipsoidFactory(SetFactory, Sparse):
             )
         return Ellipsoid(broadcast("centre", self.centre or 0.0, dimension), np.array(self.shape))
 
+    @staticmethod
+    def options_of(convex: ConvexSet) -> Mapping[str, Any] | None:
+        return {**_centred(convex.centre), "shape": convex.shape.tolist()} if isinstance(convex, Ellipsoid) else None
+
 
 @final
 class NormFactory(SetFactory, Sparse):
@@ -132,3 +150,20 @@ class NormFactory(SetFactory, Sparse):
     def build(self, dimension: int) -> NormBall:
         """The ball."""
         return NormBall(float(self.p), self.radius, broadcast("centre", self.centre or 0.0, dimension))
+
+    @staticmethod
+    def options_of(convex: ConvexSet) -> Mapping[str, Any] | None:
+        if not isinstance(convex, NormBall):
+            return None
+        exponent = "inf" if np.isinf(convex.p) else convex.p
+        return {"p": exponent, "radius": convex.radius, **_centred(convex.centre)}
+
+
+def _or_free(bounds: Array) -> list[float | None]:
+    """Bounds as a config writes them: null where there is none."""
+    return [float(value) if np.isfinite(value) else None for value in bounds]
+
+
+def _centred(centre: Array) -> dict[str, Any]:
+    """The key of a centre; none for the origin, so that the centre of initial states can stand beside the set."""
+    return {"centre": centre.tolist()} if centre.any() else {}

@@ -161,6 +161,9 @@ class PathOptions(SetOptions, populate_by_name=True):
     mixed: MixedOptions | None = None
     """Bounds of state and control together, with the control of every piece that meets the window."""
 
+    name: Annotated[str, Field(min_length=1)] | None = None
+    """What messages, tables and figures call it; path, or path[0] and so on, unless given."""
+
     def _given(self) -> list[str]:
         return super()._given() + ["mixed"] * (self.mixed is not None)
 
@@ -174,8 +177,12 @@ class PathOptions(SetOptions, populate_by_name=True):
                 got=f"from {self.start:g} to {stop:g}",
             )
         members = self.members(where, states)
+        if self.name is not None and len(members) + (self.mixed is not None) > 1:
+            raise InputError(
+                path=f"{where}.name", expected="one set in an entry with a name", got=f"{' and '.join(self._given())}"
+            )
         found: list[PathConstraint | MixedConstraint] = [
-            PathConstraint(member, self.start, stop, relative_to=self.relative_to) for member in members
+            PathConstraint(member, self.start, stop, self.name, self.relative_to) for member in members
         ]
         if self.mixed is None:
             return found
@@ -185,7 +192,7 @@ class PathOptions(SetOptions, populate_by_name=True):
                 " itself: write that as an entry of its own",
                 path=f"{where}.relative_to",
             )
-        return [*found, MixedConstraint(self.mixed.H, self.mixed.G, self.mixed.h, self.start, stop)]
+        return [*found, MixedConstraint(self.mixed.H, self.mixed.G, self.mixed.h, self.start, stop, self.name)]
 
 
 @final

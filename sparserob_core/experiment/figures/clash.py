@@ -23,6 +23,7 @@ from sparserob_core.sip.result import Result
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
     from sparserob_core.experiment.assemble import Experiment
 
@@ -61,7 +62,13 @@ class Strip:
 
 
 def draw_clash(experiment: Experiment, result: Result, directory: Path) -> list[Path]:
-    """Draw why nothing is feasible into ``directory/figures``: ``clash.pdf`` and ``clash.png``. Returns the files.
+    """Draw why nothing is feasible into ``directory/figures``: ``clash.pdf`` and ``clash.png``. Returns the files;
+    raises `InputError` as `clash_figure`."""
+    return look.write_figure(directory / "figures" / "clash", clash_figure(experiment, result))
+
+
+def clash_figure(experiment: Experiment, result: Result) -> Figure:
+    """The figure of why nothing is feasible.
 
     One strip for every quantity of the reasons, or else of the rows whose multipliers prove the infeasibility. Raises
     `InputError` when the result is not infeasible, when it is about no quantity that can be drawn (equalities alone,
@@ -95,7 +102,7 @@ def draw_clash(experiment: Experiment, result: Result, directory: Path) -> list[
         figure.legend(
             entries.values(), entries.keys(), loc="outside lower center", ncols=2, columnspacing=1.6, handlelength=1.6
         )
-        return look.write_figure(directory / "figures" / "clash", figure)
+        return figure
 
 
 def clash_strips(program: SemiInfiniteProgram, result: Result) -> list[Strip]:

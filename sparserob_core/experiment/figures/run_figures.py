@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,15 +32,20 @@ def write_figures(directory: Path, data: FigureData) -> list[Path]:
     """
     require_matplotlib()
     with style():
-        files = write_figure(directory / "control", draw_control(data))
-        files += write_figure(directory / "states", draw_states(data))
-        if data.gains is not None:
-            files += write_figure(directory / "gains", draw_gains(data))
-            files += write_figure(directory / "effort", draw_effort(data)) if data.effort is not None else []
-            files += write_figure(directory / "answers", draw_answers(data)) if data.answers is not None else []
-        if data.history:
-            files += write_figure(directory / "convergence", draw_convergence(data))
-    return files
+        return [file for name, draw in run_pictures(data).items() for file in write_figure(directory / name, draw())]
+
+
+def run_pictures(data: FigureData) -> dict[str, Callable[[], Figure]]:
+    """The figures that there are of a decision, by name."""
+    known: dict[str, tuple[bool, Callable[[FigureData], Figure]]] = {
+        "control": (True, draw_control),
+        "states": (True, draw_states),
+        "gains": (data.gains is not None, draw_gains),
+        "effort": (data.effort is not None, draw_effort),
+        "answers": (data.answers is not None, draw_answers),
+        "convergence": (bool(data.history), draw_convergence),
+    }
+    return {name: partial(draw, data) for name, (there, draw) in known.items() if there}
 
 
 def draw_control(data: FigureData) -> Figure:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -25,6 +24,7 @@ from sparserob_core.experiment.directory.artefacts import RunDirectory, create_d
 from sparserob_core.experiment.initial_states.feasible_set import ON_EDGE, InitialStates
 from sparserob_core.experiment.initial_states.search import InitialStatesSearch
 from sparserob_core.experiment.initial_states.section import section
+from sparserob_core.experiment.run.given import GivenConfig, as_config
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.method import GAP_TOLERANCE
@@ -35,7 +35,7 @@ THINNEST = 1e-10  # of the first box, and of the walls of the problem: a coordin
 
 
 def initial_states(
-    config: str | Path | Mapping[str, Any],
+    config: GivenConfig,
     overrides: Mapping[str, object] | Iterable[str] | None = None,
     states: Sequence[int] = (0, 1),
     *,
@@ -61,7 +61,7 @@ def initial_states(
     whole("directions", directions, 4)
     whole("values", values, 0)
     limit = _limit(within)
-    loaded = load_config(config, overrides)
+    loaded = load_config(as_config(config), overrides)
     tools = tools_of(loaded)
     experiment = assemble(loaded, tools.deadline)
     if not isinstance(experiment, ControlExperiment):

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,24 +13,23 @@ from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, assemble, build, counting, tools_of
 from sparserob_core.experiment.config.load import load_config
 from sparserob_core.experiment.directory.finished import read_finished
+from sparserob_core.experiment.run.given import GivenConfig, as_config
+from sparserob_core.experiment.run.outcome import Outcome, SolvedProblem
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.method import GAP_TOLERANCE, Deadline, as_seconds, require_suited
 from sparserob_core.sip.methods.own_units import solve_in_own_units
 
-if TYPE_CHECKING:
-    from sparserob_core.experiment.run.run import Outcome
-
 
 def controller(
-    config: str | Path | Mapping[str, Any] | Outcome,
+    config: GivenConfig,
     resolve: bool = False,
     *,
     seconds: float | None = None,
     plugins: Iterable[str | Path] = (),
 ) -> Controller:
-    """The `Controller` that applies the proven control of a config (a file or a mapping, which is solved first, without
-    files), of a run's directory, or of what ``sr.run`` returned.
+    """The `Controller` that applies the proven control of a config (a file, a mapping or a problem, which is solved
+    first, without files), of a run's directory, or of what ``sr.run``, or ``sr.solve`` for a problem, returned.
 
     ``resolve``: what is left of the horizon is solved anew at every step, for about ``seconds`` a step at most (no
     limit unless given), and the last proven plan goes on where that does not give a better one. Under feedback, where
@@ -61,20 +59,15 @@ def resolving(experiment: ControlExperiment, seconds: float | None) -> Resolving
 
 
 def _planned(config: object, plugins: Iterable[str | Path]) -> tuple[Plan, ControlExperiment]:
-    experiment = getattr(config, "experiment", None)
-    if isinstance(experiment, Experiment):
-        result = config.result  # type: ignore[attr-defined]
-        return _plan(experiment, result.status, result.message, result.decision, result.indices)
+    if isinstance(config, Outcome | SolvedProblem):
+        result = config.result if isinstance(config, Outcome) else config
+        return _plan(config.experiment, result.status, result.message, result.decision, result.indices)
     if isinstance(config, str | Path) and Path(config).is_dir():
         finished = read_finished(Path(config), plugins)
         finished.require_certified()
         status, message = str(finished.summary["status"]), str(finished.summary["message"])
         return _plan(finished.experiment, status, message, finished.decision)
-    if not isinstance(config, str | Path | Mapping):
-        raise InputError(
-            f"config: expected a config, the directory of a run or what sr.run returned, got {type(config).__name__}"
-        )
-    loaded = load_config(config)
+    loaded = load_config(as_config(config))
     deadline = Deadline(loaded.config.limits.seconds)
     experiment = assemble(loaded, deadline)
     if not isinstance(experiment, ControlExperiment):

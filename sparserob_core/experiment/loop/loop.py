@@ -6,7 +6,7 @@ import time as clock
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -18,13 +18,13 @@ from sparserob_core.control.studies.laws import LawName, Uncertainty
 from sparserob_core.control.studies.simulate import fine_times, finer, walk
 from sparserob_core.control.transcription.own_units import row_units
 from sparserob_core.control.transcription.record import Transcription
-from sparserob_core.errors import InputError
 from sparserob_core.experiment.directory.adversary import adversaries
 from sparserob_core.experiment.directory.artefacts import RunDirectory
 from sparserob_core.experiment.directory.finished import FinishedRun, read_finished
 from sparserob_core.experiment.loop.controller import controller
 from sparserob_core.experiment.loop.study import ClosedLoops
 from sparserob_core.experiment.run.events import StudyProgress
+from sparserob_core.experiment.run.given import GivenRun, as_run
 from sparserob_core.experiment.simulation.simulation import ADVERSARY, LAWS
 from sparserob_core.experiment.simulation.violations import ViolationCount
 from sparserob_core.sip.convex_set import Array
@@ -32,7 +32,7 @@ from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.program import TOLERANCE
 
 if TYPE_CHECKING:
-    from sparserob_core.experiment.run.run import Outcome
+    pass
 
 LOOPS, RESOLVED_LOOPS = 10, 1  # of every law, unless told
 SHOWN, DRAWN = 400, 3  # times, and loops of every law, that are drawn
@@ -43,7 +43,7 @@ Drawn = tuple[str, Array | None, Array, Array | None]  # law, disturbance (1, mw
 
 
 def loop(
-    run: str | Path | Outcome,
+    run: GivenRun,
     resolve: bool = False,
     trajectories: int | None = None,
     seed: int = 0,
@@ -53,7 +53,7 @@ def loop(
     plugins: Iterable[str | Path] = (),
     notify: Notify = ignore,
 ) -> ClosedLoops:
-    """Run the controller of a finished run in closed loop: what ``sparserob loop RUN`` does.
+    """Run the controller of a finished run (`as_run`) in closed loop: what ``sparserob loop RUN`` does.
 
     Every constraint's worst case is replayed once, and every law of `simulate` drives ``trajectories`` loops (10, or 1
     where the remaining horizon is solved anew at every step: ``resolve``, ``seconds`` as for `controller`). The state
@@ -68,12 +68,10 @@ def loop(
     whole("seed", seed, 0)
     if out is not None:
         require_writable(Path(out))
-    directory = getattr(run, "directory", run)
-    if not isinstance(directory, str | Path):
-        raise InputError(f"run: expected the directory of a run or what sr.run returned, got {type(run).__name__}")
     began = clock.perf_counter()
-    finished = read_finished(Path(directory), plugins, getattr(run, "experiment", None))
-    acting = controller(directory if directory is run else cast(Any, run), resolve, seconds=seconds, plugins=plugins)
+    directory, experiment = as_run(run)
+    finished = read_finished(directory, plugins, experiment)
+    acting = controller(run, resolve, seconds=seconds, plugins=plugins)
     found = replace(_closed(finished, acting, resolve, count, seed, notify), seconds=clock.perf_counter() - began)
     RunDirectory(finished.directory).write_json("loop.json", found.summary())
     if out is not None and (missing := missing_matplotlib()):

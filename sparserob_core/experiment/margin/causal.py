@@ -9,7 +9,7 @@ import numpy as np
 from sparserob_core.control.studies.causal import Ended, Limits
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.experiment.margin.scaling import Scaling
-from sparserob_core.experiment.run.causal import active, proven, searched
+from sparserob_core.experiment.run.conclusion.causal import active, proven, searched
 from sparserob_core.sip.events import Notify
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.result import Result

@@ -21,6 +21,7 @@ from sparserob_core.experiment.margin.causal import causal_upper
 from sparserob_core.experiment.margin.horizon import HORIZON, HorizonSearch, horizon_search
 from sparserob_core.experiment.margin.scaling import Scaling, scaling
 from sparserob_core.experiment.margin.search import Margin, MarginSearch, Point
+from sparserob_core.experiment.run.given import GivenConfig, as_config
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.methods.exchange import Exchange
 from sparserob_core.sip.relaxed.parametric import ParametricProgram
@@ -30,7 +31,7 @@ __all__ = ["Margin", "Point", "margin", "margin_rows", "summary_of_margin"]
 
 
 def margin(
-    config: str | Path | Mapping[str, Any],
+    config: GivenConfig,
     of: str = "disturbance",
     overrides: Mapping[str, object] | Iterable[str] | None = None,
     *,
@@ -40,7 +41,8 @@ def margin(
     write: bool = False,
     notify: Notify = ignore,
 ) -> Margin:
-    """The margin of an experiment: what ``sparserob margin CONFIG key=value ... --of OF`` does.
+    """The margin of an experiment: what ``sparserob margin CONFIG key=value ... --of OF`` does, of a config, a
+    problem, or a run (`as_config`).
 
     ``of``: ``disturbance``, ``parameters`` or ``initial_state`` (the largest factor that is feasible; sets are scaled
     about their centre), ``path.0``, ``terminal.0`` or ``control`` (the smallest), ``path.0.from`` (the earliest start
@@ -58,7 +60,7 @@ def margin(
         raise InputError(f"tolerance: expected a number from 1e-9 to 0.1, got {tolerance!r}")
     if not hasattr(curve, "__index__") or curve < 0 or curve == 1:
         raise InputError(f"curve: expected a number of points, 0 for none or at least 2, got {curve!r}")
-    loaded = load_config(config, overrides)
+    loaded = load_config(as_config(config), overrides)
     search = _search(loaded, str(of), float(tolerance), notify)
     if out is None and not write:
         return search.margin(int(curve))

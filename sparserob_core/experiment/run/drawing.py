@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from io import BytesIO
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -31,6 +32,9 @@ from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.result import Result, SearchTrace
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 Drawing: TypeAlias = Callable[[], list[Path]]
 
 logger = logging.getLogger("sparserob")
@@ -39,6 +43,7 @@ SECONDS = 2.0
 """What the values of a landscape may take, after those of the coarsest grid, and what the tuples of the search may take
 that are evaluated once more. In a tenth of it the figure is coarse and the walk begins in its middle; ten times of it
 nobody waits for."""
+PAGE = 100  # dots per inch in a notebook: of a tenth nothing can be read, ten times as many make a page of megabytes
 GRID = 65  # lines along each coordinate, of which the coarsest grid has every eighth
 
 
@@ -86,10 +91,7 @@ def drawings(
     if isinstance(experiment, ControlExperiment) and result.status == "infeasible":
         yield lambda: draw_clash(experiment, result, directory)
     elif isinstance(experiment, ControlExperiment) and result.decision is not None:
-        about = {one.name for one in experiment.transcription.constraints}
-        kept = [cut for cut in result.indices if cut.family in about or experiment.transcription.feedback is None]
-        active = np.unique([cut.index[0] for cut in kept if cut.multiplier > 0])
-        decision = np.asarray(result.decision, dtype=float).ravel()
+        active, decision = _active(experiment, result), np.asarray(result.decision, dtype=float).ravel()
         yield lambda: draw_experiment(experiment, decision, active, result.history, directory, result.cost, worst)
     trace = result.trace
     if trace is not None and np.isfinite(trace.value).any():
@@ -98,6 +100,78 @@ def drawings(
             directory / "figures", trace, printable(experiment.title), result.upper_bound, exact=exact
         )
         yield lambda: _landscape(experiment, result, directory, notify)
+
+
+def pictures(experiment: Experiment, result: Result) -> dict[str, Callable[[], Figure | None]]:
+    """The figures that there are of a result, by name; one is ``None`` where nothing can move in it."""
+    from sparserob_core.experiment.figures.adversary_figure import draw_adversary
+    from sparserob_core.experiment.figures.clash import clash_figure
+    from sparserob_core.experiment.figures.climb_figure import draw_climb
+    from sparserob_core.experiment.figures.drawing import DRAWS, figure_data
+    from sparserob_core.experiment.figures.landscape_figure import draw_landscape
+    from sparserob_core.experiment.figures.run_figures import run_pictures
+
+    known: dict[str, Callable[[], Figure | None]] = {}
+    if isinstance(experiment, ControlExperiment) and result.status == "infeasible":
+        known["clash"] = lambda: clash_figure(experiment, result)
+    elif isinstance(experiment, ControlExperiment) and result.decision is not None:
+        decision = np.asarray(result.decision, dtype=float).ravel()
+        active = _active(experiment, result)
+        data = figure_data(experiment, decision, active, result.history, result.cost, draws=DRAWS)
+        known |= run_pictures(data)
+        worst = adversaries(experiment, decision)
+        if worst:
+            known["adversary"] = lambda: draw_adversary(worst, data)
+    trace = result.trace
+    if trace is not None and np.isfinite(trace.value).any():
+        title, exact = printable(experiment.title), result.status == "certified"
+        known["climb"] = lambda: draw_climb(trace, title, result.upper_bound, exact=exact)
+
+        def landscape() -> Figure | None:
+            found = landscape_of(Inspection(experiment.loaded, experiment), trace, title)
+            return None if found is None else draw_landscape(found)
+
+        known["landscape"] = landscape
+    return known
+
+
+def plot(experiment: Experiment, result: Result, name: str) -> Figure:
+    """A figure of a result, for matplotlib; raises `InputError`, which names those that there are, for another one, and
+    without matplotlib."""
+    from sparserob_core.experiment.figures.style import require_matplotlib, style
+
+    require_matplotlib()
+    known = pictures(experiment, result)
+    if name not in known:
+        there = ", ".join(known) or f"none: the result is {result.status}, without a control"
+        raise InputError(path="name", expected=f"a figure that there is ({there})", got=f"{name!r}")
+    with style():
+        figure = known[name]()
+    if figure is None:
+        raise InputError(f"name: there is no {name} to draw: nothing can move in it")
+    return figure
+
+
+def picture(experiment: Experiment, result: Result) -> bytes | None:
+    """The control, or why there is none, as a PNG; ``None`` without matplotlib, and where there is neither."""
+    from sparserob_core.experiment.figures.style import missing_matplotlib
+
+    if missing_matplotlib():
+        return None
+    stream = BytesIO()
+    try:
+        figure = plot(experiment, result, "clash" if result.status == "infeasible" else "control")
+    except InputError:
+        return None
+    figure.savefig(stream, format="png", dpi=PAGE)
+    return stream.getvalue()
+
+
+def _active(experiment: ControlExperiment, result: Result) -> Array:
+    """The times of the constraints that carry a multiplier."""
+    about = {one.name for one in experiment.transcription.constraints}
+    kept = [cut for cut in result.indices if cut.family in about or experiment.transcription.feedback is None]
+    return np.unique([cut.index[0] for cut in kept if cut.multiplier > 0])
 
 
 def _landscape(experiment: Experiment, result: Result, directory: Path, notify: Notify) -> list[Path]:

@@ -3,148 +3,33 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, final
+from typing import Any
 
-import numpy.typing as npt
-
-from sparserob_core.control.problem.problem import OptimalControlProblem
-from sparserob_core.control.studies.adversary import Adversary
-from sparserob_core.control.studies.answer import ControlResult, Tube
 from sparserob_core.control.transcription.provable import SECONDS, announced, unprovable
 from sparserob_core.errors import InputError, named
-from sparserob_core.experiment.assemble import Anew, ControlExperiment, Experiment, assemble, build, name_of, tools_of
+from sparserob_core.experiment.assemble import Anew, ControlExperiment, assemble, build, name_of, tools_of
 from sparserob_core.experiment.config.load import Loaded, load_config
-from sparserob_core.experiment.config.reader import Source, write_yaml
+from sparserob_core.experiment.config.reader import write_yaml
 from sparserob_core.experiment.directory.artefacts import create_directory
 from sparserob_core.experiment.directory.finished import UNFINISHED
 from sparserob_core.experiment.directory.provenance import git_revision, provenance
-from sparserob_core.experiment.run.bound import bounded
-from sparserob_core.experiment.run.causal import with_causal
 from sparserob_core.experiment.run.events import Broadcast, Event, Observer, RunFinished, RunStarted
-from sparserob_core.experiment.run.fewest import with_activity
+from sparserob_core.experiment.run.given import GivenConfig, as_config
 from sparserob_core.experiment.run.inspection import Inspection
 from sparserob_core.experiment.run.journal import Journal
+from sparserob_core.experiment.run.outcome import HEADING, Outcome, SolvedProblem, concluded
 from sparserob_core.experiment.terminal.printing import printable
-from sparserob_core.experiment.terminal.table import result_rows
-from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.method import Deadline, ExecutorFactory, Method, Tools, require_suited
 from sparserob_core.sip.methods.own_units import solve_in_own_units
-from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.relaxed.relaxed import require_separable
 from sparserob_core.sip.result import Result
 
-if TYPE_CHECKING:
-    from sparserob_core.control.studies.causal import CausalBound
-
-ROWS = 4  # of a table, in a line each of what `repr` says
-HEADING = "Complete and resolved. To repeat the run: sparserob run config.yaml"
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """A finished run. ``control (m, K)`` is ``None`` without a decision or for a program that is no control problem;
-    the ``result`` of a control problem is a `ControlResult`; ``summary`` is what ``result.json`` holds; ``remarks`` say
-    what could not be done beside the result; ``interrupted``: a key or a signal ended it, or came while it ended.
-
-    It can be pickled: the experiment is built anew from its config where it is read."""
-
-    result: Result
-    directory: Path
-    experiment: Experiment
-    control: Array | None
-    summary: Mapping[str, Any]
-    remarks: Sequence[str] = ()
-    interrupted: bool = False
-
-    def __post_init__(self) -> None:
-        if isinstance(self.experiment, ControlExperiment) and not isinstance(self.result, ControlResult):
-            object.__setattr__(self, "result", ControlResult.of(self.result, self.experiment.transcription))
-
-    @property
-    def status(self) -> str:
-        """The status of the result."""
-        return self.result.status
-
-    @property
-    def problem(self) -> OptimalControlProblem | None:
-        """The control problem."""
-        return self.experiment.problem if isinstance(self.experiment, ControlExperiment) else None
-
-    @property
-    def program(self) -> SemiInfiniteProgram:
-        """The semi-infinite program that was solved."""
-        return self.experiment.program
-
-    def tube(self, times: npt.ArrayLike) -> Tube:
-        """The states at times ``(T,)`` and how far the disturbance may bring them: `ControlResult.tube`."""
-        return self._of_control().tube(times)
-
-    def worst(self, constraint: str) -> Adversary:
-        """The worst case of the constraint of that name: `ControlResult.adversary`."""
-        return self._of_control().adversary(constraint)
-
-    def _of_control(self) -> ControlResult:
-        if not isinstance(self.result, ControlResult):
-            raise InputError("this is a semi-infinite program that is no control problem: it has no states")
-        return self.result
-
-    def __repr__(self) -> str:
-        said = [f"  {name}: {value}" for name, value in result_rows(self.summary)[:ROWS]]
-        return "\n".join([f"Outcome of {self.experiment.title!r} in {self.directory}", *said])
-
-    def _repr_html_(self) -> str:
-        """The table of the run and the figure of its control, for notebooks."""
-        from sparserob_core.experiment.terminal.notebook import page
-
-        return page(self.experiment.title, result_rows(self.summary), self.directory / "figures" / "control.png")
-
-    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
-        of = self.result
-        plain, causal = (of.plain, of.causal) if isinstance(of, ControlResult) else (of, None)
-        loaded = self.experiment.loaded
-        stated = Source(loaded.source.name, loaded.source.folder, loaded.config.plain())
-        kept = (self.directory, self.control, self.summary, self.remarks, self.interrupted)
-        return _read, (stated, plain, *kept, causal)
-
-    def show(self, save: str | Path | None = None, *, serve: bool = False, connect: str | None = None) -> None:
-        """Show the run in the viewer of Rerun: a new one, one that listens at ``connect``, a browser (``serve``), or
-        later (``save``, a file).
-
-        Raises `InputError` where there is none, or no display."""
-        from sparserob_core.experiment.run.replay import events, play
-
-        inspection = Inspection(self.experiment.loaded)
-        play(
-            events(inspection, self.experiment.title, self.directory, self.result),
-            save=save,
-            serve=serve,
-            connect=connect,
-        )
-
-
-def _read(
-    stated: Source,
-    result: Result,
-    directory: Path,
-    control: Array | None,
-    summary: Mapping[str, Any],
-    remarks: Sequence[str],
-    interrupted: bool,
-    causal: CausalBound | None = None,
-) -> Outcome:
-    """A pickled outcome; its experiment is built anew from its config."""
-    experiment = assemble(load_config(stated))
-    if isinstance(experiment, ControlExperiment):
-        result = ControlResult.of(result, experiment.transcription, causal)
-    return Outcome(result, directory, experiment, control, summary, remarks, interrupted)
-
 
 def run(
-    config: str | Path | Mapping[str, Any],
+    config: GivenConfig,
     overrides: Mapping[str, object] | Iterable[str] | None = None,
     out: str | Path | None = None,
     *,
@@ -154,16 +39,16 @@ def run(
 ) -> Outcome:
     """Run an experiment: what ``sparserob run CONFIG key=value ... --out OUT`` does.
 
-    ``config`` is a file or a mapping, ``overrides`` a mapping such as ``{"solver.name": "clarabel"}`` or texts
-    ``key=value``. ``observers`` watch beside those that the config names. ``limits.seconds`` of the config bounds its
-    time: the method then ends as at an interrupt.
+    ``config`` is a file, a mapping or a problem (`as_config`), ``overrides`` a mapping such as
+    ``{"solver.name": "clarabel"}`` or texts ``key=value``. ``observers`` watch beside those that the config names.
+    ``limits.seconds`` of the config bounds its time: the method then ends as at an interrupt.
     Raises `ConfigError` or another `InputError` before anything is solved, and `TimeLimitError` when the limit comes
     before there is anything to solve. An interrupt ends the method with what it
     knows by then: the outcome is that of the last round, ``undecided`` unless more was proven. An error, or an
     interrupt before there was a decision, leaves a directory with the config, the rounds so far and the status
     ``failed``.
     """
-    loaded = load_config(config, overrides)
+    loaded = load_config(as_config(config), overrides)
     git = git_revision(loaded.source.folder)
     return run_loaded(loaded, git, out, quiet=quiet, figures=figures, observers=observers)
 
@@ -237,15 +122,12 @@ def _run(
                 result, complete = journal.known(_said(pressed), time.perf_counter() - started), False
                 if result is None:
                     raise
-            if isinstance(experiment, ControlExperiment):
-                known = bounded(experiment, result) if result.sparsest is None else result
-                known = with_activity(experiment, known, tools)
-                result = with_causal(ControlResult.of(known, experiment.transcription), tools)
+            result = concluded(experiment, result, tools)
             ending = RunFinished(
                 status=result.status,
                 message=result.message,
                 seconds=result.seconds,
-                result=result.plain if isinstance(result, ControlResult) else result,
+                result=result.plain if isinstance(result, SolvedProblem) else result,
                 pressed=deadline.pressed,
             )
             control, summary, remarks = journal.finish(result, figures and complete, certify=complete, notify=broadcast)

@@ -7,7 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from sparserob_core.experiment.run.run import Outcome, run
+from sparserob_core.experiment.run.outcome import Outcome
+from sparserob_core.experiment.run.run import run
 from sparserob_core.experiment.run.viewer import recorded, recorder
 
 

@@ -28,6 +28,7 @@ from sparserob_core.experiment.directory.artefacts import RunDirectory
 from sparserob_core.experiment.directory.finished import FinishedRun, read_finished
 from sparserob_core.experiment.plugins.messages import nearest
 from sparserob_core.experiment.run.events import StudyProgress
+from sparserob_core.experiment.run.given import GivenRun, as_run
 from sparserob_core.experiment.simulation.simulation import (
     ADVERSARY,
     ANY,
@@ -42,14 +43,14 @@ from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.program import TOLERANCE
 
 if TYPE_CHECKING:
-    from sparserob_core.experiment.run.run import Outcome
+    pass
 
 TRAJECTORIES = 10_000
 FAN, SHOWN = 120, 400  # trajectories and times that are kept for drawing
 
 
 def simulate(
-    run: str | Path | Outcome,
+    run: GivenRun,
     trajectories: int | None = None,
     law: str = "iid",
     seed: int = 0,
@@ -58,7 +59,7 @@ def simulate(
     plugins: Iterable[str | Path] = (),
     notify: Notify = ignore,
 ) -> Simulation:
-    """Propagate sampled trajectories of a finished run exactly: what ``sparserob simulate RUN`` does.
+    """Propagate sampled trajectories of a finished run (`as_run`) exactly: what ``sparserob simulate RUN`` does.
 
     ``law`` is one of ``iid``, ``vertices``, ``slow``, ``neighbours``, or ``adversary``, which replays the worst case of
     every constraint and takes no number of ``trajectories`` (10 000 otherwise). The result is written to
@@ -74,7 +75,8 @@ def simulate(
     count = _checked(law, trajectories, seed)
     if out is not None:
         require_writable(Path(out))
-    finished = read_finished(_directory(run), plugins, getattr(run, "experiment", None))
+    directory, experiment = as_run(run)
+    finished = read_finished(directory, plugins, experiment)
     model = finished.experiment.transcription
     if not model.constraints:
         raise InputError(
@@ -297,10 +299,3 @@ def _checked(law: str, trajectories: int | None, seed: int) -> int:
         )
     whole("seed", seed, 0)
     return TRAJECTORIES if trajectories is None else whole("trajectories", trajectories, 1)
-
-
-def _directory(run: object) -> Path:
-    directory = getattr(run, "directory", run)
-    if not isinstance(directory, str | Path):
-        raise InputError(f"run: expected the directory of a run or what sr.run returned, got {type(run).__name__}")
-    return Path(directory)

@@ -158,7 +158,7 @@ class Plan:
 
 
 def make_plan(
-    config: str | Path | Mapping[str, Any],
+    config: str | Path | Mapping[str, Any] | Source,
     axes: Mapping[str, object] | Sequence[str] | None = None,
     overrides: Mapping[str, object] | Iterable[str] | None = None,
     *,

@@ -14,8 +14,8 @@ from sparserob_core.experiment.assemble import assemble
 from sparserob_core.experiment.config.load import load_config
 from sparserob_core.experiment.config.plain import value_text
 from sparserob_core.experiment.directory.finished import stored_run
+from sparserob_core.experiment.run.outcome import Outcome
 from sparserob_core.experiment.run.replay import stored_result
-from sparserob_core.experiment.run.run import Outcome
 from sparserob_core.experiment.sweep.axes import Axis
 from sparserob_core.experiment.sweep.plan import FILE, Arrangement, read_plan
 from sparserob_core.experiment.sweep.table import Row, read_table

@@ -33,6 +33,7 @@ from sparserob_core.experiment.run.events import (
     SweepProgress,
     SweepStarted,
 )
+from sparserob_core.experiment.run.given import GivenConfig, as_config
 from sparserob_core.experiment.sweep.axes import Axis
 from sparserob_core.experiment.sweep.plan import FILE, Arrangement, Plan, Point, make_plan, read_plan
 from sparserob_core.experiment.sweep.point import Answer, Bounds, Task, run_point
@@ -96,7 +97,7 @@ class Outline:
 
 
 def sweep(
-    config: str | Path | Mapping[str, Any],
+    config: GivenConfig,
     axes: Mapping[str, object] | Sequence[str] | None = None,
     overrides: Mapping[str, object] | Iterable[str] | None = None,
     *,
@@ -111,13 +112,14 @@ def sweep(
 ) -> Study:
     """Run a config at every point of some axes: what ``sparserob sweep CONFIG key=a,b,c key=start:stop:count`` does.
 
-    ``config`` is a config, a study's own file (``sweep.yaml``), or the directory of a study to go on with. ``axes``
-    maps keys to lists of values, or to texts such as ``"0:19:20"`` or ``"log:1e-6:1:13"``; or they are texts
-    ``key=values``. ``overrides`` hold for all points. ``points``: all combinations (``"grid"``, the default),
-    ``"zip"``, or ``number`` points at ``"random"`` or along ``"sobol"``. ``executor``: a name, or a mapping with a
-    name, unless the config's own is meant; the runs themselves are serial, and no result depends on it. ``figures``:
-    whether to draw every run. ``notify`` receives `SweepProgress`. ``observers`` watch the study, from `SweepStarted`
-    to `SweepFinished`; one that raises is detached with a warning, and the study goes on.
+    ``config`` is a config or a problem (`as_config`), a study's own file (``sweep.yaml``), or the directory of a
+    study to go on with. ``axes`` maps keys to lists of values, or to texts such as ``"0:19:20"`` or
+    ``"log:1e-6:1:13"``; or they are texts ``key=values``. ``overrides`` hold for all points. ``points``: all
+    combinations (``"grid"``, the default), ``"zip"``, or ``number`` points at ``"random"`` or along ``"sobol"``.
+    ``executor``: a name, or a mapping with a name, unless the config's own is meant; the runs themselves are
+    serial, and no result depends on it. ``figures``: whether to draw every run. ``notify`` receives
+    `SweepProgress`. ``observers`` watch the study, from `SweepStarted` to `SweepFinished`; one that raises is
+    detached with a warning, and the study goes on.
 
     In ``out`` (``runs/NAME-sweep/STAMP-HASH`` unless given) a study of the same base is gone on with: what is finished
     there, by the hash of its config, is not run again; what failed or ended at a time limit is. A point that fails is a
@@ -128,8 +130,8 @@ def sweep(
 
     Raises `InputError` before anything is run when an axis, a point's config or the directory is at fault.
     """
-    config, out = _found(config, out)
-    plan = make_plan(config, axes, overrides, points=points, number=_number(points, number))
+    stated, out = _found(config, out)
+    plan = make_plan(as_config(stated), axes, overrides, points=points, number=_number(points, number))
     if point is not None:
         _check_one(out, executor)
     checked = plan.checked(notify)
@@ -160,7 +162,7 @@ def sweep(
 
 
 def outline(
-    config: str | Path | Mapping[str, Any],
+    config: GivenConfig,
     axes: Mapping[str, object] | Sequence[str] | None = None,
     *,
     points: Arrangement | None = None,
@@ -170,8 +172,8 @@ def outline(
     notify: Notify = ignore,
 ) -> Outline:
     """What `sweep` would run with the same arguments; nothing is written. Raises `InputError` as it does."""
-    config, out = _found(config, out)
-    plan = make_plan(config, axes, points=points, number=_number(points, number))
+    stated, out = _found(config, out)
+    plan = make_plan(as_config(stated), axes, points=points, number=_number(points, number))
     checked = plan.checked(notify)
     _executors(checked[0], executor)
     directory = None if out is None else Path(out)
@@ -182,9 +184,7 @@ def outline(
     return Outline(plan, checked, walk.names, frozenset(left))
 
 
-def _found(
-    config: str | Path | Mapping[str, Any], out: str | Path | None
-) -> tuple[str | Path | Mapping[str, Any], str | Path | None]:
+def _found(config: GivenConfig, out: str | Path | None) -> tuple[GivenConfig, str | Path | None]:
     """The config, and where its study is: of the directory of a study its own file, and that directory."""
     if not isinstance(config, str | Path) or not Path(config).is_dir():
         return config, out

@@ -13,7 +13,7 @@ from scipy.optimize import linprog
 import sparserob_core as sr
 from sparserob_core.control.studies.answer import ControlResult
 from sparserob_core.control.studies.causal import CausalBound, CausalSearch, Limits
-from sparserob_core.experiment.run.causal import active, proven
+from sparserob_core.experiment.run.conclusion.causal import active, proven
 from sparserob_core.sip.convex_set import Array
 
 T, RATE = 3.0, 0.4

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import sparserob_core as sr
-from sparserob_core.experiment.run import fewest
+from sparserob_core.experiment.run.conclusion import fewest
 from sparserob_core.sip.methods.fewest import LeastCount
 
 POINTS = [0.0, 0.3265913656188229, 1.1495849815782953, 1.94871063947864, 2.3776706047703655, 3.1290281125662176]

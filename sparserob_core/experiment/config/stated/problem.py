@@ -1,0 +1,165 @@
+"""A problem that was stated in Python as the key `problem` of a config: data, never code.
+
+What a config cannot say is refused with the key that it would stand at; nothing is left out in silence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from sparserob_core.control.problem.cost import Cost, Quadratic
+from sparserob_core.control.problem.expression import ExpressionMatrix
+from sparserob_core.control.problem.names import Names
+from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
+from sparserob_core.control.problem.tracing import traced
+from sparserob_core.control.sets.sets import Box, Equality, SetFactory
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.plugins.hookspecs import SetPlugin
+from sparserob_core.experiment.plugins.registry import load_registry
+from sparserob_core.sip.convex_set import Array, ConvexSet
+
+WRITTEN = {
+    "system", "horizon", "initial_state", "control", "initial_set", "weights", "disturbance", "disturbance_class",
+    "path", "terminal", "title", "initial_control", "control_step", "names", "cost",
+}  # fmt: skip
+"""The fields of a problem that are written; one that is added and not named here is refused, not lost."""
+WRITTEN_OF_SYSTEM = {"A", "B", "E", "parameters", "names", "c", "delay"}
+
+
+def problem_keys(problem: OptimalControlProblem) -> dict[str, Any]:
+    """The key ``problem`` of a config, as the problem ``linear`` reads it."""
+    unknown = {one.name for one in fields(problem)} - WRITTEN
+    if unknown:
+        raise InputError(path=sorted(unknown)[0], expected="a field that a config can say", got="another one")
+    keys: dict[str, Any] = {
+        "name": "linear",
+        "system": _system_keys(problem.system),
+        "horizon": problem.horizon,
+        "initial_state": _initial_keys(problem),
+        "control": set_keys("control", problem.control),
+        "weights": np.asarray(problem.weights).tolist(),
+        "disturbance_class": problem.disturbance_class,
+        "path": [_path_keys(f"path.{i}", entry) for i, entry in enumerate(problem.path)],
+        "terminal": [_terminal_keys(f"terminal.{i}", entry) for i, entry in enumerate(problem.terminal)],
+        **_cost_keys(problem.cost),
+        **_names_keys(problem.names),
+    }
+    if problem.disturbance is not None:
+        keys["disturbance"] = set_keys("disturbance", problem.disturbance)
+    if problem.control_step is not None:
+        keys["control_step"] = set_keys("control_step", problem.control_step)
+    if problem.initial_control is not None and (problem.control_step is not None or problem.system.delay > 0.0):
+        keys["initial_control"] = np.asarray(problem.initial_control).tolist()
+    return keys
+
+
+def set_keys(where: str, convex: ConvexSet) -> dict[str, Any]:
+    """A set as a config writes it: the key of its kind, with what it is built from. Raises `InputError` where no kind
+    that is registered has such sets."""
+    registry = load_registry()
+    for kind in registry.names(SetPlugin.kind):
+        factory = registry.get(SetPlugin.kind, kind).options_type()
+        options = factory.options_of(convex) if issubclass(factory, SetFactory) else None
+        if options is not None:
+            return {kind: dict(options)}
+    known = ", ".join(registry.names(SetPlugin.kind))
+    raise InputError(path=where, expected=f"a set that a config can name ({known})", got=type(convex).__name__)
+
+
+def _system_keys(system: LinearSystem | SwitchedSystem) -> dict[str, Any]:
+    unknown = {one.name for mode in system.modes for one in fields(mode)} - WRITTEN_OF_SYSTEM
+    if unknown:
+        raise InputError(path=f"system.{sorted(unknown)[0]}", expected="a system in its own units", got="another")
+    first = system.modes[0]
+    shared: dict[str, Any] = {"delay": system.delay} if system.delay else {}
+    if first.parameters is not None:
+        shared["parameters"] = _parameter_keys(first.parameters, first.names)
+    if isinstance(system, SwitchedSystem):
+        return {"pieces": [{"until": until, **_matrix_keys(mode)} for until, mode in system.pieces], **shared}
+    return {**_matrix_keys(first), **shared}
+
+
+def _matrix_keys(system: LinearSystem) -> dict[str, Any]:
+    keys: dict[str, Any] = {name: _rows(system, name) for name in ("A", "B", "E")}
+    if system.c is not None:
+        keys["c"] = [row[0] for row in _rows(system, "c")]
+    return keys
+
+
+def _rows(system: LinearSystem, name: str) -> list[list[str | float]]:
+    given = getattr(system, name)
+    if isinstance(given, ExpressionMatrix):
+        return [[entry.text for entry in row] for row in given.entries]
+    if callable(given):
+        return traced(name, given, system.names, system.probes)
+    rows: list[list[str | float]] = np.asarray(given, dtype=float).tolist()
+    return rows
+
+
+def _parameter_keys(parameters: ConvexSet, names: Sequence[str]) -> dict[str, Any]:
+    if isinstance(parameters, Box):
+        bounds = zip(parameters.lower.tolist(), parameters.upper.tolist(), strict=True)
+        return {name: list(interval) for name, interval in zip(names, bounds, strict=True)}
+    return {"names": list(names), **set_keys("system.parameters", parameters)}
+
+
+def _initial_keys(problem: OptimalControlProblem) -> Any:
+    centre = np.asarray(problem.initial_state).tolist()
+    if problem.initial_set is None:
+        return centre
+    deviations = set_keys("initial_state", problem.initial_set)
+    if any("centre" in options for options in deviations.values()):
+        raise InputError(
+            path="initial_state",
+            expected="deviations that are centred at 0, since a config has one centre, that of the initial states",
+            got="a set with a centre of its own",
+        )
+    return {"centre": centre, **deviations}
+
+
+def _path_keys(where: str, entry: PathConstraint | MixedConstraint | ConvexSet) -> dict[str, Any]:
+    assert not isinstance(entry, ConvexSet)  # a problem has made constraints of its sets
+    window = {"from": entry.start, "to": entry.stop, **({} if entry.name is None else {"name": entry.name})}
+    if isinstance(entry, MixedConstraint):
+        kept = np.isfinite(np.asarray(entry.h))
+        rows = {key: np.asarray(getattr(entry, key))[kept].tolist() for key in ("H", "G", "h")}
+        return {"mixed": rows, **window}
+    moved = {} if entry.relative_to is None else {"relative_to": np.asarray(entry.relative_to).tolist()}
+    return {**set_keys(where, entry.set), **window, **moved}
+
+
+def _terminal_keys(where: str, entry: ConvexSet | Equality) -> dict[str, Any]:
+    if isinstance(entry, Equality):
+        return {"equals": [None if np.isnan(value) else float(value) for value in entry.values]}
+    return set_keys(where, entry)
+
+
+def _cost_keys(cost: Cost) -> dict[str, Any]:
+    keys: dict[str, Any] = {} if cost.l1 == 1.0 else {"l1": cost.l1}
+    if cost.group:
+        keys["group"] = [list(group) for group in cost.group]
+    for key, term in zip(("state", "control", "final"), cost.terms, strict=True):
+        if term is not None:
+            keys[key] = _term_keys(key, term)
+    return {"cost": keys} if keys else {}
+
+
+def _term_keys(key: str, term: Quadratic) -> dict[str, Any]:
+    matrix: Array = np.asarray(term.Q)
+    if key == "control":
+        return {"R": matrix.tolist()}
+    return {"Q": matrix.tolist(), "reference": np.asarray(term.reference).tolist()}
+
+
+def _names_keys(names: Names) -> dict[str, Any]:
+    keys: dict[str, Any] = {kind: list(getattr(names, kind)) for kind in ("states", "controls", "disturbances")}
+    units = {kind: list(getattr(names, f"{kind[:-1]}_units")) for kind in keys}
+    stated = {**units, "time": names.time}
+    found = {key: value for key, value in keys.items() if value}
+    measured = {key: value for key, value in stated.items() if value}
+    return {"names": {**found, **({"units": measured} if measured else {})}} if found or measured else {}

@@ -1,0 +1,63 @@
+"""What a problem is solved with, as the keys beside it, and both as one config."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path as File
+from typing import Any
+
+import numpy as np
+
+from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.config.reader import Source
+from sparserob_core.experiment.config.stated.problem import problem_keys
+from sparserob_core.experiment.plugins.components import Registry
+from sparserob_core.options import Options
+
+NAME = "problem"  # in messages, and of the folder of its runs: a title may hold anything
+
+
+def source_of(problem: OptimalControlProblem, beside: Mapping[str, Any] | None = None) -> Source:
+    """The config of a problem, with the other keys ``beside`` it; raises `InputError` that begins with the key where it
+    cannot be said."""
+    title = {"title": problem.title} if problem.title else {}
+    try:
+        stated = problem_keys(problem)
+    except InputError as error:
+        raise error.under("problem") from None
+    return Source(NAME, File.cwd(), {**title, "problem": stated, **(beside or {})})
+
+
+def component_keys(registry: Registry, kind: str, choice: object) -> dict[str, Any]:
+    """The entry of a component that was chosen by its name, by a mapping, or as an object: then that of the record
+    whose class it is. Raises `InputError` where there is none."""
+    if isinstance(choice, str):
+        return {"name": choice}
+    if isinstance(choice, Mapping):
+        return dict(choice)
+    if isinstance(choice, Options):
+        for name in registry.names(kind):
+            record = registry.get(kind, name)
+            if not record.missing and record.options_type() is type(choice):
+                return {"name": name, **choice.model_dump(mode="json", by_alias=True)}
+    raise InputError(path=kind, expected="a component that is registered under a name", got=type(choice).__name__)
+
+
+def dictionary_keys(registry: Registry, which: str, choice: object) -> dict[str, Any]:
+    """The entry of a dictionary; one that was made in Python must be of indicators, on pieces of any length."""
+    if not isinstance(choice, Dictionary):
+        return component_keys(registry, "dictionary", choice)
+    pieces = choice.pieces
+    owner = np.arange(pieces) * choice.functions // pieces
+    plain = Dictionary.indicators(choice.breakpoints, owner)
+    if (choice.sparse != plain.sparse).nnz:
+        raise InputError(
+            path=f"dictionaries.{which}",
+            expected="indicators of its pieces, or a dictionary by name, so that a config can say which",
+            got=f"{choice.functions} functions on {pieces} pieces",
+        )
+    equal = np.array_equal(choice.breakpoints, np.linspace(0.0, choice.horizon, pieces + 1))
+    grid = {"pieces": pieces} if equal else {"breakpoints": choice.breakpoints.tolist()}
+    return {"name": "piecewise_constant", **grid, **({} if choice.is_indicators else {"functions": choice.functions})}

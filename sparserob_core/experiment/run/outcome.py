@@ -1,0 +1,310 @@
+"""What a run, or `solve` for a problem, returned: an answer that saves itself, draws itself, and is taken wherever a
+run directory is."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import weakref
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, final
+
+import numpy.typing as npt
+
+from sparserob_core.control.policies.policy import Policy
+from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.studies.adversary import Adversary
+from sparserob_core.control.studies.answer import ControlResult, Tube
+from sparserob_core.control.transcription.record import Transcription
+from sparserob_core.errors import InputError
+from sparserob_core.experiment.assemble import ControlExperiment, Experiment, assemble, name_of, tools_of
+from sparserob_core.experiment.config.load import Loaded, load_config
+from sparserob_core.experiment.config.reader import Source, require_readable, write_yaml
+from sparserob_core.experiment.config.stated.source import component_keys, dictionary_keys, source_of
+from sparserob_core.experiment.directory.artefacts import create_directory
+from sparserob_core.experiment.directory.provenance import git_revision, provenance
+from sparserob_core.experiment.plugins.registry import load_registry
+from sparserob_core.experiment.run.conclusion.bound import bounded
+from sparserob_core.experiment.run.conclusion.causal import with_causal
+from sparserob_core.experiment.run.conclusion.fewest import with_activity
+from sparserob_core.experiment.run.inspection import Inspection
+from sparserob_core.experiment.run.journal import Journal
+from sparserob_core.experiment.terminal.table import result_rows
+from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.method import Tools
+from sparserob_core.sip.program import SemiInfiniteProgram
+from sparserob_core.sip.result import Result
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from sparserob_core.control.studies.causal import CausalBound
+
+ROWS = 4  # of a table, in a line each of what `repr` says
+HEADING = "Complete and resolved. To repeat the run: sparserob run config.yaml"
+COMPONENTS = ("method", "maximiser", "solver", "regulariser", "policy")
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """How `solve` was asked for a problem: components by name, by mapping or as objects (``choices``), dictionaries,
+    and the other keys of a config (``rest``)."""
+
+    problem: OptimalControlProblem
+    choices: Mapping[str, Any]
+    dictionaries: Mapping[str, Any]
+    rest: Mapping[str, Any]
+
+    def source(self) -> Source:
+        """The config that says the same; raises `InputError` where none can."""
+        registry, beside = load_registry(), dict(self.rest)
+        for kind, choice in self.choices.items():
+            beside[kind] = None if choice is None else component_keys(registry, kind, choice)
+        beside["maximiser"] = {**beside["maximiser"], **beside.pop("search")}
+        beside["dictionaries"] = {
+            which: dictionary_keys(registry, which, choice) for which, choice in self.dictionaries.items()
+        }
+        return source_of(self.problem, beside)
+
+
+@final
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class SolvedProblem(ControlResult):
+    """The `ControlResult` of `solve` or of a run, which is a run itself: it is saved, drawn, and taken by `check`,
+    `simulate`, `margin`, `controller`, `loop` and `compare`. ``origin``: the config that it is of, or how it was asked
+    for, which becomes one when it is needed."""
+
+    origin: Source | Asked = field(repr=False)
+
+    @staticmethod
+    def run(result: Result, experiment: ControlExperiment, causal: CausalBound | None = None) -> SolvedProblem:
+        """The result of a run, with its experiment."""
+        loaded = experiment.loaded
+        stated = Source(loaded.source.name, loaded.source.folder, loaded.config.plain())
+        made = SolvedProblem.asked(result, experiment.transcription, stated, causal)
+        made.__dict__["experiment"] = experiment
+        return made
+
+    @staticmethod
+    def asked(
+        result: Result, model: Transcription, origin: Source | Asked, causal: CausalBound | None = None
+    ) -> SolvedProblem:
+        """The result of a problem that was transcribed."""
+        known = {one.name: getattr(result, one.name) for one in fields(Result)}
+        return SolvedProblem(**known, model=model, causal=causal, origin=origin)
+
+    @cached_property
+    def experiment(self) -> ControlExperiment:
+        """The experiment, as a config describes it; raises `InputError` where no config can."""
+        return ControlExperiment(self._loaded, self.model)
+
+    @cached_property
+    def directory(self) -> Path:
+        """The directory of the run: where it was saved last, or else a temporary one that goes with the result."""
+        path = Path(tempfile.mkdtemp(prefix="sparserob-"))
+        weakref.finalize(self, shutil.rmtree, path, ignore_errors=True)
+        return self._saved(path / "run", figures=False).directory
+
+    def save(self, directory: str | Path, *, figures: bool = True) -> Outcome:
+        """Write a run directory like any other into ``directory``, new or empty, and return its outcome.
+
+        What a run adds to a result is added here too: a lower bound without rounding, what is proven of the time of
+        action, and under feedback a bound for every causal policy. Raises `InputError` where no config can say the
+        problem, such as a function of the parameters that is no arithmetic, and where the directory cannot be made.
+        """
+        outcome = self._saved(Path(directory), figures)
+        self.__dict__["directory"] = outcome.directory
+        return outcome
+
+    def plot(self, name: str = "states") -> Figure:
+        """A figure of the run, for matplotlib: ``control``, ``states``, ``convergence``, ``adversary``, under feedback
+        ``gains``, ``effort`` and ``answers``, of a search ``climb`` and ``landscape``, and ``clash`` of what is
+        infeasible. Raises `InputError`, which names those that there are, for another one."""
+        from sparserob_core.experiment.run.drawing import plot
+
+        return plot(self.experiment, self, name)
+
+    @property
+    def _loaded(self) -> Loaded:
+        known = self.__dict__.get("experiment")
+        return load_config(_source(self.origin)) if known is None else known.loaded
+
+    def _saved(self, path: Path, figures: bool) -> Outcome:
+        experiment = self.experiment
+        loaded, tools = experiment.loaded, tools_of(experiment.loaded)
+        plain = loaded.config.plain()
+        text = write_yaml(plain, HEADING)
+        require_readable(plain, text)
+        result = self if "directory" in self.__dict__ else concluded(experiment, self, tools)
+        with create_directory(path, name_of(loaded), loaded.config.digest()) as directory:
+            directory.write_text("config.yaml", text)
+            journal = Journal(directory, experiment, provenance(plain, git_revision(loaded.source.folder)))
+            journal.asked = True  # nobody listened, so that nothing is said of a maximiser that had nothing to do
+            control, summary, remarks = journal.finish(result, figures)
+        return Outcome(result, directory.path, experiment, control, summary, remarks)
+
+    def _repr_html_(self) -> str:
+        """The table of the result and its control, for notebooks; a problem that no config can say has no figure."""
+        from sparserob_core.experiment.directory.record import control_of, summary_of
+        from sparserob_core.experiment.run.drawing import picture
+        from sparserob_core.experiment.terminal.notebook import page
+
+        dictionary = self.model.control
+        summary = summary_of(self, control_of(self, self.model.program, dictionary), dictionary)
+        title = self.problem.title or "Result"
+        try:
+            drawn = picture(self.experiment, self)
+        except InputError:
+            drawn = None
+        return page(title, result_rows({"title": title, **summary}), drawn)
+
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        model = self.model
+        policy = None if model.feedback is None else model.feedback.policy
+        given = (model.problem, model.control, model.disturbance, model.formulation, policy)
+        return _reread, (self.plain, *given, self.causal, self.origin)
+
+
+def concluded(experiment: Experiment, result: Result, tools: Tools) -> Result:
+    """What a run makes of the result of a method before it is written down: bounds that are proven without rounding,
+    what is known of the time of action, and of causal policies."""
+    if not isinstance(experiment, ControlExperiment):
+        return result
+    known = bounded(experiment, result) if result.sparsest is None else result
+    known = with_activity(experiment, known, tools)
+    concluding = with_causal(SolvedProblem.run(known, experiment), tools)
+    concluding.__dict__["experiment"] = experiment
+    return concluding
+
+
+def _source(origin: Source | Asked) -> Source:
+    return origin.source() if isinstance(origin, Asked) else origin
+
+
+def _reread(
+    result: Result,
+    problem: OptimalControlProblem,
+    control: Dictionary,
+    disturbance: Dictionary,
+    form: Any,
+    policy: Policy | None,
+    causal: CausalBound | None,
+    origin: Source | Asked,
+) -> SolvedProblem:
+    """A pickled result; its program is built anew."""
+    from sparserob_core.control.transcription.transcribe import prepare
+
+    return SolvedProblem.asked(result, prepare(problem, control, disturbance, form, policy), origin, causal)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """A finished run. ``control (m, K)`` is ``None`` without a decision or for a program that is no control problem;
+    the ``result`` of a control problem is a `ControlResult`; ``summary`` is what ``result.json`` holds; ``remarks`` say
+    what could not be done beside the result; ``interrupted``: a key or a signal ended it, or came while it ended.
+
+    It can be pickled: the experiment is built anew from its config where it is read."""
+
+    result: Result
+    directory: Path
+    experiment: Experiment
+    control: Array | None
+    summary: Mapping[str, Any]
+    remarks: Sequence[str] = ()
+    interrupted: bool = False
+
+    def __post_init__(self) -> None:
+        if isinstance(self.experiment, ControlExperiment) and not isinstance(self.result, SolvedProblem):
+            object.__setattr__(self, "result", SolvedProblem.run(self.result, self.experiment))
+
+    @property
+    def status(self) -> str:
+        """The status of the result."""
+        return self.result.status
+
+    @property
+    def problem(self) -> OptimalControlProblem | None:
+        """The control problem."""
+        return self.experiment.problem if isinstance(self.experiment, ControlExperiment) else None
+
+    @property
+    def program(self) -> SemiInfiniteProgram:
+        """The semi-infinite program that was solved."""
+        return self.experiment.program
+
+    def tube(self, times: npt.ArrayLike) -> Tube:
+        """The states at times ``(T,)`` and how far the disturbance may bring them: `ControlResult.tube`."""
+        return self._of_control().tube(times)
+
+    def worst(self, constraint: str) -> Adversary:
+        """The worst case of the constraint of that name: `ControlResult.adversary`."""
+        return self._of_control().adversary(constraint)
+
+    def plot(self, name: str = "states") -> Figure:
+        """A figure of the run, for matplotlib: `SolvedProblem.plot`."""
+        from sparserob_core.experiment.run.drawing import plot
+
+        return plot(self.experiment, self.result, name)
+
+    def _of_control(self) -> SolvedProblem:
+        if not isinstance(self.result, SolvedProblem):
+            raise InputError("this is a semi-infinite program that is no control problem: it has no states")
+        return self.result
+
+    def __repr__(self) -> str:
+        said = [f"  {name}: {value}" for name, value in result_rows(self.summary)[:ROWS]]
+        return "\n".join([f"Outcome of {self.experiment.title!r} in {self.directory}", *said])
+
+    def _repr_html_(self) -> str:
+        """The table of the run and the figure of its control, for notebooks."""
+        from sparserob_core.experiment.terminal.notebook import page
+
+        file = self.directory / "figures" / "control.png"
+        drawn = file.read_bytes() if file.is_file() else None
+        return page(self.experiment.title, result_rows(self.summary), drawn)
+
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        of = self.result
+        plain, causal = (of.plain, of.causal) if isinstance(of, ControlResult) else (of, None)
+        loaded = self.experiment.loaded
+        stated = Source(loaded.source.name, loaded.source.folder, loaded.config.plain())
+        kept = (self.directory, self.control, self.summary, self.remarks, self.interrupted)
+        return _read, (stated, plain, *kept, causal)
+
+    def show(self, save: str | Path | None = None, *, serve: bool = False, connect: str | None = None) -> None:
+        """Show the run in the viewer of Rerun: a new one, one that listens at ``connect``, a browser (``serve``), or
+        later (``save``, a file).
+
+        Raises `InputError` where there is none, or no display."""
+        from sparserob_core.experiment.run.replay import events, play
+
+        inspection = Inspection(self.experiment.loaded)
+        play(
+            events(inspection, self.experiment.title, self.directory, self.result),
+            save=save,
+            serve=serve,
+            connect=connect,
+        )
+
+
+def _read(
+    stated: Source,
+    result: Result,
+    directory: Path,
+    control: Array | None,
+    summary: Mapping[str, Any],
+    remarks: Sequence[str],
+    interrupted: bool,
+    causal: CausalBound | None = None,
+) -> Outcome:
+    """A pickled outcome; its experiment is built anew from its config."""
+    experiment = assemble(load_config(stated))
+    if isinstance(experiment, ControlExperiment):
+        result = SolvedProblem.run(result, experiment, causal)
+    return Outcome(result, directory, experiment, control, summary, remarks, interrupted)
