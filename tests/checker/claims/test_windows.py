@@ -504,3 +504,49 @@ def test_the_unit_of_a_row_is_the_smallest_of_its_width_its_limit_and_how_far_it
     slack = flat.units(flat.windows[0]).slack
     assert slack(np.array([1.0]), arb(2)) == pytest.approx(2e-9)
     assert slack(np.array([-2.0]), arb(18)) == pytest.approx(7e-9)
+
+
+def test_a_bound_with_groups_uses_the_length_of_the_slope():
+    """Both states go down by 0.6 and 0.8 together, at the least cost 1 of lengths."""
+    plane = {
+        "system": LinearSystem(np.zeros((2, 2)), np.eye(2)), "initial_state": [0.6, 0.8], "disturbance": None,
+        "decision": ((-0.3, -0.3), (-0.4, -0.4)), "terminal": [Box([-9.0, -9.0], [0.0, 0.0])],
+        "cost": sr.Cost(group="all"),
+    }  # fmt: skip
+    entries = [
+        {"constraint": "terminal", "time": 2.0, "direction": axis, "parameter": [], "multiplier": y}
+        for axis, y in (([1.0, 0.0], 0.6), ([0.0, 1.0], 0.8))
+    ]
+    for control in (Box([-1.0] * 2, [1.0] * 2), NormBall(2.0, 1.0, dimension=2)):
+        for at, value in (((-0.3, -0.4), 1.0), ((0.0, 0.0), 1.0)):
+            tangent = [[at[0]] * 2, [at[1]] * 2]
+            said = {"multipliers": {"constraints": entries, "equalities": [], "pieces": None, "tangent": tangent}}
+            case = case_of(certificate=said, control=control, **plane)
+            assert float(claims._multiplied(case, priced=True).mid()) == pytest.approx(value)
+        # a slope that is longer than the weight by a tenth costs that, as far as the control reaches
+        longer = [{**entry, "multiplier": 1.1 * entry["multiplier"]} for entry in entries]
+        said["multipliers"] = {**said["multipliers"], "constraints": longer}
+        found = float(claims._multiplied(case_of(certificate=said, control=control, **plane), priced=True).mid())
+        assert found <= 1.1 - 2 * 0.1 * 1.0 + 1e-12
+        assert found >= 1.1 - 2 * 0.1 * 1.5
+
+
+def test_numbers_that_are_far_apart_are_computed_with_more_bits():
+    assert claims._precision(case_of()) == claims.PRECISION + 1  # 2 is the horizon times 1
+    for A, apart in (([[2.0**-10, 2.0**19]], 20 + 9), ([[0.25, 0.5]], 1 + 1), ([[1e-300, 1e300]], None)):
+        plant = LinearSystem(np.array([*A, [0.0, 0.0]]), np.array([[0.5], [0.5]]))
+        case = case_of(system=plant, initial_state=[0.0, 0.0], disturbance=None)
+        assert claims._precision(case) == (claims.MOST_PRECISION if apart is None else claims.PRECISION + apart)
+
+
+def test_the_largest_cost_is_that_of_the_far_end_of_every_channel():
+    case = case_of(control=Box([-1.0], [2.0]), weights=[3.0], cost=sr.Cost(l1=0.5))
+    assert claims.largest_cost(case) == pytest.approx(0.5 * 3.0 * 2.0 * 2.0)
+    case = case_of(control=Box([-2.0], [1.0]), weights=[3.0], cost=sr.Cost(l1=0.5))
+    assert claims.largest_cost(case) == pytest.approx(0.5 * 3.0 * 2.0 * 2.0)
+    bent = case_of(
+        control=Box([-2.0], [1.0]), cost=sr.Cost(state={"Q": [[1.0]]}), disturbance=None,
+        system=LinearSystem(np.zeros((1, 1)), ONE),
+    )  # fmt: skip
+    # held at 2 or at -2, whichever costs more: int_0^2 (1 + 2 t)^2 dt = 62 / 3
+    assert claims.largest_cost(bent) == pytest.approx(4.0 + 62.0 / 3.0)

@@ -1,0 +1,137 @@
+"""Guards checker/reach/measurable and the products of disturbance_support: integrals of the largest of polynomials, and
+products of matrices that are known to a radius, in exact arithmetic and by hand."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from flint import arb, ctx
+
+from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.reach.disturbance_support import Operator
+from sparserob_core.checker.reach.flow import OwnUnits, stacked
+from sparserob_core.checker.reach.measurable import APART, Kernel, Side, _equal, _swept, _valued
+from sparserob_core.checker.sets.polynomials import Enclosed
+from sparserob_core.control.sets.sets import Box, NormBall
+
+
+def largest(P, end, count=200_001):
+    """The integral of the largest of polynomials ``P (p + 1, v)`` from -1 to ``end``, by the trapezoidal rule."""
+    u = np.linspace(-1.0, end, count)
+    return float(np.trapezoid((u[:, None] ** np.arange(len(P)) @ P).max(axis=1), u))
+
+
+def test_the_integral_of_the_largest_of_polynomials_is_enclosed_and_sharp():
+    rng = np.random.default_rng(1)
+    P = rng.normal(size=(30, 5, 3)) * 0.7 ** np.arange(5)[:, None]
+    ends = np.where(np.arange(30) % 3, 1.0, rng.uniform(-0.9, 0.9, size=30))
+    none = np.zeros((30, 3))
+    value, more, less = _swept(P, none, ends)
+    truth = np.array([largest(p, end) for p, end in zip(P, ends, strict=True)])
+    assert (less == 0.0).all()
+    assert (value <= truth + 1e-8).all() and (truth <= value + more + 1e-8).all()
+    assert (more <= 1e-12).all()
+
+
+def test_two_that_cross_are_integrated_from_crossing_to_crossing():
+    """``|u|`` from -1 to 1 is 1, ``max(u^2, 1/4)`` is 1/4 + 2 (1/3 - 1/24 - 1/8)."""
+    P = np.zeros((2, 3, 2))
+    P[0, 1] = [1.0, -1.0]
+    P[1, 2, 0], P[1, 0, 1] = 1.0, 0.25
+    value, more, less = _swept(P, np.zeros((2, 2)), np.ones(2))
+    assert value == pytest.approx([1.0, 2.0 * (0.125 + (1.0 - 0.125) / 3.0)])
+    assert (more < 1e-12).all() and (less == 0.0).all()
+
+
+def test_errors_of_polynomials_are_errors_of_the_integral():
+    """What stands for the largest is off by its own error; another one may be larger by both."""
+    P = np.array([[[3.0, 1.0]]])
+    for e in ([0.1, 0.4], [0.4, 0.1], [0.25, 0.25]):
+        value, more, less = _swept(P, np.array([e]), np.array([0.5]))
+        assert value[0] == pytest.approx(4.5)
+        assert more[0] == pytest.approx(1.5 * (e[0] + 2.0 * max(e)))
+        assert less[0] == pytest.approx(1.5 * e[0])
+
+
+def test_roots_are_found_between_signs_that_differ_and_the_middle_is_taken_elsewhere():
+    P = np.array([[0.0, 1.0, 0.0], [-0.25, 0.0, 1.0], [1.0, 0.0, 1.0], [1e-300, 0.0, 0.0]])
+    start, stop = np.array([-0.7, 0.0, -1.0, -1.0]), np.array([1.0, 1.0, 0.5, 0.0])
+    assert _equal(P, start, stop) == pytest.approx([0.0, 0.5, -0.25, -0.5], abs=1e-7)
+    assert _valued(P, np.array([0.5, 0.5, 2.0, 0.0])).tolist() == [0.5, 0.0, 5.0, 1e-300]
+
+
+def kernel_of(A, E, length):
+    matrices = [stacked([balls(row) for row in np.atleast_2d(part)]) for part in (A, E)]
+    growth = float(np.linalg.norm(np.atleast_2d(A), 2)) * 2.0 + 1.0
+    return Kernel.of(*matrices, arb(length), OwnUnits.of(matrices[0], growth, np.abs(np.atleast_2d(E))[:, 0]))
+
+
+@pytest.mark.parametrize("rate", [-1.5, 0.0, 2.0])
+def test_the_integral_and_the_steepest_slope_of_an_exponential_are_the_closed_forms(rate):
+    """``|a| (2 e^{rate r}) c`` with ``|w| <= c``, up to a share of the length."""
+    with ctx.workprec(128):
+        kernel = kernel_of(rate, 2.0, 0.8)
+        sides = Side.of(Box([-0.5], [0.5]))
+        a = Enclosed(np.array([[1.0], [-3.0]]), np.zeros((2, 1)))
+        for share in (0.1, 0.25, 0.37, 0.5, 0.9, 1.0):
+            found = kernel.most(a, sides, share)
+            height = 0.8 * share if rate == 0.0 else np.expm1(rate * 0.8 * share) / rate
+            truth = np.array([1.0, 3.0]) * height
+            assert (np.abs(found.mid - truth) <= found.rad + 1e-15).all()
+            assert (found.rad <= 1e-11).all()
+            if share < 1.0:  # the place among the parts is rounded
+                top = np.array([1.0, 3.0]) * max(1.0, np.exp(rate * 0.8 * share)) * (1.0 - 1e-9)
+                assert (found.rad >= APART * kernel.count * top * kernel.half).all()
+        wide = kernel.most(Enclosed(a.mid, np.full((2, 1), 0.25)), sides)
+        height = 0.8 if rate == 0.0 else np.expm1(rate * 0.8) / rate
+        assert (wide.mid + wide.rad >= np.array([1.25, 3.25]) * height * (1 - 1e-13)).all()
+        assert (wide.rad <= 0.25 * height * 4.0).all()
+        steep = kernel.steepest(a.mid, sides)
+        truth = np.array([1.0, 3.0]) * abs(rate) * max(1.0, np.exp(rate * 0.8))
+        assert (steep >= truth * (1 - 1e-12)).all()
+        assert (steep <= truth * 1.3 + 1e-12).all()
+
+
+def test_sides_are_segments_of_a_box_and_corners_of_what_has_them():
+    box = Side.of(Box([-1.0, 2.0], [3.0, 5.0]))
+    assert [side.corners.tolist() for side in box] == [[[2.0, 0.0], [-2.0, 0.0]], [[0.0, 1.5], [0.0, -1.5]]]
+    (ball,) = Side.of(NormBall(1.0, 0.5, centre=[1.0, 2.0]))
+    assert sorted(ball.corners.tolist()) == [[-0.5, 0.0], [0.0, -0.5], [0.0, 0.5], [0.5, 0.0]]
+    assert (ball.rad < 1e-15).all()
+    # in two channels the segments add up, the ball is the largest of its corners
+    with ctx.workprec(128):
+        kernel = kernel_of(np.zeros((2, 2)), np.eye(2), 2.0)
+        a = Enclosed(np.array([[1.0, -2.0]]), np.zeros((1, 2)))
+        assert kernel.most(a, box).mid == pytest.approx([2.0 * (2.0 + 3.0)])
+        assert kernel.most(a, [ball]).mid == pytest.approx([2.0 * 1.0])
+
+
+def exact(values):
+    return np.vectorize(Fraction, otypes=[object])(np.asarray(values, dtype=float))
+
+
+@pytest.mark.parametrize(("left", "right"), [(0.0, 0.0), (1e-3, 0.0), (0.0, 1e-3), (0.2, 0.5)])
+def test_a_product_with_a_matrix_that_is_known_to_a_radius_holds_every_product(left, right):
+    rng = np.random.default_rng(2)
+    mid, rows = rng.normal(size=(4, 30)), rng.normal(size=(30, 5))
+    A = Operator(mid, left * rng.uniform(0.5, 1.0, size=mid.shape))
+    B = Enclosed(rows, right * rng.uniform(0.5, 1.0, size=rows.shape))
+    found = A.applied(B)
+    corners = []
+    for sign in (1.0, -1.0):  # as far from the middle as the radii let them, all in one direction
+        for i in range(4):
+            for j in range(5):
+                one = exact(mid[i]) + int(sign) * exact(np.sign(rows[:, j])) * exact(A.rad[i])
+                other = exact(rows[:, j]) + int(sign) * exact(np.sign(mid[i])) * exact(B.rad[:, j])
+                off = abs(sum(one * other) - Fraction(float(found.mid[i, j])))
+                if sign > 0:
+                    # the product of both radii counts wherever signs allow
+                    same = sum(exact(A.rad[i]) * exact(B.rad[:, j]) * exact(np.sign(mid[i]) * np.sign(rows[:, j])))
+                    corners.append(float(off + sum(exact(A.rad[i]) * exact(B.rad[:, j])) - same))
+                assert off <= Fraction(float(found.rad[i, j]))
+    largest_rad = found.rad.ravel()
+    assert (largest_rad >= np.array(corners) * (1 - 1e-13)).all()
+    assert (largest_rad <= np.array(corners) * (1 + 1e-9) + 30 * 5e-15 * 5).all()
+    assert (found.rad > 0.0).all()
