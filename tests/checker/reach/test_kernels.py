@@ -17,7 +17,7 @@ from sparserob_core.checker.sets.polynomials import Enclosed
 from sparserob_core.control.sets.sets import Box, NormBall
 
 
-def largest(P, end, count=200_001):
+def largest(P, end, count=8_001):
     """The integral of the largest of polynomials ``P (p + 1, v)`` from -1 to ``end``, by the trapezoidal rule."""
     u = np.linspace(-1.0, end, count)
     return float(np.trapezoid((u[:, None] ** np.arange(len(P)) @ P).max(axis=1), u))
@@ -25,13 +25,13 @@ def largest(P, end, count=200_001):
 
 def test_the_integral_of_the_largest_of_polynomials_is_enclosed_and_sharp():
     rng = np.random.default_rng(1)
-    P = rng.normal(size=(30, 5, 3)) * 0.7 ** np.arange(5)[:, None]
-    ends = np.where(np.arange(30) % 3, 1.0, rng.uniform(-0.9, 0.9, size=30))
-    none = np.zeros((30, 3))
+    P = rng.normal(size=(12, 5, 3)) * 0.7 ** np.arange(5)[:, None]
+    ends = np.where(np.arange(12) % 3, 1.0, rng.uniform(-0.9, 0.9, size=12))
+    none = np.zeros((12, 3))
     value, more, less = _swept(P, none, ends)
     truth = np.array([largest(p, end) for p, end in zip(P, ends, strict=True)])
     assert (less == 0.0).all()
-    assert (value <= truth + 1e-8).all() and (truth <= value + more + 1e-8).all()
+    assert (value <= truth + 1e-6).all() and (truth <= value + more + 1e-6).all()
     assert (more <= 1e-12).all()
 
 
