@@ -95,6 +95,7 @@ from sparserob_core.experiment.plugins.hookspecs import SelectionPlugin as Selec
 from sparserob_core.experiment.plugins.hookspecs import SetPlugin as SetPlugin
 from sparserob_core.experiment.plugins.hookspecs import SolverPlugin as SolverPlugin
 from sparserob_core.experiment.plugins.hookspecs import hookimpl as hookimpl
+from sparserob_core.experiment.plugins.records import INTERFACE as INTERFACE
 from sparserob_core.experiment.plugins.registry import load_registry as load_registry
 from sparserob_core.sip.method import Continuation as Continuation
 from sparserob_core.sip.method import ExecutorFactory as ExecutorFactory

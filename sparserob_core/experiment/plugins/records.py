@@ -9,9 +9,17 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import ClassVar
 
+from sparserob_core.arguments import is_whole
 from sparserob_core.errors import PluginError, UnknownPluginError, not_installed
 from sparserob_core.experiment.plugins.attribution import asked, attributed
 from sparserob_core.options import Options
+
+INTERFACE = 1
+"""The version of the public interface: what a component may import, and what it is called with. It rises when a
+component that was right would no longer be."""
+
+OLDEST = 1
+"""The oldest version whose components run as they are."""
 
 RECORDS: dict[str, type[Plugin]] = {}
 """Every kind of component, by name, in the order of `hookspecs`."""
@@ -29,6 +37,8 @@ class Plugin:
     ``needs``    a module that may be missing, and what pip is to install then, such as
                  ``("rerun", "rerun-sdk")``, or ``""`` where pip cannot; it is looked for where the
                  component is built, before anything is solved;
+    ``interface``  the version of the public interface that it was written for (`INTERFACE`); without it 1, the first
+                 that records could say;
     ``open``     its options, or further ones, are those of the package that it needs, which is imported to ask for
                  them: schema and reference leave them open.
 
@@ -48,6 +58,7 @@ class Plugin:
     source: str = ""
     needs: tuple[str, str] | None = None
     open: bool = False
+    interface: int = 1
 
     def __init_subclass__(cls, hook: str, component: str) -> None:
         cls.hook, cls.component = hook, component
@@ -63,6 +74,25 @@ class Plugin:
         options: object = self.options
         if options is not None and not (isinstance(options, type) and issubclass(options, Options)):
             raise PluginError(f"{self}: options must be a subclass of sparserob_core.Options, got {self.options!r}")
+
+        self._check_interface()
+
+    def _check_interface(self) -> None:
+        """Refuse a record of an interface that is not here, with the line to change."""
+        if not is_whole(self.interface, 1):
+            raise PluginError(f"{self}: interface must be a whole number of at least 1, got {self.interface!r}")
+        line = f"{type(self).__name__}(name={self.name!r}, ...)"
+        if self.interface > INTERFACE:
+            raise PluginError(
+                f"{self}: written for interface {self.interface}, and this SparseRob has {INTERFACE}: install a newer "
+                f"one, or, where the component needs nothing newer, change `interface={self.interface}` to "
+                f"`interface={INTERFACE}` in {line}"
+            )
+        if self.interface < OLDEST:
+            raise PluginError(
+                f"{self}: written for interface {self.interface}, and this SparseRob has {OLDEST} to {INTERFACE}: the "
+                f"changelog says what changed; then write `interface={INTERFACE}` in {line}"
+            )
 
     def __str__(self) -> str:
         return f"{self.kind} '{self.name}'"
