@@ -1,16 +1,17 @@
 """The four pieces of the paper's algorithm that a user may replace: ``Regu``, ``SC1``, ``SC2`` and ``SlCr``.
 
-Each is an object that is called; a plain function with the same arguments serves as well.
+Each is an object that is called; a plain function with the same arguments serves as well, and under a name too:
+``SelectionPlugin(name="mine", factory=Selection.of(function))``.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import exp
-from typing import final
+from typing import Self, final
 
 import numpy as np
 from pydantic import Field
@@ -50,7 +51,23 @@ class Progress:
         return np.inf if earlier < 0 or window >= self.evaluations else self.best_value - self.improvements[earlier][1]
 
 
-class Schedule(ABC):
+class Rule:
+    """One of the four pieces: an object that is called."""
+
+    @classmethod
+    def of(cls, function: Callable[..., object]) -> type[Self]:
+        """A class of rules of this kind, without options, that answer with a plain function."""
+        own = {"__call__": staticmethod(function), "__reduce__": lambda rule: (_rule, (cls, function))}
+        named = {"__doc__": function.__doc__, "__module__": function.__module__}
+        return type(function.__name__, (cls,), {**own, **named})
+
+
+def _rule(kind: type[Rule], function: Callable[..., object]) -> Rule:
+    """A rule that was pickled."""
+    return kind.of(function)()
+
+
+class Schedule(Rule, ABC):
     """``Regu``: the weight of the regulariser in the next outer iteration."""
 
     @abstractmethod
@@ -59,7 +76,7 @@ class Schedule(ABC):
         positive."""
 
 
-class OuterStop(ABC):
+class OuterStop(Rule, ABC):
     """``SC1``: when the optimisers of successive outer iterations are near enough to one another."""
 
     @abstractmethod
@@ -67,7 +84,7 @@ class OuterStop(ABC):
         """Whether to stop after these outer iterations, of which there is at least one."""
 
 
-class InnerStop(ABC):
+class InnerStop(Rule, ABC):
     """``SC2``: when one global maximisation has gone on for long enough; its budget bounds it in any case."""
 
     @abstractmethod
@@ -75,7 +92,7 @@ class InnerStop(ABC):
         """Whether to stop the search; asked after every batch of evaluations."""
 
 
-class Selection(ABC):
+class Selection(Rule, ABC):
     """``SlCr``: whether a walk goes on from a candidate."""
 
     @abstractmethod

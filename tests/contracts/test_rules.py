@@ -4,6 +4,7 @@ the contract of its kind, and rules that are wrong on purpose fail it."""
 from __future__ import annotations
 
 import math
+import pickle
 import time
 
 import numpy as np
@@ -238,6 +239,30 @@ FAULTS = [
 @pytest.mark.parametrize(("contract", "kind", "name", "call", "test"), FAULTS)
 def test_the_contract_catches_a_rule_that_is_wrong_on_purpose(contract, kind, name, call, test):
     fails(contract, rule(kind, name, call), test)
+
+
+def halved(epsilon, j):
+    """Half of it."""
+    return epsilon / 2
+
+
+class TestAPlainFunctionAsASchedule(ScheduleContract):
+    component = sr.Schedule.of(halved)
+
+
+def test_a_plain_function_is_a_rule_under_a_name(tmp_path):
+    file = tmp_path / "halving.py"
+    file.write_text(
+        "import sparserob_core as sr\n\ndef halved(epsilon, j):\n    return epsilon / 2\n\n"
+        "@sr.hookimpl\ndef sparserob_schedules():\n"
+        "    yield sr.SchedulePlugin(name='halving', factory=sr.Schedule.of(halved))\n"
+    )
+    regu = sr.load_registry([file]).build("schedule", "halving")
+    assert isinstance(regu, sr.Schedule)
+    assert regu(0.5, 1) == 0.25
+    again = pickle.loads(pickle.dumps(sr.Selection.of(metropolis)()))
+    assert isinstance(again, sr.Selection)
+    assert again(0.0, 1.0, 1.0, None)
 
 
 class TestARightSelection(SelectionContract):
