@@ -14,7 +14,7 @@ OCTAVES = 40.0  # halvings of a side from the farthest to the nearest neighbour 
 GOLDEN = (5.0**0.5 - 1.0) / 2.0
 
 
-def block_ascent(objective: Objective, start: Array | None = None) -> None:
+def block_ascent(objective: Objective, start: Array | None = None) -> bool:
     """Climb from ``start (d,)``, or from the best point, of an objective that is linear in blocks (`Objective.linear`)
     until nothing near the blocks that act is a gain; where it is not, or the value there is not finite, do nothing.
 
@@ -23,16 +23,17 @@ def block_ascent(objective: Objective, start: Array | None = None) -> None:
     not act may be moved without loss: one half of them is placed beside those that act, at distances from half a side
     down to its ``2^-40``, which is a line search in all other coordinates at once; the other half is spread over the
     box, by the additive recurrence of Kronecker, and finds what is not yet known. So no step makes the value less.
-    Notes ``acting``, how many blocks act. Ends by `SearchEnded` when the budget is spent.
+    Notes ``acting``, how many blocks act. Returns whether it has climbed to where neighbours were tried and
+    none is a gain, which they are not where every block acts; ends by `SearchEnded` when the budget is spent.
     """
     linear = objective.linear
     if linear is None or (start is None and not np.isfinite(objective.best_value)):
-        return
+        return False
     climb = _Climb(objective, linear)
     best, still, tried = objective.best_point if start is None else start, 0, 0.0
     value = float(objective.evaluate(best[np.newaxis])[0])
     if not np.isfinite(value):
-        return
+        return False
     while still < PATIENCE or tried < 2.0 * OCTAVES:
         acts = linear.acting()
         objective.note(acting=float(acts.sum()))
@@ -44,6 +45,7 @@ def block_ascent(objective: Objective, start: Array | None = None) -> None:
             best, value = trial, reached
         else:  # by rounding only: see the last point's inner solution again
             objective.evaluate(best[np.newaxis])
+    return bool(np.isfinite(tried))
 
 
 class _Climb:

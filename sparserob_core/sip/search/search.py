@@ -357,9 +357,9 @@ def maximise(
             stopped = f"{stopped}; then polished"
             from sparserob_core.sip.search.local_search import polish
 
-            block_ascent(shown)
-            points, values = objective.seen()
-            polish(shown, points[:, moves], values)
+            if not block_ascent(shown):  # whose end no local method improves that knows less of the blocks
+                points, values = objective.seen()
+                polish(shown, points[:, moves], values)
     except SearchEnded:
         pass
     except KeyboardInterrupt as pressed:

@@ -3,6 +3,7 @@ function whose maximum is known, and on the paper's tuples with the disturbance 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -97,6 +98,27 @@ def test_a_polish_takes_the_ascent_for_every_maximiser_and_sees_only_what_can_mo
     target = Target(peaks, peaks.domain, block=peaks.m + 2, linear=peaks.linear)
     report = maximise(target, Once(), 200, np.random.default_rng(0), Rules(polish=polish))
     assert (report.best_value > peaks.maximum - 1e-3) == (polish > 0.0)
+
+
+def test_a_polish_ends_where_the_ascent_does_and_gives_back_what_is_left():
+    class Once(sr.Maximiser):
+        def search(self, objective, rng):
+            domain = objective.domain
+            objective.evaluate(rng.uniform(domain.lower, domain.upper)[np.newaxis])
+            return float("inf")
+
+    peaks, few = Peaks(), 5
+    target = Target(peaks, peaks.domain, block=peaks.m + 2, linear=peaks.linear)
+    report = maximise(target, Once(), 2000, np.random.default_rng(0), Rules(polish=0.9))
+    assert report.evaluations < 400 and report.stopped.endswith("; then polished")
+    assert report.best_value == pytest.approx(peaks.maximum, abs=1e-8)
+    objective = CountedObjective(target, few)
+    objective.evaluate(peaks.domain.lower[np.newaxis])
+    with pytest.raises(sr.SearchEnded):
+        sr.block_ascent(objective)
+    assert objective.evaluations == few
+    whole = maximise(replace(target, linear=None), Once(), 2000, np.random.default_rng(0), Rules(polish=0.9))
+    assert whole.evaluations > 400  # a polish without blocks is as it was
 
 
 def test_a_polish_that_nobody_speaks_of_is_the_maximiser_s_own_share_where_blocks_are_linear_and_nothing_elsewhere():
