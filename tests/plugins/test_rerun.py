@@ -302,6 +302,9 @@ def test_the_map_is_over_the_times_of_the_two_indices_that_decide_most_the_earli
     anchor = np.array([[0.2, 0.5], [0.9, 0.5], [0.6, 0.4]])
     both = mapped(Plain(lambda s: s[0, 0] + 10 * s[2, 0], [2, 0, -1, -1], 2), anchor)
     assert (both.first, both.second) == ((0, 0), (2, 0)) and both.names() == ("t of the earlier", "t of the later")
+    assert both.names("h") == ("t of the earlier, in h", "t of the later, in h")
+    mixed = mapped(Plain(lambda s: s[0, 0], [0], 2), anchor[:1])
+    assert mixed.names("h") == ("t, in h", "p")  # a unit of time behind a time, and behind nothing else
     assert both.values[0, 0] == 0.0 and both.values[-1, 0] == 1.0 and both.values[0, -1] == 10.0
     # only one index with a time decides: the time of one more index is the second axis
     assert mapped(Plain(lambda s: s[1, 0], [1, -1, -1, -1], 2), anchor).first == (0, 0)

@@ -127,6 +127,26 @@ def test_the_pairs_of_many_tuples_are_those_of_one_after_the_other() -> None:
     assert sr.deciding_slots(none, one, widths, (0, 0)).tolist() == [[0, 0], [0, 0]]
 
 
+def test_in_a_narrow_panel_of_the_climb_what_is_proven_far_below_is_said_below_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from unittest.mock import MagicMock
+
+    from sparserob_rerun.search import climb
+    from sparserob_rerun.search.way import Stage
+
+    drawn: list[climb.Drawing] = []
+    monkeypatch.setattr(climb.Drawing, "log", lambda self, *rest, **more: drawn.append(self))
+    stages = [Stage(number, 0.1, 10 * number) for number in range(6)]
+    for stage in stages:
+        stage.values, stage.lower_bound = np.linspace(1.0, 2.0, 10), -50.0
+    climb.Climb(MagicMock(), MagicMock()).draw(stages)
+    below = sorted((at[1], at[0], words) for at, words, _ in drawn[0].labels if at[1] > climb.HEIGHT)
+    assert [words for *_, words in below if "proven" in words] == ["proven ≥ -50"] * climb.MOST
+    assert below[-1][2] == "2 earlier searches are not shown" and below[-1][0] < climb.EXTENT[3]
+    assert np.unique(np.diff([y for y, *_ in below])).tolist() == [0.0, 30.0, 32.0]  # three lines, none on another
+
+
 def test_words_are_bright_and_lines_of_plots_legible_on_a_dark_and_on_a_light_ground() -> None:
     from sparserob_rerun.drawing import palette as ink
 

@@ -78,8 +78,7 @@ class Recorder:
         self.timelines, self.rounds = Timelines(rr, stream), Rounds(rr, stream, inspection)
         problem = None if inspection is None else inspection.problem
         self.physics = Physics(rr, stream, inspection) if inspection is not None and problem is not None else None
-        unit = "" if problem is None or not problem.names.time else f", in {problem.names.time}"
-        self.terrain = Terrain(rr, stream, unit)
+        self.terrain = Terrain(rr, stream, "" if problem is None else problem.names.time)
         self.explorer = Explorer(self._landscape, inspection, opening.landscape, opening.waits)
         self.search = SearchView(rr, stream, self.timelines)
         self.climb, self.stages = Climb(rr, stream), list[Stage]()

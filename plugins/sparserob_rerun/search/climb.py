@@ -37,7 +37,7 @@ class Climb:
             self._panel(drawing, clouds, stage, (place * (width + GAP), width), exact)
         hidden = len(stages) - len(shown)
         if hidden > 0:
-            drawing.text(WIDTH / 2, HEIGHT + 62.0, f"{hidden} earlier searches are not shown", ink.GREY)
+            drawing.text(WIDTH / 2, HEIGHT + 88.0, f"{hidden} earlier searches are not shown", ink.GREY)
         drawing.log(
             self.rr, self.stream, "search/stages", layers=("frame", "restart", "bound", "exact", "best", "walk")
         )
@@ -72,7 +72,8 @@ class Climb:
             if level is not None and low <= level <= high:
                 drawing.line(layer, axes.at(np.array(axes.x), np.full(2, level)), colour, 2.0)
         if np.isfinite(stage.lower_bound) and not low <= stage.lower_bound <= high:
-            drawing.text(place[0] + place[1] / 2, HEIGHT - 24.0, f"proven ≥ {stage.lower_bound:.5g}", ink.GREEN)
+            words = f"proven ≥ {stage.lower_bound:.5g}"  # below the panel: in a narrow one it lies over the walk
+            drawing.text(place[0] + place[1] / 2, HEIGHT + 58.0, words, ink.GREEN)
         if 0 < stage.searched < count:  # then its last share of the budget
             at = numbers[stage.searched - 1] + 0.5
             drawing.dashed("restart", axes.at(np.full(2, at), np.array([low, high])), ink.GREEN)

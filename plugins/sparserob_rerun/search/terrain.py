@@ -34,7 +34,7 @@ class Terrain:
     """
 
     def __init__(self, rr: Any, stream: Any, unit: str = "") -> None:
-        """``unit``: of the time, as it is written behind its name."""
+        """``unit``: of the time; empty where none is known."""
         self.rr, self.stream, self.unit = rr, stream, unit
         self.known: sr.Landscape | None = None
         self.scale = (0.0, 1.0)
@@ -50,10 +50,10 @@ class Terrain:
         self.stream.log(
             "landscape/map/g", self.rr.Transform3D(scale=SIDE / PIXELS), self.rr.Image(np.ascontiguousarray(image))
         )
-        (one, other), drawing, axes = landscape.names(), Drawing(), self._axes(landscape)
+        (one, other), drawing, axes = landscape.names(self.unit), Drawing(), self._axes(landscape)
         drawing.frame(axes, "", room=1.4)
-        drawing.text(axes.width / 2, axes.height + 56.0, f"across: {one}{self.unit}", ink.GREY)
-        drawing.text(axes.width / 2, -34.0, f"up: {other}{self.unit}", ink.GREY)
+        drawing.text(axes.width / 2, axes.height + 56.0, f"across: {one}", ink.GREY)
+        drawing.text(axes.width / 2, -34.0, f"up: {other}", ink.GREY)
         two = landscape.first[0] != landscape.second[0]
         weight = [f"epsilon {landscape.epsilon:.3g}"] if landscape.epsilon > 0.0 else []
         both = ["over the two indices that decide most"] if two else []
@@ -267,7 +267,7 @@ class Terrain:
                 labels=[f"best {landscape.value:.6g}"],
             ),
         )
-        names = landscape.names()
+        names = landscape.names(self.unit)
         flat = landscape.flat
         corners = {
             (0.5, -0.12, 0.0): f"{names[0]}: {across[0]:.3g} to {across[-1]:.3g}",

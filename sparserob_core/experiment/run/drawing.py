@@ -239,7 +239,7 @@ def landscape_of(
         title=title,
         epsilon=epsilon,
         axes=[across, up],
-        names=landscape.names(),
+        names=landscape.names("" if inspection.problem is None else printable(inspection.problem.names.time)),
         values=values,
         best=np.array([landscape.axes[k][landscape.at[k]] for k in (0, 1)]),
         best_value=landscape.value,

@@ -171,17 +171,18 @@ class Landscape:
         finite = np.isfinite(corners[0]) & np.isfinite(corners[1]) & np.isfinite(corners[2]) & np.isfinite(corners[3])
         return np.asarray(np.where(finite, mixed, nearest))
 
-    def names(self) -> tuple[str, str]:
-        """The two coordinates in words: ``t of the first deciding index``; just ``t`` where a tuple has a single
-        index."""
+    def names(self, unit: str = "") -> tuple[str, str]:
+        """The two coordinates in words: ``t of the earlier``; just ``t`` where a tuple has a single index. Behind a
+        time its ``unit``, where one is given: ``t of the earlier, in s``."""
         (one, c), (other, k) = self.first, self.second
+        in_unit = [f", in {unit}" if unit and self.g.kinds[place] == "time" else "" for place in (c, k)]
         if len(self.anchor) == 1:
-            return self.g.names[c], self.g.names[k]
+            return self.g.names[c] + in_unit[0], self.g.names[k] + in_unit[1]
         if c == k:
             which = ("the earlier", "the later") if self.g.kinds[c] == "time" else ("the lower", "the upper")
         else:
             which = ("the one", "the one" if one == other else "the other")
-        return f"{self.g.names[c]} of {which[0]}", f"{self.g.names[k]} of {which[1]}"
+        return f"{self.g.names[c]} of {which[0]}{in_unit[0]}", f"{self.g.names[k]} of {which[1]}{in_unit[1]}"
 
 
 @final
