@@ -10,7 +10,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from make_site import docstrings, generated
+from make_site import docstrings, generated, mathematics
 
 project = "SparseRob"
 author = "SparseRob contributors"
@@ -20,6 +20,7 @@ extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx_design", "sphinx_copybutt
 exclude_patterns = ["paper", "make_site", "figures", "**/.ipynb_checkpoints"]
 source_suffix = {".md": "myst-nb"}
 
+html_math_renderer = "mathml"
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 4
 # Pages also stand on their own in the repository: they link to files and folders beside docs/.
@@ -48,4 +49,5 @@ pygments_style, pygments_dark_style = "default", "github-dark"
 def setup(app: object) -> None:
     """The generated pages are written before the sources are read; docstrings are plain text, and are made safe."""
     generated.write()
+    mathematics.setup(app)  # type: ignore[arg-type]
     app.connect("autodoc-process-docstring", docstrings.made_safe)  # type: ignore[attr-defined]

@@ -23,7 +23,12 @@ LONG = {"experiment1_paper"}  # minutes: its pictures are in the paper's page
 def gallery() -> str:
     """The page."""
     PICTURES.mkdir(parents=True, exist_ok=True)
-    lines = ["# Gallery", "", "Every config of `configs/`, with what its run finds.", ""]
+    lines = [
+        "# Every config",
+        "",
+        "All of `configs/` in the order of their names, with what the run of each finds.",
+        "",
+    ]
     for config in sorted((ROOT / "configs").glob("*.yaml")):
         lines += _entry(config)
     return "\n".join(lines)

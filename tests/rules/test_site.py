@@ -59,6 +59,23 @@ def test_every_page_is_in_the_site():
     assert not [entry for entry in here if not (ROOT / "docs" / f"{entry}.md").exists()]
 
 
+@pytest.mark.skipif(find_spec("latex2mathml") is None, reason="the extra docs is not installed")
+def test_every_formula_of_a_page_is_set_without_a_script():
+    from make_site.mathematics import mathml
+
+    formulas = []
+    for page in [ROOT / "README.md", *(ROOT / "docs").glob("**/*.md")]:
+        text = re.sub(r"```.*?```|`[^`]*`", "", page.read_text(), flags=re.DOTALL)
+        formulas += re.findall(r"\$\$(.+?)\$\$|(?<!\\)\$([^$\n]+?)\$", text, re.DOTALL)
+    assert len(formulas) > 100
+    for display, inline in formulas:
+        assert mathml(display or inline, display=bool(display)).startswith("<math")
+    assert mathml(r"a &= b \\ c &= d").count("<mtr>") == 2
+    for unknown in (r"\nosuch x", r"\begin{nosuch} a & b \\ c & d \end{nosuch}"):
+        with pytest.raises(ValueError, match="not known"):
+            mathml(unknown)
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(
     any(find_spec(name) is None for name in ("sphinx", "myst_nb", "furo", "do_mpc", "pyomo")),
