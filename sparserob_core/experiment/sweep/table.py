@@ -61,8 +61,9 @@ MEANING = {
 
 
 def row_of(axes: Mapping[str, Any], summary: Mapping[str, Any] | None, run: str, digest: str, said: str = "") -> Row:
-    """A row: the values of the axes, then every number and text of ``summary`` (``result.json``), those inside an
-    object as ``object.name``. Without a summary the status is ``failed``, and ``said`` says why."""
+    """A row: the values of the axes, and the numbers of those that are lists as ``axis.0``, then every number and text
+    of ``summary`` (``result.json``), those inside an object as ``object.name``. Without a summary the status is
+    ``failed``, and ``said`` says why."""
     found: Row = {"status": "failed", "message": said} if summary is None else {}
     for name, value in (summary or {}).items():
         inside = dict(_entries(name, value))
@@ -70,7 +71,19 @@ def row_of(axes: Mapping[str, Any], summary: Mapping[str, Any] | None, run: str,
             found |= {
                 key: one for key, one in inside.items() if key not in LEFT and not isinstance(one, list | Mapping)
             }
-    return {**axes, **{key: one for key, one in found.items() if key not in axes}, "run": run, "hash": digest}
+    told = {**_numbers(axes), **axes}
+    return {**told, **{key: one for key, one in found.items() if key not in told}, "run": run, "hash": digest}
+
+
+def _numbers(axes: Mapping[str, Any]) -> Row:
+    """The entries of values that are lists of numbers, each under the key that the config has for it."""
+    lists = {key: value for key, value in axes.items() if isinstance(value, list | tuple)}
+    return {
+        f"{key}.{place}": one
+        for key, value in lists.items()
+        if all(isinstance(one, int | float) and not isinstance(one, bool) for one in value)
+        for place, one in enumerate(value)
+    }
 
 
 def _entries(name: str, value: Any) -> Iterator[tuple[str, Any]]:
@@ -86,10 +99,27 @@ def _entries(name: str, value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def columns_of(axes: Sequence[str], rows: Iterable[Row]) -> list[str]:
-    """The columns of a table: the axes, what is known of every run in a fixed order, then the rest by name."""
-    seen = {name for row in rows for name in row} - set(axes)
+    """The columns of a table: the axes, each before its entries where it has some, what is known of every run in a
+    fixed order, then the rest by name."""
+    kept = list(rows)
+    entries = {
+        axis: max((sum(_entry_of(name, axes) == axis for name in row) for row in kept), default=0) for axis in axes
+    }
+    first = [
+        name
+        for axis in axes
+        for name in (axis, *(f"{axis}.{place}" for place in range(entries[axis])))
+        if name == axis or name not in axes
+    ]
+    seen = {name for row in kept for name in row} - set(first)
     rest = sorted(seen - {*FIRST, *LAST})
-    return [*axes, *(name for name in (*FIRST, *rest, *LAST) if name not in axes)]
+    return [*first, *(name for name in (*FIRST, *rest, *LAST) if name not in first)]
+
+
+def _entry_of(name: str, axes: Sequence[str]) -> str | None:
+    """The axis of whose value a column holds one number."""
+    axis, _, place = name.rpartition(".")
+    return axis if axis in axes and place.isdigit() and name not in axes else None
 
 
 def table_text(axes: Sequence[str], rows: Sequence[Row]) -> str:
@@ -104,6 +134,8 @@ def columns_text(axes: Sequence[str], rows: Sequence[Row]) -> str:
     lines = [["column", "unit", "meaning"]]
     for name in columns_of(axes, rows):
         unit, meaning = ("", "an axis: this key of the config") if name in axes else MEANING.get(name, ("1", ""))
+        if axis := _entry_of(name, axes):
+            unit, meaning = "", f"the number at place {name.rpartition('.')[2]} of {axis}"
         lines.append([name, unit, meaning or (f"{name.partition('.')[2]} of {name.partition('.')[0]} in result.json")])
     return _csv(lines)
 

@@ -25,7 +25,7 @@ import pytest
 import sparserob_core as sr
 from sparserob_core.experiment.directory.lock import NAME, Lock
 from sparserob_core.experiment.sweep.study import read_study
-from sparserob_core.experiment.sweep.table import read_table
+from sparserob_core.experiment.sweep.table import columns_of, read_table, row_of
 from tests.experiment.cli.test_process import started, wait_for
 from tests.support.places import ROOT
 from tests.support.stub import CONFIG, Command
@@ -150,6 +150,26 @@ def test_a_study_leaves_what_is_documented(counting: Path, tmp_path: Path) -> No
         summary = json.loads((run / "result.json").read_text())
         assert (summary["cost"], summary["provenance"]["hash"]) == (row["cost"], row["hash"])
         assert (run / "config.yaml").is_file() and not (run / NAME).exists()
+
+
+def test_an_axis_of_lists_has_its_numbers_in_columns(counting: Path, tmp_path: Path) -> None:
+    boxes = [[1.0], [0.5], 2.0]
+    study = sr.sweep(counting, {"problem.control.box": boxes}, {"method.number": 3}, out=tmp_path / "out")
+    assert list(study.table[0])[:3] == ["problem.control.box", "problem.control.box.0", "status"]
+    assert [row["problem.control.box.0"] for row in study.table] == [1.0, 0.5, None]
+    assert [row["problem.control.box"] for row in read_table(study.directory)] == boxes
+    assert [row["problem.control.box.0"] for row in read_table(study.directory)] == [1.0, 0.5, None]
+    text = (study.directory / "columns.csv").read_text()
+    about = {one["column"]: one["meaning"] for one in csv.DictReader(io.StringIO(text))}
+    assert "place 0 of problem.control.box" in about["problem.control.box.0"]
+
+
+def test_numbers_of_an_axis_do_not_displace_another_axis() -> None:
+    row = row_of({"box": [1.0, 2.0], "box.1": 7}, {"status": "certified"}, "run", "hash")
+    assert (row["box"], row["box.0"], row["box.1"]) == ([1.0, 2.0], 1.0, 7)
+    assert columns_of(["box", "box.1"], [row])[:3] == ["box", "box.0", "box.1"]
+    assert "box.0" not in row_of({"box": [[0, 1], [2, 3]]}, None, "run", "hash")
+    assert "box.0" not in row_of({"box": [True]}, None, "run", "hash")
 
 
 def test_a_study_is_read_again_as_it_was(counting: Path, tmp_path: Path) -> None:
