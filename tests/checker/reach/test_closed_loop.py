@@ -15,7 +15,8 @@ from sparserob_core.checker.reach.directions import Directions
 from sparserob_core.checker.reach.measurable import MeasurableLoop
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import Enclosed
-from sparserob_core.control.sets.sets import Ellipsoid
+from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.sets.sets import Box, Ellipsoid
 from tests.support.closed_loops import EXACT, LOOPS, MEASURABLE, exponentials, gains
 
 H = np.array([[1.0, 0.0], [0.0, -1.0], [0.6, 0.8], [-1.0, 0.3]])
@@ -236,3 +237,22 @@ def test_an_excess_of_a_set_is_judged_in_the_unit_of_how_far_it_reaches():
                 over, slack, _ = directions.over(0, 0.25, 0.25, z, z)
                 assert over <= slack
                 assert slack == pytest.approx(TOLERANCE * radius, rel=1e-6)
+
+
+def test_an_innovation_adds_up_what_a_disturbance_did_on_every_part_of_its_piece():
+    """``x' = w`` on a grid that divides the pieces of the control: 1 after the first, nothing of it later."""
+    plant = LinearSystem(np.zeros((1, 1)), np.ones((1, 1)), E=np.ones((1, 1)))
+    grid, pieces = [0.0, 0.25, 0.5, 1.0, 1.5, 2.0, 3.0], [0.0, 1.0, 2.0, 3.0]
+    with ctx.workprec(96):
+        for changes, seen in (
+            ([0.0, 1.0, 2.0], [{}, {0: 1.0}, {1: 1.0}]),
+            ([0.0, 0.5, 1.5], [{}, {0: 0.5, 1: 0.5}, {1: 0.5, 2: 0.5}]),
+            ([0.0], [{}, {0: 1.0}, {0: 1.0}]),
+        ):
+            loop = ClosedLoop(
+                plant, [0.0], np.zeros((1, 3)), np.zeros((3, 3, 1, 1)), grid, pieces, changes, Box([-1.0], [1.0]), None
+            )
+            found = [{b: float(push[0, 0].mid()) for b, push in one.items()} for one in loop.seen]
+            assert found == seen
+    for start, stop, key, exact in ((0.0, 1.0, 1.0, True), (0.25, 1.0, 0.75, True), (1e-20, 1.0, 1.0, False)):
+        assert ClosedLoop._exact(start, stop, key) is exact
