@@ -284,5 +284,10 @@ def test_the_share_of_time_that_a_control_acts_is_that_of_what_is_not_dust():
     # where 0 is outside, a piece always counts
     always = case_of(Box([0.25], [1.0]), decision=((0.5, 0.5),))
     assert activity.least(always, [], None) == 1.0
+    # beside another channel that need not act: half of all, and nothing for the values that it must have
+    half = case_of(Box([0.25, -1.0], [1.0, 1.0]), decision=((0.5, 0.5), (0.0, 0.0)))
+    assert activity.least(half, [], None) == 0.5
+    below = case_of(Box([-1.0, -1.0], [-0.25, 1.0]), decision=((-0.5, -0.5), (0.0, 0.0)))
+    assert activity.least(below, [], None) == 0.5
     scaled = activity.shared(case, rows, None)[0][0]
     assert scaled[0] == pytest.approx(0.5)

@@ -223,6 +223,8 @@ def test_without_control_the_disturbance_adds_up_and_with_it_the_state_and_contr
     judged = claims()
     assert float(judged.disturbed(np.ones(1), 2.0, balls([0.25])[0]).mid()) == pytest.approx(0.5 + 0.5 - 0.25)
     assert float(judged.farthest(np.ones(1), np.zeros(1), 2.0, None).mid()) == pytest.approx(0.975)
+    assert float(judged.farthest(np.ones(1), np.zeros(1), 0.5, None).mid()) == pytest.approx(0.65 + 0.125)
+    assert float(judged.disturbed(np.ones(1), 0.5, balls([0.25])[0]).mid()) == pytest.approx(0.5 + 0.125 - 0.25)
     # x(2) + u_1 = 0.4 + w_1
     assert float(judged.farthest(np.ones(1), np.ones(1), 2.0, 1).mid()) == pytest.approx(0.65)
     assert float(judged.farthest(np.ones(1), -np.ones(1), 2.0, 1).mid()) == pytest.approx(0.8 + 0.25 + 0.25)

@@ -18,6 +18,7 @@ import sparserob_core as sr
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.claims import claims, constraints, replay
 from sparserob_core.checker.claims.case import Case
+from sparserob_core.checker.claims.causal import causal_bound
 from sparserob_core.checker.claims.cost import _integrated, _semidefinite
 from sparserob_core.checker.outcome import Broken, Clock, Finding, Unchecked
 from sparserob_core.checker.reach.flow import stacked
@@ -212,6 +213,10 @@ def test_a_set_of_parameters_that_is_no_box_is_filled_and_its_corners_are_not_in
     assert kept(case_of(below(worst * 1.01), certificate=square, **plant))
     with pytest.raises((Broken, Unchecked)):  # what would be proven wrongly would be within the time
         kept(replace(case_of(below(0.9 * worst), certificate=square, **plant), clock=Clock(0.4)))
+    halves = proof(([0.0, -0.5, -0.5], [2.0, 0.0, 0.5]), ([0.0, 0.0, -0.5], [2.0, 0.5, 0.5]))
+    for order in (1, -1):
+        cells = {name: ends if name == "tolerance" else ends[::order] for name, ends in halves.items()}
+        assert kept(case_of(below(worst * 1.1), certificate={"proof": {"path": cells}}, **plant))
     for low, high in (([-0.49, -0.5], [0.5, 0.5]), ([-0.5, -0.5], [0.5, 0.499])):
         with pytest.raises(Broken, match="leave out"):
             cells = {"proof": {"path": proof(([0.0, *low], [2.0, *high]))}}
@@ -363,8 +368,6 @@ def causal(cost="nominal", lower=None, priced=True, signals=((UP := (0.25, 0.25)
         **more,
     }
     case = case_of(certificate={"causal": said}, policy=AffinePolicy(cost=cost), terminal=[Box([-9.0], [0.7])])
-    from sparserob_core.checker.claims.causal import causal_bound
-
     return case, float(causal_bound(case, said, priced).mid())
 
 
@@ -392,6 +395,23 @@ def test_a_bound_against_every_causal_policy_is_by_hand():
                   {"rows": ((0, 0.0),)}, {"rows": ((0, -1.0),)}, {"rows": ((True, 1.0),)}):  # fmt: skip
         with pytest.raises(Broken):
             causal(**wrong)
+    case, _ = causal()
+    entry = case.certificate["causal"]["multipliers"][0]
+    for wrong in ({"direction": [1.0, 0.0]}, {"time": 1.0}, {"time": 2.1}, {"constraint": "nobody"}, {"signal": None}):
+        said = {**case.certificate["causal"], "multipliers": [{**entry, **wrong}]}
+        with pytest.raises(Broken):
+            causal_bound(case, said, priced=True)
+    for change in (
+        {"system": replace(case.problem.system, delay=0.5)},
+        {"system": uncertain(Box([-0.1], [0.1]))["system"]},
+        {"cost": sr.Cost(control={"R": [[1.0]]})},
+    ):
+        with pytest.raises(Unchecked):
+            causal_bound(
+                replace(case, problem=replace(case.problem, **change)), case.certificate["causal"], priced=True
+            )
+    with pytest.raises(Unchecked):
+        causal_bound(replace(case, policy=None), case.certificate["causal"], priced=True)
     case, _ = causal("peak", lower=0.79)
     assert "0.79" in claims._causal(case)
     for lower, cost in ((0.8 + 1e-9, "peak"), (None, "peak"), (1.0, "nominal")):
@@ -495,6 +515,11 @@ def test_the_unit_of_a_row_is_the_smallest_of_its_width_its_limit_and_how_far_it
     early = case_of(sr.PathConstraint(Box([-9.0], [9.0]), 0.0, 1.0))
     assert early.units(early.windows[0]).rows == pytest.approx([2.25, 2.25])
     assert early.units(early.windows[0]).sums == pytest.approx([2.25])
+    late = case_of(sr.PathConstraint(Box([-9.0], [9.0]), 0.5, 2.0))
+    assert late.units(late.windows[0]).rows == pytest.approx([3.5, 3.5])
+    moving = case_of(sr.PathConstraint(Box([-9.0], [9.0]), relative_to=np.array([[0.0, 1.0], [2.0, 1.0]])))
+    assert moving.units(moving.windows[0]).rows == pytest.approx([2.5, 2.5])
+    assert moving.units(moving.windows[0]).sums == pytest.approx([4.5])
     ball = case_of(NormBall(2.0, 3.0, centre=[0.5]))
     window = ball.windows[0]
     assert ball.units(window).slack(np.array([2.0]), window.limit(np.array([2.0]), 0.0)) == pytest.approx(
