@@ -80,6 +80,7 @@ def test_it_goes_on_from_its_state_as_if_it_had_never_stopped(name):
             text = json.dumps(broken.state())
         again = sr.ask_tell(**arguments, state=json.loads(text))
         assert again.evaluations == broken.evaluations
+        assert again.state() == broken.state(), "what was told is its own, not aside, before it is asked again too"
         assert again.ask().tolist() == asked, "what was asked and not told is asked again"
         by_hand(again)
         assert again.report().trace.points.tolist() == whole.report().trace.points.tolist()
