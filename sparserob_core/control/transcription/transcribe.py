@@ -17,6 +17,7 @@ from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.policies.policy import Policy
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.representable import require_representable
 from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.response.disturbance import DisturbanceModel, disturbance_model
 from sparserob_core.control.response.functional import WorstCase
@@ -88,6 +89,7 @@ def prepare(
                 f"{name} dictionary: a piece is {dictionary.lengths.min():.2g} long, "
                 f"which is rounding for a horizon of {problem.horizon:g}"
             )
+    require_representable(problem)
     refuse_without_steps(problem, control)
     if isinstance(policy, AffinePolicy):
         from sparserob_core.control.transcription.feedback import refuse

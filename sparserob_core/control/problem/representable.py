@@ -1,0 +1,60 @@
+"""Refuse problems whose numbers, or whose states, are too large to be computed with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+
+import numpy as np
+
+from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.errors import InputError, Path
+
+LARGEST = 1e75
+"""Numbers in a problem, and how much a state may grow until the horizon. Four of them are multiplied where a problem is
+put into its own units, and the product is a number; of ten times larger ones it is none. Of ten times smaller ones
+nothing else becomes possible: a double carries 16 digits, and no proof is left long before."""
+KEYS = {"initial_set": "initial_state", "stop": "to", "start": "from"}
+"""Fields that a config calls otherwise."""
+
+
+def require_representable(problem: OptimalControlProblem) -> None:
+    """Raise `InputError`, which begins with the key, for a number beyond `LARGEST`, and for a system that grows by more
+    than that within the horizon: ``e^(a T)``, ``a`` the largest real part of an eigenvalue of a mode."""
+    for path, value in _numbers(problem, ()):
+        _require_small(path, value)
+    last = 0.0
+    for i, mode in enumerate(problem.system.modes):
+        until = (*problem.system.switches, problem.horizon)[i]
+        place: Path = ("system", "pieces", i) if problem.system.switches else ("system",)
+        for name, values in zip("ABE", mode.forced.matrices(mode.probes), strict=True):
+            _require_small((*place, name), values)
+        A = mode.matrices(mode.probes)[0]
+        rate = float(np.linalg.eigvals(A).real.max())
+        if rate * (until - last) > np.log(LARGEST):
+            raise InputError(
+                path=(*place, "A"),
+                expected=f"a state that grows by at most {LARGEST:g} until the horizon",
+                got=f"e^({rate:.4g} * {until - last:.4g}), of an eigenvalue with the real part {rate:.4g}",
+            )
+        last = until
+
+
+def _require_small(path: Path, value: np.ndarray) -> None:
+    size = np.abs(value[np.isfinite(value)])
+    if size.max(initial=0.0) > LARGEST:
+        raise InputError(path=path, expected=f"numbers of at most {LARGEST:g} in size", got=f"{float(size.max()):g}")
+
+
+def _numbers(record: object, path: Path) -> Iterator[tuple[Path, np.ndarray]]:
+    """Every array and number of a record, with the keys that lead to it."""
+    if isinstance(record, np.ndarray) and record.dtype.kind == "f":
+        yield path, record
+    elif isinstance(record, float):
+        yield path, np.array([record])
+    elif isinstance(record, tuple | list):
+        for i, entry in enumerate(record):
+            yield from _numbers(entry, (*path, i))
+    elif is_dataclass(record):
+        for field in fields(record):
+            yield from _numbers(getattr(record, field.name, None), (*path, KEYS.get(field.name, field.name)))
