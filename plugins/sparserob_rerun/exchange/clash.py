@@ -33,9 +33,7 @@ def draw_clash(rr: Any, stream: Any, strips: Sequence[sr.Strip]) -> None:
 
 def _strip(drawing: Drawing, place: int, strip: sr.Strip) -> None:
     worst = (strip.best - strip.sigma_low, strip.best + strip.sigma_high)
-    shown = [v for v in (strip.low, strip.high, strip.reach_low, strip.reach_high, *worst) if np.isfinite(v)]
-    room = 0.1 * max(max(shown) - min(shown), 1e-9)
-    axes = Axes(LEFT, place * (HEIGHT + GAP), WIDTH, HEIGHT, (min(shown) - room, max(shown) + room), (0.0, 3.0))
+    axes = Axes(LEFT, place * (HEIGHT + GAP), WIDTH, HEIGHT, strip.view, (0.0, 3.0))
     (left, top), (right, bottom) = axes.at(axes.x[0], 3.0)[0], axes.at(axes.x[1], 0.0)[0]
     drawing.text((left + right) / 2, top - 34.0, strip.label.replace("\n", ", "))
     drawing.text((left + right) / 2, top - 14.0, _said(strip), ink.ORANGE)
@@ -46,8 +44,9 @@ def _strip(drawing: Drawing, place: int, strip: sr.Strip) -> None:
         if np.isfinite(edge):
             drawing.hatched("hatch", axes, (min(edge, end), max(edge, end)), (0.0, 3.0), ink.HATCH)
             drawing.line("wall", axes.at(np.full(2, edge), np.array([0.0, 3.0])), ink.VERMILLION, 2.0)
+    reach = np.clip((strip.reach_low, strip.reach_high), *axes.x)
     for layer, (low, high), height, colour in (
-        ("reach", (strip.reach_low, strip.reach_high), 2.1, ink.SKY),
+        ("reach", (float(reach[0]), float(reach[1])), 2.1, ink.SKY),
         ("worst", worst, 0.9, ink.ORANGE),
     ):
         if high > low:
@@ -60,7 +59,8 @@ def _strip(drawing: Drawing, place: int, strip: sr.Strip) -> None:
 def _said(strip: sr.Strip) -> str:
     down, up = f"{strip.sigma_low:.4g}", f"{strip.sigma_high:.4g}"
     moved = down if up in ("0", down) else up if down == "0" else f"{down} downwards and {up} upwards"
-    alone = f"the disturbance alone moves it by {moved}; " if moved != "0" else ""
+    unit = f" {strip.unit}" if strip.unit else ""
+    alone = f"the disturbance alone moves it by {moved}{unit}; " if moved != "0" else ""
     if strip.short > 0.0:
-        return f"{alone}the best that the control does, {strip.best:.4g}, still misses by {strip.short:.4g}"
+        return f"{alone}the best that the control does, {strip.best:.4g}{unit}, still misses by {strip.short:.4g}{unit}"
     return f"{alone}it can be met, but not together with the others"

@@ -267,7 +267,7 @@ def _fewest(case: Case, status: str) -> str:
         derived = _tree(case) / activity.largest(case)
         if not 0.0 <= written <= min(derived, acted if proven else np.inf) + FIGURES:
             raise Broken(f"lower is {written!r}, the leaves prove {derived!r}")
-        return f"no admissible control acts for a share of time below {written:.6g}"
+        return _at_least(case, written)
     if own is None and case.problem.cost.blocks and not case.problem.cost.is_quadratic:
         derived = activity.least_of_cost(case, _multiplied(case, priced=True))
     else:
@@ -276,8 +276,14 @@ def _fewest(case: Case, status: str) -> str:
         derived = activity.least(case, rows, pieces)
     if not 0.0 <= written <= derived + FIGURES or (proven and written > acted + FIGURES):
         raise Broken(f"lower is {written!r}, the multipliers prove {derived!r}")
-    least = f"no admissible control acts for a share of time below {written:.6g}"
-    return f"{least}, {'this' if other is case else 'another'} one for {acted:.6g}" if proven else least
+    least = _at_least(case, written)
+    return f"{least}, {'this' if other is case else 'another'} one {acted:.1%}" if proven else least
+
+
+def _at_least(case: Case, share: float) -> str:
+    """How little an admissible control acts, in the words of a run."""
+    mean = ", the mean over its channels" if case.problem.system.controls > 1 else ""
+    return f"every admissible control acts at least {share:.1%} of the time{mean}"
 
 
 def _other(case: Case, data: Mapping[str, Any]) -> Case:

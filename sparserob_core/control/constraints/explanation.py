@@ -96,9 +96,11 @@ class TimedExplanation(Explanation):
             return super().beyond(amount)
         reached, pushed = (self.free + self.sign * self.sigma) / self.scale, self.sigma / self.scale
         also = "" if " and " in self.cause else "s"
-        moved = f" under the worst {self.cause}, which move{also} it by {pushed:.4g}," if self.sigma > 0 else ""
+        moved = (
+            f" under the worst {self.cause}, which move{also} it by {pushed:.4g}{self._in}," if self.sigma > 0 else ""
+        )
         return (
-            f"{self.quantity} = {reached:.6g}{moved} is outside {self.bound} ({self.constraint}), "
+            f"{self.quantity} = {reached:.6g}{self._in}{moved} is outside {self.bound} ({self.constraint}), "
             f"whatever the decision{self._at}"
         )
 
@@ -121,7 +123,10 @@ class TimedExplanation(Explanation):
         if moved > 0:
             more, less = told_apart(moved / 2 / self.scale, allowed / 2 / self.scale)
             verb = "move" if " and " in self.cause else "moves"
-            return f"the {self.cause} alone {verb} {self.quantity} by {more}, {self._set} allows {less}{self._at}"
+            return (
+                f"the {self.cause} alone {verb} {self.quantity} by {more}{self._in}, {self._set} allows"
+                f" {less}{self._in}{self._at}"
+            )
         return f"{self.text} and {other.text} leave nothing between them{self._at}"
 
     def _uncontrollable(self, other: TimedExplanation, rest: Array, share: float, allowed: float, moved: float) -> str:
@@ -130,12 +135,13 @@ class TimedExplanation(Explanation):
         free = (self.sign * self.free + share * other.sign * other.free) / self.scale
         rest, allowed, moved = rest / self.scale, allowed / self.scale, moved / self.scale
         most = "at least" if side < 0 else "at most"
-        taken = f" less {moved:.4g} for the worst {self.cause}s" if moved > 0 and side > 0 else ""
-        taken = f" and {moved:.4g} more for the worst {self.cause}s" if moved > 0 and side < 0 else taken
+        unit = measured_in(rest, self.names)
+        taken = f" less {moved:.4g}{unit} for the worst {self.cause}s" if moved > 0 and side > 0 else ""
+        taken = f" and {moved:.4g}{unit} more for the worst {self.cause}s" if moved > 0 and side < 0 else taken
         quantity = combination(side * rest, self.names, f"({self.time:.6g})")
         return (
-            f"the control cannot move {quantity}, which is {side * free:.6g}, "
-            f"but {self.statement} and {other.statement} ask for {most} {side * allowed:.6g}{taken}"
+            f"the control cannot move {quantity}, which is {side * free:.6g}{unit}, "
+            f"but {self.statement} and {other.statement} ask for {most} {side * allowed:.6g}{unit}{taken}"
         )
 
     def out_of_reach(self, amount: float, needed: float) -> str:
@@ -143,14 +149,25 @@ class TimedExplanation(Explanation):
             return super().out_of_reach(amount, needed)
         amount, needed = amount / self.scale, needed / self.scale
         if needed - amount < 0:
-            return f"{self.text} is violated by at least {amount:.4g}, whatever the control{self._at}"
+            return f"{self.text} is violated by at least {amount:.4g}{self._in}, whatever the control{self._at}"
         verb = "raise" if self.sign < 0 else "lower"
-        pushed = f", {self.sigma / self.scale:.4g} of it for the worst {self.cause}" if self.sigma > 0 else ""
+        pushed = f", {self.sigma / self.scale:.4g}{self._in} of it for the worst {self.cause}" if self.sigma > 0 else ""
         can, must = told_apart(needed - amount, needed)
         return (
-            f"the control can {verb} {self.quantity} by at most {can}, and {must} is needed{pushed}: "
-            f"without control it is {self.free / self.scale:.4g}, {self._set} asks for {self.bound}{self._at}"
+            f"the control can {verb} {self.quantity} by at most {can}{self._in}, and {must}{self._in} is needed"
+            f"{pushed}: without control it is {self.free / self.scale:.4g}{self._in}, {self._set} asks for"
+            f" {self.bound}{self._at}"
         )
+
+    @property
+    def unit(self) -> str:
+        """What the quantity is measured in; empty where that is not known."""
+        return self._in.strip()
+
+    @property
+    def _in(self) -> str:
+        normal = self.direction if self.gain is None else np.concatenate([self.direction, self.gain])
+        return measured_in(normal, self.names, self.direction.size)
 
     @property
     def _at(self) -> str:
@@ -192,12 +209,15 @@ def explanation(
         combination(sign * normal / scale, functionals.names, f"({time:.6g})", direction.size),
         system.describe(parameter) if parameter.size else "",
     )
-    remarks = [f"the initial state gives {free / scale:.6g}"] if time <= 0 else []
+    unit = measured_in(normal, functionals.names, direction.size)
+    remarks = [f"the initial state gives {free / scale:.6g}{unit}"] if time <= 0 else []
     remarks += (
-        [f"the {cause} alone {'move' if len(names) > 1 else 'moves'} it by {sigma / scale:.4g}"] if sigma > 0 else []
+        [f"the {cause} alone {'move' if len(names) > 1 else 'moves'} it by {sigma / scale:.4g}{unit}"]
+        if sigma > 0
+        else []
     )
     remarks += [f"at {where}"] if where else []
-    statement = f"{name}: {quantity} {'>=' if sign < 0 else '<='} {limit / scale:.6g}"
+    statement = f"{name}: {quantity} {'>=' if sign < 0 else '<='} {limit / scale:.6g}{unit}"
     opposite = _opposite(H if mixed is None else np.hstack([H, mixed[0]]), h, row)
     return TimedExplanation(
         f"{statement} ({', '.join(remarks)})" if remarks else statement,
@@ -216,7 +236,8 @@ def explanation(
             limit / scale,
             None if opposite is None else opposite / scale,
             sign,
-        ),
+        )
+        + unit,
         limit=limit,
         free=free,
         sigma=sigma,
@@ -240,6 +261,20 @@ def combination(direction: Array, names: Names, suffix: str = "", states: int | 
         name = names.state(int(state)) if state < last else names.control(int(state) - last)
         parts.append(f"{sign}{' ' if parts else ''}{'' if size == 1 else f'{size:.4g} '}{name}{suffix}")
     return " ".join(parts) or "0"
+
+
+def measured_in(normal: Array, names: Names, states: int | None = None) -> str:
+    """The unit of a combination, with a space before it, where all that it adds up has the same; empty elsewhere. What
+    is beyond the number of ``states`` is the control's."""
+    last = normal.size if states is None else states
+    units = {
+        (names.state_units[i] if names.state_units else "")
+        if i < last
+        else (names.control_units[i - last] if names.control_units else "")
+        for i in np.flatnonzero(normal).tolist()
+    }
+    unit = units.pop() if len(units) == 1 else ""
+    return f" {unit}" if unit else ""
 
 
 def _opposite(H: Array, h: Array, row: int) -> float | None:

@@ -182,7 +182,9 @@ def _result(loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Verdicts:
     left += [name for name in summary if name not in known]
     for name, read in (("worst", WORST), ("sparsity", SPARSITY)):
         left += sorted(_besides(name, summary.get(name), read)) if name not in left else []
-    return different, "it says what the certificate says", left
+    share = None if different or "sparsity" in left else summary["sparsity"]["active_fraction"]
+    acts = "" if share is None else f"; its control acts {share:.1%} of the time"
+    return different, f"it says what the certificate says{acts}", left
 
 
 def _causal(case: Case) -> dict[str, tuple[object, ...]]:

@@ -3,7 +3,6 @@ can bring its quantity, and what is allowed."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
@@ -13,8 +12,7 @@ import numpy as np
 from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.figures import style as look
-from sparserob_core.experiment.terminal.printing import printable
-from sparserob_core.sip.convex_set import Array
+from sparserob_core.experiment.figures.figure_data import plain
 from sparserob_core.sip.evidence import Cut
 from sparserob_core.sip.program import ConstraintFamily, SemiInfiniteProgram
 from sparserob_core.sip.proof.reasons import least_of, reasons
@@ -29,6 +27,9 @@ if TYPE_CHECKING:
 
 SHOWN = 8  # quantities at most
 BAR = 0.16  # half the height of a bar
+ROOM = (
+    0.3  # of what a picture shows, on either side: of a tenth a wall stands at its edge, of ten times is a line again
+)
 
 
 @final
@@ -36,7 +37,7 @@ BAR = 0.16  # half the height of a bar
 class Strip:
     """One quantity ``label``: allowed in ``[low, high]``, brought by the control to ``[reach_low, reach_high]`` where
     nothing disturbs it, and moved from there by the worst disturbance by ``sigma_low`` downwards and ``sigma_high``
-    upwards."""
+    upwards; all of them in ``unit``, empty where none is known."""
 
     label: str
     low: float
@@ -45,6 +46,16 @@ class Strip:
     reach_high: float
     sigma_low: float
     sigma_high: float
+    unit: str = ""
+
+    @property
+    def view(self) -> tuple[float, float]:
+        """What a picture shows: what is allowed, and what the worst disturbance makes of the best, with room around
+        them. The control may reach a thousand times farther, and a wall would be a line."""
+        ends = [self.low, self.high, self.best - self.sigma_low, self.best + self.sigma_high]
+        shown = [value for value in ends if np.isfinite(value)]
+        room = ROOM * max(max(shown) - min(shown), 1e-9)
+        return min(shown) - room, max(shown) + room
 
     @property
     def short(self) -> float:
@@ -82,23 +93,18 @@ def clash_figure(experiment: Experiment, result: Result) -> Figure:
             "figures: the constraints that clash are none on a single combination of states; there is nothing to draw"
         )
     look.require_matplotlib()
+    from matplotlib.figure import Figure
+
     with look.style():
-        figure, axes = look.panels(1, 0.62 * len(strips) + 0.5, extra=0.35)
-        _draw(axes[0], strips)
+        figure = Figure(figsize=(look.WIDTH, 0.95 * len(strips) + 1.15), layout="constrained")
+        axes = list(figure.subplots(len(strips), 1, squeeze=False)[:, 0])
+        for ax, strip in zip(axes, strips, strict=True):
+            _draw(ax, strip)
         alone = any(strip.short > 0.0 for strip in strips)
-        axes[0].set_title(printable(experiment.title), pad=8 if alone else 22)
-        if not alone:
-            axes[0].text(
-                0.0,
-                1.0,
-                "each of them can be met, but not all by one control",
-                transform=axes[0].transAxes,
-                fontsize=9.5,
-                color=look.GREY,
-                va="bottom",
-            )
-        axes[0].set_xlabel("value of the quantity")
-        entries = dict(zip(*reversed(axes[0].get_legend_handles_labels()), strict=True))
+        rest = "" if alone else "\neach of them can be met, but not all by one control"
+        figure.suptitle(plain(experiment.title) + rest, x=0.01, ha="left", fontsize=11.5)
+        handles = [axes_handles for ax in axes for axes_handles in zip(*ax.get_legend_handles_labels(), strict=True)]
+        entries = {label: handle for handle, label in handles}
         figure.legend(
             entries.values(), entries.keys(), loc="outside lower center", ncols=2, columnspacing=1.6, handlelength=1.6
         )
@@ -149,6 +155,7 @@ def _strip(program: SemiInfiniteProgram, family: ConstraintFamily, cut: Cut) -> 
         reach[1],
         sigmas.get(-1.0, 0.0),
         sigmas.get(1.0, 0.0),
+        said.unit,
     )
 
 
@@ -156,37 +163,23 @@ def _reduced(program: SemiInfiniteProgram, family: ConstraintFamily) -> SemiInfi
     return SemiInfiniteProgram(n=program.n, families=[family])
 
 
-def _draw(ax: Axes, strips: Sequence[Strip]) -> None:
-    left, right = _view(strips)
+def _draw(ax: Axes, strip: Strip) -> None:
+    left, right = strip.view
     ax.set_xlim(left, right)
-    for position, strip in enumerate(strips):
-        y = len(strips) - 1.0 - position
-        _forbidden(ax, strip, y, left, right)
-        _bar(
-            ax,
-            strip.best - strip.sigma_low,
-            strip.best + strip.sigma_high,
-            y - 0.17,
-            look.ORANGE,
-            "what the worst disturbance makes of its best",
-        )
-        _bar(ax, strip.reach_low, strip.reach_high, y + 0.17, look.BLUE, "where the control can bring it")
-        ax.plot([strip.best], [y - 0.17], "|", color=look.INK, markersize=9, zorder=4, linewidth=0, label="its best")
-        if strip.short > 0.0:
-            ax.annotate(
-                f"misses by {strip.short:.3g}",
-                (right, y - 0.3),
-                xytext=(-3, 0),
-                textcoords="offset points",
-                ha="right",
-                va="center",
-                fontsize=9,
-                bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0},
-                zorder=5,
-            )
-    ax.set_yticks([len(strips) - 1.0 - k for k in range(len(strips))], [strip.label for strip in strips])
-    ax.set_ylim(-0.6, len(strips) - 0.4)
+    _forbidden(ax, strip, 0.0, left, right)
+    worst = "what the worst disturbance makes of its best"
+    _bar(ax, strip.best - strip.sigma_low, strip.best + strip.sigma_high, -0.17, look.ORANGE, worst)
+    _bar(ax, strip.reach_low, strip.reach_high, 0.17, look.BLUE, "where the control can bring it")
+    ax.plot([strip.best], [-0.17], "|", color=look.INK, markersize=9, zorder=4, linewidth=0, label="its best")
+    unit = f" {plain(strip.unit)}" if strip.unit else ""
+    said = [f"misses by {strip.short:.3g}{unit}"] if strip.short > 0.0 else []
+    if strip.reach_low < left or strip.reach_high > right:
+        said.append(f"the control reaches {strip.reach_low:.3g} to {strip.reach_high:.3g}{unit}")
+    ax.set_title("  ·  ".join(said), loc="right", fontsize=9, color=look.INK, pad=2)
+    ax.set_yticks([0.0], [plain(strip.label)])
+    ax.set_ylim(-0.45, 0.45)
     ax.tick_params(axis="y", length=0)
+    ax.set_xlabel(plain(strip.unit), labelpad=1)
 
 
 def _forbidden(ax: Axes, strip: Strip, y: float, left: float, right: float) -> None:
@@ -213,23 +206,3 @@ def _bar(ax: Axes, low: float, high: float, y: float, colour: str, label: str) -
         ax.barh([y], [high - low], left=[low], height=BAR, linewidth=0, label=label, **look_of)
     elif colour == look.BLUE:
         ax.plot([low], [y], "o", markersize=5.5, markeredgewidth=0, **look_of)
-
-
-def _view(strips: Sequence[Strip]) -> tuple[float, float]:
-    values: Array = np.array(
-        [
-            value
-            for strip in strips
-            for value in (
-                strip.low,
-                strip.high,
-                strip.reach_low,
-                strip.reach_high,
-                strip.best - strip.sigma_low,
-                strip.best + strip.sigma_high,
-            )
-        ]
-    )
-    shown = values[np.isfinite(values)]
-    room = 0.08 * max(float(shown.max() - shown.min()), 1e-9)
-    return float(shown.min()) - room, float(shown.max()) + room

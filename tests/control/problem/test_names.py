@@ -1,9 +1,12 @@
 """Guards names and units of a problem, and plants of other packages: they reach every text and change no number."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.experiment.figures.clash import clash_strips
 
 A, B = [[0.0, 1.0], [-2.0, -0.5]], [[0.0], [1.0]]
 NAMES = sr.Names(states=["height", "speed"], controls=["thrust"], state_units=["m", "m/s"], time="s")
@@ -26,8 +29,19 @@ def test_a_reason_says_the_names_and_without_them_the_same():
     named = sr.solve(problem(NAMES, 0.09), control={"name": "piecewise_constant", "pieces": 20})
     plain = sr.solve(problem(sr.Names(), 0.09), control={"name": "piecewise_constant", "pieces": 20})
     assert named.status == plain.status == "infeasible"
-    assert "speed(5)" in named.message
-    assert named.message.replace("height", "x1").replace("speed", "x2") == plain.message
+    assert "speed(5) by 0.3947 m/s" in named.message and "allows 0.3 m/s" in named.message
+    without = named.message.replace(" m/s", "").replace(" m", "")
+    assert without.replace("height", "x1").replace("speed", "x2") == plain.message.replace(" m", "")
+
+
+def test_the_strips_of_a_clash_are_in_their_units_and_show_what_misses_what():
+    named = sr.solve(problem(NAMES, 0.09), control={"name": "piecewise_constant", "pieces": 20})
+    strip = next(one for one in clash_strips(named.model.program, named) if one.label.startswith("speed(5)"))
+    assert strip.unit == "m/s"
+    left, right = strip.view
+    assert left < strip.best - strip.sigma_low < strip.low < strip.high < strip.best + strip.sigma_high < right
+    far = replace(strip, reach_low=-1e3, reach_high=1e3)
+    assert far.view == pytest.approx(strip.view, abs=2.0 * (right - left))
 
 
 def test_names_change_no_number():
