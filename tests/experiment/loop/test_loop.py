@@ -85,6 +85,21 @@ def test_a_loop_that_is_solved_anew_pays_less(config, tmp_path) -> None:
     assert not anew.contradicts
 
 
+def test_re_solves_are_asked_of_the_solver_that_the_config_names(tmp_path, monkeypatch) -> None:
+    clarabel = pytest.importorskip("sparserob_clarabel").Clarabel
+    asked, solve = [], clarabel.solve
+    monkeypatch.setattr(clarabel, "solve", lambda *one: (asked.append(one), solve(*one))[1])
+    known = {key: value for key, value in BASE.items() if key != "policy"}
+    known["problem"] = {**known["problem"], "disturbance": {"box": [0.02, 0.02]}}
+    changes = {"solver.name": "clarabel", "dictionaries.control.pieces": 5}
+    outcome = sr.run(known, changes, out=tmp_path / "run", quiet=True, figures=False)
+    asked.clear()
+    sr.loop(outcome, False, 1)
+    assert not asked
+    assert sr.loop(outcome, True, 1).resolved > 0
+    assert asked
+
+
 @pytest.mark.usefixtures("drafts")
 def test_the_command_runs_a_config_and_closes_the_loop(config, tmp_path, capsys) -> None:
     out = tmp_path / "run"

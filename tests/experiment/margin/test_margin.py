@@ -50,6 +50,17 @@ def test_a_disturbance_may_grow_until_it_fills_the_terminal_set():
     assert np.allclose(found.amounts, 0.25, atol=1e-6)
 
 
+def test_the_solver_that_a_config_names_answers_the_programs_of_a_margin(monkeypatch: pytest.MonkeyPatch) -> None:
+    clarabel = pytest.importorskip("sparserob_clarabel").Clarabel
+    asked, solve = [], clarabel.solve
+    monkeypatch.setattr(clarabel, "solve", lambda *one: (asked.append(one), solve(*one))[1])
+    stated = config(disturbance={"box": [0.0, 0.1]}, terminal=[{"box": [None, 0.5]}])
+    assert_encloses(sr.margin(stated, of="disturbance"), 2.5)
+    assert not asked
+    assert_encloses(sr.margin(stated, "disturbance", {"solver.name": "clarabel"}), 2.5)
+    assert asked
+
+
 def test_a_disturbance_that_is_not_centred_grows_about_its_centre():
     """w2 in [0, 0.2]: the middle 0.1 is met by the control, the rest 0.1 f moves x2(2) by 0.2 f."""
     found = sr.margin(
