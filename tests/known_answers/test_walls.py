@@ -9,6 +9,8 @@ import pytest
 from scipy.optimize import linprog
 
 import sparserob_core as sr
+from sparserob_core.experiment.run import run as run_module
+from sparserob_core.sip.method import Deadline
 
 LOSS, GUST, WALL, START = (0.3, 0.5), 0.1, 1.0, 2.0
 
@@ -58,6 +60,103 @@ def test_a_wall_that_is_ridden_all_day_takes_few_rounds_however_long_the_day(pie
     assert result.status == "certified"
     assert abs(result.cost - least_heat(pieces)) <= 1e-6 * result.cost
     assert result.counts["rounds"] <= 12
+
+
+def ridden(wall: str, pieces: int, uncertain: bool = False, feedback: bool = False) -> dict[str, Any]:
+    """``x' = -a x + u + w``, one state or two, along a wall that is sloped or has bends, or inside an ellipse that
+    moves: the cheapest control rides it all the time."""
+    horizon = pieces / 4
+    bent = [[0, 1.5], [1, 1.5], [2, 1.5 + horizon / 8], [3, 1.5 + horizon / 8], [4, 1.5]]
+    along = {
+        "sloped": [[0, 1.5], [horizon, 1.5 + horizon / 8]],
+        "moving": [[row[0] * horizon / 4, row[1]] for row in bent],
+        "curved": [[0, 1.5, 1.0], [horizon, 1.5 + horizon / 16, 1.0 + horizon / 12]],
+    }[wall]
+    size = len(along[0]) - 1
+    A = [[("-a" if uncertain else -0.5) if i == j else 0 for j in range(size)] for i in range(size)]
+    flat, round_ = {"polytope": {"H": [[-1.0]], "h": [0.0]}}, {"ellipsoid": {"shape": [[0.04, 0], [0, 0.02]]}}
+    names = ("control",) if feedback else ("control", "disturbance")
+    return {
+        "problem": {
+            "name": "linear",
+            "system": {"A": A, "B": np.eye(size).tolist(), **({"parameters": {"a": [0.45, 0.5]}} if uncertain else {})},
+            "horizon": horizon,
+            "initial_state": [1.6, 1.0][:size],
+            "control": {"box": {"lower": [0.0] * size, "upper": [6.0] * size}},
+            "disturbance": {"box": [0.02] * size},
+            "path": [{**(flat if size == 1 else round_), "relative_to": along, "from": 0.25}],
+        },
+        "dictionaries": {name: {"name": "piecewise_constant", "pieces": pieces} for name in names},
+        "observers": [],
+        **({"policy": {"name": "affine"}} if feedback else {}),
+    }
+
+
+@pytest.mark.parametrize(
+    ("wall", "uncertain", "feedback", "most"),
+    [
+        ("sloped", False, False, 6),
+        ("sloped", True, False, 11),
+        ("moving", False, False, 14),
+        pytest.param("moving", True, False, 16, marks=pytest.mark.slow),
+        pytest.param("moving", False, True, 14, marks=pytest.mark.slow),
+    ],
+)
+def test_a_wall_that_moves_takes_no_more_rounds_the_longer_it_is_ridden(
+    wall: str, uncertain: bool, feedback: bool, most: int
+) -> None:
+    for pieces in (8, 16) if feedback else (8, 32):
+        result = sr.run(ridden(wall, pieces, uncertain, feedback), quiet=True, figures=False).result
+        assert result.status == "certified"
+        assert result.counts["rounds"] <= most
+
+
+class Clock(Deadline):
+    """A limit of a minute that is over after so many looks at it, whatever the clock says."""
+
+    looks = 8
+
+    def __init__(self, seconds: float | None = None) -> None:
+        super().__init__(60.0)
+        self.looked = 0
+
+    def check(self) -> None:
+        self.looked += 1
+        super().check()
+
+    @property
+    def used(self) -> float:
+        return min(1.0, self.looked / self.looks)
+
+    @property
+    def passed(self) -> bool:
+        return self.looked > self.looks or super().passed
+
+    @property
+    def reason(self) -> str:
+        return "the limit of 60 s is reached" if self.looked > self.looks else super().reason
+
+
+@pytest.mark.parametrize(
+    ("wall", "uncertain", "feedback", "method", "looks"),
+    [
+        ("moving", False, True, "exchange", 8),
+        ("moving", True, False, "exchange", 36),
+        ("moving", True, False, "sparsest", 36),
+        pytest.param("moving", True, False, "reweighted", 36, marks=pytest.mark.slow),
+    ],
+)
+def test_a_limit_leaves_a_proven_control_whatever_the_method(
+    wall: str, uncertain: bool, feedback: bool, method: str, looks: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_module, "Deadline", Clock)
+    monkeypatch.setattr(Clock, "looks", looks)
+    given = {**ridden(wall, 16, uncertain, feedback), "method": {"name": method}}
+    result = sr.run(given, quiet=True, figures=False).result
+    assert result.stopped == "the limit of 60 s is reached"
+    assert result.status == "verified"
+    assert result.lower_bound < result.upper_bound < 1.2 * result.lower_bound or method == "sparsest"
+    assert np.isfinite(result.upper_bound)
 
 
 def heating() -> dict[str, Any]:

@@ -17,7 +17,7 @@ from sparserob_core.sip.convex_set import Array, Box
 from sparserob_core.sip.finite import UncertainRows
 from sparserob_core.sip.program import ConstraintFamily, Enclosure, Explanation, Separation
 
-KEPT = 12  # separated times for each row and round
+KEPT = 64  # separated times for each row and round
 ZOOMED, ZOOMS, CLOSER = 9, 14, 4.0  # samples around a maximum, and how often they are drawn so many times closer
 NEAR, FEW = 1e-3, 4  # maxima that are so near to their limit are refined, and so many in any case
 HALVINGS, HALVED = 14, 200  # how often samples are drawn closer, and how many intervals at a time
@@ -245,7 +245,7 @@ class FeedbackConstraint:
         cells = np.arange(times.size - 1)
         for _ in range(HALVINGS):
             lower, upper = times[cells], times[cells + 1]
-            bounds = (self.loop.bounds(x, lower, upper, self.flat.H) - self.flat.h).max(axis=1)
+            bounds = self.enclosure(x, lower[:, None], upper[:, None]).bounds
             ends = np.maximum(values[cells], values[cells + 1]).max(axis=1)
             hidden = (bounds > HIDDEN) & (bounds - ends > SHARE * np.maximum(bounds, ends.max(initial=0.0)))
             if not hidden.any():

@@ -269,7 +269,7 @@ class FlatConstraint(StateConstraint):
     def _worst(self, x: Float[Array, " n"]) -> Separation:
         values = self.on_lattice(x)
         positions = local_maxima(values, self.lattice[1], KEPT)
-        positions = np.concatenate([positions, self._along(values, positions)])
+        positions = np.concatenate([positions, self._along(values, positions), self._beside(values)])
         heights, rows = values[tuple(positions.T)], positions[:, 1]
         indices = np.hstack([self.times[positions[:, 2], None], self.lattice[0][positions[:, 0]]])
         found = heights
@@ -294,6 +294,30 @@ class FlatConstraint(StateConstraint):
             pieces = self.commanded(indices[order, 0])
             order = order[(rows[order] < self.samples.proven) | (pieces[:, 0] != pieces[:, -1])]
         return Separation(indices[order], rows[order], found[order])
+
+    def _beside(self, values: Array) -> np.ndarray:
+        """Positions ``(k, 3)`` in ``values (v, r, times)`` next to times at which anything turns or jumps, where the
+        violation may rise above 0 before the next samples, at most `KEPT` before and `KEPT` behind such times: a
+        parabola across a kink does not see that, one on either side of it does."""
+        found = [np.zeros((0, 3), dtype=int)]
+        for step in (-1, 1):
+            at = self._kinks[(self._kinks + 2 * step >= 0) & (self._kinks + 2 * step < self.times.size)]
+            near, far = (np.abs(self.times[at + k * step] - self.times[at]) for k in (1, 2))
+            here, next_, last = (values[:, :, at + k * step] for k in (0, 1, 2))
+            rate = (next_ - here) / near
+            bend = ((last - next_) / (far - near) - rate) / far
+            slope = rate - bend * near
+            # The vertex is slope / (-2 bend) away and slope^2 / (-4 bend) higher, of which parabolas may be wrong by 4.
+            rises = (slope > 0.0) & (slope < -2.0 * bend * far) & (slope**2 >= bend * here)
+            v, r, t = rises.nonzero()
+            order = np.argsort(-here[v, r, t], kind="stable")[:KEPT]
+            found.append(np.stack([v[order], r[order], at[t[order]] + step], axis=1))
+        return np.concatenate(found)
+
+    @cached_property
+    def _kinks(self) -> np.ndarray:
+        """The sampled times at which anything turns or jumps, and the ends."""
+        return np.flatnonzero(np.isin(self.times, np.concatenate([[self.start], self.samples.cuts, [self.stop]])))
 
     def _along(self, values: Array, maxima: np.ndarray) -> np.ndarray:
         """Positions ``(k, 3)`` in ``values (v, r, times)`` along spans where a row is violated and none of its ``maxima

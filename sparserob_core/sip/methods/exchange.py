@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, NamedTuple, TypeAlias
+from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -23,8 +23,23 @@ from sparserob_core.sip.finite import FiniteSolution
 from sparserob_core.sip.inner.vertex import MANY, vertex
 from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.methods.counting import count, met, tidied
-from sparserob_core.sip.methods.ledger import THINNER, Answer, Found, Ledger, Prover, prover_of
-from sparserob_core.sip.program import EQUALITY, TOLERANCE, ConstraintFamily, SemiInfiniteProgram, Separation
+from sparserob_core.sip.methods.ledger import (
+    ALLOWED,
+    THINNER,
+    Answer,
+    Found,
+    Ledger,
+    Missed,
+    Prover,
+    Violated,
+    above,
+    or_proven,
+    proofs_of,
+    prover_of,
+    secure_in_time,
+    witnesses,
+)
+from sparserob_core.sip.program import EQUALITY, SemiInfiniteProgram
 from sparserob_core.sip.proof.verdict import worst_of
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows, rows_at
 from sparserob_core.sip.result import SMALL_COST, Result
@@ -37,21 +52,9 @@ SMALLEST_MARGIN, LARGEST_MARGIN = 1e-15, 1e-6  # in units of the decision's boun
 FASTEST = 0.125  # of a weight, what steps of the continuation that are taken at once may leave
 CRUDE = 1e-4  # residual and relative gap of a relaxed solution that a round can do with
 SPARSIFYING = 60  # rounds after which no vertex is looked for any more
-ALLOWED = TOLERANCE / 2  # a violation that the search may leave to the proof
-# Cells for the first look at a decision. With a tenth of them, decisions of ordinary problems with parameters are
-# secured that are proven at once; with ten times as many, who rides a wall waits ten times longer for a first bound.
-GLANCE = 4096
 # Active rows at which a margin may cost a quarter of the tolerated gap. With ten times as many, a day on a wall takes
 # twice as many cells; with a tenth of them, costs of ordinary problems are 2e-8 of themselves above the least.
 MANY_ACTIVE = 32
-DUE = (0.4, 0.65, 0.85)  # shares of a limit after which a decision is secured, where none is proven yet
-SECURED = 6  # distances at which that is tried, each at least twice what the one before has left open
-# Of the cost, what the distance may cost at first. A tenth of it takes three times as many cells along a wall that is
-# ridden; ten times as much is a bound that nobody is content with.
-SPARED = 1e-3
-PAID = 2.0  # of what is left open, what the rows are tightened by: half of it is for what the new optimum violates
-
-Violated: TypeAlias = Sequence[tuple[Array, np.ndarray, str]]  # indices (k, d), rows (k,) and the name of a family
 
 
 class Exchange(Method, Options):
@@ -119,18 +122,20 @@ class Exchange(Method, Options):
             x = answer.solution.x
             ledger.best = ledger.best or answer
             found: Found = separate(program, x, tools, ALLOWED, number)
-            violated: Violated = [_above(family, separation) for family, separation in found]
+            violated: Violated = [above(family, separation) for family, separation in found]
             suggested = _suggested(program, x, violated)
             ledger.tell(number, answer, found, suggested, kept=working.rows.h.size)
 
             kept = (answer, found) if np.isfinite(suggested) else kept
 
             # Secure: where time runs out, prove a decision that keeps away from the constraints while there is some.
-            _secure_in_time(working, ledger, prover, answer, found)
+            imposed = secure_in_time(working, ledger, prover, answer, found, number)
 
             # Exchange: impose them, drop what has been idle; tighten the rows that are violated though imposed.
             # Sharpen: nothing is violated but the bounds have not met, so do without the regulariser.
-            exchanged = not last and (working.exchange(answer, violated, number) or working.tighten(violated))
+            exchanged = not last and (
+                working.exchange(answer, violated, number) or imposed or working.tighten(violated)
+            )
             if exchanged or (not last and self.exact and ledger.open(x) and working.sharpen(ledger, x)):
                 continue
 
@@ -143,9 +148,9 @@ class Exchange(Method, Options):
             # Prove: over the whole continuum; a witness that the proof meets is one more index to impose.
             if not self.exact:
                 working.plain_bound(ledger)
-            proofs = _proofs(working, ledger, prover, answer, found)
+            proofs, imposed = proofs_of(working, ledger, prover, answer, found)
             # What rounding may do, where it alone keeps a proof open, is allowed for like the solver's accuracy.
-            again = working.exchange(answer, _witnesses(program, proofs), number) or working.allow_for(proofs)
+            again = imposed or working.exchange(answer, witnesses(program, proofs), number) or working.allow_for(proofs)
             if last or tools.deadline.passed or not again:
                 result = ledger.judged(answer, worst_of(found), proofs, self._ending(ledger, answer, last))
                 return _or_earlier(ledger, result, answer, kept, prover)
@@ -224,19 +229,25 @@ class Working:
         fresh = self._unknown(violated)
         if not fresh.h.size:
             return 0
-        y, added = answer.multipliers, np.zeros(fresh.h.size)
+        known, added = answer.multipliers, np.zeros(fresh.h.size)
+        y = np.concatenate([known, np.zeros(self.rows.h.size - known.size)])  # none of what was imposed since
         idle = np.where(y > 0.0, 0, self.idle + 1)
         keep = (idle < IDLE_ROUNDS) | (number > DROPPING_ROUNDS)
         self.rows = self.rows.take(keep).joined(fresh)
         self.idle = np.concatenate([idle[keep], added.astype(int)])
-        fixed = answer.solution.y[: answer.solution.y.size - y.size]
+        fixed = answer.solution.y[: answer.solution.y.size - known.size]
         self.guess = replace(answer.solution, y=np.concatenate([fixed, y[keep], added]))
         return added.size
+
+    def impose(self, violated: Violated) -> int:
+        """See `Tightening`."""
+        before = self.rows.h.size
+        return self.rows.h.size - before if self.add(violated) else 0
 
     def add(self, rows: Violated) -> bool:
         """Impose rows that no solution speaks of yet; ``False`` when none is new."""
         fresh = self._unknown(rows)
-        self.rows, self.guess = self.rows.joined(fresh), None
+        self.rows, self.guess = self.rows.joined(fresh), None if fresh.h.size else self.guess
         self.idle = np.concatenate([self.idle, np.zeros(fresh.h.size, dtype=int)])
         return bool(fresh.h.size)
 
@@ -276,6 +287,28 @@ class Working:
         self.allowed += 1
         return True
 
+    def priced(self, answer: Answer) -> float:
+        """See `Tightening`."""
+        return float(answer.multipliers @ np.linalg.norm(answer.rows.G, axis=1))
+
+    @property
+    def longest(self) -> float:
+        """See `Tightening`."""
+        return float(np.linalg.norm(self.rows.G, axis=1).max(initial=0.0))
+
+    def distance(self, missed: Missed) -> float:
+        """See `Tightening`."""
+        row = rows_at(self.program, missed.family, missed.at, missed.row)
+        return missed.violation / max(float(np.linalg.norm(row.G)), np.finfo(float).tiny)
+
+    def tightened(self, ledger: Ledger, answer: Answer, margin: float) -> Answer | None:
+        """See `Tightening`."""
+        solution = ledger.relaxed.solve(self.rows, self.epsilon, margin)
+        if not _usable(solution):
+            return None
+        ledger.improve(ledger.relaxed.lower_bound(self.rows, solution))
+        return Answer(solution, self.rows, self.epsilon, solution.value)
+
     def _unknown(self, violated: Violated) -> Rows:
         known, fresh = {(cut.family, cut.row, cut.index.tobytes()) for cut in self.rows.cuts}, Rows.none(self.program.n)
         for indices, rows, family in violated:
@@ -305,117 +338,13 @@ class Working:
             self.margin = min(max(margin, self.floor), self.most)
 
 
-def _proofs(working: Working, ledger: Ledger, prover: Prover, answer: Answer, found: Found) -> Sequence[Proof]:
-    """What is proven of an answer: by one glance where that will do, else by a proof in full, before which there is a
-    decision that is proven."""
-    x = answer.solution.x
-    proofs = prover(x, GLANCE // 4 if ledger.tools.deadline.bounded else GLANCE)
-    if ledger.prove(answer, found, proofs) or not proofs:
-        return proofs
-    missed = _left_open(ledger.program, proofs)
-    if missed and not _is_secured(ledger):
-        _secure(working, ledger, prover, answer, missed)
-    # Where there are no cells, another look would be the same one.
-    if any(proof.cells for proof in proofs) and not any(proof.verdict == "refuted" for proof in proofs):
-        proofs = prover(x)
-        ledger.prove(answer, found, proofs)
-    return proofs
-
-
-def _secure_in_time(working: Working, ledger: Ledger, prover: Prover, answer: Answer, found: Found) -> None:
-    """Secure a decision at certain shares of a limit, though that of this round violates what was ``found``."""
-    due = working.secured < len(DUE) and ledger.tools.deadline.used >= DUE[working.secured]
-    if due and not _is_secured(ledger):
-        working.secured += 1
-        _secure(working, ledger, prover, answer, [_peak(family, separation) for family, separation in found])
-
-
-class Missed(NamedTuple):
-    """The largest violation of a family that was met, or that is not excluded, and its index ``(1, d)`` and row
-    ``(1,)``."""
-
-    violation: float
-    family: str
-    at: Array
-    row: np.ndarray
-
-
-def _secure(working: Working, ledger: Ledger, prover: Prover, answer: Answer, missed: Sequence[Missed]) -> None:
-    """Prove a decision that keeps away from the constraints, so that there is an upper bound while the proof of a
-    better one goes on: the optimum of the imposed rows, all of them tightened by as much as `SPARED` of the cost of
-    ``answer`` pays for and by more than what it ``missed``, and again by what that proof leaves open. Nothing is
-    claimed where nothing is that far from the constraints."""
-    program, x, margin = ledger.program, answer.solution.x, working.margin
-    sizes = np.linalg.norm(working.rows.G, axis=1)
-    price, largest = float(answer.multipliers @ sizes), float(sizes.max(initial=0.0))
-    margin += SPARED * abs(program.cost(x)) / max(price, np.finfo(float).tiny)
-    for _ in range(SECURED):
-        distances = (above / _size(rows_at(program, family, at, row)) for above, family, at, row in missed)
-        margin += PAID * max(distances, default=0.0)
-        if not np.isfinite(PAID * float(margin) * largest):  # in Python's numbers, which overflow in silence
-            return
-        solution = ledger.relaxed.solve(working.rows, working.epsilon, margin)
-        if not _usable(solution):
-            return
-        farther = Answer(solution, working.rows, working.epsilon, solution.value)
-        found = separate(program, solution.x, ledger.tools, ALLOWED)
-        missed = [_peak(family, separation) for family, separation in found if separation.violations.max() > ALLOWED]
-        if missed:
-            continue
-        proofs = prover(solution.x, GLANCE)
-        if ledger.prove(farther, found, proofs) or not proofs:
-            return
-        missed = _left_open(program, proofs)
-        if not missed:
-            return
-
-
-def _is_secured(ledger: Ledger) -> bool:
-    """Whether a decision is proven that costs little more than what such a one must."""
-    return ledger.proven is not None and ledger.gap(ledger.proven[0].solution.x) <= PAID * SPARED
-
-
-def _size(row: Rows) -> float:
-    """The norm of one row."""
-    return max(float(np.linalg.norm(row.G)), np.finfo(float).tiny)
-
-
-def _peak(family: ConstraintFamily, separation: Separation) -> Missed:
-    """The largest violation that was found of a family."""
-    largest = max(0.0, float(separation.violations[0]))
-    return Missed(largest, family.name, separation.indices[:1], separation.rows[:1])
-
-
-def _left_open(program: SemiInfiniteProgram, proofs: Sequence[Proof]) -> list[Missed]:
-    """What proofs could not exclude, each with where the largest violation was met; nothing where one of them excludes
-    nothing at all, or speaks of another formulation than the imposed rows: then no distance would help it."""
-    missed = [
-        Missed(
-            proof.violation if proof.verdict == "refuted" else proof.bound,
-            proof.family,
-            proof.index[None],
-            np.array([proof.row]),
-        )
-        for proof in proofs
-        if proof.verdict != "proven"
-        and proof.index is not None
-        and proof.formulation == program.family(proof.family).formulation
-    ]
-    complete = len(missed) == sum(proof.verdict != "proven" for proof in proofs)
-    return missed if complete and all(np.isfinite(one.violation) for one in missed) else []
-
-
 def _or_earlier(
     ledger: Ledger, result: Result, answer: Answer, kept: tuple[Answer, Found] | None, prover: Prover
 ) -> Result:
     """The result, or that of a decision that is proven, or of the last one that seemed feasible, with an open gap,
     where only that is proven."""
-    if result.status not in ("refuted", "undecided"):
-        return result
-    if ledger.proven is not None:
-        secured, found, proofs = ledger.proven
-        return ledger.judged(secured, worst_of(found), proofs, ledger.tools.deadline.reason)
-    if kept is None or kept[0] is answer:
+    result = or_proven(ledger, result)
+    if result.status not in ("refuted", "undecided") or kept is None or kept[0] is answer:
         return result
     earlier = ledger.judged(kept[0], worst_of(kept[1]), prover(kept[0].solution.x))
     return earlier if earlier.status in ("certified", "verified") else result
@@ -452,10 +381,10 @@ def _sparser(
     program, x = ledger.program, answer.solution.x
     if program.activity is None or (number > SPARSIFYING and answer.epsilon == 0.0):
         return answer, found, ()
-    held, closed = working.rows.G[answer.multipliers > 0.0], not ledger.open(x)
+    held, closed = answer.rows.G[answer.multipliers > 0.0], not ledger.open(x)
     candidates = [met(program, tidied(program, x), held, held @ x)]  # dust may be all that is between the bounds
     if closed and answer.epsilon == 0.0 and program.finite.P is None and program.blocks is None:
-        rows = working.rows
+        rows = answer.rows
         norms = np.linalg.norm(rows.G, axis=1)
         plain = ledger.relaxed.finite(rows.G, rows.h - working.margin * norms, 0.0)
         corner = vertex(plain, answer.solution.y, answer.solution.mu)
@@ -465,13 +394,13 @@ def _sparser(
         if other is x or count(program, other) >= least or not _fits(ledger, other):
             continue
         looked = separate(program, other, ledger.tools, ALLOWED, number)
-        above = [one for family, separation in looked if (one := _above(family, separation))[1].size]
-        if not above:
+        beyond = [one for family, separation in looked if (one := above(family, separation))[1].size]
+        if not beyond:
             value = program.cost(other) if answer.epsilon == 0.0 else answer.value
             kept = replace(answer, solution=replace(answer.solution, x=other), value=value), looked
             violated, least = [], count(program, other)
         elif answer.epsilon == 0.0:
-            violated = above
+            violated = beyond
     return *kept, violated
 
 
@@ -484,22 +413,6 @@ def _fits(ledger: Ledger, x: Array) -> bool:
 def _suggested(program: SemiInfiniteProgram, x: Array, violated: Violated) -> float:
     """The upper bound that a decision suggests."""
     return np.inf if any(rows.size for _, rows, _ in violated) else program.cost(x)
-
-
-def _above(family: ConstraintFamily, found: Separation) -> tuple[Array, np.ndarray, str]:
-    """The indices, rows and family of what is violated by more than the search may leave to the proof."""
-    violated = found.violations > ALLOWED
-    return found.indices[violated], found.rows[violated], family.name
-
-
-def _witnesses(program: SemiInfiniteProgram, proofs: Sequence[Proof]) -> Violated:
-    return [
-        (proof.index[None], np.array([proof.row]), proof.family)
-        for proof in proofs
-        if proof.verdict == "refuted"
-        and proof.index is not None
-        and proof.formulation == program.family(proof.family).formulation
-    ]
 
 
 def _usable(solution: FiniteSolution) -> bool:

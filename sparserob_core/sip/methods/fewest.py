@@ -13,7 +13,8 @@ from sparserob_core.sip.events import ignore
 from sparserob_core.sip.evidence import Cut, Proof
 from sparserob_core.sip.method import Method, Tools
 from sparserob_core.sip.methods.counting import DUST, count, counted_below, prices_of
-from sparserob_core.sip.methods.exchange import Exchange, Violated
+from sparserob_core.sip.methods.exchange import Exchange
+from sparserob_core.sip.methods.ledger import Violated
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.proof.branch_and_bound import CELLS, prove
 from sparserob_core.sip.result import Result

@@ -21,7 +21,20 @@ from sparserob_core.sip.evidence import Cut, Dual, InfeasibleSubsystem, Proof
 from sparserob_core.sip.finite import INTERIOR, FiniteSolution
 from sparserob_core.sip.inner.central.interior import Interior
 from sparserob_core.sip.inner.counterpart import Counterpart, RobustAnswer, robust_bound
-from sparserob_core.sip.methods.ledger import THINNER, Answer, Ledger, Prover
+from sparserob_core.sip.methods.ledger import (
+    ALLOWED,
+    GLANCE,
+    SPARED,
+    THINNER,
+    Answer,
+    Ledger,
+    Missed,
+    Prover,
+    Violated,
+    or_proven,
+    proofs_of,
+    secure_in_time,
+)
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, SemiInfiniteProgram, WorstConstraint
 from sparserob_core.sip.proof.verdict import NAMED, explained, worst_of
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram, Rows
@@ -32,7 +45,6 @@ from sparserob_core.sip.solver import Asked
 if TYPE_CHECKING:
     from sparserob_core.sip.method import Tools
 
-ALLOWED = TOLERANCE / 2  # a violation that the search may leave to the proof
 ROUNDING = 2.0**-46  # of the numbers of which a bound is made
 FIRST, LARGEST = 1e-8, 1e-6  # margins by which rows are tightened, in their own units
 # The least of them but 0, where a gap asks for it: a tenth of that is below what the simplex method leaves (1e-13 of
@@ -67,7 +79,7 @@ class Robust:
     price: float = 0.0
     calls: Counter[str] = field(default_factory=Counter)
     asked: Asked | None = None
-    shown: tuple[Array, Sequence[Proof]] | None = None
+    secured: int = 0
 
     @staticmethod
     def start(program: SemiInfiniteProgram, asked: Asked | None = None) -> Robust:
@@ -94,14 +106,45 @@ class Robust:
     def solve(self, size: float, seconds: float = np.inf) -> RobustAnswer:
         """The optimum with the rows tightened, as accurate as this round asks for; ``size``: of the cost. Not solved
         where ``seconds`` do not suffice."""
+        return self._solve(self.margin, self.accuracy * size, seconds)
+
+    def _solve(self, margin: float, accuracy: float, seconds: float) -> RobustAnswer:
         if isinstance(self.counterpart, Interior):
-            answer = self.counterpart.solve(self.margin, self.accuracy * size, seconds)
+            answer = self.counterpart.solve(margin, accuracy, seconds)
             self.calls[INTERIOR] += 1
         else:
             before = Counter(self.counterpart.answered)
-            answer = self.counterpart.solve(self.margin, seconds)
+            answer = self.counterpart.solve(margin, seconds)
             self.calls += self.counterpart.answered - before
         return answer
+
+    def priced(self, answer: Answer) -> float:
+        """See `Tightening`."""
+        return float(answer.multipliers.sum())
+
+    @property
+    def longest(self) -> float:
+        """See `Tightening`; margins are in the rows' own units."""
+        return 1.0
+
+    def distance(self, missed: Missed) -> float:
+        """See `Tightening`."""
+        return missed.violation
+
+    def impose(self, violated: Violated) -> int:
+        """See `Tightening`."""
+        return sum(self.add(self.program.family(name), indices) for indices, _, name in violated)
+
+    def tightened(self, ledger: Ledger, answer: Answer, margin: float) -> Answer | None:
+        """See `Tightening`; no more accurate than its distance costs."""
+        accuracy = min(self.accuracy, SHARPER * SPARED) * _size(self.program, answer.solution.x)
+        found = self._solve(margin, accuracy, _left(ledger.tools))
+        _count(self, ledger)
+        if not found.solved:
+            return None
+        ledger.improve(self.dual(found, priced=True))
+        solution = replace(answer.solution, y=found.y, mu=found.mu)
+        return _at(self, replace(answer, solution=solution, rows=_rows(self)), _settled(self.program, found.x))
 
     def sharper(self, violation: float, size: float, added: bool, tolerance: float) -> bool:
         """Whether the next round is to be more accurate, because what was added changes little, and can be."""
@@ -172,11 +215,6 @@ def robust_exchange(
         with tools.deadline.enforced():
             return _exchange(working, ledger, prover, rounds)
     except KeyboardInterrupt as error:
-        if working.shown is not None and ledger.best is not None:
-            x, proofs = working.shown
-            met = [(one, one.worst(x)) for one in program.families if not one.defines and one.worst is not None]
-            answer = _at(working, ledger.best, x)
-            return ledger.judged(answer, worst_of(met), proofs, tools.deadline.interrupt(error))
         return ledger.stopped(error, prover)
 
 
@@ -207,11 +245,14 @@ def _exchange(working: Robust, ledger: Ledger, prover: Prover, rounds: int) -> R
         if program.guide is not None and (not feasible or ledger.open(x)):
             violated += _undefined(working, x, feasible)
             if number & (number - 1) == 0:  # 1, 2, 4, 8, ...
-                _show(working, prover)
+                _prove_best(working, ledger, prover, answer)
         ledger.tell(number, answer, told, program.cost(x) if feasible else np.inf, kept=len(working.cuts))
 
+        # Secure: where time runs out, prove a decision that keeps away from the constraints while there is some.
+        imposed = secure_in_time(working, ledger, prover, answer, told, number)
+
         # Exchange: impose them, or sharpen what stands for the imposed ones, or choose another margin.
-        if not last and _advanced(working, ledger, x, violated, feasible, worst_of(told).violation):
+        if not last and (imposed or _advanced(working, ledger, x, violated, feasible, worst_of(told).violation)):
             continue
 
         # Choose: of the decisions that cost as little, the one that the program likes best, where that is proven.
@@ -220,13 +261,13 @@ def _exchange(working: Robust, ledger: Ledger, prover: Prover, rounds: int) -> R
             return chosen
 
         # Prove: over the whole continuum; a witness that the proof meets is one more index to impose.
-        proofs = prover(x)
-        if not last and not tools.deadline.passed and _learned(working, x, proofs):
+        proofs, imposed = proofs_of(working, ledger, prover, answer, told)
+        if not last and not tools.deadline.passed and (imposed or _learned(working, x, proofs)):
             working.best = np.zeros(0)
             continue
         ending = f"the {rounds} rounds of the method are used up" if last else ""
         ending = tools.deadline.reason if tools.deadline.passed else ending
-        return ledger.judged(answer, worst_of(told), proofs, ending)
+        return or_proven(ledger, ledger.judged(answer, worst_of(told), proofs, ending))
     raise AssertionError("the last round returns")
 
 
@@ -270,13 +311,11 @@ def _chosen(working: Robust, ledger: Ledger, answer: Answer, prover: Prover) -> 
     return ledger.judged(_at(working, answer, decision), worst_of(met), proofs, "")
 
 
-def _show(working: Robust, prover: Prover) -> None:
-    """Prove the best decision known, to have one to return where time ends the search."""
-    best = working.best
-    if best.size and not (working.shown is not None and working.shown[0] is best):
-        proofs = prover(best)
-        if all(one.verdict == "proven" for one in proofs):
-            working.shown = best, proofs
+def _prove_best(working: Robust, ledger: Ledger, prover: Prover, answer: Answer) -> None:
+    """Look at the best decision known, where nothing that costs as little is proven."""
+    best, program = working.best, ledger.program
+    if best.size and (ledger.proven is None or program.cost(best) < program.cost(ledger.proven[0].solution.x)):
+        ledger.prove(_at(working, answer, best), separate(program, best, ledger.tools, ALLOWED), prover(best, GLANCE))
 
 
 def _guided(working: Robust, ledger: Ledger) -> None:
@@ -409,10 +448,8 @@ def _told(working: Robust, ledger: Ledger, found: RobustAnswer) -> Answer:
     """The decision of an answer, with the bound that its multipliers prove; the first one is kept, should there be no
     time for another."""
     program, none = working.program, np.zeros(0)
-    working.raw = x = np.clip(found.x, program.finite.lower, program.finite.upper)
-    x = x if program.settle is None else program.settle(x)
-    if program.finite.residual(x) > TOLERANCE:  # what is settled is beyond its bounds: then so is what it stands for
-        x = np.clip(x, program.finite.lower, program.finite.upper)
+    working.raw = np.clip(found.x, program.finite.lower, program.finite.upper)
+    x = _settled(program, found.x)
     dual = working.dual(found, priced=True)
     ledger.improve(dual)
     solution = FiniteSolution("optimal", x, np.inf, dual.bound, found.y, found.mu, none, np.inf, np.inf)
@@ -420,6 +457,15 @@ def _told(working: Robust, ledger: Ledger, found: RobustAnswer) -> Answer:
     if ledger.best is None:
         ledger.keep(answer)
     return answer
+
+
+def _settled(program: SemiInfiniteProgram, x: Array) -> Array:
+    """A decision within its bounds, and what families define at what they say."""
+    x = np.clip(x, program.finite.lower, program.finite.upper)
+    x = x if program.settle is None else program.settle(x)
+    if program.finite.residual(x) > TOLERANCE:  # what is settled is beyond its bounds: then so is what it stands for
+        x = np.clip(x, program.finite.lower, program.finite.upper)
+    return x
 
 
 def _left(tools: Tools) -> float:
