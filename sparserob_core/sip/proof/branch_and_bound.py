@@ -31,6 +31,7 @@ CLIMBED = (
 FIRST_BATCH, QUICK = 16, 0.25  # cells bounded first, and the seconds that a batch may take, where time is limited
 OFTEN = 1.0  # seconds after which a batch that is not over is told of
 STALLED, ADVANCED = 30.0, 0.99  # a worst bound that has not fallen below this share within so many seconds is stuck
+ADVICE = "a larger method.tolerance would help, as it keeps decisions farther away, or narrower index sets"
 REST, TINY = 8, 1e-5  # halvings without progress after which a bound below `TINY` of its unit is taken for rounding
 MOVES = 24  # steps of such a climb at most
 MOST_CUT = 32  # open cells that are cut towards peaks
@@ -119,12 +120,14 @@ class Course:
         """What hinders the proof, and what would help: at the worst cell, in the user's units."""
         advice = "" if self.family.hindrance is None else self.family.hindrance(lower, upper)
         if self.deadline.passed:
-            advice = "there was no time to halve it"
+            advice = (
+                "there was no time to halve it; more seconds (limits.seconds) would help, or a larger method.tolerance"
+            )
         known = self.family.index_units
         lower, upper = (lower, upper) if known is None or known.size != lower.size else (lower * known, upper * known)
         allowed = bound * (1.0 if self.family.row_units is None else float(self.family.row_units.max()))
         cell = f"the cell from {_shown(lower)} to {_shown(upper)} still allows {allowed:.1e}"
-        return f"{self.family.name}: {cell}; {advice or 'narrower index sets, or numbers of one size, would help'}"
+        return f"{self.family.name}: {cell}; {advice or ADVICE}"
 
 
 def _branch_and_bound(family: ConstraintFamily, x: Array, course: Course) -> Proof:
