@@ -43,7 +43,7 @@ def seen_of(A: np.ndarray, E: np.ndarray, changes: list[float]) -> Seen:
         changes[:-1],
         Box(-np.ones(mw), np.ones(mw)),
     )
-    pushed = Pushed.of(loop.parts["A"], loop.parts["E"], range(mw))
+    pushed = Pushed.of([(loop.parts["A"], loop.parts["E"])], range(mw))
     blocks = sorted({block for seen in loop.seen for block in seen})
     table = np.empty((3 * d, len(blocks) * mw), dtype=object)
     table[:] = arb(0)
@@ -135,3 +135,15 @@ def test_the_lower_bound_of_a_policy_is_verified_where_the_disturbance_has_break
     }
     sr.run(config, out=f"{tmp_path}/run", quiet=True, figures=False)
     assert sr.check(f"{tmp_path}/run").status == "verified"
+
+
+def test_what_systems_that_take_turns_bring_to_a_state_counts_wherever_any_of_them_does() -> None:
+    """``w`` enters the first state; one system leads it to the second one, another from there to the third."""
+    entry = arb_mat([[1], [0], [0]])
+    lead = [arb_mat([[0, 0, 0], [1, 0, 0], [0, 0, 0]]), arb_mat([[0, 0, 0], [0, 0, 0], [0, 1, 0]])]
+    alone = [Pushed.of([(A, entry)], [0]) for A in lead]
+    assert [one.states for one in alone] == [2, 1] and not alone[0].pattern[2, 0]
+    together = Pushed.of([(A, entry) for A in lead], [0])
+    assert together.states == 3 and together.entries == 1 and together.pattern.all()
+    elsewhere = Pushed.of([(lead[0], entry), (lead[0], arb_mat([[0], [0], [1]]))], [0])
+    assert elsewhere.states == 3 and elsewhere.entries == 1

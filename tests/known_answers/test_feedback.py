@@ -312,7 +312,7 @@ def policies(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("changed", "said"),
     [
         ({"disturbance_class": "l1_ball"}, "piecewise_constant or measurable"),
-        ({"system": {**SPRING["system"], "delay": 0.1}}, "delay"),
+        ({"system": {**SPRING["system"], "delay": 0.1}, "disturbance_class": "measurable"}, "delay"),
     ],
 )
 def test_what_is_not_built_is_refused_in_one_sentence(changed: dict[str, Any], said: str, tmp_path: Path) -> None:

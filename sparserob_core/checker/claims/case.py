@@ -124,7 +124,10 @@ class Case:
         self.clock.check()
         ends = float(self.control.breakpoints[-1]), float(self.disturbance.breakpoints[-1])
         last = max(*ends, self.problem.horizon)
-        every = np.unique([*self.acting, *self.disturbance.breakpoints.tolist(), *self.problem.system.switches])
+        measured = [] if self.policy is None else self.control.breakpoints.tolist()
+        every = np.unique(
+            [*self.acting, *measured, *self.disturbance.breakpoints.tolist(), *self.problem.system.switches]
+        )
         return [*every[(every < last) & ~np.isin(every, ends)].tolist(), last]
 
     @cached_property

@@ -72,9 +72,10 @@ class FeedbackClaims:
     def _loop(self, nominal: Array, gains: Array, changes: list[float] | None = None) -> ClosedLoop:
         """The loop; where ``changes`` are given, under disturbances that jump there only."""
         case = self.case
-        if not isinstance(case.problem.system, LinearSystem) or case.problem.system.parameter_count:
+        system, answers = case.problem.system, case.policy is not None and not case.measurable
+        if system.parameter_count or not (answers or isinstance(system, LinearSystem)):
             raise Unchecked("the checker knows feedback and measurable disturbances of known systems only")
-        if case.policy is None and not (case.control.is_indicators and case.problem.system.delay == 0.0):
+        if not answers and not (case.control.is_indicators and system.delay == 0.0):
             raise Unchecked(
                 "of measurable disturbances the checker knows controls of their own on every piece, undelayed"
             )
@@ -89,6 +90,7 @@ class FeedbackClaims:
             held,
             case.problem.disturbance,
             case.problem.initial_set,
+            tuple(float(v) for v in before(case.problem)),
         )
 
     def control(self) -> str:
@@ -116,7 +118,7 @@ class FeedbackClaims:
     def _control_turning(self) -> str:
         """Every piece of the control in its curved set, for every disturbance."""
         shape, loop = known(self.case.problem.control), self.loop
-        every = Directions(loop, shape, np.diag(1.0 / np.array(shape.radius)), loop.acting)
+        every = Directions(loop, shape, np.diag(1.0 / np.array(shape.radius)), loop.inputs)
         m, pieces = shape.dimension, len(loop.effects)
         faces = [(-np.ones(m), np.ones(m)) for _ in range(2 * m)]
         for place, (low, high) in enumerate(faces):
@@ -148,9 +150,9 @@ class FeedbackClaims:
     def _change(self, k: int) -> arb_mat:
         """The change of the nominal control, and of its answers, to piece ``k``, ``(m, 1 + Q)``."""
         if k:
-            return self.loop.acting(k) - self.loop.acting(k - 1)
+            return self.loop.inputs(k) - self.loop.inputs(k - 1)
         zero = [0.0] * self.loop.starts[-1]
-        return self.loop.acting(0) - stacked([balls([float(u), *zero]) for u in before(self.case.problem)])
+        return self.loop.inputs(0) - stacked([balls([float(u), *zero]) for u in before(self.case.problem)])
 
     def cost(self) -> arb:
         """The cost of the policy; where that is an effort, the written one, which is shown to be none too small."""
@@ -389,7 +391,7 @@ class FeedbackClaims:
         if window is None:
             assert held is not None
             k = int(np.clip(bisect_right(loop.breakpoints, time) - 1, 0, case.control.pieces - 1))
-            acting = loop.acting(k) if name == self.of_control else self._change(k)
+            acting = loop.inputs(k) if name == self.of_control else self._change(k)
             limit = known(held).limit(direction)
             unit = 1.0 if known(held).facets is None else max(known(held).units, default=1.0)
             return _dot(direction, [row[0] + _along(row[1:], z) for row in acting.tolist()]) - limit, TOLERANCE * unit
@@ -402,7 +404,7 @@ class FeedbackClaims:
             if type(said) is not int:
                 raise Broken(f"{name}: the piece of the control is {said!r}")
             window.meets(loop.breakpoints, said, time)
-            state += loop.acting(said).tolist()
+            state += loop.inputs(said).tolist()
         values = [row[0] + _along(row[1:], z) for row in state]
         return _dot(direction, values) - limit, case.units(window).slack(direction, limit)
 
@@ -420,7 +422,7 @@ class FeedbackClaims:
     def farthest(self, c: Array, gain: Array, time: float, k: int | None) -> arb:
         """The largest ``c'x(t) + gain'u``, ``u`` the control on piece ``k``, over all deviations."""
         piece = min(max(bisect_right(self.case.grid, time) - 1, 0), len(self.case.grid) - 2)
-        beside = None if k is None else stacked([balls(gain)]) * self.loop.acting(k)
+        beside = None if k is None else stacked([balls(gain)]) * self.loop.inputs(k)
         return self.loop.highest(piece, time, c[None], beside)[0]
 
     @cached_property
@@ -547,7 +549,7 @@ class FeedbackClaims:
         if self.case.problem.initial_set is not None and block == loop.blocks:
             return Pushed(np.eye(d, dtype=bool)[:, list(varying)], len(varying), len(varying))
         if varying not in self._pushes:
-            self._pushes[varying] = Pushed.of(loop.parts["A"], loop.parts["E"], varying)
+            self._pushes[varying] = Pushed.of([(one["A"], one["E"]) for one in loop.modes], varying)
         return self._pushes[varying]
 
     @cached_property
@@ -619,7 +621,7 @@ class _Sides:
         """The largest left sides at a time in a piece of the grid, with the control on piece ``k``."""
         beside = None
         if self.gains.shape[1]:
-            beside = stacked([balls(row) for row in self.gains]) * self.loop.acting(k)
+            beside = stacked([balls(row) for row in self.gains]) * self.loop.inputs(k)
         found = self.loop.highest(piece, time, self.rows, beside)
         if self.window.reference is None:
             return found

@@ -20,7 +20,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.series import norm
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.reach.flow import Flow, OwnUnits, held, middles, stacked
+from sparserob_core.checker.reach.flow import OwnUnits, flows, held, middles, stacked
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.polynomials import OUTWARD, Enclosed, rounding
 from sparserob_core.control.sets.sets import ConvexSet
@@ -29,7 +29,7 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
-    from sparserob_core.control.problem.system import LinearSystem
+    from sparserob_core.control.problem.system import System
 
 TERMS = 8  # of the expansion that bounds a second derivative
 
@@ -46,9 +46,9 @@ def middle(shape: ConvexSet) -> Array:
 class ClosedLoop:
     """A known system from ``initial_state`` under the nominal control ``(m, K)`` and ``gains (K, K, m, d)``; ``grid``:
     every breakpoint; ``breakpoints``: those of the control; ``changes``: where the disturbance may jump; ``initial``:
-    the set of deviations of the initial state."""
+    the set of deviations of the initial state; ``before (m,)``: what acts until a delay of the control is over."""
 
-    system: LinearSystem
+    system: System
     initial_state: list[float]
     nominal: Array
     gains: Array
@@ -57,21 +57,27 @@ class ClosedLoop:
     changes: list[float]
     shape: ConvexSet | None
     initial: ConvexSet | None = None
-    _steps: dict[float, tuple[arb_mat, arb_mat]] = field(default_factory=dict, repr=False)
+    before: tuple[float, ...] = ()
+    _steps: dict[tuple[int, float], tuple[arb_mat, arb_mat]] = field(default_factory=dict, repr=False)
 
     @cached_property
-    def parts(self) -> dict[str, arb_mat]:
-        """``A``, ``B``, ``E``."""
-        flow = Flow(self.system, (), (), 0)
-        return {name: matrices[0] for name, matrices in flow.parts.items()}
+    def modes(self) -> list[dict[str, arb_mat]]:
+        """``A``, ``B``, ``E`` of the systems that take turns."""
+        return [{name: matrices[0] for name, matrices in flow.parts.items()} for flow in flows(self.system, ())]
 
     @property
-    def drift(self) -> list[arb]:
-        """What drives every state beside control and disturbance: the columns of ``B`` beyond those of the control."""
-        from flint import arb
+    def parts(self) -> dict[str, arb_mat]:
+        """Those of the first one."""
+        return self.modes[0]
 
-        m = self.gains.shape[2]
-        return [sum(row[m:], arb(0)) for row in self.parts["B"].tolist()]
+    def mode(self, time: float) -> int:
+        """Which of them acts from a time on."""
+        return bisect_right(self.system.switches, time)
+
+    @cached_property
+    def acting(self) -> list[float]:
+        """When every piece of the control begins to act."""
+        return [time + self.system.delay for time in self.breakpoints[:-1]]
 
     @property
     def blocks(self) -> int:
@@ -101,20 +107,22 @@ class ClosedLoop:
         return [0, *accumulate(shape.dimension for shape, _ in self.sets)]
 
     def _places(self, piece: int) -> tuple[int, int]:
-        """Of a piece of the grid the piece of the control and the block of the disturbance."""
+        """Of a piece of the grid the piece of the control that acts, -1 where the one before does, and the block of the
+        disturbance."""
         inside = (self.grid[piece] + self.grid[piece + 1]) / 2
-        return bisect_right(self.breakpoints, inside) - 1, bisect_right(self.changes, inside) - 1
+        return bisect_right(self.acting, inside) - 1, bisect_right(self.changes, inside) - 1
 
     def _held(self, start: float, stop: float) -> tuple[arb_mat, arb_mat]:
         """``e^{A s}`` and its integral, ``s`` from one time to another."""
         from flint import arb
 
         length = arb(stop) - arb(start)
-        key = stop - start
-        if key in self._steps and self._exact(start, stop, key):
+        key = self.mode(start), stop - start
+        exact = self._exact(start, stop, stop - start)
+        if key in self._steps and exact:
             return self._steps[key]
-        found = held(self.parts["A"], self._identity, length)
-        if self._exact(start, stop, key):
+        found = held(self.modes[key[0]]["A"], self._identity, length)
+        if exact:
             self._steps[key] = found
         return found
 
@@ -140,14 +148,15 @@ class ClosedLoop:
         if self.initial is not None:
             found[0][self.blocks] = self._identity
         for piece in range(len(self.grid) - 1 if self.blocks else 0):
-            k, block = self._places(piece)
+            k, (_, block) = self.on(piece), self._places(piece)
             if k + 1 >= K:
-                continue
-            Gamma = self._held(self.grid[piece], self.grid[piece + 1])[1]
-            Phi = self._held(self.grid[piece + 1], self.breakpoints[k + 1])[0]
-            push = Phi * Gamma * self.parts["E"]
+                break
+            Phi, Gamma = self._held(self.grid[piece], self.grid[piece + 1])
+            seen = {earlier: Phi * push for earlier, push in found[k + 1].items()}
+            push = Gamma * self.modes[self.mode(self.grid[piece])]["E"]
             if any(not x.is_zero() for x in push.entries()):
-                found[k + 1][block] = found[k + 1][block] + push if block in found[k + 1] else push
+                seen[block] = seen[block] + push if block in seen else push
+            found[k + 1] = seen
         return found
 
     @cached_property
@@ -175,28 +184,27 @@ class ClosedLoop:
         """What drives the nominal state and every response on each piece of the grid, ``(d, 1 + Q)``."""
         from flint import arb
 
-        m, E, found = self.gains.shape[2], self.parts["E"], []
-        B, drift = stacked([row[:m] for row in self.parts["B"].tolist()]), self.drift
-        onto = [E * stacked([[arb(float(v))] for v in self.middle])] if self.blocks else []
-        by_control = {}
-        for k, effect in enumerate(self.effects):
-            v = [[arb(float(value))] for value in self.nominal[:, k]]
-            by_control[k] = B * stacked([head + row for head, row in zip(v, effect, strict=True)])
+        m, found = self.gains.shape[2], []
+        pushed = stacked([[arb(float(v))] for v in self.middle])
+        by_control: dict[tuple[int, int], arb_mat] = {}
         for piece in range(len(self.grid) - 1):
-            k, block = self._places(piece)
-            rows = by_control[k].tolist()
-            for i, c in enumerate(drift):
-                rows[i][0] = rows[i][0] + c
+            (k, block), number = self._places(piece), self.mode(self.grid[piece])
+            B, E = self.modes[number]["B"].tolist(), self.modes[number]["E"]
+            if (number, k) not in by_control:
+                by_control[number, k] = stacked([row[:m] for row in B]) * self.inputs(k)
+            rows = by_control[number, k].tolist()
+            onto = (E * pushed).entries() if self.blocks else [arb(0)] * len(rows)
+            for i, (row, more) in enumerate(
+                zip(B, onto, strict=True)
+            ):  # the columns beyond the control's are the drift
+                rows[i][0] = sum(row[m:], rows[i][0]) + more
             if self.blocks:
-                for i in range(len(rows)):
-                    rows[i][0] = rows[i][0] + onto[0][i, 0]
-                self._entered(rows, block)
+                self._entered(rows, block, E)
             found.append(stacked(rows))
         return found
 
-    def _entered(self, rows: list[list[arb]], block: int) -> None:
-        """Add what a block of the disturbance drives to what drives the state, row by row."""
-        E = self.parts["E"]
+    def _entered(self, rows: list[list[arb]], block: int, E: arb_mat) -> None:
+        """Add what a block of the disturbance drives through ``E`` to what drives the state, row by row."""
         for i, row in enumerate(rows):
             for b in range(self.width):
                 row[1 + block * self.width + b] = row[1 + block * self.width + b] + E[i, b]
@@ -250,15 +258,18 @@ class ClosedLoop:
                     total = total - x * arb(float(m)) if m else total
         return total
 
-    def acting(self, k: int) -> arb_mat:
-        """The nominal control and its answers on a piece of it, ``(m, 1 + Q)``."""
+    def inputs(self, k: int) -> arb_mat:
+        """The nominal control and its answers on a piece of it, ``(m, 1 + Q)``; on piece -1 the control before."""
         from flint import arb
 
-        return stacked([[arb(float(v)), *row] for v, row in zip(self.nominal[:, k], self.effects[k], strict=True)])
+        none = [arb(0)] * self.starts[-1]
+        given = (self.before, [none] * len(self.before)) if k < 0 else (self.nominal[:, k], self.effects[k])
+        return stacked([[arb(float(v)), *row] for v, row in zip(*given, strict=True)])
 
     def on(self, piece: int) -> int:
-        """The piece of the control that acts on a piece of the grid."""
-        return self._places(piece)[0]
+        """The piece of the control that is commanded on a piece of the grid: the one that acts, where there is no
+        delay."""
+        return bisect_right(self.breakpoints, (self.grid[piece] + self.grid[piece + 1]) / 2) - 1
 
     def heights(self, state: arb_mat, rows: Array | arb_mat, beside: arb_mat | None = None) -> list[arb]:
         """``max c'x`` over all deviations for every row ``c`` of ``rows (r, d)``, at a time with this `state`, and with
@@ -278,9 +289,14 @@ class ClosedLoop:
         return np.asarray(np.max([np.abs(middles(drive)) @ sizes for drive in self.drives], axis=0))
 
     @cached_property
+    def owns(self) -> list[OwnUnits]:
+        """The units in which rests are bounded, of every system."""
+        return [OwnUnits.of(parts["A"], self.grid[-1], self._speed) for parts in self.modes]
+
+    @property
     def own(self) -> OwnUnits:
-        """The units in which rests are bounded."""
-        return OwnUnits.of(self.parts["A"], self.grid[-1], self._speed)
+        """Those of the first one."""
+        return self.owns[0]
 
     def bent(self, piece: int, start: float, stop: float, rows: Array | arb_mat) -> Array:
         """By how much ``max c'x(t)`` may lie above its chord on ``[start, stop]``, a part of a piece of the grid, at
@@ -288,7 +304,8 @@ class ClosedLoop:
         response, each times how far its deviation goes. The rest of the expansion is taken in `own` units."""
         from flint import arb
 
-        A, h = self.parts["A"], arb(stop) - arb(start)
+        number = self.mode(self.grid[piece])
+        A, own, h = self.modes[number]["A"], self.owns[number], arb(stop) - arb(start)
         rate = A * self.state(piece, start) + self.drives[piece]
         row, factor = exactly(rows) * A, arb(1)
         total = np.zeros((row.nrows(), 1 + self.starts[-1]))
@@ -297,10 +314,10 @@ class ClosedLoop:
             total = total + (np.abs(found.mid) + found.rad) * float((factor * OUTWARD).upper())
             row, factor = row * A, factor * h / (order + 1)
         sizes = np.concatenate([[1.0], self.radii])
-        far = Enclosed.of(self.own.states(rate))
+        far = Enclosed.of(own.states(rate))
         speed = float((np.sqrt(((np.abs(far.mid) + far.rad) ** 2).sum(axis=0)) @ sizes) * OUTWARD)
-        tail = float((factor * (self.own.growth * h).exp()).upper()) * speed
-        lengths = np.array([float(norm(stacked([line])).upper()) for line in self.own.rows(row).tolist()])
+        tail = float((factor * (own.growth * h).exp()).upper()) * speed
+        lengths = np.array([float(norm(stacked([line])).upper()) for line in own.rows(row).tolist()])
         summed = total @ sizes * (1.0 + rounding(sizes.size)) + tail * lengths
         return np.asarray(float((h * h / 8).upper()) * summed * OUTWARD)
 

@@ -268,7 +268,7 @@ class MeasurableLoop(ClosedLoop):
                 found[k + 1][piece] = self._held(self.grid[piece + 1], self.breakpoints[k + 1])[0]
         return found
 
-    def _entered(self, rows: list[list[arb]], block: int) -> None:
+    def _entered(self, rows: list[list[arb]], block: int, E: arb_mat) -> None:
         """Nothing: what happens within a piece counts at its end."""
 
     def _ended(self, piece: int, state: arb_mat) -> arb_mat:

@@ -22,7 +22,7 @@ from sparserob_core.checker.reach.flow import middles, scaled, stacked
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
-    from flint import arb, arb_mat, fmpq_mat
+    from flint import arb, arb_mat, fmpq, fmpq_mat
 
 EVENED = 20  # steps in which rows and columns become of one size; the first few do most, twice as many change nothing
 
@@ -32,29 +32,44 @@ Pattern = npt.NDArray[np.bool_]
 @final
 @dataclass(frozen=True, eq=False)
 class Pushed:
-    """Who of the states can see which entry of a disturbance in ``x' = A x + E w``, whatever the times: ``pattern (d,
-    mw)``; of all of these at most ``states`` are independent of each other, and at most ``entries``."""
+    """Who of the states can see which entry of a disturbance in ``x' = A x + E w``, whatever the times, and whichever
+    of several systems act: ``pattern (d, mw)``; of all of these at most ``states`` are independent of each other, and
+    at most ``entries``."""
 
     pattern: Pattern
     states: int
     entries: int
 
     @staticmethod
-    def of(A: arb_mat, E: arb_mat, varying: Sequence[int]) -> Pushed:
-        """Without rounding, for the entries ``varying`` of a disturbance; raises `Unchecked` where the numbers of the
-        system are not exact."""
-        if not all(x.is_exact() for part in (A, E) for x in part.entries()):
-            raise Unchecked("the numbers of the system are not exact")
-        a, e = _rational(A.tolist()), _rational([[row[b] for b in varying] for row in E.tolist()])
-        powers, linked = [e], middles(A) != 0.0
-        pattern: Pattern = middles(E)[:, list(varying)] != 0.0
-        for _ in range(A.nrows() - 1):
-            powers.append(a * powers[-1])
-            pattern = pattern | (linked.astype(int) @ pattern.astype(int) > 0)
+    def of(modes: Sequence[tuple[arb_mat, arb_mat]], varying: Sequence[int]) -> Pushed:
+        """Without rounding, for the entries ``varying`` of a disturbance, of systems ``A (d, d)``, ``E (d, mw)``;
+        raises `Unchecked` where their numbers are not exact.
+
+        Where columns of ``E`` are brought to by any of the systems, one after another, is the least subspace that holds
+        them and that no ``A`` leaves; it is reached within ``d`` steps."""
         from flint import fmpq_mat
 
-        together = fmpq_mat([column for part in powers for column in part.transpose().tolist()])
-        return Pushed(pattern, together.rank(), e.rank())
+        if not all(x.is_exact() for mode in modes for part in mode for x in part.entries()):
+            raise Unchecked("the numbers of the system are not exact")
+        systems = [_rational(A.transpose().tolist()) for A, _ in modes]
+        entered = [[[row[b] for b in varying] for row in E.tolist()] for _, E in modes]
+        pattern: Pattern = np.any([middles(E)[:, list(varying)] != 0.0 for _, E in modes], axis=0)
+        linked = np.any([middles(A) != 0.0 for A, _ in modes], axis=0).astype(int)
+        spanned = _basis([row for one in entered for row in _rational(one).transpose().tolist()])
+        for _ in range(linked.shape[0] - 1):
+            moved = [row for a in systems for row in (fmpq_mat(spanned) * a).tolist()] if spanned else []
+            spanned = _basis([*spanned, *moved])
+            pattern = pattern | (linked @ pattern.astype(int) > 0)
+        return Pushed(pattern, len(spanned), _rational([row for one in entered for row in one]).rank())
+
+
+def _basis(rows: list[list[fmpq]]) -> list[list[fmpq]]:
+    """Independent rows that span what some rows do."""
+    from flint import fmpq_mat
+
+    reduced, rank = fmpq_mat(rows).rref()
+    basis: list[list[fmpq]] = reduced.tolist()[:rank]
+    return basis
 
 
 def _rational(rows: Sequence[Sequence[arb]]) -> fmpq_mat:

@@ -497,7 +497,7 @@ def told(said: TimedExplanation, loop: ClosedLoop, w: Array, controls: bool = Fa
     text = f"{said.statement} for every {' and '.join(name for name, one in every if one is not None) or 'disturbance'}"
     if not w.size and loop.spread.size:
         return replace(said, text=text, disturbance=None, begun=None, deviation=None, quantity="")
-    point, width = loop.spread.middle + w, loop.steps.E.shape[2]
+    point, width = loop.spread.middle + w, problem.response.system.disturbances
     signal = changes = None
     if loop.measurable is not None:
         breakpoints, signal = loop.signal(w, said.time, None if controls else said.direction, said.piece)

@@ -81,11 +81,11 @@ class ClosedLoop:
     def entries(self) -> Array:
         """Which entries of the deviations act on every piece of the grid, and how: ``(L, mw, Q)``."""
         model, grid = self.functionals.disturbance, self.functionals.response.grid
-        table = np.zeros((grid.pieces, self.steps.E.shape[2], self.spread.size))
+        width = self.functionals.response.system.disturbances
+        table = np.zeros((grid.pieces, width, self.spread.size))
         if model is not None and self.measurable is None:
             assert model.starts is not None
             block = np.searchsorted(model.starts, np.arange(grid.pieces), side="right") - 1
-            width = model.channels
             for i in range(width):
                 table[np.arange(grid.pieces), i, block * width + i] = 1.0
         return table
@@ -113,10 +113,13 @@ class ClosedLoop:
     def drives(self, x: Array) -> Array:
         """What drives the nominal state and every response, on the pieces of the grid: ``(L, d, 1 + Q)``."""
         grid, m = self.functionals.response.grid, self.answers.shape[1]
-        B, E = self.steps.B[0], self.steps.E[0]
-        nominal = grid.inputs(self.nominal(x)).T @ B.T + self.middles @ E.T
-        answered = B[:, :m] @ self.effects(x)[grid.control_piece] + E @ self.entries
-        return np.concatenate([nominal[:, :, None], answered], axis=2)
+        B, E = (grid.of_modes(matrices)[grid.modes] for matrices in (self.steps.B[0], self.steps.E[0]))
+        inputs = np.concatenate([grid.inputs(self.nominal(x)).T[:, :, None], self.middles[:, :, None]], axis=1)
+        nominal = np.concatenate([B, E], axis=2) @ inputs
+        acts = grid.control_piece >= 0
+        answered = E @ self.entries
+        answered[acts] += B[acts, :, :m] @ self.effects(x)[grid.control_piece[acts]]
+        return np.concatenate([nominal, answered], axis=2)
 
     def path(self, x: Array) -> tuple[Array, Array]:
         """The nominal state and every response at the breakpoints of the grid, ``(L + 1, d, 1 + Q)``, and what drives
@@ -144,9 +147,8 @@ class ClosedLoop:
         grid = self.functionals.response.grid
         pieces = grid.locate(times) if pieces is None else pieces
         nodes, drives = self.path(x)
-        distinct, which = grid.distinct(np.clip(times - grid.breakpoints[pieces], 0.0, None))
-        flow, driven = self.functionals.response.flows(distinct)
-        return np.asarray(flow[which] @ nodes[pieces] + driven[which] @ drives[pieces])
+        flow, driven = self.functionals.response.flows_in(pieces, np.clip(times - grid.breakpoints[pieces], 0.0, None))
+        return np.asarray(flow @ nodes[pieces] + driven @ drives[pieces])
 
     def height(self, along: Array) -> Array:
         """``max_w`` of functionals ``(..., 1 + Q)`` of the nominal state and the responses."""
@@ -171,8 +173,10 @@ class ClosedLoop:
         On a cell every functional is within ``(b - a)^2 / 8`` times its largest second derivative of its chord, and a
         support function of a chord lies below the chord of the support functions.
         """
-        grid, A = self.functionals.response.grid, self.steps.A[0, 0]
+        grid = self.functionals.response.grid
         pieces = grid.locate((lower + upper) / 2)
+        modes = np.zeros(1, dtype=int) if grid.mode is None else grid.mode[pieces]
+        A = self.steps.A[0, modes]  # (1, d, d) of one system, (k, d, d) of several
         ends = [self.states(x, times, pieces) for times in (lower, upper)]
         along = [H @ end for end in ends]
         h = (upper - lower)[:, None, None]
@@ -181,7 +185,7 @@ class ClosedLoop:
         for order in range(TERMS):
             second += factor * np.abs(row @ rates)
             row, factor = row @ A, factor * h / (order + 1)
-        growth = np.linalg.norm(A, 2) * h
+        growth = np.linalg.norm(self.steps.A[0], 2, axis=(1, 2))[modes, None, None] * h
         with np.errstate(over="ignore", invalid="ignore"):
             tail = (
                 factor
@@ -213,9 +217,9 @@ class ClosedLoop:
         """The pieces ``(k,)`` of the grid in which the state at ``times (k,)`` is looked at. A breakpoint is one of the
         piece that it ends; but where the control on a piece ``acting (k,)`` stands beside the state, which begins then,
         of that: this control has answered what happened before."""
-        grid = self.functionals.response.grid
+        grid, ends = self.functionals.response.grid, self.functionals.dictionary.breakpoints
         found = grid.locate(times)
-        return found if acting is None else np.maximum(found, np.searchsorted(grid.control_piece, acting))
+        return found if acting is None else np.maximum(found, np.searchsorted(grid.commanded(ends), acting))
 
     def signal(
         self, deviation: Array, time: float, direction: Array | None, acting: int | None = None

@@ -42,18 +42,19 @@ def innovations_seen(
         begun[0] = np.eye(d)
     if model is None:
         return begun
-    grid, E = response.grid, response.steps(KNOWN).E[0]
     if pieces is not None:
         return np.concatenate([_measurable(response, control, pieces), begun], axis=2)
+    grid, steps = response.grid, response.steps(KNOWN)
     assert model.starts is not None
     block = np.searchsorted(model.starts, np.arange(grid.pieces), side="right") - 1
-    ends = control.breakpoints[grid.control_piece + 1]
-    flows = response.flows(np.concatenate([ends - grid.breakpoints[1:], grid.lengths]))
-    moved = flows[0][: grid.pieces] @ flows[1][grid.pieces :] @ E
-    D = np.zeros((K, d, model.block_count, E.shape[1]))
-    for piece in range(grid.pieces):
-        if grid.control_piece[piece] + 1 < K:  # what happens on the last piece is seen when all is over
-            D[grid.control_piece[piece] + 1, :, block[piece]] += moved[piece]
+    pushes = steps.Gamma[0, response.which] @ grid.of_modes(steps.E[0])[grid.modes]
+    commanded = grid.commanded(control.breakpoints)
+    D = np.zeros((K, d, model.block_count, pushes.shape[2]))
+    for piece in range(int(np.searchsorted(commanded, K - 1))):  # what happens on the last one is seen when all is over
+        seen, last = D[commanded[piece] + 1], int(block[piece]) + 1
+        first = int(block[np.searchsorted(commanded, commanded[piece])])
+        seen[:, first:last] = np.tensordot(steps.Phi[0, response.which[piece]], seen[:, first:last], axes=1)
+        seen[:, block[piece]] += pushes[piece]
     return np.concatenate([D.reshape(K, d, -1), begun], axis=2)
 
 

@@ -192,8 +192,6 @@ class Controller:
         nominal = self._nominal[:, piece]
         if self._measuring is None:
             return nominal.copy()
-        grid, control = self._plan.known.response.grid, nominal
-        for number in np.flatnonzero(grid.control_piece == piece).tolist():
-            inputs = self._measuring(number, state[:, None])
-            control = inputs[: nominal.size, 0]
-        return self._plan.drawn_in(control, nominal)
+        for number in np.flatnonzero(self._measuring.commanded == piece).tolist():
+            self._measuring(number, state[:, None])
+        return self._plan.drawn_in(self._measuring.command(piece)[:, 0], nominal)

@@ -81,6 +81,21 @@ class TimeGrid:
             acting = np.where(self.control_piece >= 0, acting, self.before[:, None])
         return np.vstack([acting, np.ones((self.constants, self.pieces))]) if self.constants else acting
 
+    def commanded(self, breakpoints: Array) -> np.ndarray:
+        """Which piece of the control with these ``breakpoints (K + 1,)`` is commanded on every piece of the grid,
+        ``(L,)``: the one that acts, where there is no delay."""
+        middles = (self.breakpoints[:-1] + self.breakpoints[1:]) / 2
+        return np.asarray(np.searchsorted(breakpoints, middles) - 1)
+
+    @property
+    def modes(self) -> np.ndarray:
+        """Which mode acts on every piece, ``(L,)``."""
+        return np.zeros(self.pieces, dtype=int) if self.mode is None else self.mode
+
+    def of_modes(self, matrices: Array) -> Array:
+        """The matrices ``(J, d, m)`` of every mode, from ``(d, J m)`` side by side."""
+        return np.stack(np.split(matrices, len(self.turns), axis=-1))
+
     @cached_property
     def turns(self) -> list[slice]:
         """The pieces on which every mode acts, one mode after another."""
@@ -155,7 +170,8 @@ def merge_grids(
     switches: Sequence[float] = (),
 ) -> TimeGrid:
     """The merged grid of two sets of breakpoints over the same horizon; a control acts later by ``delay``, less than
-    the horizon, and ``before (m,)`` acts until then. The mode changes at ``switches``.
+    the horizon, and ``before (m,)`` acts until then; when it is commanded, and what it answers is measured, is on the
+    grid too. The mode changes at ``switches``.
 
     A breakpoint of the disturbance that is one of the control's but for rounding is taken for it. Two breakpoints of
     one set are never taken for one, however near they are, so that no piece of either is lost.
@@ -163,7 +179,8 @@ def merge_grids(
     begin = control
     if delay > 0.0:
         begin, horizon = control + delay, float(control[-1])
-        control = np.concatenate([[0.0], begin[begin < horizon - SAME_TIME * horizon], [horizon]])
+        later = np.concatenate([[0.0], begin[begin < horizon - SAME_TIME * horizon], [horizon]])
+        control = _joined(control, later)
     points = _joined(control, disturbance)
     if switches:
         points = _joined(points, np.array(switches))
@@ -523,6 +540,16 @@ class Propagator:
         """``e^{A r}`` and its integral ``(k, d, d)`` for durations ``(k,)``; for a known system."""
         return self._transitions(self.steps(np.zeros((1, 0))).A[0, 0], durations)
 
+    def flows_in(self, pieces: np.ndarray, durations: Array) -> tuple[Array, Array]:
+        """`flows` of the systems that act on ``pieces (k,)`` of the grid."""
+        A, modes = self.steps(np.zeros((1, 0))).A[0], self.grid.modes[pieces]
+        flow, driven = np.empty((2, durations.size, *A.shape[1:]))
+        for mode in np.unique(modes):
+            mine = modes == mode
+            distinct, which = self.grid.distinct(durations[mine])
+            flow[mine], driven[mine] = (part[which] for part in self._transitions(A[mode], distinct))
+        return flow, driven
+
     def _transitions(self, A: Array, durations: Array) -> tuple[Array, Array]:
         return (self.propagate or transitions)(A, durations)
 
@@ -727,6 +754,10 @@ class Response:
     def flows(self, durations: Array) -> tuple[Array, Array]:
         """`Propagator.flows`."""
         return self.propagator.flows(durations)
+
+    def flows_in(self, pieces: np.ndarray, durations: Array) -> tuple[Array, Array]:
+        """`Propagator.flows_in`."""
+        return self.propagator.flows_in(pieces, durations)
 
     @property
     def uniform(self) -> bool:

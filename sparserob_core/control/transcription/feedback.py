@@ -151,8 +151,10 @@ def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dic
         and not disturbance.is_complete,
         f"path constraint of another name than {' or '.join(map(str, named))}, which is taken": bool(named),
         "terminal set with an interior under measurable disturbances: they reach a fixed state": measurable and ends,
-        "control that acts at once, without a delay": problem.system.delay > 0.0,
-        "single linear system, without pieces": bool(problem.system.switches),
+        "control that acts at once under measurable disturbances, without a delay": measurable
+        and problem.system.delay > 0.0,
+        "single linear system under measurable disturbances, without pieces": measurable
+        and bool(problem.system.switches),
         "control_step with flat sides": problem.control_step is not None and problem.control_step.halfspaces() is None,
         "cost that is the L1 norm alone, without group": not problem.cost.is_linear,
     }

@@ -66,7 +66,7 @@ def test_the_state_in_balls_is_that_of_a_loop_that_measures(name):
             heights = loop.highest(piece, time, H)
             assert [float(h.mid()) for h in heights] == pytest.approx(case.height(H @ truth).tolist(), abs=1e-10)
         for k, truth in enumerate(controls):
-            assert table(loop.acting(k)) == pytest.approx(truth, abs=1e-10)
+            assert table(loop.inputs(k)) == pytest.approx(truth, abs=1e-10)
         assert (loop.radii >= case.radii).all()
         assert loop.radii == pytest.approx(
             np.concatenate([np.zeros(0), *(np.array(known(s).radius) + np.abs(m) for s, m in case.sets)]), rel=1e-9
