@@ -484,7 +484,7 @@ def _secure(
             break
         answer = farther
         x = farther.solution.x
-        looked = separate(program, x, ledger.tools, ALLOWED)
+        looked = separate(program, x, ledger.tools, ALLOWED, max(1, len(ledger.history)))
         found = [
             (family, one) for family, one in looked if not family.defines and one.violations.max(initial=0.0) > ALLOWED
         ]

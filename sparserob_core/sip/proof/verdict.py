@@ -61,11 +61,11 @@ def _worse(proof: Proof, family: ConstraintFamily, found: Separation) -> Proof:
 
 
 def worst_of(separations: Sequence[tuple[ConstraintFamily, Separation]]) -> WorstConstraint:
-    """The most violated constraint that the separations of all families have found."""
+    """The most violated constraint that the separations of all families have found; what defines a value is none."""
     found = [
         WorstConstraint(float(s.violations[0]), family.name, s.indices[0], int(s.rows[0]), family.formulation)
         for family, s in separations
-        if s.violations.size
+        if s.violations.size and not family.defines
     ]
     return max(found, key=lambda one: one.violation, default=WorstConstraint(-np.inf, "", np.zeros(0)))
 
