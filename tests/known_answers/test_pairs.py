@@ -1,0 +1,138 @@
+"""Guards the table of pairs in docs/scope.md: features of problems, two at a time, are what the table says: proven and
+checked, proven alone, left open, or refused."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import sparserob_core as sr
+from sparserob_core.experiment.check.check import check
+from tests.support.places import ROOT
+
+Config = dict[str, Any]
+
+BASE: Config = {
+    "problem": {
+        "name": "linear",
+        "system": {"A": [[0, 1], [-1, -0.4]], "B": [[0.2, 0], [0, 1]]},
+        "horizon": 3.0,
+        "initial_state": [-0.5, 0.5],
+        "control": {"box": 1.0},
+        "disturbance": {"box": [0.03, 0.03]},
+        "path": [{"box": [0.6, None], "from": 0.2}],
+        "terminal": [{"box": [0.25, 0.25]}],
+    },
+    "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 6}},
+    "observers": [],
+}
+
+
+def in_problem(**more: Any) -> Callable[[Config], object]:
+    return lambda config: config["problem"].update(copy.deepcopy(more))
+
+
+def also_on_the_path(**entry: Any) -> Callable[[Config], object]:
+    return lambda config: config["problem"]["path"].append(copy.deepcopy(entry))
+
+
+def costing(**more: Any) -> Callable[[Config], object]:
+    return lambda config: config["problem"].setdefault("cost", {}).update(more)
+
+
+def in_turns(config: Config) -> None:
+    system = config["problem"]["system"]
+    one = {name: system.pop(name) for name in ("A", "B")}
+    system["pieces"] = [{"until": 1.25, **one}, {"until": 3.0, **copy.deepcopy(one), "B": [[0.3, 0], [0, 0.8]]}]
+
+
+def systems(config: Config) -> list[Config]:
+    system = config["problem"]["system"]
+    return list(system.get("pieces", [system]))
+
+
+def with_parameters(config: Config) -> None:
+    for one in systems(config):
+        one["A"] = [[0, 1], ["-1 + p", -0.4]]
+    config["problem"]["system"]["parameters"] = {"p": [-0.05, 0.05]}
+
+
+def with_drift(config: Config) -> None:
+    for one in systems(config):
+        one["c"] = [0, 0.05]
+
+
+def at_rest_at_the_end(config: Config) -> None:
+    config["problem"]["terminal"] = [{"equals": [None, 0.1]}]
+    del config["problem"]["disturbance"]  # it would reach the state that is fixed
+
+
+FEATURES: dict[str, Callable[[Config], object]] = {
+    "pieces of the system": in_turns,
+    "parameters": with_parameters,
+    "drift": with_drift,
+    "delay": lambda config: config["problem"]["system"].update(delay=0.2),
+    "initial set": in_problem(initial_state={"centre": [-0.5, 0.5], "box": [0.02, 0.02]}),
+    "moving set": also_on_the_path(**{"box": [0.8, None], "from": 0.3, "relative_to": [[0, -0.2, 0], [3, 0.1, 0]]}),
+    "mixed": also_on_the_path(**{"mixed": {"H": [[0, 1]], "G": [[0.2, 0.5]], "h": [1.0]}, "from": 0.5}),
+    "curved path": also_on_the_path(**{"ellipsoid": {"centre": [0, 0], "shape": [[0.5, 0], [0, 0.6]]}, "from": 0.5}),
+    "fixed final state": at_rest_at_the_end,
+    "measurable": in_problem(disturbance_class="measurable", disturbance={"box": [0.015, 0.015]}),
+    "control_step": in_problem(control_step={"box": 0.9}),
+    "curved control_step": in_problem(control_step={"norm": {"p": 2, "radius": 1.0}}),
+    "group": costing(group="all"),
+    "quadratic cost": costing(l1=1.0, control={"R": [[0.1, 0], [0, 0.1]]}),
+    "prices by piece": in_problem(weights=[[0, 1, 1], [1.5, 2, 2]]),
+    "haar": lambda config: config["dictionaries"].update(control={"name": "haar", "pieces": 8}),
+    "sparsest": lambda config: config.update(method={"name": "sparsest", "nodes": 300}),
+    "affine": lambda config: config.update(policy={"name": "affine"}),
+}
+SIGNS = {
+    ("proven", "verified"): "●",
+    ("proven", "undecided"): "○",
+    ("undecided", "undecided"): "?",
+    ("refused", ""): "–",
+}
+NAMES = list(FEATURES)
+
+
+def sign(names: set[str], directory: Path) -> str:
+    """What becomes of a problem with these features."""
+    config = copy.deepcopy(BASE)
+    for name, put in FEATURES.items():
+        if name in names:
+            put(config)
+    try:
+        outcome = sr.run(config, out=directory, quiet=True, figures=False)
+    except sr.InputError:
+        return SIGNS["refused", ""]
+    status = "proven" if outcome.status in ("certified", "verified") else outcome.status
+    return SIGNS[status, check(directory).status]
+
+
+def table() -> list[list[str]]:
+    """The signs in docs/scope.md, row by row."""
+    text = (ROOT / "docs" / "scope.md").read_text(encoding="utf-8").split("## Every pair")[1].split("\n## ")[0]
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
+    assert lines[0] == ["", *map(str, range(1, len(NAMES) + 1))]
+    assert [line[0] for line in lines[2:]] == [f"{number}. {name}" for number, name in enumerate(NAMES, 1)]
+    return [line[1:] for line in lines[2:]]
+
+
+def test_the_table_of_pairs_has_a_sign_for_each_and_is_the_same_from_both_sides() -> None:
+    signs = table()
+    assert all(len(row) == len(NAMES) and set(row) <= set(SIGNS.values()) for row in signs)
+    assert all(signs[i][j] == signs[j][i] for i in range(len(NAMES)) for j in range(i))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_every_pair_is_what_the_table_says(name: str, tmp_path: Path) -> None:
+    number = NAMES.index(name)
+    others = NAMES[: number + 1]
+    found = {other: sign({name, other}, tmp_path / str(k)) for k, other in enumerate(others)}
+    assert found == dict(zip(others, table()[number][: number + 1], strict=True))
