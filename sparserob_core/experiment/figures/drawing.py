@@ -41,16 +41,17 @@ def draw_experiment(
     directory: Path,
     cost: float | None,
     worst: Mapping[str, Array],
+    status: str,
 ) -> list[Path]:
     """Draw the figures of a decision (``theta (m, N)``, or whole) into ``directory/figures``; raises `InputError` when
-    there is nothing to draw.
+    there is nothing to draw. Where the ``status`` claims no proof, their titles say so.
 
     ``worst``: the arrays of `adversaries`, empty when there is no constraint to be driven against.
     """
     from sparserob_core.experiment.figures.adversary_figure import write_adversary
     from sparserob_core.experiment.figures.run_figures import write_figures
 
-    data = figure_data(experiment, theta, active_times, history, cost, draws=DRAWS)
+    data = figure_data(experiment, theta, active_times, history, cost, draws=DRAWS, status=status)
     files = write_figures(directory / "figures", data)
     if worst:
         files += write_adversary(directory / "figures" / "adversary", worst, data)
@@ -64,12 +65,16 @@ def figure_data(
     history: Sequence[RoundFinished],
     cost: float | None,
     draws: int = 0,
+    status: str = "",
 ) -> FigureData:
     """What figures of a decision (``theta (m, N)``, or whole) show; under feedback also what so many random
-    disturbances and the worst one make of the control. Raises `InputError` when the program is no control problem."""
+    disturbances and the worst one make of the control. The title says so where a ``status`` claims no proof. Raises
+    `InputError` when the program is no control problem."""
     if not isinstance(experiment, ControlExperiment):
         raise InputError("figures: they are for control problems; this is a semi-infinite program of another kind")
-    return _data(experiment, theta, active_times, history, cost, draws)
+    data = _data(experiment, theta, active_times, history, cost, draws)
+    unproven = f"{data.title}: {status}, not proven" if status not in ("", "certified", "verified") else data.title
+    return replace(data, title=unproven)
 
 
 def active_times(solution: Mapping[str, Array]) -> Array:

@@ -82,17 +82,19 @@ def draw_control(data: FigureData) -> Figure:
 def draw_states(data: FigureData) -> Figure:
     """Every state with its worst-case tube; what the constraints forbid is hatched, the terminal set is a bracket."""
     figure, axes = panels(len(data.drawn_states), 1.9, extra=0.2)
+    uncertain = bool((data.tube_upper > data.tube_lower).any())
     for component, ax in zip(data.drawn_states, axes, strict=True):
-        ax.fill_between(
-            data.times,
-            data.tube_lower[component],
-            data.tube_upper[component],
-            color=look.SKY,
-            alpha=0.45,
-            linewidth=0,
-            zorder=2,
-            label="worst case" if data.gains is None else "worst case, with feedback",
-        )
+        if uncertain:
+            ax.fill_between(
+                data.times,
+                data.tube_lower[component],
+                data.tube_upper[component],
+                color=look.SKY,
+                alpha=0.45,
+                linewidth=0,
+                zorder=2,
+                label="worst case" if data.gains is None else "worst case, with feedback",
+            )
         for outer in (data.alone_lower, data.alone_upper):
             if outer is not None:
                 ax.plot(
@@ -106,7 +108,14 @@ def draw_states(data: FigureData) -> Figure:
                 )
         for edge in (data.tube_lower[component], data.tube_upper[component]):
             ax.plot(data.times, edge, color=look.SKY, linewidth=0.8, zorder=2)
-        ax.plot(data.times, data.state[component], color=look.BLUE, linewidth=1.5, zorder=3, label="nominal")
+        ax.plot(
+            data.times,
+            data.state[component],
+            color=look.BLUE,
+            linewidth=1.5,
+            zorder=3,
+            label="nominal" if uncertain else "state",
+        )
         walls = [wall for wall in data.walls if wall.state == component]
         ax.set_ylim(*_limits(data, component, walls))
         draw_walls(ax, walls)

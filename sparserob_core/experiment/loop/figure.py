@@ -33,7 +33,8 @@ COLOURS = {
 def write_loops(file: Path, loops: ClosedLoops, finished: FinishedRun) -> None:
     """Draw loops over the tube of their plan into a file (.png, .pdf, .svg); raises `InputError` when it cannot be
     written."""
-    data = figure_data(finished.experiment, finished.decision, active_times(finished.solution), (), None)
+    active, status = active_times(finished.solution), str(finished.summary["status"])
+    data = figure_data(finished.experiment, finished.decision, active, (), None, status=status)
     with style():
         write_figure(file, draw_loops(loops, data))
 

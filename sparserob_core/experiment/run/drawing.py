@@ -92,7 +92,9 @@ def drawings(
         yield lambda: draw_clash(experiment, result, directory)
     elif isinstance(experiment, ControlExperiment) and result.decision is not None:
         active, decision = _active(experiment, result), np.asarray(result.decision, dtype=float).ravel()
-        yield lambda: draw_experiment(experiment, decision, active, result.history, directory, result.cost, worst)
+        yield lambda: draw_experiment(
+            experiment, decision, active, result.history, directory, result.cost, worst, result.status
+        )
     trace = result.trace
     if trace is not None and np.isfinite(trace.value).any():
         exact = result.status == "certified"
@@ -117,7 +119,7 @@ def pictures(experiment: Experiment, result: Result) -> dict[str, Callable[[], F
     elif isinstance(experiment, ControlExperiment) and result.decision is not None:
         decision = np.asarray(result.decision, dtype=float).ravel()
         active = _active(experiment, result)
-        data = figure_data(experiment, decision, active, result.history, result.cost, draws=DRAWS)
+        data = figure_data(experiment, decision, active, result.history, result.cost, DRAWS, result.status)
         known |= run_pictures(data)
         worst = adversaries(experiment, decision)
         if worst:

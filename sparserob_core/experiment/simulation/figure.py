@@ -28,7 +28,8 @@ def write_simulation(
 
     Raises `InputError` when the file cannot be written.
     """
-    data = figure_data(finished.experiment, finished.decision, active_times(finished.solution), (), None)
+    active, status = active_times(finished.solution), str(finished.summary["status"])
+    data = figure_data(finished.experiment, finished.decision, active, (), None, status=status)
     if worst is not None:
         write_adversary(file, worst, data)
         return

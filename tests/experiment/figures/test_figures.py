@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import sparserob_core as sr
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.figures.figure_data import FigureData, Wall
 from sparserob_core.experiment.figures.run_figures import draw_control, draw_convergence, draw_states, write_figures
@@ -74,6 +75,29 @@ def test_walls_appear_only_in_the_panel_of_their_state(data: FigureData) -> None
     labels = [set(axes.get_legend_handles_labels()[1]) for axes in (first, second)]
     assert "forbidden" in labels[0] and "forbidden" not in labels[1]
     assert "terminal set" in labels[1] and "terminal set" not in labels[0]
+
+
+def test_the_legend_speaks_of_a_worst_case_only_where_something_is_uncertain(data: FigureData) -> None:
+    known = replace(data, tube_lower=data.state, tube_upper=data.state)
+    labels = [set(draw_states(one).axes[0].get_legend_handles_labels()[1]) for one in (data, known)]
+    assert labels[0] >= {"worst case", "nominal"} and not labels[1] & {"worst case", "nominal"}
+    assert "state" in labels[1]
+
+
+@pytest.mark.parametrize(("radius", "proven"), [(0.01, True), (5.0, False)])
+def test_the_title_says_where_nothing_is_proven(radius: float, proven: bool, tmp_path: Path) -> None:
+    problem = sr.OptimalControlProblem(
+        system=sr.LinearSystem([[0.0]], [[1.0]]),
+        horizon=1.0,
+        initial_state=[0.5],
+        control=sr.Box([-1.0], [1.0]),
+        disturbance=sr.Box([-radius], [radius]),
+        terminal=[sr.Box([-0.3], [0.3])],
+    )
+    control = sr.load_registry().build("dictionary", "piecewise_constant", {"pieces": 2}).build(1.0)
+    result = sr.solve(problem, control=control, method="exchange" if proven else "nominal")
+    title = result.plot("states").axes[0].get_title(loc="left")
+    assert title.endswith("refuted, not proven") is not proven
 
 
 def test_of_many_states_those_with_constraints_are_drawn_and_those_that_move_the_farthest(data: FigureData) -> None:
