@@ -31,15 +31,21 @@ def _public() -> dict[str, str]:
 
 _HOME = _public()
 __all__ = sorted(_HOME)  # noqa: PLE0605
+_FORMER = {
+    f"{piece}Plugin": "sparserob_core.experiment.plugins.hookspecs"
+    for piece in ("Schedule", "OuterStop", "InnerStop", "Selection")
+}
+"""Names that packages of interface 1 may use, and that are no longer told."""
 
 
 def __getattr__(name: str) -> object:
-    if name not in _HOME:
+    home = _HOME.get(name) or _FORMER.get(name)
+    if home is None:
         from difflib import get_close_matches
 
         near = " or ".join(repr(match) for match in get_close_matches(name, __all__, 2))
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}" + f"; did you mean {near}?" * bool(near))
-    value = getattr(import_module(_HOME[name]), name)
+    value = getattr(import_module(home), name)
     globals()[name] = value
     return value
 

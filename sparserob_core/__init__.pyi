@@ -82,16 +82,13 @@ from sparserob_core.errors import not_installed as not_installed
 from sparserob_core.options import Options as Options
 from sparserob_core.experiment.plugins.hookspecs import DictionaryPlugin as DictionaryPlugin
 from sparserob_core.experiment.plugins.hookspecs import ExecutorPlugin as ExecutorPlugin
-from sparserob_core.experiment.plugins.hookspecs import InnerStopPlugin as InnerStopPlugin
 from sparserob_core.experiment.plugins.hookspecs import MaximiserPlugin as MaximiserPlugin
 from sparserob_core.experiment.plugins.hookspecs import MethodPlugin as MethodPlugin
 from sparserob_core.experiment.plugins.hookspecs import ObserverPlugin as ObserverPlugin
-from sparserob_core.experiment.plugins.hookspecs import OuterStopPlugin as OuterStopPlugin
 from sparserob_core.experiment.plugins.hookspecs import PolicyPlugin as PolicyPlugin
 from sparserob_core.experiment.plugins.hookspecs import ProblemPlugin as ProblemPlugin
 from sparserob_core.experiment.plugins.hookspecs import RegulariserPlugin as RegulariserPlugin
-from sparserob_core.experiment.plugins.hookspecs import SchedulePlugin as SchedulePlugin
-from sparserob_core.experiment.plugins.hookspecs import SelectionPlugin as SelectionPlugin
+from sparserob_core.experiment.plugins.hookspecs import RulePlugin as RulePlugin
 from sparserob_core.experiment.plugins.hookspecs import SetPlugin as SetPlugin
 from sparserob_core.experiment.plugins.hookspecs import SolverPlugin as SolverPlugin
 from sparserob_core.experiment.plugins.hookspecs import hookimpl as hookimpl
@@ -125,6 +122,7 @@ from sparserob_core.sip.rules import InnerStop as InnerStop
 from sparserob_core.sip.rules import OuterStep as OuterStep
 from sparserob_core.sip.rules import OuterStop as OuterStop
 from sparserob_core.sip.rules import Progress as Progress
+from sparserob_core.sip.rules import Rule as Rule
 from sparserob_core.sip.rules import Schedule as Schedule
 from sparserob_core.sip.rules import Selection as Selection
 from sparserob_core.control.policies.affine import AffinePolicy as AffinePolicy

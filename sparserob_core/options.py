@@ -124,13 +124,15 @@ def _docstrings(owner: type) -> Mapping[str, str]:
     return found
 
 
-def part(kind: str) -> Any:
-    """The default of an option that is itself a component of that kind: none.
+def part(kind: str, of: type | None = None) -> Any:
+    """The default of an option that is itself a component of that kind: none. ``of``: the class of those that will do,
+    where not all of the kind do.
 
     A config names the component; the registry builds it before the component that has the option. In Python the option
     takes the component itself.
     """
-    return Field(default=None, json_schema_extra={"component": kind})
+    which = {} if of is None else {"of": f"{of.__module__}:{of.__qualname__}"}
+    return Field(default=None, json_schema_extra={"component": kind, **which})
 
 
 def _sentences(name: str, error: ValidationError) -> list[str]:

@@ -1,7 +1,7 @@
 """The four pieces of the paper's algorithm that a user may replace: ``Regu``, ``SC1``, ``SC2`` and ``SlCr``.
 
 Each is an object that is called; a plain function with the same arguments serves as well, and under a name too:
-``SelectionPlugin(name="mine", factory=Selection.of(function))``.
+``RulePlugin(name="mine", factory=Selection.of(function))``.
 """
 
 from __future__ import annotations
@@ -52,7 +52,8 @@ class Progress:
 
 
 class Rule:
-    """One of the four pieces: an object that is called."""
+    """One of the four pieces of the paper's loop, an object that is called: a `Schedule`, an `OuterStop`, an
+    `InnerStop` or a `Selection`."""
 
     @classmethod
     def of(cls, function: Callable[..., object]) -> type[Self]:

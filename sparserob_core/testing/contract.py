@@ -69,11 +69,12 @@ class Contract(ABC, Generic[Component]):
 
     component: ClassVar[Any] = None
     kind: ClassVar[str]
+    of: ClassVar[type | None] = None
 
-    def __init_subclass__(cls, kind: str | None = None) -> None:
+    def __init_subclass__(cls, kind: str | None = None, of: type | None = None) -> None:
         super().__init_subclass__()
         if kind is not None:
-            cls.kind = kind
+            cls.kind, cls.of = kind, of
             for name, test in [*vars(cls).items()]:
                 if name.startswith("test_"):
                     setattr(cls, name, without_output(test))
@@ -100,6 +101,8 @@ class Contract(ABC, Generic[Component]):
 
     def expected(self) -> tuple[type, ...]:
         """The classes of which a component of this kind may be."""
+        if self.of is not None:
+            return (self.of,)
         module, _, name = record_type(self.kind).component.partition(":")
         return (getattr(import_module(module), name),)
 

@@ -12,6 +12,7 @@ import pytest
 import sparserob_core as sr
 import sparserob_core.testing as contracts
 from sparserob_core.experiment.plugins.records import RECORDS
+from sparserob_core.experiment.scaffold.new_plugin import kinds
 from tests.contracts import (
     test_dictionaries,
     test_executors,
@@ -110,7 +111,8 @@ def contract_of(kind):
 
 
 def test_every_kind_has_its_table_of_faults():
-    assert set(FAULTS) == set(PRINTING) == set(RECORDS)
+    assert set(FAULTS) == set(PRINTING) == set(kinds())
+    assert {contract_of(kind).kind for kind in kinds()} == set(RECORDS)
     assert all(len(faults) >= 10 for faults in FAULTS.values())
 
 

@@ -93,7 +93,8 @@ class _Rows:
         if "kinds" in member:
             return f"{member['kinds']}: one key per kind"
         if "component" in member:
-            return f"{str(member['component']).replace('_', ' ')} by name, or with its options"
+            of = str(member.get("of", "")).rpartition(":")[2]
+            return f"{member['component']}{f' ({of})' if of else ''} by name, or with its options"
         kind = member.get("type")
         if kind == "array":
             inside = " or ".join(dict.fromkeys(self._type(item) for _, item in self._members(member.get("items", {}))))

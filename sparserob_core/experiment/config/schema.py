@@ -10,7 +10,7 @@ from pydantic_core import core_schema
 
 from sparserob_core.experiment.config.run_config import SLOTS, MaximiserEntry, RunConfig
 from sparserob_core.experiment.config.set_options import shorthand
-from sparserob_core.experiment.plugins.components import Registry
+from sparserob_core.experiment.plugins.components import Part, Registry
 from sparserob_core.experiment.plugins.components import parts as components
 from sparserob_core.experiment.plugins.records import Plugin
 from sparserob_core.options import meanings
@@ -51,14 +51,14 @@ def config_schema(registry: Registry) -> dict[str, Any]:
     for path, slot in SLOTS.items():
         holder = schema if len(path) == 1 else parts["Dictionaries"]
         previous = holder["properties"][path[-1]]
-        choice = _choice(registry, slot.kind, slot.name, parts)
+        choice = _choice(registry, Part(slot.kind), slot.name, parts)
         if any(option.get("type") == "null" for option in previous.get("anyOf", [])):
             choice["anyOf"].append({"type": "null"})
         holder["properties"][path[-1]] = {
             **{key: previous[key] for key in ("default", "description") if key in previous},
             **choice,
         }
-    schema["properties"]["observers"]["items"] = _choice(registry, "observer", None, parts)
+    schema["properties"]["observers"]["items"] = _choice(registry, Part("observer"), None, parts)
     for unused in ("Entry", "MaximiserEntry"):
         parts.pop(unused, None)
     _add_kinds(registry, parts)
@@ -90,18 +90,20 @@ def _alternatives(field: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _choice(
-    registry: Registry, kind: str, default: str | None, parts: dict[str, Any], but: str | None = None
+    registry: Registry, which: Part, default: str | None, parts: dict[str, Any], but: str | None = None
 ) -> dict[str, Any]:
     """A component of a kind, by name or with its options; ``but``: one that cannot be meant, within its own options."""
-    names = [name for name in registry.names(kind) if name != but]
+    kind = which.kind
+    names = [name for name in registry.names(kind, which.of) if name != but]
     entries = []
     for name in names:
         record = registry.get(kind, name)
         entry = options_schema(record, ask=False)
         for key, part in ({} if record.open else components(record.options_type())).items():
             described = entry["properties"][key]
-            described.pop("component")
-            others = _choice(registry, part, None, parts, but=name if part == kind else None)
+            for extra in ("component", "of"):
+                described.pop(extra, None)
+            others = _choice(registry, part, None, parts, but=name if part.kind == kind else None)
             described["anyOf"] = [*others["anyOf"], {"type": "null"}]
         parts.update({f"{kind}.{name}.{part}": value for part, value in entry.pop("$defs", {}).items()})
         entries.append(_named(entry, record, needs_name=name != default))

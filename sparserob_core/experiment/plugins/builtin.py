@@ -5,12 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from sparserob_core.experiment.plugins.hookspecs import (
-    InnerStopPlugin,
     MethodPlugin,
-    OuterStopPlugin,
     ProblemPlugin,
-    SchedulePlugin,
-    SelectionPlugin,
+    RulePlugin,
     SolverPlugin,
     hookimpl,
 )
@@ -69,72 +66,45 @@ def sparserob_solvers() -> Iterator[SolverPlugin]:
 
 
 @hookimpl
-def sparserob_schedules() -> Iterator[SchedulePlugin]:
-    """``Regu``."""
-    yield SchedulePlugin(
-        name="geometric",
-        factory=f"{RULES}:Geometric",
-        summary="A constant factor, 1/2 by default.",
+def sparserob_rules() -> Iterator[RulePlugin]:
+    """Those of the paper's loop, and others in their places."""
+    yield RulePlugin(name="geometric", factory=f"{RULES}:Geometric", summary="Regu: a constant factor, 1/2 by default.")
+    yield RulePlugin(
+        name="accelerating", factory=f"{RULES}:Accelerating", summary="Regu: the j-th power of a factor in iteration j."
     )
-    yield SchedulePlugin(
-        name="accelerating",
-        factory=f"{RULES}:Accelerating",
-        summary="The j-th power of a factor in iteration j.",
-    )
-
-
-@hookimpl
-def sparserob_outer_stops() -> Iterator[OuterStopPlugin]:
-    """``SC1``."""
-    yield OuterStopPlugin(
+    yield RulePlugin(
         name="optimisers_settle",
         factory=f"{RULES}:OptimisersSettle",
-        summary="The norm of the difference of successive optimisers is small.",
+        summary="SC1: the norm of the difference of successive optimisers is small.",
     )
-    yield OuterStopPlugin(
+    yield RulePlugin(
         name="costs_settle",
         factory=f"{RULES}:CostsSettle",
-        summary="The difference of successive costs is small.",
+        summary="SC1: the difference of successive costs is small.",
     )
-    yield OuterStopPlugin(
-        name="iterations",
-        factory=f"{RULES}:Iterations",
-        summary="A number of outer iterations.",
-    )
-
-
-@hookimpl
-def sparserob_inner_stops() -> Iterator[InnerStopPlugin]:
-    """``SC2``."""
-    yield InnerStopPlugin(
-        name="evaluations",
-        factory=f"{RULES}:Evaluations",
-        summary="A number of evaluations.",
-    )
-    yield InnerStopPlugin(
+    yield RulePlugin(name="iterations", factory=f"{RULES}:Iterations", summary="SC1: a number of outer iterations.")
+    yield RulePlugin(name="evaluations", factory=f"{RULES}:Evaluations", summary="SC2: a number of evaluations.")
+    yield RulePlugin(
         name="temperature_floor",
         factory=f"{RULES}:TemperatureFloor",
-        summary="The temperature of an annealing maximiser is low.",
+        summary="SC2: the temperature of an annealing maximiser is low.",
     )
-    yield InnerStopPlugin(
-        name="stalled",
-        factory=f"{RULES}:Stalled",
-        summary="The best value has not risen for a while.",
+    yield RulePlugin(
+        name="stalled", factory=f"{RULES}:Stalled", summary="SC2: the best value has not risen for a while."
     )
-
-
-@hookimpl
-def sparserob_selections() -> Iterator[SelectionPlugin]:
-    """``SlCr``."""
-    yield SelectionPlugin(
+    yield RulePlugin(
         name="metropolis",
         factory=f"{RULES}:Metropolis",
-        summary="What is worse by delta, with probability exp(-delta / temperature).",
+        summary="SlCr: what is worse by delta is accepted with probability exp(-delta / temperature).",
     )
-    yield SelectionPlugin(
-        name="threshold", factory=f"{RULES}:Threshold", summary="What is worse by no more than the temperature."
+    yield RulePlugin(
+        name="threshold",
+        factory=f"{RULES}:Threshold",
+        summary="SlCr: what is worse by no more than the temperature is accepted.",
     )
-    yield SelectionPlugin(name="improvement", factory=f"{RULES}:Improvement", summary="Only what is not worse.")
+    yield RulePlugin(
+        name="improvement", factory=f"{RULES}:Improvement", summary="SlCr: only what is not worse is accepted."
+    )
 
 
 @hookimpl

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any, final
 
-from sparserob_core.errors import InputError, SparseRobError, UnknownPluginError
-from sparserob_core.experiment.plugins.attribution import attributed
+from sparserob_core.errors import InputError, PluginError, SparseRobError, UnknownPluginError
+from sparserob_core.experiment.plugins.attribution import attributed, short_repr
 from sparserob_core.experiment.plugins.guards import guarded
 from sparserob_core.experiment.plugins.hookspecs import record_type
 from sparserob_core.experiment.plugins.messages import Complaint, complaints, nearest, shown
@@ -28,15 +29,28 @@ class Failure:
         return f"plugin '{self.plugin}' failed to load: {self.reason}"
 
 
-def parts(model: type[Options]) -> dict[str, str]:
-    """The options that are components themselves: name of the option to kind, as
-    ``json_schema_extra={"component": kind}`` says."""
+@dataclass(frozen=True)
+class Part:
+    """The ``kind`` of an option that is a component itself, and the class ``of`` those that will do."""
+
+    kind: str
+    of: type | None = None
+
+
+def parts(model: type[Options]) -> dict[str, Part]:
+    """The options that are components themselves, by name, as `sparserob_core.options.part` says."""
     extras = {key: field.json_schema_extra for key, field in model.model_fields.items()}
     return {
-        key: str(extra["component"])
+        key: Part(str(extra["component"]), _class(str(extra["of"])) if "of" in extra else None)
         for key, extra in extras.items()
         if isinstance(extra, dict) and "component" in extra
     }
+
+
+def _class(place: str) -> type:
+    module, _, name = place.partition(":")
+    found: type = getattr(import_module(module), name)
+    return found
 
 
 @final
@@ -67,9 +81,10 @@ class Registry:
             )
         known[record.name] = record
 
-    def names(self, kind: str) -> list[str]:
-        """The registered names of a kind, sorted."""
-        return sorted(self._records[record_type(kind).kind])
+    def names(self, kind: str, of: type | None = None) -> list[str]:
+        """The registered names of a kind, sorted; with a class, of those that may be ``of`` it."""
+        known = self._records[record_type(kind).kind]
+        return sorted(name for name, record in known.items() if of is None or record.may_be(of))
 
     def records(self) -> Iterator[Plugin]:
         """Every record, by kind and name."""
@@ -77,13 +92,14 @@ class Registry:
             for name in self.names(kind):
                 yield self._records[kind][name]
 
-    def get(self, kind: str, name: str) -> Plugin:
-        """The record of that name; raises `UnknownPluginError` with the nearest known names and every plugin that
-        failed."""
-        known = self._records[record_type(kind).kind]
-        if name in known:
-            return known[name]
-        raise UnknownPluginError(f"no {kind} is named '{name}'{nearest(name, known)}{self.notes()}")
+    def get(self, kind: str, name: str, of: type | None = None) -> Plugin:
+        """The record of that name, with a class only ``of`` it; raises `UnknownPluginError` with the nearest known
+        names and every plugin that failed."""
+        found = self._records[record_type(kind).kind].get(name)
+        if found is not None and (of is None or found.may_be(of)):
+            return found
+        what = kind if of is None else f"{kind} of the class {of.__name__}"
+        raise UnknownPluginError(f"no {what} is named '{name}'{nearest(name, self.names(kind, of))}{self.notes()}")
 
     def check(self, kind: str, name: str, options: Mapping[str, object]) -> tuple[Options | None, list[Complaint]]:
         """The typed options, or what is wrong with them. An option that is itself a component is spelt out with its own
@@ -98,6 +114,8 @@ class Registry:
             if isinstance(entry, str | Mapping):
                 given[key], faults = self._spelt_out(part, entry)
                 wrong += [fault.under((key,)) for fault in faults]
+                if faults:
+                    del given[key]  # what is wrong with it is said
         try:
             with attributed(record.origin, "checking its options", but=(SparseRobError, ValidationError)):
                 checked = model.model_validate(given, context={"registry": self})
@@ -105,7 +123,7 @@ class Registry:
             return None, [*complaints(error, model, options), *wrong]
         return (None if wrong else checked), wrong
 
-    def _spelt_out(self, kind: str, entry: str | Mapping[str, Any]) -> tuple[object, list[Complaint]]:
+    def _spelt_out(self, part: Part, entry: str | Mapping[str, Any]) -> tuple[object, list[Complaint]]:
         """A component within another one's options as a mapping with its name and all its options, and what is wrong
         with it."""
         name, options = (
@@ -114,11 +132,11 @@ class Registry:
             else (entry.get("name"), {key: entry[key] for key in entry if key != "name"})
         )
         if not isinstance(name, str):
-            return entry, [
-                Complaint(("name",), f"expected the name of one of {', '.join(self.names(kind))} (got {shown(name)})")
-            ]
+            known = ", ".join(self.names(part.kind, part.of))
+            return entry, [Complaint(("name",), f"expected the name of one of {known} (got {shown(name)})")]
         try:
-            checked, wrong = self.check(kind, name, options)
+            self.get(part.kind, name, part.of)
+            checked, wrong = self.check(part.kind, name, options)
         except UnknownPluginError as error:
             return entry, [Complaint(("name",) if isinstance(entry, Mapping) else (), str(error))]
         return (entry if checked is None else {"name": name, **checked.model_dump(mode="json", by_alias=True)}), wrong
@@ -129,14 +147,19 @@ class Registry:
         if checked is None:
             raise InputError("\n".join(f"{kind} {name}: {complaint}" for complaint in wrong))
         inner = {
-            key: guarded(
-                self.build(part, value["name"], {option: value[option] for option in value if option != "name"}),
-                self.get(part, value["name"]).origin,
-            )
+            key: self._part(part, value)
             for key, part in parts(type(checked)).items()
             if isinstance(value := getattr(checked, key), Mapping)
         }
         return self.get(kind, name).create(checked.model_copy(update=inner))
+
+    def _part(self, part: Part, entry: Mapping[str, Any]) -> object:
+        """A component within another one's options, behind the check of its kind."""
+        record = self.get(part.kind, entry["name"], part.of)
+        built = self.build(part.kind, entry["name"], {key: entry[key] for key in entry if key != "name"})
+        if part.of is not None and not isinstance(built, part.of):
+            raise PluginError(f"{record.origin}: building it gave {short_repr(built)}, expected a {part.of.__name__}")
+        return guarded(built, record.origin)
 
     def find(self, name: str) -> list[Plugin]:
         """The records called ``name``, or ``kind.name``; raises `UnknownPluginError` with the nearest names when there

@@ -62,23 +62,9 @@ class MaximiserPlugin(Plugin, hook="sparserob_maximisers", component="sparserob_
 
 
 @final
-class SchedulePlugin(Plugin, hook="sparserob_schedules", component="sparserob_core.sip.rules:Schedule"):
-    """A `Schedule`: the next weight of the regulariser, the paper's ``Regu``."""
-
-
-@final
-class OuterStopPlugin(Plugin, hook="sparserob_outer_stops", component="sparserob_core.sip.rules:OuterStop"):
-    """An `OuterStop`: when outer iterations end, the paper's ``SC1``."""
-
-
-@final
-class InnerStopPlugin(Plugin, hook="sparserob_inner_stops", component="sparserob_core.sip.rules:InnerStop"):
-    """An `InnerStop`: when one global maximisation ends, the paper's ``SC2``."""
-
-
-@final
-class SelectionPlugin(Plugin, hook="sparserob_selections", component="sparserob_core.sip.rules:Selection"):
-    """A `Selection`: whether a walk accepts a candidate, the paper's ``SlCr``."""
+class RulePlugin(Plugin, hook="sparserob_rules", component="sparserob_core.sip.rules:Rule"):
+    """A `Rule` of the paper's loop: a `Schedule` (``Regu``), an `OuterStop` (``SC1``), an `InnerStop` (``SC2``) or a
+    `Selection` (``SlCr``)."""
 
 
 @final
@@ -105,12 +91,22 @@ def _specification(record: type[Plugin]) -> object:
     def hook() -> Iterable[Plugin]:
         return ()
 
-    hook.__name__, hook.__doc__ = record.hook, record.__doc__
+    hook.__doc__ = record.__doc__
     return pluggy.HookspecMarker(GROUP)(hook)
 
 
-HOOKS = {record.hook: record for record in RECORDS.values()}
-SPECIFICATIONS = type("Specifications", (), {name: _specification(record) for name, record in HOOKS.items()})
+HOOKS: dict[str, type[Plugin]] = {record.hook: record for record in RECORDS.values()}
+FORMER: dict[str, type[Plugin]] = dict.fromkeys(
+    ("sparserob_schedules", "sparserob_outer_stops", "sparserob_inner_stops", "sparserob_selections"), RulePlugin
+)
+"""Hooks that packages of interface 1 may have: each of the four pieces had its own, and a record, before they were one
+kind."""
+
+SchedulePlugin = OuterStopPlugin = InnerStopPlugin = SelectionPlugin = RulePlugin
+
+SPECIFICATIONS = type(
+    "Specifications", (), {name: _specification(record) for name, record in {**FORMER, **HOOKS}.items()}
+)
 
 
 def record_type(kind: str) -> type[Plugin]:

@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from typing import ClassVar
 
 from sparserob_core.arguments import is_whole
-from sparserob_core.errors import PluginError, UnknownPluginError, not_installed
+from sparserob_core.errors import PluginError, SparseRobError, UnknownPluginError, not_installed
 from sparserob_core.experiment.plugins.attribution import asked, attributed
 from sparserob_core.options import Options
 
@@ -134,6 +134,15 @@ class Plugin:
         if not callable(factory):
             raise PluginError(f"{self.origin}: {self.factory!r} is not callable")
         return factory  # type: ignore[no-any-return]
+
+    def may_be(self, of: type) -> bool:
+        """Whether it builds an instance of a class, or may do so: what a function builds shows when it is called, and
+        what cannot be loaded is an error where it is chosen."""
+        try:
+            factory = self.resolved()
+        except SparseRobError:
+            return True
+        return not isinstance(factory, type) or issubclass(factory, of)
 
     def options_type(self) -> type[Options]:
         """The class of the options: as registered, else the component's own class, else no options at all."""

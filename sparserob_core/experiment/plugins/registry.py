@@ -19,7 +19,7 @@ from sparserob_core.errors import PluginError, UnknownPluginError
 from sparserob_core.experiment.plugins import files
 from sparserob_core.experiment.plugins.attribution import attributed, short_repr
 from sparserob_core.experiment.plugins.components import DISABLE, Failure, Registry
-from sparserob_core.experiment.plugins.hookspecs import GROUP, HOOKS, SPECIFICATIONS
+from sparserob_core.experiment.plugins.hookspecs import FORMER, GROUP, HOOKS, SPECIFICATIONS
 from sparserob_core.experiment.plugins.messages import nearest
 from sparserob_core.experiment.plugins.records import Plugin
 
@@ -187,7 +187,7 @@ def _yielded(plugin: _Loaded, who: str, callers: Sequence[pluggy.HookCaller]) ->
             raise PluginError(f"{who}: unknown hook '{caller.name}'{nearest(caller.name, HOOKS)}")
     _refuse_unmarked(who, plugin.module, {caller.name for caller in callers})
     for caller in callers:
-        expected = HOOKS[caller.name]
+        expected = HOOKS.get(caller.name) or FORMER[caller.name]
         with attributed(who, f"hook {caller.name}", but=()):
             yielded = [record for records in caller() for record in records]
         for record in yielded:

@@ -1,7 +1,8 @@
 """Writes the package of a plugin to begin with, from the templates beside this file.
 
 A template is one text that holds several files, each below a line ``#### path``. ``package.txt`` has what every package
-has, and for each kind of component one more text has the component, its tests, and a config that names it.
+has, and for each kind of component, of rules for each of the four pieces, one more text has the component, its tests,
+and a config that names it.
 """
 
 from __future__ import annotations
@@ -20,11 +21,13 @@ from sparserob_core.experiment.plugins.registry import load_registry
 
 LONGEST = 30  # letters of a name: lines of the templates stay within 120 columns
 PACKAGE = "package"
+RULES = ("schedule", "outer_stop", "inner_stop", "selection")  # what they are called with differs
 HEADING = re.compile(r"^#### (\S+)\n", re.MULTILINE)
 
 
 def new_plugin(kind: str, name: str, out: str | Path = ".") -> Path:
-    """Write the package ``sparserob-NAME`` with a component of that kind into the folder ``out``; return its folder.
+    """Write the package ``sparserob-NAME`` with a component of that kind, or with one of the `RULES`, into the folder
+    ``out``; return its folder.
 
     Nothing is overwritten. Raises `InputError` for an unknown kind, for a name that is no name, or is taken by an
     installed component, plugin or module, and for a folder that exists.
@@ -32,7 +35,8 @@ def new_plugin(kind: str, name: str, out: str | Path = ".") -> Path:
     spelt = {one.replace("_", "-"): one for one in kinds()}
     if kind.replace("_", "-") not in spelt:
         raise InputError(path="kind", expected=f"one of {', '.join(spelt)}", got=repr(kind))
-    record = record_type(spelt[kind.replace("_", "-")])
+    chosen = spelt[kind.replace("_", "-")]
+    record = record_type("rule" if chosen in RULES else chosen)
     _check_name(record.kind, name)
     package = f"sparserob_{name}"
     folder = Path(out) / package.replace("_", "-")
@@ -42,12 +46,12 @@ def new_plugin(kind: str, name: str, out: str | Path = ".") -> Path:
         "name": name,
         "package": package,
         "distribution": package.replace("_", "-"),
-        "kind": record.kind.replace("_", " "),
-        "article": "An" if record.kind[0] in "aeiou" else "A",
+        "kind": chosen.replace("_", " "),
+        "article": "An" if chosen[0] in "aeiou" else "A",
         "hook": record.hook,
-        "Class": _camel(name).removesuffix(_camel(record.kind)) + _camel(record.kind),
+        "Class": _camel(name).removesuffix(_camel(chosen)) + _camel(chosen),
     }
-    texts = {**_files(PACKAGE, words), **_files(record.kind, words)}
+    texts = {**_files(PACKAGE, words), **_files(chosen, words)}
     try:
         for path, text in texts.items():
             place = folder / path
@@ -59,8 +63,8 @@ def new_plugin(kind: str, name: str, out: str | Path = ".") -> Path:
 
 
 def kinds() -> list[str]:
-    """The kinds of components, in the order of the hooks."""
-    return list(RECORDS)
+    """What a package can be begun with: the kinds of components, in the order of the hooks; for rules the `RULES`."""
+    return [one for kind in RECORDS for one in (RULES if kind == "rule" else (kind,))]
 
 
 def _check_name(kind: str, name: str) -> None:

@@ -31,7 +31,7 @@ from sparserob_core.sip.relaxed.batches import Batches, Oracle
 from sparserob_core.sip.relaxed.relaxed import RelaxedProgram
 from sparserob_core.sip.relaxed.tuples import TupleValue, imposed_program
 from sparserob_core.sip.result import Result, SearchTrace
-from sparserob_core.sip.rules import Metropolis, OptimisersSettle, OuterStep
+from sparserob_core.sip.rules import InnerStop, Metropolis, OptimisersSettle, OuterStep, OuterStop, Schedule, Selection
 from sparserob_core.sip.search.search import Rules, Target, maximise
 from sparserob_core.sip.separation.separation import separate
 
@@ -55,17 +55,17 @@ class SparseRob(Method, Options):
     indices: int | None = Field(default=None, ge=1, strict=True)
     """How many indices a tuple has; null: as many as there are decision variables (m N), which the theorem asks for."""
 
-    regu: Any = part("schedule")
+    regu: Any = part("rule", Schedule)
     """``Regu``: the next weight of the regulariser; null: the factor of ``continuation``."""
 
-    sc1: Any = part("outer_stop")
+    sc1: Any = part("rule", OuterStop)
     """``SC1``: when the outer iteration stops, at the last weight of ``continuation`` at the latest; null:
     `optimisers_settle`."""
 
-    sc2: Any = part("inner_stop")
+    sc2: Any = part("rule", InnerStop)
     """``SC2``: when a search stops, at the maximiser's budget at the latest; null: only then."""
 
-    slcr: Any = part("selection")
+    slcr: Any = part("rule", Selection)
     """``SlCr``: whether a maximiser that walks accepts a candidate; null: `metropolis`."""
 
     tolerance: float = Field(default=GAP_TOLERANCE, gt=0.0, le=1.0)

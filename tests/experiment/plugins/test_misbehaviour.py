@@ -22,11 +22,11 @@ KINDS = {
     "maximiser": ("Maximiser", "sparserob_maximisers", "MaximiserPlugin", "def search(self, objective, rng)"),
     "method": ("Method", "sparserob_methods", "MethodPlugin", "def solve(self, program, tools)"),
     "problem": ("ProblemFactory", "sparserob_problems", "ProblemPlugin", "def build(self)"),
-    "inner_stop": ("InnerStop", "sparserob_inner_stops", "InnerStopPlugin", "def __call__(self, progress)"),
-    "outer_stop": ("OuterStop", "sparserob_outer_stops", "OuterStopPlugin", "def __call__(self, steps)"),
-    "schedule": ("Schedule", "sparserob_schedules", "SchedulePlugin", "def __call__(self, epsilon, j)"),
+    "inner_stop": ("InnerStop", "sparserob_rules", "RulePlugin", "def __call__(self, progress)"),
+    "outer_stop": ("OuterStop", "sparserob_rules", "RulePlugin", "def __call__(self, steps)"),
+    "schedule": ("Schedule", "sparserob_rules", "RulePlugin", "def __call__(self, epsilon, j)"),
     "selection": (
-        "Selection", "sparserob_selections", "SelectionPlugin", "def __call__(self, now, candidate, temperature, rng)",
+        "Selection", "sparserob_rules", "RulePlugin", "def __call__(self, now, candidate, temperature, rng)",
     ),
 }  # fmt: skip
 SPARSEROB = {"name": "sparserob", "indices": 2}
@@ -115,6 +115,7 @@ def test_a_component_that_misbehaves_is_named_and_ends_with_status_5(kind, body,
     code, said = status(plugin(kind, body), CHOSEN[kind])
     flat = " ".join(said.split())
     hook = KINDS[kind][1]
+    kind = "rule" if hook == "sparserob_rules" else kind
     assert code == 5, said
     assert f"{kind} 'odd' (plugin 'odd', {tmp_path / 'odd.py'}, hook {hook}): " in flat
     assert re.search(words, flat), flat

@@ -14,12 +14,11 @@ from click.testing import CliRunner
 
 import sparserob_core as sr
 from sparserob_core.experiment.cli.main import _status, commands
-from sparserob_core.experiment.plugins.records import RECORDS
 from sparserob_core.experiment.scaffold import new_plugin as module
-from sparserob_core.experiment.scaffold.new_plugin import LONGEST, new_plugin
+from sparserob_core.experiment.scaffold.new_plugin import LONGEST, RULES, kinds, new_plugin
 from tests.support.places import ROOT
 
-KINDS = list(RECORDS)
+KINDS = kinds()
 
 
 def run(arguments, place, *paths):
@@ -61,7 +60,7 @@ def test_a_package_has_what_an_author_needs(kind, tmp_path):
 def test_packages_are_as_clean_as_this_one_whatever_the_length_of_their_names(tmp_path):
     for kind in KINDS:
         for name in ("z", "trial", "q" * LONGEST, kind):
-            if name not in sr.load_registry().names(kind):
+            if kind in RULES or name not in sr.load_registry().names(kind):
                 new_plugin(kind, name if name != kind else f"my_{kind}", tmp_path / f"{kind}_{name}")
     run(["-m", "ruff", "check", "--no-cache", "."], tmp_path)
     run(["-m", "ruff", "format", "--check", "--no-cache", "."], tmp_path)
@@ -124,6 +123,7 @@ def test_the_command_says_where_the_package_is_and_how_to_go_on(tmp_path, capsys
 def test_a_package_is_installed_found_typed_and_passes_its_tests(kind, tmp_path):
     name = f"trial_{kind}"
     folder, prefix = new_plugin(kind, name, tmp_path), tmp_path / "prefix"
+    kind = "rule" if kind in RULES else kind
     install = ["-m", "pip", "install", "-q", "--no-deps", "--no-index", "--no-build-isolation", "--prefix", str(prefix)]
     run([*install, str(folder)], tmp_path)
     site = next(prefix.rglob("site-packages"))

@@ -227,7 +227,11 @@ class TestTheFourPieces:
     @pytest.mark.parametrize(
         ("option", "words"),
         [
-            ({"regu": "geometrical"}, "no schedule is named 'geometrical'; did you mean 'geometric'"),
+            ({"regu": "geometrical"}, "no rule of the class Schedule is named 'geometrical'; did you mean 'geometric'"),
+            (
+                {"sc2": "metropolis"},
+                r"no rule of the class InnerStop is named 'metropolis'; known: evaluations, stalled",
+            ),
             ({"regu": {"name": "geometric", "factor": 1.5}}, r"method\.regu\.factor: .*less than 1"),
             ({"regu": {"name": "geometric", "faktor": 0.5}}, r"method\.regu\.faktor: unknown key"),
             ({"sc2": {"window": 3}}, r"method\.sc2\.name: expected the name of one of evaluations, stalled"),

@@ -72,8 +72,8 @@ def new_plugin(kind: str, name: str, out: str) -> int:
     It is typed, documented and installable, and has the tests that every component of its kind has to pass. Nothing is
     overwritten.
 
-    KIND is one of: problem, set, policy, method, dictionary, regulariser, solver, maximiser, schedule, outer-stop,
-    inner-stop, selection, executor, observer.
+    KIND is one of: problem, set, policy, method, dictionary, regulariser, solver, maximiser, executor, observer, or of
+    the rules of the paper's loop: schedule, outer-stop, inner-stop, selection.
     """
     from sparserob_core.experiment.scaffold.new_plugin import new_plugin as write
 
