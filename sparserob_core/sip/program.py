@@ -363,6 +363,11 @@ class SemiInfiniteProgram:
         return self.family(name).formulated(formulation)
 
     @cached_property
+    def origin(self) -> object:
+        """What the program was made of, where whoever made it has said so; ``None`` once anything of it is replaced."""
+        return None
+
+    @cached_property
     def largest_cost(self) -> float:
         """The largest possible cost: that of the bounds. Where an entry that costs something has no bound, a million
         of the largest coefficient, but at most a million. Nothing that is claimed depends on it."""

@@ -61,12 +61,15 @@ def transcribe(
     The decision is ``theta (m, N)`` raveled; its image ``S theta`` is the control on every piece, channel-major
     ``(m K,)``. ``disturbance`` defaults to the control's dictionary. ``formulation``: ``reduced`` eliminates the
     disturbance exactly, by support functions; ``literal`` keeps its coefficients as part of the index. ``policy``: an
-    `AffinePolicy` answers what is measured; its gains follow ``theta`` in the decision. Raises `InputError` when a
-    dictionary does not span the horizon.
+    `AffinePolicy` answers what is measured; its gains follow ``theta`` in the decision. The program remembers what it
+    is of, so that `solve` gives it a result like that of its problem; one in which something is replaced does not.
+    Raises `InputError` when a dictionary does not span the horizon.
     """
     if formulation not in ("reduced", "literal"):
         raise InputError(f"formulation: expected reduced or literal, got {formulation!r}")
-    return prepare(problem, control, disturbance or control, formulation, policy).program
+    model = prepare(problem, control, disturbance or control, formulation, policy)
+    model.program.__dict__["origin"] = model
+    return model.program
 
 
 def prepare(

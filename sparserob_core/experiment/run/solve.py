@@ -12,6 +12,7 @@ from sparserob_core.arguments import share, whole
 from sparserob_core.control.policies.policy import Policy
 from sparserob_core.control.problem.dictionary import Dictionary, DictionaryFactory
 from sparserob_core.control.problem.problem import OptimalControlProblem
+from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.plugins.components import Registry
 from sparserob_core.experiment.plugins.registry import load_registry
@@ -30,7 +31,6 @@ from sparserob_core.sip.solver import named as named_solver
 if TYPE_CHECKING:
     from typing import Unpack
 
-    from sparserob_core.control.transcription.record import Transcription
     from sparserob_core.experiment.run.outcome import SolvedProblem
     from sparserob_core.sip.events import Notify
 
@@ -106,12 +106,14 @@ def solve(
     tuples, nothing elsewhere. ``seconds``: the time after which it returns what it knows, as it does
     at an interrupt from the keyboard; ``Result.stopped`` then says so; where no control can ever be certified it is 30
     unless given. The result of a control problem knows its control, tube and worst cases as functions of time
-    (`ControlResult`), and is a run: it can be saved, drawn, and given to whatever takes one (`SolvedProblem`).
+    (`ControlResult`), and is a run: it can be saved, drawn, and given to whatever takes one (`SolvedProblem`). So is
+    that of a program that `transcribe` made; of any other program it is a `Result`, which nothing could check.
     Raises `InputError` when an argument is at fault.
     """
     deadline, registry = Deadline(as_seconds(seconds)), load_registry()
-    if isinstance(problem, OptimalControlProblem):
-        deadline = _announced(problem, deadline)
+    stated = problem.origin if isinstance(problem, SemiInfiniteProgram) else problem
+    if isinstance(stated, OptimalControlProblem | Transcription):
+        deadline = _announced(stated if isinstance(stated, OptimalControlProblem) else stated.problem, deadline)
     model = _stated(registry, problem, control, disturbance, policy)
     program = model if isinstance(model, SemiInfiniteProgram) else model.program
     if regulariser == "default":
@@ -143,12 +145,16 @@ def solve(
             "maximiser": maximiser,
             "solver": solver,
             "regulariser": regulariser,
-            "policy": policy,
+            "policy": policy if model.feedback is None else model.feedback.policy,
         },
-        dictionaries={
-            "control": PIECES if control is None else control,
-            **({} if disturbance is None else {"disturbance": disturbance}),
-        },
+        dictionaries=(
+            {"control": model.control, "disturbance": model.disturbance}
+            if isinstance(problem, SemiInfiniteProgram)
+            else {
+                "control": PIECES if control is None else control,
+                **({} if disturbance is None else {"disturbance": disturbance}),
+            }
+        ),
         rest={
             "search": {"budget": tools.budget, "polish": tools.polish},
             "continuation": steps.model_dump(mode="json"),
@@ -192,7 +198,7 @@ def _stated(
             raise InputError(
                 "control, disturbance, policy: these are for an OptimalControlProblem, got a SemiInfiniteProgram"
             )
-        return problem
+        return problem.origin if isinstance(problem.origin, Transcription) else problem
     if not isinstance(problem, OptimalControlProblem):
         raise InputError(
             f"problem: expected an OptimalControlProblem or a SemiInfiniteProgram, got {type(problem).__name__}"

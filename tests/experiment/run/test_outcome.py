@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import json
 import pickle
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -150,6 +151,37 @@ def test_a_result_that_is_not_saved_leaves_nothing_behind() -> None:
     del result
     gc.collect()
     assert not directory.parent.exists()
+
+
+@pytest.mark.parametrize("given", [{}, {"formulation": "literal"}, {"policy": sr.AffinePolicy(cost="peak")}])
+def test_the_result_of_a_program_that_was_transcribed_is_a_run_too(given: dict[str, Any], tmp_path: Path) -> None:
+    pieces = sr.Dictionary.indicators(np.linspace(0.0, 2.0, 5))
+    program = sr.transcribe(cart(), control=pieces, **given)
+    result = sr.solve(program, method={"name": "exchange", "tolerance": 1e-6})
+    assert isinstance(result, sr.SolvedProblem)
+    assert result.tube([1.0]).lower.shape == (2, 1)
+    outcome = result.save(tmp_path / "run", figures=False)
+    assert sr.check(outcome).status == "verified"
+    assert ("policy" in given) == (outcome.experiment.loaded.config.policy.name == "affine")
+
+
+def test_a_program_with_something_replaced_is_no_problem_any_more() -> None:
+    program = sr.transcribe(cart(), control=sr.Dictionary.indicators(np.linspace(0.0, 2.0, 5)))
+    other = replace(program, families=program.families[:1])
+    assert not isinstance(sr.solve(other), sr.SolvedProblem)
+    assert other.origin is None
+
+
+def test_a_dictionary_without_a_name_can_be_solved_and_looked_at_and_says_why_it_cannot_be_written(
+    tmp_path: Path,
+) -> None:
+    sums = np.vstack([np.kron(np.eye(2), [1.0, 1.0]), np.kron(np.eye(2), [1.0, -1.0])])
+    result = sr.solve(sr.transcribe(cart(), control=sr.Dictionary(np.linspace(0.0, 2.0, 5), sums)))
+    assert isinstance(result, sr.SolvedProblem)
+    assert result.status == "certified" and result.control.values.shape == (1, 4)
+    with pytest.raises(sr.InputError, match=r"dictionaries.control: expected .* by name, so that a config can say"):
+        result.save(tmp_path / "run")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_result_can_be_pickled_and_then_saved(solved: sr.SolvedProblem, tmp_path: Path) -> None:
