@@ -126,6 +126,7 @@ from sparserob_core.sip.rules import Rule as Rule
 from sparserob_core.sip.rules import Schedule as Schedule
 from sparserob_core.sip.rules import Selection as Selection
 from sparserob_core.control.policies.affine import AffinePolicy as AffinePolicy
+from sparserob_core.control.policies.policy import Charge as Charge
 from sparserob_core.control.policies.policy import OpenLoop as OpenLoop
 from sparserob_core.control.policies.policy import Policy as Policy
 from sparserob_core.experiment.config.problems import LinearKeys as LinearKeys

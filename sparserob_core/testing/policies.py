@@ -1,4 +1,4 @@
-"""The contract of a policy: what the control may know, said once and for all."""
+"""The contract of a policy: what the control may know and what it answers, said once and for all."""
 
 from __future__ import annotations
 
@@ -6,10 +6,15 @@ import inspect
 import pickle
 from typing import get_args
 
-from sparserob_core.control.policies.policy import Policy, Quantity
+import numpy as np
+
+from sparserob_core.control.policies.policy import Charge, Policy, Quantity, answers_of
+from sparserob_core.errors import InputError
 from sparserob_core.testing.contract import Contract, broken, demand
 
 QUANTITIES = frozenset(get_args(Quantity))
+GRIDS = ([0.0, 2.0], [0.0, 0.1, 0.3, 0.7, 1.0], [0.0, 1e-3, 2e-3, 3e-3], [float(k) for k in range(13)])
+"""Breakpoints of a control: of one piece, of uneven ones, of short ones, of many."""
 
 
 class PolicyContract(Contract[Policy], kind="policy"):
@@ -17,7 +22,9 @@ class PolicyContract(Contract[Policy], kind="policy"):
 
     ``knows`` is a property: the frozen set of the quantities (``state``, ``disturbance``, ``parameters``) whose *past*
     values are known when the control is chosen. Nothing can be known of the future. It is a promise about the whole
-    run, so it never changes. Of the policies that know something only `AffinePolicy` can be transcribed.
+    run, so it never changes. ``answers(breakpoints)`` returns truth values ``(K, K)`` for breakpoints ``(K + 1,)``:
+    whether the control on piece ``k`` answers what is measured at breakpoint ``j``, which is never later than the
+    piece. Whoever answers anything knows the ``state``. ``charge`` is a `Charge`, the cost that it is chosen by.
     """
 
     def known(self, policy: Policy) -> frozenset[str]:
@@ -43,6 +50,21 @@ class PolicyContract(Contract[Policy], kind="policy"):
             f"name quantities whose past values are measured: {', '.join(sorted(QUANTITIES))}; the future is not known",
         )
         return knows
+
+    def answered(self, policy: Policy, breakpoints: list[float]) -> np.ndarray:
+        """What the policy answers; a broken contract where that is no table of truth values, or comes too early."""
+        times = np.array(breakpoints)
+        try:
+            mask = answers_of(policy, times)
+        except InputError as error:
+            broken(
+                f"on {len(breakpoints) - 1} pieces: {error}",
+                "return a square array of truth values from `answers`, one row for each piece, True only where the"
+                " breakpoint is no later than the piece, and name the state in `knows`",
+            )
+        except Exception as error:  # noqa: BLE001  a component may raise anything, and must not
+            broken(f"answers raised {type(error).__name__}: {error}", "let it take any increasing times from 0 on")
+        return mask
 
     def test_it_knows_past_values_of_named_quantities_only(self) -> None:
         self.known(self.create())
@@ -89,4 +111,30 @@ class PolicyContract(Contract[Policy], kind="policy"):
             policy == other and hash(policy) == hash(other),
             "two policies with the same options are not equal",
             "derive it from `sparserob_core.Policy` and `sparserob_core.Options`, and add no other fields",
+        )
+
+    def test_it_answers_what_is_measured_by_then_and_nothing_else(self) -> None:
+        for breakpoints in GRIDS:
+            self.answered(self.create(), breakpoints)
+
+    def test_what_it_answers_depends_on_its_options_and_the_breakpoints_alone(self) -> None:
+        policy = self.create()
+        copy = pickle.loads(pickle.dumps(policy))  # noqa: S301  made here
+        for breakpoints in GRIDS:
+            first = self.answered(policy, breakpoints)
+            for other in (policy, self.create(), copy):
+                demand(
+                    bool((self.answered(other, breakpoints) == first).all()),
+                    f"on {len(breakpoints) - 1} pieces it answers other measurements when it is asked again",
+                    "let `answers` depend on the breakpoints and the options only, and not write into them",
+                )
+
+    def test_its_charge_is_a_cost_that_is_known(self) -> None:
+        charge: object = self.create().charge
+        if not isinstance(charge, Charge):
+            broken(f"charge is a {type(charge).__name__}", "return a `sparserob_core.Charge` from the property")
+        demand(
+            charge.cost in ("nominal", "peak", "worst") and charge == self.create().charge,
+            f"charge is {charge}",
+            'name a cost of nominal, peak and worst, the same whenever it is asked, as in `sr.Charge(cost="peak")`',
         )

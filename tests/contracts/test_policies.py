@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 
+import numpy as np
 import pytest
 
 import sparserob_core as sr
@@ -30,11 +31,14 @@ class TestRegisteredPolicy(PolicyContract):
 
 
 class Measured(sr.Policy, sr.Options):
-    """A right policy, for wrong ones to inherit from: the state is measured."""
+    """A right policy, for wrong ones to inherit from: the state is measured, and answered at once."""
 
     @property
     def knows(self):
         return frozenset({"state"})
+
+    def answers(self, breakpoints):
+        return np.eye(len(breakpoints) - 1, dtype=bool)
 
 
 class TestMeasured(PolicyContract):
@@ -155,6 +159,71 @@ class Unpicklable(sr.Policy):
         return self.sensor()
 
 
+class Silent(sr.Policy, sr.Options):
+    """Knows the state, and does not say what it answers."""
+
+    @property
+    def knows(self):
+        return frozenset({"state"})
+
+
+class Prophetic(Measured):
+    def answers(self, breakpoints):
+        return np.eye(len(breakpoints) - 1, k=1, dtype=bool) | super().answers(breakpoints)
+
+
+class Counted(Measured):
+    """Numbers where truth values belong."""
+
+    def answers(self, breakpoints):
+        return np.eye(len(breakpoints) - 1)
+
+
+class TooLarge(Measured):
+    """A row for every breakpoint, the last one too."""
+
+    def answers(self, breakpoints):
+        return np.eye(len(breakpoints), dtype=bool)
+
+
+class Unknowing(Measured):
+    """Answers a state that it does not know."""
+
+    @property
+    def knows(self):
+        return frozenset({"parameters"})
+
+
+class Nameless(Measured):
+    """Fails on one piece."""
+
+    def answers(self, breakpoints):
+        return super().answers(breakpoints)[breakpoints[:-1] <= breakpoints[2]]
+
+
+class Changing(Measured):
+    def answers(self, breakpoints):
+        return super().answers(breakpoints) & bool(next(ANSWERED))
+
+
+ANSWERED = itertools.cycle([True, True, True, False])
+
+
+class Free(Measured):
+    """Is charged nothing that there is."""
+
+    @property
+    def charge(self):
+        return "peak"
+
+
+class Cheap(Measured):
+    @property
+    def charge(self):
+        return sr.Charge(cost="cheap")
+
+
+ANSWERS = "test_it_answers_what_is_measured_by_then_and_nothing_else"
 PAST = "test_it_knows_past_values_of_named_quantities_only"
 CONSTANT = "test_what_it_knows_never_changes"
 FAULTS = {
@@ -171,6 +240,15 @@ FAULTS = {
     Counting: "test_reading_what_it_knows_changes_nothing_about_it",
     Surrounded: "test_a_copy_in_another_process_knows_the_same",
     Unpicklable: "test_a_copy_in_another_process_knows_the_same",
+    Silent: ANSWERS,
+    Prophetic: ANSWERS,
+    Counted: ANSWERS,
+    TooLarge: ANSWERS,
+    Unknowing: ANSWERS,
+    Nameless: ANSWERS,
+    Changing: "test_what_it_answers_depends_on_its_options_and_the_breakpoints_alone",
+    Free: "test_its_charge_is_a_cost_that_is_known",
+    Cheap: "test_its_charge_is_a_cost_that_is_known",
     Unique: "test_its_options_are_what_it_depends_on",
 }
 

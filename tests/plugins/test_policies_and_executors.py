@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import sparserob_core as sr
@@ -60,13 +62,13 @@ def test_an_affine_policy_knows_the_state(registry):
     assert registry.build("policy", "affine", {"cost": "peak"}).knows == {"state"}
 
 
-def test_a_policy_that_knows_something_else_cannot_be_transcribed(tmp_path):
+def test_a_policy_that_does_not_say_what_it_answers_cannot_be_transcribed(tmp_path):
     (tmp_path / "feedback.py").write_text(
         "import sparserob_core as sr\nclass Feedback(sr.Policy, sr.Options):\n"
         "    @property\n    def knows(self):\n        return frozenset({'state'})\n"
         "@sr.hookimpl\ndef sparserob_policies():\n    yield sr.PolicyPlugin(name='feedback', factory=Feedback)\n"
     )
-    with pytest.raises(sr.ConfigError, match=r"policy\.name: expected open_loop or affine.* knows the state"):
+    with pytest.raises(sr.ConfigError, match=r"policy\.name: expected .*method answers.* knows the state"):
         sr.run({**CONFIG, "policy": "feedback", "plugins": [str(tmp_path / "feedback.py")]}, out=tmp_path / "run")
 
 
@@ -105,3 +107,121 @@ def test_workers_that_cannot_be_had_are_named(tmp_path, body, words):
     chosen = {"executor": "odd", "plugins": [str(tmp_path / "odd.py")]}
     with pytest.raises(sr.PluginError, match=f"executor 'odd' .*{words}"):
         sr.run({**CONFIG, **chosen}, out=tmp_path / "run", figures=False)
+
+
+ANSWERING = '''
+import numpy as np
+import sparserob_core as sr
+from pydantic import Field
+
+
+class Recent(sr.Policy, sr.Options):
+    """Answers the last few measurements."""
+
+    recent: int = Field(default=1, ge=0)
+    cost: str = "nominal"
+
+    @property
+    def knows(self):
+        return frozenset({"state"})
+
+    def answers(self, breakpoints):
+        pieces = np.arange(len(breakpoints) - 1)
+        age = pieces[:, None] - pieces
+        return (age >= 0) & (age < self.recent)
+
+    @property
+    def charge(self):
+        return sr.Charge(cost=self.cost, causal_signals=4)
+
+
+@sr.hookimpl
+def sparserob_policies():
+    yield sr.PolicyPlugin(name="recent", factory=Recent)
+'''
+DISTURBED = {
+    "problem": {
+        "name": "linear", "horizon": 2.0, "system": {"A": [[0, 1], [0, 0]], "B": [[0], [1]]},
+        "initial_state": [1.0, 0.0], "control": {"box": 2.0}, "disturbance": {"box": [0.02, 0.05]},
+        "path": [{"box": [1.1, None]}], "terminal": [{"box": [0.4, 0.4]}],
+    },
+    "dictionaries": {"control": {"name": "piecewise_constant", "pieces": 6}}, "observers": [],
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def plugin(tmp_path_factory):
+    file = tmp_path_factory.mktemp("plugin") / "recent.py"
+    file.write_text(ANSWERING)
+    return str(file)
+
+
+def ran(place, policy, plugin):
+    config = {**DISTURBED, "policy": policy, "plugins": [plugin]}
+    return sr.run(config, out=place, quiet=True, figures=False)
+
+
+@pytest.mark.parametrize("cost", ["nominal", "peak", "worst"])
+def test_a_policy_of_somebody_else_that_answers_the_last_measurement_is_solved_proven_and_checked(
+    tmp_path, plugin, cost
+):
+    """The same as a memory that keeps no more, by value; the check loads no plugin."""
+    theirs = ran(tmp_path / "theirs", {"name": "recent", "cost": cost}, plugin)
+    ours = ran(tmp_path / "ours", {"name": "affine", "cost": cost, "memory": 0.0, "causal_signals": 4}, plugin)
+    assert theirs.result.status == ours.result.status == "certified"
+    assert theirs.result.cost == pytest.approx(ours.result.cost, rel=1e-6)
+    gains = np.load(theirs.directory / "solution.npz")["gains"]
+    assert gains.any() and not gains[~np.eye(6, dtype=bool)].any()
+    found = sr.check(theirs.directory)
+    assert found.status == "verified"
+    assert "not loaded" in next(claim.text for claim in found.claims if claim.name == "policy")
+    loaded = sr.check(theirs.directory, plugins=[plugin])
+    assert loaded.status == "verified"
+    assert "not loaded" not in next(claim.text for claim in loaded.claims if claim.name == "policy")
+
+
+def test_more_measurements_cost_no_more_and_none_cost_what_an_open_loop_does(tmp_path, plugin):
+    policies = [{"name": "recent", "recent": count} for count in (0, 1, 2, 6)] + ["open_loop", "affine"]
+    chosen = [one if isinstance(one, str) else {**one, "cost": "nominal"} for one in policies]
+    runs = [ran(tmp_path / str(number), policy, plugin) for number, policy in enumerate(chosen)]
+    none, one, two, all_of_them, open_loop, affine = (run.result.cost for run in runs)
+    assert none == open_loop and "gains" not in np.load(runs[0].directory / "solution.npz")
+    assert all(run.result.status == "certified" for run in runs)
+    assert none > one * 1.001 > two > all_of_them * 0.999999
+    assert all_of_them == pytest.approx(affine, rel=1e-6)
+    assert sr.check(runs[0].directory).status == "verified"
+
+
+def test_answers_that_are_written_must_be_those_of_the_config_and_of_the_gains(tmp_path, plugin):
+    """Fewer answers would prove a higher bound, and more of them allow gains that nobody asked for."""
+    theirs = ran(tmp_path / "theirs", {"name": "recent", "recent": 2}, plugin).directory
+    ours = ran(tmp_path / "ours", "affine", plugin).directory
+
+    def judged(directory, answers, **given):
+        file = directory / "certificate.json"
+        said = json.loads(file.read_text())
+        file.write_text(json.dumps({**said, "policy": {**said["policy"], **answers}}))
+        found = {claim.name: claim.verdict for claim in sr.check(directory, **given).claims}
+        file.write_text(json.dumps(said))
+        return found
+
+    last = [[[k, k]] for k in range(6)]
+    assert judged(theirs, {"answers": last})["control"] == "fails"
+    assert judged(theirs, {"answers": last}, plugins=[plugin])["policy"] == "fails"
+    assert judged(ours, {"answers": last})["policy"] == "fails"
+    assert judged(ours, {"cost": "peak"})["policy"] == "fails"
+    assert judged(theirs, {"cost": "peak"})["cost"] == "fails"
+    early = [[[0, 1]], *last[1:]]
+    wrong = (
+        early,
+        [*last[:5], [[5, 6]]],
+        [*last[:5], [[5.0, 5.0]]],
+        [*last[:5], [[True, 5]]],
+        last[:5],
+        "all",
+        [*last[:5], 5],
+    )
+    for answers in wrong:
+        assert judged(theirs, {"answers": answers})["policy"] == "fails"
+    assert judged(theirs, {"cost": ["nominal"]})["policy"] == "fails"
+    assert sr.check(theirs).status == sr.check(ours).status == "verified"

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain, pairwise
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, final, get_args
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from sparserob_core.checker.claims.window import Beside, Window
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import stacked
-from sparserob_core.control.policies.affine import AffinePolicy
+from sparserob_core.control.policies.policy import Charge, Cost, Policy, WrittenPolicy, answers_of
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem
 from sparserob_core.control.sets.sets import ConvexSet, Equality
@@ -42,12 +42,27 @@ class Case:
     clock: Clock = field(default_factory=Clock)
     counts: bool = False
     letters: tuple[float, ...] | None = None
-    policy: AffinePolicy | None = None
+    policy: Policy | None = None
 
     @cached_property
     def of_control(self) -> str:
         """What the control's own set is called: ``rate`` where a constraint on the path is called ``control``."""
         return "rate" if any(window.name == "control" for window in self.windows) else "control"
+
+    @cached_property
+    def answers(self) -> np.ndarray:
+        """Truth values ``(K, K)``: whether the control on a piece may answer what is measured at a breakpoint."""
+        return answers_of(self.policy, self.control.breakpoints)
+
+    @property
+    def unloaded(self) -> bool:
+        """Whether the policy is what the certificate says of it, since its component is not at hand."""
+        return isinstance(self.policy, WrittenPolicy)
+
+    @property
+    def charge(self) -> Cost:
+        """Which cost the policy is charged; that of the nominal control where there is none."""
+        return "nominal" if self.policy is None else self.policy.charge.cost
 
     @cached_property
     def windows(self) -> list[Window]:
@@ -256,6 +271,28 @@ def _numeric(data: object) -> bool:
             return False
         level = list(chain.from_iterable(value for value in level if isinstance(value, list)))
     return True
+
+
+def written_policy(certificate: Mapping[str, Any], pieces: int) -> WrittenPolicy:
+    """What a certificate says of its policy: the cost that it is charged, and the ranges of breakpoints that each of
+    the ``pieces`` answers; raises `Broken` where that is no such thing."""
+    data = certificate.get("policy")
+    if not isinstance(data, Mapping):
+        raise Broken("policy: expected a cost, and the breakpoints that every piece answers")
+    rows, said_of_cost = listed(data, "answers"), data.get("cost")
+    cost: Cost | None = next((one for one in get_args(Cost) if one == said_of_cost), None)
+    if cost is None:
+        raise Broken(f"policy: the cost is {said_of_cost!r}, expected one of {', '.join(get_args(Cost))}")
+    if len(rows) != pieces:
+        raise Broken(f"policy: answers of {len(rows)} pieces, expected {pieces}")
+    mask = np.zeros((pieces, pieces), dtype=bool)
+    for k, ranges in enumerate(rows):
+        for said in ranges if isinstance(ranges, list) else [ranges]:
+            whole = isinstance(said, list) and len(said) == 2 and all(type(place) is int for place in said)
+            if not whole or not 0 <= said[0] <= said[1] <= k:
+                raise Broken(f"policy: piece {k + 1} answers the breakpoints {said!r}, expected a range up to {k}")
+            mask[k, said[0] : said[1] + 1] = True
+    return WrittenPolicy(mask, Charge(cost))
 
 
 def number(data: Mapping[str, Any], name: str) -> float:

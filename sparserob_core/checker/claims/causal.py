@@ -57,8 +57,7 @@ def causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> arb:
             if any(not x.is_zero() for x in row.slope[k]):
                 group = groups[k].setdefault(_until(signal, seen[k]), [arb(0)] * m)
                 group[:] = [a + weight * x for a, x in zip(group, row.slope[k], strict=True)]
-    assert case.policy is not None
-    shared = _shares(data, len(signals)) if priced and case.policy.cost == WORST else None
+    shared = _shares(data, len(signals)) if priced and case.charge == WORST else None
     for k in range(K):
         prices: dict[bytes, arb] = {_until(rest, seen[k]): arb(1)} if shared is None else {}
         for signal, share in zip(signals, shared or (), strict=False):
@@ -152,12 +151,11 @@ def _of_piece(case: Case, k: int, groups: dict[bytes, list[arb]], counts: dict[b
     together; ``counts``: how much of the price a group pays; that of a peak is shared among all."""
     from flint import arb
 
-    assert case.policy is not None
     m, control = case.problem.system.controls, case.problem.control
     prices = case.price.costs[k] if priced else [arb(0)] * m
     total, zero = arb(0), [arb(0)] * m
     shares = dict.fromkeys(groups, zero) | {key: [part * price for price in prices] for key, part in counts.items()}
-    if priced and case.policy.cost == PEAK:
+    if priced and case.charge == PEAK:
         shares = _shared(case, prices, groups)
     for key, slope in groups.items():
         total = total + known(control).least(shares[key], shares[key], slope)

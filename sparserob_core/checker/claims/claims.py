@@ -10,7 +10,7 @@ import numpy as np
 
 from sparserob_core.checker.arithmetic.balls import balls, below
 from sparserob_core.checker.claims import activity
-from sparserob_core.checker.claims.case import Case, listed, number, numbers
+from sparserob_core.checker.claims.case import Case, listed, number, numbers, written_policy
 from sparserob_core.checker.claims.constraints import bounded, equalities
 from sparserob_core.checker.claims.duality import Row, before, steps
 from sparserob_core.checker.claims.replay import reached
@@ -43,11 +43,12 @@ def check(case: Case, gap_tolerance: float | None) -> list[Finding]:
         if type(case.certificate.get("format")) is not int or case.certificate["format"] != 1:
             return [Finding("certificate", "fails", f"its format is {case.certificate.get('format')!r}, expected 1")]
         causal = [judged("causal", lambda: _causal(case))] if "causal" in case.certificate else []
+        policy = [judged("policy", lambda: _policy(case))] if "policy" in case.certificate else []
         if status == "infeasible":
-            return [judged("infeasibility", lambda: _infeasible(case)), *causal]
+            return [*policy, judged("infeasibility", lambda: _infeasible(case)), *causal]
         if status not in ("certified", "verified", "refuted", "undecided"):
             return [Finding("status", "fails", f"it is {status!r}, which claims nothing")]
-        claims = [judged("control", lambda: _control(case)), judged("cost", lambda: _cost(case))]
+        claims = [*policy, judged("control", lambda: _control(case)), judged("cost", lambda: _cost(case))]
         claims += [judged("lower bound", lambda: _lower(case))]
         if "fewest_active" in case.certificate:
             claims.append(judged("fewest active", lambda: _fewest(case, str(status))))
@@ -124,6 +125,22 @@ def _feedback(case: Case) -> FeedbackClaims:
 def _looped(case: Case) -> bool:
     """Whether the state is followed block by block of what deviates: under feedback, and measurable disturbances."""
     return case.policy is not None or case.measurable
+
+
+def _policy(case: Case) -> str:
+    """What is written of the policy, which bounds and gains are about, must be what the problem's policy says."""
+    written = written_policy(case.certificate, case.control.pieces)
+    if written.charge.cost != case.charge:
+        raise Broken(f"the cost {written.charge.cost} is written, the config asks for {case.charge}")
+    different = np.argwhere(written.mask != case.answers)
+    if different.size:
+        k, j = different[0].tolist()
+        does = "is" if written.mask[k, j] else "is not"
+        raise Broken(f"that piece {k + 1} answers breakpoint {j + 1} {does} written, which the config's policy denies")
+    told = f"answers {int(case.answers.sum())} of {case.control.pieces * (case.control.pieces + 1) // 2} pairs of a"
+    told += f" piece and a measurement before it, and is charged {case.charge}"
+    # what a component that is not loaded would say is not known: bounds are of the policies that are written
+    return f"it {told}" + (", as is written; its own component is not loaded" if case.unloaded else "")
 
 
 def _kept(case: Case, window: Window) -> str:

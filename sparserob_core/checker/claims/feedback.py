@@ -47,10 +47,10 @@ class FeedbackClaims:
     @cached_property
     def gains(self) -> Array:
         """The gains, none of a control that answers nothing; raises `Broken` where they answer what is not yet
-        measured, or is forgotten."""
-        case, policy = self.case, self.case.policy
+        measured, or what the policy does not answer."""
+        case = self.case
         K, m, d = case.control.pieces, case.problem.system.controls, case.problem.system.states
-        if policy is None:
+        if case.policy is None:
             return np.zeros((K, K, m, d))
         gains = numbers(case.certificate.get("gains"), "gains")
         if gains.shape != (K, K, m, d):
@@ -59,9 +59,11 @@ class FeedbackClaims:
         for k, j in np.argwhere(gains.any(axis=(2, 3))).tolist():
             if j > k or (j == 0 and case.problem.initial_set is None):
                 raise Broken(f"the control from t = {float(times[k]):.6g} on answers what is not measured yet")
-            old = float(times[k]) - float(times[j])
-            if policy.memory is not None and old > policy.memory + 1e-12 * case.problem.horizon:
-                raise Broken(f"the control from t = {float(times[k]):.6g} on answers what is {old:.6g} old")
+            if not case.answers[k, j]:
+                raise Broken(
+                    f"the control from t = {float(times[k]):.6g} on answers what was measured at"
+                    f" {float(times[j]):.6g}, which its policy does not"
+                )
         return gains
 
     @cached_property
@@ -159,15 +161,14 @@ class FeedbackClaims:
         from flint import arb
 
         case, total = self.case, arb(0)
-        assert case.policy is not None
-        if case.policy.cost == WORST:
+        if case.charge == WORST:
             written = arb(number(case.certificate, "cost"))
             self._effort(written + FIGURES * abs(written))
             return written
         for k, costs in enumerate(case.price.costs):
             for i, price in enumerate(costs):
                 u = arb(float(case.theta[i, k]))
-                if case.policy.cost == PEAK:
+                if case.charge == PEAK:
                     row = self.loop.effects[k][i]
                     height = (u + self.loop.support(row)).max(-u + self.loop.support([-x for x in row]))
                 else:
@@ -442,17 +443,16 @@ class FeedbackClaims:
         from flint import arb
 
         case = self.case
-        assert case.policy is not None
         K, m = case.control.pieces, case.problem.system.controls
         loop = self.loop_at_rest
-        rows = [_Row.of(case, self._told(entry), entry, case.policy.cost) for entry in entries]
+        rows = [_Row.of(case, self._told(entry), entry, case.charge) for entry in entries]
         total = sum((row.multiplier * row.constant for row in rows), arb(0))
         slope = [[sum((r.multiplier * r.nominal[k][i] for r in rows if not r.nominal[k][i].is_zero()), arb(0))
                   for i in range(m)] for k in range(K)]  # fmt: skip
-        peaks, most = case.policy.cost == PEAK, arb(0)
+        peaks, most = case.charge == PEAK, arb(0)
         for k, asked_of in enumerate(case.price.costs):
             prices = asked_of if priced else [arb(0)] * m
-            if case.policy.cost == WORST:
+            if case.charge == WORST:
                 most = most + sum((p * _reach(case.problem.control, i) for i, p in enumerate(asked_of)), arb(0))
                 prices = [arb(0)] * m
             if peaks:
@@ -461,7 +461,7 @@ class FeedbackClaims:
                     total = total + (asked * _reach(case.problem.control, i)).min(arb(0))
                 prices = [arb(0)] * m
             total = total + known(case.problem.control).least(prices, prices, slope[k])
-        if case.policy.cost == WORST:
+        if case.charge == WORST:
             left = arb(int(priced)) - sum((r.multiplier for r in rows if r.of_effort), arb(0))
             total = total + (left * most).min(arb(0))
         return total - self._of_gains(loop, rows)
@@ -499,14 +499,10 @@ class FeedbackClaims:
     def _clusters(self, loop: ClosedLoop, k: int) -> list[tuple[list[int], arb_mat, list[int]]]:
         """The breakpoints that the control on a piece answers, those that see a block in common together; for each what
         gives, from a combination of the states seen there, a combination of the blocks, ``(q, J d)``."""
-        policy, times = self.case.policy, self.case.control.breakpoints
-        assert policy is not None
-        slack = 1e-12 * self.case.problem.horizon
-        oldest = -np.inf if policy.memory is None else float(times[k]) - policy.memory - slack
         groups: list[tuple[list[int], set[int]]] = []
-        for j in range(k + 1):
+        for j in np.flatnonzero(self.case.answers[k, : k + 1]).tolist():
             seen = {block for block in loop.seen[j] if self._chords[block]}
-            if float(times[j]) < oldest or not seen:
+            if not seen:
                 continue
             mine, rest = ([j], seen), []
             for members, blocks in groups:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.control.response.response import SAME_TIME, Response
+from sparserob_core.control.response.response import Response
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -114,12 +114,12 @@ class Answers:
         return bool(np.unique(at).size == at.size and (value == 1.0).all())
 
 
-def answers(D: Array, breakpoints: Array, channels: int, memory: float | None) -> Answers:
-    """The coordinates of gains that answer innovations ``D (K, d, Q)`` for ``memory`` at most; in units in which states
-    and deviations are of ordinary size. Variables are numbered piece by piece of the control, and then channel by
-    channel of everything that hangs together."""
+def answers(D: Array, mask: np.ndarray, channels: int) -> Answers:
+    """The coordinates of gains that answer innovations ``D (K, d, Q)``, each piece those of its row of the truth values
+    ``mask (K, K)``; in units in which states and deviations are of ordinary size. Variables are numbered piece by piece
+    of the control, and then channel by channel of everything that hangs together."""
     K, d, Q = D.shape
-    alike = list(_alike(D, breakpoints, memory))
+    alike = list(_alike(D, mask))
     sizes = np.zeros((K, 1 + max((one.cluster for one in alike), default=0)), dtype=int)
     for one in alike:
         sizes[one.pieces, one.cluster] = channels * one.free.size
@@ -155,21 +155,17 @@ class _Alike:
     G: Array
 
 
-def _alike(D: Array, breakpoints: Array, memory: float | None) -> Iterator[_Alike]:
+def _alike(D: Array, mask: np.ndarray) -> Iterator[_Alike]:
     """All pieces of the control that answer anything, cluster by cluster."""
-    K = D.shape[0]
-    oldest = np.full(K, -np.inf) if memory is None else breakpoints[:K] - memory - SAME_TIME * breakpoints[-1]
     for number, cluster in enumerate(_clusters((D != 0.0).any(axis=1))):
-        last = np.searchsorted(cluster, np.arange(K), side="right")
-        first = np.minimum(np.searchsorted(breakpoints[cluster], oldest), last)
-        windows, which = np.unique(first * (K + 1) + last, return_inverse=True)
-        for window, code in enumerate(windows.tolist()):
-            seen = cluster[code // (K + 1) : code % (K + 1)]
-            if not seen.size:
+        choices, which = np.unique(mask[:, cluster], axis=0, return_inverse=True)
+        for place, chosen in enumerate(choices):
+            if not chosen.any():
                 continue
+            seen = cluster[chosen]
             columns, free, Z, G = _coordinates(D[seen])
             if free.size:
-                yield _Alike(np.flatnonzero(which == window), number, seen, columns, free, Z, G)
+                yield _Alike(np.flatnonzero(which.ravel() == place), number, seen, columns, free, Z, G)
 
 
 def _listed(at: Array, which: Array, value: Array) -> tuple[np.ndarray, np.ndarray, Array]:

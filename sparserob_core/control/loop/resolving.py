@@ -123,7 +123,7 @@ class Plan:
         assert feedback is not None
         nominal, spread = self.left(piece, innovations), feedback.loop.spread
         size = np.abs(nominal)
-        if feedback.policy.cost == "peak":
+        if feedback.charge.cost == "peak":
             effects = feedback.loop.effects(self.decision)[piece:].copy()
             begin, grid = float(self.known.control.breakpoints[piece]), self.known.response.grid
             acting = feedback.loop.entries[grid.breakpoints[1:] > begin]  # (L', mw, Q): which deviations act later

@@ -79,7 +79,7 @@ class Retuning:
         model, grid = self.model, self.model.response.grid
         assert model.feedback is not None
         loop, signal = model.feedback.loop, model.functionals.disturbance
-        if model.feedback.policy.cost not in ("nominal", "peak") or not loop.spread.is_box or loop.middles.any():
+        if model.feedback.charge.cost not in ("nominal", "peak") or not loop.spread.is_box or loop.middles.any():
             return None
         if model.problem.disturbance_class != "piecewise_constant":
             return None

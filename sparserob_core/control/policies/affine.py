@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from typing import Literal, final
 
+import numpy as np
 from pydantic import Field
 
-from sparserob_core.control.policies.policy import Policy, Quantity
+from sparserob_core.control.policies.policy import Charge, Policy, Quantity
 from sparserob_core.options import Options
+from sparserob_core.sip.convex_set import Array
+
+SAME = 1e-12  # of the horizon: what is older than `memory` by less is not; ten times less and breakpoints that are sums
+# of steps fall out by rounding, ten times more and nobody would see it before pieces are as short as that
 
 
 @final
@@ -47,3 +52,15 @@ class AffinePolicy(Policy, Options):
     def knows(self) -> frozenset[Quantity]:
         """The state, at the breakpoints."""
         return frozenset({"state"})
+
+    def answers(self, breakpoints: Array) -> np.ndarray:
+        """Everything that was measured, or what is no older than ``memory``."""
+        starts = breakpoints[:-1]
+        oldest = np.inf if self.memory is None else self.memory + SAME * breakpoints[-1]
+        answered: np.ndarray = np.tril(starts[:, None] - starts <= oldest)
+        return answered
+
+    @property
+    def charge(self) -> Charge:
+        """What the options say."""
+        return Charge(self.cost, self.among, self.causal_signals, self.causal_seconds)

@@ -11,7 +11,7 @@ import numpy as np
 
 from sparserob_core.control.constraints.flat import FlatConstraint
 from sparserob_core.control.feedback.tree import Grown, Sampled, Tree
-from sparserob_core.control.policies.affine import AffinePolicy
+from sparserob_core.control.policies.policy import Charge
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.finite import Spread
@@ -70,10 +70,10 @@ class Limits:
         self.ended: Ended = "settled"
 
     @staticmethod
-    def of(policy: AffinePolicy, results: Sequence[Result], columns: int, passed: Callable[[], bool]) -> Limits:
+    def of(charge: Charge, results: Sequence[Result], columns: int, passed: Callable[[], bool]) -> Limits:
         """In proportion to what the policy's own ``results`` took, with ``columns`` of their programs."""
         programs = sum(result.counts.get("relaxed_programs", 0) for result in results)
-        return Limits(policy.causal_signals, WORK + programs * (EACH + PER * columns), policy.causal_seconds, passed)
+        return Limits(charge.causal_signals, WORK + programs * (EACH + PER * columns), charge.causal_seconds, passed)
 
     @property
     def seconds(self) -> float:
@@ -138,7 +138,7 @@ class CausalSearch:
         seen = np.searchsorted(self.starts, self.model.control.breakpoints[:-1])
         width = self.spread.size // max(1, self.starts.size)
         worst = extreme(self.spread, self.sampled.N)
-        tree = Tree(self.sampled, worst, problem.control, prices, seen, width, feedback.policy.cost, highest)
+        tree = Tree(self.sampled, worst, problem.control, prices, seen, width, feedback.charge.cost, highest)
         tree.add(np.zeros(self.spread.size))
         tree.seconds = lambda: limits.seconds
         for _, _, deviation in self._active:

@@ -57,9 +57,9 @@ class InitialPlane:
     def free(self) -> InitialPlane:
         """The same plane where nothing has a price that needs variables of its own."""
         feedback = self.model.feedback
-        if feedback is None or feedback.policy.cost == "nominal":
+        if feedback is None or feedback.charge.cost == "nominal":
             return self
-        model = made_again(self.model, feedback.policy.model_copy(update={"cost": "nominal", "among": None}))
+        model = made_again(self.model, replace(feedback.charge, cost="nominal", among=None))
         return InitialPlane(model, self.states, self.centre, self.radius)
 
     def point(self, z: Array) -> Array:

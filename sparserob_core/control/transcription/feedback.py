@@ -18,7 +18,7 @@ from sparserob_core.control.feedback.closed_loop import ClosedLoop, deviations_o
 from sparserob_core.control.feedback.innovations import Answers, answers, innovations_seen
 from sparserob_core.control.feedback.measurable import MeasurablePieces, measurable_pieces
 from sparserob_core.control.feedback.zonoid import has_corners
-from sparserob_core.control.policies.affine import AffinePolicy
+from sparserob_core.control.policies.policy import Charge, Policy
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
 from sparserob_core.control.problem.units import Units, power_of_two
@@ -43,11 +43,13 @@ def with_feedback(
     model: Transcription,
     own: Transcription,
     units: Units,
-    policy: AffinePolicy,
+    policy: Policy,
+    mask: np.ndarray,
     wider: Callable[[], OwnUnits] | None = None,
 ) -> tuple[Transcription, Transcription]:
-    """The program of a problem under a policy, from its transcription ``model`` without feedback and without terminal
-    equalities, and the same in its ``own`` ``units``: the user's and the own one."""
+    """The program of a problem under a policy that answers what ``mask (K, K)`` says, from its transcription ``model``
+    without feedback and without terminal equalities, and the same in its ``own`` ``units``: the user's and the own
+    one."""
     pieces = measurable_pieces(own.functionals)
     spread = _spread(own, pieces)
     begins = own.problem.initial_set is not None
@@ -57,21 +59,21 @@ def with_feedback(
     deviations = np.concatenate([deviations, units.states]) if begins else deviations
     seen = innovations_seen(own.response, own.control, own.functionals.disturbance, begins, pieces)
     seen = seen * (spread.chords > 0.0)  # what cannot deviate is not answered
-    memory = None if policy.memory is None else policy.memory / units.time
-    scaled = answers(seen, own.control.breakpoints, own.problem.system.controls, memory)
+    scaled = answers(seen, mask, own.problem.system.controls)
     known = _in_users(scaled, units, deviations)
 
     acting = None if pieces is None else pieces.in_units_of(model.functionals, units.states, units.disturbances)
     fixed = _fixed(problem, own, units)
     repeated = own.control.pieces
 
-    def in_users(one: Transcription, policy: AffinePolicy) -> tuple[SemiInfiniteProgram, ClosedLoop]:
-        return _program(one, policy, known, acting, fixed[0], _steps(one.problem, repeated, own=False))
+    def in_users(one: Transcription, charge: Charge) -> tuple[SemiInfiniteProgram, ClosedLoop]:
+        return _program(one, charge, known, acting, fixed[0], _steps(one.problem, repeated, own=False))
 
-    def in_own(one: Transcription, policy: AffinePolicy) -> tuple[SemiInfiniteProgram, ClosedLoop]:
-        return _program(one, policy, scaled, pieces, fixed[1], _steps(one.problem, repeated, own=True))
+    def in_own(one: Transcription, charge: Charge) -> tuple[SemiInfiniteProgram, ClosedLoop]:
+        return _program(one, charge, scaled, pieces, fixed[1], _steps(one.problem, repeated, own=True))
 
-    mine, theirs = in_users(model, policy), in_own(own, policy)
+    charge = policy.charge
+    mine, theirs = in_users(model, charge), in_own(own, charge)
     told = [
         _told_by(family, other, units, deviations, own)
         for family, other in zip(theirs[0].families, mine[0].families, strict=True)
@@ -81,29 +83,34 @@ def with_feedback(
         [
             np.repeat(units.controls, repeated),
             units.controls[scaled.channel] / deviations[scaled.entry],
-            np.full(1, units.cost) if policy.cost == "worst" else np.repeat(units.controls, repeated),
+            np.full(1, units.cost) if charge.cost == "worst" else np.repeat(units.controls, repeated),
         ]
     )[: scaled_program.n]
     program = mine[0].mirrored(lambda _: OwnUnits(scaled_program, decision, decision, np.zeros(0), units.cost, wider))
     scaled_problem = units.of_problem(problem)
     return (
-        replace(model, problem=problem, program=program, feedback=Feedback(policy, mine[1], in_users)),
-        replace(own, problem=scaled_problem, program=scaled_program, feedback=Feedback(policy, theirs[1], in_own)),
+        replace(model, problem=problem, program=program, feedback=Feedback(policy, mask, charge, mine[1], in_users)),
+        replace(
+            own,
+            problem=scaled_problem,
+            program=scaled_program,
+            feedback=Feedback(policy, mask, charge, theirs[1], in_own),
+        ),
     )
 
 
-def made_again(model: Transcription, policy: AffinePolicy) -> Transcription:
-    """The transcription with the program that belongs to its initial state and to a policy that costs something
+def made_again(model: Transcription, charge: Charge) -> Transcription:
+    """The transcription with the program that belongs to its initial state, and to a policy that is charged something
     else."""
     assert model.feedback is not None
-    program, loop = model.feedback.made(model, policy)
+    program, loop = model.feedback.made(model, charge)
     named = {family.name: family for family in model.program.families}
     families = [
         replace(one, explain=told.explain, row_units=told.row_units, index_units=told.index_units)
         for one, told in ((one, named.get(one.name, one)) for one in program.families)
     ]
     program = replace(program, families=families, cost_unit=model.program.cost_unit)
-    return replace(model, program=program, feedback=replace(model.feedback, policy=policy, loop=loop))
+    return replace(model, program=program, feedback=replace(model.feedback, charge=charge, loop=loop))
 
 
 def _fixed(
@@ -160,7 +167,7 @@ def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dic
     }
     for wanted, hindered in reasons.items():
         if hindered:
-            raise InputError(f"affine needs a {wanted}", path="policy.name")
+            raise InputError(f"feedback needs a {wanted}", path="policy.name")
 
 
 def _in_users(own: Answers, units: Units, deviations: Array) -> Answers:
@@ -175,7 +182,7 @@ def _in_users(own: Answers, units: Units, deviations: Array) -> Answers:
 
 def _program(
     model: Transcription,
-    policy: AffinePolicy,
+    charge: Charge,
     known: Answers,
     acting: MeasurablePieces | None,
     fixed: tuple[Array, Array],
@@ -185,7 +192,7 @@ def _program(
     its control's steps are."""
     functionals, problem, pieces = model.functionals, model.problem, model.control.pieces
     nominal, first = functionals.variables, functionals.variables + known.variables
-    size = first + {"nominal": 0, "peak": nominal, "worst": 1}[policy.cost]
+    size = first + {"nominal": 0, "peak": nominal, "worst": 1}[charge.cost]
     loop = ClosedLoop(functionals, known, _spread(model, acting), size, acting)
     families = [of_state(constraint, loop).family() for constraint in model.constraints]
     settled: list[Callable[[Array], Array]] = []
@@ -211,7 +218,7 @@ def _program(
     weights, lower, upper = np.zeros(size), np.concatenate([low, -most]), np.concatenate([high, most])
     cost = problem.prices(model.control.breakpoints).ravel()
     guide, largest, among = None, None, None
-    if policy.cost == "peak":
+    if charge.cost == "peak":
         both = np.vstack([axes, -axes])
         peaks = FeedbackControl(PEAK, loop, both, np.zeros(len(both)), first)
         families.append(peaks.family())
@@ -219,19 +226,19 @@ def _program(
         weights[first:] = cost
         lower = np.concatenate([lower, np.zeros(nominal)])
         upper = np.concatenate([upper, np.maximum(np.abs(low), np.abs(high))])
-    elif policy.cost == "worst":
+    elif charge.cost == "worst":
         effort = FeedbackEffort(EFFORT, loop, cost, first)
         families.append(effort.family())
         settled.append(effort.settled)
-        guide = (_program(model, policy.model_copy(update={"cost": "peak"}), known, acting, fixed, steps)[0], first)
+        guide = (_program(model, replace(charge, cost="peak"), known, acting, fixed, steps)[0], first)
         weights[first:] = 1.0
         lower = np.append(lower, 0.0)
         largest = float(cost @ np.maximum(np.abs(low), np.abs(high)))
         upper = np.append(upper, 2.0 * largest)
     else:
         weights[:nominal] = cost
-        if policy.among == "peak":
-            peak = policy.model_copy(update={"cost": "peak"})
+        if charge.among == "peak":
+            peak = replace(charge, cost="peak")
             among = (_program(model, peak, known, acting, fixed, steps)[0], first)
     program = SemiInfiniteProgram(
         n=size,

@@ -21,7 +21,7 @@ from sparserob_core.sip.program import ConstraintFamily, Formulation, SemiInfini
 
 if TYPE_CHECKING:
     from sparserob_core.control.feedback.closed_loop import ClosedLoop
-    from sparserob_core.control.policies.affine import AffinePolicy
+    from sparserob_core.control.policies.policy import Charge, Policy
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,14 +43,17 @@ class RowUnits:
 @final
 @dataclass(frozen=True, eq=False)
 class Feedback:
-    """How the control of a transcribed problem answers what it measures: its ``policy`` and the closed ``loop``.
+    """How the control of a transcribed problem answers what it measures: its ``policy``, what that answers here,
+    ``answers (K, K)``, what it is charged, and the closed ``loop``.
 
-    ``made(model, policy)``: the program and the loop of another transcription of the problem, in the same units, from
-    another initial state, under a policy that differs in what it costs."""
+    ``made(model, charge)``: the program and the loop of another transcription of the problem, in the same units, from
+    another initial state, under a policy that answers the same and may be charged something else."""
 
-    policy: AffinePolicy
+    policy: Policy
+    answers: np.ndarray
+    charge: Charge
     loop: ClosedLoop
-    made: Callable[[Transcription, AffinePolicy], tuple[SemiInfiniteProgram, ClosedLoop]]
+    made: Callable[[Transcription, Charge], tuple[SemiInfiniteProgram, ClosedLoop]]
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,7 @@ from sparserob_core.control.constraints.literal import LiteralConstraint
 from sparserob_core.control.constraints.sensitivity import Sensitivity
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.taylor import TaylorSpace
-from sparserob_core.control.policies.affine import AffinePolicy
-from sparserob_core.control.policies.policy import Policy
+from sparserob_core.control.policies.policy import Policy, answers_of
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
 from sparserob_core.control.problem.representable import require_representable
@@ -60,10 +59,10 @@ def transcribe(
 
     The decision is ``theta (m, N)`` raveled; its image ``S theta`` is the control on every piece, channel-major
     ``(m K,)``. ``disturbance`` defaults to the control's dictionary. ``formulation``: ``reduced`` eliminates the
-    disturbance exactly, by support functions; ``literal`` keeps its coefficients as part of the index. ``policy``: an
-    `AffinePolicy` answers what is measured; its gains follow ``theta`` in the decision. The program remembers what it
-    is of, so that `solve` gives it a result like that of its problem; one in which something is replaced does not.
-    Raises `InputError` when a dictionary does not span the horizon.
+    disturbance exactly, by support functions; ``literal`` keeps its coefficients as part of the index. ``policy``: one
+    that answers what is measured, such as an `AffinePolicy`, has its gains after ``theta`` in the decision. The program
+    remembers what it is of, so that `solve` gives it a result like that of its problem; one in which something is
+    replaced does not. Raises `InputError` when a dictionary does not span the horizon.
     """
     if formulation not in ("reduced", "literal"):
         raise InputError(f"formulation: expected reduced or literal, got {formulation!r}")
@@ -81,7 +80,8 @@ def prepare(
 ) -> Transcription:
     """The program of a problem on its dictionaries, with everything that it was made of. Raises `InputError` when a
     dictionary does not span the horizon, for terminal equalities that no control can meet, or steps that none can take,
-    and for a policy that is neither `OpenLoop` (as none is) nor `AffinePolicy`."""
+    and for a policy that does not say what it answers, or answers what it cannot know; one that answers nothing is an
+    open loop, as none is."""
     for name, dictionary in (("control", control), ("disturbance", disturbance)):
         if abs(dictionary.horizon - problem.horizon) > 1e-12 * problem.horizon:
             raise InputError(
@@ -94,17 +94,17 @@ def prepare(
             )
     require_representable(problem)
     refuse_without_steps(problem, control)
-    if isinstance(policy, AffinePolicy):
+    mask = answers_of(policy, control.breakpoints)
+    if policy is not None and mask.any():
         from sparserob_core.control.transcription.feedback import refuse
 
-        refuse(problem, control, disturbance, policy.cost)
+        refuse(problem, control, disturbance, policy.charge.cost)
         if formulation != "reduced":
-            raise InputError(f"formulation: expected reduced with policy: affine, got {formulation!r}")
-        return _answering(problem, control, disturbance, policy)[0]
+            raise InputError(
+                f"formulation: expected reduced with a policy that answers what is measured, got {formulation!r}"
+            )
+        return _answering(problem, control, disturbance, policy, mask)[0]
     model = _assembled(problem, control, disturbance, formulation)
-    if policy is not None and policy.knows:
-        known = ", ".join(sorted(policy.knows))
-        raise InputError(path="policy.name", expected="open_loop or affine", got=f"one that knows the {known}")
     return replace(model, program=model.program.mirrored(lambda _: _in_own_units(model)))
 
 
@@ -112,10 +112,12 @@ def _answering(
     problem: OptimalControlProblem,
     control: Dictionary,
     disturbance: Dictionary,
-    policy: AffinePolicy,
+    policy: Policy,
+    mask: np.ndarray,
     wide: bool = False,
 ) -> tuple[Transcription, Transcription, Units]:
-    """A problem under a policy, in the user's units, in its own, and these (`in_own_units`)."""
+    """A problem under a policy that answers what ``mask`` says, in the user's units, in its own, and these
+    (`in_own_units`)."""
     from sparserob_core.control.transcription.feedback import with_feedback
 
     ends = [end for end in problem.terminal if not isinstance(end, Equality)]
@@ -123,12 +125,12 @@ def _answering(
     own, units = in_own_units(model, wide)
 
     def wider() -> OwnUnits:
-        found = _answering(problem, control, disturbance, policy, wide=True)[0].program.own_units
+        found = _answering(problem, control, disturbance, policy, mask, wide=True)[0].program.own_units
         assert found is not None
         return found
 
     more = wider if not wide and _is_narrow(model, units) else None
-    return *with_feedback(problem, model, own, units, policy, more), units
+    return *with_feedback(problem, model, own, units, policy, mask, more), units
 
 
 def _functionals(
@@ -209,7 +211,8 @@ def in_own_units(model: Transcription, wide: bool = False) -> tuple[Transcriptio
     control that goes as far as that allows, ``wide`` asks for those of its whole range nonetheless.
     """
     if model.feedback is not None:
-        return _answering(model.problem, model.control, model.disturbance, model.feedback.policy)[1:]
+        answering = model.feedback
+        return _answering(model.problem, model.control, model.disturbance, answering.policy, answering.answers)[1:]
     controls = np.ones(model.problem.system.controls)
     own, units = _scaled(model, controls)
     short = shortfall(own.constraints)
@@ -395,7 +398,7 @@ def from_state(model: Transcription, initial_state: Array) -> Transcription:
         from sparserob_core.control.transcription.feedback import made_again
 
         begun = replace(model, problem=problem, functionals=functionals, constraints=constraints)
-        return made_again(begun, model.feedback.policy)
+        return made_again(begun, model.feedback.charge)
     moved = {
         one.name: replace(_reduced(one), row_units=told.row_units, index_units=told.index_units)
         for one, told in zip(constraints, model.program.families, strict=False)

@@ -19,6 +19,8 @@ from sparserob_core.sip.program import SemiInfiniteProgram
 
 if TYPE_CHECKING:
     from sparserob_core.checker.claims.case import Case
+    from sparserob_core.control.policies.policy import Policy
+    from sparserob_core.control.problem.dictionary import Dictionary
     from sparserob_core.experiment.config.load import Loaded
     from sparserob_core.experiment.run.given import GivenRun
 
@@ -58,8 +60,7 @@ def check(directory: GivenRun, plugins: Iterable[str | Path] = (), seconds: floa
     """
     from sparserob_core.checker.claims.case import Case
     from sparserob_core.checker.claims.claims import check as derive
-    from sparserob_core.control.policies.affine import AffinePolicy
-    from sparserob_core.experiment.assemble import build, counting, dictionaries_of, gap_tolerance, problem_of
+    from sparserob_core.experiment.assemble import counting, dictionaries_of, gap_tolerance, problem_of
 
     if type(seconds) not in (int, float) or not seconds > 0:
         raise InputError(path="seconds", expected="a positive number", got=repr(seconds))
@@ -75,13 +76,31 @@ def check(directory: GivenRun, plugins: Iterable[str | Path] = (), seconds: floa
             f"{path}: expected the run of a control problem; certificates of other programs cannot be checked"
         )
     control, disturbance = dictionaries_of(loaded, problem.horizon)
-    policy = build(loaded, "policy", loaded.config.policy)
-    answering = policy if isinstance(policy, AffinePolicy) else None
-    case = Case(problem, control, disturbance, data, clock, *counting(loaded), answering)
+    case = Case(problem, control, disturbance, data, clock, *counting(loaded), _policy(loaded, data, control))
     derived = derive(case, gap_tolerance(loaded))
     files = compared(replace(stored, largest=_largest(path, case)), loaded, case, summary)
     claims = (_config(loaded, data, summary), *derived, *files.claims)
     return Check(loaded.config.title or path.name, claims, time.perf_counter() - started, files.not_compared)
+
+
+def _policy(loaded: Loaded, data: Mapping[str, Any], control: Dictionary) -> Policy | None:
+    """The policy of a config where it answers anything. Of one whose component is not at hand, what the certificate
+    says of it: what is claimed is claimed of such policies."""
+    from sparserob_core.checker.claims.case import written_policy
+    from sparserob_core.checker.outcome import Broken
+    from sparserob_core.control.policies.policy import answers_of
+    from sparserob_core.experiment.assemble import build
+
+    entry = loaded.config.policy
+    policy: Policy
+    if entry.name in loaded.registry.names("policy"):
+        policy = build(loaded, "policy", entry)
+    else:
+        try:
+            policy = written_policy(data, control.pieces)
+        except Broken:  # nothing is written, or the claim `policy` says what is wrong
+            return None
+    return policy if answers_of(policy, control.breakpoints).any() else None
 
 
 def _place(run: GivenRun) -> Path:

@@ -77,13 +77,16 @@ BEGUN = {"deviation"}
 def _unread(case: Case) -> set[str]:
     """The names ``key.key`` of what a certificate says besides what its claims rest on."""
     data = case.certificate
-    read = CERTIFICATE.get(str(data.get("status")), FIGURED) | (set() if case.policy is None else {"gains", "causal"})
+    read = CERTIFICATE.get(str(data.get("status")), FIGURED) | (
+        set() if case.policy is None else {"gains", "causal", "policy"}
+    )
     left = {name for name, value in data.items() if name not in read and not (name in SOMETIMES and value in NOTHING)}
     pieced = {window.name for window in case.windows if window.is_mixed}
     proof, witness, fewest = (data.get(name) for name in ("proof", "witness", "fewest_active"))
     of_activity = fewest.get("multipliers") if isinstance(fewest, Mapping) else None
     left |= _besides("fewest_active", fewest, {"lower", "upper", "multipliers", "decision", "proof"})
     causal = data.get("causal") if case.policy is not None else None
+    left |= _besides("policy", data.get("policy") if case.policy is not None else None, {"cost", "answers"})
     left |= _besides("causal", causal, {"lower_bound", "signals", "multipliers", "shares"})
     rows = causal.get("multipliers") if isinstance(causal, Mapping) else None
     for entry in rows if isinstance(rows, list) else []:

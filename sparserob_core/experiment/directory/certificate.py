@@ -44,7 +44,8 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
     least and its proof where that is another one. Where the cost is the time that the control acts, ``J`` is beside it,
     and ``tree`` holds the parts of the controls, each with multipliers of its own. ``witness``: what refutes the
     decision. Under feedback ``decision`` is the nominal control, ``gains (K, K, m, d)`` are what answers the
-    innovations, every constraint with a multiplier is one at a ``disturbance`` (a measurable one jumps at its
+    innovations, ``policy`` says which cost is charged and which breakpoints every piece answers, as ranges ``[first,
+    last]`` from 0 on, every constraint with a multiplier is one at a ``disturbance`` (a measurable one jumps at its
     ``changes``), and at a ``deviation`` of the initial state from its centre where there is a set of them, and
     ``causal`` is the bound against every causal policy.
     """
@@ -59,7 +60,10 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
         else experiment.transcription.nominal(result.decision).reshape(program.channels, experiment.control.functions)
     )
     feedback = experiment.transcription.feedback
-    answered = {} if feedback is None or theta is None else {"gains": feedback.loop.gains(np.asarray(result.decision))}
+    answered: dict[str, Any] = {}
+    if feedback is not None:
+        answered["policy"] = {"cost": feedback.charge.cost, "answers": [_runs(row) for row in feedback.answers]}
+        answered |= {} if theta is None else {"gains": feedback.loop.gains(np.asarray(result.decision))}
     causal = result.causal if isinstance(result, ControlResult) and result.causal and result.causal.rows else None
     return {
         "format": FORMAT,
@@ -76,6 +80,12 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
         "proof": _proofs(experiment, result.proofs),
         "witness": _witness(experiment, result) if result.status == "refuted" else None,
     }
+
+
+def _runs(row: np.ndarray) -> list[list[int]]:
+    """The places ``[first, last]`` of the truth values ``(K,)`` that follow one another."""
+    turns = np.flatnonzero(np.diff(np.concatenate([[0], row.astype(int), [0]])))
+    return [[int(first), int(end) - 1] for first, end in turns.reshape(-1, 2)]
 
 
 def causal_data(bound: CausalBound) -> dict[str, Any]:

@@ -36,15 +36,15 @@ def causal_upper(
     base = max(known, default=1.0)
     model = model_at(base)
     assert model.feedback is not None
-    policy, result = model.feedback.policy, results.get(base)
-    if not policy.causal_signals:
+    charge, result = model.feedback.charge, results.get(base)
+    if not charge.causal_signals:
         return np.nan, None
     notify(StudyProgress(text=f"looking for the factor of {scaling.of} above which no causal policy exists"))
     refused = [one for factor, one in results.items() if one.status == "infeasible" and factor > 0.0]
     rests = [] if result is None else active(model, result)
     rests += [at for one in refused for at in active(model, one)]
     search = searched(model, None if result is None else result.decision, rests)
-    limits = Limits.of(policy, list(results.values()), model.program.n, lambda: tools.deadline.passed)
+    limits = Limits.of(charge, list(results.values()), model.program.n, lambda: tools.deadline.passed)
     found = search.largest_factor(scaling.highest / base, limits)
     if found is None:
         return np.nan, limits.ended

@@ -135,7 +135,7 @@ def _search(loaded: Loaded, of: str, tolerance: float, notify: Notify) -> Margin
     policy = None if feedback is None else feedback.policy
     if of == HORIZON:
         if policy is not None:
-            raise InputError(path="policy.name", expected="open_loop for the margin of the horizon", got="affine")
+            raise InputError(path="policy.name", expected="open_loop for the margin of the horizon", got="feedback")
         both, method = (control, disturbance), _method(loaded)
         return horizon_search(experiment.title, problem, both, method, tools, tolerance, notify)
     chosen = scaling(problem, of, *_positions(loaded, problem))

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, final
 
 import numpy as np
 
+from sparserob_core.control.policies.policy import Charge, Policy, Quantity
 from sparserob_core.control.problem.dictionary import Dictionary, DictionaryFactory
 from sparserob_core.control.problem.problem import OptimalControlProblem, ProblemFactory
 from sparserob_core.errors import PluginError
@@ -79,6 +80,25 @@ class _Dictionary(DictionaryFactory):
                 f"{self.origin}: build returned a dictionary on [{first!r}, {last!r}], expected [0, {horizon!r}]"
             )
         return built
+
+
+@final
+class _Policy(Policy):
+    """What it answers, `sparserob_core.control.policies.policy.answers_of` checks."""
+
+    def __init__(self, policy: Policy, origin: str) -> None:
+        self._policy, self.origin = policy, origin
+
+    @property
+    def knows(self) -> frozenset[Quantity]:
+        return asked(self.origin, "knows", lambda: self._policy.knows, frozenset)
+
+    def answers(self, breakpoints: Array) -> np.ndarray:
+        return asked(self.origin, "answers", lambda: self._policy.answers(breakpoints), np.ndarray)
+
+    @property
+    def charge(self) -> Charge:
+        return asked(self.origin, "charge", lambda: self._policy.charge, Charge)
 
 
 @final
@@ -193,6 +213,7 @@ def _rule(kind: type, expected: tuple[type, ...], words: str) -> Callable[[Any, 
 GUARDS: dict[type, Callable[[Any, str], Any]] = {
     ProblemFactory: _Problem,
     DictionaryFactory: _Dictionary,
+    Policy: _Policy,
     Method: _Method,
     ExecutorFactory: _Executors,
     Solver: _Solver,

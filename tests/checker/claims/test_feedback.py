@@ -118,7 +118,7 @@ def test_answers_to_what_is_not_measured_or_is_forgotten_are_refused():
         if kept:
             assert judged.gains.any()
         else:
-            with pytest.raises(Broken, match="old"):
+            with pytest.raises(Broken, match="measured at 0, which its policy does not"):
                 judged.gains  # noqa: B018
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sparserob_core.control.feedback.innovations import answers
+from sparserob_core.control.policies.affine import AffinePolicy
 
 
 def innovations(rng: np.random.Generator, K: int, d: int, Q: int) -> np.ndarray:
@@ -27,7 +28,7 @@ def test_gains_have_the_effects_that_the_variables_say(seed: int, memory: float 
     K, d, channels = int(rng.integers(1, 9)), int(rng.integers(1, 4)), int(rng.integers(1, 4))
     Q = int(rng.integers(1, 3 * K))
     D, breakpoints = innovations(rng, K, d, Q), np.concatenate([[0.0], np.sort(rng.random(K - 1)), [1.0]])
-    known = answers(D, breakpoints, channels, memory)
+    known = answers(D, AffinePolicy(memory=memory).answers(breakpoints), channels)
     numbers = rng.normal(size=known.variables)
     F, M = known.effects(numbers), known.gains(numbers)
     np.testing.assert_allclose(np.einsum("kjid,jdq->kiq", M, D), F, atol=1e-8 * max(1.0, np.abs(M).max(initial=0.0)))
@@ -43,13 +44,35 @@ def test_there_are_as_many_variables_as_what_is_seen_is_independent(seed: int) -
     rng = np.random.default_rng(seed)
     K, d, Q = 5, 2, 12
     D = innovations(rng, K, d, Q)
-    known = answers(D, np.linspace(0.0, 1.0, K + 1), 2, None)
+    known = answers(D, np.tril(np.ones((K, K), dtype=bool)), 2)
     for k in range(K):
         rank = np.linalg.matrix_rank(D[: k + 1].reshape(-1, Q))
         assert np.count_nonzero(known.piece == k) == 2 * rank
 
 
 def test_nothing_that_is_seen_is_nothing_that_is_answered() -> None:
-    known = answers(np.zeros((3, 2, 4)), np.linspace(0.0, 1.0, 4), 2, None)
+    known = answers(np.zeros((3, 2, 4)), np.tril(np.ones((3, 3), dtype=bool)), 2)
     assert known.variables == 0
     assert not known.effects(np.zeros(0)).any() and not known.gains(np.zeros(0)).any()
+
+
+def test_what_is_as_old_as_the_memory_is_answered_however_the_times_are_rounded() -> None:
+    """In floats ``0.8 - 0.5 > 0.3``."""
+    mask = AffinePolicy(memory=0.3).answers(np.linspace(0.0, 1.0, 11))
+    assert (mask == (np.tril(np.ones((10, 10))) - np.tril(np.ones((10, 10)), -4)).astype(bool)).all()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_of_any_choice_of_measurements_the_effects_are_all_that_gains_of_them_can_have(seed: int) -> None:
+    """Of every piece: the rank of what it answers, and gains that answer nothing else."""
+    rng = np.random.default_rng(seed)
+    K, d, Q = 5, 2, 12
+    D, mask = innovations(rng, K, d, Q), np.tril(rng.random((K, K)) < 0.5)
+    known = answers(D, mask, 1)
+    numbers = rng.normal(size=known.variables)
+    F, M = known.effects(numbers), known.gains(numbers)
+    np.testing.assert_allclose(np.einsum("kjid,jdq->kiq", M, D), F, atol=1e-8 * max(1.0, np.abs(M).max(initial=0.0)))
+    assert not M[~mask].any()
+    for k in range(K):
+        rank = 0 if not mask[k].any() else np.linalg.matrix_rank(D[mask[k]].reshape(-1, Q))
+        assert np.count_nonzero(known.piece == k) == rank

@@ -32,12 +32,12 @@ def with_causal(result: ControlResult, tools: Tools) -> ControlResult:
         return result
     from sparserob_core.control.studies.causal import CausalBound, Limits
 
-    policy = model.feedback.policy
-    if not policy.causal_signals:
+    charge = model.feedback.charge
+    if not charge.causal_signals:
         return result
     try:
         search = searched(model, result.decision, active(model, result))
-        limits = Limits.of(policy, [result], model.program.n, lambda: tools.deadline.passed)
+        limits = Limits.of(charge, [result], model.program.n, lambda: tools.deadline.passed)
         cost = result.cost if result.status in ("certified", "verified") else np.inf
         found = search.least_cost(cost, limits)
         nothing = replace(result, causal=CausalBound(-np.inf, ended=limits.ended))
