@@ -24,6 +24,7 @@ from sparserob_core.checker.reach.tube import Tube
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Corners, Parameters
 from sparserob_core.checker.sets.sides import Bounded, Curved, Sides
+from sparserob_core.control.problem.names import joined, measured_in
 from sparserob_core.control.sets.sets import Box
 from sparserob_core.sip.convex_set import Array
 
@@ -63,8 +64,15 @@ def bounded(case: Case, window: Window) -> str:
     )
     size = f"{found.cells} cells" + (f" in {found.boxes} boxes" if found.boxes > 1 else "")
     if found.bound < 0:
-        return f"kept, with a margin of at least {-found.bound:.1e} ({size})"
-    return f"kept to {found.bound:.1e}, {found.share:.1e} of its own unit ({size})"
+        return f"kept, with a margin of at least {-found.bound:.1e}{_unit(case, window)} ({size})"
+    return f"kept to {found.bound:.1e}{_unit(case, window)}, {found.share:.1e} of its own unit ({size})"
+
+
+def _unit(case: Case, window: Window) -> str:
+    """The units of the rows of a window; of a curved set, whose excess is in multiples of its gauge, none."""
+    sides = window.shape.halfspaces()
+    rows = () if sides is None else sides[0]
+    return joined(measured_in(row, case.problem.names, window.states).strip() for row in rows)
 
 
 def normals_of(window: Window, data: object) -> Array:

@@ -8,7 +8,7 @@ from typing import ClassVar, final
 import numpy as np
 
 from sparserob_core.brief import brief
-from sparserob_core.control.problem.names import UNNAMED, Names
+from sparserob_core.control.problem.names import UNNAMED, Names, measured_in
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.program import Explanation, WorstConstraint, told_apart
@@ -261,20 +261,6 @@ def combination(direction: Array, names: Names, suffix: str = "", states: int | 
         name = names.state(int(state)) if state < last else names.control(int(state) - last)
         parts.append(f"{sign}{' ' if parts else ''}{'' if size == 1 else f'{size:.4g} '}{name}{suffix}")
     return " ".join(parts) or "0"
-
-
-def measured_in(normal: Array, names: Names, states: int | None = None) -> str:
-    """The unit of a combination, with a space before it, where all that it adds up has the same; empty elsewhere. What
-    is beyond the number of ``states`` is the control's."""
-    last = normal.size if states is None else states
-    units = {
-        (names.state_units[i] if names.state_units else "")
-        if i < last
-        else (names.control_units[i - last] if names.control_units else "")
-        for i in np.flatnonzero(normal).tolist()
-    }
-    unit = units.pop() if len(units) == 1 else ""
-    return f" {unit}" if unit else ""
 
 
 def _opposite(H: Array, h: Array, row: int) -> float | None:

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 
+from sparserob_core.control.problem.names import measured_in
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import Reference
@@ -133,6 +134,16 @@ class StateConstraint(ABC):
         ``(r, d + m)``."""
         directions, gains = self.functionals_at(index[None])[1], self.gains
         return directions if gains is None else np.hstack([directions, gains])
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """The unit of every row, empty where it has none that is known; of a curved set, whose one row is in multiples
+        of its gauge, none."""
+        if self.sides is None:
+            return ("",)
+        H, names = self.sides[0], self.functionals.names
+        normals = H if self.gains is None else np.hstack([H, self.gains])
+        return tuple(measured_in(normal, names, H.shape[1]).strip() for normal in normals)
 
     @shaped
     def at(self, x: Float[Array, " n"], indices: Float[Array, "k j"]) -> Float[Array, "k r"]:

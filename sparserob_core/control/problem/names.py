@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import final
+
+import numpy as np
+import numpy.typing as npt
 
 from sparserob_core.errors import InputError
 
@@ -77,3 +80,24 @@ class Names:
 
 
 UNNAMED = Names()
+
+
+def measured_in(normal: npt.NDArray[np.float64], names: Names, states: int | None = None) -> str:
+    """The unit of a combination, with a space before it, where all that it adds up has the same; empty elsewhere. What
+    is beyond the number of ``states`` is the control's."""
+    last = normal.size if states is None else states
+    units = {
+        (names.state_units[i] if names.state_units else "")
+        if i < last
+        else (names.control_units[i - last] if names.control_units else "")
+        for i in np.flatnonzero(normal).tolist()
+    }
+    unit = units.pop() if len(units) == 1 else ""
+    return f" {unit}" if unit else ""
+
+
+def joined(units: Iterable[str]) -> str:
+    """The unit of a number that is one of several rows', with a space before it: ``m``, or ``m or m/s`` where rows have
+    different ones; empty where one of them is not known."""
+    known = list(dict.fromkeys(units))
+    return f" {' or '.join(known)}" if known and all(known) else ""

@@ -186,7 +186,8 @@ def _result(loaded: Loaded, case: Case, summary: Mapping[str, Any]) -> Verdicts:
     for name, read in (("worst", WORST), ("sparsity", SPARSITY)):
         left += sorted(_besides(name, summary.get(name), read)) if name not in left else []
     share = None if different or "sparsity" in left else summary["sparsity"]["active_fraction"]
-    acts = "" if share is None else f"; its control acts {share:.1%} of the time"
+    where = ", in at least one channel" if case.problem.system.controls > 1 else ""
+    acts = "" if share is None else f"; its control acts {share:.1%} of the time{where}"
     return different, f"it says what the certificate says{acts}", left
 
 
@@ -232,6 +233,8 @@ def _sparsity(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     if not isinstance(said, Mapping):
         return ["sparsity is no mapping"]
     derived: dict[str, Any] = {"active_fraction": None, "switches": None}
+    if said.get("channels", case.problem.system.controls) != case.problem.system.controls:
+        return [f"sparsity: channels is {said['channels']!r}, not {case.problem.system.controls}"]
     fewest, claimed = said.get("fewest_active"), case.certificate.get("fewest_active")
     if isinstance(claimed, Mapping):
         claimed = {name: claimed.get(name) for name in ("lower", "upper")}
@@ -340,7 +343,7 @@ def _near(said: object, point: object) -> bool:
 
 
 WORST = {"violation", "constraint", "time", "parameter", "initial_state"}
-SPARSITY = {"active_fraction", "switches", "fewest_active"}
+SPARSITY = {"active_fraction", "switches", "channels", "fewest_active"}
 
 
 def _added_up(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
@@ -350,6 +353,24 @@ def _added_up(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     return [] if said == words else [f"cost_of is {said!r}, not {words!r}"]
 
 
+def _units(case: Case, summary: Mapping[str, Any]) -> list[str]:
+    """The units must be those that the config names."""
+    said, names = summary.get("units") or {}, case.problem.names
+    known = {"", *names.state_units, *names.control_units}
+    rows = said.get("rows") if isinstance(said, Mapping) else None
+    if not isinstance(said, Mapping) or not isinstance(rows, Mapping | None):
+        return ["units is no mapping with rows"]
+    told = [
+        said.get("worst", ""),
+        *(unit for row in (rows or {}).values() for unit in (row if isinstance(row, list) else [row])),
+    ]
+    different = [unit for unit in told if not isinstance(unit, str) or unit not in known]
+    wrong = [f"units: {unit} is none of the config's" for unit in dict.fromkeys(map(repr, different))]
+    for key, mine in (("time", names.time), ("states", list(names.state_units))):
+        wrong += [f"units: {key} is {said[key]!r}, not {mine!r}"] if key in said and said[key] != mine else []
+    return wrong
+
+
 COMPARED: dict[str, Callable[[Case, Mapping[str, Any]], list[str] | None]] = {
     "gap": _gap,
     "cost_scale": _cost_scale,
@@ -357,6 +378,7 @@ COMPARED: dict[str, Callable[[Case, Mapping[str, Any]], list[str] | None]] = {
     "sparsity": _sparsity,
     "value": _value,
     "worst": _worst,
+    "units": _units,
 }
 
 

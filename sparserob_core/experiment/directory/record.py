@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from sparserob_core.control.constraints.control import of_control
 from sparserob_core.control.constraints.explanation import Witness
 from sparserob_core.control.problem.dictionary import Dictionary
+from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.experiment.directory.sparsity import sparsity, verdict
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.evidence import Proof
@@ -23,11 +25,10 @@ PROVEN = ("certified", "verified")
 PACKAGES = ("sparserob", "numpy", "scipy", "piqp", "proxsuite", "clarabel")
 
 
-def summary_of(result: Result, control: Array | None, dictionary: Dictionary | None) -> dict[str, Any]:
-    """``result.json`` but for what only the run knows (title, seed, versions)."""
-    acting = (
-        asdict(sparsity(control, dictionary.breakpoints)) if control is not None and dictionary is not None else None
-    )
+def summary_of(result: Result, control: Array | None, model: Transcription | None) -> dict[str, Any]:
+    """``result.json`` but for what only the run knows (title, seed, versions); ``model``: of a control problem."""
+    acting = asdict(sparsity(control, model.control.breakpoints)) if control is not None and model is not None else None
+    units = {} if model is None else units_of(model, result)
     return {
         "status": result.status,
         "message": result.message,
@@ -41,10 +42,12 @@ def summary_of(result: Result, control: Array | None, dictionary: Dictionary | N
         "cost_scale": result.cost_scale,
         "stopped": result.stopped,
         "worst": _witness(result.worst),
+        **({"units": units} if units else {}),
         "tolerances": {proof.family: _tolerance(proof) for proof in result.proofs if proof.verdict == "proven"},
         **({} if result.missed is None else {"equalities": {"allowed": EQUALITY, "missed": result.missed}}),
         "sparsity": {
             **(acting or {"active_fraction": None, "switches": None}),
+            **({} if model is None else {"channels": model.problem.system.controls}),
             "fewest_active": None
             if result.activity is None
             else {"lower": result.activity.lower, "upper": result.activity.upper},
@@ -60,6 +63,22 @@ def summary_of(result: Result, control: Array | None, dictionary: Dictionary | N
         **({} if result.scenario_bound is None else {"scenario_bound": asdict(result.scenario_bound)}),
         "seconds": result.seconds,
     }
+
+
+def units_of(model: Transcription, result: Result) -> dict[str, Any]:
+    """The units of what is told: of ``time``, of the ``states``, of every row of a constraint (``rows``, by its name)
+    and of the ``worst`` violation; nothing where the problem names none."""
+    names = model.problem.names
+    if not (names.time or names.state_units or names.control_units):
+        return {}
+    rows = {one.name: list(one.measured) for one in model.constraints}
+    every = set(names.control_units)
+    alike = every.pop() if len(every) == 1 and model.problem.control.halfspaces() is not None else ""
+    rows |= {name: [alike] for name in (of_control(model.problem), "control_step") if name not in rows}
+    worst = result.worst
+    mine = [] if worst is None else rows.get(worst.constraint, [])
+    measured = mine[0 if len(mine) == 1 else worst.row] if worst is not None and mine else ""
+    return {"time": names.time, "states": list(names.state_units), "rows": rows, "worst": measured}
 
 
 def _tolerance(proof: Proof) -> dict[str, Any]:

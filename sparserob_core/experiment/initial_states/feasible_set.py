@@ -71,6 +71,12 @@ class InitialStates:
         return f"{self.called.state(self.states[0])}(0)", f"{self.called.state(self.states[1])}(0)"
 
     @property
+    def units(self) -> tuple[str, str]:
+        """What the two coordinates are measured in; empty where that is not known."""
+        named = self.called.state_units
+        return (named[self.states[0]], named[self.states[1]]) if named else ("", "")
+
+    @property
     def start(self) -> Array:
         """The config's own initial state in the plane, ``(2,)``."""
         return np.asarray(self.origin[list(self.states)])
@@ -175,8 +181,10 @@ class InitialStates:
                 ("coordinates", " and ".join(self.names)),
                 ("area", f"at least {self.inner_area:.6g}, at most {self.outer_area:.6g}"),
                 *(
-                    (name, f"from {low:.6g} to {high:.6g}")
-                    for name, low, high in zip(self.names, self.outer.min(axis=0), self.outer.max(axis=0), strict=True)
+                    (name, f"from {low:.6g} to {high:.6g} {unit}".rstrip())
+                    for name, low, high, unit in zip(
+                        self.names, self.outer.min(axis=0), self.outer.max(axis=0), self.units, strict=True
+                    )
                 ),
                 ("directions", str(len(self.bounds))),
             ]

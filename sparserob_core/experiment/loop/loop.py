@@ -13,6 +13,7 @@ import numpy as np
 from sparserob_core.arguments import whole
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.loop.controller import Controller
+from sparserob_core.control.problem.names import joined
 from sparserob_core.control.response.response import Response
 from sparserob_core.control.studies.laws import LawName, Uncertainty
 from sparserob_core.control.studies.simulate import fine_times, finer, walk
@@ -135,6 +136,10 @@ def _closed(
         shown=times[shown],
         paths=[(law, path) for law, path, _ in kept],
         controls=[(law, control) for law, _, control in kept],
+        units={
+            **{one.name: joined(one.measured).strip() for one in model.constraints},
+            CONTROL: joined(model.problem.names.control_units).strip() if model.problem.control.halfspaces() else "",
+        },
     )
 
 

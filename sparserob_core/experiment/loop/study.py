@@ -23,7 +23,7 @@ class ClosedLoops:
     and times inside every piece; the set of controls is ``control``. ``milliseconds (steps,)`` of every step.
     ``cost`` is that of the run, ``planned`` the first term of it for the plan's own control (under feedback the nominal
     one), ``costs (loops,)`` the same term for the control that was applied, law after law. ``paths`` and ``controls``
-    are the first loops of every law, for drawing.
+    are the first loops of every law, for drawing. ``units``: of the violations, as the config names them.
     """
 
     title: str
@@ -43,6 +43,7 @@ class ClosedLoops:
     shown: Array = field(repr=False)
     paths: Sequence[tuple[str, Array]] = field(repr=False)
     controls: Sequence[tuple[str, Array]] = field(repr=False)
+    units: Mapping[str, str] = field(default_factory=dict)
     undrawn: str = ""
 
     __repr__ = brief
@@ -116,7 +117,10 @@ class ClosedLoops:
                 (f"cost under {law}", f"{one.mean():.7g} on average, {one.max():.7g} at most")
                 for law, one in self.paid.items()
             ),
-            *((f"largest violation of {name}", f"{found:.3e}") for name, (found, _) in self.constraints.items()),
+            *(
+                (f"largest violation of {name}", f"{found:.3e} {self.units.get(name, '')}".rstrip())
+                for name, (found, _) in self.constraints.items()
+            ),
         ]
         return (), rows
 

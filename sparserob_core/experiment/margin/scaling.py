@@ -8,6 +8,7 @@ from typing import Literal, TypeAlias, final
 
 import numpy as np
 
+from sparserob_core.control.problem.names import joined
 from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
 from sparserob_core.control.sets.sets import ConvexSet, Equality
 from sparserob_core.errors import InputError
@@ -57,7 +58,7 @@ def scaling(
     """
     choices = dict(_choices(problem, members, ends))
     if of in choices:
-        return choices[of]()
+        return _measured(choices[of](), problem)
     absent = {
         "disturbance": problem.disturbance,
         "parameters": problem.system.parameters,
@@ -71,6 +72,20 @@ def scaling(
             f"of: '{of}' cannot be varied, the problem has no {part}; expected one of {', '.join(sorted(choices))}"
         )
     raise InputError(f"of: expected what is to be varied, got '{of}'{nearest(of, {*choices, 'horizon'})}")
+
+
+def _measured(chosen: Scaling, problem: OptimalControlProblem) -> Scaling:
+    """The same with the unit behind its quantity, where the problem names one for all that it may be of."""
+    names = problem.names
+    of_states = joined(set(names.state_units)) if len(set(names.state_units)) == 1 else ""
+    unit = {
+        "disturbance": joined(names.disturbance_units),
+        "parameters": "",
+        "control": joined(names.control_units),
+        "control_step": joined(names.control_units),
+    }.get(chosen.of, of_states if chosen.relative else joined([names.time])).strip()
+    label = chosen.label.replace("[unit of time]", f"[{unit}]") if unit else chosen.label
+    return replace(chosen, label=label, quantity=f"{chosen.quantity} [{unit}]" if unit else chosen.quantity)
 
 
 def _choices(

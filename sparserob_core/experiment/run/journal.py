@@ -10,6 +10,7 @@ import numpy as np
 
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.studies.answer import ControlResult
+from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.errors import Path, SparseRobError, dotted
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment
 from sparserob_core.experiment.config.load import Loaded
@@ -48,7 +49,7 @@ class Journal(Observer):
         config = self.experiment.loaded.config
         summary = {
             "title": self.experiment.title,
-            **summary_of(result, control, self._dictionary),
+            **summary_of(result, control, self._model),
             **self._added_up(result),
             **self._causal(result),
             "notes": list(_notes(self.experiment.loaded, result, self.asked)),
@@ -82,7 +83,11 @@ class Journal(Observer):
 
     @property
     def _dictionary(self) -> Dictionary | None:
-        return self.experiment.control if isinstance(self.experiment, ControlExperiment) else None
+        return None if self._model is None else self._model.control
+
+    @property
+    def _model(self) -> Transcription | None:
+        return self.experiment.transcription if isinstance(self.experiment, ControlExperiment) else None
 
     def known(self, said: str, seconds: float) -> Result | None:
         """What is known of a run whose method was interrupted: the decision of the last round, undecided; ``None``

@@ -12,6 +12,8 @@ import numpy as np
 
 from sparserob_core.arguments import whole
 from sparserob_core.control.constraints.flat import INSIDE
+from sparserob_core.control.constraints.state import StateConstraint
+from sparserob_core.control.problem.names import joined
 from sparserob_core.control.response.response import Response
 from sparserob_core.control.studies.laws import LawName, Uncertainty
 from sparserob_core.control.studies.simulate import fine_times, finer, trajectories_at_once, walk
@@ -225,6 +227,7 @@ def _replayed(finished: FinishedRun, stored: Mapping[str, Array], started: float
                 worst=float(stored["violations"][position]),
                 worst_time=when,
                 worst_parameter=stored["parameters"][position].tolist(),
+                **_measured(constraint),
             )
         )
     shown = np.unique(np.linspace(0, times.size - 1, min(times.size, SHOWN)).round().astype(int))
@@ -265,9 +268,15 @@ def _shares(counts: Sequence[ViolationCount], worst: Mapping[str, Array], count:
                 worst=np.nan if row is None else float(worst["violations"][row]),
                 worst_time=np.nan if row is None else float(worst["times"][row]),
                 worst_parameter=() if row is None else worst["parameters"][row].tolist(),
+                **_measured(one.constraint),
             )
         )
     return shares
+
+
+def _measured(constraint: StateConstraint) -> dict[str, str]:
+    """What the violations of a constraint, and its times, are measured in."""
+    return {"unit": joined(constraint.measured).strip(), "time_unit": constraint.functionals.names.time}
 
 
 def _together(shares: Sequence[ConstraintShare], violated: int) -> ConstraintShare:
@@ -286,6 +295,8 @@ def _together(shares: Sequence[ConstraintShare], violated: int) -> ConstraintSha
         worst=worst.worst,
         worst_time=worst.worst_time,
         worst_parameter=worst.worst_parameter,
+        unit=seen.unit if len({one.unit for one in shares}) == 1 else "",
+        time_unit=seen.time_unit,
     )
 
 

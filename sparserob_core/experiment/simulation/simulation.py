@@ -34,7 +34,7 @@ class ConstraintShare:
 
     ``largest`` is the largest violation seen (negative: a margin), at ``time``; ``worst`` is the largest that any
     admissible disturbance and parameter was found to cause, at ``worst_time`` and ``worst_parameter (nu,)``: nan where
-    nothing is known.
+    nothing is known. ``unit``: of the violations, ``m or m/s`` where rows differ; ``time_unit``: of the times.
     """
 
     name: str
@@ -48,6 +48,8 @@ class ConstraintShare:
     worst: float
     worst_time: float
     worst_parameter: Sequence[float]
+    unit: str = ""
+    time_unit: str = ""
 
     __repr__ = brief
 
@@ -122,10 +124,10 @@ class Simulation:
             return names, [
                 [
                     one.name,
-                    f"{one.worst_time:.6g}",
+                    _number(one.worst_time, ".6g", one.time_unit),
                     _vector(one.worst_parameter),
-                    f"{one.worst:.6e}",
-                    f"{one.largest:.6e}",
+                    _number(one.worst, ".6e", one.unit),
+                    _number(one.largest, ".6e", one.unit),
                     f"{one.largest - one.worst:.1e}",
                 ]
                 for one in self.constraints
@@ -146,9 +148,9 @@ class Simulation:
                 str(one.violated),
                 _percent(one.share),
                 f"{_percent(one.lower)} to {_percent(one.upper)}",
-                _violation(one.largest, one.time),
-                _number(one.worst, ".3e"),
-                _number(one.worst_time, ".6g"),
+                _violation(one),
+                _number(one.worst, ".3e", one.unit),
+                _number(one.worst_time, ".6g", one.time_unit),
             ]
             for one in rows
         ]
@@ -204,12 +206,13 @@ def _percent(share: float) -> str:
     return f"{100 * share:.4g} %"
 
 
-def _number(value: float, form: str) -> str:
-    return format(value, form) if np.isfinite(value) else "-"
+def _number(value: float, form: str, unit: str) -> str:
+    return f"{value:{form}} {unit}".rstrip() if np.isfinite(value) else "-"
 
 
-def _violation(value: float, time: float) -> str:
-    return f"{value:.3e} at t = {time:.6g}" if np.isfinite(time) else f"{value:.3e}"
+def _violation(one: ConstraintShare) -> str:
+    seen = f"{one.largest:.3e} {one.unit}".rstrip()
+    return f"{seen} at t = {_number(one.time, '.6g', one.time_unit)}" if np.isfinite(one.time) else seen
 
 
 def _vector(values: Sequence[float]) -> str:

@@ -29,12 +29,13 @@ FIRST = (
     "worst.time",
     "sparsity.active_fraction",
     "sparsity.switches",
+    "sparsity.channels",
     "sparsity.fewest_active.lower",
     "sparsity.fewest_active.upper",
 )
 LAST = ("stopped", "message", "run", "hash", "seconds")
 """Columns at the end; ``seconds`` is the last one, for it alone differs when a study is repeated."""
-LEFT = frozenset({"title", "versions", "provenance", "config", "tolerances", "worst.parameter", "seed"})
+LEFT = frozenset({"title", "versions", "provenance", "config", "tolerances", "units", "worst.parameter", "seed"})
 MEANING = {
     "status": ("", "what was proven; see method.md"),
     "cost": ("cost", "J of the returned control, without the regulariser"),
@@ -47,8 +48,9 @@ MEANING = {
     "worst.violation": ("constraint", "by how much the worst constraint is exceeded; negative: a margin"),
     "worst.constraint": ("", "which constraint that is"),
     "worst.time": ("time", "when"),
-    "sparsity.active_fraction": ("1", "share of the time at which the control acts"),
+    "sparsity.active_fraction": ("1", "share of the time at which the control acts, in at least one channel"),
     "sparsity.switches": ("1", "how often it switches"),
+    "sparsity.channels": ("1", "number of channels, over which the least shares are the mean"),
     "sparsity.fewest_active.lower": ("1", "share of the time that every admissible control acts at least"),
     "sparsity.fewest_active.upper": ("1", "share of the time for which some admissible control acts"),
     "stopped": ("", "the limit that ended the run early"),

@@ -47,6 +47,7 @@ def _write(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) ->
 def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     """What a user wants to know of a finished run, from the contents of ``result.json``."""
     worst, sparsity, counts = summary["worst"], summary["sparsity"], summary["counts"]
+    units = summary.get("units") or {}
     rows = [
         ("status", f"{summary['status']}: {summary['message']}"),
         ("cost", _number(summary["cost"], ".9g")),
@@ -55,16 +56,16 @@ def result_rows(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("upper bound", _number(summary["upper_bound"], ".9g")),
         ("relative gap", _number(summary["gap"], ".2e")),
         ("any causal policy", _causal(summary)),
-        ("worst violation", _worst(worst)),
-        ("proven to", _tolerances(summary.get("tolerances") or {})),
+        ("worst violation", _worst(worst, units)),
+        ("proven to", _tolerances(summary.get("tolerances") or {}, units.get("rows") or {})),
         ("equalities", _equalities(summary.get("equalities"))),
         ("active indices", str(counts["active_indices"])),
         ("rounds", str(counts["rounds"])),
         ("solved by", _solved_by(counts.get("solved_by"))),
-        ("share of time active", _number(sparsity["active_fraction"], ".1%")),
+        ("share of time active", _active(sparsity)),
         ("J", _number(summary.get("J"), ".9g")),
         ("sparsest", sparsity.get("verdict") or "unknown"),
-        ("fewest active", _fewest(sparsity.get("fewest_active"))),
+        ("fewest active", _fewest(sparsity.get("fewest_active"), sparsity.get("channels"))),
         ("switches", _number(sparsity["switches"], "d")),
         ("seconds", f"{_number(summary['seconds'], '.3f')} of the method, which solves and proves"),
         *(("note", f"{note['place']}: {note['key']}: {note['note']}") for note in summary.get("notes") or ()),
@@ -88,8 +89,14 @@ def _solved_by(counts: Mapping[str, int] | None) -> str:
     return ", ".join(f"{count} {WHO.get(name, f'by {name}')}" for name, count in counts.items())
 
 
-def _fewest(known: Mapping[str, Any] | None) -> str:
-    """How little any admissible control must act."""
+def _active(sparsity: Mapping[str, Any]) -> str:
+    """How much of the time the control acts."""
+    share, several = sparsity["active_fraction"], (sparsity.get("channels") or 1) > 1
+    return _number(share, ".1%") + (", in at least one channel" if several and share is not None else "")
+
+
+def _fewest(known: Mapping[str, Any] | None, channels: int | None) -> str:
+    """How little any admissible control must act, in the words of the checker."""
     if not known:
         return "unknown"
     lower, upper = _number(known["lower"], ".1%"), known["upper"]
@@ -98,7 +105,8 @@ def _fewest(known: Mapping[str, Any] | None) -> str:
         if upper is None
         else f", and {_number(upper, '.1%')} suffice" + (": none acts less" if upper == known["lower"] else "")
     )
-    return f"every admissible control acts at least {lower} of the time{above}"
+    mean = ", the mean over its channels" if (channels or 1) > 1 else ""
+    return f"every admissible control acts at least {lower} of the time{mean}{above}"
 
 
 def _causal(summary: Mapping[str, Any]) -> str:
@@ -113,16 +121,29 @@ def _number(value: Any, form: str) -> str:
     return "unknown" if value is None else format(value, form)
 
 
-def _tolerances(tolerances: Mapping[str, Any]) -> str:
-    """What was proven to count as no violation, in the user's units."""
+def _tolerances(tolerances: Mapping[str, Any], units: Mapping[str, Sequence[str]]) -> str:
+    """What was proven to count as no violation, in the user's units: of rows with the same unit the least and the
+    largest."""
     if not tolerances:
         return "unknown"
     parts = []
     for name, one in tolerances.items():
-        rows = [one["own"]] if one["rows"] is None else list(one["rows"])
-        least, most = f"{min(rows):.1e}", f"{max(rows):.1e}"
-        parts.append(f"{least if least == most else f'{least} to {most}'} in {name}")
+        if one["rows"] is None:
+            parts.append(f"{one['own']:.1e} in {name}")
+            continue
+        rows = list(one["rows"])
+        mine = list(units.get(name) or [""])
+        measured = mine * len(rows) if len(mine) == 1 else mine
+        alike: dict[str, list[float]] = {}
+        for unit, row in zip(measured, rows, strict=True):
+            alike.setdefault(unit, []).append(row)
+        parts.append(f"{', '.join(_span(found, unit) for unit, found in alike.items())} in {name}")
     return f"{', '.join(parts)} ({next(iter(tolerances.values()))['own']:g} of each row's own unit)"
+
+
+def _span(found: Sequence[float], unit: str) -> str:
+    least, most = f"{min(found):.1e}", f"{max(found):.1e}"
+    return (least if least == most else f"{least} to {most}") + (f" {unit}" if unit else "")
 
 
 def _equalities(said: Mapping[str, Any] | None) -> str:
@@ -132,12 +153,19 @@ def _equalities(said: Mapping[str, Any] | None) -> str:
     return f"missed by {said['missed']:.1e} of the numbers added up, computed; {said['allowed']:g} counts as none"
 
 
-def _worst(worst: Mapping[str, Any]) -> str:
+def _worst(worst: Mapping[str, Any], units: Mapping[str, Any]) -> str:
     if worst["violation"] is None:
         return "unknown"
-    at = "" if worst["time"] is None else f" at t = {worst['time']:.6g}"
+    unit, time, states = (units.get(key) or "" for key in ("worst", "time", "states"))
+    at = "" if worst["time"] is None else f" at t = {_measured(worst['time'], time)}"
     if worst["parameter"] is not None and len(worst["parameter"]):
         at += ", p = (" + ", ".join(f"{value:.6g}" for value in worst["parameter"]) + ")"
     if worst.get("initial_state") is not None:
-        at += ", from (" + ", ".join(f"{value:.6g}" for value in worst["initial_state"]) + ")"
-    return f"{worst['violation']:.2e} in {worst['constraint']}{at}"
+        begun = worst["initial_state"]
+        measured = zip(begun, states or [""] * len(begun), strict=True)
+        at += ", from (" + ", ".join(_measured(value, one) for value, one in measured) + ")"
+    return f"{worst['violation']:.2e}{f' {unit}' if unit else ''} in {worst['constraint']}{at}"
+
+
+def _measured(value: float, unit: str) -> str:
+    return f"{value:.6g} {unit}".rstrip()

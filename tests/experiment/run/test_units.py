@@ -1,0 +1,105 @@
+"""Guards that the units of a problem stand behind what is told of it, row by row, and that nothing is said of a unit
+that is not known."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import sparserob_core as sr
+from sparserob_core.experiment.terminal.table import result_rows
+
+NAMES = {
+    "states": ["place", "speed"],
+    "units": {"states": ["m", "m/s"], "controls": ["N", "N"], "disturbances": ["m/s", "m/s"], "time": "s"},
+}
+PROBLEM: dict[str, Any] = {
+    "name": "linear",
+    "system": {"A": [[0, 1], [0, 0]], "B": [[0, 0], [1, 0.5]]},
+    "horizon": 2.0,
+    "initial_state": {"centre": [0.5, 0.0], "box": [0.01, 0.01]},
+    "control": {"box": 1.0},
+    "disturbance": {"box": 0.02},
+    "path": [{"box": [1.0, None]}],
+    "terminal": [{"box": 0.2}],
+}
+PIECES = {"control": {"name": "piecewise_constant", "pieces": 4}}
+
+
+@pytest.fixture(scope="module")
+def outcome(tmp_path_factory: pytest.TempPathFactory) -> sr.Outcome:
+    place = tmp_path_factory.mktemp("units") / "run"
+    config = {"problem": {**PROBLEM, "names": NAMES}, "dictionaries": PIECES}
+    return sr.run(config, out=place, quiet=True, figures=False)
+
+
+def told(outcome: sr.Outcome) -> dict[str, str]:
+    return dict(result_rows(outcome.summary))
+
+
+def test_a_run_tells_units_row_by_row(outcome: sr.Outcome) -> None:
+    rows = told(outcome)
+    worst, where = outcome.summary["worst"], outcome.summary["units"]
+    assert f"{worst['violation']:.2e} {where['worst']} in {worst['constraint']}" in rows["worst violation"]
+    assert where["worst"] in {"m", "m/s"} and " s, from (0." in rows["worst violation"]
+    assert rows["worst violation"].endswith(" m/s)")
+    assert " m in path" in rows["proven to"] and " m/s in terminal" in rows["proven to"] and " m, " in rows["proven to"]
+    assert sorted(where["rows"]["terminal"]) == ["m", "m", "m/s", "m/s"]
+    assert where["time"] == "s"
+
+
+def test_shares_of_several_channels_say_of_what_they_are(outcome: sr.Outcome) -> None:
+    rows = told(outcome)
+    assert rows["share of time active"].endswith("%, in at least one channel")
+    assert "of the time, the mean over its channels" in rows["fewest active"]
+    assert outcome.summary["sparsity"]["channels"] == 2
+    said = {claim.name: claim.text for claim in sr.check(outcome).claims}
+    assert "the mean over its channels" in said["fewest active"]
+    assert said["result.json"].endswith("of the time, in at least one channel")
+
+
+def test_margins_of_a_check_have_the_units_of_their_rows(outcome: sr.Outcome) -> None:
+    said = {claim.name: claim.text for claim in sr.check(outcome).claims}
+    assert " m (" in said["path"]
+    assert " m or m/s (" in said["terminal"]
+
+
+def test_tables_of_samples_and_loops_have_units(outcome: sr.Outcome) -> None:
+    columns, rows = sr.simulate(outcome, 5).table()
+    path = dict(zip(columns, rows[0], strict=True))
+    assert " m at t = " in path["largest violation seen"] and path["largest violation seen"].endswith(" s")
+    assert path["worst case"].endswith(" m") and path["at"].endswith(" s")
+    loops = dict(sr.loop(outcome, trajectories=1).table()[1])
+    assert loops["largest violation of path"].endswith(" m")
+    assert loops["largest violation of control"].endswith(" N")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"worst": "km"}, "units: 'km' is none of the config's"),
+        ({"time": "h"}, "units: time is 'h', not 's'"),
+        ({"rows": 3}, "units is no mapping with rows"),
+        ({"rows": {"path": 3}}, "units: 3 is none of the config's"),
+    ],
+)
+def test_other_units_than_those_of_the_config_fail_the_check(
+    outcome: sr.Outcome, tmp_path: Path, change: dict[str, Any], words: str
+) -> None:
+    for file in outcome.directory.iterdir():
+        if file.is_file():
+            (tmp_path / file.name).write_bytes(file.read_bytes())
+    summary = json.loads((tmp_path / "result.json").read_text("utf-8"))
+    summary["units"] |= change
+    (tmp_path / "result.json").write_text(json.dumps(summary), "utf-8")
+    said = {claim.name: (claim.verdict, claim.text) for claim in sr.check(tmp_path).claims}
+    assert said["result.json"] == ("fails", words)
+
+
+def test_nothing_is_said_of_units_that_nobody_has_named(tmp_path: Path) -> None:
+    outcome = sr.run({"problem": PROBLEM, "dictionaries": PIECES}, out=tmp_path / "run", quiet=True, figures=False)
+    assert "units" not in outcome.summary
+    assert " in path" in told(outcome)["proven to"] and " m" not in told(outcome)["proven to"]
