@@ -280,11 +280,13 @@ def _more_digits(case: _Case, claim: Claim | None) -> FiniteSolution | None:
         badness = np.inf
         try:
             for one in refined(qp, case.solver, start, factor * case.tolerance):
-                for by, solution in _candidates(case, recover(one), one.message):
-                    believed = case.judge(solution, "with more digits", by)
-                    if believed is not None:
-                        return believed
-                before, badness = badness, min(badness, _badness(solution))
+                candidates = list(_candidates(case, recover(one), one.message))
+                judged = [case.judge(solution, "with more digits", by) for by, solution in candidates]
+                believed = [solution for solution in judged if solution is not None]
+                if believed:  # digits are what was asked for: of those that are believed, the one that misses least
+                    return min(believed, key=lambda solution: solution.residual)
+                before = badness
+                badness = min([badness, *(_badness(solution) for _, solution in candidates)])
                 if badness > 0.5 * before:
                     break
         except Exception as error:  # noqa: BLE001  as in `_ask`
