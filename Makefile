@@ -26,14 +26,15 @@ endef
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help install demo live paper test tests test-slow test-pythons mutants lint style types bench dist docs docs-pictures clean
+.PHONY: help install demo live paper test tests test-changed test-slow test-pythons mutants lint style types bench dist docs docs-pictures clean
 
 help:
 	@echo "make demo        solve the repaired experiment 1, print the bounds, draw the figures"
 	@echo "make live        watch the paper's annealing for a minute: in a viewer, or on a page where there is no display"
 	@echo "make paper       every experiment and figure of the paper, and docs/paper.md (a few minutes)"
-	@echo "make test        lint, types, import rules, tests: the first stage, about six minutes on two processors"
-	@echo "make test-slow   the second stage: larger instances of what the first one tests"
+	@echo "make test        lint, types, import rules, tests: the first stage, about four minutes on two processors"
+	@echo "make test-changed  the tests of the first stage that the changes since main can affect (SINCE=REVISION)"
+	@echo "make test-slow   the second stage: what takes long, and larger instances of what the first one tests"
 	@echo "make mutants     300 small errors in what proves and checks (COUNT=20 SEED=1 for fewer): which do the tests notice? (hours)"
 	@echo "make test-pythons  the tests of the first stage on every Python from 3.11 to 3.14 that is found"
 	@echo "make bench       time the certified solve, and solvers and maximisers beside other people's"
@@ -92,6 +93,11 @@ test: style
 
 tests: $(INSTALLED)
 	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal
+
+# SINCE=REVISION (main): what the modules that were changed since can affect, by the imports.
+test-changed: $(INSTALLED)
+	@chosen=$$($(BIN)/python -m tests.changed $(SINCE)) && \
+	if [ -n "$$chosen" ]; then $(BIN)/python -m pytest --numprocesses 2 --dist worksteal $$chosen; else echo "nothing was changed"; fi
 
 test-slow: $(INSTALLED)
 	$(BIN)/python -m pytest -m slow --numprocesses 2 --dist worksteal -p no:cacheprovider

@@ -332,7 +332,9 @@ GROUPS = {
 }
 
 
-@pytest.mark.parametrize("group", GROUPS)
+@pytest.mark.parametrize(
+    "group", [pytest.param(name, marks=pytest.mark.slow if name == "nonsense" else ()) for name in GROUPS]
+)
 def test_no_forgery_is_accepted_even_where_all_files_agree_with_it(group: str, honest: Callable[[str], Honest]) -> None:
     accepted = [
         kind for kind, (name, change) in GROUPS[group].items() if not honest(name).refuses(change, group == "nonsense")
@@ -364,6 +366,7 @@ def test_a_changed_config_no_longer_has_the_recorded_digest(kind: str, runs: Run
         assert found.claims[0].verdict == "fails"
 
 
+@pytest.mark.slow
 def test_a_copy_that_was_only_rewritten_is_verified(runs: Runs, tmp_path: Path) -> None:
     for name in CONFIGS:
         assert check(forged(runs(name), tmp_path / name, lambda files: None, consistent=True)).status == "verified"

@@ -455,6 +455,7 @@ def test_workers_end_with_the_process_that_started_them_however_it_ends(tmp_path
     assert said.count("KeyboardInterrupt") <= 1, f"workers have answered the interrupt too: {said}"
 
 
+@pytest.mark.slow
 def test_a_script_without_a_guard_starts_its_work_once(tmp_path):
     (tmp_path / "study.py").write_text(
         "import sparserob_core as sr\nfrom sparserob_core.testing.executors import echo\n"

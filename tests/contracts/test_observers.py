@@ -56,6 +56,7 @@ class Counting(sr.Observer):
         self.over.set()
 
 
+@pytest.mark.slow
 class TestAnHonestObserver(ObserverContract):
     def create(self):
         return Counting()
@@ -194,6 +195,7 @@ FAULTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("flawed", "test"), FAULTS.items(), ids=[one.__name__ for one in FAULTS])
 def test_the_contract_catches_an_observer_that_is_bad_on_purpose(flawed, test, monkeypatch):
     monkeypatch.setattr("sparserob_core.testing.observers.GRACE", 0.2)

@@ -53,6 +53,7 @@ class TestDualNewton(SolverContract):
         return REGISTRY.build("solver", "dual_newton")
 
 
+@pytest.mark.slow
 def test_all_solvers_find_the_same_value():
     for instance in [*linear_instances(), *regularised_instances()]:
         values = [

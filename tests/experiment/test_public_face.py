@@ -47,6 +47,7 @@ def test_the_module_shows_its_public_names_and_nothing_that_leaks() -> None:
     assert {name for name in dir(sr) if not name.startswith("__")} == set(sr.__all__)
 
 
+@pytest.mark.slow
 def test_a_type_checker_sees_the_types_of_the_public_names(tmp_path: Path) -> None:
     file = tmp_path / "user.py"
     file.write_text(

@@ -109,6 +109,7 @@ SWITCHED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("problem", [HARD, SWITCHED], ids=["one system", "two systems that take turns"])
 def test_the_cost_is_that_of_the_physics_integrated_by_another_program(problem, tmp_path):
     outcome = run(problem, 17, tmp_path / "run")
@@ -186,6 +187,7 @@ def test_a_robust_quadratic_program_is_that_of_an_independent_solver(tmp_path):
     assert outcome.control[0] == pytest.approx(np.array(solution.x), abs=np.sqrt(2 * 2e-7 / bent))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dictionary", ["haar", "walsh"])
 def test_the_cost_does_not_depend_on_the_functions_that_span_the_controls(dictionary, tmp_path):
     problem = {**SPRING, "cost": EVERYTHING}

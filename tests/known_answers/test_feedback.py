@@ -177,6 +177,7 @@ def dense(problem: dict[str, Any], pieces: int, within: int, cost: str) -> float
     return float(found.fun)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cost", ["nominal", "peak"])
 def test_an_independent_linear_program_on_a_grid_comes_near_from_below(cost: str, tmp_path: Path) -> None:
     problem = springs(0.25, 0.5)
@@ -196,7 +197,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("name", VARIANTS)
-@pytest.mark.parametrize("cost", ["nominal", "peak"])
+@pytest.mark.parametrize("cost", [pytest.param("nominal", marks=pytest.mark.slow), "peak"])
 def test_grids_and_memory_keep_every_guarantee(name: str, cost: str, tmp_path: Path) -> None:
     proven(run(springs(0.2, 0.5), 10, tmp_path / "run", cost, **json.loads(json.dumps(VARIANTS[name]))))
 
@@ -229,6 +230,7 @@ def test_a_drift_is_answered_too(tmp_path: Path) -> None:
     proven(run({**springs(0.1, 0.5), "system": system}, 10, tmp_path / "run", "peak"))
 
 
+@pytest.mark.slow
 def test_other_units_change_nothing(tmp_path: Path) -> None:
     """The spring in seconds and metres, and in units of 1/4 s and 1/1024 m: factors of two."""
     first = run(springs(0.25, 0.5), 10, tmp_path / "first", "peak")
@@ -360,6 +362,7 @@ def test_the_margin_of_the_first_experiment_is_where_no_causal_policy_goes_furth
     assert 0.2895 <= found.amounts[0] <= found.amounts[1] <= 0.2906
 
 
+@pytest.mark.slow
 def test_the_margin_of_a_policy_is_bracketed_where_independent_programs_found_it(tmp_path: Path) -> None:
     """The spring with 20 pieces and the path from 0.5 withstands between 0.33612 and 0.33619, five times as much as
     without feedback."""
@@ -396,6 +399,7 @@ def test_no_causal_policy_costs_less_than_a_tree_of_signals_proves(tmp_path: Pat
     assert outcome.summary["causal_ended"] == "settled"
 
 
+@pytest.mark.slow
 def test_the_bound_against_causal_policies_depends_on_no_clock_and_says_so_where_it_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -551,6 +555,7 @@ def test_the_witness_is_where_the_simulated_loop_goes(refuted: Path) -> None:
     assert largest[witness["constraint"]] == pytest.approx(witness["violation"], rel=1e-9)
 
 
+@pytest.mark.slow
 def test_minimum_attention_answers_what_it_measures_and_its_rate_has_a_name_of_its_own(tmp_path: Path) -> None:
     outcome = sr.run(CONFIGS / "experiment3_feedback.yaml", out=tmp_path / "run", quiet=True, figures=False)
     assert {"control", "rate", "equals"} <= set(outcome.summary["tolerances"])

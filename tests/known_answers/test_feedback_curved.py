@@ -93,6 +93,7 @@ def test_curved_sets_keep_every_guarantee(name: str, tmp_path: Path) -> None:
     proven(run({**SPRING, **SETS[name]}, tmp_path / "run", "peak", pieces=8))
 
 
+@pytest.mark.slow
 def test_nothing_need_be_flat(tmp_path: Path) -> None:
     """The bound against every causal policy has no rows then, and is 0 or that of the set of the control."""
     round_ = {"terminal": [{"norm": {"p": 2, "radius": 0.3}}], "disturbance": {"norm": {"p": 2, "radius": 0.05}}}

@@ -76,6 +76,7 @@ def spring() -> sr.InitialStates:
     return sr.initial_states(config(SPRING), directions=16, values=2)
 
 
+@pytest.mark.slow
 def test_linear_programs_of_their_own_say_the_same_on_both_sides_of_the_boundary(spring: sr.InitialStates) -> None:
     assert spring.status in ("certified", "verified")
     assert len(spring.inner) >= 8

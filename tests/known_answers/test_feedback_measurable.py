@@ -178,6 +178,7 @@ def test_other_units_change_nothing(tmp_path: Path) -> None:
     assert found.result.cost / (u * t) == pytest.approx(plain.result.cost, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_without_gains_the_tube_is_that_of_the_open_loop() -> None:
     answer = sr.solve(_problem(), control={"name": "piecewise_constant", "pieces": PIECES}, policy=POLICY)
     model: Transcription = answer.model
@@ -259,7 +260,10 @@ FORGERIES: dict[str, Callable[[dict[str, Any]], Any]] = {
 }
 
 
-@pytest.mark.parametrize("name", FORGERIES)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.slow if "outside of its set" in name else ()) for name in FORGERIES],
+)
 def test_a_forged_certificate_is_found(name: str, tmp_path: Path, certified: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(certified, copy)
@@ -287,6 +291,7 @@ def test_what_is_not_built_is_refused_in_one_sentence(changed: dict[str, Any], s
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_what_a_bound_rests_on_is_composed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever rounds the bound, derives it, seeks another or writes it down takes the same signals."""
     composed: list[bytes] = []

@@ -124,6 +124,7 @@ def test_the_control_answers_the_initial_state_from_the_first_piece_on(tmp_path:
     assert np.count_nonzero(gains.any(axis=(2, 3))) == 1
 
 
+@pytest.mark.slow
 def test_no_causal_policy_is_better_than_one_that_begins_in_the_middle_of_the_initial_states(tmp_path: Path) -> None:
     """The middle of the set is one of the initial states: what is proven from it holds for the set, and only that."""
     lower = {}

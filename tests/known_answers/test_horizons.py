@@ -65,6 +65,7 @@ def feasible(T: float, pieces: int, w: float) -> bool:
     return answer.status == 0
 
 
+@pytest.mark.slow
 def test_the_spring_can_be_at_rest_at_some_horizons_only(tmp_path: Path) -> None:
     """|w| <= 0.09: feasible for T = 1.5 to 3, infeasible up to 1 and from 3.5 on."""
     found = margin(SOON, curve=20, tolerance=1e-4, out=tmp_path / "margin")
@@ -190,6 +191,7 @@ def test_what_is_feasible_at_once_has_no_shortest_horizon() -> None:
     assert found.status == "unbounded" and found.lower == 0.0 and 0.0 < found.upper <= 2e-5
 
 
+@pytest.mark.slow
 def test_limits_on_steps_are_left_out_of_what_is_excluded_and_said_so() -> None:
     """u may change by 0.2 from piece to piece: its mean is 0.8, so that 1.5 / 0.8 is the least horizon with them."""
     found = margin({**RATE, "control_step": {"box": 0.2}, "initial_control": 0.0}, tolerance=1e-3)
@@ -198,6 +200,7 @@ def test_limits_on_steps_are_left_out_of_what_is_excluded_and_said_so() -> None:
     assert 1.5 / 0.8 - 1e-9 <= found.upper <= 1.5 / 0.8 + 8e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", [2.0, 2.0**-7])
 def test_another_unit_of_time_gives_the_same_horizons_to_the_last_bit(unit: float) -> None:
     slower = {
@@ -245,6 +248,7 @@ def test_an_interrupted_search_knows_what_was_covered() -> None:
     assert "interrupted" in found.message
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_curve(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = tmp_path / "rate.yaml"
     config.write_text(

@@ -188,7 +188,7 @@ def test_a_baseline_is_refuted_by_an_initial_state_that_it_did_not_look_at(metho
     assert {claim.name: claim.verdict for claim in found.claims}["violation"] == "holds", found.claims
 
 
-@pytest.mark.parametrize("formulation", ["literal", "reduced"])
+@pytest.mark.parametrize("formulation", [pytest.param("literal", marks=pytest.mark.slow), "reduced"])
 def test_the_papers_loop_agrees_with_the_exchange(formulation: str) -> None:
     method = {"name": "sparserob", "formulation": formulation, "indices": 6}
     problem = {**SPRING, "initial_state": BOX, "path": [], "disturbance": {"box": [0.02, 0.02]}}

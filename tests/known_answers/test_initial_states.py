@@ -53,6 +53,7 @@ def cart() -> sr.InitialStates:
     return sr.initial_states(CART, directions=24, values=6)
 
 
+@pytest.mark.slow
 def test_every_half_plane_is_the_support_function_of_the_null_controllable_set(cart: sr.InitialStates) -> None:
     exact = np.array([support(direction, 30) for direction in cart.directions])
     assert len(exact) == 24

@@ -246,6 +246,7 @@ def same_set(plain: sr.InitialStates, other: sr.InitialStates, f: Factors, uniqu
         assert other.cost(middle / x) / f.cost == pytest.approx(plain.cost(middle), rel=1e-2)
 
 
+@pytest.mark.slow
 def test_a_set_of_initial_states_changes_by_its_units_only():
     plain, f = (
         sr.initial_states(written(Factors()), directions=6, values=0),
@@ -283,6 +284,7 @@ def same_margin(of: str, curved: bool, seed: int, binary: bool) -> None:
     assert other.feasible.upper_bound / f.cost == pytest.approx(plain.feasible.upper_bound, rel=5e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("of", ["disturbance", "control", "terminal.0"])
 def test_a_margin_changes_by_its_units_only(of):
     same_margin(of, curved=False, seed=10, binary=False)

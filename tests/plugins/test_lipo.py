@@ -45,6 +45,7 @@ def test_lipo_evaluates_no_point_that_is_excluded_by_an_earlier_one():
     assert report.trace.notes["rejected"][-1, 1] > 0.5
 
 
+@pytest.mark.slow
 def test_adalipo_evaluates_excluded_points_only_when_it_explores():
     report = sr.maximise(TWO, UNIT, "adalipo", budget=300, growth=0.01, polish=0.0)
     constants = report.trace.notes["constant"][1:, 1]
@@ -92,6 +93,7 @@ def test_without_a_constant_lipo_is_pure_random_search_and_proves_nothing():
     assert np.abs(report.trace.points.mean(axis=0) - 0.5).max() < 0.07
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(
     seed=st.integers(0, 10_000),

@@ -136,6 +136,7 @@ def test_values_of_any_size_and_minus_infinity_are_survived():
     assert sr.maximise(wild, SQUARE, "maxlipo", budget=120, polish=0.0).best_value > -0.1
 
 
+@pytest.mark.slow
 def test_the_time_per_evaluation_stays_below_a_fifth_of_that_of_dlib():
     # dlib takes 12.5 ms at a thousand evaluations in two coordinates, on slower ground than a test may assume.
     ticks = []

@@ -271,6 +271,7 @@ def test_an_array_of_one_number_is_a_number_to_the_model_of_ngopt():
         metamodel.float(np.zeros(2))
 
 
+@pytest.mark.slow
 def test_an_optimiser_with_a_thread_of_its_own_leaves_none_behind_and_warns_of_nothing():
     before = threading.active_count()
     for _ in range(3):

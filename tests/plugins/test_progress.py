@@ -241,6 +241,7 @@ def on_terminal(tmp_path: Path, *arguments: str) -> tuple[subprocess.CompletedPr
     return done, shown.decode()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a pseudo-terminal")
 @pytest.mark.usefixtures("small")
 def test_on_a_real_terminal_it_shows_and_clears_its_lines_and_quiet_and_json_silence_it(tmp_path: Path) -> None:

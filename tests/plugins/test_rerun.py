@@ -63,6 +63,7 @@ def answered(tmp_path_factory: pytest.TempPathFactory) -> sr.Outcome:
 FEEDBACK = {"/feedback/gains/u1_x1", "/feedback/gains/u1_x2", "/feedback/answers/u1", "/feedback/frames/frame"}
 
 
+@pytest.mark.slow
 def test_gains_answers_and_effort_of_a_policy_are_in_the_recording(answered: sr.Outcome) -> None:
     found = read(answered.directory / "recording.rrd")
     assert set(found) >= FEEDBACK
@@ -74,6 +75,7 @@ def test_gains_answers_and_effort_of_a_policy_are_in_the_recording(answered: sr.
     assert largest == pytest.approx(np.maximum(np.abs(least), np.abs(most)))
 
 
+@pytest.mark.slow
 def test_a_policy_that_is_shown_again_has_the_same_pictures(answered: sr.Outcome, tmp_path: Path) -> None:
     again = tmp_path / "again.rrd"
     assert command("replay", str(answered.directory), "--save", str(again)) == 0
@@ -94,6 +96,7 @@ def test_a_gain_is_drawn_where_it_is_seen_and_answered() -> None:
     assert (shown == 8.0).sum() == (PIXELS // 2) ** 2  # the last piece takes half of the time
 
 
+@pytest.mark.slow
 def test_every_evaluation_is_in_the_recording_with_the_value_that_the_trace_has(searched: sr.Outcome) -> None:
     trace = searched.result.trace
     assert trace is not None and trace.value.size > 60

@@ -172,6 +172,7 @@ def test_what_was_recorded_is_in_the_file_two_seconds_later(tmp_path: Path) -> N
         outlet.close()
 
 
+@pytest.mark.slow
 def test_a_panel_that_fails_is_named_in_the_log_and_costs_nothing_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -126,6 +126,7 @@ def test_an_observer_hears_the_end_of_a_study_that_is_interrupted_and_what_was_f
     assert isinstance(first, sr.SweepStarted) and list(first.rows) == [0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("axes", "options", "parts"),
     [

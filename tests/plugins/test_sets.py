@@ -153,6 +153,7 @@ def test_no_random_trajectory_leaves_a_zonotope_that_was_proven(zonotopes):
         assert not any(share.violated for share in sr.simulate(zonotopes, 500, law).constraints)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("of", ["disturbance", "path.0", "terminal.0", "control"])
 def test_a_margin_scales_a_zonotope_as_it_scales_the_box(of):
     boxes, others = (sr.margin(config, of, tolerance=1e-4) for config in (BOXES, changed(**AS_ZONOTOPE)))
@@ -206,7 +207,7 @@ def disc(tmp_path) -> str:
     return str(tmp_path / "disc.py")
 
 
-@pytest.mark.parametrize("part", ["path", "terminal", "disturbance"])
+@pytest.mark.parametrize("part", ["path", pytest.param("terminal", marks=pytest.mark.slow), "disturbance"])
 def test_a_set_of_a_file_with_three_members_works_as_the_norm_that_it_is(part, disc, tmp_path):
     radius = {"path": 1.3, "terminal": 0.4, "disturbance": 0.02}[part]
     own, known = {"disc": radius}, {"norm": {"p": 2, "radius": radius}}
@@ -227,6 +228,7 @@ def test_a_zonotope_has_the_facets_that_its_generators_span():
     assert flat.support(np.array([[1.0, -1.0], [1.0, 1.0]])) == pytest.approx([0.0, 2.0])
 
 
+@pytest.mark.slow
 def test_parameters_in_a_zonotope_give_the_answer_of_the_same_polytope(tmp_path):
     system = {"A": [[0, 1], ["-1 + p1", "-0.2 + p2"]], "B": [[0], [1]]}
     zonotope = {"zonotope": {"generators": [[0.05, 0.0], [0.03, 0.04]]}}
@@ -238,6 +240,7 @@ def test_parameters_in_a_zonotope_give_the_answer_of_the_same_polytope(tmp_path)
     assert found[0] == pytest.approx(found[1], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_run_with_a_set_of_a_file_is_checked_with_that_file_only(disc, tmp_path):
     pytest.importorskip("flint")
     cost(changed(terminal=[{"disc": 0.4}]) | {"plugins": [disc]}, tmp_path / "run")

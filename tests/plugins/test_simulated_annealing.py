@@ -53,6 +53,7 @@ def changes(budget, block, dimension, **options):
     return points[1:] != points[0]
 
 
+@pytest.mark.slow
 def test_a_uniform_share_of_the_candidates_visits_every_region_at_its_rate():
     report = search(
         corner,
@@ -82,6 +83,7 @@ def test_without_the_uniform_share_small_steps_stay_in_one_basin():
     assert unseen.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", ["gaussian", "cauchy"])
 @pytest.mark.parametrize("kind", ["one", "full"])
 def test_reflected_steps_favour_no_place_of_the_box(step, kind):
@@ -407,6 +409,7 @@ def test_the_basin_of_a_shifted_rastrigin_function_is_found_within_800_evaluatio
     assert np.mean(found) >= 0.7  # scipy's dual_annealing, with 1000 evaluations, 0.70 to 0.75
 
 
+@pytest.mark.slow
 def test_with_a_polish_the_shifted_rastrigin_function_is_solved_within_1000_evaluations_in_most_runs():
     box = sr.Box(np.full(3, -5.12), np.full(3, 5.12))
     regrets = [-search(rastrigin, box, 1000, seed, Rules(polish=0.2)).best_value for seed in range(20)]

@@ -90,7 +90,7 @@ def call(fence: Fence, place: Path, command: Command) -> None:
 
 
 EXECUTED = [page for page in PAGES if any(block.language in {"bash", "python"} for block in fences(page))]
-LIGHT = {"README.md", "docs/certificate.md", "docs/simulate.md"}
+LIGHT = {"README.md"}
 
 
 @pytest.mark.parametrize("page", sorted(LIGHT))

@@ -109,6 +109,7 @@ def test_no_draws_share_exceeds_what_the_scenario_theory_promises():
         )
 
 
+@pytest.mark.slow
 def test_a_small_study_goes_all_the_way_from_runs_to_figures(builder, tmp_path):
     from cloud import cloud_of
     from figures_controls import draw_attention, draw_controls

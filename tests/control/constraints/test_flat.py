@@ -100,6 +100,7 @@ def test_the_worst_violation_of_a_smooth_path_is_found_between_the_nodes(seed, g
     assert np.allclose(at, found.violations, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 @settings(max_examples=12, deadline=None, phases=[Phase.generate])
 @given(seed=st.integers(0, 10**6), grid=st.sampled_from(sorted(GRIDS)), bound=st.sampled_from(sorted(BOUNDS)))
 def test_the_worst_violation_of_any_path_is_found_within_a_millionth(seed, grid, bound):

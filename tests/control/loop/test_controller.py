@@ -114,7 +114,7 @@ def drives(outcome, rng):
 
 
 @pytest.mark.parametrize("name", ["open loop", "nominal", "peak"])
-@pytest.mark.parametrize("resolve", [False, True])
+@pytest.mark.parametrize("resolve", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_no_loop_violates_a_constraint(plans, name, resolve) -> None:
     plant, controller = Plant(plans[name]), sr.controller(plans[name], resolve)
     every = list(drives(plans[name], np.random.default_rng(0)))
@@ -177,6 +177,7 @@ def test_the_control_is_the_gains_times_the_innovations(plans, name) -> None:
     assert applied == pytest.approx(expected, abs=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["open loop", "nominal", "peak"])
 def test_a_resolved_plan_is_taken_only_where_it_costs_less_than_what_is_left(plans, name) -> None:
     outcome = plans[name]
@@ -330,7 +331,7 @@ POLYTOPE = {"polytope": {"H": [[1, 1], [-1, 0], [0, -1]], "h": [0.06, 0.05, 0.05
 
 
 @pytest.mark.parametrize("disturbance", [{"box": [0.05, 0.05]}, {"norm": {"p": 1.5, "radius": 0.05}}, POLYTOPE])
-@pytest.mark.parametrize("policy", ["affine", "open_loop"])
+@pytest.mark.parametrize("policy", [pytest.param("affine", marks=pytest.mark.slow), "open_loop"])
 def test_with_a_limit_nothing_is_written_down_and_nothing_hopeless_begun_in_a_step(
     policy: str, disturbance: dict, tmp_path, monkeypatch
 ) -> None:

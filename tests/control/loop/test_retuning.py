@@ -118,6 +118,7 @@ def test_the_same_loop_costs_less_than_the_plan_applied(outcome) -> None:
     assert paid[1] < paid[0]
 
 
+@pytest.mark.slow
 def test_gains_that_were_chosen_for_an_ellipsoid_are_left_to_the_whole_program() -> None:
     round_set = {"ellipsoid": {"shape": [[1e-3, 0], [0, 1e-3]]}}
     ellipsoid = {**GAINS, "problem": {**GAINS["problem"], "disturbance": round_set}}

@@ -132,6 +132,7 @@ def test_expressions_of_parameters_can_be_pickled_too(tmp_path):
         np.testing.assert_array_equal(mine, other)
 
 
+@pytest.mark.slow
 def test_an_outcome_is_an_object_too(tmp_path):
     outcome = sr.run(CONFIG, out=tmp_path / "run", quiet=True)
     assert isinstance(outcome.result, sr.ControlResult)

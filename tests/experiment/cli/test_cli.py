@@ -97,6 +97,7 @@ def test_a_command_line_at_fault_is_one_line_in_the_style_of_every_error(
     assert line.endswith(f" (`{more} --help` says more)")
 
 
+@pytest.mark.slow
 def test_a_traceback_is_there_for_those_who_ask(config: Path, process: Command) -> None:
     assert "Traceback" in process("run", config, "problem.horizon=0", SPARSEROB_DEBUG="1").stderr
 
@@ -179,6 +180,7 @@ def test_every_config_of_the_repository_fits_the_schema_also_when_resolved(repos
         validator.validate(loaded.config.plain())
 
 
+@pytest.mark.slow
 def test_a_small_run_imports_neither_an_optimiser_nor_the_checker_nor_what_draws(
     repository: Path, tmp_path: Path
 ) -> None:
@@ -200,6 +202,7 @@ def test_a_small_run_imports_neither_an_optimiser_nor_the_checker_nor_what_draws
     assert not loaded & {f"sparserob_core.{module}" for module in elsewhere}
 
 
+@pytest.mark.slow
 def test_the_check_of_a_small_run_imports_neither_sparse_matrices_nor_what_only_policies_need(
     repository: Path, tmp_path: Path, command: Command
 ) -> None:

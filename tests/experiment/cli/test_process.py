@@ -168,6 +168,7 @@ class Press:
             raise KeyboardInterrupt
 
 
+@pytest.mark.slow
 def test_an_interrupted_margin_leaves_what_it_has_proven(tmp_path: Path) -> None:
     file = tmp_path / "margin.yaml"
     file.write_text(MARGIN)
@@ -262,6 +263,7 @@ def test_a_limit_ends_a_transcription_too(tmp_path: Path, monkeypatch: pytest.Mo
     assert sr.TimeLimitError.exit_status == 4
 
 
+@pytest.mark.slow
 def test_interrupted_initial_states_leave_true_polygons(tmp_path: Path) -> None:
     file = tmp_path / "states.yaml"
     file.write_text(MARGIN)
@@ -292,6 +294,7 @@ def test_of_two_runs_into_one_directory_the_second_ends_at_once(config: Path, tm
         assert json.loads((out / "result.json").read_text())["message"] == "the run has not finished"
 
 
+@pytest.mark.slow
 def test_of_many_that_start_at_once_one_gets_the_directory(config: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     call = [sys.executable, "-m", "sparserob_core", "run", str(config), "--out", str(out), "--no-figures", "--quiet"]
@@ -345,6 +348,7 @@ def test_what_a_dead_run_has_left_is_not_written_over(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["result.json"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("redirection", "status", "said"),
     [
@@ -370,6 +374,7 @@ def test_an_output_that_takes_nothing_is_told_in_one_line(
     assert (done.returncode, done.stderr) == (status, said)
 
 
+@pytest.mark.slow
 def test_a_quiet_run_needs_no_output(config: Path, tmp_path: Path) -> None:
     done = subprocess.run(
         f"exec {sys.executable} -m sparserob_core run {config} --out out --quiet --no-figures >&-",
@@ -416,6 +421,7 @@ def test_a_missing_matplotlib_is_a_note_beside_the_result(
     assert (done.returncode, note in done.stdout) == (0, True), done.stdout + done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "study", [("margin", "--curve", "2"), ("initial-states", "--directions", "4", "--values", "0")], ids=lambda a: a[0]
 )
@@ -444,6 +450,7 @@ def test_modules_that_scipy_looks_at_are_imported_only_when_something_of_them_is
 NARROW = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 
 
+@pytest.mark.slow
 def test_titles_overrides_and_paths_outlive_a_locale_that_has_no_letters_for_them(config: Path, tmp_path: Path) -> None:
     there = config.rename(tmp_path / "überall.yaml")
     command = [sys.executable, "-m", "sparserob_core", "run", there, "title=Wärme in °C", "--no-figures", "--out", "rü"]
@@ -453,6 +460,7 @@ def test_titles_overrides_and_paths_outlive_a_locale_that_has_no_letters_for_the
     assert "title: Wärme in °C" in (tmp_path / "rü" / "config.yaml").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_an_argument_that_is_no_text_in_any_encoding_is_an_error_of_the_override(config: Path, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "sparserob_core", "run", config, b"title=\xff", "--out", "r"]
     done = subprocess.run(command, cwd=tmp_path, env=NARROW, capture_output=True, check=False)

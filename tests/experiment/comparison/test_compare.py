@@ -298,6 +298,7 @@ def test_an_axis_within_a_decade_is_linear(runs: Runs) -> None:
     assert (left.get_xscale(), right.get_xscale()) == ("linear", "log")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("last", [2, 9, 12, 60, 900, 100_000])
 def test_the_numbers_of_an_axis_do_not_touch(runs: Runs, last: int) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -146,6 +146,7 @@ def study(tmp_path_factory):
     return folder / "study"
 
 
+@pytest.mark.slow
 def test_a_study_is_compared_over_its_problems_and_seeds(study, tmp_path):
     found = sr.compare([study], out=tmp_path / "profiles.png")
     assert isinstance(found, sr.Profiles)
@@ -176,6 +177,7 @@ def test_runs_are_told_as_json_too(study, tmp_path, command):
     assert told["runs"][0]["status"] == "certified"
 
 
+@pytest.mark.slow
 def test_a_study_in_two_halves_is_the_whole(study, tmp_path):
     for box in (0.1, 0.2):
         sr.sweep(

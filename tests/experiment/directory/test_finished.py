@@ -105,6 +105,7 @@ def test_no_command_that_reads_a_directory_executes_what_its_config_names(
         assert "--plugins FILE" in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("drafts")
 def test_a_plugin_that_the_user_names_himself_is_loaded(foreign: tuple[Path, Path, Path], command: Command) -> None:
     directory, file, marker = foreign
@@ -148,6 +149,7 @@ def test_what_is_no_run_directory_is_said_to_be_none(tmp_path: Path, read: Calla
         read(place)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("drafts")
 def test_a_column_that_a_later_version_added_is_passed_over_by_every_reader(copy: Path) -> None:
     trace = read_arrays(copy / "trace.npz")

@@ -34,6 +34,7 @@ def data(outcome: sr.Outcome) -> FigureData:
     return drawing.figure_data(outcome.experiment, decision, np.empty(0), (), None, draws=500)
 
 
+@pytest.mark.slow
 def test_a_run_with_feedback_draws_gains_effort_and_answers(outcome: sr.Outcome) -> None:
     assert outcome.directory is not None
     drawn = {file.name for file in (outcome.directory / "figures").iterdir()}
@@ -132,6 +133,7 @@ def test_the_pictures_of_a_round_draw_nothing_at_random(outcome: sr.Outcome) -> 
     assert plain.effort is None and plain.answers is None and plain.gains is not None
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("drafts")
 def test_a_policy_with_two_channels_can_be_drawn(tmp_path: Path) -> None:
     given = {"dictionaries.control.pieces": 6, "method.rounds": 1}

@@ -48,12 +48,14 @@ def files(data: FigureData, tmp_path_factory: pytest.TempPathFactory) -> list[Pa
     return write_figures(tmp_path_factory.mktemp("figures"), data)
 
 
+@pytest.mark.slow
 def test_every_figure_is_written_as_a_vector_and_as_a_picture(files: list[Path]) -> None:
     expected = {f"{name}.{kind}" for name in ("control", "states", "convergence") for kind in ("pdf", "png")}
     assert {file.name for file in files} == expected
     assert all(file.read_bytes()[:4] in (b"%PDF", b"\x89PNG") for file in files)
 
 
+@pytest.mark.slow
 def test_the_same_data_gives_the_same_bytes(files: list[Path], data: FigureData, tmp_path: Path) -> None:
     again = write_figures(tmp_path, data)
     assert [file.read_bytes() for file in files] == [file.read_bytes() for file in again]
@@ -138,6 +140,7 @@ def test_a_run_that_ended_in_its_first_round_can_be_drawn(data: FigureData, tmp_
     assert len(write_figures(tmp_path, only)) == 6
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("drafts")
 def test_a_closed_gap_in_the_only_round_can_be_drawn(data: FigureData, tmp_path: Path) -> None:
     assert len(write_figures(tmp_path, replace(data, history=data.history[-1:]))) == 6

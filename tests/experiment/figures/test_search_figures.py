@@ -107,6 +107,7 @@ def landscape(**changes: object) -> LandscapeData:
     return replace(data, **changes)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_the_map_shows_the_values_where_they_belong(tmp_path: Path) -> None:
     data = landscape()
     (mesh,) = [part for part in draw_landscape(data).axes[0].collections if hasattr(part, "get_coordinates")]

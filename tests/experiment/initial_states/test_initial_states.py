@@ -231,6 +231,7 @@ def test_other_coordinates_are_those_about_which_the_plane_lies() -> None:
     np.testing.assert_allclose(pushed.outer.max(axis=0) - still.outer.max(axis=0), shift, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_figure_names_its_axes_and_shows_every_boundary() -> None:
     found = sr.initial_states(CART, directions=8, values=4)
     ax = draw_initial_states(found).axes[0]
@@ -244,6 +245,7 @@ def test_the_figure_names_its_axes_and_shows_every_boundary() -> None:
     ]
 
 
+@pytest.mark.slow
 def test_the_command_writes_its_files_whole_and_prints_what_it_wrote(tmp_path: Path, command: Command) -> None:
     (tmp_path / "cart.yaml").write_text(json.dumps({key: value for key, value in CART.items() if key != "observers"}))
     done = command("initial-states", "cart.yaml", "--directions", "6", "--values", "2", "--json", "--out", "set")
@@ -270,6 +272,7 @@ def test_the_command_ends_with_3_for_an_empty_set_and_2_for_a_fault(tmp_path: Pa
     assert wrong.returncode == 2 and wrong.stderr.count("\n") == 1 and "states" in wrong.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("programs", "known"), [(0, False), (3, False), (4, True), (6, True)])
 def test_an_interrupt_before_the_box_fits_returns_what_is_known(programs, known, monkeypatch) -> None:
     """Four programs bound the set; the box is then fitted to it by others."""

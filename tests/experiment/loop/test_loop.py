@@ -76,6 +76,7 @@ def test_the_worst_case_of_every_constraint_is_reached_in_the_loop(outcome) -> N
     assert found.constraints["terminal"][0] > -1e-5
 
 
+@pytest.mark.slow
 def test_a_loop_that_is_solved_anew_pays_less(config, tmp_path) -> None:
     coarse = {"dictionaries.control.pieces": 6}
     outcome = sr.run(config, coarse, out=tmp_path / "run", quiet=True, figures=False)
@@ -100,6 +101,7 @@ def test_re_solves_are_asked_of_the_solver_that_the_config_names(tmp_path, monke
     assert asked
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("drafts")
 def test_the_command_runs_a_config_and_closes_the_loop(config, tmp_path, capsys) -> None:
     out = tmp_path / "run"

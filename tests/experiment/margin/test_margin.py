@@ -78,6 +78,7 @@ def test_the_smallest_terminal_set_is_as_wide_as_the_disturbance():
     assert np.allclose(found.amounts, 0.2, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_smallest_control_is_the_time_optimal_one():
     """From (1, 0) to the origin in time 2 takes |u| <= 1 exactly: twice the bound, half the factor."""
     assert_encloses(sr.margin(config(control={"box": 2.0}, terminal=[{"box": [1e-9, 1e-9]}]), of="control"), 0.5)

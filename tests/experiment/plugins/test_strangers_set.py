@@ -147,6 +147,7 @@ def test_a_sum_lies_between_polytopes_and_so_does_its_cost() -> None:
     assert inside - outside < 0.02 * exact
 
 
+@pytest.mark.slow
 def test_a_config_names_it_the_run_is_proven_and_the_checker_does_not_say_so(tmp_path: Path, command: Command) -> None:
     (tmp_path / "capsule.py").write_text(SUM)
     (tmp_path / "capsule.yaml").write_text(CONFIG)

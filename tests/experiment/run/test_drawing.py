@@ -48,6 +48,7 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(drawing, "SECONDS", 0.0)
 
 
+@pytest.mark.slow
 def test_the_figures_of_a_search_are_drawn_from_its_directory(
     searched: sr.Outcome, monkeypatch: pytest.MonkeyPatch
 ) -> None:

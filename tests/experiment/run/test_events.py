@@ -268,6 +268,7 @@ def test_nothing_is_collected_where_nobody_listens(monkeypatch: pytest.MonkeyPat
         sr.maximise(lambda x: -x[:, 0], SQUARE, "random_search", budget=50, notify=lambda event: None, polish=0.0)
 
 
+@pytest.mark.slow
 def test_there_are_few_events_for_many_evaluations_and_all_of_them_are_told() -> None:
     heard: list[sr.EvaluationsFinished] = []
     report = sr.maximise(
@@ -355,6 +356,7 @@ def test_a_batch_of_nothing_has_an_empty_trace_and_no_moves() -> None:
     assert np.isnan(Batch().acceptance)
 
 
+@pytest.mark.slow
 def test_large_points_are_not_kept_for_long() -> None:
     heard: list[sr.EvaluationsFinished] = []
     box = sr.Box(np.zeros(2**18), np.ones(2**18))

@@ -61,6 +61,7 @@ def interval(where: Path, monkeypatch: pytest.MonkeyPatch, **changed: Any) -> tu
     return outcome.summary["sparsity"], handed
 
 
+@pytest.mark.slow
 def test_another_control_is_sought_no_longer_than_the_run_took(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     said, handed = interval(tmp_path / "run", monkeypatch)
     assert handed["rounds"] >= 1
@@ -71,6 +72,7 @@ def test_another_control_is_sought_no_longer_than_the_run_took(tmp_path: Path, m
     assert 0.0 < said["fewest_active"]["lower"] <= said["fewest_active"]["upper"] < 0.33
 
 
+@pytest.mark.slow
 def test_an_interval_whose_search_ended_early_holds_as_far_as_it_came(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

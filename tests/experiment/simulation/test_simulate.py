@@ -311,6 +311,7 @@ def test_a_claim_that_a_trajectory_refutes_is_called_a_contradiction(nominal, co
         file.write_text(text)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_numbers_in_a_fresh_process(robust):
     here = sr.simulate(robust, 900, "iid", seed=5).summary()
     code = (
@@ -335,6 +336,7 @@ def test_the_result_is_in_the_run_directory(robust, command):
     assert "any of them" in table
 
 
+@pytest.mark.slow
 def test_the_figure_is_drawn_where_it_is_wanted(robust, tmp_path):
     for law in ("iid", "adversary"):
         for kind, start in ((".png", b"\x89PNG"), (".pdf", b"%PDF")):

@@ -197,6 +197,7 @@ def test_a_study_is_no_config_and_a_key_is_not_both_an_axis_and_an_override(conf
     assert not make_plan(file, None, {"seed": 3}).axes  # what a call says holds, whatever the file says
 
 
+@pytest.mark.slow
 def test_the_check_of_many_configs_is_told(config: Path) -> None:
     heard: list[str] = []
     make_plan(config, ["seed=1:250:250"]).checked(lambda event: heard.append(getattr(event, "text", "")))

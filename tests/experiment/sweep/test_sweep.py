@@ -222,6 +222,7 @@ def test_a_change_that_decides_no_result_runs_nothing(counting: Path, tmp_path: 
     assert calls(counting) == {1: 1, 2: 1}
 
 
+@pytest.mark.slow
 def test_the_first_run_of_a_process_has_imported_everything_when_its_clock_starts(tmp_path: Path) -> None:
     script = tmp_path / "study.py"
     script.write_text(
@@ -292,6 +293,7 @@ def one_point(counting: Path, out: Path, number: int) -> int:
     return len(sr.sweep(counting, {"method.number": "1:4:4", "method.wait": 0.05}, point=number, out=out).table)
 
 
+@pytest.mark.slow
 def test_processes_that_run_a_point_each_fill_one_study(counting: Path, tmp_path: Path) -> None:
     out, whole = tmp_path / "out", {"method.number": "1:4:4", "method.wait": 0.05}
     alone = timeless(sr.sweep(counting, whole, out=tmp_path / "other").directory)  # the forks have all imports by then
@@ -425,6 +427,7 @@ def test_neither_do_they_on_the_executors_that_are_offered_nor_when_a_worker_die
     assert timeless(serial.directory) == timeless(parallel.directory)
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_costs_nobody_else_anything(
     counting: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -470,6 +473,7 @@ def finished(out: Path) -> list[Path]:
     return [path for path in (out / "runs").glob("[!.]*") if (path / "result.json").is_file()]
 
 
+@pytest.mark.slow
 def test_a_sweep_that_is_killed_loses_at_most_what_was_running(counting: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with sweeping(counting, out) as process:
@@ -508,6 +512,7 @@ def test_an_interrupted_sweep_says_how_to_go_on_and_can(counting: Path, tmp_path
     assert all(calls(counting)[one] == 1 for one in kept)
 
 
+@pytest.mark.slow
 def test_of_two_sweeps_into_one_directory_the_second_ends_at_once(
     counting: Path, tmp_path: Path, command: Command
 ) -> None:

@@ -86,6 +86,7 @@ def test_under_a_lighter_curvature_the_free_entries_of_the_last_optimum_lead_to_
     assert steps[True] < steps[False]
 
 
+@pytest.mark.slow
 def test_every_separable_program_of_the_contract_is_answered_and_no_other() -> None:
     left = []
     for instances in (linear_instances, badly_scaled_instances, regularised_instances, infeasible_instances):

@@ -307,6 +307,7 @@ def test_a_bound_of_the_image_pays_with_its_own_tolerance_only():
     assert not alarm(program, Dual(program.cost(x) + z[2] * 0.9 * 1e-9 * 0.5e-5, (), np.zeros(0), z), x)
 
 
+@pytest.mark.slow
 def test_a_decision_that_misses_a_bound_by_more_than_its_own_tolerance_is_no_answer():
     """Whatever the factor of the row ``u1 + u2 <= 0.4``: a terminal state of 0.5 is out of reach."""
     for factor in (1.0, 1e-5, 1e-9):

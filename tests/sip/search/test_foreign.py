@@ -38,6 +38,7 @@ def nelder_mead(f, start):
     minimize(f, start, method="Nelder-Mead", options={"maxfev": 200})
 
 
+@pytest.mark.slow
 class TestAskedAndTold(MaximiserContract):
     def create(self):
         return sr.from_ask_tell(Halving)
