@@ -12,6 +12,7 @@ from sparserob_core.control.problem.names import Names as Names
 from sparserob_core.control.problem.system import LinearSystem as LinearSystem
 from sparserob_core.control.problem.system import SwitchedSystem as SwitchedSystem
 from sparserob_core.control.problem.problem import OptimalControlProblem as OptimalControlProblem
+from sparserob_core.control.problem.disturbances import Disturbance as Disturbance
 from sparserob_core.control.problem.problem import MixedConstraint as MixedConstraint
 from sparserob_core.control.problem.problem import PathConstraint as PathConstraint
 from sparserob_core.control.problem.problem import ProblemFactory as ProblemFactory

@@ -41,6 +41,8 @@ class MinimumAttention(sr.LinearKeys):
         d, m = plain.states, plain.controls
         path = [_extended_window(item, m) for item in self.windows(d)]
         ends = [_extended(end, m) for end in self.ends(d)]
+        listed = self.disturbances(plain, below=m)
+        width = sum(one.set.dimension for one in listed) if listed else plain.disturbances
         free = sr.OptimalControlProblem(
             system=self._augmented(d, m),
             horizon=self.horizon,
@@ -50,9 +52,10 @@ class MinimumAttention(sr.LinearKeys):
             weights=self.weights,
             disturbance=self.noise(plain),
             disturbance_class=self.disturbance_class,
+            disturbances=listed,
             path=[*path, *self._bounds(d, m)],
             terminal=[*ends, sr.Equality(np.append(np.full(d, np.nan), np.zeros(m)))],
-            names=_names(self.names.build().fitting(d, m, plain.disturbances), d, m),
+            names=_names(self.names.build().fitting(d, m, width), d, m),
         )
         return replace(free, cost=self._cost(d, m, np.asarray(free.weights)))
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.control.sets.sets import Product, product
 from sparserob_core.testing import SetContract
 from tests.support.faults import fails
 
@@ -89,6 +90,31 @@ class Scaled(SetContract):
 
 class TestScaledSet(Scaled):
     pass
+
+
+class TestProductOfABallABoxAndAnEllipsoid(SetContract):
+    def create(self):
+        ellipsoid = sr.Ellipsoid([1.0, 0.5], [[2.0, 0.3], [0.3, 0.5]])
+        return Product((sr.NormBall(2.0, 0.5, centre=[2.0, 1.0]), sr.Box([-1.0], [3.0]), ellipsoid))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_product_is_its_parts(seed):
+    """As a box or a polytope where it is one, by value in every direction; its support function is their sum."""
+    rng = np.random.default_rng(seed)
+    directions = rng.normal(size=(50, 4))
+    box, rhombus = sr.Box([-1.0, 0.0], [0.5, 2.0]), sr.NormBall(1.0, 1.5, dimension=2)
+    ball = sr.NormBall(2.0, 0.7, dimension=2)
+    for parts, kind in (([box, box], sr.Box), ([box, rhombus], sr.Polytope), ([box, ball], Product)):
+        made = product(parts)
+        assert isinstance(made, kind)
+        known = parts[0].support(directions[:, :2]) + parts[1].support(directions[:, 2:])
+        np.testing.assert_allclose(made.support(directions), known, rtol=1e-9)
+        points = made.support_point(directions)
+        np.testing.assert_allclose((points * directions).sum(axis=1), known, rtol=1e-9)
+        assert made.contains(made.sample(20, rng)).all()
+        assert not made.contains(points + 1e-3 * directions).any()
+    assert product([ball]) is ball
 
 
 class Disc(sr.ConvexSet):

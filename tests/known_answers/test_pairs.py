@@ -71,6 +71,16 @@ def at_rest_at_the_end(config: Config) -> None:
     del config["problem"]["disturbance"]  # it would reach the state that is fixed
 
 
+def in_a_list(config: Config) -> None:
+    problem = config["problem"]
+    if "disturbance" in problem:
+        sizes, kind = problem["disturbance"]["box"], problem.pop("disturbance_class", "piecewise_constant")
+        problem["disturbance"] = [
+            {"set": {"box": size}, "E": [[float(i == k)] for i in range(2)], "class": kind}
+            for k, size in enumerate(sizes)
+        ]
+
+
 FEATURES: dict[str, Callable[[Config], object]] = {
     "pieces of the system": in_turns,
     "parameters": with_parameters,
@@ -90,6 +100,7 @@ FEATURES: dict[str, Callable[[Config], object]] = {
     "haar": lambda config: config["dictionaries"].update(control={"name": "haar", "pieces": 8}),
     "sparsest": lambda config: config.update(method={"name": "sparsest", "nodes": 300}),
     "affine": lambda config: config.update(policy={"name": "affine"}),
+    "list of disturbances": in_a_list,
 }
 SIGNS = {
     ("proven", "verified"): "●",

@@ -25,7 +25,7 @@ from sparserob_core.checker.reach.measurable import MeasurableLoop
 from sparserob_core.checker.reach.preimages import Pushed, Seen
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.system import LinearSystem
-from sparserob_core.control.sets.sets import Box, Ellipsoid, NormBall
+from sparserob_core.control.sets.sets import Box, Ellipsoid, NormBall, Product
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 if TYPE_CHECKING:
@@ -840,6 +840,8 @@ def _chords(shape: ConvexSet, middle: Array) -> list[arb]:
     axes through its middle."""
     from flint import arb
 
+    if isinstance(shape, Product):
+        return [chord for part, own in shape.split(middle) for chord in _chords(part, own)]
     if isinstance(shape, NormBall):
         return [2 * arb(shape.radius)] * shape.dimension
     if isinstance(shape, Ellipsoid):

@@ -1,10 +1,10 @@
-"""Curved sets in ball arithmetic: ellipsoids, balls of p-norms, and cylinders over them."""
+"""Curved sets in ball arithmetic: ellipsoids, balls of p-norms, cylinders over them, and products of sets."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from itertools import product
+from itertools import pairwise, product
 from typing import TYPE_CHECKING, final
 
 import numpy as np
@@ -13,7 +13,7 @@ from sparserob_core.checker.arithmetic.balls import above, balls
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.sets.polynomials import OUTWARD, ROUNDING
 from sparserob_core.checker.sets.shape import Shape, along, total
-from sparserob_core.control.sets.sets import Cylinder, Ellipsoid, NormBall
+from sparserob_core.control.sets.sets import Cylinder, Ellipsoid, NormBall, Product
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -187,6 +187,31 @@ class Cylindrical(Shape):
 
     def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:
         raise Broken("a disturbance is unbounded")
+
+
+@final
+class Joint(Shape):
+    """A product: some coordinates are in one set, the next ones in another; as the set of a disturbance alone."""
+
+    source: Product
+
+    def __init__(self, source: Product, parts: Sequence[Shape]) -> None:
+        super().__init__(source)
+        self.parts = parts
+        ends = np.cumsum([0, *(part.dimension for part in parts)]).tolist()
+        self.places = [slice(start, stop) for start, stop in pairwise(ends)]
+
+    def support(self, direction: Sequence[arb]) -> arb:
+        return total(part.support(direction[place]) for part, place in zip(self.parts, self.places, strict=True))
+
+    def holds(self, point: Sequence[arb]) -> bool:
+        return all(part.holds(point[place]) for part, place in zip(self.parts, self.places, strict=True))
+
+    def bound(self, value: Array, spread: Array) -> tuple[Array, Array]:
+        each = [
+            part.bound(value[:, place], spread[:, place]) for part, place in zip(self.parts, self.places, strict=True)
+        ]
+        return np.hstack([w for w, _ in each]), np.sum([excess for _, excess in each], axis=0) * OUTWARD
 
 
 def _power(value: arb, exponent: arb) -> arb:

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from sparserob_core.checker.outcome import Unchecked
-from sparserob_core.checker.sets.curved import Ball, Cylindrical, Ellipsoidal
+from sparserob_core.checker.sets.curved import Ball, Cylindrical, Ellipsoidal, Joint
 from sparserob_core.checker.sets.flat import Boxed, Octahedral, Polyhedral, Segments
 from sparserob_core.checker.sets.shape import Shape
-from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Ellipsoid, NormBall, Polytope, Zonotope
+from sparserob_core.control.sets.sets import Box, ConvexSet, Cylinder, Ellipsoid, NormBall, Polytope, Product, Zonotope
 
 MOST_SIGNS = 10  # dimension up to which a 1-norm ball is listed by its facets
 
@@ -32,6 +32,7 @@ KINDS: Mapping[type[ConvexSet], Callable[[Any], Shape]] = MappingProxyType(
         NormBall: _ball,
         Zonotope: Segments,
         Cylinder: lambda source: Cylindrical(source, known(source.base)),
+        Product: lambda source: Joint(source, [known(part) for part in source.parts]),
     }
 )
 

@@ -6,12 +6,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.control.problem.cost import Cost
+from sparserob_core.control.problem.disturbances import Disturbance, DisturbanceClass, joined
 from sparserob_core.control.problem.names import UNNAMED, Names
 from sparserob_core.control.problem.prices import checked_weights, counted, integrals
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 
 SHORTEST = 1e-12  # of the horizon: a delay that is not rounding
 SAME = 1e-12  # of the size of a set, what is rounding
-DisturbanceClass: TypeAlias = Literal["piecewise_constant", "measurable", "l1_ball"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +88,10 @@ class OptimalControlProblem:
     control's dictionary to the next, of ``u_0 - initial_control`` too where that is told; ``None``: any.
     ``names`` are for messages, tables and figures.
 
+    ``disturbances``: instead of ``disturbance``, a list of them, each with its set, its ``E`` and its class; ``w`` is
+    made of all of them, one after another. After construction ``disturbance`` is the product of their sets, ``E`` of
+    the system has the columns of theirs, and the list is empty.
+
     ``initial_set``: the bounded set of deviations from ``initial_state``, or ``None``; it holds 0. The state begins
     anywhere in ``initial_state + initial_set``, and every constraint holds from there.
 
@@ -114,6 +118,7 @@ class OptimalControlProblem:
     control_step: ConvexSet | None = None
     names: Names = UNNAMED
     cost: Cost = Cost()  # noqa: RUF009  immutable
+    disturbances: Sequence[Disturbance] = ()
 
     def __post_init__(self) -> None:
         if not isinstance(self.system, LinearSystem | SwitchedSystem):
@@ -128,6 +133,7 @@ class OptimalControlProblem:
                 expected=f"less than {self.horizon:g} (the horizon), or no control ever acts, and more than rounding",
                 got=f"{self.system.delay:g}",
             )
+        self._join_disturbances()
         if isinstance(self.system, SwitchedSystem):
             self._check_pieces(self.system)
         self._set("initial_state", self._state())
@@ -242,6 +248,25 @@ class OptimalControlProblem:
             raise InputError(
                 "the class l1_ball needs a box that is symmetric about the origin, such as box: 0.1", path="disturbance"
             )
+
+    def _join_disturbances(self) -> None:
+        """One disturbance out of the list: that of all of them side by side."""
+        every: object = self.disturbances
+        if not isinstance(every, Sequence) or not all(isinstance(one, Disturbance) for one in every):
+            raise InputError(path="disturbance", expected="a list of Disturbance", got=f"{type(every).__name__}")
+        if not every:
+            return
+        if self.disturbance is not None or self.disturbance_class not in ("piecewise_constant", every[0].kind):
+            raise InputError(
+                path="disturbance_class" if self.disturbance is None else "disturbance",
+                expected="none beside a list of disturbances, each of which has its own",
+                got=self.disturbance_class if self.disturbance is None else self.disturbance.kind,
+            )
+        system, bound, kind = joined(self.system, every)
+        self._set("system", system)
+        self._set("disturbance", bound)
+        self._set("disturbance_class", kind)
+        self._set("disturbances", ())
 
     def _check_names(self) -> None:
         if not isinstance(self.names, Names):

@@ -25,10 +25,12 @@ __all__ = [
     "Equality",
     "NormBall",
     "Polytope",
+    "Product",
     "SetFactory",
     "Zonotope",
     "cylinder",
     "intersection",
+    "product",
 ]
 
 
@@ -200,3 +202,110 @@ def cylinder(base: ConvexSet, size: int) -> ConvexSet:
     if flat is None:
         return Cylinder(base, size)
     return Polytope(np.hstack([flat[0], np.zeros((len(flat[0]), free))]), flat[1])
+
+
+@dataclass(frozen=True, eq=False)
+class Product(ConvexSet):
+    """``{(x_1, ..., x_q) : x_i in parts_i}``, the coordinates of one part after those of another. Its support function
+    is the sum of theirs (Rockafellar 1970, section 13). Made by `product`."""
+
+    parts: tuple[ConvexSet, ...]
+
+    @property
+    def dimension(self) -> int:
+        return sum(part.dimension for part in self.parts)
+
+    @property
+    def kind(self) -> str:
+        return "product of " + " and ".join(part.kind for part in self.parts)
+
+    @property
+    def is_symmetric(self) -> bool:
+        return all(part.is_symmetric for part in self.parts)
+
+    @property
+    def is_bounded(self) -> bool:
+        return all(part.is_bounded for part in self.parts)
+
+    def split(self, points: npt.ArrayLike) -> list[tuple[ConvexSet, Array]]:
+        """Every part with its coordinates of points or directions ``(..., d)``."""
+        ends = np.cumsum([part.dimension for part in self.parts])[:-1]
+        return list(zip(self.parts, np.split(np.asarray(points, dtype=float), ends, axis=-1), strict=True))
+
+    @shaped
+    def support(self, directions: Float[Array, "*k d"]) -> Float[Array, " *k"]:
+        return np.asarray(sum(part.support(own) for part, own in self.split(directions)))
+
+    @shaped
+    def support_point(self, directions: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
+        return np.concatenate([part.support_point(own) for part, own in self.split(directions)], axis=-1)
+
+    @shaped
+    def violation(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
+        """Outside, the distances to the parts as one vector; inside, that of the part whose boundary is nearest."""
+        each = np.stack([part.violation(own) for part, own in self.split(points)])
+        outside = np.linalg.norm(np.maximum(each, 0.0), axis=0)
+        return np.asarray(np.where(outside > 0.0, outside, each.max(axis=0)))
+
+    @shaped
+    def gauge(self, points: Float[Array, "*k d"]) -> Float[Array, " *k"]:
+        return np.asarray(np.stack([part.gauge(own) for part, own in self.split(points)]).max(axis=0))
+
+    @shaped
+    def normal(self, points: Float[Array, "*k d"]) -> Float[Array, "*k d"]:
+        """That of the part that reaches its boundary first, 0 along the others."""
+        pairs = self.split(points)
+        first = np.stack([part.gauge(own) for part, own in pairs]).argmax(axis=0)[..., None]
+        return np.concatenate([np.where(first == i, part.normal(own), 0.0) for i, (part, own) in enumerate(pairs)], -1)
+
+    @shaped
+    def interior_point(self) -> Float[Array, " d"]:
+        return np.concatenate([part.interior_point() for part in self.parts])
+
+    @shaped
+    def middle(self) -> Float[Array, " d"]:
+        return np.concatenate([part.middle() for part in self.parts])
+
+    def scaled(self, factor: float) -> Product:
+        return Product(tuple(part.scaled(factor) for part in self.parts))
+
+    @shaped
+    def in_units(self, units: Float[Array, " d"]) -> Product:
+        return Product(tuple(part.in_units(own) for part, own in self.split(units)))
+
+    @shaped
+    def sample(self, count: int, rng: np.random.Generator) -> Float[Array, "{count} d"]:
+        return np.concatenate([part.sample(count, rng) for part in self.parts], axis=-1)
+
+    @shaped
+    def sample_extreme(self, count: int, rng: np.random.Generator) -> Float[Array, "{count} d"]:
+        return np.concatenate([part.sample_extreme(count, rng) for part in self.parts], axis=-1)
+
+    @shaped
+    def linearisation_excess(self, centre: Float[Array, "*k d"], spread: Float[Array, "*k J d"]) -> Float[Array, " *k"]:
+        pairs = zip(self.split(centre), self.split(spread), strict=True)
+        return np.asarray(sum(part.linearisation_excess(own, moved) for (part, own), (_, moved) in pairs))
+
+    @shaped
+    def support_minorant(
+        self, centre: Float[Array, " d"], spread: Float[Array, "J d"]
+    ) -> tuple[float, Float[Array, " J"], Float[Array, "J J"]]:
+        pairs = zip(self.split(centre), self.split(spread), strict=True)
+        each = [part.support_minorant(own, moved) for (part, own), (_, moved) in pairs]
+        values, gradients, hessians = zip(*each, strict=True)
+        return float(np.sum(values)), np.sum(gradients, axis=0), np.sum(hessians, axis=0)
+
+
+def product(parts: Sequence[ConvexSet]) -> ConvexSet:
+    """``{(x_1, ..., x_q) : x_i in parts_i}`` of bounded sets, as a box or a polytope where it is one."""
+    if len(parts) == 1:
+        return parts[0]
+    if all(part.is_box for part in parts):
+        boxes = [part.bounding_box() for part in parts]
+        return Box(np.concatenate([box.lower for box in boxes]), np.concatenate([box.upper for box in boxes]))
+    flats = [flat for part in parts if (flat := part.halfspaces()) is not None]
+    if len(flats) < len(parts):
+        return Product(tuple(parts))
+    from scipy.linalg import block_diag
+
+    return Polytope(block_diag(*(H for H, _ in flats)), np.concatenate([h for _, h in flats]))

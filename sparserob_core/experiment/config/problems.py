@@ -11,6 +11,7 @@ import numpy.typing as npt
 from pydantic import BeforeValidator, Discriminator, Field, Tag
 
 from sparserob_core.control.problem.cost import Cost
+from sparserob_core.control.problem.disturbances import Disturbance, DisturbanceClass
 from sparserob_core.control.problem.expression import CONSTANTS, FUNCTIONS, parse_column, parse_matrix
 from sparserob_core.control.problem.names import Names
 from sparserob_core.control.problem.problem import (
@@ -297,6 +298,21 @@ class CostOptions(Sparse):
         )
 
 
+@final
+class DisturbanceOptions(Sparse):
+    """One of several disturbances."""
+
+    bound: SetOptions = Field(alias="set")
+    """Set that it takes its values in."""
+
+    E: Rows | None = None
+    """How it enters, as many rows as there are states, one column per component of it; that of the system unless
+    given."""
+
+    kind: DisturbanceClass = Field(default="piecewise_constant", alias="class")
+    """Which functions it may be, as in ``disturbance_class``; the same for all of a list."""
+
+
 Matrices: TypeAlias = tuple[list[list[Any]], list[list[Any]], list[list[Any]] | None, list[Any] | None]
 
 
@@ -355,10 +371,21 @@ class LinearKeys(ProblemFactory, Options):
     cost: CostOptions = Field(default_factory=CostOptions)
     """What is minimised; the integral of the weighted absolute values of the control unless given."""
 
-    disturbance: SetOptions | None = None
-    """Set that the disturbance takes its values in; none unless given."""
+    disturbance: (
+        Annotated[
+            Annotated[SetOptions, Tag("set")] | Annotated[list[DisturbanceOptions], Tag("list")],
+            one_of(
+                "a set, such as {box: 0.1}, or a list of disturbances, such as [{set: {box: 0.1}, E: [[0], [1]]}]",
+                set=(Mapping, SetOptions),
+                list=LIST,
+            ),
+        ]
+        | None
+    ) = None
+    """Set that the disturbance takes its values in; none unless given. Or a list of disturbances, each with its set,
+    its ``E`` and its class, such as ``[{set: {box: 0.1}, E: [[0], [1]]}, {set: {box: 0.02}, E: [[1], [0]]}]``."""
 
-    disturbance_class: Literal["piecewise_constant", "measurable", "l1_ball"] = "piecewise_constant"
+    disturbance_class: DisturbanceClass = "piecewise_constant"
     """``piecewise_constant``: in the disturbance's dictionary; ``measurable``: any measurable function; ``l1_ball``:
     the coefficients of each channel have absolute sum at most the box's bound (a far smaller set)."""
 
@@ -387,8 +414,26 @@ class LinearKeys(ProblemFactory, Options):
         return self.initial_state.around("initial_state", states)[1]
 
     def noise(self, system: LinearSystem | SwitchedSystem) -> ConvexSet | None:
-        """The set of disturbances; raises `InputError`."""
-        return None if self.disturbance is None else self.disturbance.build("disturbance", system.disturbances)
+        """The set of the disturbance where one is given, none of a list (`disturbances`); raises `InputError`."""
+        if self.disturbance is None or isinstance(self.disturbance, list):
+            return None
+        return self.disturbance.build("disturbance", system.disturbances)
+
+    def disturbances(self, system: LinearSystem | SwitchedSystem, below: int = 0) -> list[Disturbance]:
+        """The disturbances where a list of them is given, under so many rows of zeros ``below`` each ``E``; raises
+        `InputError`."""
+        found: list[Disturbance] = []
+        for i, one in enumerate(self.disturbance if isinstance(self.disturbance, list) else ()):
+            where = f"disturbance.{i}"
+            if one.E is not None and len(one.E) != system.states:
+                raise InputError(
+                    path=f"{where}.E", expected=f"{system.states} rows, one per state", got=f"{len(one.E)}"
+                )
+            rows = None if one.E is None else one.E + [[0.0] * len(one.E[0])] * below
+            E = None if rows is None else parse_matrix(f"{where}.E", rows, self.system.names())
+            width = system.disturbances if one.E is None else len(one.E[0])
+            found.append(Disturbance(one.bound.build(f"{where}.set", width), E, one.kind))
+        return found
 
     def windows(self, states: int) -> list[PathConstraint | MixedConstraint]:
         """The path constraints, one per set or bounds of state and control together; raises `InputError`."""
@@ -433,6 +478,7 @@ class LinearProblem(LinearKeys):
             weights=self.weights,
             disturbance=self.noise(system),
             disturbance_class=self.disturbance_class,
+            disturbances=self.disturbances(system),
             path=self.windows(system.states),
             terminal=self.ends(system.states),
             cost=self.cost.build(system.states),

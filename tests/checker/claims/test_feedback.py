@@ -20,7 +20,7 @@ from sparserob_core.checker.claims.feedback import FeedbackClaims, _chords
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.problem.system import LinearSystem
-from sparserob_core.control.sets.sets import Box, Ellipsoid, Equality, NormBall
+from sparserob_core.control.sets.sets import Box, Ellipsoid, Equality, NormBall, Product
 
 REACH = 0.25
 TOO_MUCH, NOTHING = 5e-9, 3e-10  # of a unit: more and less than what counts as none
@@ -362,6 +362,7 @@ def test_multipliers_of_the_control_and_of_its_steps_are_rows_too():
         (NormBall(1.0, 0.7, centre=[1.0, 2.0]), [1.4, 1.4]),
         (Ellipsoid([0.0, 1.0], [[4.0, 1.0], [1.0, 0.5]]), [2 * np.sqrt(4.0 - 1 / 0.5), 2 * np.sqrt(0.5 - 1 / 4.0)]),
         (sr.Polytope(np.array([[2.0, 1.0], [-1.0, 0.0], [0.0, -1.0]]), np.array([2.0, 0.0, 0.0])), None),
+        (Product((NormBall(2.0, 0.7, dimension=2), box(0.3))), [1.4, 1.4, 0.6]),
     ],
 )
 def test_chords_are_how_long_a_set_is_through_its_middle(shape, chords):

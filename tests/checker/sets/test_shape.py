@@ -19,7 +19,7 @@ from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Parameters
 from sparserob_core.checker.sets.shape import facet, widths
 from sparserob_core.checker.sets.sides import Bounded, Curved, Sides
-from sparserob_core.control.sets.sets import Box, Cylinder, Ellipsoid, NormBall, Polytope
+from sparserob_core.control.sets.sets import Box, Cylinder, Ellipsoid, NormBall, Polytope, Product
 
 SETS = {
     "box": Box(np.array([-1.0, 0.2]), np.array([0.5, 0.7])),
@@ -477,3 +477,23 @@ def test_a_kind_of_set_without_an_answer_says_so():
         with pytest.raises(Unchecked):
             question()
     assert flat.round is None
+
+
+def test_a_product_is_bounded_and_holds_points_part_by_part():
+    parts = (SETS["ellipsoid"], Box(np.array([-0.3]), np.array([0.5])), SETS["1.5-norm"])
+    source, rng = Product(parts), np.random.default_rng(16)
+    value, spread = rng.normal(size=(60, 5)), 0.3 * rng.uniform(size=(60, 5))
+    with ctx.workprec(96):
+        shape = known(source)
+        w, excess = shape.bound(value, spread)
+        for _ in range(20):
+            f = value + spread * rng.choice([-1.0, 1.0], size=(60, 5))
+            assert (source.support(f) <= np.einsum("kd,kd->k", w, f) + excess + 1e-13).all()
+        sharp = shape.bound(value, np.zeros((60, 5)))
+        assert (np.abs(np.einsum("kd,kd->k", sharp[0], value) + sharp[1] - source.support(value)) < 1e-11).all()
+        for c, height in zip(value, source.support(value), strict=True):
+            assert float(shape.support(balls(c)).mid()) == pytest.approx(height, rel=1e-12)
+        inside = source.middle() + 0.99 * (source.support_point(value) - source.middle())
+        assert all(shape.contains(point) for point in inside)
+        for place in range(5):  # one coordinate too far, whatever the others are
+            assert not shape.contains(source.middle() + 3.0 * np.eye(5)[place])

@@ -17,7 +17,7 @@ from sparserob_core.control.problem.names import Names
 from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
 from sparserob_core.control.problem.tracing import traced
-from sparserob_core.control.sets.sets import Box, Equality, SetFactory
+from sparserob_core.control.sets.sets import Box, Equality, Product, SetFactory
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.plugins.hookspecs import SetPlugin
 from sparserob_core.experiment.plugins.registry import load_registry
@@ -25,7 +25,7 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 
 WRITTEN = {
     "system", "horizon", "initial_state", "control", "initial_set", "weights", "disturbance", "disturbance_class",
-    "path", "terminal", "title", "initial_control", "control_step", "names", "cost",
+    "path", "terminal", "title", "initial_control", "control_step", "names", "cost", "disturbances",
 }  # fmt: skip
 """The fields of a problem that are written; one that is added and not named here is refused, not lost."""
 WRITTEN_OF_SYSTEM = {"A", "B", "E", "parameters", "names", "c", "delay"}
@@ -50,12 +50,32 @@ def problem_keys(problem: OptimalControlProblem) -> dict[str, Any]:
         **_names_keys(problem.names),
     }
     if problem.disturbance is not None:
-        keys["disturbance"] = set_keys("disturbance", problem.disturbance)
+        keys["disturbance"] = _disturbance_keys(problem, keys["system"])
     if problem.control_step is not None:
         keys["control_step"] = set_keys("control_step", problem.control_step)
     if problem.initial_control is not None and (problem.control_step is not None or problem.system.delay > 0.0):
         keys["initial_control"] = np.asarray(problem.initial_control).tolist()
     return keys
+
+
+def _disturbance_keys(problem: OptimalControlProblem, system: dict[str, Any]) -> Any:
+    """The set of the disturbance; where no kind of set is a product of others, a list, which takes the columns of ``E``
+    out of the keys of the ``system``."""
+    bound = problem.disturbance
+    if not isinstance(bound, Product):
+        assert bound is not None
+        return set_keys("disturbance", bound)
+    if "E" not in system:
+        raise InputError(
+            path="disturbance", expected="sets with flat sides, or one system for all of the horizon", got=bound.kind
+        )
+    found, begin, rows = [], 0, system.pop("E")
+    for i, part in enumerate(bound.parts):
+        columns = [row[begin : begin + part.dimension] for row in rows]
+        begin += part.dimension
+        keys = {"set": set_keys(f"disturbance.{i}.set", part), "E": columns, "class": problem.disturbance_class}
+        found.append(keys)
+    return found
 
 
 def set_keys(where: str, convex: ConvexSet) -> dict[str, Any]:
