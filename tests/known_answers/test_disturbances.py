@@ -133,6 +133,47 @@ def test_every_piece_of_a_system_has_the_columns_of_all():
     assert sr.solve(problem, control=FOUR).cost == pytest.approx(0.6 + 0.1 * (1 + 2) + 0.1 * (3 + 2), rel=1e-6)
 
 
+@pytest.mark.parametrize(("start", "stop"), [(0.5, 1.5), (0.25, 1.6), (0.0, 1.0), (1.9, None), (1.0, 2.0)])
+def test_in_a_window_a_disturbance_pushes_as_long_as_it_acts(start, stop, tmp_path):
+    """``0.6 + 2 * 0.05 + 0.1 * 2 * (stop - start)``, wherever the ends lie among the pieces of the dictionaries."""
+    within = sr.Disturbance(SMALL, [[2.0]], start=start, stop=stop)
+    result = sr.solve(integrator(sr.Disturbance(sr.Box([-0.05], [0.05])), within), control=FOUR)
+    assert result.status == "certified"
+    assert result.cost == pytest.approx(0.6 + 2 * 0.05 + 0.2 * ((2.0 if stop is None else stop) - start), rel=1e-6)
+    assert sr.check(result.save(tmp_path / "run", figures=False)).status == "verified"
+
+
+def test_what_acts_in_a_window_is_answered_once_it_is_over(tmp_path):
+    """Of a window that ends with the last but one piece nothing is left to pay for."""
+    problem = integrator(sr.Disturbance(SMALL, [[2.0]], start=0.4, stop=1.5))
+    result = sr.solve(problem, control=FOUR, policy=sr.AffinePolicy(among=None, causal_signals=0))
+    assert result.cost == pytest.approx(0.6, rel=1e-6)
+    assert sr.check(result.save(tmp_path / "run", figures=False)).status == "verified"
+
+
+def test_windows_cut_the_pieces_of_a_system_and_share_their_ends():
+    first, second = sr.LinearSystem([[0.0]], [[1.0]]), sr.LinearSystem([[0.0]], [[1.0]], E=[[3.0]])
+    system = sr.SwitchedSystem([(1.0, first), (2.0, second)], delay=0.25)
+    every = [sr.Disturbance(SMALL, start=0.5, stop=1.5), sr.Disturbance(SMALL, [[2.0]], start=1.0 + 1e-13)]
+    problem = integrator(*every, system=system, initial_control=[0.0])
+    assert [until for until, _ in problem.system.pieces] == [0.5, 1.0, 1.5, 2.0]
+    assert [np.asarray(mode.E).tolist() for mode in problem.system.modes] == [
+        [[0.0, 0.0]], [[1.0, 0.0]], [[3.0, 2.0]], [[0.0, 2.0]],
+    ]  # fmt: skip
+    assert problem.system.delay == 0.25
+
+
+def test_a_config_says_when_a_disturbance_acts(tmp_path):
+    whole = {"set": {"box": 0.05}, "E": [[0], [1]]}
+    cut = [{**whole, "from": 0.0, "to": 0.8}, {**whole, "from": 0.8}]
+    halves, one = ran(tmp_path / "halves", cut), ran(tmp_path / "one", [whole])
+    assert halves.result.status == one.result.status == "certified"
+    later = ran(tmp_path / "later", [{**whole, "from": 0.8}])
+    assert later.result.cost < one.result.cost - 1e-3
+    assert halves.result.cost >= one.result.cost - 1e-6  # on a piece that both act on they need not agree
+    assert sr.check(later.directory).status == "verified"
+
+
 def test_minimum_attention_takes_a_list(tmp_path):
     problem = {
         "name": "minimum_attention", "system": {"A": [[0]], "B": [[1]]}, "horizon": 2.0, "initial_state": [1.0],
@@ -159,6 +200,10 @@ def test_minimum_attention_takes_a_list(tmp_path):
         ([{"E": [[1], [1]]}], "disturbance.0.set"),
         ([{"set": {"box": 0.1}, "window": [0, 1]}], "disturbance.0.window"),
         ([{"set": {"box": 0.1}, "class": "smooth"}], "disturbance.0.class"),
+        ([{"set": {"box": 0.1}, "from": 1.5, "to": 1.0}], "disturbance.0"),
+        ([{"set": {"box": 0.1}, "to": 3.0}], "disturbance.0"),
+        ([{"set": {"box": 0.1}, "from": -1.0}], "disturbance.0.from"),
+        ([{"set": {"box": 0.1}, "to": 1.0, "class": "measurable"}], "disturbance.0"),
         ("all", "disturbance"),
     ],
 )

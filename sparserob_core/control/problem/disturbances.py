@@ -2,15 +2,19 @@
 
 Disturbances ``E_i w_i`` of one class, with ``w_i`` in ``W_i``, push the state as ``[E_1 E_2 ...] w`` does, with ``w``
 in the product of the ``W_i``: every signal of the one is a signal of the other. So a problem that lists them is a
-problem with one, and whatever is proven of one disturbance is proven of a list.
+problem with one, and whatever is proven of one disturbance is proven of a list. One that acts in a window of time alone
+enters a system that takes turns, whose ``E`` is 0 outside of the window.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from bisect import bisect_right
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Literal, TypeAlias, final, get_args
+
+import numpy as np
 
 from sparserob_core.control.problem.expression import Entries, beside
 from sparserob_core.control.problem.system import LinearSystem, Matrix, SwitchedSystem, System
@@ -19,17 +23,22 @@ from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import ConvexSet
 
 DisturbanceClass: TypeAlias = Literal["piecewise_constant", "measurable", "l1_ball"]
+SHORTEST = 1e-12  # of the horizon: ten times more and windows are lost that a clock can tell apart; ten times less and
+# ends that are sums of steps make pieces of the system that are rounding
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Disturbance:
     """One of several disturbances: its bounded ``set``, how it enters, ``E (d, mw)`` as in `LinearSystem` (that of the
-    system unless given), and its ``kind``, the class of functions that it may be."""
+    system unless given), its ``kind``, the class of functions that it may be, and the window ``[start, stop]`` in which
+    it acts; ``stop`` is the horizon when ``None``."""
 
     set: ConvexSet
     E: Matrix | None = None
     kind: DisturbanceClass = "piecewise_constant"
+    start: float = 0.0
+    stop: float | None = None
 
     def entering(self, where: str, mode: LinearSystem) -> LinearSystem:
         """One of the systems that take turns, under this disturbance alone; raises `InputError` where it does not
@@ -42,9 +51,9 @@ class Disturbance:
             raise InputError(error.sentence, path=f"{where}.E") from None
 
 
-def joined(system: System, every: Sequence[Disturbance]) -> tuple[System, ConvexSet, DisturbanceClass]:
-    """The system under all of these disturbances side by side, the set of them together, and their class; raises
-    `InputError` that begins with ``disturbance`` and the number of the one at fault."""
+def joined(system: System, every: Sequence[Disturbance], horizon: float) -> tuple[System, ConvexSet, DisturbanceClass]:
+    """The system under all of these disturbances side by side until the ``horizon``, the set of them together, and
+    their class; raises `InputError` that begins with ``disturbance`` and the number of the one at fault."""
     kind = every[0].kind
     for i, one in enumerate(every):
         if one.kind not in get_args(DisturbanceClass):
@@ -57,17 +66,59 @@ def joined(system: System, every: Sequence[Disturbance]) -> tuple[System, Convex
                 " may do all that a piecewise constant one does",
                 got=one.kind,
             )
-    modes, sets = [], []
-    for mode in system.modes:
-        alone = [one.entering(f"disturbance.{i}", mode) for i, one in enumerate(every)]
-        modes.append(replace(mode, E=reduce(beside, [_columns(one) for one in alone])))
-        sets = [
-            _checked(f"disturbance.{i}.set", one.set, of) for i, (one, of) in enumerate(zip(every, alone, strict=True))
-        ]
-    if isinstance(system, SwitchedSystem):
-        ends = [until for until, _ in system.pieces]
-        return SwitchedSystem(list(zip(ends, modes, strict=True)), system.delay), product(sets), kind
-    return modes[0], product(sets), kind
+    windows = [_window(f"disturbance.{i}", one, horizon) for i, one in enumerate(every)]
+    for i, window in enumerate(windows):
+        if kind == "measurable" and window != (0.0, horizon):
+            raise InputError(
+                path=f"disturbance.{i}",
+                expected="a measurable disturbance that acts all the time: in a window only piecewise constant ones are"
+                " proven",
+                got=f"from {window[0]:g} to {window[1]:g}",
+            )
+    sets = [
+        _checked(f"disturbance.{i}.set", one.set, one.entering(f"disturbance.{i}", system.modes[0]))
+        for i, one in enumerate(every)
+    ]
+    pieces: list[tuple[float, LinearSystem]] = []
+    for begin, until, mode in _legs(system, windows, horizon):
+        columns = []
+        for i, (one, (start, stop)) in enumerate(zip(every, windows, strict=True)):
+            E = _columns(one.entering(f"disturbance.{i}", mode))
+            acts = start < until - SHORTEST * horizon and begin + SHORTEST * horizon < stop
+            columns.append(E if acts else np.zeros((mode.states, sets[i].dimension)))
+        pieces.append((until, replace(mode, E=reduce(beside, columns))))
+    if len(pieces) == 1 and not isinstance(system, SwitchedSystem):
+        return pieces[0][1], product(sets), kind
+    return (
+        SwitchedSystem([(until, replace(one, delay=0.0)) for until, one in pieces], system.delay),
+        product(sets),
+        kind,
+    )
+
+
+def _window(where: str, one: Disturbance, horizon: float) -> tuple[float, float]:
+    start, stop = float(one.start), horizon if one.stop is None else float(one.stop)
+    if not (0.0 <= start <= stop - SHORTEST * horizon and stop <= horizon):
+        raise InputError(
+            path=where,
+            expected=f"0 <= from < to <= {horizon:g} (the horizon), apart by more than rounding",
+            got=f"from {start:g} to {stop:g}",
+        )
+    return start, stop
+
+
+def _legs(
+    system: System, windows: Sequence[tuple[float, float]], horizon: float
+) -> Iterator[tuple[float, float, LinearSystem]]:
+    """Between which times which of the systems acts, cut where a disturbance begins or ends to act."""
+    ends = [*system.switches, horizon]
+    for time in sorted({time for window in windows for time in window}):
+        if min(abs(time - end) for end in (0.0, *ends)) > SHORTEST * horizon:
+            ends.append(time)
+    begin = 0.0
+    for until in sorted(ends):
+        yield begin, until, system.modes[bisect_right(system.switches, begin)]
+        begin = until
 
 
 def _columns(system: LinearSystem) -> Entries:

@@ -88,9 +88,10 @@ class OptimalControlProblem:
     control's dictionary to the next, of ``u_0 - initial_control`` too where that is told; ``None``: any.
     ``names`` are for messages, tables and figures.
 
-    ``disturbances``: instead of ``disturbance``, a list of them, each with its set, its ``E`` and its class; ``w`` is
-    made of all of them, one after another. After construction ``disturbance`` is the product of their sets, ``E`` of
-    the system has the columns of theirs, and the list is empty.
+    ``disturbances``: instead of ``disturbance``, a list of them, each with its set, its ``E``, its class and its window
+    of time; ``w`` is made of all of them, one after another. After construction ``disturbance`` is the product of their
+    sets, ``E`` of the system has the columns of theirs (0 in pieces of the system outside of a window), and the list is
+    empty.
 
     ``initial_set``: the bounded set of deviations from ``initial_state``, or ``None``; it holds 0. The state begins
     anywhere in ``initial_state + initial_set``, and every constraint holds from there.
@@ -133,9 +134,16 @@ class OptimalControlProblem:
                 expected=f"less than {self.horizon:g} (the horizon), or no control ever acts, and more than rounding",
                 got=f"{self.system.delay:g}",
             )
-        self._join_disturbances()
         if isinstance(self.system, SwitchedSystem):
             self._check_pieces(self.system)
+        self._join_disturbances()
+        measurable = self.disturbance is not None and self.disturbance_class == "measurable"
+        if measurable and isinstance(self.system, SwitchedSystem):
+            raise InputError(
+                path="disturbance_class",
+                expected="piecewise_constant where the system has pieces, of which measurable ones are not proven",
+                got="measurable",
+            )
         self._set("initial_state", self._state())
         self._set("initial_set", self._deviations())
         self._set("weights", checked_weights(self.weights, self.system.controls, self.horizon))
@@ -171,12 +179,6 @@ class OptimalControlProblem:
                 path=f"system.pieces.{last}.until",
                 expected=f"{self.horizon:g}, the horizon, since it is the last piece",
                 got=f"{system.pieces[last][0]:g}",
-            )
-        if self.disturbance is not None and self.disturbance_class == "measurable":
-            raise InputError(
-                path="disturbance_class",
-                expected="piecewise_constant where the system has pieces, of which measurable ones are not proven",
-                got="measurable",
             )
 
     def _state(self) -> Array:
@@ -262,7 +264,7 @@ class OptimalControlProblem:
                 expected="none beside a list of disturbances, each of which has its own",
                 got=self.disturbance_class if self.disturbance is None else self.disturbance.kind,
             )
-        system, bound, kind = joined(self.system, every)
+        system, bound, kind = joined(self.system, every, self.horizon)
         self._set("system", system)
         self._set("disturbance", bound)
         self._set("disturbance_class", kind)

@@ -312,6 +312,12 @@ class DisturbanceOptions(Sparse):
     kind: DisturbanceClass = Field(default="piecewise_constant", alias="class")
     """Which functions it may be, as in ``disturbance_class``; the same for all of a list."""
 
+    start: float | None = Field(default=None, alias="from", ge=0.0)
+    """When it begins to act; 0 unless given."""
+
+    stop: float | None = Field(default=None, alias="to", ge=0.0)
+    """When it ends to act; at the horizon unless given."""
+
 
 Matrices: TypeAlias = tuple[list[list[Any]], list[list[Any]], list[list[Any]] | None, list[Any] | None]
 
@@ -432,7 +438,7 @@ class LinearKeys(ProblemFactory, Options):
             rows = None if one.E is None else one.E + [[0.0] * len(one.E[0])] * below
             E = None if rows is None else parse_matrix(f"{where}.E", rows, self.system.names())
             width = system.disturbances if one.E is None else len(one.E[0])
-            found.append(Disturbance(one.bound.build(f"{where}.set", width), E, one.kind))
+            found.append(Disturbance(one.bound.build(f"{where}.set", width), E, one.kind, one.start or 0.0, one.stop))
         return found
 
     def windows(self, states: int) -> list[PathConstraint | MixedConstraint]:
