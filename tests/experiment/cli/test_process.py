@@ -156,6 +156,30 @@ def test_a_signal_that_is_ignored_stays_ignored(config: Path, tmp_path: Path) ->
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="nothing is forked here")
+def test_a_child_that_is_forked_ends_at_a_sigterm_however_early_it_comes() -> None:
+    program = """
+import os, signal, time
+from sparserob_core.experiment.cli.shell.process import listen
+listen()
+listen()
+for _ in range(5):
+    child = os.fork()
+    if not child:
+        time.sleep(60)
+        os._exit(7)
+    os.kill(child, signal.SIGTERM)
+    deadline = time.monotonic() + 20
+    while not (ended := os.waitpid(child, os.WNOHANG))[0]:
+        if time.monotonic() > deadline:
+            os.kill(child, signal.SIGKILL)
+        time.sleep(0.001)
+    assert ended[1] == signal.SIGTERM, ended
+assert not signal.pthread_sigmask(signal.SIG_BLOCK, [])
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
 class Press:
     """Presses Ctrl-C at the study's progress of that number."""
 

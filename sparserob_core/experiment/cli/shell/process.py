@@ -8,8 +8,10 @@ import io
 import os
 import signal
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from importlib.util import LazyLoader, find_spec, module_from_spec
 from types import FrameType
 from typing import Any, final
@@ -20,16 +22,41 @@ INTERRUPTED = 130
 """The exit status of a command that was interrupted, whatever it knew by then."""
 
 _caught: list[int] = []
+_masks = threading.local()
 
 
 def listen() -> None:
     """From now on Ctrl-C and SIGTERM raise `KeyboardInterrupt`, which says what it was unless it is from the keyboard.
-    A signal that is ignored, as Ctrl-C is in the background of a shell, stays ignored."""
+    A signal that is ignored, as Ctrl-C is in the background of a shell, stays ignored. SIGTERM ends a process that is
+    forked from this one, as a pool of workers expects."""
     with suppress(ValueError):  # not in the main thread
         if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
             signal.signal(signal.SIGINT, _interrupted)
         if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
             signal.signal(signal.SIGTERM, _interrupted)
+            if hasattr(os, "register_at_fork"):
+                _fork_safely()
+
+
+@cache
+def _fork_safely() -> None:
+    """A SIGTERM for a child waits until it has the default action again: Python forgets in a forked child the signals
+    that came before its first instruction, and a pool whose worker has died waits for the others to end."""
+    os.register_at_fork(before=_hold, after_in_parent=_release, after_in_child=_release_in_child)
+
+
+def _hold() -> None:
+    _masks.before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+
+
+def _release() -> None:
+    signal.pthread_sigmask(signal.SIG_SETMASK, _masks.before)
+
+
+def _release_in_child() -> None:
+    if signal.getsignal(signal.SIGTERM) is _interrupted:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    _release()
 
 
 def spare_imports() -> None:
