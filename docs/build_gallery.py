@@ -13,8 +13,8 @@ import click
 ROOT = Path(__file__).resolve().parent.parent
 PICTURES = ROOT / "docs" / "figures" / "gallery"
 STORIES: dict[str, tuple[str, ...]] = {
-    "rendezvous": ("states",),
-    "powered_descent": ("states",),
+    "rendezvous": ("plane", "states"),
+    "powered_descent": ("plane", "states"),
     "cart_pendulum": ("states",),
     "tank_levels": ("states",),
     "two_modes": ("states",),

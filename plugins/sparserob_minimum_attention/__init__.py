@@ -144,6 +144,7 @@ def _names(given: sr.Names, d: int, m: int) -> sr.Names:
         control_units=rates,
         disturbance_units=given.disturbance_units,
         time=given.time,
+        plane=given.plane,
     )
 
 

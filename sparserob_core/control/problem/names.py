@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import final
@@ -21,7 +22,9 @@ class Names:
 
     ``states``, ``controls``, ``disturbances``: one name each, or nothing: then they are ``x1``, ``u1``, ``w1`` and
     so on; ``state_units``, ``control_units``, ``disturbance_units``: one unit each, such as ``m/s`` (empty:
-    none is known), and ``time`` the unit of time. Raises `InputError` for a name that is empty or occurs twice.
+    none is known), and ``time`` the unit of time. ``plane``: the two states that are a place, first the one that is
+    drawn to the right, then the one upwards, for a figure of where the system moves. Raises `InputError` for a name
+    that is empty or occurs twice, and for a plane that is none.
     """
 
     states: Sequence[str] = ()
@@ -31,6 +34,7 @@ class Names:
     control_units: Sequence[str] = ()
     disturbance_units: Sequence[str] = ()
     time: str = ""
+    plane: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         seen: dict[str, str] = {}
@@ -46,6 +50,26 @@ class Names:
             self._texts(f"{kind[:-1]}_units")
         if not isinstance(self.time, str):
             raise InputError(path="names.units.time", expected="a text such as s", got=f"{self.time!r}")
+        if plane := self._texts("plane"):
+            known = "two of the states" + (f", {', '.join(self.states)}" if self.states else ", such as x1 and x2")
+            places = [self._place(name) for name in plane]
+            if len(plane) != 2 or plane[0] == plane[1] or None in places:
+                raise InputError(path="names.plane", expected=known, got=f"{list(plane)}")
+            units = [self.state_units[place] for place in places if place is not None and place < len(self.state_units)]
+            if len(set(units)) > 1:
+                raise InputError(path="names.plane", expected="two states of the same unit", got=" and ".join(units))
+
+    @property
+    def in_plane(self) -> tuple[int, int] | None:
+        """The positions of the two states that are a place; ``None`` where the problem has not said any."""
+        across, up = [self._place(name) for name in self.plane] or [None, None]
+        return None if across is None or up is None else (across, up)
+
+    def _place(self, name: str) -> int | None:
+        """The position of a state of that name."""
+        if self.states:
+            return self.states.index(name) if name in self.states else None
+        return int(name[1:]) - 1 if re.fullmatch("x[1-9][0-9]*", name) else None
 
     def fitting(self, states: int, controls: int, disturbances: int) -> Names:
         """The same names, checked against how many there are; raises `InputError`."""
@@ -57,6 +81,8 @@ class Names:
                         expected=f"{count}, one for each of the {kind}",
                         got=f"{len(given)}: {', '.join(given)}",
                     )
+        if (places := self.in_plane) is not None and max(places) >= states:
+            raise InputError(path="names.plane", expected=f"two of {states} states", got=f"{list(self.plane)}")
         return self
 
     def state(self, index: int) -> str:

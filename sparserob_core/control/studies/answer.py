@@ -142,31 +142,34 @@ def _read(
 
 def tube(model: Transcription, theta: Array, times: Array) -> Tube:
     """The tube at a decision ``theta (m N,)``, or the whole one under feedback, and at ``times (T,)``."""
+    axes = np.eye(model.problem.system.states)
+    upper, lower = supports(model, theta, times, axes), -supports(model, theta, times, -axes)
     if model.feedback is not None:
-        loop = model.feedback.loop
-        nominal, axes = loop.states(theta, times)[:, :, 0], np.eye(model.problem.system.states)
-        upper, lower = loop.values(theta, times, axes), -loop.values(theta, times, -axes)
-        return Tube(times, nominal.T, lower.T, upper.T)
-    functionals, known = model.functionals, model.functionals.central()
+        return Tube(times, model.feedback.loop.states(theta, times)[:, :, 0].T, lower, upper)
     bound = model.problem.system.parameters
-    centre = np.zeros(0) if bound is None else nominal_point(bound)
+    middle = np.tile(np.zeros(0) if bound is None else nominal_point(bound), (times.size, 1))
+    known = model.functionals.central()
+    nominal = [known.values(theta, times, np.tile(axis, (times.size, 1)), middle) for axis in axes]
+    return Tube(times, np.array(nominal), lower, upper)
+
+
+def supports(model: Transcription, theta: Array, times: Array, directions: Array) -> Array:
+    """``max c'x(t)`` over every disturbance and parameter, for ``directions (q, d)``, as ``(q, T)``; exact and at
+    sampled parameters as in a `tube`."""
+    if model.feedback is not None:
+        return model.feedback.loop.values(theta, times, directions).T
     lattice, _ = model.parameters.lattice()
     if len(lattice) > PARAMETERS:
         lattice = lattice[np.unique(np.linspace(0, len(lattice) - 1, PARAMETERS).round().astype(int))]
-    d, count = model.problem.system.states, len(lattice)
-    nominal, lower, upper = np.empty((d, times.size)), np.empty((d, times.size)), np.empty((d, times.size))
+    count, found = len(lattice), np.empty((len(directions), times.size))
     size = max(1, INSTANTS // count)
     for start in range(0, times.size, size):
         part = slice(start, start + size)
         at, p = np.tile(times[part], count), np.repeat(lattice, times[part].size, axis=0)
-        middle = centre[None].repeat(times[part].size, axis=0)
-        for state in range(d):
-            direction = np.tile(np.eye(d)[state], (at.size, 1))
-            above, below = (functionals.values(theta, at, side * direction, p) for side in (1.0, -1.0))
-            upper[state, part] = above.reshape(count, -1).max(axis=0)
-            lower[state, part] = -below.reshape(count, -1).max(axis=0)
-            nominal[state, part] = known.values(theta, times[part], direction[: times[part].size], middle)
-    return Tube(times, nominal, lower, upper)
+        for row, direction in enumerate(directions):
+            values = model.functionals.values(theta, at, np.tile(direction, (at.size, 1)), p)
+            found[row, part] = values.reshape(count, -1).max(axis=0)
+    return found
 
 
 def _times(time: npt.ArrayLike, horizon: float) -> Array:

@@ -206,7 +206,7 @@ class UnitsOptions(Options):
 
 
 @final
-class NamesOptions(Options):
+class NamesOptions(Sparse):
     """What everything is called in messages, tables, figures and recordings; no number changes."""
 
     states: list[str] = Field(default_factory=list)
@@ -221,6 +221,10 @@ class NamesOptions(Options):
     units: UnitsOptions = UnitsOptions()
     """What they are measured in."""
 
+    plane: list[str] | None = None
+    """The two states that are a place, drawn to the right and upwards: the run then has a figure of the plane in which
+    the system moves."""
+
     def build(self) -> Names:
         """The names; raises `InputError` that begins with the key."""
         units = self.units
@@ -232,6 +236,7 @@ class NamesOptions(Options):
             control_units=units.controls,
             disturbance_units=units.disturbances,
             time=units.time,
+            plane=self.plane or (),
         )
 
 

@@ -16,12 +16,13 @@ from sparserob_core.control.problem.problem import OptimalControlProblem, PathCo
 from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.sets.sets import Equality
 from sparserob_core.control.studies.adversary import find_adversary
-from sparserob_core.control.studies.answer import tube
+from sparserob_core.control.studies.answer import supports, tube
 from sparserob_core.control.transcription.record import Transcription
+from sparserob_core.control.transcription.transcribe import path_names
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.assemble import ControlExperiment, Experiment, counting
 from sparserob_core.experiment.directory.sparsity import sparsity
-from sparserob_core.experiment.figures.figure_data import FigureData, Wall
+from sparserob_core.experiment.figures.figure_data import FigureData, Limit, Plane, Wall
 from sparserob_core.experiment.terminal.printing import printable
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.events import RoundFinished
@@ -30,6 +31,9 @@ TIMES = 400  # drawn at most
 SMOOTH = 200  # drawn at least, about
 NOTHING = 1e-9  # of the largest multiplier: the rounding of a solver
 DRAWS = 2000  # of which the quantiles of the control are drawn
+CORNERS = 48  # of the polygon around every place, which reaches 0.2 % beyond a disc, and 3 % of its length beside a
+# segment: with a tenth a path is twice as wide as it is; ten times takes seconds and looks the same
+STEPS = 33  # times of a window at which a side that moves is drawn
 QUANTILES = (0.05, 0.5, 0.95)
 
 
@@ -121,6 +125,7 @@ def _data(
         active_fraction=sparsity(control, dictionary.breakpoints).active_fraction,
         cost=cost,
         names=problem.names,
+        plane=_plane(model, decision, around.times),
         tolerance=tolerance if isinstance(tolerance, float) else None,
         **answered,
     )
@@ -181,6 +186,62 @@ def _moved(model: Transcription, decision: Array) -> dict[str, Any]:
         "answers": np.einsum("kjid,jd->kji", loop.gains(decision), seen @ worst.deviation),
         "worst_case": f"the worst case of {printable(worst.name)} at t = {worst.time:.4g}",
     }
+
+
+def _plane(model: Transcription, decision: Array, times: Array) -> Plane | None:
+    """Where the system moves, if the problem says in which plane."""
+    pair, problem = model.problem.names.in_plane, model.problem
+    if pair is None:
+        return None
+    angles = 2.0 * np.pi * np.arange(CORNERS) / CORNERS
+    normals = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    directions = np.zeros((CORNERS, problem.system.states))
+    directions[:, pair] = normals
+    heights = supports(model, decision, times, directions)
+    after, next_heights = np.roll(normals, -1, axis=0), np.roll(heights, -1, axis=0)
+    left, next_left = (np.stack([-one[:, 1], one[:, 0]], axis=1)[:, None] for one in (normals, after))
+    # where the lines c'y = h of two neighbouring directions meet
+    places = (next_heights[..., None] * left - heights[..., None] * next_left) / np.sin(2.0 * np.pi / CORNERS)
+    return Plane(states=pair, places=places.transpose(1, 0, 2), limits=tuple(_limits(problem, pair, normals)))
+
+
+def _limits(problem: OptimalControlProblem, pair: tuple[int, int], around: Array) -> Iterator[Limit]:
+    """What path and terminal constraints say of the place alone; of a curved set the sides ``around (q, 2)`` it."""
+    end, names = problem.horizon, path_names(problem)
+    for name, entry in zip(names, problem.path, strict=True):
+        if not isinstance(entry, PathConstraint):
+            continue
+        normals, bounds = _lines(entry.set, pair, around)
+        stop, moved = end if entry.stop is None else float(entry.stop), Reference.of(entry.relative_to)
+        kinks = np.empty(0) if moved is None else moved.kinks(entry.start, stop)
+        times = np.unique(np.concatenate([np.linspace(entry.start, stop, STEPS), kinks]))
+        off = np.zeros((times.size, 2)) if moved is None else moved.at(times)[:, pair]
+        limit = Limit(name=printable(name), normals=normals, times=times, bounds=bounds + off @ normals.T)
+        if len(normals):
+            yield replace(limit, is_wall=not limit.moves and entry.start <= 0.0 and stop >= end)
+    for terminal in problem.terminal:
+        if isinstance(terminal, Equality):
+            fixed = [state for state in terminal.fixed.tolist() if state in pair]
+            axes = np.array([[float(state == one) for one in pair] for state in fixed]).reshape(-1, 2)
+            values = np.asarray(terminal.values)[fixed]
+            normals, bounds = np.vstack([axes, -axes]), np.concatenate([values, -values])
+        else:
+            normals, bounds = _lines(terminal, pair, around)
+        if len(normals):
+            yield Limit(name="terminal", normals=normals, times=np.array([end]), bounds=bounds[None], is_final=True)
+
+
+def _lines(bounds: ConvexSet, pair: tuple[int, int], around: Array) -> tuple[Array, Array]:
+    """The sides of a set that are about two coordinates alone: ``normals (r, 2)``, ``bounds (r,)``."""
+    sides = bounds.halfspaces()
+    if sides is None:
+        directions = np.zeros((len(around), bounds.dimension))
+        directions[:, pair] = around
+        reach = bounds.support(directions)
+        return around[np.isfinite(reach)], reach[np.isfinite(reach)]
+    H, h = sides
+    alone = (np.delete(H, pair, axis=1) == 0.0).all(axis=1) & (H[:, pair] != 0.0).any(axis=1)
+    return H[alone][:, pair], h[alone]
 
 
 def _walls(problem: OptimalControlProblem) -> Iterator[Wall]:

@@ -50,6 +50,35 @@ class Wall:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class Limit:
+    """What a constraint that is called ``name`` says of the place alone: ``normals (r, 2) y <= bounds (k, r)`` at
+    ``times (k,)``, between which the bounds go in straight lines; of the final place (``is_final``) one time.
+    ``is_wall``: it holds all the time, and stands still."""
+
+    name: str
+    normals: Array
+    times: Array
+    bounds: Array
+    is_final: bool = False
+    is_wall: bool = False
+
+    @property
+    def moves(self) -> bool:
+        """Whether a bound changes."""
+        return bool((self.bounds != self.bounds[0]).any())
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Plane:
+    """Where a system moves in a plane: the two ``states`` that are its place, drawn to the right and upwards; a polygon
+    ``places (T, q, 2)`` for every time, that contains wherever the worst case may bring it; and the ``limits``."""
+
+    states: tuple[int, int]
+    places: Array
+    limits: tuple[Limit, ...] = ()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class FigureData:
     """A solved control problem, ready to be drawn.
 
@@ -59,7 +88,7 @@ class FigureData:
     the times of the imposed constraints that carry a multiplier; ``history`` the rounds of the method. ``tolerance`` is
     the relative gap that was asked for, ``cost_scale`` what is added up to the cost, ``cost_of`` what is
     added up to it, where that is not the L1 norm alone, ``counts`` whether cost means the time that the control acts,
-    ``names`` what everything is called.
+    ``names`` what everything is called, ``plane`` where the system moves, if the problem says that it does so in one.
 
     Under feedback the control is the nominal one, ``control_least``, ``control_most (m, K)`` are how far the
     disturbance moves it, ``gains (K, K, m, d)`` answer what is measured, and ``alone_lower``, ``alone_upper (d, T)``
@@ -96,6 +125,7 @@ class FigureData:
     worst_case: str = ""
     counts: bool = False
     names: Names = UNNAMED
+    plane: Plane | None = None
 
     def __post_init__(self) -> None:
         pieces, instants = self.breakpoints.size - 1, self.times.size

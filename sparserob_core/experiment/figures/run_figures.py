@@ -25,8 +25,8 @@ IDLE = 1e-7  # of the control's bound: less than that is no action but rounding
 
 
 def write_figures(directory: Path, data: FigureData) -> list[Path]:
-    """Draw ``control``, ``states``, under feedback ``gains``, ``effort`` and ``answers``, and when there is a history
-    ``convergence`` into ``directory``, each as PDF and PNG.
+    """Draw ``control``, ``states``, ``plane`` where the system moves in one, under feedback ``gains``, ``effort`` and
+    ``answers``, and when there is a history ``convergence`` into ``directory``, each as PDF and PNG.
 
     Returns the files. Raises `InputError` when matplotlib is missing.
     """
@@ -37,9 +37,12 @@ def write_figures(directory: Path, data: FigureData) -> list[Path]:
 
 def run_pictures(data: FigureData) -> dict[str, Callable[[], Figure]]:
     """The figures that there are of a decision, by name."""
+    from sparserob_core.experiment.figures.plane_figure import draw_plane
+
     known: dict[str, tuple[bool, Callable[[FigureData], Figure]]] = {
         "control": (True, draw_control),
         "states": (True, draw_states),
+        "plane": (data.plane is not None, draw_plane),
         "gains": (data.gains is not None, draw_gains),
         "effort": (data.effort is not None, draw_effort),
         "answers": (data.answers is not None, draw_answers),

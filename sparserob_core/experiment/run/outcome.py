@@ -122,9 +122,10 @@ class SolvedProblem(ControlResult):
         return outcome
 
     def plot(self, name: str = "states") -> Figure:
-        """A figure of the run, for matplotlib: ``control``, ``states``, ``convergence``, ``adversary``, under feedback
-        ``gains``, ``effort`` and ``answers``, of a search ``climb`` and ``landscape``, and ``clash`` of what is
-        infeasible. Raises `InputError`, which names those that there are, for another one."""
+        """A figure of the run, for matplotlib: ``control``, ``states``, ``plane`` where the problem names one,
+        ``convergence``, ``adversary``, under feedback ``gains``, ``effort`` and ``answers``, of a search ``climb`` and
+        ``landscape``, and ``clash`` of what is infeasible. Raises `InputError`, which names those that there are, for
+        another one."""
         from sparserob_core.experiment.run.drawing import plot
 
         return plot(self.experiment, self, name)

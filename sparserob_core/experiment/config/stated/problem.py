@@ -180,6 +180,6 @@ def _names_keys(names: Names) -> dict[str, Any]:
     keys: dict[str, Any] = {kind: list(getattr(names, kind)) for kind in ("states", "controls", "disturbances")}
     units = {kind: list(getattr(names, f"{kind[:-1]}_units")) for kind in keys}
     stated = {**units, "time": names.time}
-    found = {key: value for key, value in keys.items() if value}
+    found = {key: value for key, value in {**keys, "plane": list(names.plane)}.items() if value}
     measured = {key: value for key, value in stated.items() if value}
     return {"names": {**found, **({"units": measured} if measured else {})}} if found or measured else {}

@@ -1,0 +1,179 @@
+"""The figure of a system that moves in a plane: its path, the places of the worst case, walls, gates and goal."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sparserob_core.experiment.figures import style as look
+from sparserob_core.experiment.figures.figure_data import FigureData, Limit, plain
+from sparserob_core.experiment.figures.run_figures import draw_legend
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from sparserob_core.sip.convex_set import Array
+
+MARGIN = (
+    0.08  # of the larger side of what is drawn, around it: nothing hides what is beside, ten times leaves no picture
+)
+SLIM = 0.25  # of the larger side, the smaller one at least: of a tenth nothing is seen, at 1 all is a square
+NEAR = 0.3  # of the larger side: a wall that is nearer to the path is within the view; of all walls one sees no path
+PALE = "#BEE1F6"  # SKY at 45 % on white
+MARKS = 4  # parts of the horizon whose ends are marked
+
+
+def draw_plane(data: FigureData) -> Figure:
+    """The nominal path with the places that the worst case brings the system to. What is forbidden all the time is
+    hatched; a set that holds for a part of it, or moves, is outlined beside the part of the path that it is about."""
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Polygon
+
+    plane = data.plane
+    assert plane is not None
+    path, places = data.state[list(plane.states)].T, plane.places
+    low, high = _view(path, places, plane.limits)
+    sides = high - low
+    tall = float(np.clip(look.WIDTH * sides[1] / sides[0], 2.0, 7.0))
+    figure = Figure(figsize=(look.WIDTH, tall + 1.1), layout="constrained")
+    ax = figure.subplots()
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+    frame = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+    colour = iter((look.GREEN, look.ORANGE, look.PURPLE, look.INK))
+    whole = [limit for limit in plane.limits if limit.is_wall]
+    _hatched(ax, frame, whole)
+    for limit in plane.limits:
+        if limit.is_final:
+            allowed = clipped(frame, limit.normals, limit.bounds[-1])
+            goal = Polygon(allowed, fill=False, edgecolor=look.VERMILLION, linewidth=2.0, zorder=4)
+            goal.set_label("terminal set")
+            ax.add_patch(goal)
+        elif not limit.is_wall:
+            _gate(ax, data, limit, path, frame, next(colour, look.INK))
+    if np.ptp(places, axis=1).max() > 0.0:
+        said = "worst case" if data.gains is None else "worst case, with feedback"
+        for number, place in enumerate(places):  # they overlap: one opaque colour, that of the tube of a state
+            ax.fill(*place.T, color=PALE, linewidth=0.4, zorder=2, label="" if number else said)
+    ax.plot(*path.T, color=look.BLUE, linewidth=1.5, zorder=3, label="nominal")
+    _marks(ax, data, path)
+    ax.set_xlabel(data.state_label(plane.states[0]))
+    ax.set_ylabel(data.state_label(plane.states[1]))
+    ax.set_title(data.title)
+    draw_legend(figure, [ax])
+    return figure
+
+
+def clipped(polygon: Array, normals: Array, bounds: Array) -> Array:
+    """A convex polygon ``(k, 2)`` without what is beyond one of the lines ``normals (r, 2) x = bounds (r,)``
+    (Sutherland and Hodgman 1974)."""
+    kept = np.asarray(polygon, dtype=float)
+    for normal, bound in zip(normals, bounds, strict=True):
+        heights, corners = kept @ normal - bound, []
+        for k in range(len(kept)):
+            a, b = heights[k - 1], heights[k]
+            if (a > 0.0) != (b > 0.0):
+                corners.append(kept[k - 1] + (kept[k] - kept[k - 1]) * a / (a - b))
+            if b <= 0.0:
+                corners.append(kept[k])
+        kept = np.array(corners).reshape(-1, 2)
+    return kept
+
+
+def _view(path: Array, places: Array, limits: tuple[Limit, ...]) -> tuple[Array, Array]:
+    """The corners of what is shown: the path, its places, the goal, and walls that are near."""
+    points = np.vstack([path, places.reshape(-1, 2)])
+    size = float(np.ptp(points, axis=0).max()) or 1.0
+    low, high = points.min(axis=0) - size, points.max(axis=0) + size
+    wide = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+    shown = [points]
+    for limit in limits:
+        if limit.is_final:
+            goal = clipped(wide, limit.normals, limit.bounds[-1])
+            shown.append(goal[((goal > low) & (goal < high)).all(axis=1)])  # of a side that is free no corner counts
+            continue
+        for normal, bounds in zip(limit.normals, limit.bounds.T, strict=True):
+            gaps = (bounds.min() - path @ normal) / (normal @ normal)
+            nearest = int(np.abs(gaps).argmin())
+            if abs(gaps[nearest]) * np.linalg.norm(normal) <= NEAR * size:
+                shown.append((path[nearest] + gaps[nearest] * normal)[None])
+    points = np.vstack(shown)
+    low, high = points.min(axis=0), points.max(axis=0)
+    size = float((high - low).max()) or 1.0
+    missing = np.maximum(SLIM * size - (high - low), 0.0) / 2 + MARGIN * size
+    return low - missing, high + missing
+
+
+def _hatched(ax: Axes, frame: Array, walls: list[Limit]) -> None:
+    """Hatch what is forbidden for the whole time."""
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path
+
+    allowed = frame
+    for wall in walls:
+        allowed = clipped(allowed, wall.normals, wall.bounds[0])
+    if not walls or not len(allowed):
+        return
+    hole = allowed[::-1]
+    if len(hole) == len(frame) and np.allclose(np.sort(hole, axis=0), np.sort(frame, axis=0)):
+        return  # no wall is within the view
+    corners = np.vstack([frame, frame[:1], hole, hole[:1]])
+    drawn = [Path.LINETO] * (len(hole) - 1)
+    codes = [Path.MOVETO, *[Path.LINETO] * 3, Path.CLOSEPOLY, Path.MOVETO, *drawn, Path.CLOSEPOLY]
+    ax.add_patch(
+        PathPatch(
+            Path(corners, codes),
+            facecolor=look.MIST,
+            edgecolor="#C4C4C4",
+            hatch="////",
+            linewidth=0,
+            zorder=0,
+            label="forbidden",
+        )
+    )
+    for one, other in zip(allowed, np.roll(allowed, -1, axis=0), strict=True):
+        if not ((one == other) & ((one == frame[0]) | (one == frame[2]))).any():  # the edge of the picture is no wall
+            ax.plot(*np.stack([one, other]).T, color=look.GREY, linewidth=1.0, zorder=1)
+
+
+def _gate(ax: Axes, data: FigureData, limit: Limit, path: Array, frame: Array, colour: str) -> None:
+    """A set that holds for a part of the time, or moves: its outline, or where its sides are when the path is beside
+    them, and that part of the path."""
+    during = (data.times >= limit.times[0]) & (data.times <= limit.times[-1])
+    unit = f" {plain(data.names.time)}" if data.names.time else ""
+    said = f"{plain(limit.name)}, $t$ from {limit.times[0]:.4g} to {limit.times[-1]:.4g}{unit}"
+    ax.plot(*path[during].T, color=colour, linewidth=4.0, alpha=0.6, zorder=2.5, solid_capstyle="butt", label=said)
+    if not limit.moves:
+        allowed = clipped(frame, limit.normals, limit.bounds[0])
+        if len(allowed):
+            ax.fill(*allowed.T, fill=False, edgecolor=colour, linewidth=1.1, linestyle=(0, (4, 2)), zorder=1.5)
+        return
+    for normal, bounds in zip(limit.normals, limit.bounds.T, strict=True):
+        here = np.stack([np.interp(limit.times, data.times, coordinate) for coordinate in path.T], axis=1)
+        beside = here + ((bounds - here @ normal) / (normal @ normal))[:, None] * normal
+        ax.plot(*beside.T, color=colour, linewidth=1.1, zorder=1.5)
+
+
+def _marks(ax: Axes, data: FigureData, path: Array) -> None:
+    """Times along the path, and those of the active constraints."""
+    from matplotlib.patheffects import withStroke
+
+    at = np.linspace(data.times[0], data.times[-1], MARKS + 1)
+    marked = np.stack([np.interp(at, data.times, coordinate) for coordinate in path.T], axis=1)
+    ax.plot(*marked.T, "o", color="white", markeredgecolor=look.BLUE, markersize=4.5, zorder=5)
+    unit = f" {plain(data.names.time)}" if data.names.time else ""
+    for time, place in zip(at, marked, strict=True):
+        ax.annotate(
+            f"{time:.4g}{unit}",
+            place,
+            xytext=(5, 5),
+            textcoords="offset points",
+            fontsize=8.5,
+            color=look.GREY,
+            path_effects=[withStroke(linewidth=2.0, foreground="white")],
+            zorder=6,
+        )
+    if len(data.active_times):
+        where = np.stack([np.interp(data.active_times, data.times, coordinate) for coordinate in path.T], axis=1)
+        ax.plot(*where.T, "^", color=look.PURPLE, markersize=6, markeredgewidth=0, zorder=5, label="active constraint")
