@@ -11,8 +11,8 @@ import numpy as np
 
 from sparserob_core.experiment.figures import style as look
 from sparserob_core.experiment.figures.figure_data import FigureData
-from sparserob_core.experiment.figures.run_figures import draw_legend, draw_time_axis, draw_walls
-from sparserob_core.experiment.figures.style import held, panels, require_matplotlib, style, write_figure
+from sparserob_core.experiment.figures.run_figures import draw_time_axis, draw_walls
+from sparserob_core.experiment.figures.style import draw_legend, held, panels, require_matplotlib, style, write_figure
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ import numpy as np
 
 from sparserob_core.experiment.figures import style as look
 from sparserob_core.experiment.figures.figure_data import FigureData, Limit, plain
-from sparserob_core.experiment.figures.run_figures import draw_legend
+from sparserob_core.experiment.figures.style import draw_legend
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,7 +11,8 @@ import numpy as np
 
 from sparserob_core.experiment.figures import style as look
 from sparserob_core.experiment.figures.figure_data import FigureData, Wall
-from sparserob_core.experiment.figures.style import held, panels, require_matplotlib, style, write_figure
+from sparserob_core.experiment.figures.plane_figure import draw_plane
+from sparserob_core.experiment.figures.style import draw_legend, held, panels, require_matplotlib, style, write_figure
 from sparserob_core.sip.result import relative_gap
 
 if TYPE_CHECKING:
@@ -37,8 +38,6 @@ def write_figures(directory: Path, data: FigureData) -> list[Path]:
 
 def run_pictures(data: FigureData) -> dict[str, Callable[[], Figure]]:
     """The figures that there are of a decision, by name."""
-    from sparserob_core.experiment.figures.plane_figure import draw_plane
-
     known: dict[str, tuple[bool, Callable[[FigureData], Figure]]] = {
         "control": (True, draw_control),
         "states": (True, draw_states),
@@ -364,20 +363,6 @@ def _terminal(ax: Axes, wall: Wall) -> None:
                 clip_on=False,
                 zorder=4,
             )
-
-
-def draw_legend(figure: Figure, axes: list[Axes]) -> None:
-    """One legend below all panels."""
-    entries = {label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    figure.legend(
-        entries.values(),
-        entries.keys(),
-        loc="outside lower center",
-        ncols=len(entries) if len("".join(entries)) <= 64 else 3,
-        columnspacing=1.6,
-        handlelength=1.4,
-        handletextpad=0.6,
-    )
 
 
 def _series(ax: Axes, rounds: Array, values: Array, colour: str, marker: str, label: str) -> None:

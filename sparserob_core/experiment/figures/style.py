@@ -75,6 +75,20 @@ def panels(rows: int, height: float, *, extra: float = 0.0) -> tuple[Figure, lis
     return figure, list(axes)
 
 
+def draw_legend(figure: Figure, axes: list[Axes]) -> None:
+    """One legend below all panels."""
+    entries = {label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    figure.legend(
+        entries.values(),
+        entries.keys(),
+        loc="outside lower center",
+        ncols=len(entries) if len("".join(entries)) <= 64 else 3,
+        columnspacing=1.6,
+        handlelength=1.4,
+        handletextpad=0.6,
+    )
+
+
 def write_figure(file: Path, figure: Figure) -> list[Path]:
     """Write a figure, each file whole: into ``file`` when its ending is a kind of figure (.png, .pdf, .svg), else into
     ``file.pdf`` (vector) and ``file.png`` (200 dots per inch). Returns the files; the same figure gives the same bytes.
