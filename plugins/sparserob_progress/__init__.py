@@ -12,10 +12,12 @@ import sparserob_core as sr
 from sparserob_progress.screen import Screen
 from sparserob_progress.status import Status, duration
 
+SHOWN = (sr.RoundFinished, sr.EvaluationsFinished, sr.ProofProgress, sr.StudyProgress)
+
 
 class ProgressObserver(sr.Observer, sr.Options):
-    """Bounds, round, worst violation, the search with its best value, rate and time left, and the proof, on the
-    standard error stream.
+    """The phase, bounds, round, worst violation, what is proven, the search with its best value, rate and time left,
+    and the proof, on the standard error stream.
 
     Nothing is shown for a quiet run, nor before ``patience`` seconds have passed. On a terminal the lines are renewed
     in place and disappear when the run is over; anywhere else one line is written every five seconds.
@@ -55,7 +57,7 @@ class ProgressObserver(sr.Observer, sr.Options):
         status.receive(event)
         if isinstance(event, sr.RunFinished):
             self.close()
-        elif self._screen is None and isinstance(event, sr.RoundFinished | sr.EvaluationsFinished | sr.ProofProgress):
+        elif self._screen is None and isinstance(event, SHOWN):
             sys.stderr.write(f"{duration(status.elapsed)}  {status.last(event)}\n")
         elif self._screen is not None:
             self._require(self._screen)

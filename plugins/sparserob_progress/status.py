@@ -23,6 +23,7 @@ class Status:
         self.proving: sr.ProofProgress | None = None
         self.study: sr.StudyProgress | None = None
         self.lower, self.upper, self.gap = -math.inf, math.inf, math.inf
+        self.phase = ""
 
     @property
     def elapsed(self) -> float:
@@ -33,21 +34,23 @@ class Status:
         """Take note of an event."""
         match event:
             case sr.RoundFinished():
-                self.round, self.proving = event, None
+                self.round, self.proving, self.study, self.phase = event, None, None, "relax"
                 self.lower = max(self.lower, event.lower_bound)
                 self.upper = min(self.upper, math.inf if event.simplified else event.upper_bound)
                 self.gap = math.inf if event.simplified else event.gap
             case sr.EvaluationsFinished():
-                self.searched, self.proving = event, None
+                self.searched, self.proving, self.phase = event, None, "search"
                 self.lower = max(self.lower, event.lower_bound)
             case sr.ProofProgress():
-                self.searched, self.proving = None, event
+                self.searched, self.proving, self.phase = None, event, "proof"
             case sr.StudyProgress():
                 self.searched, self.proving, self.study = None, None, event
+                self.phase = event.text.partition(":")[0] if event.phase else ""
 
     def parts(self) -> list[tuple[str, str]]:
         """What is known, as labels and texts of less than 70 characters."""
-        parts = [("bounds", _bounds(self.lower, self.upper, self.gap))] if self.round or self.searched else []
+        parts = [("phase", self.phase)] if self.phase else []
+        parts += [("bounds", _bounds(self.lower, self.upper, self.gap))] if self.round or self.searched else []
         if self.round is not None:
             parts += [("round", _round(self.round)), ("", _work(self.round))]
             if math.isfinite(self.round.proven):
@@ -67,13 +70,15 @@ class Status:
         """One event in one line."""
         match event:
             case sr.RoundFinished():
-                return (
-                    f"round {_round(event)}  {_bounds(event.lower_bound, event.upper_bound, event.gap)}  {_work(event)}"
-                )
+                bounds = _bounds(event.lower_bound, event.upper_bound, event.gap)
+                proven = f"  proven {_number(event.proven)}" if math.isfinite(event.proven) else ""
+                return f"round {_round(event)}  {bounds}{proven}  {_work(event)}"
             case sr.EvaluationsFinished():
                 return "  ".join(["search " + _search(event), _notes(event)]).strip()
             case sr.ProofProgress():
                 return f"proof {_proof(event)}"
+            case sr.StudyProgress():
+                return event.text
             case _:
                 return type(event).__name__
 

@@ -11,6 +11,7 @@ from scipy.optimize import linprog
 import sparserob_core as sr
 from sparserob_core.experiment.run import run as run_module
 from sparserob_core.sip.method import Deadline
+from sparserob_core.sip.methods import sparsest
 
 LOSS, GUST, WALL, START = (0.3, 0.5), 0.1, 1.0, 2.0
 
@@ -100,6 +101,8 @@ def ridden(wall: str, pieces: int, uncertain: bool = False, feedback: bool = Fal
         ("moving", False, False, 14),
         pytest.param("moving", True, False, 16, marks=pytest.mark.slow),
         pytest.param("moving", False, True, 14, marks=pytest.mark.slow),
+        pytest.param("curved", False, False, 24, marks=pytest.mark.slow),
+        pytest.param("curved", False, True, 24, marks=pytest.mark.slow),
     ],
 )
 def test_a_wall_that_moves_takes_no_more_rounds_the_longer_it_is_ridden(
@@ -109,6 +112,12 @@ def test_a_wall_that_moves_takes_no_more_rounds_the_longer_it_is_ridden(
         result = sr.run(ridden(wall, pieces, uncertain, feedback), quiet=True, figures=False).result
         assert result.status == "certified"
         assert result.counts["rounds"] <= most
+
+
+def test_a_curved_wall_that_is_ridden_takes_few_rounds_with_parameters_too() -> None:
+    result = sr.run(ridden("curved", 8, uncertain=True), quiet=True, figures=False).result
+    assert result.status == "certified"
+    assert result.counts["rounds"] <= 20
 
 
 class Clock(Deadline):
@@ -157,6 +166,22 @@ def test_a_limit_leaves_a_proven_control_whatever_the_method(
     assert result.status == "verified"
     assert result.lower_bound < result.upper_bound < 1.2 * result.lower_bound or method == "sparsest"
     assert np.isfinite(result.upper_bound)
+
+
+def test_with_an_alphabet_any_control_is_proven_before_the_sparsest_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    gaps: list[float] = []
+
+    def spied(program: Any, relaxed: Any, rows: Any, letters: Any, gap: float = 0.0) -> Any:
+        gaps.append(gap)
+        return propose(program, relaxed, rows, letters, gap)
+
+    propose = sparsest.proposed
+    monkeypatch.setattr(sparsest, "proposed", spied)
+    given = {**ridden("moving", 8), "method": {"name": "sparsest", "alphabet": [0, 0.5, 1.0, 1.5, 3.0, 6.0]}}
+    result = sr.run(given, quiet=True, figures=False).result
+    assert result.status == "certified"
+    assert gaps[0] == sparsest.ANY, "the first one need not be the best"
+    assert gaps == sorted(gaps, reverse=True), "those after a proven one are asked to be"
 
 
 def heating() -> dict[str, Any]:

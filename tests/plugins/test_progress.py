@@ -112,6 +112,21 @@ def test_a_verbose_run_has_one_plain_line_for_every_event(monkeypatch: pytest.Mo
     ]
 
 
+def test_the_phase_is_named_and_what_is_proven(monkeypatch: pytest.MonkeyPatch) -> None:
+    from sparserob_progress.status import Status
+
+    status, said = Status("a title"), []
+    figures = sr.StudyProgress(text="figures: the worst cases", phase=True)
+    study = sr.StudyProgress(text="3 of 7 loops", done=3, total=7)
+    for event in (ROUND, PROOF, SEARCH, finished_round(3, proven=0.5), figures, study):
+        status.receive(event)
+        said.append(dict(status.parts()).get("phase"))
+    assert said == ["relax", "proof", "search", "relax", "figures", None]
+    assert "proven a control of cost 0.5" in status.line()
+    assert "proven 0.5" in status.last(finished_round(3, proven=0.5))
+    assert status.last(figures) == "figures: the worst cases"
+
+
 def test_a_short_run_and_a_quiet_run_show_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     for stream in (io.StringIO(), Terminal()):
         assert watch(stream, monkeypatch, [started(), ROUND, SEARCH, ENDING]) == ""

@@ -11,7 +11,14 @@ import numpy as np
 
 from sparserob_core.control.constraints.explanation import explanation
 from sparserob_core.control.constraints.flat import FlatConstraint
-from sparserob_core.control.constraints.local_maxima import climb, local_maxima, vertices
+from sparserob_core.control.constraints.local_maxima import (
+    climb,
+    highest_at,
+    local_maxima,
+    ridden,
+    turns,
+    vertices,
+)
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.combination import Combination, combination
@@ -20,13 +27,13 @@ from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.lifted import LiftedSystem
 from sparserob_core.control.response.parameters import ParameterIndex
 from sparserob_core.control.response.reference import Moving, Reference
-from sparserob_core.control.sets.directions import across, faces, on_surface, sampled, shares, unit
+from sparserob_core.control.sets.directions import across, faces, neighbours, on_surface, sampled, shares, unit
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.program import Enclosure, Explanation, Separation
 
-CANDIDATES = 24  # sampled maxima that are climbed from
-KEPT = 8  # separated constraints per round
+SAMPLED = 8  # samples in any direction that are climbed from, beside the maxima along time
+STEP = 0.1  # first step of directions, on the cube of edge 2
 
 
 @final
@@ -89,32 +96,79 @@ class CurvedConstraint(StateConstraint):
     def worst(self, x: Float[Array, " n"]) -> Separation:
         """The largest local maxima over a lattice of times, parameters and directions, climbed from until the steps
         vanish."""
-        flat, count = self._flat, self._flat.parameters.count
+        flat, box, times = self._flat, self.index_set, self._flat.times
         values = flat.on_lattice(x)
-        positions = local_maxima(values, flat.lattice[1], CANDIDATES)
-        heights = values[tuple(positions.T)]
-        positions = positions[np.argsort(-heights, kind="stable")][:CANDIDATES]
-        times = vertices(values, positions, flat.times)[0]
-        points = np.hstack([times[:, None], flat.lattice[0][positions[:, 0]], sampled(self._b)[positions[:, 1]]])
-        box = self.index_set
+        held, heights = self._profile(x, values)
+        samples = local_maxima(values, flat.lattice[1], SAMPLED)
+        samples = samples[np.argsort(-values[tuple(samples.T)], kind="stable")][:SAMPLED]
+        others = self._at(vertices(values, samples, times)[0], samples)
         step = np.concatenate(
             [
-                [np.max(np.diff(flat.times), initial=0.0)],
-                (box.upper - box.lower)[1 : 1 + count] / 4,
-                np.full(self._b, 0.1),
+                [np.max(np.diff(times), initial=0.0)],
+                (box.upper - box.lower)[1 : 1 + self.parameters.count] / 4,
+                np.full(self._b, STEP),
             ]
         )
 
-        def project(inside: Array) -> Array:
-            inside = np.clip(inside, box.lower, box.upper)
-            return np.hstack(
-                [inside[:, :1], self.parameters.clamp(inside[:, 1 : 1 + count]), on_surface(inside[:, 1 + count :])]
-            )
+        def climbed(points: Array) -> tuple[Array, Array]:
+            every = np.vstack([points, others])
+            return climb(lambda at, _: self._height(x, at), every, step, self._inside)
 
-        one = np.zeros(points.shape[0], dtype=int)
-        indices, found = climb(lambda at, which: self.violations(x, at, one[which]), points, step, project)
-        order = _distinct(indices, found)[:KEPT]
-        return Separation(indices[order], np.zeros(order.size, dtype=int), found[order])
+        indices, found = ridden(held, heights, flat.pieces, flat.kinks, lambda points: self._turned(x, points), climbed)
+        return Separation(indices, np.zeros(found.size, dtype=int), found)
+
+    @shaped
+    def _profile(
+        self, x: Float[Array, " n"], values: Float[Array, "v r t"]
+    ) -> tuple[Float[Array, "t j"], Float[Array, " t"]]:
+        """The worst index at every sampled time and its violation, at the worst sampled parameter, in a direction that
+        is climbed to from the sampled ones wherever these say that the set may be left. Samples are lower by what lies
+        between directions, which hides where along a wall that is ridden it is left."""
+        places, likely = turns(values.max(axis=0), neighbours(self._b), self.unit)
+        rows, at = places.T
+        heights = values[:, rows, at].max(axis=0)
+        held = self._at(self._flat.times[at], np.stack([values[:, rows, at].argmax(axis=0), rows], axis=1))
+        held[:likely], heights[:likely] = self._turned(x, held[:likely])
+        best = highest_at(at, heights)
+        return held[best], heights[best]
+
+    @shaped
+    def _turned(
+        self, x: Float[Array, " n"], indices: Float[Array, "k j"]
+    ) -> tuple[Float[Array, "k j"], Float[Array, " k"]]:
+        """Indices at the same times and parameters, their directions climbed from, and the violations there."""
+        if not indices.size:
+            return indices, np.zeros(0)
+        indices, first = self._inside(indices), 1 + self.parameters.count
+        times = indices[:, 0]
+        along = self.functionals.turning(x, times, self.parameters.clamp(indices[:, 1:first]))
+        moves = np.zeros((times.size, self.set.dimension)) if self.reference is None else self.reference.at(times)
+
+        def height(z: Array, which: np.ndarray) -> Array:
+            c = unit(self.set, z) / self.unit
+            return np.asarray(along(c, which) - self.set.support(c) - (c * moves[which]).sum(axis=1))
+
+        start = np.full(self._b, STEP)
+        z, found = climb(height, indices[:, first:], start, lambda z: on_surface(np.clip(z, -1.0, 1.0)))
+        return np.hstack([indices[:, :first], z]), found
+
+    @shaped
+    def _at(self, times: Float[Array, " k"], positions: Int[np.ndarray, "k q"]) -> Float[Array, "k j"]:
+        """Indices ``(t, p, z)`` of positions on the lattice, at these times."""
+        return np.hstack([times[:, None], self._flat.lattice[0][positions[:, 0]], sampled(self._b)[positions[:, 1]]])
+
+    @shaped
+    def _height(self, x: Float[Array, " n"], indices: Float[Array, "k j"]) -> Float[Array, " k"]:
+        return self.violations(x, indices, np.zeros(len(indices), dtype=int))
+
+    @shaped
+    def _inside(self, points: Float[Array, "k j"]) -> Float[Array, "k j"]:
+        """The nearest indices to points ``(k, j)``, directions on the surface of their cube."""
+        box, count = self.index_set, self.parameters.count
+        inside = np.clip(points, box.lower, box.upper)
+        return np.hstack(
+            [inside[:, :1], self.parameters.clamp(inside[:, 1 : 1 + count]), on_surface(inside[:, 1 + count :])]
+        )
 
     @property
     @shaped
@@ -287,13 +341,3 @@ class CurvedConstraint(StateConstraint):
             self.parameters,
             reference=self.reference,
         )
-
-
-@shaped
-def _distinct(indices: Float[Array, "k j"], found: Float[Array, " k"]) -> Int[np.ndarray, " u"]:
-    """Positions of different maxima, highest first."""
-    kept: list[int] = []
-    for position in np.argsort(-found, kind="stable"):
-        if all(np.abs(indices[position] - indices[other]).max() > 1e-6 for other in kept):
-            kept.append(int(position))
-    return np.array(kept, dtype=int)

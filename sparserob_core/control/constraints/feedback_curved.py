@@ -14,18 +14,16 @@ from typing import final
 
 import numpy as np
 
-from sparserob_core.control.constraints.curved import CurvedConstraint
+from sparserob_core.control.constraints.curved import STEP, CurvedConstraint
 from sparserob_core.control.constraints.explanation import TimedExplanation
 from sparserob_core.control.constraints.feedback import STATES, FeedbackConstraint, indexed, told
-from sparserob_core.control.constraints.local_maxima import climb, local_maxima
+from sparserob_core.control.constraints.local_maxima import climb, highest_at, ridden, turns
 from sparserob_core.control.feedback.closed_loop import ROUND_OFF, ClosedLoop
-from sparserob_core.control.sets.directions import faces, on_surface, sampled, unit
+from sparserob_core.control.sets.directions import faces, neighbours, on_surface, sampled, unit
 from sparserob_core.sip.convex_set import Array, Box, ConvexSet
 from sparserob_core.sip.finite import UncertainRows
 from sparserob_core.sip.program import ConstraintFamily, Enclosure, Explanation, Separation
 
-CANDIDATES, KEPT = 16, 8  # sampled maxima that are climbed from; separated constraints per round
-NEAR, CLOSE = 12.0, 1e-6  # shares of a window, and of the cube, within which samples are one; found maxima that are one
 BEGUN = 5  # times that a method begins with, in the directions of the axes
 
 
@@ -133,34 +131,50 @@ class Turning(ABC):
             [self.loop.height(c @ self.answers(x, times[first : first + step])) for first in range(0, times.size, step)]
         )
         values = values - reach
-        positions = local_maxima(values.T[None], (1,), CANDIDATES)
-        heights = values[positions[:, 2], positions[:, 1]]
-        every = np.hstack([times[positions[:, 2], None], z[positions[:, 1]]])
-        points = every[
-            _apart(every, heights, np.append(np.ptp(times) / NEAR, np.full(self._b, 2.0 / NEAR)))[:CANDIDATES]
-        ]
-        indices, found = self._climbed(x, points, float(np.max(np.diff(times), initial=0.0)))
-        kept = _apart(indices, found, np.full(1 + self._b, CLOSE))[:KEPT]
-        return Separation(indices[kept], np.zeros(kept.size, dtype=int), found[kept])
+        places, likely = turns(values.T, neighbours(self._b), self.unit)
+        rows, at = places.T
+        heights, held = values[at, rows], np.hstack([times[at, None], z[rows]])
+        held[:likely], heights[:likely] = self._turned(x, held[:likely])
+        best = highest_at(at, heights)
+        held, heights = held[best], heights[best]
+        wide, pieces = float(np.max(np.diff(times), initial=0.0)), np.searchsorted(self.spans[0], times)
+        indices, found = ridden(
+            held,
+            heights,
+            pieces,
+            np.flatnonzero(np.isin(times, np.concatenate(self.spans))),
+            lambda points: self._turned(x, points),
+            lambda points: self._climbed(x, points, wide),
+        )
+        return Separation(indices, np.zeros(found.size, dtype=int), found)
+
+    def _turned(self, x: Array, points: Array) -> tuple[Array, Array]:
+        """Where climbs from points ``(k, 1 + b)`` over directions alone end, and how high."""
+        if not points.size:
+            return points, np.zeros(0)
+        held = np.clip(points[:, :1], self.spans[0][0], self.spans[1][-1])
+        at, step = self.answers(x, held[:, 0]), np.full(self._b, STEP)
+
+        def excess(z: Array, which: np.ndarray) -> Array:
+            c = self.normals(z)
+            size = max(1, STATES // at[0].size)
+            parts = [slice(first, first + size) for first in range(0, which.size, size)]
+            along = [self.loop.height(np.einsum("kd,kdq->kq", c[part], at[which[part]])) for part in parts]
+            return np.asarray(np.concatenate(along) - self.set.support(c))
+
+        z, found = climb(excess, points[:, 1:], step, lambda z: on_surface(np.clip(z, -1.0, 1.0)))
+        return np.hstack([held, z]), found
 
     def _climbed(self, x: Array, points: Array, wide: float) -> tuple[Array, Array]:
         """Where climbs from points ``(k, 1 + b)`` end, and how high; over directions alone at a single time."""
         first, last = self.spans[0][0], self.spans[1][-1]
         if first == last:
-            held = np.full(len(points), first)
-            at = self.answers(x, held[:1])[0]
-
-            def excess(z: Array, _: np.ndarray) -> Array:
-                c = self.normals(z)
-                return np.asarray(self.loop.height(c @ at) - self.set.support(c))
-
-            z, found = climb(excess, points[:, 1:], np.full(self._b, 0.1), lambda z: on_surface(np.clip(z, -1.0, 1.0)))
-            return np.hstack([held[:, None], z]), found
+            return self._turned(x, points)
 
         def project(inside: Array) -> Array:
             return np.hstack([np.clip(inside[:, :1], first, last), on_surface(np.clip(inside[:, 1:], -1.0, 1.0))])
 
-        sizes = np.append(wide, np.full(self._b, 0.1))
+        sizes = np.append(wide, np.full(self._b, STEP))
         return climb(lambda at, _: self.excess(x, at)[:, 0], points, sizes, project)
 
     @property
@@ -315,7 +329,7 @@ class FeedbackCurvedControl(Turning):
             along = np.einsum("kd,kdq->kq", directions, every[which])
             return np.asarray(self.loop.height(along) - self.set.support(directions))
 
-        z, found = climb(excess, start, np.full(self._b, 0.1), lambda at: on_surface(np.clip(at, -1.0, 1.0)))
+        z, found = climb(excess, start, np.full(self._b, STEP), lambda at: on_surface(np.clip(at, -1.0, 1.0)))
         order = np.argsort(-found, kind="stable")
         indices = np.hstack([self.times[order, None], z[order]])
         return Separation(indices, np.zeros(order.size, dtype=int), found[order])
@@ -331,12 +345,3 @@ def of_state(constraint: object, loop: ClosedLoop) -> FeedbackConstraint | Feedb
     if isinstance(constraint, CurvedConstraint):
         return FeedbackCurved(loop, constraint)
     return FeedbackConstraint(constraint, loop)  # type: ignore[arg-type]
-
-
-def _apart(points: Array, heights: Array, sizes: Array) -> np.ndarray:
-    """Positions of the highest of points ``(k, j)``, none of which is within ``sizes (j,)`` of a higher one."""
-    left, kept = np.argsort(-heights, kind="stable"), []
-    while left.size:
-        kept.append(int(left[0]))
-        left = left[(np.abs(points[left] - points[left[0]]) > sizes).any(axis=1)]
-    return np.array(kept, dtype=int)

@@ -11,7 +11,15 @@ from typing import final
 import numpy as np
 
 from sparserob_core.control.constraints.explanation import explanation
-from sparserob_core.control.constraints.local_maxima import TINY, climb, local_maxima, step_out, vertices
+from sparserob_core.control.constraints.local_maxima import (
+    TINY,
+    along_spans,
+    beside_kinks,
+    climb,
+    local_maxima,
+    step_out,
+    vertices,
+)
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.problem.problem import MixedConstraint
@@ -269,7 +277,13 @@ class FlatConstraint(StateConstraint):
     def _worst(self, x: Float[Array, " n"]) -> Separation:
         values = self.on_lattice(x)
         positions = local_maxima(values, self.lattice[1], KEPT)
-        positions = np.concatenate([positions, self._along(values, positions), self._beside(values)])
+        positions = np.concatenate(
+            [
+                positions,
+                along_spans(values, positions, self.pieces, KEPT),
+                beside_kinks(values, self.times, self.kinks, KEPT),
+            ]
+        )
         heights, rows = values[tuple(positions.T)], positions[:, 1]
         indices = np.hstack([self.times[positions[:, 2], None], self.lattice[0][positions[:, 0]]])
         found = heights
@@ -295,48 +309,10 @@ class FlatConstraint(StateConstraint):
             order = order[(rows[order] < self.samples.proven) | (pieces[:, 0] != pieces[:, -1])]
         return Separation(indices[order], rows[order], found[order])
 
-    def _beside(self, values: Array) -> np.ndarray:
-        """Positions ``(k, 3)`` in ``values (v, r, times)`` next to times at which anything turns or jumps, where the
-        violation may rise above 0 before the next samples, at most `KEPT` before and `KEPT` behind such times: a
-        parabola across a kink does not see that, one on either side of it does."""
-        found = [np.zeros((0, 3), dtype=int)]
-        for step in (-1, 1):
-            at = self._kinks[(self._kinks + 2 * step >= 0) & (self._kinks + 2 * step < self.times.size)]
-            near, far = (np.abs(self.times[at + k * step] - self.times[at]) for k in (1, 2))
-            here, next_, last = (values[:, :, at + k * step] for k in (0, 1, 2))
-            rate = (next_ - here) / near
-            bend = ((last - next_) / (far - near) - rate) / far
-            slope = rate - bend * near
-            # The vertex is slope / (-2 bend) away and slope^2 / (-4 bend) higher, of which parabolas may be wrong by 4.
-            rises = (slope > 0.0) & (slope < -2.0 * bend * far) & (slope**2 >= bend * here)
-            v, r, t = rises.nonzero()
-            order = np.argsort(-here[v, r, t], kind="stable")[:KEPT]
-            found.append(np.stack([v[order], r[order], at[t[order]] + step], axis=1))
-        return np.concatenate(found)
-
     @cached_property
-    def _kinks(self) -> np.ndarray:
+    def kinks(self) -> np.ndarray:
         """The sampled times at which anything turns or jumps, and the ends."""
         return np.flatnonzero(np.isin(self.times, np.concatenate([[self.start], self.samples.cuts, [self.stop]])))
-
-    def _along(self, values: Array, maxima: np.ndarray) -> np.ndarray:
-        """Positions ``(k, 3)`` in ``values (v, r, times)`` along spans where a row is violated and none of its ``maxima
-        (j, 3)`` is near: the highest sample of every piece of the control, thinned evenly to `KEPT` a row.
-
-        A state that leaves a wall for good has one maximum, at the end. Imposed there alone, the wall would be left a
-        piece later in the next round, and rounds would grow with its length.
-        """
-        heights = values.max(axis=0)
-        pieces = np.searchsorted(self.functionals.dictionary.breakpoints, self.times)
-        found = [np.zeros((0, 3), dtype=int)]
-        for row, height in enumerate(heights):
-            near = pieces[maxima[maxima[:, 1] == row, 2]]
-            over = np.flatnonzero((height > 0.0) & ~np.isin(pieces, [near - 1, near, near + 1]))
-            over = over[np.lexsort((-height[over], pieces[over]))]
-            over = over[np.unique(pieces[over], return_index=True)[1]]
-            over = over[np.unique(np.linspace(0, over.size - 1, min(KEPT, over.size)).astype(int))]
-            found.append(np.stack([values[:, row, over].argmax(axis=0), np.full(over.size, row), over], axis=1))
-        return np.concatenate(found)
 
     @shaped
     def explain(self, index: Float[Array, " j"], row: int) -> Explanation:
@@ -418,6 +394,11 @@ class FlatConstraint(StateConstraint):
     def times(self) -> Array:
         """`Samples.times`."""
         return self.samples.times
+
+    @cached_property
+    def pieces(self) -> np.ndarray:
+        """The numbers ``(times,)`` of the control's pieces that the sampled times end or are in."""
+        return np.searchsorted(self.functionals.dictionary.breakpoints, self.times)
 
     @property
     def lattice(self) -> tuple[Array, tuple[int, ...]]:

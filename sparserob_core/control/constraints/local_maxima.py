@@ -10,6 +10,18 @@ import numpy as np
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 SMALLEST = 1e-6  # of the first step: a step that is not made smaller any more
+CLIMBED = 16  # maxima along time at which a curved set is left, that are climbed from
+NEARER, LOOKS = 8, 2  # the others are narrowed down to so many times nearer, and so often
+UNSURE = 4.0  # by how much the rise that a parabola predicts may be wrong
+CLOSE = 1e-6  # found maxima that are one, in times and on the cube of directions
+# Indices of a curved set that are found at once, and those told where nothing is violated. With ten times fewer of the
+# first, rounds grow with the length of a wall that is ridden; with ten times more, there are more than help.
+MOST, TOLD = 64, 8
+TURNS = 4  # directions at a time in which a curved set may be left
+# Of them and of times, from how many directions are climbed to. With ten times fewer, a violation beside a wall that is
+# ridden for long is left to the proof, which meets one a round.
+HELD = 2048
+NEAR = 0.02  # of the way out of a set, how near its wall a sample must be to be looked at
 MOVES = 120  # steps at most
 ENOUGH = 0.002  # a step that gains less than this share of the value is followed by a smaller one
 # multiples of the last moves that are tried besides, to follow a ridge (Hooke and Jeeves 1961)
@@ -42,6 +54,133 @@ def local_maxima(values: Array, lattice: tuple[int, ...], kept: int) -> np.ndarr
         mine = positions[:, 1] == row
         best.append(positions[mine][(-heights[mine]).argsort(kind="stable")][:kept])
     return np.concatenate(best)
+
+
+def along_spans(values: Array, maxima: np.ndarray, pieces: np.ndarray, kept: int) -> np.ndarray:
+    """Positions ``(k, 3)`` in ``values (v, r, times)`` along spans where a row is above 0 and none of its ``maxima (j,
+    3)`` is near: the highest sample of every piece of the control, of which ``pieces (times,)`` are the numbers,
+    thinned evenly to ``kept`` a row.
+
+    A state that leaves a wall for good has one maximum, at the end. Imposed there alone, the wall would be left a
+    piece later in the next round, and rounds would grow with its length.
+    """
+    heights = values.max(axis=0)
+    found = [np.zeros((0, 3), dtype=int)]
+    for row, height in enumerate(heights):
+        near = pieces[maxima[maxima[:, 1] == row, 2]]
+        over = np.flatnonzero((height > 0.0) & ~np.isin(pieces, [near - 1, near, near + 1]))
+        over = over[np.lexsort((-height[over], pieces[over]))]
+        over = over[np.unique(pieces[over], return_index=True)[1]]
+        over = over[np.unique(np.linspace(0, over.size - 1, min(kept, over.size)).astype(int))]
+        found.append(np.stack([values[:, row, over].argmax(axis=0), np.full(over.size, row), over], axis=1))
+    return np.concatenate(found)
+
+
+def beside_kinks(values: Array, times: Array, kinks: np.ndarray, kept: int) -> np.ndarray:
+    """Positions ``(k, 3)`` in ``values (v, r, times)`` next to ``kinks``, the places among ``times`` at which anything
+    turns or jumps, where the violation may rise above 0 before the next samples, at most ``kept`` before and ``kept``
+    behind such times: a parabola across a kink does not see that, one on either side of it does."""
+    found = [np.zeros((0, 3), dtype=int)]
+    for step in (-1, 1):
+        at = kinks[(kinks + 2 * step >= 0) & (kinks + 2 * step < times.size)]
+        near, far = (np.abs(times[at + k * step] - times[at]) for k in (1, 2))
+        here, next_, last = (values[:, :, at + k * step] for k in (0, 1, 2))
+        rate = (next_ - here) / near
+        bend = ((last - next_) / (far - near) - rate) / far
+        slope = rate - bend * near
+        # The vertex is slope / (-2 bend) away and slope^2 / (-4 bend) higher, of which parabolas may be wrong by 4.
+        rises = (slope > 0.0) & (slope < -2.0 * bend * far) & (slope**2 >= bend * here)
+        v, r, t = rises.nonzero()
+        order = np.argsort(-here[v, r, t], kind="stable")[:kept]
+        found.append(np.stack([v[order], r[order], at[t[order]] + step], axis=1))
+    return np.concatenate(found)
+
+
+def turns(heights: Array, beside: np.ndarray, unit: float) -> tuple[np.ndarray, int]:
+    """Positions ``(k, 2)`` in ``heights (r, times)`` of local maxima over directions, at most `TURNS` at a time, and
+    how many of them, the first ones, may be above 0 between the sampled directions; ``beside (r, j)``: the numbers of
+    the directions that are neighbours of each.
+
+    The worst case of a disturbance that has corners has several maxima: what lies between sampled directions may make
+    any of them the largest.
+    """
+    around = heights[beside]
+    peak = heights >= around.max(axis=1)
+    promise = np.where(peak, 2.0 * heights - around.min(axis=1), -np.inf)
+    order = np.argsort(-np.where(peak, heights, -np.inf), axis=0, kind="stable")[:TURNS]
+    rows, times = order.ravel(), np.tile(np.arange(heights.shape[1]), len(order))
+    promised = promise[rows, times]
+    first = np.argsort(-promised, kind="stable")
+    first = first[: int(peak[rows, times].sum())]
+    likely = int((promised[first] * unit > -NEAR).sum())
+    return np.stack([rows[first], times[first]], axis=1), min(HELD, max(TOLD, likely))
+
+
+def highest_at(times: np.ndarray, heights: Array) -> np.ndarray:
+    """Of candidates at the places ``times (k,)`` the position of the highest at every place, in the order of places."""
+    order = np.lexsort((-heights, times))
+    return order[np.unique(times[order], return_index=True)[1]]
+
+
+def ridden(
+    held: Array,
+    heights: Array,
+    pieces: np.ndarray,
+    kinks: np.ndarray,
+    turned: Callable[[Array], tuple[Array, Array]],
+    climbed: Callable[[Array], tuple[Array, Array]],
+) -> tuple[Array, Array]:
+    """Where a curved set is left, along time: indices ``(k, j)``, the first coordinate of which is the time, and the
+    violations there ``(k,)``, worst first.
+
+    ``held (n, j)``: the worst index at every sampled time, with its ``heights (n,)`` and the numbers of the ``pieces
+    (n,)`` of the control; ``kinks``: the places among them at which anything turns. The largest maxima along time are
+    ``climbed`` from; the others that may be violations are ``turned``, which leaves their times alone; and where there
+    is no maximum near, one sample a piece is taken.
+    """
+    line, times = heights[None, None], held[:, 0]
+    peaks = local_maxima(line, (1,), MOST)
+    peaks = np.unique(np.vstack([peaks, beside_kinks(line, times, kinks, MOST)]), axis=0)
+    moved, promised = vertices(line, peaks, times)
+    promised = line[0, 0, peaks[:, 2]] + UNSURE * (promised - line[0, 0, peaks[:, 2]])
+    spans = along_spans(line, peaks, pieces, MOST)[:, 2]
+    points = held[peaks[:, 2]]
+    points[:, 0] = moved
+    order = np.argsort(-promised, kind="stable")
+    first, others = order[:CLIMBED], order[CLIMBED:]
+    others = others[promised[others] > 0.0]
+    known = np.concatenate([peaks[:, 2], spans])  # at a kink a parabola is no guide
+    nearer = _narrowed(points[others], float(np.diff(times).max(initial=0.0)), turned)
+    parts = [climbed(points[first]), nearer, (held[known], heights[known])]
+    indices, found = np.vstack([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
+    order = _distinct(indices, found)
+    order = order[(found[order] > 0.0) | (np.arange(order.size) < TOLD)][:MOST]
+    return indices[order], found[order]
+
+
+def _narrowed(points: Array, spacing: float, turned: Callable[[Array], tuple[Array, Array]]) -> tuple[Array, Array]:
+    """Points ``(k, j)`` moved along time to the vertices of parabolas through nearer and nearer ones, ``turned``."""
+    if not points.size:
+        return points, np.zeros(0)
+    width = spacing / NEARER
+    for _ in range(LOOKS):
+        around = points.repeat(3, axis=0)
+        around[:, 0] += np.tile(width * np.array([-1.0, 0.0, 1.0]), len(points))
+        before, now, after = turned(around)[1].reshape(-1, 3).T
+        slope, bend = (after - before) / 2, 2 * now - before - after
+        share = slope / np.where(np.abs(slope) < bend, bend, np.maximum(np.abs(slope), TINY))
+        points[:, 0] += width * share
+        width /= NEARER
+    return turned(points)
+
+
+def _distinct(indices: Array, found: Array) -> np.ndarray:
+    """Positions of different maxima, highest first."""
+    left, kept = np.argsort(-found, kind="stable"), []
+    while left.size:
+        kept.append(int(left[0]))
+        left = left[(np.abs(indices[left] - indices[left[0]]) > CLOSE).any(axis=1)]
+    return np.array(kept, dtype=int)
 
 
 def vertices(values: Array, positions: np.ndarray, times: Array) -> tuple[Array, Array]:

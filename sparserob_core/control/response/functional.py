@@ -216,6 +216,35 @@ class WorstCase:
             result[part] = known.free @ self.response.initial_state + driven + support
         return result
 
+    def turning(self, theta: Array, times: Array, parameters: Array) -> Callable[[Array, np.ndarray], Array]:
+        """``max_w c'x(t)`` at a decision as a function of the direction alone, at ``times (k,)`` and ``parameters (k,
+        nu)``: of directions ``(j, d)`` and the places ``(j,)`` that they are at, ``(j,)``. Weights are linear in the
+        direction, so that those of the axes are computed once."""
+        d, control = self.response.initial_state.size, self.on_grid(theta)
+        axes = np.tile(np.eye(d), (times.size, 1))
+        every = [np.repeat(one, d, axis=0) for one in (times, parameters)]
+        parts = [self.response.weights(every[0][part], axes[part], every[1][part]) for part in self._chunks(every[1])]
+        free = np.concatenate([part.free for part in parts])
+        driven = np.concatenate([np.einsum("klm,ml->k", part.control, control) for part in parts])
+        states = (free @ self.response.initial_state + driven).reshape(-1, d)
+        disturbed = np.concatenate([part.disturbance for part in parts])
+        known = [one.reshape(times.size, d, *one.shape[1:]) for one in (free, disturbed)]
+
+        def along(directions: Array, which: np.ndarray) -> Array:
+            found = (directions * states[which]).sum(axis=1)
+            size = max(1, CHUNK // max(1, known[1][:1].size))
+            for part in (slice(first, first + size) for first in range(0, which.size if self.disturbed else 0, size)):
+                at, c = which[part], directions[part]
+                weights = Weights(
+                    np.einsum("kd,kde->ke", c, known[0][at]),
+                    np.zeros((at.size, 0, 0)),
+                    np.einsum("kd,kdlq->klq", c, known[1][at]),
+                )
+                found[part] += self._support(weights, times[at], c, parameters[at])
+            return np.asarray(found)
+
+        return along
+
     @shaped
     def profile(
         self, times: Float[Array, " k"], directions: Float[Array, "r d"], parameter: Float[Array, " nu"]

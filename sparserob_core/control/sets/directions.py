@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -66,6 +67,19 @@ def sampled(dimension: int) -> Float[Array, "k b"]:
         )
     ]
     return np.unique(np.array(every), axis=0)
+
+
+@cache
+def neighbours(dimension: int) -> np.ndarray:
+    """For every one of the `sampled` directions the numbers of those beside it ``(k, j)``; its own number where it has
+    fewer than others."""
+    points = sampled(dimension)
+    spacing = 2.0 / max(1, PER_EDGE.get(dimension, 3) - 1)
+    rows = [np.flatnonzero(np.abs(points - point).max(axis=1) <= 1.01 * spacing) for point in points]
+    found = np.tile(np.arange(len(rows))[:, None], max(row.size for row in rows))
+    for number, row in enumerate(rows):
+        found[number, : row.size] = row
+    return found
 
 
 @shaped

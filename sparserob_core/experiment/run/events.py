@@ -71,11 +71,13 @@ class RunFinished(Event):
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StudyProgress(Event):
     """A study of many programs or trajectories goes on (a margin, a set of initial states, a simulation): in words, and
-    as ``done`` of ``total`` steps (0: unknown)."""
+    as ``done`` of ``total`` steps (0: unknown). ``phase``: a run goes on with what comes after its method, which the
+    words name up to a colon."""
 
     text: str
     done: int = 0
     total: int = 0
+    phase: bool = False
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -21,7 +21,7 @@ from sparserob_core.experiment.directory.artefacts import RunDirectory, trace_co
 from sparserob_core.experiment.directory.certificate import certificate
 from sparserob_core.experiment.directory.record import arrays_of, control_of, summary_of, versions
 from sparserob_core.experiment.directory.rounds import round_arrays
-from sparserob_core.experiment.run.events import EvaluationsFinished, Event, Observer, RoundFinished
+from sparserob_core.experiment.run.events import EvaluationsFinished, Event, Observer, RoundFinished, StudyProgress
 from sparserob_core.sip.convex_set import Array
 from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.result import Result
@@ -136,6 +136,7 @@ class Journal(Observer):
         kept = round_arrays(rounds)
         if kept:
             write.write_arrays("rounds.npz", kept)
+        notify(StudyProgress(text="certificate: written down", phase=True))
         proof = certificate(experiment, result)
         if proof is not None and certify:
             write.write_json("certificate.json", proof)
@@ -147,6 +148,7 @@ class Journal(Observer):
                 summary,
                 ("no figures: the run was stopped; sparserob figures draws them",) if figures else (),
             )
+        notify(StudyProgress(text="figures: the worst cases, and what there is to draw", phase=True))
         worst = adversaries(experiment, np.asarray(result.decision)) if control is not None else {}
         if worst:
             write.write_arrays(ADVERSARY, worst)

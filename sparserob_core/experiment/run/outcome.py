@@ -31,10 +31,12 @@ from sparserob_core.experiment.plugins.registry import load_registry
 from sparserob_core.experiment.run.conclusion.bound import bounded
 from sparserob_core.experiment.run.conclusion.causal import with_causal
 from sparserob_core.experiment.run.conclusion.fewest import with_activity
+from sparserob_core.experiment.run.events import StudyProgress
 from sparserob_core.experiment.run.inspection import Inspection
 from sparserob_core.experiment.run.journal import Journal
 from sparserob_core.experiment.terminal.table import result_rows
 from sparserob_core.sip.convex_set import Array
+from sparserob_core.sip.events import Notify, ignore
 from sparserob_core.sip.method import Tools
 from sparserob_core.sip.program import SemiInfiniteProgram
 from sparserob_core.sip.result import Result
@@ -171,13 +173,16 @@ class SolvedProblem(ControlResult):
         return _reread, (self.plain, *given, self.causal, self.origin)
 
 
-def concluded(experiment: Experiment, result: Result, tools: Tools) -> Result:
+def concluded(experiment: Experiment, result: Result, tools: Tools, notify: Notify = ignore) -> Result:
     """What a run makes of the result of a method before it is written down: bounds that are proven without rounding,
-    what is known of the time of action, and of causal policies."""
+    what is known of the time of action, and of causal policies. ``notify`` receives `StudyProgress`, one a phase."""
     if not isinstance(experiment, ControlExperiment):
         return result
+    notify(StudyProgress(text="certificate: what the multipliers prove without rounding", phase=True))
     known = bounded(experiment, result) if result.sparsest is None else result
+    notify(StudyProgress(text="fewest active: how little any admissible control must act", phase=True))
     known = with_activity(experiment, known, tools)
+    notify(StudyProgress(text="causal bound: what no causal policy can do", phase=True))
     concluding = with_causal(SolvedProblem.run(known, experiment), tools)
     concluding.__dict__["experiment"] = experiment
     return concluding

@@ -122,7 +122,7 @@ def _run(
                 result, complete = journal.known(_said(pressed), time.perf_counter() - started), False
                 if result is None:
                     raise
-            result = concluded(experiment, result, tools)
+            result = concluded(experiment, result, tools, broadcast)
             ending = RunFinished(
                 status=result.status,
                 message=result.message,

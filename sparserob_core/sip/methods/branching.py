@@ -214,9 +214,11 @@ def unrelaxed_of(program: FiniteProgram) -> tuple[Array, Array, Array | None]:
     return y, mu, z
 
 
-def proposed(program: SemiInfiniteProgram, relaxed: RelaxedProgram, rows: Rows, letters: Array | None) -> Array | None:
-    """What HiGHS takes for the decision ``(n,)`` of which the fewest entries count among those that meet the ``rows``;
-    ``None`` where it finds none in time. Nothing is believed of it."""
+def proposed(
+    program: SemiInfiniteProgram, relaxed: RelaxedProgram, rows: Rows, letters: Array | None, gap: float = 0.0
+) -> Array | None:
+    """What HiGHS takes for the decision ``(n,)`` of which the fewest entries count among those that meet the ``rows``,
+    up to a relative ``gap``; ``None`` where it finds none in time. Nothing is believed of it."""
     from scipy.optimize import Bounds, LinearConstraint, milp
     from scipy.sparse import csr_array, eye_array, hstack
 
@@ -238,7 +240,7 @@ def proposed(program: SemiInfiniteProgram, relaxed: RelaxedProgram, rows: Rows, 
             constraints=couplings,
             integrality=np.concatenate([np.zeros(n), np.ones(count)]),
             bounds=Bounds(np.repeat([-np.inf, 0.0], [n, count]), np.repeat([np.inf, 1.0], [n, count])),
-            options={"time_limit": SECONDS if left is None else min(SECONDS, left)},
+            options={"time_limit": SECONDS if left is None else min(SECONDS, left), "mip_rel_gap": gap},
         )
     return None if found.x is None else np.asarray(found.x[:n])
 

@@ -255,16 +255,16 @@ def _exchange(working: Robust, ledger: Ledger, prover: Prover, rounds: int) -> R
         if not last and (imposed or _advanced(working, ledger, x, violated, feasible, worst_of(told).violation)):
             continue
 
-        # Choose: of the decisions that cost as little, the one that the program likes best, where that is proven.
-        chosen = _chosen(working, ledger, answer, prover) if feasible and not ledger.open(x) else None
-        if chosen is not None:
-            return chosen
-
         # Prove: over the whole continuum; a witness that the proof meets is one more index to impose.
         proofs, imposed = proofs_of(working, ledger, prover, answer, told)
         if not last and not tools.deadline.passed and (imposed or _learned(working, x, proofs)):
             working.best = np.zeros(0)
             continue
+
+        # Choose: of the decisions that cost as little, the one that the program likes best, where that is proven.
+        chosen = _chosen(working, ledger, answer, prover) if feasible and not ledger.open(x) else None
+        if chosen is not None:
+            return chosen
         ending = f"the {rounds} rounds of the method are used up" if last else ""
         ending = tools.deadline.reason if tools.deadline.passed else ending
         return or_proven(ledger, ledger.judged(answer, worst_of(told), proofs, ending))
@@ -284,7 +284,8 @@ def _chosen(working: Robust, ledger: Ledger, answer: Answer, prover: Prover) -> 
     counterpart = Counterpart(second.finite, program.spread, ceiling=(weights, most), asked=working.asked)
     easier = Robust(second, counterpart, margin=working.margin, asked=working.asked)
     for family in second.families:
-        known = [cut.index for cut in working.cuts if cut.family == family.name and not cut.row]
+        held = {cut.index.tobytes(): cut.index for cut in answer.active if cut.family == family.name}
+        known = list(held.values())
         start = np.zeros((0, family.index_set.dimension)) if family.start is None else family.start
         easier.add(family, np.array(known) if known else start)
     for number in range(1, GUIDED + 1):

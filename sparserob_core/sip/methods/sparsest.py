@@ -25,7 +25,7 @@ from sparserob_core.sip.method import GAP_TOLERANCE, Method, Tools
 from sparserob_core.sip.methods.branching import Branching, proposed
 from sparserob_core.sip.methods.counting import DUST, count, counted_below, prices_of
 from sparserob_core.sip.methods.exchange import Exchange
-from sparserob_core.sip.methods.ledger import unproven
+from sparserob_core.sip.methods.ledger import PAID, unproven
 from sparserob_core.sip.methods.reweighted import imposed_cuts, on_support
 from sparserob_core.sip.program import TOLERANCE, SemiInfiniteProgram
 from sparserob_core.sip.proof.branch_and_bound import prove
@@ -37,6 +37,9 @@ from sparserob_core.sip.separation.separation import separate
 PROVEN = ("certified", "verified")
 PROPOSALS = 40  # of the mixed-integer solver
 SECONDS = 20.0  # that one of its programs may take
+# Relative gap of a proposal while none is proven. With a tenth of it a limit of seconds is over before the first one;
+# with ten times as much it is no different: any decision is closer to the least.
+ANY = 1.0
 SAME = 1e-6  # relative difference of two counts that is none
 
 
@@ -141,6 +144,8 @@ class _Search:
     rounds: list[RoundFinished] = field(default_factory=list)
     tree: Branching | None = None
     tried: set[bytes] = field(default_factory=set)
+    missed: float = 0.0
+    """By how much the last decision of letters missed constraints that were not yet imposed, in their norms."""
 
     def __post_init__(self) -> None:
         self.relaxed = RelaxedProgram(self.bounded, self.tools.solver, None, deadline=self.tools.deadline)
@@ -234,7 +239,12 @@ class _Search:
             pairs = zip(separation.indices[above], separation.rows[above], strict=True)
             fresh += [Cut(family.name, index, int(row), formulation=family.formulation) for index, row in pairs]
         if fresh:
-            return self._keep(fresh)
+            known = self.rows.h.size
+            new = self._keep(fresh)
+            G, h = self.rows.G[known:], self.rows.h[known:]
+            norms = np.maximum(np.linalg.norm(G, axis=1), np.finfo(float).tiny)
+            self.missed = float(((G @ x - h) / norms).max(initial=0.0))
+            return new
         if program.finite.residual(x) > TOLERANCE or program.finite.missed(x) > TOLERANCE:
             return False
         proofs = prove(program, x, tools.notify, deadline=tools.deadline)
@@ -279,14 +289,23 @@ class _Search:
         self.tools.notify(self.told)
 
     def propose(self) -> None:
-        """Ask the mixed-integer solver for decisions that count less than the best, until it has none."""
+        """Ask the mixed-integer solver for decisions that count less than the best, until it has none. While none is
+        proven, any will do that keeps away from the constraints by more than the last one missed them."""
+        margin, most = 0.0, np.inf
         for _ in range(PROPOSALS):
             self.tools.deadline.check()
             if self.closed:
                 return
-            x = proposed(self.bounded, self.relaxed, self.rows, self.letters)
+            crude = self.letters is not None and self.best is None
+            norms = np.linalg.norm(self.rows.G, axis=1)
+            rows = replace(self.rows, h=self.rows.h - margin * norms) if crude else self.rows
+            x = proposed(self.bounded, self.relaxed, rows, self.letters, ANY if crude else 0.0)
+            if x is None and crude and margin > 0.0:
+                margin, most = 0.0, 0.0  # nothing is that far from the constraints
+                continue
             if x is None or not self.look(x):
                 return
+            margin = min(PAID * self.missed, most)
 
     def branch(self) -> None:
         """Close what is left by branch and bound."""

@@ -93,6 +93,20 @@ class Course:
     told: float = field(default_factory=time.perf_counter)
     examined: int = 0
     fall: deque[tuple[float, float]] = field(default_factory=deque)
+    along: str = ""
+    """Where along the first coordinate, the time of a path constraint, cells are open: the wall that is ridden."""
+
+    def opened(self, lower: Array, upper: Array) -> None:
+        """Note the open cells ``(k, d)``: how much of the first coordinate they cover, and from where to where."""
+        unit = 1.0 if self.family.index_units is None else float(self.family.index_units[0])
+        ends, box = unit * np.stack([lower[:, 0], upper[:, 0]]), self.family.index_set
+        whole = unit * float(box.upper[0] - box.lower[0]) if box.dimension else 0.0
+        if whole <= 0.0 or not np.isfinite(whole):
+            return
+        first = np.argsort(ends[0], kind="stable")
+        starts, reached = ends[0, first], np.maximum.accumulate(ends[1, first])
+        covered = float(np.maximum(reached - np.maximum(starts, np.append(starts[0], reached[:-1])), 0.0).sum())
+        self.along = f"open along {covered:.3g} of {whole:.3g}, from {starts[0]:.5g} to {reached[-1]:.5g}"
 
     def tell(self, cells: int, bound: float, lower: Array, upper: Array, pending: int = 0) -> None:
         """Tell that ``cells`` are open, of which the worst, from ``lower (d,)`` to ``upper (d,)``, has this bound;
@@ -127,6 +141,7 @@ class Course:
         lower, upper = (lower, upper) if known is None or known.size != lower.size else (lower * known, upper * known)
         allowed = bound * (1.0 if self.family.row_units is None else float(self.family.row_units.max()))
         cell = f"the cell from {_shown(lower)} to {_shown(upper)} still allows {allowed:.1e}"
+        cell = f"{self.along}; {cell}" if self.along else cell
         return f"{self.family.name}: {cell}; {advice or ADVICE}"
 
 
@@ -163,6 +178,7 @@ def _branch_and_bound(family: ConstraintFamily, x: Array, course: Course) -> Pro
 
         # Cut what is open, as long as cells, their width and time allow: once towards the peaks, then into halves.
         worst, at = float(bounds.max()), int(bounds.argmax())
+        course.opened(lower[open_], upper[open_])
         course.tell(int(open_.sum()), worst, lower[at], upper[at])
         low, high = lower[open_], upper[open_]
         parts = None if bend is None else _towards(peaks, low, high, bounds[open_], bend[open_])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.sip.method import Deadline
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, Enclosure, Separation
 from sparserob_core.sip.proof import branch_and_bound
 from sparserob_core.sip.proof.branch_and_bound import Course, _at_rest, _halved, _towards, prove_family
@@ -40,6 +41,26 @@ def test_what_is_left_open_is_told_by_the_worst_cell():
     assert "2 of 3 cells" in found.reason and "from [4.] to [6.]" in found.reason and "3.0e+00" in found.reason
     assert [(one.cells, one.bound, one.examined, one.budget) for one in told] == [(2, 3.0, 3, 4)]
     assert np.isnan(told[0].bound_before)
+
+
+@pytest.mark.parametrize(
+    ("open_", "said"),
+    [
+        ([(1, 2), (2, 4), (3, 3.5), (6, 7)], "open along 4 of 8, from 1 to 7"),
+        ([(0, 8)], "open along 8 of 8, from 0 to 8"),
+        ([(5, 5)], "open along 0 of 8, from 5 to 5"),
+    ],
+)
+def test_what_is_left_open_is_told_by_how_long_the_wall_is_ridden(open_, said):
+    course = Course(family(lambda a, b: a), lambda event: None, 10, Deadline())
+    lower, upper = (np.array(ends, dtype=float)[:, None] for ends in zip(*open_[::-1], strict=True))
+    course.opened(lower, upper)
+    assert course.along == said
+
+
+def test_how_long_a_wall_is_ridden_is_said_in_the_unit_of_the_user():
+    made = family(lambda a, b: np.where(a < 4.0, 3.0, -1.0), cells=cells(0, 4, 8), index_units=np.array([2.0]))
+    assert "open along 8 of 16, from 0 to 8" in prove_family(made, np.zeros(1), cells=1).reason
 
 
 def test_a_proof_is_as_good_as_its_worst_closed_cell():
