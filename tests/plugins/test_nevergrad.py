@@ -152,7 +152,15 @@ def test_the_generator_alone_decides_the_search_and_the_global_random_numbers_ar
     assert first.tolist() != search(optimiser="CMA", seed=1).trace.points.tolist()
 
 
-def test_a_number_of_a_normal_pair_that_waits_is_there_after_every_step_whoever_draws_between_them():
+@pytest.mark.parametrize("in_memory", [True, False])
+def test_a_number_of_a_normal_pair_that_waits_is_there_after_every_step_whoever_draws_between_them(
+    in_memory, monkeypatch
+):
+    from sparserob_nevergrad import guarded as module
+
+    assert module._place() or sys.implementation.name != "cpython"
+    if not in_memory:  # as where it is not known where the state lies
+        monkeypatch.setattr(module, "_place", lambda: 0)
     """One draw, none, or two between two steps: the next ones are those of a generator that nobody exchanged."""
     guarded = Guarded(None, 1, 1, np.random.default_rng(0))
     draws = (1, 0, 1, 2, 0, 0, 3, 1, 0, 1, 0, 624, 624, 1)
