@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from threadpoolctl import threadpool_limits
 
 import sparserob_core as sr
 from tests.support.places import CONFIGS
@@ -36,19 +37,18 @@ SEARCH = {
 
 
 class Timed(sr.Observer):
-    """Another observer, and how many seconds the solver waits for it."""
+    """Another observer: its processor time in the solver's thread, and how many seconds the end takes by the clock."""
 
     def __init__(self, observer: sr.Observer) -> None:
         self.observer, self.seconds, self.events, self.closing = observer, 0.0, 0, 0.0
 
     def receive(self, event: sr.Event) -> None:
-        started = time.perf_counter()
+        started, clock = time.thread_time(), time.perf_counter()
         self.observer.receive(event)
-        spent = time.perf_counter() - started
-        self.seconds += spent
+        self.seconds += time.thread_time() - started
         self.events += 1
         if isinstance(event, sr.RunFinished):
-            self.closing = spent
+            self.closing = time.perf_counter() - clock
 
     def close(self) -> None:
         self.observer.close()
@@ -56,17 +56,19 @@ class Timed(sr.Observer):
 
 @dataclass(frozen=True)
 class Measured:
-    """Seconds by the clock, seconds of work in threads beside the solver's, and the outcome."""
+    """Seconds by the clock, of the solver's thread and of those beside it, and the outcome."""
 
     wall: float
+    own: float
     beside: float
     outcome: sr.Outcome
 
 
 @contextmanager
 def peak_of_children() -> Iterator[list[float]]:
-    """The most memory, in MB, that the processes of this one held of their own at any time."""
-    peak, over = [0.0], threading.Event()
+    """The most memory, in MB, that the processes of this one held of their own at any time; and the processor time that
+    the looking took so far."""
+    peak, over = [0.0, 0.0], threading.Event()
 
     def look() -> None:
         while not over.wait(3.0):
@@ -75,6 +77,7 @@ def peak_of_children() -> Iterator[list[float]]:
                     peak[0] = max(peak[0], psutil.Process(child.pid).memory_full_info().uss / 1e6)
                 except psutil.Error:
                     continue
+            peak[1] = time.thread_time()
 
     watcher = threading.Thread(target=look, daemon=True)
     watcher.start()
@@ -83,33 +86,35 @@ def peak_of_children() -> Iterator[list[float]]:
     watcher.join()
 
 
-def measured(directory: Path, *observers: sr.Observer) -> Measured:
-    wall, work, own = time.perf_counter(), time.process_time(), time.thread_time()
+def measured(directory: Path, looking: list[float], *observers: sr.Observer) -> Measured:
+    wall, work, own, looked = time.perf_counter(), time.process_time(), time.thread_time(), looking[1]
     outcome = sr.run(CONFIG, SEARCH, directory, quiet=True, figures=False, observers=observers)
-    beside = time.process_time() - work - (time.thread_time() - own)
-    return Measured(time.perf_counter() - wall, beside, outcome)
+    own = time.thread_time() - own
+    beside = time.process_time() - work - own - (looking[1] - looked)
+    return Measured(time.perf_counter() - wall, own, max(0.0, beside), outcome)
 
 
 @pytest.mark.benchmark
 def test_a_recording_costs_a_run_of_ten_thousand_evaluations_less_than_two_per_cent_and_200_megabytes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Two measures: the seconds that the solver waits for the recording, with the work of the threads beside it, and
-    the difference by the clock, which on a busy machine says as much about its other users; of that no more is asked
-    than that it hides among theirs.
+    """The processor time that the recording takes in the process of the run, in the solver's thread and beside it, as a
+    share of the solver's own. By the clock the end is added, which takes as long whatever the run; the difference of
+    two runs by the clock says as much about the other users of the machine, and no more is asked of it than that it
+    hides among theirs.
     """
     plain: list[Measured] = []
     recorded: list[tuple[Measured, Timed]] = []
-    with peak_of_children() as peak:
+    with peak_of_children() as peak, threadpool_limits(limits=1):
         for turn in range(TURNS):
-            plain.append(measured(tmp_path / f"plain{turn}"))
+            plain.append(measured(tmp_path / f"plain{turn}", peak))
             timed = Timed(sr.load_registry().build("observer", "rerun"))
-            recorded.append((measured(tmp_path / f"recorded{turn}", timed), timed))
+            recorded.append((measured(tmp_path / f"recorded{turn}", peak, timed), timed))
             traces = [one.outcome.result.trace for one in (plain[-1], recorded[-1][0])]
             assert traces[0] is not None and traces[1] is not None and traces[0].value.size >= EVALUATIONS
             assert (traces[0].value == traces[1].value).all()
-    fastest = min(one.wall for one in plain)
-    direct = min(timed.seconds + one.beside for one, timed in recorded) / fastest
+    own, fastest = min(one.own for one in plain), min(one.wall for one in plain)
+    share = min(timed.seconds + one.beside for one, timed in recorded) / own
     clock = min(one.wall for one, _ in recorded) / fastest - 1.0
     noise = max(one.wall for one in plain) / fastest - 1.0
     with capsys.disabled():
@@ -119,10 +124,10 @@ def test_a_recording_costs_a_run_of_ten_thousand_evaluations_less_than_two_per_c
         )
         for one, timed in recorded:
             print(
-                f"the solver waits {timed.seconds:.2f} s for {timed.events} events, {timed.closing:.2f} s of them at"
-                f" the end; other threads work {one.beside:.2f} s"
+                f"processor time: {timed.seconds:.3f} s of the solver's thread for {timed.events} events,"
+                f" {one.beside:.3f} s beside it, of {own:.2f} s; the end takes {timed.closing:.2f} s by the clock"
             )
-        print(f"in all {100 * direct:.2f} %; {peak[0]:.0f} MB in the process that records")
-    assert direct < 0.02
+        print(f"in all {100 * share:.2f} %; {peak[0]:.0f} MB in the process that records")
+    assert share < 0.02
     assert clock < 0.02 + noise
     assert 0.0 < peak[0] < 200.0

@@ -39,7 +39,7 @@ SMALL = {
 @pytest.mark.parametrize("config", ["experiment1_literal.yaml", "experiment1_reduced.yaml"])
 def test_every_evaluated_tuple_says_which_indices_have_the_largest_multipliers(config: str) -> None:
     from sparserob_rerun.recording.outlet import joined
-    from sparserob_rerun.search.projection import Projector
+    from sparserob_rerun.search.projection import Projector, thin
 
     heard = Heard()
     sr.run(CONFIGS / config, SMALL, None, quiet=True, figures=False, observers=[heard])
@@ -53,8 +53,9 @@ def test_every_evaluated_tuple_says_which_indices_have_the_largest_multipliers(c
             assert event.deciding[row].tolist() == g.deciding().tolist()
             tuples.append(slots)
         assert np.abs(event.batch.trace.values - values[-event.count :]).max() < 1e-7
-    small, whole = Projector().small(joined(heard.events))
-    assert small.batch.trace.points.size == 0 and small.batch.trace.values.size == small.count == 80
+    small = thin(joined(heard.events))
+    whole = Projector().of(small)
+    assert small.batch.trace.points.shape == (80, 5) and small.batch.trace.values.size == small.count == 80
     assert whole.places.shape == (80, 2, 1) and whole.coordinates == (0,)
     rows = np.arange(80)
     assert (whole.places[:, 0, 0] == np.array(tuples)[rows, whole.slots[:, 0], 0]).all()
@@ -79,7 +80,7 @@ def batch_of(points: np.ndarray, deciding: list[list[int]], **more: object) -> s
 
 
 def test_cells_are_drawn_over_the_indices_that_decide_in_their_middle_and_walks_keep_the_earlier_one_across() -> None:
-    from sparserob_rerun.search.projection import Projector, outlines_on
+    from sparserob_rerun.search.projection import Projector, outlines_on, thin
 
     points = np.array([[0.1, 0, 0.5, 0, 0.9, 0], [0.3, 1, 0.5, 1, 0.2, 1], [0.4, 0, 0.8, 1, 0.2, 0]])
     deciding = [[2, 0, -1, -1], [1, -1, -1, -1], [0, 2, 1, -1]]
@@ -87,7 +88,7 @@ def test_cells_are_drawn_over_the_indices_that_decide_in_their_middle_and_walks_
     cells = sr.Sketch(points[[0, 2]] - half, points[[0, 2]] + half)
     stranger = sr.Sketch(*(np.full((1, 6), 0.77),) * 2)
     event = batch_of(points, deciding, sketches={"cells": cells, "stranger": stranger})
-    _, projection = Projector().small(event)
+    projection = Projector().of(thin(event))
     # the second tuple has one that decides; the other one is of the pair before
     assert projection.slots.tolist() == [[2, 0], [1, 2], [0, 2]]
     assert projection.places[:, :, 0].tolist() == [[0.9, 0.1], [0.5, 0.2], [0.4, 0.2]]
@@ -144,7 +145,7 @@ def test_in_a_narrow_panel_of_the_climb_what_is_proven_far_below_is_said_below_i
     below = sorted((at[1], at[0], words) for at, words, _ in drawn[0].labels if at[1] > climb.HEIGHT)
     assert [words for *_, words in below if "proven" in words] == ["proven ≥ -50"] * climb.MOST
     assert below[-1][2] == "2 earlier searches are not shown" and below[-1][0] < climb.EXTENT[3]
-    assert np.unique(np.diff([y for y, *_ in below])).tolist() == [0.0, 30.0, 32.0]  # three lines, none on another
+    assert np.unique(np.diff([y for y, *_ in below])).tolist() == [0.0, climb.LINE]  # three lines, none on another
 
 
 def test_words_are_bright_and_lines_of_plots_legible_on_a_dark_and_on_a_light_ground() -> None:

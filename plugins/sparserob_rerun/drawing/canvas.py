@@ -15,7 +15,7 @@ import numpy as np
 from sparserob_rerun.drawing.palette import FAINT, GREY, GROUND, INK, Colour, Floats, worded
 
 HATCHES = 60
-LOW = 150.0  # a plot that is lower has fewer ticks
+LINE = 34.0  # units between two numbers on an axis upwards: a line of words is 26 high, and the lowest is lifted
 LETTER = 5.0  # half the width of a letter, in units of a drawing that is a little smaller than its panel
 LIFT = 9.0  # the viewer writes labels this far below their points
 
@@ -84,23 +84,23 @@ class Drawing:
         which is more in a panel that is small."""
         left, top, right, bottom = axes.left, axes.top, axes.left + axes.width, axes.top + axes.height
         self.line("frame", np.array([[left, top], [left, bottom], [right, bottom]]), GREY, 1.0)
-        few = ticks(*axes.y, 3) if axes.height < LOW else np.zeros(0)
-        for value in few if few.size > 1 else ticks(*axes.y):
+        for value in _apart(axes, room * LINE, decades):
             y = float(axes.at(axes.x[0], value)[0, 1])
             self.line("frame", np.array([[left - 5, y], [left, y]]), GREY, 1.0)
             words = f"1e{value:g}" if decades else f"{value:.6g}"
-            self.text(left - room * (10 + LETTER * len(words)), y, words, GREY)
+            # above the corner, where the first number across has its place
+            self.text(left - room * (10 + LETTER * len(words)), min(y, bottom - 8 * room), words, GREY)
         for value in ticks(*axes.x):
             x = float(axes.at(value, axes.y[0])[0, 0])
             self.line("frame", np.array([[x, bottom], [x, bottom + 5]]), GREY, 1.0)
             if ticks_below:
-                self.text(x, bottom + 15 * room, f"{value:g}", GREY)
+                self.text(x, bottom + 17 * room, f"{value:g}", GREY)
         if axes.y[0] < 0.0 < axes.y[1]:
             self.line("frame", axes.at(np.array(axes.x), np.zeros(2)), FAINT, 0.7)
         if title:
             self.text((left + right) / 2, top - 16 * room, title)
         if x_label:
-            self.text(right + room * (10 + LETTER * len(x_label)), bottom, x_label, GREY)
+            self.text(right + room * (14 + LETTER * len(x_label)), bottom - 12 * room, x_label, GREY)
 
     def band(self, layer: str, axes: Axes, x: Floats, lower: Floats, upper: Floats, colour: Colour) -> None:
         """The area between two curves, as upright strokes."""
@@ -165,6 +165,15 @@ class Drawing:
                 rr.Points2D(points, colors=colours, radii=rr.Radius.ui_points(sizes), draw_order=80.0),
                 static=static,
             )
+
+
+def _apart(axes: Axes, line: float, whole: bool) -> Floats:
+    """Round numbers on the axis upwards, as many as there is room for: a ``line`` from one to the next; two at least,
+    where there are as many. ``whole``: no others than whole ones."""
+    choices = [values for values in (ticks(*axes.y, most) for most in (5, 4, 3, 2)) if values.size > 1]
+    choices = [values for values in choices if not whole or (values == np.rint(values)).all()] or [ticks(*axes.y)]
+    unit = axes.height / (axes.y[1] - axes.y[0])
+    return next((v for v in choices if v.size > 1 and unit * float(np.diff(v).min()) >= line), choices[-1])
 
 
 def ticks(low: float, high: float, most: int = 5) -> Floats:

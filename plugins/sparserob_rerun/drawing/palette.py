@@ -6,6 +6,7 @@ Okabe and Ito (2008), "Color universal design"; a colour means the same thing in
 
 from __future__ import annotations
 
+from functools import cache
 from typing import TypeAlias
 
 import numpy as np
@@ -63,6 +64,7 @@ def _luminance(colour: Floats) -> float:
     return float(np.array([0.2126, 0.7152, 0.0722]) @ (colour / 255.0) ** 2.2)
 
 
+@cache
 def legible(colour: Colour) -> Colour:
     """A colour for lines on a ground that may be dark or light: no brighter than `LEGIBLE`."""
     parts = np.array(colour[:3], dtype=float)
@@ -70,6 +72,7 @@ def legible(colour: Colour) -> Colour:
     return red, green, blue, colour[3]
 
 
+@cache
 def worded(colour: Colour) -> Colour:
     """A colour for words: mixed with so much white that it is `BRIGHT`."""
     parts = np.array(colour[:3], dtype=float)

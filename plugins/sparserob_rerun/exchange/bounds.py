@@ -13,9 +13,9 @@ from sparserob_rerun.drawing.palette import Floats
 if TYPE_CHECKING:
     import sparserob_core as sr
 
-LEFT, WIDTH, HEIGHT, GAP = 74.0, 640.0, 136.0, 52.0
-ONE = (-20.0, LEFT + WIDTH + 90.0, -40.0, HEIGHT + 34.0)
-BOTH = (-20.0, LEFT + WIDTH + 90.0, -40.0, 2 * HEIGHT + GAP + 34.0)
+LEFT, WIDTH, HEIGHT, GAP = 74.0, 640.0, 136.0, 66.0
+ONE = (-20.0, LEFT + WIDTH + 94.0, -44.0, HEIGHT + 48.0)
+BOTH = (-20.0, LEFT + WIDTH + 94.0, -44.0, 2 * HEIGHT + GAP + 48.0)
 """Left, right, top and bottom of the bounds, and of both drawings."""
 VIEW = 1.5  # the view reaches down by this many times the size of the best bound; first bounds may be far below
 SMALLEST = 1e-12
@@ -65,13 +65,13 @@ class Bounds:
         margin = 0.1 * (high - low) if high > low else 0.5 * max(1.0, abs(high))
         axes = Axes(LEFT, 0.0, WIDTH, HEIGHT, across, (low - margin, high + margin))
         said = f"{_number(lower.max())} ≤ J* ≤ {_number(best)}"
-        drawing.frame(axes, f"proven bounds on the cost: {said}; the gap is shaded", "round")
-        if np.isfinite(best):
+        there, closes = np.isfinite(lower), bool(np.isfinite(best))
+        shades = closes and there.sum() > 1
+        drawing.frame(axes, f"proven bounds on the cost: {said}{'; the gap is shaded' if shades else ''}", "round")
+        if closes:
             drawing.line("marks", axes.at(np.array(across), np.full(2, best)), ink.VERMILLION, 1.0)
-        there = np.isfinite(lower)
-        if there.sum() > 1:
-            top = best if np.isfinite(best) else axes.y[1]
-            drawing.band("tube", axes, rounds[there], lower[there], np.full(int(there.sum()), top), ink.TUBE)
+        if shades:
+            drawing.band("tube", axes, rounds[there], lower[there], np.full(int(there.sum()), best), ink.TUBE)
         for values, colour in ((lower, ink.GREEN), (upper, ink.VERMILLION)):
             there = np.isfinite(values)
             if there.any():

@@ -29,7 +29,7 @@ SERIES = {
 
 def extent(families: int) -> tuple[float, float, float, float]:
     """Left, right, top and bottom of the violation plots."""
-    return -30.0, LEFT + WIDTH + 60.0, -40.0, max(1, min(FAMILIES, families)) * (HEIGHT + GAP) + 8.0
+    return -30.0, LEFT + WIDTH + 64.0, -40.0, max(1, min(FAMILIES, families)) * (HEIGHT + GAP) + 8.0
 
 
 def shown_families(program: sr.SemiInfiniteProgram) -> list[sr.ConstraintFamily]:

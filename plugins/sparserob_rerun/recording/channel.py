@@ -152,7 +152,7 @@ class Receiver:
         while True:
             try:
                 message = self.pipe.recv()
-                if isinstance(message, tuple) and isinstance(message[0], sr.RunFinished | sr.SweepFinished):
+                if isinstance(message, sr.RunFinished | sr.SweepFinished):
                     self.over = time.monotonic()
                 self.inbox.put(message)
             except (EOFError, OSError):

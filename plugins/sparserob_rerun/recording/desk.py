@@ -160,12 +160,12 @@ def _listen(messages: Receiver, recorder: Recorder | StudyRecorder, guard: Guard
 
 def _receive(message: Any, recorder: Recorder | StudyRecorder, wrong: list[str]) -> None:
     try:
-        recorder.receive(*message)
+        recorder.receive(message)
     except Exception as error:  # noqa: BLE001  a picture less is better than no recording
         if not wrong:
-            wrong.append(f"a {type(message[0]).__name__} could not be drawn: {type(error).__name__}: {error}")
-    if isinstance(message[0], sr.RunFinished) and isinstance(recorder, Recorder):
-        recorder.over = message[0].seconds if message[0].result is not None else -1.0
+            wrong.append(f"a {type(message).__name__} could not be drawn: {type(error).__name__}: {error}")
+    if isinstance(message, sr.RunFinished) and isinstance(recorder, Recorder):
+        recorder.over = message.seconds if message.result is not None else -1.0
 
 
 @final

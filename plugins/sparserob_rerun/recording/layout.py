@@ -73,7 +73,9 @@ def _columns(rrb: Any, shown: Shown) -> list[Any]:
     )
     middle = (
         rrb.Vertical(
-            search.landscape(shown.searches, shown.answers), *numbers, row_shares=[5, 4, 2, 2][: 1 + len(numbers)]
+            search.landscape(shown.searches, shown.answers),
+            *numbers,
+            row_shares=[10, 8, 4 if shown.searches else 5, 4][: 1 + len(numbers)],
         )
         if shown.landscape
         else rrb.Vertical(*numbers)

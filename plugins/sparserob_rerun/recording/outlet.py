@@ -20,7 +20,7 @@ from sparserob_rerun.recording.channel import Sender
 from sparserob_rerun.recording.desk import Account, Ending, record
 from sparserob_rerun.recording.recorder import Opening
 from sparserob_rerun.recording.sinks import Destinations
-from sparserob_rerun.search.projection import Projector
+from sparserob_rerun.search.projection import thin
 from sparserob_rerun.study.recorder import StudyOpening
 
 CAPACITY = 512  # events that may wait
@@ -40,7 +40,7 @@ class Outlet:
         self.patience = 0.0 if landscape is None else landscape.patience
         self.file, self.incomplete = chosen.save, ""
         self.closing = OVER if opening.waits else CLOSING
-        self.dropped, self.dead, self.projector = 0, False, Projector()
+        self.dropped, self.dead = 0, False
         self.waits = opening.waits
         room, (reader, writer) = context.BoundedSemaphore(capacity), context.Pipe(duplex=False)
         self.report, theirs = context.Pipe(duplex=False)
@@ -58,7 +58,7 @@ class Outlet:
             self.process.start()
         for end in (theirs, reader):
             end.close()
-        self.sender = Sender(writer, room, follows, self._packed)
+        self.sender = Sender(writer, room, follows, packed)
 
     def send(self, event: sr.Event) -> None:
         """Pass an event on, or drop it where too many are waiting already. Evaluations are collected for a moment."""
@@ -74,12 +74,6 @@ class Outlet:
                 if not self.waits and not (last and tries):
                     break
         self.dropped += 1
-
-    def _packed(self, events: list[Any]) -> Any:
-        """What is sent of successive events: of evaluated tuples only what is drawn."""
-        if isinstance(events[0], sr.EvaluationsFinished):
-            return self.projector.small(joined(events))
-        return events[0] if isinstance(events[0], Ending) else (events[0], None)
 
     def close(self, keep: float = 0.0) -> list[str]:
         """End the recording; returns what there is to complain about, and keeps in ``incomplete`` why the recording is
@@ -125,6 +119,11 @@ class Outlet:
         return []
 
 
+def packed(events: Sequence[Any]) -> Any:
+    """What is sent of successive events: of evaluated tuples only what may be drawn."""
+    return thin(joined(events)) if isinstance(events[0], sr.EvaluationsFinished) else events[0]
+
+
 def follows(before: Any, event: Any) -> bool:
     """Whether an event goes on where another one of the same search ended."""
     if not isinstance(before, sr.EvaluationsFinished) or not isinstance(event, sr.EvaluationsFinished):
@@ -142,8 +141,8 @@ def joined(parts: Sequence[sr.EvaluationsFinished]) -> sr.EvaluationsFinished:
     for batch in batches:
         for name, rows in batch.notes.items():
             notes.setdefault(name, []).extend(rows)
-    points = [np.concatenate(list(batch.points)) for batch in batches if len(batch.points)]
-    values = [np.concatenate(list(batch.values)) for batch in batches if len(batch.values)]
+    points = [piece for batch in batches for piece in batch.points]
+    values = [piece for batch in batches for piece in batch.values]
     moments = [moment for batch in batches for moment in batch.moments]
     whole = replace(first, points=points, values=values, moments=moments, notes=notes)
     sketches = {role: sketch for part in parts for role, sketch in part.sketches.items()}

@@ -23,7 +23,7 @@ from sparserob_rerun.recording.layout import Shown, layout
 from sparserob_rerun.recording.waiting import BOUNDS, CLIMB, CONTROL, LANDSCAPE, VIOLATIONS, Waiting
 from sparserob_rerun.search.climb import Climb
 from sparserob_rerun.search.explorer import Aim, Explorer
-from sparserob_rerun.search.projection import Projection
+from sparserob_rerun.search.projection import Projector
 from sparserob_rerun.search.search import SearchView
 from sparserob_rerun.search.terrain import Terrain
 from sparserob_rerun.search.way import Stage
@@ -78,9 +78,9 @@ class Recorder:
         self.timelines, self.rounds = Timelines(rr, stream), Rounds(rr, stream, inspection)
         problem = None if inspection is None else inspection.problem
         self.physics = Physics(rr, stream, inspection) if inspection is not None and problem is not None else None
-        self.terrain = Terrain(rr, stream, "" if problem is None else problem.names.time)
+        self.terrain = Terrain(rr, stream, "" if problem is None else problem.names.time, shown.searches)
         self.explorer = Explorer(self._landscape, inspection, opening.landscape, opening.waits)
-        self.search = SearchView(rr, stream, self.timelines)
+        self.search, self.projector = SearchView(rr, stream, self.timelines), Projector()
         self.climb, self.stages = Climb(rr, stream), list[Stage]()
         self.shown, self.searches, self.began = shown, shown.searches, 0.0
         self.best_value, self.unseen, self.behind, self.way = -np.inf, 0, False, False
@@ -98,12 +98,12 @@ class Recorder:
         self.say(f"run: {opening.title}")
         self._page("solving", [])
 
-    def receive(self, event: sr.Event, projection: Projection | None = None) -> None:
-        """Log one event; of evaluated points their ``projection`` has come along."""
+    def receive(self, event: sr.Event) -> None:
+        """Log one event; one of evaluated tuples is a thin one (`thin`)."""
         self.heard = time.monotonic()
         match event:
             case sr.EvaluationsFinished():
-                self._evaluations(event, projection or Projection())
+                self._evaluations(event)
             case sr.RoundFinished():
                 self._round(event)
             case sr.ProofProgress():
@@ -147,13 +147,13 @@ class Recorder:
             share = ", with the regulariser's share" if landscape.epsilon > 0.0 else ""
             self.draw(LANDSCAPE, self.terrain.mark, f"proven to be the highest: {self.exact:.6g}{share}")
 
-    def _evaluations(self, event: sr.EvaluationsFinished, projection: Projection) -> None:
+    def _evaluations(self, event: sr.EvaluationsFinished) -> None:
         if event.total == event.count:
             self.began = self.timelines.seconds
         if event.family:
             self.draw("the search for violations", self.search.separation, event, self.began)
             return
-        stage = self._stage(event)
+        stage, projection = self._stage(event), self.projector.of(event)
         stage.add(event, projection)
         self.draw("the search", self.search.show, event, stage, self.began, self._moving(event.block), projection)
         self.timelines.move(stage.base + event.total, event.round, self.began + event.seconds)

@@ -3,7 +3,6 @@ screen."""
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any, final
 
 import numpy as np
@@ -13,8 +12,9 @@ from sparserob_rerun.drawing.canvas import Axes, Drawing, ticks
 from sparserob_rerun.drawing.palette import Floats
 from sparserob_rerun.search.way import Stage
 
-WIDTH, HEIGHT, GAP = 1150.0, 300.0, 110.0
-EXTENT = (-100.0, WIDTH + 50.0, -92.0, HEIGHT + 104.0)
+WIDTH, HEIGHT, GAP = 1150.0, 240.0, 110.0
+EXTENT = (-100.0, WIDTH + 50.0, -100.0, HEIGHT + 166.0)
+LINE = 44.0  # units between two lines of words
 CORNERS, POINTS = 500, 300  # of a curve, and of a cloud, in one panel
 MOST = 4  # panels beside one another; of more stages the last ones
 
@@ -37,7 +37,8 @@ class Climb:
             self._panel(drawing, clouds, stage, (place * (width + GAP), width), exact)
         hidden = len(stages) - len(shown)
         if hidden > 0:
-            drawing.text(WIDTH / 2, HEIGHT + 88.0, f"{hidden} earlier searches are not shown", ink.GREY)
+            words = "1 earlier search is not shown" if hidden == 1 else f"{hidden} earlier searches are not shown"
+            drawing.text(WIDTH / 2, HEIGHT + 26.0 + 2 * LINE, words, ink.GREY)
         drawing.log(
             self.rr, self.stream, "search/stages", layers=("frame", "restart", "bound", "exact", "best", "walk")
         )
@@ -73,7 +74,7 @@ class Climb:
                 drawing.line(layer, axes.at(np.array(axes.x), np.full(2, level)), colour, 2.0)
         if np.isfinite(stage.lower_bound) and not low <= stage.lower_bound <= high:
             words = f"proven ≥ {stage.lower_bound:.5g}"  # below the panel: in a narrow one it lies over the walk
-            drawing.text(place[0] + place[1] / 2, HEIGHT + 58.0, words, ink.GREEN)
+            drawing.text(place[0] + place[1] / 2, HEIGHT + 26.0 + LINE, words, ink.GREEN)
         if 0 < stage.searched < count:  # then its last share of the budget
             at = numbers[stage.searched - 1] + 0.5
             drawing.dashed("restart", axes.at(np.full(2, at), np.array([low, high])), ink.GREEN)
@@ -99,7 +100,7 @@ def _frame(drawing: Drawing, axes: Axes, stage: Stage, best: float) -> None:
         drawing.text(x, bottom + 26.0, f"{value:.0f}", ink.GREY)
     middle = (left + right) / 2
     if np.isfinite(stage.epsilon) and stage.epsilon > 0.0:
-        drawing.text(middle, top - 62.0, f"epsilon {stage.epsilon:.3g}")
+        drawing.text(middle, top - 24.0 - LINE, f"epsilon {stage.epsilon:.3g}")
     drawing.text(middle, top - 24.0, f"best {best:.6g}", ink.ORANGE)
 
 
@@ -107,13 +108,12 @@ def _corners(values: Floats) -> np.ndarray:
     """Which of the values ``(n,)`` a curve needs: the lowest and the highest of every stretch."""
     if values.size <= 2 * CORNERS:
         return np.arange(values.size)
-    edges = np.linspace(0, values.size, CORNERS + 1).astype(int)
-    ends = [
-        (start + int(np.nanargmin(values[start:end])), start + int(np.nanargmax(values[start:end])))
-        for start, end in pairwise(edges)
-        if np.isfinite(values[start:end]).any()
-    ]
-    return np.unique(np.array([0, *np.ravel(ends), values.size - 1], dtype=int))
+    stretch = np.arange(values.size) * CORNERS // values.size
+    order = np.lexsort((values, stretch))  # in each stretch from the lowest to the highest, NaN last
+    order = order[np.isfinite(values[order])]
+    change = np.flatnonzero(np.diff(stretch[order]))
+    ends = order[np.concatenate([[0], change, change + 1, [order.size - 1]])] if order.size else order
+    return np.unique(np.concatenate([[0], ends, [values.size - 1]]))
 
 
 def _limits(values: Floats, walk: Floats, best: Floats, levels: list[float]) -> tuple[float, float]:

@@ -1,6 +1,7 @@
 """What a search does, in the coordinates of the map: where the two indices are that decide most in each of its tuples.
 
-It is computed where the tuples are known, in the process of the run, so that none of them has to travel.
+Of a tuple only the coordinates that a map may have travel to the process that records (`thin`), never those of its
+disturbances: all else is computed there, and takes no time from the search.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from sparserob_rerun.drawing.palette import Floats
 
 REMEMBERED = 20_000
 """Evaluated tuples whose deciding indices are remembered for cells around them, 200 bytes each. With a tenth of it most
-cells of a search by partition are older; with ten times as many they take 40 MB of the run's memory."""
+cells of a search by partition are older; with ten times as many they take 40 MB."""
 DIGITS = 1e7
 """By this many parts of a box two tuples are told apart: ten times fewer mix neighbours in deep cells, ten times more
 lose those whose middle was rounded."""
@@ -52,45 +53,66 @@ class Projection:
     sketches: Mapping[str, Outlines] = field(default_factory=dict)
 
 
+def thin(event: sr.EvaluationsFinished) -> sr.EvaluationsFinished:
+    """The event with points, domain and sketches over the ``coordinates`` of each index only, the others left out;
+    without any of them where there is no map of it."""
+    batch, domain, width = event.batch, event.domain, len(event.coordinates)
+    count = sum(len(values) for values in batch.values)
+    values = [np.concatenate(list(batch.values))] if count else []
+    if domain is None or not width or len(event.deciding) != count or not count:
+        none = replace(batch, points=[np.zeros((count, 0))], values=values, origin=None)
+        return replace(event, domain=None, sketches={}, deciding=event.deciding[:0], batch=none)
+    starts = np.arange(0, domain.dimension, event.block)[:, np.newaxis]
+    columns = (starts + np.array(event.coordinates)).ravel()
+    points = np.concatenate(list(batch.points))[:, columns]
+    origin = None if batch.origin is None else batch.origin[columns]
+    return replace(
+        event,
+        domain=sr.Box(domain.lower[columns], domain.upper[columns]),
+        batch=replace(batch, points=[points], values=values, origin=origin),
+        sketches={role: _thinned(sketch, columns) for role, sketch in event.sketches.items()},
+    )
+
+
+def _thinned(sketch: sr.Sketch, columns: np.ndarray) -> sr.Sketch:
+    lower = sketch.lower[:, columns]
+    return sr.Sketch(lower, lower if sketch.points else sketch.upper[:, columns], sketch.rounded)
+
+
 @final
 class Projector:
-    """Projects the events of searches; it remembers of evaluated tuples which of their indices decide."""
+    """Projects the events of searches, `thin` ones; it remembers of evaluated tuples which of their indices decide."""
 
     def __init__(self) -> None:
         self.pair, self.known = (0, 0), dict[int, tuple[int, int]]()
 
-    def small(self, event: sr.EvaluationsFinished) -> tuple[sr.EvaluationsFinished, Projection]:
-        """The event without points, domain and sketches, and what is drawn of them."""
-        batch, count = event.batch, sum(len(values) for values in event.batch.values)
-        bare = replace(event, domain=None, sketches={}, deciding=np.zeros((0, 0), dtype=int))
-        bare = replace(bare, batch=replace(batch, points=[np.zeros((count, 0))], origin=None))
-        domain, width = event.domain, len(event.coordinates)
-        if domain is None or not width or len(event.deciding) != count or not count:
-            return bare, Projection()
-        if event.total == event.count:
-            self.pair, self.known = (0, min(1, domain.dimension // event.block - 1)), {}
-        columns = np.arange(0, domain.dimension, event.block)[:, np.newaxis] + np.array(event.coordinates)
-        plain = np.concatenate([piece[:, columns.ravel()] for piece in batch.points])
-        lower, upper = (side[columns.ravel()] for side in (domain.lower, domain.upper))
+    def of(self, event: sr.EvaluationsFinished) -> Projection:
+        """What is drawn of an event."""
+        if event.domain is None:
+            return Projection()
+        count, width = event.count, len(event.coordinates)
+        lower, upper = event.domain.lower, event.domain.upper
+        if event.total == count:
+            self.pair, self.known = (0, min(1, lower.size // width - 1)), {}
+        plain = event.batch.trace.points
         tuples = plain.reshape(count, -1, width)
         slots = sr.deciding_slots(event.deciding, tuples, (upper - lower)[:width], self.pair)
         self.pair = (int(slots[-1, 0]), int(slots[-1, 1]))
         self.known.update(zip(_keys(plain, lower, upper).tolist(), map(tuple, slots.tolist()), strict=True))
         for key in list(islice(self.known, max(0, len(self.known) - REMEMBERED))):
             del self.known[key]
-        thin = replace(batch, points=[plain], origin=None if batch.origin is None else batch.origin[columns.ravel()])
-        rows, moved = thin.moves.T
+        rows, moved = event.batch.moves.T
         moves = np.column_stack([rows, np.array(event.coordinates)[moved % width], plain[rows, moved]])
-        sketches = {role: self._outlines(sketch, columns, (lower, upper)) for role, sketch in event.sketches.items()}
+        sketches = {role: self._outlines(sketch, event.domain, width) for role, sketch in event.sketches.items()}
         places = tuples[np.arange(count)[:, np.newaxis], slots]
-        return bare, Projection(event.coordinates, places, slots, moves, sketches)
+        return Projection(event.coordinates, places, slots, moves, sketches)
 
-    def _outlines(self, sketch: sr.Sketch, columns: np.ndarray, box: tuple[Floats, Floats]) -> Outlines:
-        lower, upper = sketch.lower[:, columns.ravel()], sketch.upper[:, columns.ravel()]
-        keys = _keys((lower + upper) / 2, *box)
+    def _outlines(self, sketch: sr.Sketch, box: sr.Box, width: int) -> Outlines:
+        lower, upper = sketch.lower, sketch.upper
+        keys = _keys((lower + upper) / 2, box.lower, box.upper)
         pairs = np.array([self.known.get(int(key), self.pair) for key in keys]).reshape(-1, 2)
         mine = np.arange(len(pairs))[:, np.newaxis], pairs
-        low, high = (side.reshape(-1, *columns.shape)[mine] for side in (lower, upper))
+        low, high = (side.reshape(len(pairs), -1, width)[mine] for side in (lower, upper))
         return Outlines(low, high, sketch.rounded, sketch.points, len(pairs))
 
 

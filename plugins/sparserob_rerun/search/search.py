@@ -23,6 +23,7 @@ NOTES = {  # what a maximiser notes: the words for it, and its colour
     "accepted": ("share accepted of the last 50 moves that changed g", ink.GREEN),
     "scale": ("log10 of the size of a move, in widths of the box", ink.SKY),
     "move": ("moves: 0 all, 1 one coordinate, 2 some, 3 index", ink.PURPLE),
+    "acting": ("indices with a multiplier, in the polish", ink.ORANGE),
     "depth": ("depth of the opened cell", ink.SKY),
     "openings": ("cells opened", ink.GREEN),
     "hmax": ("deepest cells allowed", ink.GREY),

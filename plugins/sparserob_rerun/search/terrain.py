@@ -17,7 +17,8 @@ from sparserob_rerun.search.way import Shadow, Stage, shadow
 
 PIXELS, SIDE = 128, 384.0
 TRIED, LEG, LAST = 300, 400, 20  # points that stay visible, corners of the walk, and its last ones
-ROW = 36.0  # units between two lines of words: in a panel of a third of the screen a line is 25 units high
+ROWS = {True: 37.0, False: 45.0}
+"""Units between two lines of words: of a search the panel is larger, and has more lines. A line is 22 pixels high."""
 BESIDE = 700.0  # where the words are: at the right of the map
 LETTERS = 46  # in a line; a word more does not fit there
 VISIBLE = 1e-6  # of g: what two solvers make of one value differs by less, and what is seen by more
@@ -33,10 +34,11 @@ class Terrain:
     the tuple through which it is (``anchor (2,)``), ``value`` there, ``epsilon`` and ``level``, the stride of the grid.
     """
 
-    def __init__(self, rr: Any, stream: Any, unit: str = "") -> None:
-        """``unit``: of the time; empty where none is known."""
-        self.rr, self.stream, self.unit = rr, stream, unit
+    def __init__(self, rr: Any, stream: Any, unit: str = "", searches: bool = True) -> None:
+        """``unit``: of the time; empty where none is known. ``searches``: whether there is a search."""
+        self.rr, self.stream, self.unit, self.row = rr, stream, unit, ROWS[searches]
         self.known: sr.Landscape | None = None
+        self.lines, self.legend = 0, 0  # of words on the map, and of those below them about the search
         self.scale = (0.0, 1.0)
 
     def surface(self, landscape: sr.Landscape, aim: Aim) -> None:
@@ -52,8 +54,8 @@ class Terrain:
         )
         (one, other), drawing, axes = landscape.names(self.unit), Drawing(), self._axes(landscape)
         drawing.frame(axes, "", room=1.4)
-        drawing.text(axes.width / 2, axes.height + 56.0, f"across: {one}", ink.GREY)
-        drawing.text(axes.width / 2, -34.0, f"up: {other}", ink.GREY)
+        drawing.text(axes.width / 2, axes.height + 72.0, f"across: {one}", ink.GREY)
+        drawing.text(axes.width / 2, -44.0, f"up: {other}", ink.GREY)
         two = landscape.first[0] != landscape.second[0]
         weight = [f"epsilon {landscape.epsilon:.3g}"] if landscape.epsilon > 0.0 else []
         both = ["over the two indices that decide most"] if two else []
@@ -61,7 +63,8 @@ class Terrain:
         said += [(words, ink.GREY) for words in _said(landscape)]
         said += [(words, ink.ORANGE) for words in _own(landscape, aim)]
         for line, (words, colour) in enumerate(said):
-            drawing.text(BESIDE, 30.0 + ROW * line, words, colour)
+            drawing.text(BESIDE, self._line(line), words, colour)
+        self.lines = len(said)
         drawing.log(self.rr, self.stream, "landscape/map/axes", layers=("frame",))
         self._anchor(landscape, axes)
         across, up, values = landscape.shown
@@ -173,7 +176,7 @@ class Terrain:
             few = not sketch.points and sketch.count > SHOWN
             words = f"white: {role}, {SHOWN} of {sketch.count}" if few else f"white: {role}"
             words = f"blue: {role}" if sketch.points else words
-            legend.text(BESIDE, 30.0 + ROW * (8 + len(legend.labels)), words, ink.GREY)
+            legend.text(BESIDE, self._line(self.lines + len(legend.labels)), words, ink.GREY)
             if sketch.points:
                 at = axes.at(lower[:, 0], lower[:, 1])
                 self.stream.log(
@@ -199,7 +202,8 @@ class Terrain:
 
         if stage.walks:
             words = "white line and dot: the walk, and where it is now"
-            legend.text(BESIDE, 30.0 + ROW * (8 + len(legend.labels)), words, ink.GREY)
+            legend.text(BESIDE, self._line(self.lines + len(legend.labels)), words, ink.GREY)
+        self.legend = len(legend.labels)
         legend.log(self.rr, self.stream, "landscape/map/legend")
 
     def mark(self, words: str) -> None:
@@ -211,8 +215,12 @@ class Terrain:
             drawing = Drawing()
             drawing.dot(at, ink.PURPLE, 9.0)
             for line, part in enumerate(_halves(words)):
-                drawing.text(BESIDE, 30.0 + ROW * (10 + line), part, ink.PURPLE)
+                drawing.text(BESIDE, self._line(self.lines + self.legend + line), part, ink.PURPLE)
             drawing.log(self.rr, self.stream, "landscape/map/exact")
+
+    def _line(self, number: int) -> float:
+        """How far down a line of words is."""
+        return self.row * number
 
     def _scale(self, landscape: sr.Landscape, aim: Aim) -> tuple[float, float]:
         """What is dark and what is bright; one colour for a flat slice, which has no range. The value that the search
@@ -271,7 +279,7 @@ class Terrain:
         flat = landscape.flat
         corners = {
             (0.5, -0.12, 0.0): f"{names[0]}: {across[0]:.3g} to {across[-1]:.3g}",
-            (-0.12, 0.5, 0.0): f"{names[1]}: {up[0]:.3g} to {up[-1]:.3g}",
+            (1.12, 0.5, 0.0): f"{names[1]}: {up[0]:.3g} to {up[-1]:.3g}",
             (0.0, 0.0, 1.05): ", ".join(_said(landscape)) if flat else f"g = {scale[1]:.4g}",
             (0.0, 0.0, -0.03): "" if flat else f"g = {scale[0]:.4g}",
         }

@@ -20,7 +20,7 @@ def landscape(searches: bool, answers: bool) -> Any:
     return view("/landscape/map", f"{name}: when the run is over" if answers else name, EXTENT)
 
 
-EXTENT = (-60.0, 1000.0, -64.0, 472.0)
+EXTENT = (-60.0, 1000.0, -76.0, 490.0)
 
 
 def climb() -> Any:
@@ -76,5 +76,5 @@ def surface(rrb: Any) -> Any:
         origin="/landscape/surface",
         name="Landscape as a surface",
         background=list(ink.GROUND[:3]),
-        eye_controls=rrb.EyeControls3D(position=(1.35, -0.95, 1.35), look_target=(0.5, 0.5, 0.3), eye_up=(0, 0, 1)),
+        eye_controls=rrb.EyeControls3D(position=(1.55, -0.95, 1.95), look_target=(0.5, 0.5, 0.35), eye_up=(0, 0, 1)),
     )

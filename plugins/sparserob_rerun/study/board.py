@@ -21,7 +21,7 @@ LEFT, WIDTH, HEIGHT = 150.0, 620.0, 330.0
 EXTENT = (0.0, LEFT + WIDTH + 40.0, -62.0, HEIGHT + 116.0)
 """Left, right, top and bottom of the map."""
 LETTER = 8.0  # pixels, about
-CLOSE = 16.0  # the same in a cell
+CORNER = 9.0  # pixels of a mark from the corner of a cell that has words
 SHADE = 0.35  # of the colour of a status, for a cell: words are bright, and are to be read on it
 LINE = 22.0  # pixels between two labels above one another
 MARKED = 14.0  # pixels of a cell from which on it has room for a mark
@@ -166,12 +166,12 @@ class Board:
             self.boxes[0].append(at)
             self.boxes[1].append(EMPTY if status in ("waiting", "running") else shaded(status))
             told = _told(rows.get(place, {})) if status not in ("waiting", "running") else []
-            told = told[: int(high / CLOSE) - 1] if wide >= COSTED else []
+            told = told[: int(high / LINE)] if wide >= COSTED else []
             if half.min() * 2.0 >= MARKED and status != "waiting":
-                lift = np.array([0.0, 0.5 * CLOSE * len(told)])
-                mark(drawing, at - lift, status)
+                corner = np.array([CORNER - wide / 2.0, CORNER - high / 2.0])
+                mark(drawing, at + corner if told else at, status)
                 for line, words in enumerate(told):
-                    drawing.text(at[0], at[1] - lift[1] + CLOSE * (line + 1), words)
+                    drawing.text(at[0], at[1] + LINE * (line + 0.5 * (1 - len(told))), words)
             elif status == "running":
                 drawing.dot(at[np.newaxis], ink.INK, 2.0)
 

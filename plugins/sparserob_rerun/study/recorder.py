@@ -61,7 +61,7 @@ class StudyRecorder:
             self._tell(f"{len(self.rows)} points were finished before")
         self._picture()
 
-    def receive(self, event: sr.Event, projection: object = None) -> None:
+    def receive(self, event: sr.Event) -> None:
         """Log one event."""
         match event:
             case sr.SweepProgress():
