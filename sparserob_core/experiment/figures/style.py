@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import os
-from contextlib import AbstractContextManager
+import re
+import warnings
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,8 +35,11 @@ KINDS: dict[str, dict[str, Any]] = {
 }
 """Kinds of files, by their endings, and what is left out of them so that the same figure gives the same bytes."""
 
+logger = logging.getLogger("sparserob")
+_told = set[str]()
+
 _STYLE: dict[str, Any] = {
-    "font.family": "STIXGeneral",
+    "font.family": ["STIXGeneral", "DejaVu Sans"],
     "mathtext.fontset": "stix",
     "font.size": 10.5,
     "axes.titlesize": 11.5,
@@ -102,13 +109,33 @@ def write_figure(file: Path, figure: Figure) -> list[Path]:
     files = [file] if named else [file.with_name(f"{file.name}{kind}") for kind in (".pdf", ".png")]
     for one in files:
         stream, kind = BytesIO(), one.suffix.lower()
-        figure.savefig(stream, format=kind[1:], **KINDS[kind])
+        with _letters_told():
+            figure.savefig(stream, format=kind[1:], **KINDS[kind])
         figure.set_layout_engine("none")  # everything has its place now, in the next file too
         try:
             write_whole(one, stream.getvalue())
         except SparseRobError as error:
             raise InputError(str(error)) from error
     return files
+
+
+@contextmanager
+def _letters_told() -> Iterator[None]:
+    """Letters that no font here has, such as those of a title, are told once, in one line; matplotlib says it for every
+    letter and file."""
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        yield
+    missing = set[str]()
+    for one in heard:
+        glyph = re.match(r"Glyph (\d+) .*missing from", str(one.message))
+        if glyph is None:
+            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+        else:
+            missing.add(chr(int(glyph[1])))
+    if new := missing - _told:
+        _told.update(new)
+        logger.warning("figures: no font here has %s: boxes stand there", " ".join(sorted(new)))
 
 
 def require_writable(file: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import sparserob_core as sr
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.figures.figure_data import FigureData, Wall
 from sparserob_core.experiment.figures.run_figures import draw_control, draw_convergence, draw_states, write_figures
-from sparserob_core.experiment.figures.style import held
+from sparserob_core.experiment.figures.style import _letters_told, held
 from sparserob_core.sip.events import RoundFinished
 
 
@@ -168,3 +169,14 @@ def test_equal_steps_are_drawn_as_one() -> None:
     values, ends = held(np.array([1.0, 1.0, 0.0, 2.0, 2.0, 2.0]), np.arange(7.0))
     np.testing.assert_array_equal(values, [1.0, 0.0, 2.0])
     np.testing.assert_array_equal(ends, [0.0, 2.0, 3.0, 6.0])
+
+
+def test_letters_that_no_font_has_are_told_once_and_other_warnings_are_kept(tmp_path, caplog, data):
+    pytest.importorskip("matplotlib")
+    odd = replace(data, title="Zug \uf8ff Ω")  # a letter of nobody's
+    with caplog.at_level("WARNING", "sparserob"):
+        write_figures(tmp_path, odd)
+        write_figures(tmp_path, odd)
+    assert [record.getMessage() for record in caplog.records] == ["figures: no font here has \uf8ff: boxes stand there"]
+    with pytest.warns(UserWarning, match="something else"), _letters_told():
+        warnings.warn("something else", UserWarning, stacklevel=1)
