@@ -52,7 +52,9 @@ class Case:
     @cached_property
     def answers(self) -> np.ndarray:
         """Truth values ``(K, K)``: whether the control on a piece may answer what is measured at a breakpoint."""
-        return answers_of(self.policy, self.control.breakpoints)
+        points, measured = self.control.breakpoints, self.problem.measurements
+        mask = answers_of(self.policy, points)
+        return mask if measured is None else mask & measured.known(points)
 
     @property
     def unloaded(self) -> bool:

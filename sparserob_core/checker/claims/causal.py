@@ -1,8 +1,9 @@
 """The claim against every causal policy, derived anew in balls from signals and multipliers alone.
 
-A control on piece ``k`` depends on the disturbance before ``tau_k`` only: it is one vector for all signals that agree
-until then. So a weighted sum of constraints under the signals is, for every causal policy, at least what the least of
-every such vector over the set of the control leaves, its part of the cost included.
+A control on piece ``k`` depends on the disturbance before ``tau_k`` only, or before the last measurement that is known
+by then, whatever is measured: it is one vector for all signals that agree until then. So a weighted sum of constraints
+under the signals is, for every causal policy, at least what the least of every such vector over the set of the control
+leaves, its part of the cost included.
 """
 
 from __future__ import annotations
@@ -40,7 +41,9 @@ def causal_bound(case: Case, data: Mapping[str, Any], priced: bool) -> arb:
     signals, rest = _signals(case, data), middle_of(case)
     K, m, total = case.control.pieces, case.problem.system.controls, arb(0)
     changes = case.changes or []
-    seen = [bisect_left(changes, float(t)) for t in case.control.breakpoints[:-1]]  # blocks that began before
+    points, measured = case.control.breakpoints, case.problem.measurements
+    known_last = points[:-1] if measured is None else measured.latest(points)
+    seen = [bisect_left(changes, float(t)) for t in known_last]  # blocks that began before what is known was measured
     groups: list[dict[bytes, list[arb]]] = [{_until(rest, n): [arb(0)] * m} for n in seen]
     entries = listed(data, "multipliers")
     if len(entries) > MOST:

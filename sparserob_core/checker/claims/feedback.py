@@ -39,7 +39,7 @@ FIGURES = 1e-11  # of an effort: how closely it is known
 
 @final
 class FeedbackClaims:
-    """What a certificate claims of a policy: nominal control and ``gains (K, K, m, d)``."""
+    """What a certificate claims of a policy: nominal control and ``gains (K, K, m, p)``."""
 
     def __init__(self, case: Case) -> None:
         self.case = case
@@ -49,15 +49,15 @@ class FeedbackClaims:
         """The gains, none of a control that answers nothing; raises `Broken` where they answer what is not yet
         measured, or what the policy does not answer."""
         case = self.case
-        K, m, d = case.control.pieces, case.problem.system.controls, case.problem.system.states
         if case.policy is None:
-            return np.zeros((K, K, m, d))
+            return self._none
         gains = numbers(case.certificate.get("gains"), "gains")
-        if gains.shape != (K, K, m, d):
-            raise Broken(f"the gains have shape {gains.shape}, expected {(K, K, m, d)}")
-        times = case.control.breakpoints
+        if gains.shape != self._none.shape:
+            raise Broken(f"the gains have shape {gains.shape}, expected {self._none.shape}")
+        times, measured = case.control.breakpoints, case.problem.measurements
+        told = case.problem.initial_set is not None or (measured is not None and measured.noise is not None)
         for k, j in np.argwhere(gains.any(axis=(2, 3))).tolist():
-            if j > k or (j == 0 and case.problem.initial_set is None):
+            if j > k or (j == 0 and not told):
                 raise Broken(f"the control from t = {float(times[k]):.6g} on answers what is not measured yet")
             if not case.answers[k, j]:
                 raise Broken(
@@ -65,6 +65,24 @@ class FeedbackClaims:
                     f" {float(times[j]):.6g}, which its policy does not"
                 )
         return gains
+
+    @property
+    def _none(self) -> Array:
+        """Gains that answer nothing, ``(K, K, m, p)``."""
+        system, measured, K = self.case.problem.system, self.case.problem.measurements, self.case.control.pieces
+        return np.zeros((K, K, system.controls, system.states if measured is None else measured.outputs))
+
+    @cached_property
+    def observer(self) -> Array | None:
+        """What makes innovations of the outputs, ``(K, d, p)``; any is right that is written."""
+        case = self.case
+        if case.problem.measurements is None or case.policy is None:
+            return None
+        shape = case.control.pieces, case.problem.system.states, case.problem.measurements.outputs
+        found = numbers(case.certificate.get("observer"), "observer")
+        if found.shape != shape:
+            raise Broken(f"the observer has shape {found.shape}, expected {shape}")
+        return found
 
     @cached_property
     def loop(self) -> ClosedLoop:
@@ -82,6 +100,9 @@ class FeedbackClaims:
                 "of measurable disturbances the checker knows controls of their own on every piece, undelayed"
             )
         held = (changes or []) if case.measurable else (case.changes or [])
+        measured = None if case.policy is None else case.problem.measurements
+        if measured is not None and case.measurable:
+            raise Unchecked("the checker knows outputs beside disturbances that are constant on pieces only")
         return (MeasurableLoop if case.measurable and changes is None else ClosedLoop)(
             case.problem.system,
             [float(v) for v in np.asarray(case.problem.initial_state)],
@@ -93,6 +114,8 @@ class FeedbackClaims:
             case.problem.disturbance,
             case.problem.initial_set,
             tuple(float(v) for v in before(case.problem)),
+            measured,
+            self.observer,
         )
 
     def control(self) -> str:
@@ -429,9 +452,8 @@ class FeedbackClaims:
     @cached_property
     def at_rest(self) -> ClosedLoop:
         """The system without any control, under the disturbances of the problem."""
-        case, d = self.case, self.case.problem.system.states
-        K, m = case.control.pieces, case.problem.system.controls
-        return self._loop(np.zeros((m, K)), np.zeros((K, K, m, d)))
+        K, m = self.case.control.pieces, self.case.problem.system.controls
+        return self._loop(np.zeros((m, K)), self._none)
 
     def multiplied(self, entries: Sequence[Any], priced: bool) -> arb:
         """The bound that multipliers of constraints at single disturbances prove, for every policy of the kind.
@@ -474,8 +496,7 @@ class FeedbackClaims:
         rows = [row for row in rows if any(not x.is_zero() for part in row.innovations for x in part)]
         if not rows:
             return total
-        K, m = case.control.pieces, case.problem.system.controls
-        d = case.problem.system.states
+        K, m, d = case.control.pieces, case.problem.system.controls, loop.outputs
         left = stacked([[r.multiplier * r.nominal[k][i] for r in rows] for k in range(K) for i in range(m)])
         right = stacked([[x for part in r.innovations for x in part] for r in rows])
         product = (left * right).tolist()
@@ -519,7 +540,7 @@ class FeedbackClaims:
 
         if members not in self._inverses:
             blocks = sorted({block for j in members for block in loop.seen[j] if self._chords[block]})
-            d, zero = loop.parts["A"].nrows(), arb(0)
+            d, zero = loop.outputs, arb(0)
             table: list[list[arb]] = []
             for j in members:
                 lists = {block: push.tolist() for block, push in loop.seen[j].items()}
@@ -542,7 +563,9 @@ class FeedbackClaims:
     def _pushed(self, loop: ClosedLoop, block: int) -> Pushed:
         """Who can see the deviations of a block; of the initial state everyone sees its own."""
         d, varying = loop.parts["A"].nrows(), tuple(self._chords[block])
-        if self.case.problem.initial_set is not None and block == loop.blocks:
+        if loop.measured is not None:  # outputs see what the observer makes of everything: as many as there are
+            return Pushed(np.ones((loop.outputs, len(varying)), dtype=bool), loop.outputs, len(varying))
+        if self.case.problem.initial_set is not None and block == loop.begun:
             return Pushed(np.eye(d, dtype=bool)[:, list(varying)], len(varying), len(varying))
         if varying not in self._pushes:
             self._pushes[varying] = Pushed.of([(one["A"], one["E"]) for one in loop.modes], varying)
@@ -572,8 +595,8 @@ class FeedbackClaims:
         return self._resting([float(t) for a, b in ends for t in a + parts * (b - a)])
 
     def _resting(self, changes: list[float] | None) -> ClosedLoop:
-        K, m, d = self.case.control.pieces, self.case.problem.system.controls, self.case.problem.system.states
-        return self._loop(np.zeros((m, K)), np.zeros((K, K, m, d)), changes)
+        K, m = self.case.control.pieces, self.case.problem.system.controls
+        return self._loop(np.zeros((m, K)), self._none, changes)
 
     def _told(self, entry: object) -> ClosedLoop:
         """The system at rest under disturbances that jump where the one does that an entry names."""
@@ -681,7 +704,7 @@ class _Row:
             if direction.shape != (case.problem.system.controls,):
                 raise Broken(f"{name}: {direction.size} numbers where {case.problem.system.controls} are expected")
             row = case.duality.step_row(direction, time)
-            return _Row(y, row.constant, row.slope, _seen(loop, z, case.problem.system.states), None)
+            return _Row(y, row.constant, row.slope, _seen(loop, z), None)
         return _Row._of_state(case, loop, (name, direction, time, y), z, entry.get("piece"))
 
     @staticmethod
@@ -706,7 +729,7 @@ class _Row:
             window.meets(loop.breakpoints, piece, time)
             own = [a + b for a, b in zip(slope[piece], balls(gain), strict=True)]
             slope = [own if k == piece else values for k, values in enumerate(slope)]
-        return _Row(y, row.constant + _given(case, loop, c, time, z), slope, _seen(loop, z, d), None)
+        return _Row(y, row.constant + _given(case, loop, c, time, z), slope, _seen(loop, z), None)
 
     @staticmethod
     def _of_control(
@@ -716,13 +739,13 @@ class _Row:
         from flint import arb
 
         name, direction, time, y = said
-        K, m, d = case.control.pieces, case.problem.system.controls, case.problem.system.states
+        K, m = case.control.pieces, case.problem.system.controls
         if direction.shape != (m,):
             raise Broken(f"{name}: {direction.size} numbers where {m} are expected")
         nominal = [[arb(0)] * m for _ in range(K)]
         piece = int(np.clip(bisect_right(loop.breakpoints, time) - 1, 0, K - 1))
         nominal[piece] = balls(direction)
-        seen = [part if j <= piece else [arb(0)] * d for j, part in enumerate(_seen(loop, z, d))]
+        seen = [part if j <= piece else [arb(0)] * loop.outputs for j, part in enumerate(_seen(loop, z))]
         if name != PEAK:
             return _Row(y, -known(case.problem.control).limit(direction), nominal, seen, None)
         channel = int(np.abs(direction).argmax())
@@ -733,7 +756,7 @@ class _Row:
     @staticmethod
     def _of_effort(case: Case, loop: ClosedLoop, shares: Array, y: float, z: list[list[arb]]) -> _Row:
         """The control at deviations, each entry of it times a share of ``[-1, 1]``, is at most the effort."""
-        K, m, d = case.control.pieces, case.problem.system.controls, case.problem.system.states
+        K, m = case.control.pieces, case.problem.system.controls
         if shares.shape != (m * K,) or not (np.abs(shares) <= 1.0).all():
             raise Broken(f"{EFFORT}: expected {m * K} numbers from -1 to 1")
         from flint import arb
@@ -742,7 +765,7 @@ class _Row:
             [price * arb(float(shares[i * K + k])) for i, price in enumerate(costs)]
             for k, costs in enumerate(case.price.costs)
         ]
-        return _Row(y, arb(0), nominal, _seen(loop, z, d), None, of_effort=True)
+        return _Row(y, arb(0), nominal, _seen(loop, z), None, of_effort=True)
 
 
 def _fixed(case: Case, direction: Array, time: float) -> arb:
@@ -762,33 +785,35 @@ def _given(case: Case, loop: ClosedLoop, direction: Array, time: float, z: list[
     from flint import arb
 
     weights = case.duality.pushed(direction, time, loop.changes)
+    parts = [*zip(loop.sets, z, strict=True)]
+    parts = parts[: loop.blocks] + parts[loop.begun :]  # noise reaches the state through answers alone
     weights += [] if case.problem.initial_set is None else [case.duality.carried(direction, time)]
     return sum(
         (
             weight * (arb(float(m)) + off)
-            for row, (_, about), block in zip(weights, loop.sets, z, strict=True)
+            for row, ((_, about), block) in zip(weights, parts, strict=True)
             for weight, m, off in zip(row, about, block, strict=True)
         ),
         arb(0),
     )
 
 
-def _seen(loop: ClosedLoop, z: list[list[arb]], d: int) -> list[list[arb]]:
-    """The innovations ``(K, d)`` of deviations, block by block."""
+def _seen(loop: ClosedLoop, z: list[list[arb]]) -> list[list[arb]]:
+    """The innovations ``(K, p)`` of deviations, block by block."""
     from flint import arb
 
     return [
         [
             sum((push[s, b] * x for block, push in seen.items() for b, x in enumerate(z[block])), arb(0))
-            for s in range(d)
+            for s in range(loop.outputs)
         ]
         for seen in loop.seen
     ]
 
 
 def _deviations(case: Case, loop: ClosedLoop, entry: Mapping[str, Any], name: str) -> list[list[arb]]:
-    """The deviations, block by block, of the ``disturbance (mw, blocks)`` and of the initial state, ``deviation (d,)``
-    from its centre, that an entry names, which must be in their sets."""
+    """The deviations, block by block, of the ``disturbance (mw, blocks)``, of the ``noise (K, p)`` and of the initial
+    state, ``deviation (d,)`` from its centre, that an entry names, which must be in their sets."""
     from flint import arb
 
     points: list[Array] = []
@@ -797,13 +822,19 @@ def _deviations(case: Case, loop: ClosedLoop, entry: Mapping[str, Any], name: st
         if w.shape != (loop.width, loop.blocks):
             raise Broken(f"{name}: a disturbance of shape {w.shape}, expected {(loop.width, loop.blocks)}")
         points = list(w.T)
+    if loop.noises and loop.measured is not None:
+        v = numbers(entry.get("noise"), f"{name}: noise")
+        if v.shape != (loop.noises, loop.outputs):
+            raise Broken(f"{name}: a noise of shape {v.shape}, expected {(loop.noises, loop.outputs)}")
+        points += list(v)
     if case.problem.initial_set is not None:
         points.append(numbers(entry.get("deviation"), f"{name}: deviation"))
         if points[-1].shape != (case.problem.system.states,):
             raise Broken(f"{name}: a deviation of the initial state of shape {points[-1].shape}")
     for number_of, (point, (shape, _)) in enumerate(zip(points, loop.sets, strict=True)):
         if not known(shape).contains(point):
-            what = "disturbance" if number_of < loop.blocks else "deviation of the initial state"
+            kinds = ("disturbance", "noise", "deviation of the initial state")
+            what = kinds[(number_of >= loop.blocks) + (number_of >= loop.begun)]
             raise Broken(f"{name}: the {what} {point.tolist()} is not shown to be in its set")
     return [
         [arb(float(v)) - arb(float(c)) for v, c in zip(point, about, strict=True)]

@@ -29,9 +29,17 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
+    from sparserob_core.control.problem.measurements import Measurements
     from sparserob_core.control.problem.system import System
 
 TERMS = 8  # of the expansion that bounds a second derivative
+
+
+def arb_of(value: float) -> arb:
+    """The ball of an exact number."""
+    from flint import arb
+
+    return arb(float(value))
 
 
 def middle(shape: ConvexSet) -> Array:
@@ -46,7 +54,9 @@ def middle(shape: ConvexSet) -> Array:
 class ClosedLoop:
     """A known system from ``initial_state`` under the nominal control ``(m, K)`` and ``gains (K, K, m, d)``; ``grid``:
     every breakpoint; ``breakpoints``: those of the control; ``changes``: where the disturbance may jump; ``initial``:
-    the set of deviations of the initial state; ``before (m,)``: what acts until a delay of the control is over."""
+    the set of deviations of the initial state; ``before (m,)``: what acts until a delay of the control is over;
+    ``measured``: what is seen of the state at every breakpoint, with the ``observer (K, d, p)`` that makes innovations
+    of it, of all of the state where there is none."""
 
     system: System
     initial_state: list[float]
@@ -58,6 +68,8 @@ class ClosedLoop:
     shape: ConvexSet | None
     initial: ConvexSet | None = None
     before: tuple[float, ...] = ()
+    measured: Measurements | None = None
+    observer: Array | None = None
     _steps: dict[tuple[int, float], tuple[arb_mat, arb_mat]] = field(default_factory=dict, repr=False)
 
     @cached_property
@@ -99,7 +111,24 @@ class ClosedLoop:
         """The set and the middle of every block of the deviations: those of the disturbance, that of the initial
         state."""
         held = [] if self.shape is None else [(self.shape, self.middle)] * self.blocks
+        noise = None if self.measured is None else self.measured.noise
+        held += [] if noise is None else [(noise, middle(noise))] * self.noises
         return held if self.initial is None else [*held, (self.initial, middle(self.initial))]
+
+    @property
+    def noises(self) -> int:
+        """How many blocks the noise of the measurements has, after those of the disturbance."""
+        return 0 if self.measured is None or self.measured.noise is None else len(self.breakpoints) - 1
+
+    @property
+    def begun(self) -> int:
+        """The place of the block of the initial state, where there is one: the last."""
+        return self.blocks + self.noises
+
+    @property
+    def outputs(self) -> int:
+        """How many numbers an innovation has."""
+        return int(self.parts["A"].nrows()) if self.measured is None else self.measured.outputs
 
     @cached_property
     def starts(self) -> list[int]:
@@ -142,11 +171,46 @@ class ClosedLoop:
 
     @cached_property
     def seen(self) -> list[dict[int, arb_mat]]:
-        """``D_jl``: what every innovation is of every block, ``(d, mw)``; blocks that are not seen are left out."""
+        """``D_jl``: what every innovation is of every block, ``(p, mw)``; blocks that are not seen are left out."""
+        return self._entering if self.measured is None else self._observed(self.measured)
+
+    def _observed(self, measured: Measurements) -> list[dict[int, arb_mat]]:
+        """The innovations of the observer: its error goes on from breakpoint to breakpoint, less what it corrects."""
+        assert self.observer is not None
+        C = stacked([[arb_of(v) for v in row] for row in np.asarray(measured.C)])
+        unit = stacked([[arb_of(i == j) for j in range(self.outputs)] for i in range(self.outputs)])
+        found: list[dict[int, arb_mat]] = []
+        error: dict[int, arb_mat] = {}
+        for j, entering in enumerate(self._entering):
+            for block, push in entering.items():
+                error[block] = error[block] + push if block in error else push
+            seen = {block: C * push for block, push in error.items()}
+            if self.noises:
+                seen[self.blocks + j] = unit
+            found.append(seen)
+            if j + 1 == len(self.breakpoints) - 1:
+                break
+            L, flow = stacked([[arb_of(v) for v in row] for row in self.observer[j]]), self._between[j]
+            error = {block: flow * error[block] - L * push if block in error else -L * push
+                     for block, push in seen.items()}  # fmt: skip
+        return found
+
+    @cached_property
+    def _between(self) -> list[arb_mat]:
+        """The flows from each breakpoint of the control to the next."""
+        found = [self._identity for _ in self.breakpoints[:-1]]
+        for piece in range(len(self.grid) - 1):
+            found[self.on(piece)] = self._held(self.grid[piece], self.grid[piece + 1])[0] * found[self.on(piece)]
+        return found
+
+    @cached_property
+    def _entering(self) -> list[dict[int, arb_mat]]:
+        """What of every block enters the state from one breakpoint to the next, ``(d, mw)``, by the next; from the
+        beginning, what it begins with."""
         K = len(self.breakpoints) - 1
         found: list[dict[int, arb_mat]] = [{} for _ in range(K)]
         if self.initial is not None:
-            found[0][self.blocks] = self._identity
+            found[0][self.begun] = self._identity
         for piece in range(len(self.grid) - 1 if self.blocks else 0):
             k, (_, block) = self.on(piece), self._places(piece)
             if k + 1 >= K:
@@ -223,7 +287,7 @@ class ClosedLoop:
             answers = [[] for _ in begin]
         else:
             begin = [v + arb(float(m)) for v, m in zip(begin, self.sets[-1][1], strict=True)]
-        zero = [arb(0)] * self.starts[self.blocks]
+        zero = [arb(0)] * self.starts[self.begun]
         found = [stacked([[v, *zero, *row] for v, row in zip(begin, answers, strict=True)])]
         for piece, drive in enumerate(self.drives):
             Phi, Gamma = self._held(self.grid[piece], self.grid[piece + 1])

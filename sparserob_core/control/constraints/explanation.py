@@ -44,7 +44,8 @@ class TimedExplanation(Explanation):
     name of the constraint. Words say all of these, and the ``direction``, divided by ``scale``; ``names``: what the
     states are called. ``deviation (d,)`` is that of ``begun`` from the centre of the initial states. ``gain (m,)``: the
     part of the normal on the control, of a mixed constraint, and ``piece`` the piece of the control that it looks at.
-    ``changes``: when each of the disturbance's pieces begins, where that depends on the constraint.
+    ``changes``: when each of the disturbance's pieces begins, where that depends on the constraint. ``noise (K, p)``:
+    the worst noise of what is measured at every breakpoint of the control, where there is any.
     """
 
     decides: ClassVar[str] = "control"
@@ -70,6 +71,7 @@ class TimedExplanation(Explanation):
     gain: Array | None = None
     piece: int | None = None
     changes: Array | None = None
+    noise: Array | None = None
 
     def witness(self, worst: WorstConstraint) -> WorstConstraint:
         return Witness(

@@ -492,20 +492,21 @@ def worst_of_each(found: Array, times: Array) -> Separation:
 def told(said: TimedExplanation, loop: ClosedLoop, w: Array, controls: bool = False) -> TimedExplanation:
     """What is said of a constraint, on the state or on the ``controls``, of every disturbance, or at deviations
     ``w (Q,)``."""
-    problem = loop.functionals
-    every = ("disturbance", problem.disturbance), ("initial state", problem.initial)
+    problem, noises = loop.functionals, loop.noises(w) if w.size else None
+    noisy = True if loop.observer is not None and loop.observer.noisy else None
+    every = ("disturbance", problem.disturbance), ("noise", noisy), ("initial state", problem.initial)
     text = f"{said.statement} for every {' and '.join(name for name, one in every if one is not None) or 'disturbance'}"
     if not w.size and loop.spread.size:
-        return replace(said, text=text, disturbance=None, begun=None, deviation=None, quantity="")
+        return replace(said, text=text, disturbance=None, begun=None, deviation=None, quantity="", noise=None)
     point, width = loop.spread.middle + w, problem.response.system.disturbances
     signal = changes = None
     if loop.measurable is not None:
         breakpoints, signal = loop.signal(w, said.time, None if controls else said.direction, said.piece)
         changes = breakpoints[:-1]
     elif problem.disturbance is not None:
-        signal = point[: point.size - int(loop.begins.sum())].reshape(-1, width).T
+        signal = point[: loop.noise.start].reshape(-1, width).T
     if problem.initial is None:
-        return replace(said, text=text, disturbance=signal, changes=changes, quantity="")
+        return replace(said, text=text, disturbance=signal, changes=changes, quantity="", noise=noises)
     deviation = loop.begins @ point
     return replace(
         said,
@@ -515,4 +516,5 @@ def told(said: TimedExplanation, loop: ClosedLoop, w: Array, controls: bool = Fa
         begun=problem.response.initial_state + deviation,
         deviation=deviation,
         quantity="",
+        noise=noises,
     )

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from sparserob_core.control.feedback.innovations import KNOWN, Answers
+from sparserob_core.control.feedback.innovations import KNOWN, Answers, innovations_seen
 from sparserob_core.control.feedback.measurable import MeasurablePieces
+from sparserob_core.control.feedback.observer import Observer, between
 from sparserob_core.control.response.functional import WorstCase
 from sparserob_core.control.response.measurable import MISSED
 from sparserob_core.sip.convex_set import Array, ConvexSet
@@ -34,8 +35,9 @@ class ClosedLoop:
 
     The decision ``x (n,)`` begins with the nominal control ``v (m, K)``, raveled; the variables of ``answers`` follow,
     and then whatever else the program has. ``spread``: the deviations of the disturbance, block after block (of
-    ``measurable`` ones what they make of the state at the end of every piece of the grid), and of the initial state
-    where there is a set of them.
+    ``measurable`` ones what they make of the state at the end of every piece of the grid), of the noise of what is
+    measured, breakpoint after breakpoint, and of the initial state where there is a set of them. ``observer``: what
+    makes innovations of outputs; they are those of the whole state where there is none.
     """
 
     functionals: WorstCase
@@ -43,6 +45,7 @@ class ClosedLoop:
     spread: Spread
     variables: int
     measurable: MeasurablePieces | None = None
+    observer: Observer | None = None
     _paths: dict[bytes, tuple[Array, Array]] = field(default_factory=dict, repr=False)
 
     @property
@@ -96,6 +99,34 @@ class ClosedLoop:
         d = self.functionals.response.initial_state.size
         count = 0 if self.functionals.initial is None else d
         return np.hstack([np.zeros((d, self.spread.size - count)), np.eye(d, count)])
+
+    @property
+    def noise(self) -> slice:
+        """Which entries of the deviations are those of the noise; none where there is none."""
+        last = self.spread.size - int(self.begins.sum())
+        noisy = self.observer is not None and self.observer.noisy
+        return slice(last - (self.answers.shape[0] * self.answers.shape[3] if noisy else 0), last)
+
+    def noises(self, deviation: Array) -> Array | None:
+        """The noise ``(K, p)`` of a deviation ``(Q,)``; ``None`` where there is none."""
+        point = (self.spread.middle + deviation)[self.noise]
+        return point.reshape(self.answers.shape[0], -1) if point.size else None
+
+    @cached_property
+    def innovations(self) -> Array:
+        """What every innovation is of the deviations, ``(K, p, Q)``."""
+        problem, begun = self.functionals, int(self.begins.sum())
+        seen = innovations_seen(
+            problem.response, problem.dictionary, problem.disturbance, begun > 0, pieces=self.measurable
+        )
+        if self.observer is None:
+            return seen
+        return self.observer.seen(seen, between(problem.response, problem.dictionary), begun)
+
+    @cached_property
+    def expected(self) -> tuple[Array, Array]:
+        """The least and the largest of every innovation, ``(K, p)`` each."""
+        return -self.spread.support(-self.innovations), self.spread.support(self.innovations)
 
     @cached_property
     def start(self) -> Array:
@@ -347,7 +378,14 @@ def shared(H: Array, spread: Spread) -> tuple[np.ndarray, Array]:
     return part, factor
 
 
-def deviations_of(bound: ConvexSet | None, blocks: int, initial: ConvexSet | None = None) -> Spread:
-    """The deviations of a disturbance with values in ``bound``, ``blocks`` times, and of the initial state where its
-    own are in ``initial``."""
-    return Spread(tuple((count, one) for count, one in ((blocks, bound), (1, initial)) if one is not None))
+def deviations_of(
+    bound: ConvexSet | None,
+    blocks: int,
+    initial: ConvexSet | None = None,
+    noise: ConvexSet | None = None,
+    measured: int = 0,
+) -> Spread:
+    """The deviations of a disturbance with values in ``bound``, ``blocks`` times, of a ``noise``, ``measured`` times,
+    and of the initial state where its own are in ``initial``."""
+    every = ((blocks, bound), (measured, noise), (1, initial))
+    return Spread(tuple((count, one) for count, one in every if one is not None))

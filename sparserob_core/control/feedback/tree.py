@@ -60,10 +60,10 @@ class Sampled:
             constant = free @ loop.start + loop.functionals.given(weights)
             constant = constant + np.einsum("rli,li->r", on_noise, loop.middles)
             T = loop.functionals.on_decision(weights).reshape(at.size, -1, K)
-            N = np.einsum("rli,liq->rq", on_noise, loop.entries[..., ~loop.begins.any(axis=0)])
+            N = np.einsum("rli,liq->rq", on_noise, loop.entries[..., : loop.noise.start])
             limits, numbers = h[side] - constant, np.full(at.size, number)
             parts.append((T, N, limits, numbers, side, at, np.searchsorted(starts, at)))
-        m, Q = loop.answers.shape[1], int((~loop.begins.any(axis=0)).sum())
+        m, Q = loop.answers.shape[1], loop.noise.start
         if not parts:
             none = np.zeros(0, dtype=int)
             return Sampled(np.zeros((0, m, K)), np.zeros((0, Q)), np.zeros(0), none, none, np.zeros(0), none)

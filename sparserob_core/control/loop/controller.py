@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.brief import brief
+from sparserob_core.control.feedback.observer import Observer
 from sparserob_core.control.loop.resolving import Plan, Resolving
 from sparserob_core.control.studies.measuring import Measuring
 from sparserob_core.errors import InputError
@@ -89,8 +90,8 @@ class Controller:
 
     def step(self, time: float, state: npt.ArrayLike) -> Array:
         """The control ``(m,)`` for the piece that begins at ``time``, a breakpoint, from the ``state (d,)`` measured
-        then. Breakpoints come one after another. Raises `InputError` for a time or a state that is none, and is then as
-        it was before."""
+        then, or of a problem with ``measurements`` from the outputs ``(p,)``. Breakpoints come one after another.
+        Raises `InputError` for a time or a state that is none, and is then as it was before."""
         began = clock.perf_counter()
         piece, measured = self._timed(time), self._measured(state)
         covered = self._covered and self._within(measured)
@@ -103,7 +104,8 @@ class Controller:
             else:
                 answer = None
         u = self._control(piece - self._plan.first, measured)
-        self._reach = self._plan.reach(piece - self._plan.first, measured, u)
+        if self._observer is None:
+            self._reach = self._plan.reach(piece - self._plan.first, measured, u)
         self._next, self._covered, self._before, self._last = piece + 1, covered, u, measured
         at = float(self._planned.model.control.breakpoints[piece])
         taken = (False, np.nan, np.nan) if answer is None else (answer.plan is not None, answer.cost, answer.lower)
@@ -138,18 +140,29 @@ class Controller:
             raise InputError(path="time", expected=said, got=f"{time!r}")
         return self._next
 
+    @property
+    def _observer(self) -> Observer | None:
+        """What makes innovations of outputs; ``None`` where the state is measured."""
+        feedback = self._plan.known.feedback
+        return None if feedback is None else feedback.loop.observer
+
     def _measured(self, state: object) -> Array:
-        count = self._planned.model.problem.system.states
+        observer, count, one = self._observer, self._planned.model.problem.system.states, "state"
+        if observer is not None:
+            count, one = observer.C.shape[0], "output"
         try:
             measured = np.array(state, dtype=float)
         except (TypeError, ValueError):
             measured = np.zeros(0)
         if measured.shape != (count,) or not np.isfinite(measured).all():
-            raise InputError(path="state", expected=f"{count} finite numbers, one per state", got=f"{state!r}")
+            raise InputError(path="state", expected=f"{count} finite numbers, one per {one}", got=f"{state!r}")
         return measured
 
     def _within(self, state: Array) -> bool:
-        """Whether a state is among those that the last one may lead to, or may begin with; coordinate by coordinate."""
+        """Whether a state is among those that the last one may lead to, or may begin with; coordinate by coordinate. Of
+        outputs: whether the innovation is as large as deviations can make it, number by number."""
+        if self._observer is not None:
+            return self._expected(state)
         if self._next == 0:
             problem = self._planned.model.problem
             centre, axes = np.asarray(problem.initial_state, dtype=float), np.eye(state.size)
@@ -163,6 +176,14 @@ class Controller:
         lower, upper = self._reach
         room = SEEN * max(float(np.abs(lower).max()), float(np.abs(upper).max()), np.finfo(float).tiny)
         return bool((state >= lower - room).all() and (state <= upper + room).all()) and self._caused(state, room)
+
+    def _expected(self, outputs: Array) -> bool:
+        feedback = self._plan.known.feedback
+        assert self._measuring is not None and feedback is not None
+        new = self._measuring.seen(outputs)[-1]
+        least, most = (bound[self._next - self._plan.first] for bound in feedback.loop.expected)
+        room = SEEN * float(np.max([np.abs(outputs), np.abs(new), np.abs(least), np.abs(most)]))
+        return bool((new >= least - room).all() and (new <= most + room).all())
 
     def _caused(self, state: Array, room: float) -> bool:
         """Whether an admissible disturbance led from the last state to this one, where that can be told."""
@@ -184,8 +205,6 @@ class Controller:
         feedback = self._plan.known.feedback
         if self._measuring is None or feedback is None:
             return [np.zeros(state.size)]
-        if self._next == self._plan.first:
-            return [state - feedback.loop.start if feedback.loop.begins.any() else np.zeros(state.size)]
         return self._measuring.seen(state)
 
     def _control(self, piece: int, state: Array) -> Array:
@@ -193,5 +212,5 @@ class Controller:
         if self._measuring is None:
             return nominal.copy()
         for number in np.flatnonzero(self._measuring.commanded == piece).tolist():
-            self._measuring(number, state[:, None])
+            self._measuring.after(number, lambda _: state[:, None])
         return self._plan.drawn_in(self._measuring.command(piece)[:, 0], nominal)

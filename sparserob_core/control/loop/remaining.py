@@ -30,6 +30,8 @@ def refuse_remaining(model: Transcription) -> None:
             or (problem.disturbance_class == "piecewise_constant" and not model.disturbance.is_complete)
         ),
         "a control that acts at once, without a delay": problem.system.delay > 0.0,
+        "a policy that measures the whole state, not outputs": model.feedback is not None
+        and problem.measurements is not None,
     }
     for wanted, hindered in reasons.items():
         if hindered:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from sparserob_core.control.problem.cost import Cost
 from sparserob_core.control.problem.disturbances import Disturbance, DisturbanceClass, joined
+from sparserob_core.control.problem.measurements import Measurements
 from sparserob_core.control.problem.names import UNNAMED, Names
 from sparserob_core.control.problem.prices import checked_weights, counted, integrals
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
@@ -96,6 +97,9 @@ class OptimalControlProblem:
     ``initial_set``: the bounded set of deviations from ``initial_state``, or ``None``; it holds 0. The state begins
     anywhere in ``initial_state + initial_set``, and every constraint holds from there.
 
+    ``measurements``: what a policy that answers measurements sees; the whole state, without noise and at once, unless
+    given. Of a control that answers nothing it changes nothing.
+
     ``weights``: a positive number, one for each control, or rows of a time and the weights from then on, which are not
     negative: prices, or a supply that is free for a while. The first time is 0.
 
@@ -120,6 +124,7 @@ class OptimalControlProblem:
     names: Names = UNNAMED
     cost: Cost = Cost()  # noqa: RUF009  immutable
     disturbances: Sequence[Disturbance] = ()
+    measurements: Measurements | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.system, LinearSystem | SwitchedSystem):
@@ -154,6 +159,7 @@ class OptimalControlProblem:
             step = _checked_set("control_step", self.control_step, self.system.controls, "controls")
             self._set("control_step", None if _restricts_nothing(step) else step)
         self._check_disturbance()
+        self._set("measurements", self._measured())
         self._check_names()
         windows = [self._windowed(f"path.{i}", entry) for i, entry in enumerate(_listed("path", self.path))]
         self._set("path", tuple(window for window in windows if not _restricts_nothing(window.set)))
@@ -214,6 +220,16 @@ class OptimalControlProblem:
         """What each control counts per time that it acts, ``(m,)``: its weight, or 1 where weights change with
         time."""
         return counted(self.weights)
+
+    def _measured(self) -> Measurements | None:
+        if self.measurements is None:
+            return None
+        if not isinstance(self.measurements, Measurements):
+            raise InputError(path="measurements", expected="Measurements", got=type(self.measurements).__name__)
+        try:
+            return self.measurements.checked(self.system.states, self.horizon)
+        except InputError as error:
+            raise error.under("measurements") from None
 
     def _costs(self) -> Cost:
         if not isinstance(self.cost, Cost):

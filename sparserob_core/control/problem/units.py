@@ -62,6 +62,9 @@ class Units:
             ),
             control_step=None if problem.control_step is None else problem.control_step.in_units(self.controls),
             names=problem.names,
+            measurements=(
+                None if problem.measurements is None else problem.measurements.in_units(self.states, self.time)
+            ),
         )
 
     def _window(self, entry: PathConstraint | MixedConstraint) -> PathConstraint | MixedConstraint:

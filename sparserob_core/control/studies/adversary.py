@@ -33,7 +33,7 @@ class Adversary:
 
     ``direction (d,)`` is row ``row`` of a set with flat sides, or a unit normal of a curved one. The disturbance
     ``(mw, L)`` is constant between ``breakpoints (L + 1,)``; ``None`` where there is none. ``deviation (Q,)``: under
-    feedback what the control answers, as in `ClosedLoop`.
+    feedback what the control answers, as in `ClosedLoop`; ``noise (K, p)`` that of what is measured, if any.
     """
 
     name: str
@@ -47,6 +47,7 @@ class Adversary:
     disturbance: Array | None
     initial_state: Array
     deviation: Array | None = None
+    noise: Array | None = None
 
     __repr__ = brief
 
@@ -103,6 +104,7 @@ def _of_loop(constraint: StateConstraint, decision: Array, loop: ClosedLoop) -> 
         breakpoints=breakpoints,
         disturbance=disturbance,
         deviation=deviation,
+        noise=loop.noises(deviation),
     )
 
 

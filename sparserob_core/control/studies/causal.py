@@ -116,8 +116,7 @@ class CausalSearch:
         grid, disturbance = model.response.grid, model.functionals.disturbance
         places = np.zeros(0, dtype=int) if disturbance is None or disturbance.starts is None else disturbance.starts
         self.starts = grid.breakpoints[places]
-        begins = model.problem.initial_set is not None
-        self.spread = Spread(self.loop.spread.sets[:-1] if begins else self.loop.spread.sets)
+        self.spread = Spread(() if disturbance is None else self.loop.spread.sets[:1])
         asked = [(one.H, one.h, self._times(one, active)) for one in self.constraints]
         self.sampled = Sampled.of(self.loop, asked, self.starts)
         self._active = active
@@ -135,7 +134,8 @@ class CausalSearch:
         problem, feedback = self.model.problem, self.model.feedback
         assert feedback is not None
         prices = problem.prices(self.model.control.breakpoints)
-        seen = np.searchsorted(self.starts, self.model.control.breakpoints[:-1])
+        points, measured = self.model.control.breakpoints, problem.measurements
+        seen = np.searchsorted(self.starts, points[:-1] if measured is None else measured.latest(points))
         width = self.spread.size // max(1, self.starts.size)
         worst = extreme(self.spread, self.sampled.N)
         tree = Tree(self.sampled, worst, problem.control, prices, seen, width, feedback.charge.cost, highest)

@@ -191,3 +191,12 @@ def _drawn_in(convex: ConvexSet, points: Array) -> Array:
     flat = points.reshape(-1, points.shape[-1])
     middle = convex.interior_point()
     return (middle + (flat - middle) / np.maximum(convex.gauge(flat), 1.0)[:, None]).reshape(points.shape)
+
+
+def noises(bound: ConvexSet | None, law: LawName, count: int, measured: int, rng: np.random.Generator) -> Array | None:
+    """``count`` noises ``(measured, p, count)`` of what is measured one time after another, each on its own: extreme
+    points of the set where the law is of such, else uniform ones; ``None`` where there is no noise."""
+    if bound is None:
+        return None
+    points = (_extreme if law == "vertices" else _uniform)(bound, count * measured, rng)
+    return np.ascontiguousarray(points.reshape(count, measured, -1).transpose(1, 2, 0))

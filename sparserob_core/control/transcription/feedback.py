@@ -17,6 +17,7 @@ from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.feedback.closed_loop import ClosedLoop, deviations_of
 from sparserob_core.control.feedback.innovations import Answers, answers, innovations_seen
 from sparserob_core.control.feedback.measurable import MeasurablePieces, measurable_pieces
+from sparserob_core.control.feedback.observer import Observer, between
 from sparserob_core.control.feedback.zonoid import has_corners
 from sparserob_core.control.policies.policy import Charge, Policy
 from sparserob_core.control.problem.dictionary import Dictionary
@@ -56,21 +57,30 @@ def with_feedback(
     blocks = 0 if own.functionals.disturbance is None else own.functionals.disturbance.block_count
     deviations = np.tile(units.disturbances[: own.problem.system.disturbances], blocks)
     deviations = deviations if pieces is None else np.ones(pieces.size)
-    deviations = np.concatenate([deviations, units.states]) if begins else deviations
     seen = innovations_seen(own.response, own.control, own.functionals.disturbance, begins, pieces)
+    outputs, observed, theirs_observed, begun = units.states, None, None, units.states[: len(units.states) * begins]
+    if problem.measurements is not None and own.problem.measurements is not None:
+        outputs, flows = problem.measurements.units(units.states), between(own.response, own.control)
+        radii = np.delete(spread.radii, np.arange(deviations.size, spread.size - begun.size))
+        observed = Observer.of(own.problem.measurements, seen, flows, radii)
+        theirs_observed = observed.in_units(units.states, outputs)
+        seen = observed.seen(seen, flows, begun.size)
+        deviations = np.append(deviations, np.tile(outputs, own.control.pieces if observed.noisy else 0))
+    deviations = np.append(deviations, begun)
     seen = seen * (spread.chords > 0.0)  # what cannot deviate is not answered
     scaled = answers(seen, mask, own.problem.system.controls)
-    known = _in_users(scaled, units, deviations)
+    known = _in_users(scaled, outputs, deviations)
 
     acting = None if pieces is None else pieces.in_units_of(model.functionals, units.states, units.disturbances)
     fixed = _fixed(problem, own, units)
     repeated = own.control.pieces
 
     def in_users(one: Transcription, charge: Charge) -> tuple[SemiInfiniteProgram, ClosedLoop]:
-        return _program(one, charge, known, acting, fixed[0], _steps(one.problem, repeated, own=False))
+        steps = _steps(one.problem, repeated, own=False)
+        return _program(one, charge, known, (acting, theirs_observed), fixed[0], steps)
 
     def in_own(one: Transcription, charge: Charge) -> tuple[SemiInfiniteProgram, ClosedLoop]:
-        return _program(one, charge, scaled, pieces, fixed[1], _steps(one.problem, repeated, own=True))
+        return _program(one, charge, scaled, (pieces, observed), fixed[1], _steps(one.problem, repeated, own=True))
 
     charge = policy.charge
     mine, theirs = in_users(model, charge), in_own(own, charge)
@@ -158,6 +168,8 @@ def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dic
         and not disturbance.is_complete,
         f"path constraint of another name than {' or '.join(map(str, named))}, which is taken": bool(named),
         "terminal set with an interior under measurable disturbances: they reach a fixed state": measurable and ends,
+        "measurement of the whole state without noise under measurable disturbances": measurable
+        and problem.measurements is not None,
         "control that acts at once under measurable disturbances, without a delay": measurable
         and problem.system.delay > 0.0,
         "single linear system under measurable disturbances, without pieces": measurable
@@ -170,13 +182,14 @@ def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dic
             raise InputError(f"feedback needs a {wanted}", path="policy.name")
 
 
-def _in_users(own: Answers, units: Units, deviations: Array) -> Answers:
-    """The same coordinates of gains in the user's units; powers of two change no number but its exponent."""
+def _in_users(own: Answers, measured: Array, deviations: Array) -> Answers:
+    """The same coordinates of gains in the user's units, in which one of what is ``measured (d,)`` and of the
+    ``deviations (Q,)`` is that; powers of two change no number but its exponent."""
     _, _, Q, d = own.shape
     at, which, value = own.effect
     effect = (at, which, value * deviations[own.entry[which]] / deviations[at % Q])
     at, which, value = own.gain
-    gain = (at, which, value * deviations[own.entry[which]] / units.states[at % d])
+    gain = (at, which, value * deviations[own.entry[which]] / measured[at % d])
     return replace(own, effect=effect, gain=gain)
 
 
@@ -184,7 +197,7 @@ def _program(
     model: Transcription,
     charge: Charge,
     known: Answers,
-    acting: MeasurablePieces | None,
+    acting: tuple[MeasurablePieces | None, Observer | None],
     fixed: tuple[Array, Array],
     steps: Callable[[ClosedLoop], FeedbackSteps] | None,
 ) -> tuple[SemiInfiniteProgram, ClosedLoop]:
@@ -193,7 +206,7 @@ def _program(
     functionals, problem, pieces = model.functionals, model.problem, model.control.pieces
     nominal, first = functionals.variables, functionals.variables + known.variables
     size = first + {"nominal": 0, "peak": nominal, "worst": 1}[charge.cost]
-    loop = ClosedLoop(functionals, known, _spread(model, acting), size, acting)
+    loop = ClosedLoop(functionals, known, _spread(model, acting[0]), size, *acting)
     families = [of_state(constraint, loop).family() for constraint in model.constraints]
     settled: list[Callable[[Array], Array]] = []
     if fixed[1].size:
@@ -262,9 +275,9 @@ def _spread(model: Transcription, acting: MeasurablePieces | None) -> Spread:
     problem, disturbance = model.problem, model.functionals.disturbance
     if acting is not None:
         return Spread((*acting.sets, *deviations_of(None, 0, problem.initial_set).sets), MISSED)
-    return deviations_of(
-        problem.disturbance, 0 if disturbance is None else disturbance.block_count, problem.initial_set
-    )
+    blocks = 0 if disturbance is None else disturbance.block_count
+    noise = None if problem.measurements is None else problem.measurements.noise
+    return deviations_of(problem.disturbance, blocks, problem.initial_set, noise, model.control.pieces)
 
 
 def _told_by(

@@ -72,13 +72,16 @@ CELLS = {"tolerance", "lower", "upper"}
 WITNESS = {"constraint", "time", "parameter", "direction", "disturbance", "violation"}
 BEGUN = {"deviation"}
 """Of a witness, and of a multiplier under feedback, where the initial states are a set."""
+NOISE = {"noise"}
+"""Of both, where a policy measures outputs with a noise."""
 
 
 def _unread(case: Case) -> set[str]:
     """The names ``key.key`` of what a certificate says besides what its claims rest on."""
-    data = case.certificate
+    data, measured = case.certificate, case.problem.measurements
+    noisy = case.policy is not None and measured is not None and measured.noise is not None
     read = CERTIFICATE.get(str(data.get("status")), FIGURED) | (
-        set() if case.policy is None else {"gains", "causal", "policy"}
+        set() if case.policy is None else {*ANSWERS, "causal", "policy"}
     )
     left = {name for name, value in data.items() if name not in read and not (name in SOMETIMES and value in NOTHING)}
     pieced = {window.name for window in case.windows if window.is_mixed}
@@ -104,6 +107,7 @@ def _unread(case: Case) -> set[str]:
             mixed = isinstance(entry, Mapping) and str(entry.get("constraint")) in pieced
             more = ({"piece"} if mixed else set()) | (set() if case.policy is None else {"disturbance"})
             more |= BEGUN if case.policy is not None and case.problem.initial_set is not None else set()
+            more |= NOISE if noisy else set()
             more |= {"changes"} if case.measurable and case.policy is not None else set()
             left |= _besides("multipliers.constraints", entry, MULTIPLIER | more)
             left |= {"multipliers.constraints.parameter"} if _of_a_curved_set_of_controls(case, entry) else set()
@@ -112,7 +116,7 @@ def _unread(case: Case) -> set[str]:
         left |= _besides("proof", proof, set(shapes))
         for name, shape in shapes.items():
             left |= _besides(f"proof.{name}", proof.get(name), CELLS if _flat(shape) else CELLS | {"normals"})
-    known = WITNESS if case.problem.initial_set is None else WITNESS | BEGUN
+    known = WITNESS | (BEGUN if case.problem.initial_set is not None else set()) | (NOISE if noisy else set())
     mixed = isinstance(witness, Mapping) and str(witness.get("constraint")) in pieced
     known = known | {"piece"} if mixed else known
     known = known - {"disturbance", *BEGUN} if case.measurable and case.policy is None else known
@@ -396,6 +400,7 @@ def _same(said: object, value: object, figures: float = FIGURES) -> bool:
 
 
 STORED = ("theta", "control", "breakpoints", "decision")
+ANSWERS = ("gains", "observer")
 
 
 def _solution(stored: StoredRun, case: Case) -> Verdicts:
@@ -407,11 +412,12 @@ def _solution(stored: StoredRun, case: Case) -> Verdicts:
         theta, control, breakpoints, flat = (arrays[name] for name in STORED)
         decision = np.array(case.certificate["decision"], dtype=float)
         size = case.control.summands(decision)
-        gains = np.array(case.certificate.get("gains", []), dtype=float)
+        answered = [] if case.policy is None else [name for name in ANSWERS if name in case.certificate]
         same = (
             np.array_equal(theta, decision)
             and np.array_equal(flat[: decision.size], decision.ravel())
-            and (flat.size == decision.size if case.policy is None else np.array_equal(arrays["gains"], gains))
+            and (case.policy is not None or flat.size == decision.size)
+            and all(np.array_equal(arrays[k], np.array(case.certificate[k], dtype=float)) for k in answered)
             and np.array_equal(breakpoints, case.control.breakpoints)
             and control.shape == size.shape
             and bool((np.abs(control - case.control.control(decision)) <= FIGURES * size).all())
@@ -422,8 +428,7 @@ def _solution(stored: StoredRun, case: Case) -> Verdicts:
         return [f"it holds no array {error}"], "", []
     except (ValueError, TypeError, OverflowError):
         return ["its control and the certificate's are no arrays of one shape"], "", []
-    stored_gains = set() if case.policy is None else {"gains"}
-    left = sorted(set(arrays) - {*STORED} - stored_gains - set(_witnessed(case, arrays)))
+    left = sorted(set(arrays) - {*STORED, *answered} - set(_witnessed(case, arrays)))
     different = [] if same else ["its control is not the certificate's"]
     different += [text for text in _witnessed(case, arrays).values() if text]
     return different, "it holds the certificate's control", left

@@ -13,6 +13,7 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag
 from sparserob_core.control.problem.cost import Cost
 from sparserob_core.control.problem.disturbances import Disturbance, DisturbanceClass
 from sparserob_core.control.problem.expression import CONSTANTS, FUNCTIONS, parse_column, parse_matrix
+from sparserob_core.control.problem.measurements import Measurements
 from sparserob_core.control.problem.names import Names
 from sparserob_core.control.problem.problem import (
     MixedConstraint,
@@ -354,6 +355,28 @@ def _system(
     )
 
 
+@final
+class MeasurementOptions(Options):
+    """What is measured at every breakpoint of the control's dictionary: ``C x`` and a noise."""
+
+    C: Matrix
+    """One row per output, one number per state."""
+
+    noise: SetOptions | None = None
+    """Set that the noise of the outputs takes its values in, bounded; none unless given."""
+
+    latency: float = Field(default=0.0, ge=0.0)
+    """How long it takes until a measurement is known to the control; 0 unless given."""
+
+    def build(self) -> Measurements:
+        """The measurements; raises `InputError` that begins with the key."""
+        noise = None if self.noise is None else self.noise.build("measurements.noise", len(self.C))
+        lengths = {len(row) for row in self.C}
+        if len(lengths) > 1:
+            raise InputError(path="measurements.C", expected="rows of one length", got=f"{sorted(lengths)}")
+        return Measurements(self.C, noise, self.latency)
+
+
 class LinearKeys(ProblemFactory, Options):
     """The keys that problems about a linear system share; what the control is, they say themselves."""
 
@@ -471,6 +494,10 @@ class LinearProblem(LinearKeys):
     """Set of the change of the control from one piece of its dictionary to the next, and from ``initial_control`` to
     the first piece where that is given; any change unless given."""
 
+    measurements: MeasurementOptions | None = None
+    """What a policy measures and answers: ``{C: ..., noise: ..., latency: ...}``; all states, without noise and at
+    once, unless given."""
+
     def build(self) -> OptimalControlProblem:
         """The problem; raises `InputError` that begins with the key at fault."""
         system = self.system.build()
@@ -498,6 +525,7 @@ class LinearProblem(LinearKeys):
                 None if self.control_step is None else self.control_step.build("control_step", system.controls)
             ),
             names=self.names.build(),
+            measurements=None if self.measurements is None else self.measurements.build(),
         )
 
     def _control_before(self, controls: int) -> list[float] | None:

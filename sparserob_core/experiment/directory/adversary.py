@@ -38,8 +38,9 @@ def adversaries(experiment: Experiment, decision: Array) -> dict[str, Array]:
     One row per family ``f``: ``names``, ``rows`` (which side; 0 for a curved set), ``times``, ``directions (f, d)`` and
     ``bounds`` with ``direction'x(time) - bound = violation`` in ``violations`` (negative: a margin),
     ``parameters (f, nu)``, ``initial_states (f, d)``, and ``disturbances (f, mw, L)``, constant between the common
-    ``breakpoints (L + 1,)``; ``states (f, d, T)`` at ``state_times (T,)`` is what they do to the state. Nothing,
-    ``{}``, for a program that is no control problem, or has no state constraint.
+    ``breakpoints (L + 1,)``; ``noises (f, K, p)`` where outputs are measured with a noise; ``states (f, d, T)`` at
+    ``state_times (T,)`` is what they do to the state. Nothing, ``{}``, for a program that is no control problem, or has
+    no state constraint.
     """
     if not isinstance(experiment, ControlExperiment):
         return {}
@@ -62,19 +63,22 @@ def propagated(model: Transcription, theta: Array, arrays: Mapping[str, Array]) 
     times = fine_times(Response(response.system, grid, response.initial_state), model.parameters, arrays["times"])
     fine = Response(response.system, finer(grid, times), response.initial_state)
     disturbances = arrays["disturbances"] if arrays["disturbances"].shape[1] else None
-    acting, begun = controlled(model, theta, grid.control_piece), arrays["initial_states"]
+    noises = arrays["noises"].transpose(1, 2, 0) if "noises" in arrays else None
+    acting, begun = controlled(model, theta, grid.control_piece, noises), arrays["initial_states"]
     states = np.stack(list(walk(fine, acting, arrays["parameters"], disturbances, begun)))
     return times, np.ascontiguousarray(states.transpose(2, 1, 0))
 
 
-def controlled(model: Transcription, decision: Array, which: np.ndarray) -> Array | Callable[[int, Array], Array]:
+def controlled(
+    model: Transcription, decision: Array, which: np.ndarray, noises: Array | None = None
+) -> Array | Callable[[int, Array], Array]:
     """What `walk` drives a system with at a decision, on pieces that lie in the pieces ``which`` of the grid: inputs
-    ``(m, pieces)``, or under feedback what answers the states."""
+    ``(m, pieces)``, or under feedback what answers the states, measured with ``noises (K, p, n)``."""
     if model.feedback is None:
         return model.functionals.on_grid(model.nominal(decision))[:, which]
     from sparserob_core.control.studies.measuring import Measuring
 
-    measuring, latest = Measuring.of(model, decision), (-1, np.zeros(0))
+    measuring, latest = Measuring.of(model, decision, noises), (-1, np.zeros(0))
 
     def acting(piece: int, state: Array) -> Array:
         nonlocal latest
@@ -143,6 +147,12 @@ def _require_shapes(file: Path, arrays: Mapping[str, Array], model: Transcriptio
             raise InputError(
                 f"{file}: {name}: expected finite numbers of shape {shape}, got shape {arrays[name].shape}"
             )
+    measured = model.problem.measurements if model.feedback is not None else None
+    if measured is not None and measured.noise is not None:
+        shape = (sizes["f"], model.control.pieces, measured.outputs)
+        given = arrays.get("noises", np.zeros(0))
+        if given.shape != shape or given.dtype.kind != "f" or not np.isfinite(given).all():
+            raise InputError(f"{file}: noises: expected finite numbers of shape {shape}, got shape {given.shape}")
 
 
 def _stacked(found: Sequence[Adversary], model: Transcription) -> dict[str, Array]:
@@ -165,4 +175,5 @@ def _stacked(found: Sequence[Adversary], model: Transcription) -> dict[str, Arra
         "breakpoints": points,
         "disturbances": disturbances,
         "initial_states": np.array([one.initial_state for one in found]),
+        **({"noises": np.array(noises)} if (noises := [one.noise for one in found if one.noise is not None]) else {}),
     }

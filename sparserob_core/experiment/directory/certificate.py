@@ -43,11 +43,12 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
     multipliers of a program of its own, or those of the cost where there are none, and with the decision that acts
     least and its proof where that is another one. Where the cost is the time that the control acts, ``J`` is beside it,
     and ``tree`` holds the parts of the controls, each with multipliers of its own. ``witness``: what refutes the
-    decision. Under feedback ``decision`` is the nominal control, ``gains (K, K, m, d)`` are what answers the
+    decision. Under feedback ``decision`` is the nominal control, ``gains (K, K, m, p)`` are what answers the
     innovations, ``policy`` says which cost is charged and which breakpoints every piece answers, as ranges ``[first,
     last]`` from 0 on, every constraint with a multiplier is one at a ``disturbance`` (a measurable one jumps at its
-    ``changes``), and at a ``deviation`` of the initial state from its centre where there is a set of them, and
-    ``causal`` is the bound against every causal policy.
+    ``changes``), at a ``deviation`` of the initial state from its centre where there is a set of them, and at a
+    ``noise (K, p)`` of the outputs, of which ``observer (K, d, p)`` makes innovations; ``causal`` is the bound against
+    every causal policy.
     """
     if not isinstance(experiment, ControlExperiment) or result.status == "failed":
         return None
@@ -64,6 +65,7 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
     if feedback is not None:
         answered["policy"] = {"cost": feedback.charge.cost, "answers": [_runs(row) for row in feedback.answers]}
         answered |= {} if theta is None else {"gains": feedback.loop.gains(np.asarray(result.decision))}
+        answered |= {} if feedback.loop.observer is None else {"observer": feedback.loop.observer.L}
     causal = result.causal if isinstance(result, ControlResult) and result.causal and result.causal.rows else None
     return {
         "format": FORMAT,
@@ -177,6 +179,7 @@ def _multipliers(experiment: ControlExperiment, dual: Dual) -> dict[str, Any] | 
                 **({} if program.spread is None else {"disturbance": _admissible(problem, said)}),
                 **({} if program.spread is None else _deviation(problem, said)),
                 **({} if said.changes is None else {"changes": said.changes}),
+                **_noise(problem, said),
             }
             for cut, said in explained
         ]
@@ -246,6 +249,14 @@ def _deviation(problem: OptimalControlProblem, said: TimedExplanation) -> dict[s
     return {"deviation": _inside(bound, said.deviation, bound.interior_point())}
 
 
+def _noise(problem: OptimalControlProblem, said: TimedExplanation) -> dict[str, Array]:
+    """The noise ``(K, p)`` that a constraint is at, certainly in its set; nothing without one."""
+    bound = None if problem.measurements is None else problem.measurements.noise
+    if bound is None or said.noise is None:
+        return {}
+    return {"noise": np.array([_inside(bound, row, bound.interior_point()) for row in said.noise])}
+
+
 def _inside(bound: ConvexSet, point: Array, middle: Array) -> Array:
     if bound.is_box:
         box = bound.bounding_box()
@@ -294,6 +305,7 @@ def _witness(experiment: ControlExperiment, result: Result) -> dict[str, Any] | 
         **_direction(said),
         "disturbance": signal,
         **_deviation(problem, said),
+        **_noise(problem, said),
         "violation": worst.violation,
     }
 

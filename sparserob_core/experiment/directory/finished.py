@@ -178,7 +178,7 @@ class FinishedRun:
         claims of that control is true is for `check` to say."""
         file = self.directory / "certificate.json"
         said = read_json(file) if file.is_file() else {}
-        held = {"decision": self.theta, "gains": self.solution.get("gains", np.zeros(0))}
+        held = {"decision": self.theta} | {name: self.solution.get(name, np.zeros(0)) for name in ("gains", "observer")}
         for name in (name for name in held if said.get(name) is not None):
             try:
                 same = np.array_equal(np.array(said[name], dtype=float), held[name])
@@ -196,11 +196,13 @@ class FinishedRun:
         followed = {"theta": model.nominal(decision), "control": model.pieces(decision)}
         if model.feedback is not None:
             followed["gains"] = model.feedback.loop.gains(decision)
+            observer = model.feedback.loop.observer
+            followed |= {} if observer is None else {"observer": observer.L}
         elif self.solution.get("decision", np.zeros(0)).shape == decision.shape:
             followed["decision"] = decision
         for name, value in followed.items():
             held = self.solution.get(name)
-            if held is None and name != "gains":
+            if held is None and name not in ("gains", "observer"):
                 continue
             size = float(np.abs(value).max(initial=0.0))
             if (

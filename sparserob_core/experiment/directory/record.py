@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import platform
+from collections.abc import Mapping
 from dataclasses import asdict
 from functools import cache
 from importlib import metadata
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -125,12 +127,13 @@ def arrays_of(
     program: SemiInfiniteProgram,
     dictionary: Dictionary | None,
     control: Array | None,
-    gains: Array | None = None,
+    answers: Mapping[str, Array] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """``solution.npz``: the decision, and for a control problem ``breakpoints``, ``control``, ``theta``; one row per
     imposed index in ``times``, ``indices`` (padded with NaN where families differ in dimension), ``rows``,
     ``families``, ``formulations`` (what its index says) and ``multipliers``; ``worst_disturbance (mw, pieces)`` where
-    the worst constraint has one; ``gains (K, K, m, n)`` under feedback."""
+    the worst constraint has one; under feedback the ``answers``: ``gains (K, K, m, p)``, and of outputs the
+    ``observer (K, d, p)``."""
     cuts = list(result.indices)
     width = max((np.size(cut.index) for cut in cuts), default=0)
     indices = np.full((len(cuts), width), np.nan)
@@ -149,8 +152,7 @@ def arrays_of(
         arrays["breakpoints"] = dictionary.breakpoints
     if isinstance(result.worst, Witness) and result.worst.disturbance is not None:
         arrays["worst_disturbance"] = result.worst.disturbance
-    if gains is not None:
-        arrays["gains"] = gains
+    arrays |= answers
     if control is not None and dictionary is not None:
         arrays |= {
             "control": control,

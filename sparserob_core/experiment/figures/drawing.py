@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from sparserob_core.control.feedback.closed_loop import ClosedLoop
-from sparserob_core.control.feedback.innovations import innovations_seen
 from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
 from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.sets.sets import Equality
@@ -145,6 +144,7 @@ def _answered(model: Transcription, decision: Array, times: Array, draws: int) -
         "control_least": nominal - loop.spread.support(-effects).T,
         "control_most": nominal + loop.spread.support(effects).T,
         "gains": loop.gains(decision),
+        "outputs": loop.observer is not None,
         **(_drawn(loop, nominal, effects, draws) if draws and held else {}),
         **(_moved(model, decision) if draws else {}),
     }
@@ -180,10 +180,8 @@ def _moved(model: Transcription, decision: Array) -> dict[str, Any]:
     if worst is None or worst.deviation is None:
         return {}
     loop = model.feedback.loop
-    disturbance, begins = model.functionals.disturbance, model.problem.initial_set is not None
-    seen = innovations_seen(model.response, model.control, disturbance, begins, loop.measurable)
     return {
-        "answers": np.einsum("kjid,jd->kji", loop.gains(decision), seen @ worst.deviation),
+        "answers": np.einsum("kjid,jd->kji", loop.gains(decision), loop.innovations @ worst.deviation),
         "worst_case": f"the worst case of {printable(worst.name)} at t = {worst.time:.4g}",
     }
 

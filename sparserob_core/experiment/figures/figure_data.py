@@ -91,10 +91,10 @@ class FigureData:
     ``names`` what everything is called, ``plane`` where the system moves, if the problem says that it does so in one.
 
     Under feedback the control is the nominal one, ``control_least``, ``control_most (m, K)`` are how far the
-    disturbance moves it, ``gains (K, K, m, d)`` answer what is measured, and ``alone_lower``, ``alone_upper (d, T)``
-    is the tube that the nominal control alone has. ``effort (3, m, K)`` are quantiles of ``|u|`` over ``draws``
-    admissible disturbances (5 %, 50 %, 95 %), and ``answers (K, K, m)`` what the control on every piece adds for the
-    innovation of every breakpoint in the ``worst_case`` that is named; each where it was asked for.
+    disturbance moves it, ``gains (K, K, m, p)`` answer what is measured, ``outputs`` or states, and ``alone_lower``,
+    ``alone_upper (d, T)`` is the tube that the nominal control alone has. ``effort (3, m, K)`` are quantiles of ``|u|``
+    over ``draws`` admissible disturbances (5 %, 50 %, 95 %), and ``answers (K, K, m)`` what the control on every piece
+    adds for the innovation of every breakpoint in the ``worst_case`` that is named; each where it was asked for.
     """
 
     title: str
@@ -119,6 +119,7 @@ class FigureData:
     control_least: Array | None = None
     control_most: Array | None = None
     gains: Array | None = None
+    outputs: bool = False
     effort: Array | None = None
     draws: int = 0
     answers: Array | None = None
@@ -161,6 +162,8 @@ class FigureData:
 
     def gain_label(self, channel: int, component: int) -> str:
         """The label of a gain: of which control on which state, and its unit where both are known."""
+        if self.outputs:
+            return f"gain on $y_{{{component + 1}}}$"
         u, x = self.names.control_units, self.names.state_units
         unit = f" [{plain(u[channel])} per {plain(x[component])}]" if u and x and u[channel] and x[component] else ""
         plainly = label(self.names.states, (), "x", component, self.state.shape[0])

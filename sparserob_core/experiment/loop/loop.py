@@ -15,7 +15,7 @@ from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.loop.controller import Controller
 from sparserob_core.control.problem.names import joined
 from sparserob_core.control.response.response import Response
-from sparserob_core.control.studies.laws import LawName, Uncertainty
+from sparserob_core.control.studies.laws import LawName, Uncertainty, noises
 from sparserob_core.control.studies.simulate import fine_times, finer, walk
 from sparserob_core.control.transcription.own_units import row_units
 from sparserob_core.control.transcription.record import Transcription
@@ -40,7 +40,8 @@ SHOWN, DRAWN = 400, 3  # times, and loops of every law, that are drawn
 CONTROL = "control"
 ROUNDING = 1e-12  # of the size of the set of controls
 
-Drawn = tuple[str, Array | None, Array, Array | None]  # law, disturbance (1, mw, M), parameter (1, nu), state (1, d)
+# law, disturbance (1, mw, M), parameter (1, nu), state (1, d), noise (K, p)
+Drawn = tuple[str, Array | None, Array, Array | None, Array | None]
 
 
 def loop(
@@ -101,10 +102,10 @@ def _closed(
     found = {one.name: -np.inf for one in model.constraints}
     limits = {one.name: TOLERANCE * float(row_units(one, model.problem.control).min()) for one in model.constraints}
     resolved, uncovered, outside = 0, 0, -np.inf
-    for number, (law, disturbance, parameter, begun) in enumerate(drawn):
+    for number, (law, disturbance, parameter, begun, noise) in enumerate(drawn):
         on = grid if law == ADVERSARY else model.response.grid
         fine = Response(model.response.system, finer(on, times), model.response.initial_state)
-        closing = _Closing(model, acting, on.control_piece if law == ADVERSARY else np.arange(on.pieces))
+        closing = _Closing(model, acting, on.control_piece if law == ADVERSARY else np.arange(on.pieces), noise)
         states = np.stack(list(walk(fine, closing, parameter, disturbance, begun)))
         laws[law] = laws.get(law, 0) + 1
         for name, largest in _violations(model, finished, states, times, closing.applied).items():
@@ -145,10 +146,10 @@ def _closed(
 
 class _Closing:
     """What drives a system: a controller, asked at the breakpoints of the control in the order in which they come.
-    ``which``: the pieces of the model's grid that are walked through."""
+    ``which``: the pieces of the model's grid that are walked through; ``noise (K, p)``: that of measured outputs."""
 
-    def __init__(self, model: Transcription, acting: Controller, which: np.ndarray) -> None:
-        self.model, self.acting, self.which = model, acting, which
+    def __init__(self, model: Transcription, acting: Controller, which: np.ndarray, noise: Array | None) -> None:
+        self.model, self.acting, self.which, self.noise = model, acting, which, noise
         self.applied = np.zeros((model.problem.system.controls, model.control.pieces))
         self._asked = 0
         acting.reset()
@@ -159,32 +160,45 @@ class _Closing:
         grid = self.model.response.grid
         middle = (grid.breakpoints[piece] + grid.breakpoints[piece + 1]) / 2
         if self._asked < points.size - 1 and middle > points[self._asked]:
-            self.applied[:, self._asked] = self.acting.step(float(points[self._asked]), state[:, 0])
+            self.applied[:, self._asked] = self.acting.step(float(points[self._asked]), self._measured(state[:, 0]))
             self._asked += 1
         return np.asarray(grid.inputs(self.applied)[:, piece, None])
+
+    def _measured(self, state: Array) -> Array:
+        """What is measured of a state ``(d,)``."""
+        measured = None if self.model.feedback is None else self.model.problem.measurements
+        if measured is None:
+            return state
+        seen: Array = np.asarray(measured.C) @ state
+        return seen if self.noise is None else seen + self.noise[self._asked]
 
 
 def _replayed(model: Transcription, worst: Mapping[str, Array]) -> Iterator[Drawn]:
     """The worst case of every constraint, under the plan."""
     for row in range(worst["names"].size if worst else 0):
         disturbance = worst["disturbances"][row : row + 1] if worst["disturbances"].shape[1] else None
-        yield ADVERSARY, disturbance, worst["parameters"][row : row + 1], worst["initial_states"][row : row + 1]
+        noise = worst["noises"][row] if "noises" in worst else None
+        yield ADVERSARY, disturbance, worst["parameters"][row : row + 1], worst["initial_states"][row : row + 1], noise
 
 
 def _sampled(model: Transcription, worst: Mapping[str, Array], count: int, rng: np.random.Generator) -> Iterator[Drawn]:
     """``count`` loops of every law; one loop where nothing is uncertain."""
     functionals, parameters = model.functionals, model.parameters
-    if not functionals.disturbed and parameters.set is None:
-        yield "iid", None, np.zeros((1, 0)), None
+    measured = None if model.feedback is None else model.problem.measurements
+    bound = None if measured is None else measured.noise
+    if not functionals.disturbed and parameters.set is None and bound is None:
+        yield "iid", None, np.zeros((1, 0)), None, None
         return
     known = tuple(worst[name] for name in ("times", "directions", "parameters")) if worst else (np.zeros(0),) * 3
     uncertainty = Uncertainty(functionals, parameters, model.constraints, (known[0], known[1], known[2]))
     for law in (law for law in LAWS if law != ADVERSARY and (worst or law != "neighbours")):
         disturbances, drawn, begun = uncertainty.draw(cast(LawName, law), count, rng)
+        seen = noises(bound, cast(LawName, law), count, model.control.pieces, rng)
         for row in range(count):
             one = slice(row, row + 1)
             signal = None if disturbances is None else disturbances[one]
-            yield law, signal, drawn[one], None if begun is None else begun[one]
+            noise = None if seen is None else seen[:, :, row]
+            yield law, signal, drawn[one], None if begun is None else begun[one], noise
 
 
 def _violations(

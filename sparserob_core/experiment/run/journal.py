@@ -129,8 +129,8 @@ class Journal(Observer):
         `StudyProgress` where a figure takes longer."""
         experiment, write = self.experiment, self.directory
         control, summary = self.record(result)
-        gains = gains_of(experiment, result)
-        write.write_arrays("solution.npz", arrays_of(result, experiment.program, self._dictionary, control, gains))
+        answers = answers_of(experiment, result)
+        write.write_arrays("solution.npz", arrays_of(result, experiment.program, self._dictionary, control, answers))
         rounds = self.rounds or list(result.history)
         write.write_arrays("trace.npz", trace_columns(rounds))
         kept = round_arrays(rounds)
@@ -159,10 +159,14 @@ class Journal(Observer):
         return control, summary, drawn(experiment, result, write.path, worst, notify)
 
 
-def gains_of(experiment: Experiment, result: Result) -> Array | None:
-    """The gains ``(K, K, m, n)`` of a decision; ``None`` without feedback."""
+def answers_of(experiment: Experiment, result: Result) -> dict[str, Array]:
+    """The ``gains (K, K, m, p)`` of a decision, and the ``observer (K, d, p)`` where outputs are measured; nothing
+    without feedback."""
     feedback = experiment.transcription.feedback if isinstance(experiment, ControlExperiment) else None
-    return None if feedback is None or result.decision is None else feedback.loop.gains(np.asarray(result.decision))
+    if feedback is None or result.decision is None:
+        return {}
+    observer = {} if feedback.loop.observer is None else {"observer": feedback.loop.observer.L}
+    return {"gains": feedback.loop.gains(np.asarray(result.decision)), **observer}
 
 
 def _notes(loaded: Loaded, result: Result, asked: bool) -> Iterator[Mapping[str, str]]:

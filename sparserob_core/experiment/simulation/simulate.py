@@ -15,7 +15,7 @@ from sparserob_core.control.constraints.flat import INSIDE
 from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.problem.names import joined
 from sparserob_core.control.response.response import Response
-from sparserob_core.control.studies.laws import LawName, Uncertainty
+from sparserob_core.control.studies.laws import LawName, Uncertainty, noises
 from sparserob_core.control.studies.simulate import fine_times, finer, trajectories_at_once, walk
 from sparserob_core.control.transcription.own_units import row_units
 from sparserob_core.errors import InputError
@@ -113,8 +113,8 @@ def _sampled(
 ) -> Simulation:
     model = finished.experiment.transcription
     response, parameters = model.response, model.parameters
-    control, acting = controlled(model, finished.decision, np.arange(response.grid.pieces)), _Acting()
-    control = acting.of(control) if callable(control) else control
+    acting, measured = _Acting(), None if model.feedback is None else model.problem.measurements
+    noise = None if measured is None else measured.noise
     ends = [moment for constraint in model.constraints for moment in (constraint.start, constraint.stop)]
     times = fine_times(response, parameters, np.concatenate([ends, worst.get("times", np.zeros(0))]))
     fine = Response(response.system, finer(response.grid, times), response.initial_state)
@@ -132,6 +132,9 @@ def _sampled(
     while done < count:
         size = min(block, count - done)
         disturbances, drawn, begun = uncertainty.draw(law, size, rng)
+        seen = noises(noise, law, size, model.control.pieces, rng)
+        control = controlled(model, finished.decision, np.arange(response.grid.pieces), seen)
+        control = acting.of(control) if callable(control) else control
         for one in counts:
             one.begin(size)
         for position, state in enumerate(walk(fine, control, drawn, disturbances, begun)):

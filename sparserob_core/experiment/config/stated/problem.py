@@ -13,6 +13,7 @@ import numpy as np
 
 from sparserob_core.control.problem.cost import Cost, Quadratic
 from sparserob_core.control.problem.expression import ExpressionMatrix
+from sparserob_core.control.problem.measurements import Measurements
 from sparserob_core.control.problem.names import Names
 from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
@@ -25,7 +26,7 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 
 WRITTEN = {
     "system", "horizon", "initial_state", "control", "initial_set", "weights", "disturbance", "disturbance_class",
-    "path", "terminal", "title", "initial_control", "control_step", "names", "cost", "disturbances",
+    "path", "terminal", "title", "initial_control", "control_step", "names", "cost", "disturbances", "measurements",
 }  # fmt: skip
 """The fields of a problem that are written; one that is added and not named here is refused, not lost."""
 WRITTEN_OF_SYSTEM = {"A", "B", "E", "parameters", "names", "c", "delay"}
@@ -53,6 +54,8 @@ def problem_keys(problem: OptimalControlProblem) -> dict[str, Any]:
         keys["disturbance"] = _disturbance_keys(problem, keys["system"])
     if problem.control_step is not None:
         keys["control_step"] = set_keys("control_step", problem.control_step)
+    if problem.measurements is not None:
+        keys["measurements"] = _measurement_keys(problem.measurements)
     if problem.initial_control is not None and (problem.control_step is not None or problem.system.delay > 0.0):
         keys["initial_control"] = np.asarray(problem.initial_control).tolist()
     return keys
@@ -174,6 +177,11 @@ def _term_keys(key: str, term: Quadratic) -> dict[str, Any]:
     if key == "control":
         return {"R": matrix.tolist()}
     return {"Q": matrix.tolist(), "reference": np.asarray(term.reference).tolist()}
+
+
+def _measurement_keys(measured: Measurements) -> dict[str, Any]:
+    noise = {} if measured.noise is None else {"noise": set_keys("measurements.noise", measured.noise)}
+    return {"C": np.asarray(measured.C).tolist(), **noise, "latency": measured.latency}
 
 
 def _names_keys(names: Names) -> dict[str, Any]:

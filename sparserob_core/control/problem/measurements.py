@@ -1,0 +1,95 @@
+"""What is measured of a state, with which noise, and when that is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from sparserob_core.errors import InputError
+from sparserob_core.shapes import sealed
+from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound
+
+SAME = (
+    1e-12  # of the horizon: what is known by less later than a breakpoint is known at it; ten times less and a latency
+)
+# of a whole piece is one piece more by rounding, ten times more and nobody would see it
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """``y_j = C x(tau_j) + v_j`` at every breakpoint ``tau_j`` of the control's dictionary, with ``C (p, d)`` and
+    ``v_j`` in the bounded set ``noise``, ``None`` for none; the control knows ``y_j`` from ``tau_j + latency`` on, in
+    the time unit of the problem."""
+
+    C: npt.ArrayLike
+    noise: ConvexSet | None = None
+    latency: float = 0.0
+
+    def __post_init__(self) -> None:
+        sealed(self)
+
+    @property
+    def outputs(self) -> int:
+        """How many numbers are measured at once, ``p``."""
+        return int(np.asarray(self.C).shape[0])
+
+    def checked(self, states: int, horizon: float) -> Measurements:
+        """The same with ``C`` as an array, and without a noise that is a point at 0; raises `InputError` that begins
+        with the key below ``measurements``."""
+        try:
+            C = np.array(self.C, dtype=float)
+        except (TypeError, ValueError):
+            raise InputError(path="C", expected="a matrix of numbers", got=f"{self.C!r}") from None
+        if C.ndim != 2 or C.shape[1] != states or not C.shape[0] or not np.isfinite(C).all():
+            raise InputError(
+                path="C",
+                expected=f"rows of {states} finite numbers, one per state, and a row per output",
+                got=f"an array of shape {C.shape}" if np.isfinite(C).all() else "a number that is not finite",
+            )
+        if not C.any(axis=1).all():
+            row = int(np.flatnonzero(~C.any(axis=1))[0])
+            raise InputError(path=f"C.{row}", expected="an output that depends on a state", got="zeros")
+        noise = self.noise
+        if noise is not None:
+            if noise.dimension != C.shape[0]:
+                expected = f"a set of {C.shape[0]} coordinates, one per output"
+                raise InputError(path="noise", expected=expected, got=f"{noise.dimension} coordinates")
+            reach = noise.reach(np.eye(C.shape[0]))
+            if not np.isfinite(reach).all():
+                raise InputError(path="noise", expected="a bounded set", got="an unbounded one")
+            noise = noise if reach.any() else None
+        latency = as_bound("latency", self.latency)
+        if latency.shape != (1,) or not 0.0 <= latency[0] < horizon:
+            raise InputError(
+                path="latency", expected=f"a time from 0 to less than {horizon:g}, the horizon", got=f"{self.latency!r}"
+            )
+        return replace(self, C=C, noise=noise, latency=float(latency[0]))
+
+    def units(self, states: Array) -> Array:
+        """What one of each output is in the user's units, ``(p,)``, where one of each state is ``states (d,)``: powers
+        of two, of the largest that a state gives to it."""
+        sizes = (np.abs(np.asarray(self.C)) * states).max(axis=1)
+        units: Array = np.exp2(np.round(np.log2(sizes)))
+        return units
+
+    def in_units(self, states: Array, time: float) -> Measurements:
+        """The same with every number in other units, of time and of the states; outputs in those that `units` says."""
+        outputs = self.units(states)
+        C = np.asarray(self.C) * states / outputs[:, None]
+        noise = None if self.noise is None else self.noise.in_units(outputs)
+        return Measurements(C, noise, self.latency / time)
+
+    def latest(self, breakpoints: Array) -> Array:
+        """When what each piece of the control knows last was measured, ``(K,)``; 0 of one that knows nothing."""
+        known = self.known(breakpoints)
+        latest: Array = np.where(known, breakpoints[:-1], 0.0).max(axis=1)
+        return latest
+
+    def known(self, breakpoints: Array) -> np.ndarray:
+        """Truth values ``(K, K)``: whether the control on piece ``k`` may know what was measured at breakpoint ``j``,
+        of the ``breakpoints (K + 1,)`` of the control's dictionary."""
+        starts, late = breakpoints[:-1], self.latency - SAME * breakpoints[-1]
+        found: np.ndarray = np.tril(starts[:, None] - starts >= late)
+        return found
