@@ -13,7 +13,7 @@ from sparserob_core.control.problem.system import LinearSystem as LinearSystem
 from sparserob_core.control.problem.system import SwitchedSystem as SwitchedSystem
 from sparserob_core.control.problem.problem import OptimalControlProblem as OptimalControlProblem
 from sparserob_core.control.problem.disturbances import Disturbance as Disturbance
-from sparserob_core.control.problem.measurements import Measurements as Measurements
+from sparserob_core.control.policies.measurements import Measurements as Measurements
 from sparserob_core.control.problem.problem import MixedConstraint as MixedConstraint
 from sparserob_core.control.problem.problem import PathConstraint as PathConstraint
 from sparserob_core.control.problem.problem import ProblemFactory as ProblemFactory

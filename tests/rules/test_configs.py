@@ -42,6 +42,7 @@ EXPECTED: dict[str, tuple[str, float | None, float]] = {
     "haar": ("certified", 0.537592, 5e-6),
     "measurable_feedback": ("certified", 1.11265558, 1e-7),
     "heated_house": ("certified", None, 0.0),
+    "output_feedback": ("certified", 0.9351872, 1e-6),
     "initial_set": ("certified", 0.502958, 1e-6),
     "motor_voltage": ("certified", 0.799768, 1e-6),
     "narrowing_corridor": ("certified", None, 0.0),

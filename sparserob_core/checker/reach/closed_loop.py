@@ -29,7 +29,7 @@ from sparserob_core.sip.convex_set import Array
 if TYPE_CHECKING:
     from flint import arb, arb_mat
 
-    from sparserob_core.control.problem.measurements import Measurements
+    from sparserob_core.control.policies.measurements import Measurements
     from sparserob_core.control.problem.system import System
 
 TERMS = 8  # of the expansion that bounds a second derivative

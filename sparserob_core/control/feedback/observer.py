@@ -15,8 +15,8 @@ from typing import final
 import numpy as np
 
 from sparserob_core.control.feedback.innovations import KNOWN
+from sparserob_core.control.policies.measurements import Measurements
 from sparserob_core.control.problem.dictionary import Dictionary
-from sparserob_core.control.problem.measurements import Measurements
 from sparserob_core.control.response.response import Response
 from sparserob_core.sip.convex_set import Array
 

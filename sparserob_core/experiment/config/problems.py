@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BeforeValidator, Discriminator, Field, Tag
 
+from sparserob_core.control.policies.measurements import Measurements
 from sparserob_core.control.problem.cost import Cost
 from sparserob_core.control.problem.disturbances import Disturbance, DisturbanceClass
 from sparserob_core.control.problem.expression import CONSTANTS, FUNCTIONS, parse_column, parse_matrix
-from sparserob_core.control.problem.measurements import Measurements
 from sparserob_core.control.problem.names import Names
 from sparserob_core.control.problem.problem import (
     MixedConstraint,

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from sparserob_core.control.policies.measurements import Measurements
 from sparserob_core.control.problem.cost import Cost, Quadratic
 from sparserob_core.control.problem.expression import ExpressionMatrix
-from sparserob_core.control.problem.measurements import Measurements
 from sparserob_core.control.problem.names import Names
 from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
