@@ -1,0 +1,255 @@
+"""Guards sip/inner/counterpart.py: the counterpart of uncertain rows has the optimum of the program that is written out
+at every corner of the deviations, and its multipliers prove what the Lagrangian is at least."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+from scipy.sparse import csr_array
+
+from sparserob_core.control.sets.sets import NormBall
+from sparserob_core.sip.convex_set import Array, Box
+from sparserob_core.sip.finite import FiniteProgram, Spread, UncertainRows
+from sparserob_core.sip.inner.counterpart import Counterpart, RobustAnswer, robust_bound
+
+N, Q = 4, 3
+BOX = Spread(((1, Box(np.array([-0.5, -1.0]), np.array([0.5, 1.0]))), (1, Box(np.array([-0.25]), np.array([0.25])))))
+POINTED = Spread(((1, NormBall(p=1.0, radius=0.75, dimension=2)), (1, Box(np.array([0.5]), np.array([2.0])))))
+SPREADS = {"box": BOX, "pointed": POINTED}
+
+
+def corners(spread: Spread) -> Array:
+    """The corners of these two, as deviations from the middle."""
+    if spread is BOX:
+        return np.array(list(product((-0.5, 0.5), (-1.0, 1.0), (-0.25, 0.25))))
+    return np.array([[*at, last] for at in ([0.75, 0], [-0.75, 0], [0, 0.75], [0, -0.75]) for last in (-0.75, 0.75)])
+
+
+def program(rng: np.random.Generator) -> FiniteProgram:
+    A = rng.standard_normal((1, N))
+    inside = rng.uniform(-0.3, 0.3, N)
+    lower, upper = -rng.uniform(1.0, 2.0, N), rng.uniform(1.0, 2.0, N)
+    lower[0] = 0.1  # a variable that is never 0
+    inside[0] = 0.3
+    none = np.zeros((0, N))
+    return FiniteProgram(
+        0.2 * rng.standard_normal(N), rng.uniform(0.5, 1.5, N), lower, upper, none, np.zeros(0), A, A @ inside
+    )
+
+
+def rows(rng: np.random.Generator, kind: str, room: float = 0.6) -> UncertainRows:
+    """Three rows of two parts, two of which look opposite ways; ``kind``: an entry is entered by several variables, by
+    one each, or by none."""
+    C = np.zeros((2, Q, N))
+    d = rng.standard_normal((2, Q))
+    if kind == "several":
+        C = rng.standard_normal(C.shape)
+        C[0, 1] = 0.0
+    if kind == "single":
+        C[0, 0, 1], C[0, 1, 2], C[1, 2, 3], C[1, 0, 1] = 1.5, -0.7, 0.8, -1.2
+        d[C.any(axis=2)] = 0.0
+    g = rng.standard_normal((3, N))
+    g[1] = -g[0]
+    part, factor = np.array([0, 0, 1]), np.array([0.8, -0.8, 1.1])
+    return UncertainRows(
+        csr_array(g), rng.uniform(0.7, 1.0, 3) + room, part, factor, tuple(csr_array(one) for one in C), 0.3 * d
+    )
+
+
+def written_out(block: UncertainRows, spread: Spread) -> tuple[Array, Array, Array]:
+    """``G x <= h`` with one row for every row and corner, and what of ``h`` a factor multiplies."""
+    G, h, moved = [], [], []
+    for row, p in enumerate(block.part):
+        for w in corners(spread):
+            scaled = block.factor[row] * w
+            G.append(block.g.toarray()[row] + scaled @ block.C[p].toarray())
+            h.append(block.h[row])
+            moved.append(scaled @ block.d[p])
+    return np.array(G), np.array(h), np.array(moved)
+
+
+@dataclass
+class Known:
+    """The optimum of what is written out in the parts of ``x`` that are not negative, and one more variable."""
+
+    value: float
+    extra: float
+
+
+def known(
+    base: FiniteProgram, blocks: list[UncertainRows], spread: Spread, extra: str = "", margin: float = 0.0
+) -> Known | None:
+    written = [written_out(block, spread) for block in blocks]
+    G, h, moved = (np.concatenate(part) for part in zip(*written, strict=True))
+    right = h - margin - (0.0 if extra == "factor" else moved)
+    last = {"": 0.0 * h, "slack": -np.ones(h.size), "factor": moved}[extra][:, None]
+    cost = np.concatenate([base.weights + base.q, base.weights - base.q, [0.0]])
+    if extra:
+        cost = np.append(np.zeros(2 * N), 1.0 if extra == "slack" else -1.0)
+    positive = [(max(a, 0.0), max(b, 0.0)) for a, b in zip(base.lower, base.upper, strict=True)]
+    negative = [(max(-b, 0.0), max(-a, 0.0)) for a, b in zip(base.lower, base.upper, strict=True)]
+    found = linprog(
+        cost,
+        np.hstack([G, -G, last]),
+        right,
+        np.hstack([base.A, -base.A, np.zeros((base.b.size, 1))]),
+        base.b,
+        [*positive, *negative, (0.0, 50.0)],
+    )
+    return Known(found.fun, found.x[-1]) if found.status == 0 else None
+
+
+def solved(counterpart: Counterpart, blocks: list[UncertainRows], margin: float = 0.0) -> RobustAnswer:
+    for block in blocks:
+        counterpart.add(block)
+    answer = counterpart.solve(margin)
+    for _ in range(40):
+        # with a factor, variables that answer deviations are so many times their answers
+        if not answer.solved or not counterpart.sharpen(answer.x / (answer.slack if counterpart.scales else 1.0)):
+            return answer
+        answer = counterpart.solve(margin)
+    raise AssertionError("a set with few corners has few points")
+
+
+CASES = [(seed, spread, kind) for seed in range(4) for spread in SPREADS for kind in ("several", "single", "none")]
+
+
+@pytest.mark.parametrize(("seed", "name", "kind"), CASES)
+def test_the_optimum_is_that_of_what_is_written_out_and_its_multipliers_prove_it(
+    seed: int, name: str, kind: str
+) -> None:
+    rng, spread = np.random.default_rng(seed), SPREADS[name]
+    base, blocks = program(rng), [rows(rng, kind), rows(rng, "several")]
+    for margin in (0.0, 0.01):
+        answer, truth = solved(Counterpart(base, spread), blocks, margin), known(base, blocks, spread, "", margin)
+        assert truth is not None
+        assert answer.solved
+        assert base.objective(answer.x) == pytest.approx(truth.value, abs=1e-8)
+        assert max(float(block.excess(answer.x, spread).max()) for block in blocks) <= 1e-8 - margin
+        assert (answer.y >= 0.0).all()
+        assert all(spread.holds(w) for w in answer.deviations)
+        proven, size = robust_bound(base, blocks, answer.y, answer.deviations, answer.mu, priced=True)
+        lost = margin * answer.y.sum()  # rows that were tightened are priced as they are
+        assert truth.value - lost - 1e-7 <= proven <= truth.value + 1e-9
+        assert size >= abs(proven) - 1e-12
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_block_that_comes_late_and_another_margin_are_imposed_like_those_before(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    base, blocks = program(rng), [rows(rng, "several") for _ in range(3)]
+    for spread in SPREADS.values():
+        counterpart = Counterpart(base, spread)
+        for number, margin in ((1, 0.0), (2, 0.02), (3, 0.02), (3, 0.0)):
+            fresh = blocks[len(counterpart.blocks) : number]
+            answer, truth = solved(counterpart, fresh, margin), known(base, blocks[:number], spread, "", margin)
+            assert answer.solved == (truth is not None)
+            if truth is not None:
+                assert base.objective(answer.x) == pytest.approx(truth.value, abs=1e-8)
+
+
+@pytest.mark.parametrize(("seed", "name", "kind"), CASES)
+def test_what_nothing_meets_is_relaxed_as_little_as_possible_and_its_multipliers_refute_it(
+    seed: int, name: str, kind: str
+) -> None:
+    rng, spread = np.random.default_rng(seed), SPREADS[name]
+    base, blocks = program(rng), [rows(rng, kind, room=-1.5), rows(rng, "several", room=-1.5)]
+    truth = known(base, blocks, spread, "slack")
+    answer = solved(Counterpart(base, spread, elastic=True), blocks)
+    assert truth is not None
+    assert truth.extra > 0.1
+    assert answer.slack == pytest.approx(truth.extra, abs=1e-8)
+    assert answer.y.sum() == pytest.approx(1.0, abs=1e-9)
+    proven = robust_bound(base, blocks, answer.y, answer.deviations, answer.mu, priced=False)[0]
+    assert truth.extra - 1e-7 <= proven <= truth.extra + 1e-9
+
+
+@pytest.mark.parametrize(("seed", "name"), [(seed, name) for seed in range(6) for name in SPREADS])
+def test_a_factor_is_the_largest_by_which_what_no_decision_answers_can_grow(seed: int, name: str) -> None:
+    rng, spread = np.random.default_rng(seed), SPREADS[name]
+    base, blocks = program(rng), [rows(rng, "several"), rows(rng, "none")]
+    truth, answer = (
+        known(base, blocks, spread, "factor"),
+        solved(Counterpart(base, spread, scales=True, highest=50.0), blocks),
+    )
+    assert truth is not None
+    assert answer.slack == pytest.approx(truth.extra, rel=1e-7)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_ceiling_keeps_the_weighted_sum_of_absolute_values(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    base, blocks = program(rng), [rows(rng, "several")]
+    least = known(base, blocks, BOX)
+    assert least is not None
+    towards = replace(base, weights=np.zeros(N), q=rng.standard_normal(N))
+    weights = np.array([0.0, 1.0, 2.0, 0.5])
+    free = solved(Counterpart(towards, BOX), blocks).x
+    most = 0.8 * float(weights @ np.abs(free))
+    kept = solved(Counterpart(towards, BOX, ceiling=(weights, most)), blocks)
+    assert kept.solved
+    assert weights @ np.abs(kept.x) == pytest.approx(most, abs=1e-8)
+    assert not solved(Counterpart(towards, BOX, ceiling=(weights, -0.1)), blocks).solved
+
+
+@pytest.mark.parametrize("priced", [True, False])
+@pytest.mark.parametrize("seed", range(8))
+def test_what_multipliers_prove_is_the_least_of_the_lagrangian(seed: int, priced: bool) -> None:
+    rng = np.random.default_rng(seed)
+    base, blocks = program(rng), [rows(rng, "several"), rows(rng, "single")]
+    count = sum(block.h.size for block in blocks)
+    y = np.where(rng.random(count) < 0.3, 0.0, rng.exponential(1.0, count))
+    w, mu = rng.uniform(-1.0, 1.0, (count, Q)) * BOX.radii, rng.standard_normal(1)
+    ends = [{low, high, float(np.clip(0.0, low, high))} for low, high in zip(base.lower, base.upper, strict=True)]
+    least, largest = np.inf, 0.0
+    for corner in product(*ends):
+        x, first = np.array(corner), 0
+        terms = [*(mu * base.A @ x), *(-mu * base.b)]
+        if priced:
+            terms += [*(base.q * x), *(base.weights * np.abs(x))]
+        for block in blocks:
+            for row, p in enumerate(block.part):
+                answered = block.C[p].toarray() @ x + block.d[p]
+                said = [block.g.toarray()[row] @ x, block.factor[row] * w[first] @ answered, -block.h[row]]
+                terms += [y[first] * one for one in said]
+                first += 1
+        least, largest = min(least, sum(terms)), max(largest, sum(abs(term) for term in terms))
+    proven, size = robust_bound(base, blocks, y, w, mu, priced)
+    assert proven == pytest.approx(least, abs=1e-12 * largest)
+    assert size >= 0.3 * largest  # all that is added up, so that its rounding is
+
+
+def test_a_variable_without_an_end_that_a_slope_draws_there_has_no_bound() -> None:
+    rng = np.random.default_rng(0)
+    base, block = program(rng), rows(rng, "several")
+    free = replace(base, upper=np.full(N, np.inf), weights=np.zeros(N))
+    y, w = np.ones(3), np.zeros((3, Q))
+    assert robust_bound(free, [block], y, w, np.zeros(1), priced=True)[0] == -np.inf
+
+
+@pytest.mark.parametrize("scales", [False, True])
+def test_exact_rows_hold_at_every_deviation(scales: bool) -> None:
+    rng = np.random.default_rng(3)
+    base = replace(program(rng), A=np.zeros((0, N)), b=np.zeros(0))
+    g, C = np.array([[1.0, 1.0, 0.0, 0.0]]), np.zeros((1, Q, N))
+    C[0, 0, 2], C[0, 1, 3] = 2.0, 1.0
+    d = np.array([[0.6, -0.2, 0.0]])
+    both = UncertainRows(
+        csr_array(np.vstack([g, -g])), np.array([0.7, -0.7]), np.zeros(2, dtype=int), np.array([1.0, -1.0]),
+        (csr_array(C[0]),), d, exact=True,
+    )  # fmt: skip
+    counterpart = Counterpart(base, BOX, scales=scales, highest=3.0)
+    answer = solved(counterpart, [both])
+    assert answer.solved
+    factor = answer.slack if scales else 1.0
+    assert answer.x[2:] == pytest.approx(factor * np.array([-0.3, 0.2]), abs=1e-9)
+    assert answer.x[:2].sum() == pytest.approx(0.7, abs=1e-9)
+    if not scales:
+        proven = robust_bound(base, [both], answer.y, answer.deviations, answer.mu, priced=True)[0]
+        assert proven == pytest.approx(base.objective(answer.x), abs=1e-8)
+        assert (answer.y >= 0.0).all()
+        assert all(BOX.holds(one) for one in answer.deviations)
