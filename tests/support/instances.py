@@ -448,9 +448,10 @@ def charged(
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-10
     whole = np.zeros((n + tops, n + tops))
     whole[:n, :n] = P
+    size = problem.largest  # the solver's accuracies are absolute, and costs may be a millionth
     answer = clarabel.DefaultSolver(
-        csc_matrix(np.triu(whole)),
-        np.concatenate([q, problem.price[:tops] if grouped else problem.price]),
+        csc_matrix(np.triu(whole)) / size,
+        np.concatenate([q, problem.price[:tops] if grouped else problem.price]) / size,
         csc_matrix(np.vstack(blocks)),
         np.concatenate(right),
         cones,
@@ -460,7 +461,7 @@ def charged(
         return np.inf, None
     if "Solved" not in str(answer.status):
         raise ArithmeticError(str(answer.status))
-    return answer.obj_val + constant, np.array(answer.x[:n])
+    return answer.obj_val * size + constant, np.array(answer.x[:n])
 
 
 def optimum(

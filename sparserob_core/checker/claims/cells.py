@@ -165,14 +165,13 @@ def _turn(
     at the cell's start."""
     middle = sides.centre
     if middle is None:
-        if sides.curved is None:
-            _refute(place, interval, failed)
+        _refute(place, interval, failed)
         return False
     ((_, (poly,), (top,)),) = _batch(place, [middle], [interval])
     if not top <= 0.0:
         top, poly = _closer(place, middle, interval, poly, top)
     _refute(place, interval, [(middle, poly)])
-    return top <= 0.0 and worst - top > 2.0 * (poly.expansion + poly.kinks)
+    return sides.is_wide and top <= 0.0 and worst - top > 2.0 * (poly.expansion + poly.kinks)
 
 
 def _refute(place: Place, interval: Interval, rows: Sequence[tuple[Bounded, Polynomial]]) -> None:

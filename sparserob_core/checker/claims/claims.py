@@ -28,7 +28,11 @@ if TYPE_CHECKING:
 PRECISION = 96  # bits, where the numbers of a system are of one size
 MOST_PRECISION = 1024
 FIGURES = 1e-11  # relative to the larger of it and 1: how closely a written figure must agree with the one derived
-SMALL_COST = 1e-6  # of what is added up to a cost: a cost below this is judged as if it were this large
+SMALL_COST = 1e-6  # of what is added up to a cost: a gap is relative to at least so much
+# Of what is added up to a cost: so much must agree to `FIGURES` where terms cancel, that is, to 1e-14 of the terms, some
+# forty roundings. Ten times smaller, and honest costs of 0 are refused, whose terms were rounded; ten times larger, and
+# a cost may be written lower than it is by what an open gap of `SMALL_COST` is.
+CANCELLED = 1e-3
 SMALL_GAP = 1e-11  # what is subtracted from a lower bound for rounding may open a gap that was closed
 MOST_MULTIPLIERS = 100_000
 ASIDE = ("fewest active", "causal")  # claims that the status does not rest on
@@ -194,7 +198,7 @@ def _cost(case: Case) -> str:
     if case.counts:
         return _counted(case)
     derived = case.price.of(case.pieces) if case.policy is None else _feedback(case).cost()
-    _agrees("cost", number(case.certificate, "cost"), derived, SMALL_COST * added_up(case))
+    _agrees("cost", number(case.certificate, "cost"), derived, CANCELLED * added_up(case))
     return f"J = {float(derived.mid()):.12g}"
 
 
@@ -205,7 +209,7 @@ def _counted(case: Case) -> str:
     acted, total = activity.acted(case), activity.largest(case)
     _agrees("cost", number(case.certificate, "cost"), arb(acted * total), 0.0)
     derived = case.price.of(case.pieces)
-    _agrees("J", number(case.certificate, "J"), derived, SMALL_COST * case.price.added(case.pieces))
+    _agrees("J", number(case.certificate, "J"), derived, CANCELLED * case.price.added(case.pieces))
     if case.letters is not None and not np.isin(case.control.control(case.theta), case.letters).all():
         raise Broken(f"the control takes other values than {list(case.letters)}")
     return f"it acts for {acted * total:.9g} of {total:.9g}, J = {float(derived.mid()):.12g}"

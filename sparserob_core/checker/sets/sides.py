@@ -102,10 +102,15 @@ class Sides:
 
     @property
     def centre(self) -> Bounded | None:
-        """The constraint in the middle of the cell of directions, with its true limit."""
-        if self.curved is None or self.low is None or self.high is None or not (self.high > self.low).any():
+        """The constraint in the middle of the cell of directions, with its true limit; ``None`` of a flat set."""
+        if self.curved is None or self.low is None or self.high is None:
             return None
         return self.curved.true((self.low + self.high) / 2)
+
+    @property
+    def is_wide(self) -> bool:
+        """Whether it is a cell of more than one direction; on a line a curved set has two directions and no more."""
+        return self.low is not None and self.high is not None and bool((self.high > self.low).any())
 
     def halves(self) -> list[Sides]:
         """Both halves of the cell of directions, across its widest coordinate."""

@@ -263,10 +263,10 @@ def _value(case: Case, summary: Mapping[str, Any]) -> list[str] | None:
     anew."""
     if summary.get("epsilon") != 0.0 or case.certificate.get("status") == "infeasible":
         return None
-    from sparserob_core.checker.claims.claims import SMALL_COST, added_up
+    from sparserob_core.checker.claims.claims import CANCELLED, added_up
 
     value, cost = summary.get("value"), summary.get("cost")
-    slack = FIGURES * SMALL_COST * added_up(case)
+    slack = FIGURES * CANCELLED * added_up(case)
     near = isinstance(value, float) and isinstance(cost, float) and abs(value - cost) <= slack
     return [] if near or _same(value, cost) else [f"value is {value!r} without a regulariser, the cost {cost!r}"]
 

@@ -90,6 +90,19 @@ def test_a_cost_agrees_to_eleven_digits():
     claims._agrees("a", 1e-15, arb(0), 1e-3)
 
 
+def test_a_cost_whose_terms_cancel_agrees_to_the_rounding_of_its_terms():
+    """``x' = u`` from 1 to 0 under ``(-1, 0)`` costs ``x(2)^2 = 1 - 2 + 1``: to 1e-14 of these 4, and no further."""
+    for off, agrees in ((3e-16, True), (-1e-14, True), (1e-13, False), (-1e-13, False)):
+        cost = sr.Cost(l1=0.0, final={"Q": [[1.0]]})
+        plant = {"system": LinearSystem(np.zeros((1, 1)), np.ones((1, 1))), "disturbance": None, "cost": cost}
+        case = case_of(decision=((-1.0, 0.0),), certificate={"cost": off}, **plant)
+        if agrees:
+            assert claims._cost(case) == "J = 0"
+        else:
+            with pytest.raises(Broken, match="cost"):
+                claims._cost(case)
+
+
 def entry(y=1.0, **more):
     said = {"constraint": "terminal", "time": 2.0, "direction": [1.0], "parameter": [], "multiplier": y}
     return {**said, **more}

@@ -82,6 +82,24 @@ def test_a_control_is_as_large_as_its_answers_make_it():
         claims(Box([-9.0], [0.299])).control()
 
 
+def test_a_control_in_a_curved_set_is_as_large_as_its_answers_make_it():
+    """``u_1`` is between -0.325 and -0.075; of a segment around 0.1 it is the lower end that counts."""
+    for radius, kept in ((0.425 / (1 + NOTHING), True), (0.425 / (1 + TOO_MUCH), False), (0.3, False)):
+        judged = claims(NormBall(p=2.0, radius=radius, centre=[0.1]))
+        if kept:
+            assert "2 pieces in their set" in judged.control()
+        else:
+            with pytest.raises(Broken):
+                judged.control()
+    for radius, kept in ((0.3 * (1 + 1e-8), True), (0.3 * (1 - 1e-8), False)):  # u_0 is 0.3, whatever happens
+        judged = claims(Ellipsoid([0.0], [[radius**2]]), gains=gains_of(m11=0.0))
+        if kept:
+            assert judged.control()
+        else:
+            with pytest.raises(Broken):
+                judged.control()
+
+
 def test_a_step_is_as_large_as_the_answers_of_both_pieces_make_it():
     """``u_1 - u_0 = -0.5 - w_0 / 2``."""
     for size, kept in ((0.625 / (1 + NOTHING), True), (0.625 / (1 + TOO_MUCH), False), (0.55, False)):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,12 +17,18 @@ from flint import arb, ctx
 
 import sparserob_core as sr
 from sparserob_core.checker.arithmetic.balls import balls
+from sparserob_core.checker.arithmetic.jets import Monomials
 from sparserob_core.checker.claims import claims, constraints, replay
 from sparserob_core.checker.claims.case import Case
 from sparserob_core.checker.claims.causal import causal_bound
+from sparserob_core.checker.claims.cells import Place, _cut
 from sparserob_core.checker.claims.cost import _integrated, _semidefinite
 from sparserob_core.checker.outcome import Broken, Clock, Finding, Unchecked
 from sparserob_core.checker.reach.flow import stacked
+from sparserob_core.checker.reach.tube import Polynomial
+from sparserob_core.checker.sets.known import known
+from sparserob_core.checker.sets.parameters import Parameters
+from sparserob_core.checker.sets.sides import Bounded
 from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.problem.cost import Quadratic
 from sparserob_core.control.problem.expression import parse_matrix
@@ -235,6 +242,57 @@ def test_directions_of_a_curved_wall_must_span_and_fill_the_faces():
     for wrong in ([[0.0]], [[1.0, 0.0]], [1.0]):
         with pytest.raises(Broken):
             constraints.normals_of(window, wrong)
+
+
+def test_a_state_that_leaves_a_curved_wall_on_a_line_is_refuted_at_once():
+    """The two directions of a line cannot be halved; the state leaves 1.7 at 0.95."""
+    faces = {"proof": {"path": proof(*(([0.0, s], [2.0, s]) for s in (-1.0, 1.0)))}}
+    for size, met in ((1.75 / (1 + NOTHING), True), (1.75 / (1 + TOO_MUCH), False), (1.7, False)):
+        case = replace(case_of(Ellipsoid([0.0], [[size**2]]), certificate=faces), clock=Clock(5.0))
+        if met:
+            assert kept(case)
+        else:
+            with pytest.raises(Broken, match="exceeded"):
+                kept(case)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_bound_with_the_set_of_parameters_is_above_every_parameter_in_it(seed):
+    """Of ``a'p + b t`` on a part of a disc around a point that is not 0, by the set: hardly above the largest."""
+    rng = np.random.default_rng(seed)
+    middle, radius = rng.uniform(-1.0, 1.0, 2), 0.5
+    parameters = Parameters(known(NormBall(p=2.0, radius=radius, centre=middle)))
+    low = middle + rng.uniform(-0.1, 0.1, 2)
+    high = low + rng.uniform(0.4, 0.6, 2)  # its far corner is outside
+    box, monomials = (tuple(low.tolist()), tuple(high.tolist())), Monomials(2, 1)
+    flow = SimpleNamespace(centre=((low + high) / 2).tolist(), radius=((high - low) / 2).tolist(), monomials=monomials)
+    slope, offset = rng.uniform(0.5, 1.0, 2), rng.normal()
+    coefficients = np.zeros((2, 3))
+    coefficients[0, 0], coefficients[1, 0] = offset, -0.3
+    for i in range(2):
+        coefficients[0, monomials.number[tuple(int(i == j) for j in range(2))]] = slope[i] * flow.radius[i]
+    poly = Polynomial(coefficients, 1e-3, 0.0, 0.0)
+    angle = np.linspace(0.0, 2 * np.pi, 40_001)
+    edge = middle + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    inside = edge[((edge >= low) & (edge <= high)).all(axis=1)]
+    truth = offset + ((inside - flow.centre) @ slope).max() + 1e-3
+    place = Place(SimpleNamespace(flow=flow), parameters, box, Clock(9.0))
+    for limit in (0.0, 0.7):
+        row = Bounded(np.ones(1), limit, 1.0)
+        found = _cut(place, row, poly)
+        assert truth - row.allowed - 1e-9 <= found <= truth - row.allowed + 0.02
+
+
+def test_a_cost_that_is_not_convex_is_refused_by_the_term():
+    """A record takes no other than a convex one: the matrix is changed afterwards, as a forger would."""
+    for name, letter in (("state", "Q"), ("control", "R"), ("final", "Q")):
+        cost = sr.Cost(**{name: {letter: [[1.0]]}})
+        case = case_of(disturbance=None, system=LinearSystem(np.zeros((1, 1)), ONE), cost=cost)
+        case.price.convex()
+        term = dict(zip(("state", "control", "final"), case.problem.cost.terms, strict=True))[name]
+        object.__setattr__(term, "Q", -np.ones((1, 1)))
+        with pytest.raises(Broken, match=name):
+            case.price.convex()
 
 
 def test_times_are_cut_where_the_grid_is():
