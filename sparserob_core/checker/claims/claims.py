@@ -29,9 +29,9 @@ PRECISION = 96  # bits, where the numbers of a system are of one size
 MOST_PRECISION = 1024
 FIGURES = 1e-11  # relative to the larger of it and 1: how closely a written figure must agree with the one derived
 SMALL_COST = 1e-6  # of what is added up to a cost: a gap is relative to at least so much
-# Of what is added up to a cost: so much must agree to `FIGURES` where terms cancel, that is, to 1e-14 of the terms, some
-# forty roundings. Ten times smaller, and honest costs of 0 are refused, whose terms were rounded; ten times larger, and
-# a cost may be written lower than it is by what an open gap of `SMALL_COST` is.
+# Of what is added up to a cost: so much must agree to `FIGURES` where terms cancel, that is, to 1e-14 of the terms,
+# some forty roundings. Ten times smaller, and honest costs of 0 are refused, whose terms were rounded; ten times
+# larger, and a cost may be written lower than it is by as much as a gap that counts as closed.
 CANCELLED = 1e-3
 SMALL_GAP = 1e-11  # what is subtracted from a lower bound for rounding may open a gap that was closed
 MOST_MULTIPLIERS = 100_000
