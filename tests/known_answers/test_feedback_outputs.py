@@ -147,6 +147,14 @@ def test_no_causal_policy_is_cheaper_than_what_its_signals_prove(cost: str, tmp_
     assert quick.result.causal.lower <= slow.result.causal.lower * (1 + 1e-9)
 
 
+@pytest.mark.parametrize("measured", [None, POSITION])
+def test_what_costs_nothing_costs_no_causal_policy_less(measured, tmp_path: Path) -> None:
+    problem = {**SHORT, "initial_state": [0.0, 0.0], "disturbance": {"box": 0.001}}
+    outcome = run(problem, measured, tmp_path / "run", causal_signals=5)
+    proven(outcome)
+    assert outcome.result.cost == 0.0 and outcome.summary["causal_lower_bound"] == 0.0
+
+
 def _bound(data: dict[str, Any]) -> dict[str, Any]:
     return max(data["multipliers"]["constraints"], key=lambda one: one["multiplier"])
 

@@ -202,7 +202,8 @@ def _causal(case: Case) -> dict[str, tuple[object, ...]]:
     claimed = case.certificate.get("causal")
     lower = claimed.get("lower_bound") if isinstance(claimed, Mapping) else None
     none = isinstance(claimed, Mapping) and lower is None
-    return {"causal_lower_bound": (lower,), "causal_infeasible": (none, *(() if none else (None,)))}
+    least = (lower,) if claimed is not None else (None, 0.0)  # nothing costs less than nothing, and needs no proof
+    return {"causal_lower_bound": least, "causal_infeasible": (none, *(() if none else (None,)))}
 
 
 def _gap(case: Case, summary: Mapping[str, Any]) -> list[str] | None:

@@ -49,8 +49,10 @@ def with_causal(result: ControlResult, tools: Tools) -> ControlResult:
     except KeyboardInterrupt as error:
         tools.deadline.interrupt(error)
         return result
-    if derived is None or not stated.rows:  # without rows it is 0, which is no news
+    if derived is None:
         return nothing
+    if not stated.rows:  # no control costs less than nothing: news where the policy costs as little
+        return replace(result, causal=CausalBound(0.0, ended=limits.ended)) if cost == 0.0 else nothing
     if none:
         said = WORDS.format(len(stated.signals)) if result.status == "infeasible" else ""
         return replace(result, causal=replace(stated, lower=np.inf), message=result.message + said)
