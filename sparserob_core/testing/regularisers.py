@@ -21,7 +21,7 @@ VALUE = 0.4  # of `two_thrusters`
 
 def images() -> list[ControlImage]:
     """One control and two; pieces of equal and of different lengths; as many functions as pieces, and fewer."""
-    from scipy.sparse import csc_array, kron
+    from scipy.sparse import csc_array, eye_array, kron
 
     haar = np.array([[1, 1, 1, 1], [1, 1, -1, -1], [1, -1, 0, 0]], dtype=float)
     uneven = np.array([0.5, 0.1, 0.3, 0.1, 2.0])
@@ -29,8 +29,8 @@ def images() -> list[ControlImage]:
         ControlImage(csc_array(np.eye(1)), 1, np.ones(1)),
         ControlImage(csc_array(np.eye(20)), 1, np.full(20, 0.25)),
         ControlImage(csc_array(np.eye(10)), 2, np.tile(uneven, 2)),
-        ControlImage(csc_array(kron(np.eye(2), haar.T)), 2, np.full(8, 0.5)),
-        ControlImage(csc_array(kron(np.eye(3), np.ones((4, 1)))), 3, np.full(12, 100.0)),
+        ControlImage(csc_array(kron(eye_array(2), haar.T)), 2, np.full(8, 0.5)),
+        ControlImage(csc_array(kron(eye_array(3), np.ones((4, 1)))), 3, np.full(12, 100.0)),
     ]
 
 

@@ -20,7 +20,7 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 
 LEGENDRE = np.polynomial.legendre.Legendre.basis(5)
 # Gauss-Lobatto: the ends are nodes, so that no kink hides beside them
-NODES = np.concatenate([[-1.0], LEGENDRE.deriv().roots(), [1.0]])
+NODES = np.concatenate([[-1.0], LEGENDRE.deriv().roots().real, [1.0]])
 WEIGHTS = 1.0 / (15.0 * LEGENDRE(NODES) ** 2)
 ACCURACY = 1e-14  # of an integral over one interval, relative to the largest integrand times the horizon
 MISSED = 1e-12  # of a support function of a curved set, the error of its quadrature that a proof allows for: estimated

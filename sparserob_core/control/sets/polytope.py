@@ -199,7 +199,7 @@ class Polytope(ConvexSet):
         """`_maximise` for directions ``(k, d)``: several linear programs side by side in one, since calling the solver
         costs far more than a small program does; one by one where that fails."""
         from scipy.optimize import linprog
-        from scipy.sparse import block_diag
+        from scipy.sparse import block_diag, csc_array
 
         H, h, units = self._balanced
         values, points = np.zeros(len(directions)), np.tile(self.interior_point(), (len(directions), 1))
@@ -211,7 +211,7 @@ class Polytope(ConvexSet):
             scaled = directions[part] * units
             costs = -scaled / np.abs(scaled).max(axis=1, keepdims=True)
             if part.size > 1 and h.size and np.isfinite(costs).all():
-                rows = block_diag([H] * part.size, format="csc")
+                rows = block_diag([csc_array(H)] * part.size, format="csc")
                 answer = linprog(costs.reshape(-1), rows, np.tile(h, part.size), bounds=(None, None))
                 if answer.status == 0:
                     found = np.asarray(answer.x).reshape(scaled.shape)
