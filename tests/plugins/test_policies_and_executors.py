@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 import sparserob_core as sr
+from sparserob_core.experiment.config.stated.source import component_keys
+from sparserob_core.experiment.plugins.guards import guarded
 
 
 @pytest.fixture(scope="module")
@@ -225,3 +227,17 @@ def test_answers_that_are_written_must_be_those_of_the_config_and_of_the_gains(t
         assert judged(theirs, {"answers": answers})["policy"] == "fails"
     assert judged(theirs, {"cost": ["nominal"]})["policy"] == "fails"
     assert sr.check(theirs).status == sr.check(ours).status == "verified"
+
+
+def test_a_policy_of_somebody_else_is_written_by_its_name_and_options(plugin):
+    """What was solved holds it behind the check of its kind."""
+    registry = sr.load_registry([plugin])
+    chosen = guarded(registry.build("policy", "recent", {"recent": 2}), "policy recent")
+    assert component_keys(registry, "policy", chosen) == {"name": "recent", "recent": 2, "cost": "nominal"}
+
+
+def test_what_a_policy_raises_is_attributed_to_it(tmp_path):
+    text = ANSWERING.replace("age = pieces[:, None] - pieces", "raise RuntimeError('no table')")
+    (tmp_path / "broken.py").write_text(text)
+    with pytest.raises(sr.PluginError, match=r"policy 'recent'.* answers raised RuntimeError: no table"):
+        ran(tmp_path / "run", "recent", str(tmp_path / "broken.py"))

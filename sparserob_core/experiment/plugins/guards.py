@@ -46,6 +46,11 @@ def guarded(component: Component, origin: str) -> Component:
     return component if own or guard is None else guard(component, origin)
 
 
+def unguarded(component: object) -> object:
+    """The component behind its check: a policy is part of what was solved, and is asked for its class and options."""
+    return component.behind if isinstance(component, _Policy) else component
+
+
 def origin_of(kind: str, component: object) -> str:
     """What messages call a component that was handed over as an object."""
     return f"{kind} {type(component).__name__} ({type(component).__module__})"
@@ -87,18 +92,18 @@ class _Policy(Policy):
     """What it answers, `sparserob_core.control.policies.policy.answers_of` checks."""
 
     def __init__(self, policy: Policy, origin: str) -> None:
-        self._policy, self.origin = policy, origin
+        self.behind, self.origin = policy, origin
 
     @property
     def knows(self) -> frozenset[Quantity]:
-        return asked(self.origin, "knows", lambda: self._policy.knows, frozenset)
+        return asked(self.origin, "knows", lambda: self.behind.knows, frozenset)
 
     def answers(self, breakpoints: Array) -> np.ndarray:
-        return asked(self.origin, "answers", lambda: self._policy.answers(breakpoints), np.ndarray)
+        return asked(self.origin, "answers", lambda: self.behind.answers(breakpoints), np.ndarray)
 
     @property
     def charge(self) -> Charge:
-        return asked(self.origin, "charge", lambda: self._policy.charge, Charge)
+        return asked(self.origin, "charge", lambda: self.behind.charge, Charge)
 
 
 @final

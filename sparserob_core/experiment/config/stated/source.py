@@ -14,6 +14,7 @@ from sparserob_core.errors import InputError
 from sparserob_core.experiment.config.reader import Source
 from sparserob_core.experiment.config.stated.problem import problem_keys
 from sparserob_core.experiment.plugins.components import Registry
+from sparserob_core.experiment.plugins.guards import unguarded
 from sparserob_core.options import Options
 
 NAME = "problem"  # in messages, and of the folder of its runs: a title may hold anything
@@ -33,6 +34,7 @@ def source_of(problem: OptimalControlProblem, beside: Mapping[str, Any] | None =
 def component_keys(registry: Registry, kind: str, choice: object) -> dict[str, Any]:
     """The entry of a component that was chosen by its name, by a mapping, or as an object: then that of the record
     whose class it is. Raises `InputError` where there is none."""
+    choice = unguarded(choice)
     if isinstance(choice, str):
         return {"name": choice}
     if isinstance(choice, Mapping):
