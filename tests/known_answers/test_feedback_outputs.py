@@ -155,6 +155,17 @@ def test_what_costs_nothing_costs_no_causal_policy_less(measured, tmp_path: Path
     assert outcome.result.cost == 0.0 and outcome.summary["causal_lower_bound"] == 0.0
 
 
+def test_what_is_never_known_is_not_answered(tmp_path: Path) -> None:
+    """An open loop, then; a certificate that answers it is a forgery."""
+    problem = {**SHORT, "terminal": [{"box": [0.4, 0.4]}]}
+    late, alone = ({**POSITION, "latency": 1.9}, None)
+    outcome = run(problem, late, tmp_path / "late")
+    proven(outcome)
+    plain = run(problem, alone, tmp_path / "plain", memory=0.0)
+    assert outcome.result.cost >= plain.result.cost * (1 - 1e-9)
+    assert not (outcome.directory / "solution.npz").read_bytes().count(b"gains")
+
+
 def _bound(data: dict[str, Any]) -> dict[str, Any]:
     return max(data["multipliers"]["constraints"], key=lambda one: one["multiplier"])
 

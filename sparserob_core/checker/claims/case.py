@@ -52,9 +52,7 @@ class Case:
     @cached_property
     def answers(self) -> np.ndarray:
         """Truth values ``(K, K)``: whether the control on a piece may answer what is measured at a breakpoint."""
-        points, measured = self.control.breakpoints, self.problem.measurements
-        mask = answers_of(self.policy, points)
-        return mask if measured is None else mask & measured.known(points)
+        return answers_of(self.policy, self.control.breakpoints, self.problem.measurements)
 
     @property
     def unloaded(self) -> bool:

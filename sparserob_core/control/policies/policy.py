@@ -8,6 +8,7 @@ from typing import Literal, TypeAlias, final
 
 import numpy as np
 
+from sparserob_core.control.policies.measurements import Measurements
 from sparserob_core.errors import InputError
 from sparserob_core.options import Options
 from sparserob_core.sip.convex_set import Array
@@ -94,8 +95,9 @@ class WrittenPolicy(Policy):
         return self._charge
 
 
-def answers_of(policy: Policy | None, breakpoints: Array) -> np.ndarray:
-    """The truth values ``(K, K)`` of a policy, none of them of no policy. Raises `InputError` where they are no such
+def answers_of(policy: Policy | None, breakpoints: Array, measured: Measurements | None = None) -> np.ndarray:
+    """The truth values ``(K, K)`` of a policy, none of them of no policy, and of what is ``measured`` those of what is
+    known by then. Raises `InputError` where they are no such
     array, or where something is answered before it is measured, or without being known."""
     K = len(breakpoints) - 1
     if policy is None:
@@ -116,4 +118,4 @@ def answers_of(policy: Policy | None, breakpoints: Array) -> np.ndarray:
         raise InputError(
             path="policy.name", expected="a policy that knows the state, which it answers", got="one that does not"
         )
-    return mask.copy()
+    return mask.copy() if measured is None else mask & measured.known(breakpoints)

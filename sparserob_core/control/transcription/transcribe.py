@@ -94,9 +94,7 @@ def prepare(
             )
     require_representable(problem)
     refuse_without_steps(problem, control)
-    mask = answers_of(policy, control.breakpoints)
-    if problem.measurements is not None:
-        mask &= problem.measurements.known(control.breakpoints)
+    mask = answers_of(policy, control.breakpoints, problem.measurements)
     if policy is not None and mask.any():
         from sparserob_core.control.transcription.feedback import refuse
 

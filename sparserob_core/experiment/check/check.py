@@ -19,6 +19,7 @@ from sparserob_core.sip.program import SemiInfiniteProgram
 
 if TYPE_CHECKING:
     from sparserob_core.checker.claims.case import Case
+    from sparserob_core.control.policies.measurements import Measurements
     from sparserob_core.control.policies.policy import Policy
     from sparserob_core.control.problem.dictionary import Dictionary
     from sparserob_core.experiment.config.load import Loaded
@@ -76,14 +77,24 @@ def check(directory: GivenRun, plugins: Iterable[str | Path] = (), seconds: floa
             f"{path}: expected the run of a control problem; certificates of other programs cannot be checked"
         )
     control, disturbance = dictionaries_of(loaded, problem.horizon)
-    case = Case(problem, control, disturbance, data, clock, *counting(loaded), _policy(loaded, data, control))
+    case = Case(
+        problem,
+        control,
+        disturbance,
+        data,
+        clock,
+        *counting(loaded),
+        _policy(loaded, data, control, problem.measurements),
+    )
     derived = derive(case, gap_tolerance(loaded))
     files = compared(replace(stored, largest=_largest(path, case)), loaded, case, summary)
     claims = (_config(loaded, data, summary), *derived, *files.claims)
     return Check(loaded.config.title or path.name, claims, time.perf_counter() - started, files.not_compared)
 
 
-def _policy(loaded: Loaded, data: Mapping[str, Any], control: Dictionary) -> Policy | None:
+def _policy(
+    loaded: Loaded, data: Mapping[str, Any], control: Dictionary, measured: Measurements | None
+) -> Policy | None:
     """The policy of a config where it answers anything. Of one whose component is not at hand, what the certificate
     says of it: what is claimed is claimed of such policies."""
     from sparserob_core.checker.claims.case import written_policy
@@ -100,7 +111,7 @@ def _policy(loaded: Loaded, data: Mapping[str, Any], control: Dictionary) -> Pol
             policy = written_policy(data, control.pieces)
         except Broken:  # nothing is written, or the claim `policy` says what is wrong
             return None
-    return policy if answers_of(policy, control.breakpoints).any() else None
+    return policy if answers_of(policy, control.breakpoints, measured).any() else None
 
 
 def _place(run: GivenRun) -> Path:
