@@ -103,6 +103,33 @@ def test_cells_are_drawn_over_the_indices_that_decide_in_their_middle_and_walks_
     assert axes.of((1,), projection.places) is None
 
 
+def test_the_first_move_of_a_batch_is_from_where_the_walk_stood_before_it() -> None:
+    from sparserob_rerun.search.projection import Projector, thin
+
+    points = np.array([[0.1, 0, 0.5, 1, 0.9, 0], [0.1, 0, 0.5, 1, 0.8, 1]])
+    event = batch_of(points, [[2, 0, -1, -1]] * 2)
+    before = np.array([0.1, 1, 0.4, 0, 0.9, 0])
+    later = replace(event, total=9, batch=replace(event.batch, first=7, origin=before))
+    projector = Projector()
+    assert projector.of(thin(event)).moves.tolist() == [[1.0, 0.0, 0.8]]  # a search begins with no move
+    assert projector.of(thin(later)).moves.tolist() == [[0.0, 0.0, 0.5], [1.0, 0.0, 0.8]]
+
+
+def test_a_curve_of_many_values_keeps_the_lowest_and_the_highest_of_every_stretch() -> None:
+    from sparserob_rerun.search.climb import CORNERS, _corners
+
+    values = np.random.default_rng(0).random(10 * CORNERS + 3)
+    values[[5000, 4711]], values[:40], values[777] = (2.0, -1.0), np.nan, np.inf
+    kept = _corners(values)
+    assert kept.size <= 2 * CORNERS + 2 and (np.diff(kept) > 0).all() and {5000, 4711, 0, values.size - 1} <= set(kept)
+    assert 777 not in kept
+    stretch, finite = np.arange(values.size) * CORNERS // values.size, np.isfinite(values)
+    for part in range(4, CORNERS, 50):
+        mine = np.flatnonzero((stretch == part) & finite)
+        assert {mine[values[mine].argmin()], mine[values[mine].argmax()]} <= set(kept)
+    assert _corners(np.full(4 * CORNERS, np.nan)).tolist() == [0, 4 * CORNERS - 1]
+
+
 def test_an_index_beside_the_first_is_not_the_second() -> None:
     from sparserob_core.experiment.run.landscape import two_of
 
