@@ -46,6 +46,7 @@ def told(file: Path, outcome: sr.Outcome) -> None:
     log = texts(found["/log"], "TextLog:text")
     assert any(line.startswith(f"{outcome.status}: ") for line in log)
     assert not [line for line in log if "could not be drawn" in line]
+    assert len([line for line in log if line.startswith("no landscape: ")]) <= 1
     trace = outcome.result.trace
     if trace is not None and np.isfinite(trace.value).any():
         assert {"/search/g/best", "/search/stages/best"} <= set(found)

@@ -43,6 +43,8 @@ run of two seconds takes twelve; a tenth, and the first rounds of a short run ar
 COARSE = 0.3
 """Seconds of processor time that a run which is over leaves to a first, coarse landscape on any machine. Ten times as
 many, and a busy machine ends seconds later; a tenth, and it shows no landscape of a short run."""
+PATIENT = "landscape.patience is too short for the robust programs of a policy"
+KEPT = "a directory does not keep the rows that prove the bound of a policy, through which it would go"
 LINES = 24  # of the log that are on the first screen
 PROOFS = 12  # lines about the proof of one family
 SLOTS = 16  # active constraints at most that make the tuple of a method without one
@@ -89,6 +91,7 @@ class Recorder:
         self.patience = 0.0 if opening.landscape is None else opening.landscape.patience
         self.lower, self.upper, self.over = -np.inf, np.inf, -1.0
         self.exact: float | None = None
+        self.answerable = True  # whether it is known through which rows the landscape of a policy goes
         self.proofs: dict[str, int] = {}
         self.broken: dict[str, str] = {}
         self.drawn, self.said = False, deque[str](maxlen=LINES)
@@ -255,7 +258,7 @@ class Recorder:
                 self.draw(LANDSCAPE, explorer.finish, left, 8, COARSE)
             self.mark()
             if self.shown.answers and self.shown.landscape and self.terrain.known is None and self.shown.clash is None:
-                self.say("no landscape: landscape.patience is too short for the robust programs of a policy")
+                self.say(f"no landscape: {PATIENT if self.answerable else KEPT}")
                 self.shown = replace(self.shown, landscape=False)
                 self.draw("the arrangement", self.stream.send_blueprint, layout(self.shown))
         if explorer.wrong:
@@ -325,13 +328,12 @@ class Recorder:
             if self.explorer.landscape is None and self.explorer.waiting is None and result.indices:
                 if self.shown.answers:  # the rows that prove the bound of a policy, each at its deviation
                     slots = slots_of(list(result.dual.cuts), "literal", len(result.dual.cuts))
+                    self.answerable = slots.size > 0
                 else:
                     slots = slots_of(list(result.indices), self._formulation)
-                self.draw(
-                    LANDSCAPE,
-                    self.explorer.aim,
-                    Aim(slots, result.epsilon, np.nan, "others as active at the end", self.timelines.round),
-                )
+                aim = Aim(slots, result.epsilon, np.nan, "others as active at the end", self.timelines.round)
+                if self.answerable:
+                    self.draw(LANDSCAPE, self.explorer.aim, aim)
         self.say(
             f"{event.status}: {event.message}",
             {"failed": "ERROR", "refuted": "WARN", "undecided": "WARN"}.get(event.status, "INFO"),
