@@ -455,8 +455,9 @@ def _infeasible(case: Case) -> str:
     if not amount > 0:
         raise Broken(f"the multipliers prove {float(amount.lower()):.3g}, expected a positive number")
     entries = case.certificate["multipliers"]["constraints"]
+    which = "this constraint" if len(entries) == 1 else f"these {len(entries)} constraints together"
     return (
-        f"no control meets these {len(entries)} constraints together: their weighted sum is at least"
+        f"no control meets {which}: the weighted sum is at least"
         f" {float(amount.lower()):.4g} for every control, it must not be positive"
     )
 
