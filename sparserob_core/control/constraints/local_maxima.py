@@ -66,7 +66,8 @@ def along_spans(values: Array, maxima: np.ndarray, pieces: np.ndarray, kept: int
     """
     heights = values.max(axis=0)
     found = [np.zeros((0, 3), dtype=int)]
-    for row, height in enumerate(heights):
+    for row in np.flatnonzero((heights > 0.0).any(axis=1)):
+        height = heights[row]
         near = pieces[maxima[maxima[:, 1] == row, 2]]
         over = np.flatnonzero((height > 0.0) & ~np.isin(pieces, [near - 1, near, near + 1]))
         over = over[np.lexsort((-height[over], pieces[over]))]
