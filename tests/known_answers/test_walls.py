@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.optimize import linprog
 import sparserob_core as sr
 from sparserob_core.experiment.run import run as run_module
 from sparserob_core.sip.method import Deadline
-from sparserob_core.sip.methods import sparsest
+from sparserob_core.sip.methods import exchange, robust, sparsest
 
 LOSS, GUST, WALL, START = (0.3, 0.5), 0.1, 1.0, 2.0
 
@@ -166,6 +167,36 @@ def test_a_limit_leaves_a_proven_control_whatever_the_method(
     assert result.status == "verified"
     assert result.lower_bound < result.upper_bound < 1.2 * result.lower_bound or method == "sparsest"
     assert np.isfinite(result.upper_bound)
+
+
+@pytest.mark.parametrize(("feedback", "looks"), [(False, 36), (True, 8)])
+def test_a_relaxed_program_that_is_not_solved_leaves_the_control_that_is_proven(
+    feedback: bool, looks: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_module, "Deadline", Clock)
+    monkeypatch.setattr(Clock, "looks", looks)
+    monkeypatch.setattr(Clock, "passed", False)  # a share of the time is over, the time is not
+    monkeypatch.setattr(Clock, "reason", "")
+    relax, solved = exchange._relaxed, robust._solved
+
+    def failing(answer: Any) -> Any:
+        failed = replace(answer.solution, status="failed", residual=1.0, message="nothing came of it")
+        return replace(answer, solution=failed)
+
+    def relaxed(method: Any, working: Any, ledger: Any) -> Any:
+        answer = relax(method, working, ledger)
+        return answer if ledger.proven is None else failing(answer)
+
+    def counterpart(working: Any, ledger: Any) -> Any:
+        answer = solved(working, ledger)
+        return answer if ledger.proven is None else ledger.without(failing(answer))
+
+    monkeypatch.setattr(exchange, "_relaxed", relaxed)
+    monkeypatch.setattr(robust, "_solved", counterpart)
+    result = sr.run(ridden("moving", 16, not feedback, feedback), quiet=True, figures=False).result
+    assert result.status == "verified"
+    assert "nothing came of it" in result.message
+    assert result.lower_bound < result.upper_bound < 1.2 * result.lower_bound
 
 
 def test_with_an_alphabet_any_control_is_proven_before_the_sparsest_one(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -116,7 +116,7 @@ class Exchange(Method, Options):
                 if working.add(fresh):
                     continue
             if not _usable(answer.solution):
-                return ledger.without(answer)
+                return ledger.salvaged(ledger.without(answer))
 
             # Separate: the constraints of the continuum that this decision violates most.
             x = answer.solution.x

@@ -261,6 +261,14 @@ class Ledger:
         self.dual = self.relaxed.dual(rows, solution.y, solution.mu, solution.z, solution.infeasibility, priced=False)
         return replace(self.result("infeasible", found.sentence(), answer, worst), infeasible=found)
 
+    def salvaged(self, failed: Result) -> Result:
+        """The result of the decision that is proven, with what it ``failed`` for, where a relaxed program was not
+        solved after there was one; else the result itself."""
+        if failed.status != "failed" or self.proven is None:
+            return failed
+        answer, found, proofs = self.proven
+        return self.judged(answer, worst_of(found), proofs, failed.message)
+
     def result(self, status: Status, message: str, answer: Answer, worst: WorstConstraint | None = None) -> Result:
         """A result with this answer; the bounds are claimed as far as the status allows."""
         cuts, proven = answer.active, status in ("certified", "verified")
@@ -427,8 +435,12 @@ def secure_in_time(
         due = due or (ledger.proven is None and deadline.left <= RESERVED * longest)
     if not due or _is_secured(ledger):
         return False
-    missed = [_peak(family, one) for family, one in _rows(found)]
-    return _secure(tightening, ledger, prover, answer, missed, [above(*one) for one in _rows(found)])
+    missed, violated = [_peak(family, one) for family, one in _rows(found)], [above(*one) for one in _rows(found)]
+    if not any(rows.size for _, rows, _ in violated):  # it may be proven as it is, and solving takes longer
+        ledger.prove(answer, found, prover(answer.solution.x, GLANCE // 4))
+        if ledger.proven is not None:
+            return False
+    return _secure(tightening, ledger, prover, answer, missed, violated)
 
 
 def or_proven(ledger: Ledger, result: Result) -> Result:

@@ -228,7 +228,7 @@ def _exchange(working: Robust, ledger: Ledger, prover: Prover, rounds: int) -> R
         # Relax: the counterpart at the imposed indices; its cuts are a lower bound.
         answer = _solved(working, ledger)
         if isinstance(answer, Result):
-            return answer
+            return ledger.salvaged(answer)
         x = answer.solution.x
         if working.best.size and ledger.open(x) and (last or not ledger.open(working.best)):
             answer = _at(working, answer, working.best)

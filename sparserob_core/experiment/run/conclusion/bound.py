@@ -78,6 +78,8 @@ def _bounded(experiment: ControlExperiment, result: Result) -> Result:
         return safe
     closer = replace(safe, lower_bound=lowered, dual=replace(safe.dual, bound=lowered))
     status, message = verdict(result.proofs, closer.gap, tolerance)
+    ending = result.message.partition("; ")[2]  # why the method came to an end
+    message = f"{message}; {ending}" if ending and status != "certified" else message
     return replace(closer, status=status, message=message)
 
 
