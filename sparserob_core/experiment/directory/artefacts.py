@@ -35,6 +35,13 @@ def write_whole(file: Path, content: bytes) -> None:
         raise SparseRobError(f"{file}: cannot be written: {error.strerror}; nothing of it was kept") from error
 
 
+def require_room(directory: Path) -> None:
+    """Raise `InputError` unless files can be written into a run's directory: before what they are to hold is
+    computed."""
+    if not os.access(directory, os.W_OK | os.X_OK):
+        raise InputError(f"{directory}: cannot be written to; expected a directory that takes the result, or a copy")
+
+
 @final
 class RunDirectory:
     """Writes the files of a directory, each whole. One that `create_directory` made is locked until it is left: it is a

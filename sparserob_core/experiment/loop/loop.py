@@ -20,7 +20,7 @@ from sparserob_core.control.studies.simulate import fine_times, finer, walk
 from sparserob_core.control.transcription.own_units import row_units
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.experiment.directory.adversary import adversaries
-from sparserob_core.experiment.directory.artefacts import RunDirectory
+from sparserob_core.experiment.directory.artefacts import RunDirectory, require_room
 from sparserob_core.experiment.directory.finished import FinishedRun, read_finished
 from sparserob_core.experiment.loop.controller import controller
 from sparserob_core.experiment.loop.study import ClosedLoops
@@ -73,6 +73,7 @@ def loop(
     began = clock.perf_counter()
     directory, experiment = as_run(run)
     finished = read_finished(directory, plugins, experiment)
+    require_room(finished.directory)
     acting = controller(run, resolve, seconds=seconds, plugins=plugins)
     found = replace(_closed(finished, acting, resolve, count, seed, notify), seconds=clock.perf_counter() - began)
     RunDirectory(finished.directory).write_json("loop.json", found.summary())

@@ -26,7 +26,7 @@ from sparserob_core.experiment.directory.adversary import (
     propagated,
     read_adversaries,
 )
-from sparserob_core.experiment.directory.artefacts import RunDirectory
+from sparserob_core.experiment.directory.artefacts import RunDirectory, require_room
 from sparserob_core.experiment.directory.finished import FinishedRun, read_finished
 from sparserob_core.experiment.plugins.messages import nearest
 from sparserob_core.experiment.run.events import StudyProgress
@@ -79,6 +79,7 @@ def simulate(
         require_writable(Path(out))
     directory, experiment = as_run(run)
     finished = read_finished(directory, plugins, experiment)
+    require_room(finished.directory)
     model = finished.experiment.transcription
     if not model.constraints:
         raise InputError(

@@ -4,6 +4,7 @@ nothing worse than the proven worst case."""
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -399,3 +400,11 @@ def test_what_is_no_finished_run_with_a_control_is_refused(robust, tmp_path, com
         assert not list(Path(tmp_path).rglob("simulation-*"))
     with pytest.raises(sr.InputError, match="expected the directory of a run"):
         sr.simulate(7)
+
+
+def test_a_directory_that_takes_no_result_is_refused_before_anything_is_computed(tmp_path, monkeypatch):
+    monkeypatch.setattr("os.access", lambda path, mode, **_: not mode & os.W_OK)  # who tests may be allowed everything
+    from sparserob_core.experiment.directory.artefacts import require_room
+
+    with pytest.raises(sr.InputError, match="cannot be written to; expected a directory that takes the result"):
+        require_room(tmp_path)
