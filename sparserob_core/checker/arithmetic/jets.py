@@ -16,11 +16,12 @@ from sparserob_core.checker.outcome import Unchecked
 from sparserob_core.control.problem.expression import ExpressionMatrix
 
 if TYPE_CHECKING:
-    from flint import arb, arb_mat
+    from flint import arb, arb_mat, arb_series
 
     from sparserob_core.control.problem.system import LinearSystem
 
 _LARGEST_POWER = 64
+_NEWTON = 80  # steps, each halves at least; with a tenth of them long ellipses get wide balls
 
 
 @final
@@ -143,6 +144,11 @@ class Jet:
 
     __radd__, __rmul__ = __add__, __mul__
 
+    def kepler(self, eccentricity: float) -> Jet:
+        """The ``E`` with ``E - e sin E`` equal to this series: its coefficients in balls around the root, from
+        ``E' = 1 / (1 - e cos E)``."""
+        return self._composed(lambda series: kepler_series(series, eccentricity, self.monomials.degree + 1))
+
     def _composed(self, function: Callable[[Any], Any]) -> Jet:
         """``f`` of this series: the series of ``f`` at its constant term, with what is left of it put in."""
         from flint import arb, arb_series, ctx
@@ -182,6 +188,50 @@ class Jet:
     def tanh(self) -> Jet:
         twice = (self * 2.0).exp()
         return (twice - 1.0) / (twice + 1.0)
+
+
+def kepler_series(anomaly: arb_series, eccentricity: float, length: int) -> arb_series:
+    """The first ``length`` terms of the ``E`` with ``E - e sin E`` equal to a series ``M``, whatever number of a ball
+    its constant is: from ``E' = M' + e E' cos E``, term by term."""
+    from flint import arb, arb_series
+
+    e, M = arb(eccentricity), anomaly[0]
+    E = [kepler_root(arb(M.lower()), e).union(kepler_root(arb(M.upper()), e))]  # E increases with M
+    s, c = [E[0].sin()], [E[0].cos()]
+    slope = 1 - e * c[0]
+    for n in range(length - 1):
+        moved = [(k + 1) * one for k, one in enumerate(E[1:])]
+        pushed = sum((moved[k] * c[n - k] for k in range(n)), arb(0))
+        E.append(((n + 1) * anomaly[n + 1] + e * pushed) / (slope * (n + 1)))
+        moved.append((n + 1) * E[-1])
+        s.append(sum((moved[k] * c[n - k] for k in range(n + 1)), arb(0)) / (n + 1))
+        c.append(-sum((moved[k] * s[n - k] for k in range(n + 1)), arb(0)) / (n + 1))
+    return arb_series(E, length)
+
+
+def kepler_root(anomaly: arb, e: arb) -> arb:
+    """A ball around the ``E`` with ``E - e sin E = M`` of a number ``M``: by Newton's method, and then as far to either
+    side as the sign of the equation shows."""
+    from flint import arb, ctx
+
+    E = anomaly
+    low, high = anomaly - e, anomaly + e
+    for _ in range(_NEWTON):
+        missed = arb((E - e * E.sin() - anomaly).mid())
+        if missed > 0:
+            high = E
+        else:
+            low = E
+        E = arb((E - missed / (1 - e * E.cos())).mid())
+        if not (low <= E <= high):
+            E = arb(((low + high) / 2).mid())
+    width = arb(2) ** (8 - ctx.prec) * (1 + abs(anomaly))
+    for _ in range(ctx.prec):
+        below, above = E - width, E + width
+        if below - e * below.sin() < anomaly and above - e * above.sin() > anomaly:
+            return below.union(above)
+        width = 4 * width
+    raise Unchecked("Kepler's equation is not solved")
 
 
 def expanded(

@@ -18,9 +18,11 @@ from sparserob_core.checker.claims.window import Beside, Window
 from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import stacked
+from sparserob_core.checker.reach.varying import VaryingFlow
 from sparserob_core.control.policies.policy import Charge, Cost, Policy, WrittenPolicy, answers_of
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem
+from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.sets.sets import ConvexSet, Equality
 from sparserob_core.sip.convex_set import Array
 
@@ -146,6 +148,14 @@ class Case:
         return [*every[(every < last) & ~np.isin(every, ends)].tolist(), last]
 
     @cached_property
+    def varying(self) -> VaryingFlow:
+        """The flow of a system that changes with time; raises `Unchecked` for another one."""
+        system = self.problem.system
+        if not isinstance(system, VaryingSystem):
+            raise Unchecked("the system does not change with time")
+        return VaryingFlow(system, max(self.grid[-1], self.problem.horizon))
+
+    @cached_property
     def acting(self) -> list[float]:
         """When every piece of the control begins to act; from 0 on."""
         later: list[float] = np.unique([0.0, *(self.control.breakpoints[:-1] + self.problem.system.delay)]).tolist()
@@ -219,8 +229,16 @@ class Case:
     def units(self, window: Window) -> RowUnits:
         """What violations of a constraint are judged by."""
         if window not in self._units:
+            varying = self.varying if isinstance(self.problem.system, VaryingSystem) else None
             self._units[window] = RowUnits(
-                self.problem, self.scene, window.shape, window.start, window.stop, window.reference, self._acting
+                self.problem,
+                self.scene,
+                window.shape,
+                window.start,
+                window.stop,
+                window.reference,
+                self._acting,
+                varying,
             )
         return self._units[window]
 
@@ -246,7 +264,8 @@ class Case:
 
     @cached_property
     def duality(self) -> Duality:
-        return Duality(self.problem, self.control, self.changes)
+        varying = self.varying if isinstance(self.problem.system, VaryingSystem) else None
+        return Duality(self.problem, self.control, self.changes, varying)
 
 
 def numbers(data: object, name: str) -> Array:

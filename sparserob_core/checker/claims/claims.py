@@ -17,6 +17,7 @@ from sparserob_core.checker.claims.replay import reached
 from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import TOLERANCE, Broken, Finding, Unchecked
 from sparserob_core.checker.sets.known import known
+from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 PRECISION = 96  # bits, where the numbers of a system are of one size
 MOST_PRECISION = 1024
+VARYING = 96  # more bits for a tree of products, in each level of which balls grow; half of it shows after ten orbits
 FIGURES = 1e-11  # relative to the larger of it and 1: how closely a written figure must agree with the one derived
 SMALL_COST = 1e-6  # of what is added up to a cost: a gap is relative to at least so much
 # Of what is added up to a cost: so much must agree to `FIGURES` where terms cancel, that is, to 1e-14 of the terms,
@@ -100,7 +102,8 @@ def _precision(case: Case) -> int:
     entries = np.concatenate([np.ravel(part) for part in parts]) * problem.horizon
     sizes = np.abs(entries[np.isfinite(entries) & (entries != 0.0)])
     apart = np.log2(max(1.0, sizes.max(initial=1.0))) - np.log2(min(1.0, sizes.min(initial=1.0)))
-    return int(min(PRECISION + np.ceil(apart), MOST_PRECISION))
+    spare = VARYING if isinstance(problem.system, VaryingSystem) else 0
+    return int(min(PRECISION + spare + np.ceil(apart), MOST_PRECISION))
 
 
 def judged(name: str, derive: Callable[[], str]) -> Finding:

@@ -19,19 +19,21 @@ from sparserob_core.checker.claims.cells import Interval, Work, prove
 from sparserob_core.checker.claims.units import RowUnits
 from sparserob_core.checker.claims.window import Window
 from sparserob_core.checker.outcome import EQUALITY, TOLERANCE, Broken, Unchecked
-from sparserob_core.checker.reach.flow import flows
+from sparserob_core.checker.reach.flow import flows, stacked
 from sparserob_core.checker.reach.tube import Tube
+from sparserob_core.checker.reach.varying import VaryingFlow
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.parameters import Corners, Parameters
 from sparserob_core.checker.sets.sides import Bounded, Curved, Sides
 from sparserob_core.control.problem.names import joined, measured_in
+from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.sets.sets import Box
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from flint import arb
+    from flint import arb, arb_mat
 
 DEGREES = {0: 0, 1: 8, 2: 6, 3: 4, 4: 3}  # of the expansion in the parameters, by their number; 2 beyond
 TUBES_KEPT = 8
@@ -203,19 +205,34 @@ def equalities(case: Case) -> str:
     """Show that the fixed states are met at every parameter and disturbance; a sentence with the figures."""
     middle = [] if case.problem.system.parameters is None else case.problem.system.parameters.interior_point().tolist()
     scene, d = replace(case.scene, disturbance=None, initial_set=None), case.problem.system.states
-    tube = Tube(flows(case.problem.system, middle), scene, np.eye(d))
+    varying = case.varying if isinstance(case.problem.system, VaryingSystem) else None
+    if varying is not None:
+        last = _last(case, varying)
+    else:
+        last = Tube(flows(case.problem.system, middle), scene, np.eye(d)).nodes[-1].parts[0]
     horizon, everything = case.problem.horizon, Box(np.full(d, -np.inf), np.full(d, np.inf))
-    sums = RowUnits(case.problem, scene, everything, horizon, horizon).sums
+    sums = RowUnits(case.problem, scene, everything, horizon, horizon, varying=varying).sums
     worst = 0.0
     for state, value in case.equalities:
         if _reached(case, state):
             raise Unchecked(f"the uncertainty may reach x{state + 1}, which is to be fixed")
-        missed = abs(tube.nodes[-1].parts[0][state, 0] - balls([value])[0])
+        missed = abs(last[state, 0] - balls([value])[0])
         most = EQUALITY * max(float(sums[state]), abs(value))
         if not missed <= most:
             raise Broken(f"x{state + 1} is missed by up to {float(missed.upper()):.3g}, rounding is at most {most:.1e}")
         worst = max(worst, float(missed.upper()))
     return f"kept to {worst:.1e}"
+
+
+def _last(case: Case, flow: VaryingFlow) -> arb_mat:
+    """The state at the end, ``(d, 1)``, of a system that changes with time."""
+    weights, scene = flow.weights(case.grid), case.scene
+    parts = [weights.free * stacked([[v] for v in balls(scene.initial_state)])]
+    parts += [part * u for part, u in zip(weights.control, scene.control, strict=True)]
+    total = parts[0]
+    for part in parts[1:]:
+        total = total + part
+    return total
 
 
 def _reached(case: Case, state: int) -> bool:

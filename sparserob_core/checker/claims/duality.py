@@ -20,6 +20,7 @@ from sparserob_core.checker.arithmetic.balls import difference
 from sparserob_core.checker.claims.cost import Price, Tangent
 from sparserob_core.checker.outcome import Broken
 from sparserob_core.checker.reach.flow import Flow, flows, stacked
+from sparserob_core.checker.reach.varying import VaryingFlow
 from sparserob_core.checker.sets.flat import Boxed
 from sparserob_core.checker.sets.known import known
 from sparserob_core.control.problem.dictionary import Dictionary
@@ -47,11 +48,12 @@ class Row:
 @dataclass(frozen=True, eq=False)
 class Duality:
     """The data that bounds are derived from. ``changes``: where the disturbance may jump, ``None`` when there is
-    none."""
+    none; ``varying``: the flow of a system that changes with time."""
 
     problem: OptimalControlProblem
     control: Dictionary
     changes: list[float] | None
+    varying: VaryingFlow | None = None
 
     def control_row(self, direction: Array, time: float) -> Row:
         """``c'u(t) <= h(c)`` for a curved set of controls."""
@@ -84,6 +86,8 @@ class Duality:
     def row(self, direction: Array, time: float, parameter: Sequence[float], limit: arb, disturbed: bool = True) -> Row:
         """``c'x(t) <= limit`` at one parameter, for the worst disturbance and initial state, or where none reaches
         it."""
+        if self.varying is not None:
+            return self._varying_row(self.varying, direction, time, limit)
         every, delay = flows(self.problem.system, parameter), self.problem.system.delay
         parts = every[0].parts
         d, m, columns = parts["A"][0].nrows(), self.problem.system.controls, parts["B"][0].ncols()
@@ -106,6 +110,20 @@ class Duality:
             for weights in _differences([lags[s][d + columns :] if s < time else None for s in jumps], mw):
                 if any(not w.is_zero() for w in weights):
                     constant = constant + known(self.problem.disturbance).support(weights)
+        return Row(constant, slope)
+
+    def _varying_row(self, flow: VaryingFlow, direction: Array, time: float, limit: arb) -> Row:
+        """`row` of a system that changes with time, which is known, and undisturbed."""
+        m = self.problem.system.controls
+        breaks = [float(s) for s in self.control.breakpoints[:-1]]
+        weights = flow.weights([*(s for s in breaks if s < time), time])
+        row, start = stacked([[_exact(c) for c in direction]]), np.asarray(self.problem.initial_state)
+        free = (row * weights.free).entries()
+        constant = sum((w * _exact(x) for w, x in zip(free, start, strict=True)), _exact(0.0)) - limit
+        slope = [[_exact(0.0)] * m for _ in range(self.control.pieces)]
+        for k, part in enumerate(weights.control):
+            every = (row * part).entries()
+            slope[k], constant = every[:m], sum(every[m:], constant)  # a drift, whose input is 1
         return Row(constant, slope)
 
     def pushed(self, direction: Array, time: float, jumps: list[float] | None = None) -> list[list[arb]]:

@@ -15,6 +15,7 @@ from sparserob_core.checker.outcome import TOLERANCE, Broken, Unchecked
 from sparserob_core.checker.reach.flow import flows, held, stacked
 from sparserob_core.checker.reach.tube import Tube
 from sparserob_core.checker.sets.known import known
+from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
@@ -26,6 +27,8 @@ def reached(case: Case, time: float, parameter: Array, signal: object, deviation
     (``None``: no disturbance), from the centre of the initial states and a ``deviation (d,)`` in their set."""
     from flint import arb, arb_mat
 
+    if isinstance(case.problem.system, VaryingSystem):
+        raise Unchecked("trajectories of a system that changes with time are not replayed")
     every = [flow.parts for flow in flows(case.problem.system, parameter.tolist())]
     wanted = case.problem.disturbance is not None
     w = _admissible(case, signal) if wanted else None

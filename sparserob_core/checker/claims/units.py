@@ -14,6 +14,7 @@ from sparserob_core.checker.claims.duality import before
 from sparserob_core.checker.outcome import RESOLVED, TOLERANCE, Unchecked
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import Flow, flows, held, stacked
+from sparserob_core.checker.reach.varying import VaryingFlow
 from sparserob_core.checker.sets.known import known
 from sparserob_core.checker.sets.shape import smallest, widths
 from sparserob_core.control.problem.problem import OptimalControlProblem
@@ -37,7 +38,7 @@ MOST_AXES = 4  # of the parameters, at whose ends a window is looked at
 class RowUnits:
     """The units of the constraint ``x(t) - r(t)`` in ``shape`` from ``start`` to ``stop``, or ``(x(t), u(t))`` in one
     of more coordinates; ``reference (q, 1 + d)``: times and points of ``r``;
-    ``acting (m,)``: how far the control of a decision goes.
+    ``acting (m,)``: how far the control of a decision goes; ``varying``: the flow of a system that changes with time.
 
     That of a row ``c'x <= b`` is the smallest that is not zero of: how far ``c'x`` can reach over the window (any
     admissible control, the worst disturbance, any parameter), ``|b|``, and the width of the slab where the opposite row
@@ -53,6 +54,7 @@ class RowUnits:
     stop: float
     reference: Array | None = None
     acting: Array | None = None
+    varying: VaryingFlow | None = None
 
     @cached_property
     def rows(self) -> Array:
@@ -127,7 +129,7 @@ class RowUnits:
         normals, gains = np.split(
             np.array([c for c, _ in known(self.shape).facets or []]).reshape(-1, self.shape.dimension), [d], 1
         )
-        step = _Steps(self.problem, parameter, columns, self.scene.tick)
+        step = _Steps(self.problem, parameter, columns, self.scene.tick, self.varying)
         v = np.tile(np.vstack([normals, np.eye(d)]), (len(places), 1, 1))
         count = len(nodes) - 1
         driven = np.zeros((count, *v.shape[:2], columns))
@@ -202,6 +204,7 @@ class _Steps:
     parameter: tuple[float, ...]
     controls: int
     tick: float
+    varying: VaryingFlow | None
     _known: dict[tuple[int, int], tuple[Array, Array, Array]] = field(default_factory=dict)
 
     def over(self, start: float, stop: float, leg: int) -> tuple[Array, Array, Array]:
@@ -209,6 +212,9 @@ class _Steps:
         system whose turn it is."""
         from flint import arb
 
+        if self.varying is not None:
+            Phi, Gamma, Delta = self.varying.over(start, stop)
+            return _floats(Phi), _floats(Gamma), _floats(Delta)
         key = (leg, round((stop - start) / self.tick))
         if key not in self._known:
             parts = self._flows[leg].parts

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from sparserob_core.control.enclosures.elementary import (
     Series,
     exp_series,
+    kepler_series,
     log_series,
     power_series,
     sin_series,
@@ -264,6 +265,13 @@ class TaylorModel:
     def sqrt(self) -> TaylorModel:
         """Square root of positive values."""
         return self._compose(power_series(0.5, *self._domain()))
+
+    def kepler(self, eccentricity: float) -> TaylorModel:
+        """The ``E`` with ``E - e sin E`` equal to these values, for a number ``0 <= e < 1``."""
+        found = self._compose(kepler_series(eccentricity, *self._domain()))
+        centre = abs(float(self.coefficients[0]))  # Newton's method ends where the equation holds to its rounding
+        found.remainder += rounding(4) * (centre + 1.0) / (1.0 - eccentricity * math.cos(float(found.coefficients[0])))
+        return found
 
     def reciprocal(self) -> TaylorModel:
         """``1 / self``, for values of one sign."""

@@ -9,7 +9,7 @@ import numpy as np
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.prices import weights_between
 from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
-from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
+from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
 from sparserob_core.control.response.response import SAME_TIME
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.transcribe import path_names, prepare
@@ -32,6 +32,7 @@ def refuse_remaining(model: Transcription) -> None:
         "a control that acts at once, without a delay": problem.system.delay > 0.0,
         "a policy that measures the whole state, not outputs": model.feedback is not None
         and problem.measurements is not None,
+        "a system that stays the same with time, or has pieces": isinstance(problem.system, VaryingSystem),
     }
     for wanted, hindered in reasons.items():
         if hindered:
@@ -104,6 +105,7 @@ def _moved(rows: Array, begin: float) -> Array:
 
 def _system(problem: OptimalControlProblem, begin: float, horizon: float) -> LinearSystem | SwitchedSystem:
     system = problem.system
+    assert not isinstance(system, VaryingSystem)  # which was refused
     if not isinstance(system, SwitchedSystem):
         return system
     left = [(until - begin, one) for until, one in system.pieces if until > begin + SAME_TIME * problem.horizon]

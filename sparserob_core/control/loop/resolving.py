@@ -15,6 +15,7 @@ from sparserob_core.control.feedback.innovations import DEPENDENT, KNOWN
 from sparserob_core.control.loop.remaining import refuse_remaining, remaining
 from sparserob_core.control.loop.retuning import Retuning, retuned
 from sparserob_core.control.loop.tracking import Tracking, trackable
+from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.transcription.record import Transcription
 from sparserob_core.control.transcription.transcribe import from_state, in_own_units
@@ -57,6 +58,8 @@ class Plan:
         under a ``control (m,)``; ``None`` where that is not told from one piece alone."""
         problem, response = self.known.problem, self.known.response
         if problem.system.parameters is not None or problem.system.delay > 0.0 or problem.system.switches:
+            return None
+        if isinstance(problem.system, VaryingSystem):
             return None
         if problem.disturbance is not None and problem.disturbance_class != "piecewise_constant":
             return None

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import ast
 import difflib
+import keyword
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
 
+from sparserob_core.control.enclosures.elementary import eccentric_anomaly
 from sparserob_core.errors import InputError
 from sparserob_core.sip.convex_set import Array
 
@@ -28,6 +31,7 @@ FUNCTIONS: dict[str, Callable[[Value], Value]] = {
     "tanh": np.tanh,
 }
 CONSTANTS = {"pi": math.pi, "e": math.e}
+KEPLER = "kepler"  # the one function of two arguments
 _OPERATORS: dict[type[ast.operator], Callable[[Value, Value], Value]] = {
     ast.Add: np.add,
     ast.Sub: np.subtract,
@@ -57,8 +61,8 @@ class Expression:
 
 
 def parse_expression(source: str | float, names: Sequence[str]) -> Expression:
-    """Parse numbers, the given names, ``pi``, ``e``, ``+ - * / **``, parentheses and the functions sin, cos, tan, exp,
-    sqrt, log, tanh.
+    """Parse numbers, the given names, ``pi``, ``e``, ``+ - * / **`` (or ``^``), parentheses, the functions sin, cos,
+    tan, exp, sqrt, log, tanh, and ``kepler(M, e)``: the ``E`` with ``E - e sin E = M``, for a number ``0 <= e < 1``.
 
     Raises `InputError`, which names the expression, the part at fault and the known parameters. Lengths and depths are
     limited.
@@ -67,7 +71,7 @@ def parse_expression(source: str | float, names: Sequence[str]) -> Expression:
     if len(text) > _LENGTH:
         raise InputError(f"expression {text[:40] + '...'!r}: longer than {_LENGTH} characters")
     try:
-        tree = ast.parse(text.strip(), mode="eval").body
+        tree = ast.parse(text.strip().replace("^", "**"), mode="eval").body
         nodes = sum(1 for _ in ast.walk(tree))
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         raise InputError(f"expression {text!r}: cannot be read as arithmetic, such as '-2 + 3*p1' ({error})") from error
@@ -135,12 +139,30 @@ class _Parser:
 
     def call(self, node: ast.Call, depth: int) -> Evaluation:
         name = node.func.id if isinstance(node.func, ast.Name) else ast.unparse(node.func)
+        if name == KEPLER:
+            return self.kepler(node, depth)
         if name not in FUNCTIONS:
-            raise self.fault(f"unknown function {name!r}; known functions: {', '.join(FUNCTIONS)}")
+            raise self.fault(f"unknown function {name!r}; known functions: {', '.join([*FUNCTIONS, KEPLER])}")
         if len(node.args) != 1 or node.keywords or isinstance(node.args[0], ast.Starred):
             raise self.fault(f"{name} takes one argument, as in {name}(p1)")
         function, argument = FUNCTIONS[name], self.parse(node.args[0], depth + 1)
         return lambda values: function(argument(values))
+
+    def kepler(self, node: ast.Call, depth: int) -> Evaluation:
+        if len(node.args) != 2 or node.keywords or any(isinstance(one, ast.Starred) for one in node.args):
+            raise self.fault("kepler takes two arguments, as in kepler(M, 0.2)")
+        seen, self.seen = self.seen, set()
+        anomaly, given = self.parse(node.args[0], depth + 1), self.seen
+        self.seen = set()
+        told = self.parse(node.args[1], depth + 1)
+        if self.seen:
+            raise self.fault(f"the eccentricity of kepler(M, e) must be a number, it depends on {min(self.seen)}")
+        self.seen = seen | given
+        with np.errstate(all="ignore"):
+            eccentricity = float(told({}))
+        if not 0.0 <= eccentricity < 1.0:
+            raise self.fault(f"the eccentricity of kepler(M, e) must be in [0, 1), got {eccentricity:g}")
+        return lambda values: kepler(anomaly(values), eccentricity)
 
     def nearest(self, name: str) -> str:
         close = difflib.get_close_matches(name, [*self.names, *CONSTANTS], n=1)
@@ -150,15 +172,55 @@ class _Parser:
         return InputError(f"expression {self.text!r}: {reason}")
 
 
+def kepler(anomaly: Value, eccentricity: float) -> Value:
+    """The eccentric anomaly ``E`` with ``E - e sin E = M``, of numbers, arrays, or whatever has a ``kepler``."""
+    return anomaly.kepler(eccentricity) if hasattr(anomaly, "kepler") else eccentric_anomaly(anomaly, eccentricity)
+
+
+Definitions: TypeAlias = "tuple[tuple[str, Expression], ...]"
+
+
+def parse_definitions(given: Mapping[str, str | float], names: Sequence[str]) -> Definitions:
+    """Names for expressions in ``names`` and in each other, each after those that it uses, in whatever order they are
+    given. Raises `InputError`, also where names are defined in a circle."""
+    for name in given:
+        usable = name.isidentifier() and name not in CONSTANTS and name not in FUNCTIONS and name != KEPLER
+        if not usable or name in names or name in keyword.kwlist:
+            raise InputError(
+                path=f"define.{name}",
+                expected="a name of letters, digits and underscores that means nothing else",
+                got=repr(name),
+            )
+    waiting: dict[str, Expression] = {}
+    for name, text in given.items():
+        try:
+            waiting[name] = parse_expression(text, [*names, *given])
+        except InputError as error:
+            raise error.under("define", name) from None
+    found: list[tuple[str, Expression]] = []
+    while waiting:
+        ready = [name for name, one in waiting.items() if not one.names & waiting.keys()]
+        if not ready:
+            raise InputError(
+                path=f"define.{next(iter(waiting))}",
+                expected="names that are not defined by themselves",
+                got=f"a circle of {', '.join(waiting)}",
+            )
+        found += [(name, waiting.pop(name)) for name in ready]
+    return tuple(found)
+
+
 @dataclass(frozen=True, eq=False)
 class ExpressionMatrix:
     """A matrix whose entries are expressions in ``names``; a function of the parameter vector ``p (nu,)``.
 
-    ``entries``: rows of `Expression`. Calling it takes any sequence of ``nu`` numbers, arrays or Taylor models.
+    ``entries``: rows of `Expression`, in ``names`` and in those of ``defined``. Calling it takes any sequence of ``nu``
+    numbers, arrays or Taylor models.
     """
 
     entries: tuple[tuple[Expression, ...], ...]
     names: tuple[str, ...]
+    defined: Definitions = ()
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -172,12 +234,23 @@ class ExpressionMatrix:
 
     def __call__(self, p: Iterable[Value]) -> Value:
         """The matrix at one parameter vector: floats, or an object array when ``p`` holds other things than numbers."""
-        values = dict(zip(self.names, p, strict=True))
+        values = self._with_defined(dict(zip(self.names, p, strict=True)))
         return np.array([[entry(values) for entry in row] for row in self.entries])
+
+    def _with_defined(self, values: dict[str, Value]) -> dict[str, Value]:
+        """The values with those of the definitions, where an entry needs one: each once, whatever uses it."""
+        if any(name in self._defined_names for row in self.entries for entry in row for name in entry.names):
+            for name, expression in self.defined:
+                values[name] = expression(values)
+        return values
+
+    @cached_property
+    def _defined_names(self) -> frozenset[str]:
+        return frozenset(name for name, _ in self.defined)
 
     def evaluate(self, parameters: Array) -> Array:
         """The matrices ``(k, rows, columns)`` at parameters ``(k, nu)``."""
-        values = {name: parameters[:, i] for i, name in enumerate(self.names)}
+        values = self._with_defined({name: parameters[:, i] for i, name in enumerate(self.names)})
         out = np.empty((len(parameters), *self.shape))
         for i, row in enumerate(self.entries):
             for j, entry in enumerate(row):
@@ -203,11 +276,12 @@ def beside(left: Entries, right: Entries) -> Entries:
     """Two matrices with as many rows side by side, each an array, expressions or a function of the parameters."""
     if isinstance(left, np.ndarray) and isinstance(right, np.ndarray):
         return np.hstack([left, right])
-    names = next((part.names for part in (left, right) if isinstance(part, ExpressionMatrix)), ())
+    of = next((part for part in (left, right) if isinstance(part, ExpressionMatrix)), None)
+    names, defined = ((), ()) if of is None else (of.names, of.defined)
     rows = [_written(part) for part in (left, right)]
     if rows[0] is None or rows[1] is None:
         return Beside((left, right))
-    return ExpressionMatrix(tuple(a + b for a, b in zip(rows[0], rows[1], strict=True)), names)
+    return ExpressionMatrix(tuple(a + b for a, b in zip(rows[0], rows[1], strict=True)), names, defined)
 
 
 def _written(part: Entries) -> tuple[tuple[Expression, ...], ...] | None:
@@ -223,8 +297,12 @@ def _number(value: np.float64) -> Expression:
     return Expression(repr(float(value)), frozenset(), lambda values: value)
 
 
-def parse_matrix(name: str, rows: Sequence[Sequence[str | float]], names: Sequence[str]) -> ExpressionMatrix:
-    """A matrix of numbers and expressions, given row by row; ``name`` is for the errors (`InputError`)."""
+def parse_matrix(
+    name: str, rows: Sequence[Sequence[str | float]], names: Sequence[str], defined: Definitions = ()
+) -> ExpressionMatrix:
+    """A matrix of numbers and expressions, given row by row, in ``names`` and in those of ``defined``; ``name`` is for
+    the errors (`InputError`)."""
+    known = [*names, *(one for one, _ in defined)]
     if not rows or not rows[0] or len({len(row) for row in rows}) > 1:
         raise InputError(
             path=name, expected="a matrix, rows of equal length", got=f"rows of lengths {[len(row) for row in rows]}"
@@ -234,16 +312,18 @@ def parse_matrix(name: str, rows: Sequence[Sequence[str | float]], names: Sequen
         entries.append([])
         for j, entry in enumerate(row):
             try:
-                entries[i].append(_finite(parse_expression(entry, names)))
+                entries[i].append(_finite(parse_expression(entry, known)))
             except InputError as error:
                 raise error.under(name, i, j) from None
-    return ExpressionMatrix(tuple(map(tuple, entries)), tuple(names))
+    return ExpressionMatrix(tuple(map(tuple, entries)), tuple(names), defined)
 
 
-def parse_column(name: str, entries: Sequence[str | float], names: Sequence[str]) -> ExpressionMatrix:
+def parse_column(
+    name: str, entries: Sequence[str | float], names: Sequence[str], defined: Definitions = ()
+) -> ExpressionMatrix:
     """A matrix of one column; as `parse_matrix`."""
     try:
-        return parse_matrix(name, [[entry] for entry in entries], names)
+        return parse_matrix(name, [[entry] for entry in entries], names, defined)
     except InputError as error:
         error.path = error.path[:-1]  # every row has one entry
         raise

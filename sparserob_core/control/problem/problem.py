@@ -16,7 +16,7 @@ from sparserob_core.control.problem.cost import Cost
 from sparserob_core.control.problem.disturbances import Disturbance, DisturbanceClass, joined
 from sparserob_core.control.problem.names import UNNAMED, Names
 from sparserob_core.control.problem.prices import checked_weights, counted, integrals
-from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
+from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System, VaryingSystem
 from sparserob_core.control.sets.sets import Equality, Polytope
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import sealed
@@ -108,7 +108,7 @@ class OptimalControlProblem:
     legal: that problem is infeasible. Raises `InputError`.
     """
 
-    system: LinearSystem | SwitchedSystem
+    system: System
     horizon: float
     initial_state: npt.ArrayLike
     control: ConvexSet
@@ -127,7 +127,7 @@ class OptimalControlProblem:
     measurements: Measurements | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.system, LinearSystem | SwitchedSystem):
+        if not isinstance(self.system, LinearSystem | SwitchedSystem | VaryingSystem):
             raise InputError(path="system", expected="a LinearSystem", got=f"{type(self.system).__name__}")
         horizon = as_bound("horizon", self.horizon)
         if horizon.shape != (1,) or not 0.0 < horizon[0] < np.inf:
@@ -164,6 +164,8 @@ class OptimalControlProblem:
         windows = [self._windowed(f"path.{i}", entry) for i, entry in enumerate(_listed("path", self.path))]
         self._set("path", tuple(window for window in windows if not _restricts_nothing(window.set)))
         self._set("terminal", tuple(self._terminal()))
+        if isinstance(self.system, VaryingSystem):
+            self._check_varying(self.system)
         sealed(self)
 
     def _set(self, name: str, value: object) -> None:
@@ -186,6 +188,25 @@ class OptimalControlProblem:
                 expected=f"{self.horizon:g}, the horizon, since it is the last piece",
                 got=f"{system.pieces[last][0]:g}",
             )
+
+    def _check_varying(self, system: VaryingSystem) -> None:
+        """What cannot be proven yet of a system that changes with time."""
+        if abs(system.horizon - self.horizon) > SHORTEST * self.horizon:
+            raise InputError(
+                path="system", expected=f"a law up to {self.horizon:g}, the horizon", got=f"up to {system.horizon:g}"
+            )
+        quadratic = [name for name, term in zip(("state", "control", "final"), self.cost.terms, strict=True) if term]
+        refused: dict[str, object] = {
+            "disturbance": self.disturbance,
+            "initial_state": self.initial_set,
+            "measurements": self.measurements,
+            "path": self.path,
+            "terminal": [end for end in self.terminal if not isinstance(end, Equality)],
+            "cost." + (quadratic or ["state"])[0]: quadratic,
+        }
+        for key, given in refused.items():
+            if given:
+                raise _unproven(key)
 
     def _state(self) -> Array:
         d = self.system.states
@@ -274,6 +295,8 @@ class OptimalControlProblem:
             raise InputError(path="disturbance", expected="a list of Disturbance", got=f"{type(every).__name__}")
         if not every:
             return
+        if isinstance(self.system, VaryingSystem):
+            raise _unproven("disturbance")
         if self.disturbance is not None or self.disturbance_class not in ("piecewise_constant", every[0].kind):
             raise InputError(
                 path="disturbance_class" if self.disturbance is None else "disturbance",
@@ -344,6 +367,15 @@ class ProblemFactory(ABC):
         """The problem; raises `InputError` when the options do not describe one."""
 
 
+def _unproven(key: str) -> InputError:
+    return InputError(
+        path=key,
+        expected="none where the system changes with time, of which fixed final states, bounds and steps of the control"
+        " and its L1 cost are proven so far",
+        got="one",
+    )
+
+
 def _listed(name: str, value: object) -> list[object]:
     if isinstance(value, ConvexSet | PathConstraint | MixedConstraint | Equality):
         return [value]
@@ -370,7 +402,7 @@ def _checked_set(name: str, value: object, dimension: int, of: str, bounded: boo
     return value
 
 
-def _checked_mixed(where: str, entry: MixedConstraint, system: LinearSystem | SwitchedSystem) -> MixedConstraint:
+def _checked_mixed(where: str, entry: MixedConstraint, system: System) -> MixedConstraint:
     """With arrays of the right shapes, and a set of ``(x, u)`` that is not empty."""
     H, G = (
         _matrix(f"{where}.{name}", rows, f"rows of {columns} finite numbers, one per {of}", columns)

@@ -1,4 +1,5 @@
-"""Uncertain linear systems ``x' = A(p) x + B(p) u + E(p) w + c(p)``."""
+"""Linear systems: uncertain ones ``x' = A(p) x + B(p) u + E(p) w + c(p)``, such that take turns, and known ones that
+change with time."""
 
 from __future__ import annotations
 
@@ -11,12 +12,21 @@ import numpy as np
 import numpy.typing as npt
 
 from sparserob_core.control.enclosures.taylor import TaylorModel, TaylorSpace
-from sparserob_core.control.problem.expression import ExpressionMatrix, beside
+from sparserob_core.control.problem.expression import (
+    ExpressionMatrix,
+    beside,
+    parse_column,
+    parse_definitions,
+    parse_matrix,
+)
+from sparserob_core.control.sets.sets import Box
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.shapes import Float, shaped
 from sparserob_core.sip.convex_set import Array, ConvexSet
 
 Matrix: TypeAlias = npt.ArrayLike | Callable[..., object] | ExpressionMatrix
+TIME = "t"
+LOOKS = 65  # times at which the size of a system is looked at; with ten times fewer a short pericentre is overlooked
 _Entry: TypeAlias = Array | Callable[..., object] | ExpressionMatrix
 
 
@@ -480,7 +490,130 @@ class SwitchedSystem:
         return self.modes[0].describe(parameter)
 
 
-System: TypeAlias = LinearSystem | SwitchedSystem
+@final
+@dataclass(frozen=True, eq=False)
+class VaryingSystem:
+    """``x'(t) = A(t) x(t) + B(t) u(t) + E(t) w(t) + c(t)`` for ``t`` from 0 to the ``horizon``, without uncertain
+    parameters and without delay.
+
+    ``law``: a `LinearSystem` whose one parameter is the time: its matrices at ``p = (t,)`` are those at the time ``t``.
+    Made of expressions by `of`. Raises `InputError`.
+    """
+
+    law: LinearSystem
+    horizon: float
+
+    def __post_init__(self) -> None:
+        if self.law.parameter_count != 1 or self.law.delay:
+            expected = "a law whose one parameter is the time, without delay"
+            raise InputError(path="system", expected=expected, got="another")
+
+    @staticmethod
+    def of(
+        A: Sequence[Sequence[str | float]],
+        B: Sequence[Sequence[str | float]],
+        horizon: float,
+        E: Sequence[Sequence[str | float]] | None = None,
+        c: Sequence[str | float] | None = None,
+        define: Mapping[str, str | float] | None = None,
+    ) -> VaryingSystem:
+        """The system whose entries are numbers and expressions in ``t`` and in the names that ``define`` gives to
+        expressions in ``t``; see `parse_expression`. Raises `InputError` that begins with the key of a config."""
+        names, where = (TIME,), "system"
+        try:
+            defined = parse_definitions(define or {}, names)
+        except InputError as error:
+            raise error.under(where) from None
+        return VaryingSystem(
+            LinearSystem(
+                parse_matrix(f"{where}.A", A, names, defined),
+                parse_matrix(f"{where}.B", B, names, defined),
+                None if E is None else parse_matrix(f"{where}.E", E, names, defined),
+                Box(np.zeros(1), np.array([horizon])),
+                names,
+                None if c is None else parse_column(f"{where}.c", c, names, defined),
+            ),
+            horizon,
+        )
+
+    @property
+    def states(self) -> int:
+        """Number ``d`` of states."""
+        return self.law.states
+
+    @property
+    def controls(self) -> int:
+        """Number ``m`` of controls."""
+        return self.law.controls
+
+    @property
+    def disturbances(self) -> int:
+        """Number ``mw`` of disturbances."""
+        return self.law.disturbances
+
+    @property
+    def parameters(self) -> None:
+        """No uncertain parameters."""
+        return
+
+    @property
+    def parameter_count(self) -> int:
+        """0."""
+        return 0
+
+    @property
+    def names(self) -> Sequence[str]:
+        """No names, since there are no parameters."""
+        return ()
+
+    @property
+    def delay(self) -> float:
+        """0."""
+        return 0.0
+
+    @property
+    def switches(self) -> tuple[float, ...]:
+        """It never jumps from one system to another."""
+        return ()
+
+    @property
+    def c(self) -> Matrix | None:
+        """Whether there is a drift."""
+        return self.law.c
+
+    @cached_property
+    def forced(self) -> VaryingSystem:
+        """As `LinearSystem.forced`."""
+        return self if self.law.c is None else VaryingSystem(self.law.forced, self.horizon)
+
+    @cached_property
+    def modes(self) -> tuple[LinearSystem, ...]:
+        """The system as it is at several times, for what asks how large its numbers are; nothing is proven by them."""
+        times = np.linspace(0.0, self.horizon, LOOKS)[:, None]
+        A, B, E = self.law.matrices(times)
+        drifts = [None] * LOOKS if self.c is None else list(self.law.forced.matrices(times)[1][:, :, -1:])
+        return tuple(LinearSystem(a, b, e, c=drift) for a, b, e, drift in zip(A, B, E, drifts, strict=True))
+
+    @shaped
+    def in_units(
+        self,
+        A: Float[Array, "d d"],
+        B: Float[Array, "d m"],
+        E: Float[Array, "d mw"],
+        parameters: Float[Array, " nu"],
+        c: Float[Array, "d 1"] | float = 1.0,
+        time: float = 1.0,
+    ) -> VaryingSystem:
+        """As `LinearSystem.in_units`; the time of the law is divided too."""
+        return VaryingSystem(self.law.in_units(A, B, E, np.array([time]), c, 1.0), self.horizon / time)
+
+    @shaped
+    def describe(self, parameter: Float[Array, " nu"]) -> str:
+        """Nothing: no parameter is uncertain."""
+        return ""
+
+
+System: TypeAlias = LinearSystem | SwitchedSystem | VaryingSystem
 
 
 def _check_piece(i: int, pair: object, before: float) -> None:

@@ -16,7 +16,7 @@ from sparserob_core.control.enclosures.matrix_exponential import transitions
 from sparserob_core.control.problem.cost import nominal_point
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.names import UNNAMED, Names
-from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
+from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, VaryingSystem
 from sparserob_core.control.response.disturbance import DisturbanceModel
 from sparserob_core.control.response.disturbance_support import DisturbanceSupport
 from sparserob_core.control.response.initial_support import InitialSupport, Support, Supports
@@ -111,6 +111,8 @@ class WorstCase:
     @cached_property
     def _nominal(self) -> WorstCase:
         system, model = self.response.system, self.disturbance
+        if isinstance(system, VaryingSystem):  # which is known, and undisturbed
+            return self
         middle = np.zeros((1, 0)) if system.parameters is None else system.parameters.interior_point()[None]
         modes = [LinearSystem(*(part[0] for part in mode.matrices(middle))) for mode in system.modes]
         ends = (*system.switches, float(self.response.grid.breakpoints[-1]))

@@ -18,7 +18,8 @@ import numpy as np
 
 from sparserob_core.control.enclosures.cache import remember
 from sparserob_core.control.enclosures.matrix_exponential import EPSILON, Transitions, exponential, transitions
-from sparserob_core.control.problem.system import System
+from sparserob_core.control.problem.system import System, VaryingSystem
+from sparserob_core.control.response.varying.expansion import Expansion
 from sparserob_core.shapes import Float, Int, shaped
 from sparserob_core.sip.convex_set import Array
 
@@ -49,7 +50,7 @@ class TimeGrid:
     on a piece of the grid; -1 where the control ``before (m,)`` still does. ``constants``: columns of ``B`` beyond
     those of the control, whose input is always 1 (a drift). ``mode (L,)``: which of several systems that take turns
     acts; ``None`` where there is one. ``elapsed``: what went before the time that is called 0 here, where that is a
-    later one.
+    later one. ``varying``: the system changes with time, so that every piece is a mode of its own.
     """
 
     breakpoints: Array
@@ -59,6 +60,7 @@ class TimeGrid:
     constants: int = 0
     mode: np.ndarray | None = None
     elapsed: float = 0.0
+    varying: bool = False
 
     @property
     def pieces(self) -> int:
@@ -134,6 +136,8 @@ class TimeGrid:
         """A grid on other times, ``(T,)`` from 0 to the horizon, that include the breakpoints; its inputs are given on
         the pieces of this grid."""
         origin = self.locate((times[:-1] + times[1:]) / 2)
+        if self.varying:
+            return TimeGrid(times, origin, origin, mode=np.arange(origin.size), varying=True)
         return TimeGrid(times, origin, origin, mode=None if self.mode is None else self.mode[origin])
 
     @shaped
@@ -168,10 +172,11 @@ def merge_grids(
     before: Float[Array, " m"] | None = None,
     constants: int = 0,
     switches: Sequence[float] = (),
+    varying: bool = False,
 ) -> TimeGrid:
     """The merged grid of two sets of breakpoints over the same horizon; a control acts later by ``delay``, less than
     the horizon, and ``before (m,)`` acts until then; when it is commanded, and what it answers is measured, is on the
-    grid too. The mode changes at ``switches``.
+    grid too. The mode changes at ``switches``, or, of a system that is ``varying`` with time, from piece to piece.
 
     A breakpoint of the disturbance that is one of the control's but for rounding is taken for it. Two breakpoints of
     one set are never taken for one, however near they are, so that no piece of either is lost.
@@ -186,8 +191,8 @@ def merge_grids(
         points = _joined(points, np.array(switches))
     middles = (points[:-1] + points[1:]) / 2
     acting, pushing = np.searchsorted(begin, middles) - 1, np.searchsorted(disturbance, middles) - 1
-    mode = np.searchsorted(switches, middles) if switches else None
-    return TimeGrid(points, acting, pushing, before if delay > 0.0 else None, constants, mode)
+    mode = np.searchsorted(switches, middles) if switches else np.arange(middles.size) if varying else None
+    return TimeGrid(points, acting, pushing, before if delay > 0.0 else None, constants, mode, varying=varying)
 
 
 def _joined(points: Array, others: Array) -> Array:
@@ -323,6 +328,8 @@ class Propagator:
         """Matrices and whole-piece transitions at parameters ``(v, nu)``; remembered for the last few calls."""
         # no parameters: any number of rows has the same bytes
         key = bytes(str(parameters.shape), "ascii") + parameters.tobytes()
+        if key not in self._steps and self.expansion is not None:
+            remember(self._steps, key, self._varying_steps(self.expansion), STEPS_KEPT)
         if key not in self._steps:
             every = [mode.matrices(parameters) for mode in self.system.modes]
             A, B, E = (
@@ -332,6 +339,42 @@ class Propagator:
             Phi, Gamma = self._transitions(A[:, self._modes], self.lengths[None, :])
             remember(self._steps, key, Steps(A, B, E, Phi, Gamma), STEPS_KEPT)
         return self._steps[key]
+
+    @cached_property
+    def expansion(self) -> Expansion | None:
+        """The system as polynomials in time, where it changes with time."""
+        return Expansion.of(self.system) if isinstance(self.system, VaryingSystem) else None
+
+    def _varying_steps(self, expansion: Expansion) -> Steps:
+        """Steps of a system that changes with time, whose pieces are modes: ``Gamma`` is the length of a piece, and
+        ``B`` and ``E`` of a mode are what a piece makes of an input, per time."""
+        flow, lengths = expansion.flow(self.grid.breakpoints[:-1], self.grid.breakpoints[1:]), self.grid.lengths
+        A = expansion.average(self.grid.breakpoints)
+        Gamma = np.eye(A.shape[1]) * lengths[:, None, None]
+        B, E = (np.hstack(list(part / lengths[:, None, None])) for part in (flow.control, flow.disturbance))
+        return Steps(A[None], B[None], E[None], flow.state[None], Gamma[None])
+
+    def _varying_adjoint(
+        self, expansion: Expansion, times: Array, directions: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        """`adjoint` of a system that changes with time; the part of a piece before a time has a ``B`` and an ``E`` of
+        its own."""
+        steps, pieces = self.steps(np.zeros((1, 0))), self.grid.locate(times)
+        begun, every = self.grid.breakpoints[pieces], np.arange(times.size)
+        over = expansion.flow(begun, np.maximum(times, begun))
+        d, L = directions.shape[1], self.grid.pieces
+        gains, rows = np.zeros((times.size, L, d)), directions.astype(float)
+        length = self.grid.lengths[pieces]
+        gains[every, pieces] = rows * length[:, None]
+        B, E = (np.repeat(part, times.size, axis=0) for part in (steps.B, steps.E))
+        for table, part in ((B, over.control), (E, over.disturbance)):
+            table.reshape(times.size, d, L, -1)[every, :, pieces] = part / length[:, None, None]
+        rows = (rows[:, None] @ over.state)[:, 0]
+        for piece in range(int(pieces.max(initial=0)) - 1, -1, -1):
+            active = pieces > piece
+            gains[active, piece] = rows[active] * self.grid.lengths[piece]
+            rows[active] = rows[active] @ steps.Phi[0, piece]
+        return rows, gains, B, E
 
     @shaped
     def adjoint(
@@ -343,6 +386,8 @@ class Propagator:
         ``gains (k, L, d) = int_{piece, s < t} e^{A'(t-s)} c ds``, and the input matrices ``B (k, d, J m)``,
         ``E (k, d, J mw)`` at the parameters, those of several modes side by side (`TimeGrid.through`).
         """
+        if self.expansion is not None:
+            return self._varying_adjoint(self.expansion, times, directions)
         unique, which = _unique_rows(parameters)
         steps = self.steps(unique)
         pieces = self.grid.locate(times)
@@ -512,7 +557,7 @@ class Propagator:
     @property
     def uniform(self) -> bool:
         """Whether all pieces of the grid are equally long, and of one mode."""
-        return bool(self.lengths.size == 1)
+        return bool(self.lengths.size == 1) and not self.grid.varying
 
     def block(self, steps: Steps) -> int:
         """How many equal pieces, a power of two, are taken together where the states of many are asked for; 1: none.

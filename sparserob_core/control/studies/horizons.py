@@ -20,7 +20,7 @@ from sparserob_core.control.enclosures.polynomial import polynomial_bound
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.prices import weights_between
 from sparserob_core.control.problem.problem import SHORTEST, OptimalControlProblem, PathConstraint
-from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System
+from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System, VaryingSystem
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.response.disturbance import DisturbanceModel, disturbance_model
 from sparserob_core.control.response.disturbance_support import DisturbanceSupport, summed
@@ -101,6 +101,9 @@ def at_horizon(problem: OptimalControlProblem, horizon: float) -> OptimalControl
 def _until(system: System, horizon: float) -> System:
     if isinstance(system, LinearSystem):
         return system
+    if isinstance(system, VaryingSystem):
+        expected = "a system that stays the same with time: of another one no shorter horizon is looked at yet"
+        raise InputError(path="system", expected=expected, got="one in t")
     begins = (0.0, *system.switches)
     kept = [
         (min(until, horizon), one)

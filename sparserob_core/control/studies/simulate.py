@@ -52,6 +52,9 @@ def walk(
     ``parameters (n, nu)``: the variation of constants over each piece, in which both inputs are constant.
     """
     grid = response.grid
+    if grid.varying:
+        yield from _walk_varying(response, control, parameters.shape[0], initial_states)
+        return
     modes = [
         [np.moveaxis(matrix, 0, -1) if parameters.shape[1] else matrix[0] for matrix in mode.matrices(points)]
         for points in [parameters if parameters.shape[1] else parameters[:1]]
@@ -82,6 +85,21 @@ def walk(
                 inputs,
             )
         state = _times(flows[inputs[0]], state) + sigma
+        yield state
+
+
+def _walk_varying(
+    response: Response, control: Array | Callable[[int, Array], Array], count: int, initial_states: Array | None
+) -> Iterator[Array]:
+    """`walk` of a system that changes with time, which is known and undisturbed."""
+    grid, steps = response.grid, response.steps(np.zeros((1, 0)))
+    state = np.repeat(response.initial_state[:, None], count, axis=1)
+    state = state if initial_states is None else np.ascontiguousarray(initial_states.T)
+    yield state
+    for piece, B in enumerate(np.split(steps.B[0], grid.pieces, axis=1)):
+        acting = int(grid.control_piece[piece])
+        driven = control(acting, state) if callable(control) else control[:, acting, None]
+        state = steps.Phi[0, piece] @ state + steps.Gamma[0, piece] @ (B @ driven)
         yield state
 
 

@@ -26,11 +26,14 @@ def rounded_down(model: Transcription, result: Result, tolerance: float | None) 
     A row ``c'x(t) <= b`` is a sum of what the initial state, every piece of the control and every piece of the
     disturbance bring to ``c'x(t)``. The absolute values of these, at their largest, times the multipliers of the rows
     and `SHARE`, bound what the rounding of all of them does to the bound (Higham 2002, section 3.1). What a multiplier
-    of the wrong sign may be off by is subtracted too (`_neglected`).
+    of the wrong sign may be off by is subtracted too (`_neglected`). Transitions of a system that changes with time are
+    off by the share that their expansion leaves out, too.
     """
     if not np.isfinite(result.lower_bound) or result.lower_bound <= 0.0:  # without multipliers 0 is exact
         return result
-    lost = SHARE * (_added(model, result) + _quadratic(model, result) + result.lower_bound)
+    expansion = model.response.propagator.expansion
+    share = SHARE if expansion is None else SHARE + expansion.slack
+    lost = share * (_added(model, result) + _quadratic(model, result) + result.lower_bound)
     lost += _neglected(model, result)
     lowered = max(0.0, result.lower_bound - lost)
     dual = replace(result.dual, bound=min(result.dual.bound, lowered))

@@ -17,6 +17,7 @@ from sparserob_core.control.policies.policy import Policy, answers_of
 from sparserob_core.control.problem.dictionary import Dictionary
 from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
 from sparserob_core.control.problem.representable import require_representable
+from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.problem.units import Units, power_of_two
 from sparserob_core.control.response.disturbance import DisturbanceModel, disturbance_model
 from sparserob_core.control.response.functional import WorstCase
@@ -95,6 +96,9 @@ def prepare(
     require_representable(problem)
     refuse_without_steps(problem, control)
     mask = answers_of(policy, control.breakpoints, problem.measurements)
+    if policy is not None and mask.any() and isinstance(problem.system, VaryingSystem):
+        expected = "open_loop where the system changes with time, of which feedback is not proven yet"
+        raise InputError(path="policy", expected=expected, got="one that answers what is measured")
     if policy is not None and mask.any():
         from sparserob_core.control.transcription.feedback import refuse
 
@@ -139,8 +143,9 @@ def _functionals(
     system, before = problem.system.forced, np.zeros(problem.system.controls)
     before = before if problem.initial_control is None else np.asarray(problem.initial_control, dtype=float)
     constants = system.controls - problem.system.controls
+    varying = isinstance(system, VaryingSystem)
     grid = merge_grids(
-        control.breakpoints, disturbance.breakpoints, problem.system.delay, before, constants, system.switches
+        control.breakpoints, disturbance.breakpoints, problem.system.delay, before, constants, system.switches, varying
     )
     model: DisturbanceModel | None = None
     if problem.disturbance is not None:

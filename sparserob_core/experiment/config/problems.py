@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import keyword
+import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, TypeAlias, final
 
@@ -13,7 +14,15 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag
 from sparserob_core.control.policies.measurements import Measurements
 from sparserob_core.control.problem.cost import Cost
 from sparserob_core.control.problem.disturbances import Disturbance, DisturbanceClass
-from sparserob_core.control.problem.expression import CONSTANTS, FUNCTIONS, parse_column, parse_matrix
+from sparserob_core.control.problem.expression import (
+    CONSTANTS,
+    FUNCTIONS,
+    KEPLER,
+    Definitions,
+    parse_column,
+    parse_definitions,
+    parse_matrix,
+)
 from sparserob_core.control.problem.names import Names
 from sparserob_core.control.problem.problem import (
     MixedConstraint,
@@ -21,7 +30,7 @@ from sparserob_core.control.problem.problem import (
     PathConstraint,
     ProblemFactory,
 )
-from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
+from sparserob_core.control.problem.system import TIME, LinearSystem, SwitchedSystem, System, VaryingSystem
 from sparserob_core.control.sets.sets import Box, ConvexSet, Equality
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.config.option_kinds import (
@@ -106,7 +115,8 @@ class PieceOptions(Options):
 @final
 class SystemOptions(Options):
     """``x'(t) = A(p) x(t) + B(p) u(t - delay) + E(p) w(t) + c(p)``, or ``pieces`` of such systems that take turns at
-    known times; entries are numbers, or arithmetic expressions in the parameters."""
+    known times; entries are numbers, or arithmetic expressions in the parameters and in what ``define`` names. Of a
+    known system they may be expressions in the time ``t``."""
 
     A: Rows | None = None
     """Square matrix, row by row."""
@@ -128,6 +138,10 @@ class SystemOptions(Options):
     c: Annotated[list[Entry], Field(min_length=1)] | None = None
     """Constant drift such as gravity, one entry per state, in units of the state per time; none unless given."""
 
+    define: dict[str, Entry] | None = None
+    """Names for expressions, in order, that ``A``, ``B``, ``E`` and ``c`` may use, as in ``{M: n * t, E: "kepler(M,
+    0.2)"}``: ``kepler(M, e)`` is the ``E`` with ``E - e sin E = M``, ``0 <= e < 1``; none unless given."""
+
     delay: float = Field(default=0.0, ge=0.0)
     """By how much later the control acts, less than the horizon; until then ``initial_control`` acts."""
 
@@ -137,10 +151,10 @@ class SystemOptions(Options):
             self.parameters.names if isinstance(self.parameters, ParameterSetOptions) else list(self.parameters or {})
         )
         for name in given:
-            if not name.isidentifier() or keyword.iskeyword(name) or name in CONSTANTS or name in FUNCTIONS:
+            if not name.isidentifier() or keyword.iskeyword(name) or name in {*CONSTANTS, *FUNCTIONS, KEPLER}:
                 raise InputError(
                     f"{name!r} cannot name a parameter; expected letters, digits and underscores, and not one of"
-                    f" {', '.join([*CONSTANTS, *FUNCTIONS])}",
+                    f" {', '.join([*CONSTANTS, *FUNCTIONS, KEPLER])}",
                     path="system.parameters",
                 )
         if len(set(given)) < len(given):
@@ -164,15 +178,43 @@ class SystemOptions(Options):
             for i, piece in enumerate(self.pieces)
         ]
 
-    def build(self) -> LinearSystem | SwitchedSystem:
-        """The system; raises `InputError` that begins with the key."""
+    def build(self, horizon: float | None = None) -> System:
+        """The system, which may change with time up to the ``horizon`` where that is given; raises `InputError` that
+        begins with the key."""
         names = self.names()
         parameters, every = self._parameter_set(names), self.matrices()
         where, until, first = every[0]
+        if self._changes(names, every):
+            return self._varying(first, horizon)
+        try:
+            defined = parse_definitions(self.define or {}, names)
+        except InputError as error:
+            raise error.under("system") from None
         if until is None:
-            return _system(where, first, parameters, names, self.delay)
-        made = [(float(stop or 0.0), _system(key, of, parameters, names)) for key, stop, of in every]
+            return _system(where, first, parameters, names, self.delay, defined)
+        made = [(float(stop or 0.0), _system(key, of, parameters, names, 0.0, defined)) for key, stop, of in every]
         return SwitchedSystem(made, self.delay)
+
+    def _changes(self, names: tuple[str, ...], every: list[tuple[str, float | None, Matrices]]) -> bool:
+        """Whether an entry, or what is defined, speaks of the time ``t``, where that is not a parameter's name."""
+        if TIME in names:
+            return False
+        texts = [*(self.define or {}).values()]
+        for _, _, (A, B, E, c) in every:
+            texts += [entry for rows in (A, B, E or []) for row in rows for entry in row] + (c or [])
+        return any(TIME in re.findall(r"[A-Za-z_]\w*", text) for text in texts if isinstance(text, str))
+
+    def _varying(self, of: Matrices, horizon: float | None) -> VaryingSystem:
+        refused = {"parameters": self.parameters, "pieces": self.pieces, "delay": self.delay}
+        for key, given in refused.items():
+            if given:
+                expected = "none where the system changes with the time t, of which known ones without delay are proven"
+                raise InputError(path=f"system.{key}", expected=expected, got="one")
+        if horizon is None:
+            raise InputError(path="system", expected="a system that stays the same with time here", got="one in t")
+        _check_shapes("system", of)
+        A, B, E, c = of
+        return VaryingSystem.of(A, B, horizon, E, c, self.define)
 
     def _parameter_set(self, names: tuple[str, ...]) -> ConvexSet | None:
         if isinstance(self.parameters, ParameterSetOptions):
@@ -328,9 +370,8 @@ class DisturbanceOptions(Sparse):
 Matrices: TypeAlias = tuple[list[list[Any]], list[list[Any]], list[list[Any]] | None, list[Any] | None]
 
 
-def _system(
-    where: str, of: Matrices, parameters: ConvexSet | None, names: tuple[str, ...], delay: float = 0.0
-) -> LinearSystem:
+def _check_shapes(where: str, of: Matrices) -> None:
+    """Raise `InputError` where matrices do not fit each other."""
     A, B, E, c = of
     d = len(A)
     for key, rows in (("A", A), ("B", B), ("E", E)):
@@ -344,13 +385,25 @@ def _system(
         )
     if c is not None and len(c) != d:
         raise InputError(path=f"{where}.c", expected=f"{d} entries, one per state", got=f"{len(c)}")
+
+
+def _system(
+    where: str,
+    of: Matrices,
+    parameters: ConvexSet | None,
+    names: tuple[str, ...],
+    delay: float = 0.0,
+    defined: Definitions = (),
+) -> LinearSystem:
+    _check_shapes(where, of)
+    A, B, E, c = of
     return LinearSystem(
-        parse_matrix(f"{where}.A", A, names),
-        parse_matrix(f"{where}.B", B, names),
-        None if E is None else parse_matrix(f"{where}.E", E, names),
+        parse_matrix(f"{where}.A", A, names, defined),
+        parse_matrix(f"{where}.B", B, names, defined),
+        None if E is None else parse_matrix(f"{where}.E", E, names, defined),
         parameters,
         names,
-        None if c is None else parse_column(f"{where}.c", c, names),
+        None if c is None else parse_column(f"{where}.c", c, names, defined),
         delay,
     )
 
@@ -447,13 +500,13 @@ class LinearKeys(ProblemFactory, Options):
             return None
         return self.initial_state.around("initial_state", states)[1]
 
-    def noise(self, system: LinearSystem | SwitchedSystem) -> ConvexSet | None:
+    def noise(self, system: System) -> ConvexSet | None:
         """The set of the disturbance where one is given, none of a list (`disturbances`); raises `InputError`."""
         if self.disturbance is None or isinstance(self.disturbance, list):
             return None
         return self.disturbance.build("disturbance", system.disturbances)
 
-    def disturbances(self, system: LinearSystem | SwitchedSystem, below: int = 0) -> list[Disturbance]:
+    def disturbances(self, system: System, below: int = 0) -> list[Disturbance]:
         """The disturbances where a list of them is given, under so many rows of zeros ``below`` each ``E``; raises
         `InputError`."""
         found: list[Disturbance] = []
@@ -500,7 +553,7 @@ class LinearProblem(LinearKeys):
 
     def build(self) -> OptimalControlProblem:
         """The problem; raises `InputError` that begins with the key at fault."""
-        system = self.system.build()
+        system = self.system.build(self.horizon)
         if self.initial_control is not None and self.control_step is None and not system.delay > 0.0:
             raise InputError(
                 path="initial_control",

@@ -167,7 +167,7 @@ def _positions(loaded: Loaded, problem: OptimalControlProblem) -> tuple[list[lis
     factory = loaded.registry.build("problem", loaded.config.problem.name, loaded.config.problem.options)
     if not isinstance(factory, LinearKeys):
         return [[i] for i in range(len(problem.path))], [[i] for i in range(len(problem.terminal))]
-    states = factory.system.build().states
+    states = problem.system.states
     entries = [item.entries(f"path.{i}", states, factory.horizon) for i, item in enumerate(factory.path)]
     members = [[_restricts(one.set) for one in entry] for entry in entries]
     ends = [[_restricts(one) for one in item.ends(f"terminal.{i}", states)] for i, item in enumerate(factory.terminal)]

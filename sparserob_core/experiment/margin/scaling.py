@@ -10,6 +10,7 @@ import numpy as np
 
 from sparserob_core.control.problem.names import joined
 from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.sets.sets import ConvexSet, Equality
 from sparserob_core.errors import InputError
 from sparserob_core.experiment.plugins.messages import nearest
@@ -123,14 +124,14 @@ def _disturbance(problem: OptimalControlProblem) -> Scaling:
 
 
 def _parameters(problem: OptimalControlProblem) -> Scaling:
-    bound = problem.system.parameters
-    assert bound is not None
+    bound, system = problem.system.parameters, problem.system
+    assert bound is not None and not isinstance(system, VaryingSystem)
     resized = _resizing("parameters", bound)
     return Scaling(
         "parameters",
         "factor on the set of parameters",
         "largest",
-        lambda f: replace(problem, system=problem.system.with_parameters(resized(f))),
+        lambda f: replace(problem, system=system.with_parameters(resized(f))),
         "largest half-width of a parameter",
         _times(_half_width(bound)),
         affine=False,

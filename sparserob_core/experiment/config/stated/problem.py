@@ -16,7 +16,7 @@ from sparserob_core.control.problem.cost import Cost, Quadratic
 from sparserob_core.control.problem.expression import ExpressionMatrix
 from sparserob_core.control.problem.names import Names
 from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
-from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
+from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System, VaryingSystem
 from sparserob_core.control.problem.tracing import traced
 from sparserob_core.control.sets.sets import Box, Equality, Product, SetFactory
 from sparserob_core.errors import InputError
@@ -94,12 +94,14 @@ def set_keys(where: str, convex: ConvexSet) -> dict[str, Any]:
     raise InputError(path=where, expected=f"a set that a config can name ({known})", got=type(convex).__name__)
 
 
-def _system_keys(system: LinearSystem | SwitchedSystem) -> dict[str, Any]:
+def _system_keys(system: System) -> dict[str, Any]:
+    if isinstance(system, VaryingSystem):
+        return {**_matrix_keys(system.law), **_defined_keys([system.law])}
     unknown = {one.name for mode in system.modes for one in fields(mode)} - WRITTEN_OF_SYSTEM
     if unknown:
         raise InputError(path=f"system.{sorted(unknown)[0]}", expected="a system in its own units", got="another")
     first = system.modes[0]
-    shared: dict[str, Any] = {"delay": system.delay} if system.delay else {}
+    shared: dict[str, Any] = {**({"delay": system.delay} if system.delay else {}), **_defined_keys(system.modes)}
     if first.parameters is not None:
         shared["parameters"] = _parameter_keys(first.parameters, first.names)
     if isinstance(system, SwitchedSystem):
@@ -112,6 +114,13 @@ def _matrix_keys(system: LinearSystem) -> dict[str, Any]:
     if system.c is not None:
         keys["c"] = [row[0] for row in _rows(system, "c")]
     return keys
+
+
+def _defined_keys(systems: Sequence[LinearSystem]) -> dict[str, Any]:
+    """What the entries of systems use by name; of several, which share it, that of any."""
+    entries = [getattr(one, name) for one in systems for name in ("A", "B", "E", "c")]
+    defined = next((one.defined for one in entries if isinstance(one, ExpressionMatrix) and one.defined), ())
+    return {"define": {name: one.text for name, one in defined}} if defined else {}
 
 
 def _rows(system: LinearSystem, name: str) -> list[list[str | float]]:

@@ -1,0 +1,336 @@
+"""The flow of a known system that changes with time, in balls: its own power series over every piece of a grid, and
+their products by a tree, in which balls grow with the logarithm of the number of pieces only."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+
+from sparserob_core.checker.arithmetic.series import upper
+from sparserob_core.checker.arithmetic.timed import Timed
+from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.checker.reach.flow import balanced, stacked
+from sparserob_core.sip.convex_set import Array
+
+if TYPE_CHECKING:
+    from flint import arb, arb_mat, arb_poly
+
+    from sparserob_core.control.problem.system import VaryingSystem
+
+ORDER = 24  # of the system in time on a segment; with a tenth of it segments are a million times shorter
+TERMS = (16, 24, 32, 48, 64)  # of the solution over a part of a segment: the fewest that are sharp, else the last
+SHARP = 2.0**-100  # of the system's numbers, what is left out on a segment; 2^-10 would show in what states miss
+LONG = 2.0  # norm of the system times the length of a segment; ten times more takes more terms than there are
+FIRST = 8  # segments to begin with
+SHORTEST = 2.0**-30  # of the horizon: a shorter segment holds a pole
+CIRCLES = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 24.0, 48.0, 96.0)
+"""Shares of an interval on which Cauchy's bound is looked at; short intervals need the wide ones."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Segment:
+    """``[A B E]`` from ``start`` to ``stop``: a table of polynomials in the time since ``centre``, and balls ``left``
+    that hold what stands before the next power of it."""
+
+    start: float
+    stop: float
+    centre: float
+    law: list[list[arb_poly]]
+    left: list[list[arb]]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """What a state at a time is made of: ``free`` times the state at 0, and ``control`` and ``disturbance`` times the
+    inputs on every piece of a grid."""
+
+    free: arb_mat
+    control: list[arb_mat]
+    disturbance: list[arb_mat]
+
+
+@final
+@dataclass(eq=False)
+class VaryingFlow:
+    """The system ``x' = A(t) x + B(t) u + E(t) w`` from 0 to ``until``; a drift is one more column of ``B``, whose
+    input is always 1."""
+
+    system: VaryingSystem
+    until: float
+    _known: dict[tuple[float, float], tuple[arb_mat, arb_mat, arb_mat]] = field(default_factory=dict)
+    _weights: dict[tuple[float, ...], Weights] = field(default_factory=dict)
+
+    @cached_property
+    def segments(self) -> list[Segment]:
+        """The system on parts of the horizon, one after another; raises `Unchecked` where it is not finite."""
+        horizon, found = self.until, []
+        todo = [(horizon * k / FIRST, horizon * (k + 1) / FIRST) for k in reversed(range(FIRST))]
+        while todo:
+            start, stop = todo.pop()
+            made = self._segment(start, stop)
+            if made is not None:
+                found.append(made)
+                continue
+            if stop - start <= SHORTEST * horizon:
+                raise Unchecked(f"near t = {start:.9g} the system is not enclosed")
+            middle = (start + stop) / 2
+            todo += [(middle, stop), (start, middle)]
+        return found
+
+    def _segment(self, start: float, stop: float) -> Segment | None:
+        """The system from ``start`` to ``stop``; ``None`` where that is too long."""
+        from flint import arb, arb_poly
+
+        centre = (start + stop) / 2
+        half = upper(abs(arb(stop) - arb(centre)).max(abs(arb(start) - arb(centre))))
+        try:
+            exact = self._table(arb(centre), ORDER + 1)
+            wide = self._table(arb(start).union(arb(stop)), ORDER + 2)
+        except Unchecked:
+            return None
+        d, u = self.system.states, self.units
+        lost, size = arb(0), arb(0)
+        for i, row in enumerate(exact):
+            sums, over = arb(0), arb(0)
+            for j, entry in enumerate(row):
+                far = sum((upper(abs(one)) * half**k for k, one in enumerate(entry)), arb(0))
+                rest = upper(abs(wide[i][j][ORDER + 1])) * half ** (ORDER + 1)
+                if j < d:
+                    sums, over = sums + far * u[j] / u[i], over + rest * u[j] / u[i]
+                elif not rest <= arb(SHARP) * self._inputs[j - d]:
+                    return None
+            size, lost = size.max(sums), lost.max(over)
+        most = size.max(arb(self._pace))
+        if not (size * (arb(stop) - arb(start)) <= LONG and lost <= arb(SHARP) * most):
+            return None
+        law = [[arb_poly(entry) for entry in row] for row in exact]
+        return Segment(start, stop, centre, law, [[entry[ORDER + 1] for entry in row] for row in wide])
+
+    def _table(self, centre: arb, length: int) -> list[list[list[arb]]]:
+        """The first coefficients of every entry of ``[A B E]`` at all times of a ball."""
+        from flint import arb, ctx
+
+        before, ctx.cap = ctx.cap, length
+        try:
+            law, time = self.system.law, np.empty(1, dtype=object)
+            time[0] = Timed.time(centre, length)
+            parts = [law.A, law.B, *([] if law.c is None else [law.c]), law.E]
+            values = np.hstack([np.asarray(part(time) if callable(part) else part, dtype=object) for part in parts])
+            return [
+                [
+                    one.coefficients(length) if isinstance(one, Timed) else [arb(float(one))] + [arb(0)] * (length - 1)
+                    for one in row
+                ]
+                for row in values
+            ]
+        finally:
+            ctx.cap = before
+
+    @cached_property
+    def _middles(self) -> Array:
+        """The largest absolute values of the entries of ``A`` at some times; any would do."""
+        return np.asarray(np.max([np.abs(np.asarray(one.A, dtype=float)) for one in self.system.modes], axis=0))
+
+    @cached_property
+    def units(self) -> list[float]:
+        """Units of the states, powers of two, in which the system is small; any would be right."""
+        A = self._middles
+        units = balanced(A, self.system.horizon, np.ones(A.shape[0]) / self.system.horizon)
+        return [float(one) for one in units]
+
+    @cached_property
+    def _pace(self) -> float:
+        u = np.array(self.units)
+        return float((self._middles * u / u[:, None]).sum(axis=1).max())
+
+    @cached_property
+    def _inputs(self) -> list[float]:
+        """The largest entry of every column of ``[B E]`` at some times; 1 where that is 0."""
+        every = [one.forced.matrices(np.zeros((1, 0)))[1:] for one in self.system.modes]
+        tables = [np.hstack([part[0] for part in parts]) for parts in every]
+        found = np.abs(tables).max(axis=(0, 1))
+        return [float(one) if one > 0.0 else 1.0 for one in found]
+
+    def over(self, start: float, stop: float) -> tuple[arb_mat, arb_mat, arb_mat]:
+        """What an interval makes of a state, of a control that stays the same, and of such a disturbance; raises
+        `Unchecked` beyond what is expanded."""
+        if not 0.0 <= start <= stop <= self.until:
+            raise Unchecked(f"the system is not known from {start:g} to {stop:g}")
+        if (start, stop) not in self._known:
+            m = self.system.controls + (self.system.c is not None)
+            begins = [one.start for one in self.segments]
+            first = max(0, bisect_right(begins, start) - 1)
+            last = max(first, bisect_right(begins, np.nextafter(stop, -np.inf)) - 1)
+            times = [start, *begins[first + 1 : last + 1], stop]
+            whole = None
+            for number, (one, other) in enumerate(pairwise(times), first):
+                part = self._within(self.segments[number], one, other)
+                whole = part if whole is None else (part[0] * whole[0], part[0] * whole[1] + part[1])
+            assert whole is not None
+            table = whole[1].tolist()
+            self._known[start, stop] = (
+                whole[0],
+                stacked([row[:m] for row in table]),
+                stacked([row[m:] for row in table]),
+            )
+        return self._known[start, stop]
+
+    def _within(self, segment: Segment, start: float, stop: float) -> tuple[arb_mat, arb_mat]:
+        """``Y(1)`` of ``Y' = h A Y + [0, h B, h E]`` in the share of the interval, ``Y(0) = [I, 0, 0]``."""
+        from flint import arb, arb_mat, arb_poly
+
+        d, h = self.system.states, arb(stop) - arb(start)
+        shifted = arb_poly([arb(start) - arb(segment.centre), h])
+        table = [[(entry(shifted) * h).coeffs() for entry in row] for row in segment.law]
+        order = max(len(entry) for row in table for entry in row)
+        columns, none = len(table[0]), arb(0)
+        A, driven = [], []
+        for k in range(order):
+            rows = [[entry[k] if k < len(entry) else none for entry in row] for row in table]
+            A.append(arb_mat([row[:d] for row in rows]))
+            driven.append(arb_mat([[none] * d + row[d:] for row in rows]))
+        first = [[arb(int(i == j)) for j in range(columns)] for i in range(d)]
+        terms = [arb_mat(first)]
+        total, tails = terms[0], _Tails(self._norms(table))
+        count = next((one for one in TERMS if tails.of(one, None) <= arb(SHARP)), TERMS[-1])
+        for n in range(count):
+            nexts = A[0] * terms[n]
+            for k in range(1, min(n + 1, order)):
+                nexts = nexts + A[k] * terms[n - k]
+            if n < order:
+                nexts = nexts + driven[n]
+            terms.append(nexts / (n + 1))
+            total = total + terms[-1]
+        return self._widened(total.tolist(), segment, table, h, tails, count)
+
+    def _norms(self, table: list[list[list[arb]]]) -> list[arb]:
+        """The norms of largest row sums, in own units, of the coefficients of ``A``."""
+        from flint import arb
+
+        d, u = self.system.states, [arb(one) for one in self.units]
+        found = []
+        for k in range(max(len(entry) for row in table for entry in row)):
+            sums = [
+                sum((upper(abs(row[j][k])) * u[j] / u[i] for j in range(d) if k < len(row[j])), arb(0))
+                for i, row in enumerate(table)
+            ]
+            found.append(upper(_largest(sums)))
+        return found
+
+    def _widened(
+        self,
+        total: list[list[arb]],
+        segment: Segment,
+        table: list[list[list[arb]]],
+        h: arb,
+        tails: _Tails,
+        count: int,
+    ) -> tuple[arb_mat, arb_mat]:
+        """The sum of a series with what it leaves out: its tail by Cauchy's bound on circles, for the coefficients are
+        at most those of ``y' = a(s) y + b(s)`` with the norms ``a_k`` and ``b_k``; and what stands before the next
+        power of the time, by the formula of variation of constants."""
+        from flint import arb
+
+        d, u = self.system.states, [arb(one) for one in self.units]
+        sizes = tails.sizes
+        far = upper(abs(arb(segment.stop) - arb(segment.centre)).max(abs(arb(segment.start) - arb(segment.centre))))
+        rest = [[upper(abs(one)) * far ** (ORDER + 1) * upper(abs(h)) for one in row] for row in segment.left]
+        r = _largest([sum((one * u[j] / u[i] for j, one in enumerate(row[:d])), arb(0)) for i, row in enumerate(rest)])
+        a = sum(sizes, arb(0))
+        spread = (a + r).exp() * a.exp()
+
+        state = tails.of(count, None) + r * spread
+        Phi = [[_wider(total[i][j], state * u[i] / u[j]) for j in range(d)] for i in range(d)]
+        columns = []
+        for j in range(d, len(table[0])):
+            forced = [
+                _largest([upper(abs(row[j][k])) / u[i] if k < len(row[j]) else arb(0) for i, row in enumerate(table)])
+                for k in range(len(sizes))
+            ]
+            missing = _largest([row[j] / u[i] for i, row in enumerate(rest)])
+            error = tails.of(count, forced) + spread * (r * sum(forced, arb(0)) + missing)
+            columns.append([_wider(total[i][j], error * u[i]) for i in range(d)])
+        return stacked(Phi), stacked([list(row) for row in zip(*columns, strict=True)])
+
+    def weights(self, grid: Sequence[float]) -> Weights:
+        """What the state at the end of a grid, which begins at 0, is made of."""
+        key = tuple(grid)
+        if key not in self._weights:
+            parts = [self.over(*ends) for ends in pairwise(grid)]
+            after = _products([part[0] for part in parts])
+            control = [Z * part[1] for Z, part in zip(after[1:], parts, strict=True)]
+            disturbance = [Z * part[2] for Z, part in zip(after[1:], parts, strict=True)]
+            self._weights[key] = Weights(after[0], control, disturbance)
+        return self._weights[key]
+
+
+@final
+class _Tails:
+    """What the solution of ``y' = a(s) y + b(s)`` at 1 has beyond some terms, ``sizes`` the coefficients of ``a``, from
+    ``y(0) = 1`` without ``b``, and from 0 with it."""
+
+    def __init__(self, sizes: list[arb]) -> None:
+        from flint import arb
+
+        self.sizes = sizes
+        self._grown = [
+            (R, sum((size * R ** (k + 1) / (k + 1) for k, size in enumerate(sizes)), arb(0)).exp())
+            for R in map(arb, CIRCLES)
+        ]
+
+    def of(self, count: int, forced: list[arb] | None) -> arb:
+        """Beyond ``count`` terms; ``forced``: the coefficients of ``b``."""
+        from flint import arb
+
+        found = []
+        for R, y in self._grown:
+            driven = arb(1)
+            if forced is not None:
+                driven = sum((size * R ** (k + 1) / (k + 1) for k, size in enumerate(forced)), arb(0))
+            found.append(upper(y * driven * R ** (-count) / (R - 1)))
+        return min(found)
+
+
+def _products(steps: Sequence[arb_mat]) -> list[arb_mat]:
+    """``Z_k = Phi_N ... Phi_{k+1}`` for ``k = 0, ..., N``, of steps ``Phi_1, ..., Phi_N``: from the products of pairs
+    of them, each of which is made of at most twice as many products as there are levels."""
+    from flint import arb_mat
+
+    d = steps[0].nrows()
+    unit = arb_mat([[int(i == j) for j in range(d)] for i in range(d)])
+    if len(steps) == 1:
+        return [steps[0], unit]
+    odd = len(steps) % 2
+    pairs = [second * first for first, second in zip(steps[:-1:2], steps[1::2], strict=False)]
+    coarse = _products([*pairs, *([steps[-1]] if odd else [])])
+    found: list[arb_mat] = []
+    for k in range(len(steps) + 1):
+        place, inside = divmod(k, 2)
+        if not inside:
+            found.append(coarse[place])
+        elif k == len(steps):
+            found.append(unit)
+        else:
+            found.append(coarse[place + 1] * steps[k])
+    return found
+
+
+def _wider(ball: arb, radius: arb) -> arb:
+    from flint import arb
+
+    return ball + arb(0, upper(radius))
+
+
+def _largest(numbers: Sequence[arb]) -> arb:
+    found = numbers[0]
+    for one in numbers[1:]:
+        found = found.max(one)
+    return found

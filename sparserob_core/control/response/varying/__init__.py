@@ -1,0 +1,1 @@
+"""Systems that change with time, as polynomials of it, and their transitions."""

@@ -1,0 +1,244 @@
+"""Transitions of systems that change with time, with a proven bound of their error.
+
+The system is enclosed on segments of the horizon as polynomials of the time with a remainder (Taylor models, whose
+segments follow the radius of convergence). Over an interval within one segment the solution is the power series of its
+own equation; what it leaves out is bounded entry by entry by the series of the absolute values, which majorises it, and
+what the remainder may add by the formula of variation of constants.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from math import comb
+from typing import NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from sparserob_core.control.enclosures.matrix_exponential import rounding
+from sparserob_core.control.enclosures.taylor import TaylorSpace
+from sparserob_core.control.problem.system import LinearSystem, SystemInUnits, VaryingSystem
+from sparserob_core.errors import InputError, NotEnclosable
+from sparserob_core.shapes import Float, shaped
+from sparserob_core.sip.convex_set import Array
+
+DEGREE = 14  # of the system in time; with a tenth segments are a hundred times shorter
+TERMS = 40  # of the solution on an interval; ten times fewer leave more than rounding, more of them cost time
+CIRCLES = (1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)  # shares of an interval on which Cauchy's bound is looked at
+LONG = 2.0  # norm of A times the length of a segment; ten times more needs three times the terms
+SHARPEST = 1e-13  # remainder on a segment, as a share of the numbers: ten times less is below what is rounded
+BLUNTEST = 1e-10  # from which on a segment is halved even where that did not help: else what a state misses shows
+SHORTEST = 2.0**-30  # of the horizon: a shorter segment without an enclosure holds a pole
+_KNOWN: WeakKeyDictionary[LinearSystem, dict[float, Expansion]] = WeakKeyDictionary()
+FIRST = 8  # segments to begin with
+SWEEPS = 20  # of balancing
+
+
+class Flow(NamedTuple):
+    """What ``k`` intervals make of the state at their beginning, ``state (k, d, d)``, and of inputs that stay the same,
+    ``control (k, d, m)`` and ``disturbance (k, d, mw)``; ``error (k,)``: bound of what all three are off by, as a
+    share of the norms of the majorant, in the coordinates of `Expansion.units`."""
+
+    state: Array
+    control: Array
+    disturbance: Array
+    error: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Expansion:
+    """A system on segments between ``ends (s + 1,)``: ``coefficients (s, DEGREE + 1, d, d + m + mw)`` of ``[A B E]``
+    in powers of the time from -1 to 1 over each segment, and what they may be off by, ``remainder (s, d, d + m + mw)``.
+
+    ``units (d,)``: of states, in which no entry of ``A`` is much larger than the others.
+    """
+
+    ends: Array
+    coefficients: Array
+    remainder: Array
+    units: Array
+    channels: tuple[int, int]
+
+    @staticmethod
+    def of(system: VaryingSystem) -> Expansion:
+        """The expansion of a system; raises `InputError`, which names a time, where there is none, as at a pole or at
+        the root of a negative number."""
+        kept = _KNOWN.setdefault(system.law, {})
+        if system.horizon not in kept:
+            law = system.law
+            if isinstance(law, SystemInUnits):
+                base = VaryingSystem(law.base, system.horizon * float(law.units[0]))
+                kept[system.horizon] = Expansion.of(base)._in_units(law, system)
+            else:
+                kept[system.horizon] = Expansion._made(system)
+        return kept[system.horizon]
+
+    def _in_units(self, law: SystemInUnits, system: VaryingSystem) -> Expansion:
+        factors = np.hstack([law.factors[name] * np.ones(part) for name, part in self._shapes])
+        states = np.sqrt(law.factors["A"][:, 0] / law.factors["A"][0, :])  # old units over new ones, but for a factor
+        return Expansion(
+            self.ends / float(law.units[0]),
+            self.coefficients * factors,
+            self.remainder * factors,
+            self.units * states,
+            (system.controls, system.disturbances),
+        )
+
+    @property
+    def _shapes(self) -> list[tuple[str, tuple[int, int]]]:
+        d, (m, mw) = self.units.size, self.channels
+        return [("A", (d, d)), ("B", (d, m)), ("E", (d, mw))]
+
+    @staticmethod
+    def _made(system: VaryingSystem) -> Expansion:
+        law, space, horizon = system.law, TaylorSpace(1, DEGREE), system.horizon
+        A = np.max([np.abs(np.asarray(mode.A, dtype=float)) for mode in system.modes], axis=0)
+        units = balanced(A, horizon)
+        scale = 1.0 / units[:, None]
+        size = float((np.abs(A) * scale * units).sum(axis=1).max())
+        todo = [(horizon * k / FIRST, horizon * (k + 1) / FIRST, np.inf) for k in reversed(range(FIRST))]
+        ends, found, left = [0.0], [], []
+        while todo:
+            start, stop, before = todo.pop()
+            centre = (start + stop) / 2
+            radius = float(np.nextafter(max(stop - centre, centre - start), np.inf))
+            off, here = np.inf, np.inf
+            try:
+                parts = law.taylor(space, np.array([centre]), np.array([radius]))
+            except NotEnclosable as error:
+                why = f"has a pole, or is no real number ({error})"
+            else:
+                why = "has a pole, or is too steep to be enclosed"
+                coefficients, rest = np.concatenate(parts[0::2], axis=2), np.concatenate(parts[1::2], axis=1)
+                off, here = _sharpness(coefficients, rest, units, size)
+                here *= stop - start
+            if here <= LONG and (off <= SHARPEST or before / 2 <= off <= BLUNTEST):  # or halving does not help
+                ends.append(stop)
+                found.append(coefficients)
+                left.append(rest)
+            elif stop - start <= SHORTEST * horizon:
+                raise InputError(f"near t = {centre:.9g} the system {why}", path="system")
+            else:
+                todo += [(centre, stop, off), (start, centre, off)]
+        return Expansion(np.array(ends), np.array(found), np.array(left), units, (system.controls, system.disturbances))
+
+    @shaped
+    def flow(self, starts: Float[Array, " k"], stops: Float[Array, " k"]) -> Flow:
+        """What each of the intervals makes of states and inputs."""
+        d, (m, mw) = self.units.size, self.channels
+        state = np.tile(np.eye(d), (starts.size, 1, 1))
+        inputs, error = np.zeros((starts.size, d, m + mw)), np.zeros(starts.size)
+        segments = np.clip(np.searchsorted(self.ends, starts, side="right") - 1, 0, self.ends.size - 2)
+        active, at = np.flatnonzero(stops > starts), starts.copy()
+        while active.size:
+            mine = segments[active]
+            last = mine == self.ends.size - 2  # which holds whatever rounding puts behind the horizon
+            until = np.where(last, stops[active], np.minimum(stops[active], self.ends[mine + 1]))
+            step, driven, off = self._within(mine, at[active], until)
+            state[active], inputs[active] = step @ state[active], step @ inputs[active] + driven
+            error[active] += off
+            at[active] = until
+            segments[active] += 1
+            active = active[until < stops[active]]
+        return Flow(state, inputs[..., :m], inputs[..., m:], error)
+
+    @shaped
+    def average(self, times: Float[Array, " T"]) -> Float[Array, "k d d"]:
+        """About what ``A`` is between ``times (k + 1,)``: at the middles, for what asks how fast the system is."""
+        middles, d = (times[:-1] + times[1:]) / 2, self.units.size
+        mine = np.clip(np.searchsorted(self.ends, middles) - 1, 0, self.ends.size - 2)
+        begin, end = self.ends[mine], self.ends[mine + 1]
+        powers = ((2.0 * middles - begin - end) / (end - begin))[:, None] ** np.arange(DEGREE + 1)
+        answer: Array = np.einsum("kn,knij->kij", powers, self.coefficients[mine][..., :d])
+        return answer
+
+    def _within(self, segments: np.ndarray, starts: Array, stops: Array) -> tuple[Array, Array, Array]:
+        """`flow` of intervals within one segment each, with control and disturbance side by side."""
+        d = self.units.size
+        centre = (self.ends[segments] + self.ends[segments + 1]) / 2
+        radius = (self.ends[segments + 1] - self.ends[segments]) / 2
+        length = stops - starts
+        at, share = (starts - centre) / radius, length / radius
+        powers = at[:, None] ** np.arange(DEGREE + 1)
+        moved = np.zeros((starts.size, DEGREE + 1, DEGREE + 1))
+        for n in range(DEGREE + 1):
+            for k in range(n, DEGREE + 1):
+                moved[:, n, k] = comb(k, n) * powers[:, k - n] * share**n
+        every = self.coefficients[segments]
+        shape = every.shape[2:]
+        law = (moved @ every.reshape(starts.size, DEGREE + 1, -1)).reshape(starts.size, DEGREE + 1, *shape)
+        law = law * length[:, None, None, None]
+        A, driven = law[..., :d], law[..., d:]
+        total, terms = np.zeros((starts.size, *shape)), []
+        first = np.zeros((starts.size, *shape))
+        first[:, :, :d] = np.eye(d)
+        terms.append(first)
+        for n in range(TERMS):
+            nexts = np.zeros((starts.size, *shape))
+            for k in range(min(n, DEGREE) + 1):
+                nexts += A[:, k] @ terms[n - k]
+            if n <= DEGREE:
+                nexts[..., d:] += driven[:, n]
+            terms.append(nexts / (n + 1))
+        for term in reversed(terms):
+            total += term
+        return total[..., :d], total[..., d:], self._error(segments, law, length)
+
+    def _error(self, segments: np.ndarray, law: Array, length: Array) -> Array:
+        """Of a series whose coefficients are at most those of ``y`` in the norm of largest row sums in own units, where
+        ``y' = a(s) y + b(s)`` with the norms ``a_k`` and ``b_k`` of the coefficients of the system: Cauchy's tail
+        ``y(R) R^-N / (R - 1)`` for the best ``R``, the remainder's part ``r e^(a + r)`` (variation of constants), and
+        rounding; each as a share of the norms of the states, or of the inputs."""
+        d = self.units.size
+        scale = self.units / self.units[:, None]
+        sizes = (np.abs(law[..., :d]) * scale).sum(axis=3).max(axis=2)
+        orders = np.arange(1.0, DEGREE + 2)
+        tail = np.full(length.size, np.inf)
+        for R in CIRCLES:
+            grown = (sizes * R**orders / orders).sum(axis=1)
+            forced = R ** (DEGREE + 1)  # no input has more of its coefficients in the last power
+            with np.errstate(over="ignore"):
+                tail = np.minimum(tail, np.exp(grown) * forced * R ** -float(TERMS) / (R - 1.0))
+        a = sizes.sum(axis=1)
+        rest = self.remainder[segments] * length[:, None, None]
+        r = (rest[..., :d] * scale).sum(axis=2).max(axis=1)
+        inputs, lost = np.abs(law[..., d:]).sum(axis=1), rest[..., d:]
+        most = (inputs / self.units[:, None]).max(axis=1)
+        share = ((lost / self.units[:, None]).max(axis=1) / np.where(most > 0.0, most, np.inf)).max(axis=1, initial=0.0)
+        rounded = rounding(DEGREE * d + TERMS) * (1.0 + a)
+        return np.asarray((tail + (r + share) * np.exp(a + r) + rounded * np.exp(a)) * (1.0 + 1e-9))
+
+    @cached_property
+    def slack(self) -> float:
+        """The errors of the flows over all segments, one after another: how much of what is added up to a state at the
+        end of the horizon is not resolved."""
+        return float(self.flow(self.ends[:-1], self.ends[1:]).error.sum())
+
+
+def _sharpness(coefficients: Array, rest: Array, units: Array, size: float) -> tuple[float, float]:
+    """What a segment's remainder is of the numbers themselves, and the norm of ``A`` on it; ``size`` is that on the
+    whole horizon."""
+    d, scale = units.size, units / units[:, None]
+    largest = np.abs(coefficients).sum(axis=0)
+    here = float((largest[:, :d] * scale).sum(axis=1).max())
+    off = float((rest[:, :d] * scale).sum(axis=1).max()) / max(here, size, np.finfo(float).tiny)
+    most = np.where(rest[:, d:] > 0.0, largest[:, d:].max(axis=0), np.inf)
+    return max(off, float((rest[:, d:] / most).max(initial=0.0))), here
+
+
+def balanced(A: Array, horizon: float) -> Array:
+    """Units ``(d,)`` of the states, powers of two, in which ``A`` has rows and columns of like size (Osborne 1960); a
+    state that another one does not reach counts as reached by a little."""
+    rates = np.abs(A) * horizon
+    np.fill_diagonal(rates, 0.0)
+    weak = np.where(rates > 0.0, 1.0 / np.where(rates > 0.0, rates, 1.0), 0.0).T
+    rates = np.where(rates > 0.0, rates, weak)
+    exponents = np.zeros(A.shape[0])
+    for _ in range(SWEEPS):
+        for i in range(exponents.size):
+            scaled = np.exp2(exponents)
+            row, column = (rates[i] * scaled).max() / scaled[i], (rates[:, i] / scaled).max() * scaled[i]
+            if row > 0.0 and column > 0.0:
+                exponents[i] += (np.log2(row) - np.log2(column)) / 2
+    return np.asarray(np.exp2(np.clip(np.round(exponents - exponents.mean()), -500, 500)))

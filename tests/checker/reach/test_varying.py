@@ -1,0 +1,113 @@
+"""Guards checker/reach/varying: balls around the flow of a system that changes with time hold closed forms, also where
+the series are cut short, and stay narrow over many pieces."""
+
+from __future__ import annotations
+
+from decimal import Decimal
+
+import numpy as np
+import pytest
+
+pytest.importorskip("flint")
+from flint import arb, arb_series, ctx
+
+import sparserob_core.checker.reach.varying as varying
+from sparserob_core.checker.arithmetic.jets import kepler_root, kepler_series
+from sparserob_core.checker.arithmetic.timed import Timed
+from sparserob_core.checker.outcome import Unchecked
+from sparserob_core.checker.reach.varying import VaryingFlow
+from sparserob_core.control.problem.system import VaryingSystem
+from tests.support.integration import mathieu
+
+FADING = VaryingSystem.of([["-1/(1 + t)"]], [["t", 1]], 3.0, [["2 - t"]], c=["3*t^2"])
+BITS = 160
+
+
+def exact(start: float, stop: float) -> list[arb]:
+    """The state's factor, and what both controls, the drift and the disturbance bring, in balls of their own."""
+    a, b = arb(start), arb(stop)
+
+    def primitive(*powers: int) -> arb:
+        """The integral of ``(1 + t) (c_0 + c_1 t + ...)``."""
+        total = arb(0)
+        for k, c in enumerate(powers):
+            for j in (k + 1, k + 2):
+                total += c * (b**j - a**j) / j
+        return total
+
+    driven = [primitive(0, 1), primitive(1), primitive(0, 0, 3), primitive(2, -1)]
+    return [(1 + a) / (1 + b), *(one / (1 + b) for one in driven)]
+
+
+@pytest.mark.parametrize(("start", "stop"), [(0.0, 0.125), (0.5, 1.75), (0.0, 3.0), (2.0, 2.25)])
+def test_balls_hold_the_closed_form_and_are_narrow(start: float, stop: float) -> None:
+    with ctx.workprec(BITS):
+        Phi, B, E = VaryingFlow(FADING, 3.0).over(start, stop)
+        for ball, truth in zip([Phi[0, 0], B[0, 0], B[0, 1], B[0, 2], E[0, 0]], exact(start, stop), strict=True):
+            assert ball.overlaps(truth) and float(ball.rad()) < 1e-24
+            assert abs(float((ball - truth).mid())) <= float(ball.rad()) + float(truth.rad())
+
+
+@pytest.mark.parametrize(("name", "value"), [("TERMS", (3,)), ("TERMS", (6,)), ("ORDER", 1), ("ORDER", 3)])
+def test_balls_hold_the_closed_form_where_series_are_cut_short(
+    name: str, value: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(varying, "SHARP", 1.0)
+    monkeypatch.setattr(varying, name, value)
+    with ctx.workprec(BITS):
+        flow, wide = VaryingFlow(FADING, 3.0), 0.0
+        for start in np.linspace(0.0, 2.5, 11):
+            Phi, B, E = flow.over(float(start), float(start) + 0.375)
+            balls = [Phi[0, 0], B[0, 0], B[0, 1], B[0, 2], E[0, 0]]
+            assert all(one.overlaps(other) for one, other in zip(balls, exact(start, start + 0.375), strict=True))
+            wide = max(wide, *(float(one.rad()) for one in balls))
+        assert wide > 1e-12, "nothing was left out"
+
+
+def test_nothing_is_said_beyond_what_was_expanded() -> None:
+    with ctx.workprec(BITS), pytest.raises(Unchecked, match="not known"):
+        VaryingFlow(FADING, 3.0).over(2.5, float(np.nextafter(3.0, 4.0)))
+
+
+def test_a_series_that_is_too_short_is_no_expansion() -> None:
+    with pytest.raises(Unchecked, match="no expansion"):
+        Timed(arb_series([1, 2], 3)).coefficients(4)
+
+
+def test_the_weights_of_many_pieces_are_products_of_their_flows() -> None:
+    grid = np.linspace(0.0, 3.0, 38).tolist()  # an odd number of pieces on some levels
+    with ctx.workprec(BITS):
+        flow = VaryingFlow(FADING, 3.0)
+        weights = flow.weights(grid)
+        assert weights.free[0, 0].overlaps(exact(0.0, 3.0)[0]) and float(weights.free[0, 0].rad()) < 1e-22
+        for k in (0, 1, 17, 36):
+            after = exact(grid[k + 1], 3.0)[0]
+            assert weights.control[k][0, 1].overlaps(after * exact(grid[k], grid[k + 1])[2])
+            assert weights.disturbance[k][0, 0].overlaps(after * exact(grid[k], grid[k + 1])[4])
+
+
+def test_mathieus_equation_agrees_with_fifty_digits() -> None:
+    system = VaryingSystem.of([[0, 1], ["-(1.5 - 0.75*cos(2*t))", 0]], [[0], [1]], 3.0)
+    with ctx.workprec(BITS):
+        Phi = VaryingFlow(system, 3.0).over(0.0, 3.0)[0]
+        for row, truth in zip(Phi.tolist(), mathieu("1.5", "0.375", Decimal(3)), strict=True):
+            for ball, value in zip(row, truth, strict=True):
+                assert abs(float(ball.mid()) - value) <= 2e-16 * max(1.0, abs(value)) and float(ball.rad()) < 1e-24
+
+
+@pytest.mark.parametrize(("M", "e"), [(0.0, 0.9), (0.3, 0.9), (-5.0, 0.2), (40.0, 0.99), (1.0, 0.0)])
+def test_keplers_equation_is_solved_in_balls(M: float, e: float) -> None:
+    with ctx.workprec(BITS):
+        E = kepler_root(arb(M), arb(e))
+        assert (E - arb(e) * E.sin()).overlaps(arb(M)) and float(E.rad()) < 1e-36
+        before, ctx.cap = ctx.cap, 9
+        try:
+            anomaly = arb_series([arb(M), 2, 1], 9)
+            found = kepler_series(anomaly, e, 9)
+            left = found - arb_series([arb(e)], 9) * found.sin() - anomaly
+            assert all(left[k].contains(0) and float(left[k].rad()) < 1e-20 for k in range(9))
+            wide = kepler_series(arb_series([arb(M).union(arb(M + 2**-20)), 2, 1], 9), e, 9)
+            other = kepler_series(arb_series([arb(M + 2**-21), 2, 1], 9), e, 9)
+            assert all(wide[k].contains(other[k]) and wide[k].contains(found[k]) for k in range(9))
+        finally:
+            ctx.cap = before

@@ -1,0 +1,126 @@
+"""Guards control/response/varying/expansion: transitions of systems that change with time, against closed forms and an
+integrator in fifty digits, and the bound of their error where the series are cut short."""
+
+from __future__ import annotations
+
+from decimal import Decimal
+
+import numpy as np
+import pytest
+
+import sparserob_core.control.response.varying.expansion as varying
+from sparserob_core.control.problem.system import VaryingSystem
+from sparserob_core.control.response.response import Response, merge_grids
+from sparserob_core.control.response.varying.expansion import Expansion, Flow
+from sparserob_core.errors import InputError
+from sparserob_core.sip.convex_set import Array
+from tests.support.integration import mathieu
+
+FADING = VaryingSystem.of([["-1/(1 + t)"]], [["t", 1]], 3.0, [["exp(-t)"]])
+TURNING = VaryingSystem.of([[0, "1 + t"], ["-(1 + t)", 0]], [[0], [1]], 4.0)
+SHARP = 1e-12  # the error of a flow that nothing was left out of
+STARTS, STOPS = np.array([0.0, 0.5, 1.9, 0.0, 2.0]), np.array([0.1, 1.75, 2.0, 3.0, 2.0])
+
+
+def fading(starts: Array, stops: Array) -> Flow:
+    """The exact flow of ``FADING``: ``(1 + t) x`` is the integral of ``(1 + t)`` times what drives it."""
+    left, right = 1 + starts, 1 + stops
+    control = np.stack([(right**3 - left**3) / 3 - (right**2 - left**2) / 2, (right**2 - left**2) / 2], axis=1)
+    pushed = -np.exp(-stops) * (2 + stops) + np.exp(-starts) * (2 + starts)
+    return Flow(
+        (left / right)[:, None, None], control[:, None] / right[:, None, None], (pushed / right)[:, None, None], left
+    )
+
+
+def test_a_flow_is_the_closed_form() -> None:
+    found, exact = Expansion.of(FADING).flow(STARTS, STOPS), fading(STARTS, STOPS)
+    for mine, other in zip(found[:3], exact[:3], strict=True):
+        np.testing.assert_allclose(mine, other, rtol=1e-13, atol=1e-15)
+    assert (found.error < SHARP).all() and found.error[4] == 0.0
+
+
+def test_a_rotation_of_growing_speed_turns_by_its_integral() -> None:
+    found = Expansion.of(TURNING).flow(np.array([0.0, 1.0]), np.array([4.0, 2.5]))
+    for state, angle in zip(found.state, (4 + 8, 1.5 + (2.5**2 - 1) / 2), strict=True):
+        exact = [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
+        np.testing.assert_allclose(state, exact, atol=2e-14)
+
+
+def test_mathieus_equation_agrees_with_fifty_digits() -> None:
+    system = VaryingSystem.of([[0, 1], ["-(a - 2*q*cos(2*t))", 0]], [[0], [1]], 3.0, define={"a": 1.5, "q": 0.4})
+    found = Expansion.of(system).flow(np.zeros(1), np.array([3.0])).state[0]
+    np.testing.assert_allclose(found, mathieu("1.5", "0.4", Decimal(3)), rtol=0, atol=4e-15)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("TERMS", 3), ("TERMS", 6), ("DEGREE", 2), ("DEGREE", 4)],
+    ids=["3", "6", "degree 2", "degree 4"],
+)
+def test_the_error_holds_what_is_left_out(name: str, value: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    # coarse on purpose: the solution or the system is cut short, and the bound must say by how much
+    for rough in ("SHARPEST", "BLUNTEST"):
+        monkeypatch.setattr(varying, rough, 1.0)
+    monkeypatch.setattr(varying, name, value)
+    expansion = Expansion._made(FADING)
+    starts = np.repeat(np.linspace(0.0, 2.9, 30), 30)
+    stops = starts + np.tile(np.linspace(0.0, 1.0, 30), 30) * (3.0 - starts)
+    found, exact = expansion.flow(starts, stops), fading(starts, stops)
+    off = np.abs(found.state - exact.state)[:, 0, 0]
+    assert off.max() > 1e-9, "nothing was left out"
+    assert (off <= found.error + 1e-15).all()
+    single = np.searchsorted(expansion.ends, stops) - np.searchsorted(expansion.ends, starts, side="right") <= 0
+    for mine, other, most in (
+        (found.control, exact.control, np.array([3.0, 1.0])),
+        (found.disturbance, exact.disturbance, np.array([1.0])),
+    ):
+        share = np.abs(mine - other)[single, 0] / most / np.maximum(stops - starts, 1e-9)[single, None]
+        # what an input is at most on an interval is at least as large as the share of it that is left out
+        assert (share <= 4.0 * found.error[single, None] + 1e-14).all()
+
+
+@pytest.mark.parametrize(
+    ("entry", "said"),
+    [
+        ("1/(t - 1.3)", r"near t = 1\.(29999|30000)"),
+        ("sqrt(abs1 * (1.7 - t))", "near t = 1.[67]|A is not finite at t = 2"),
+        ("tan(t)", r"near t = 1\.570[78]"),
+        ("log(t - 0.5)", "A is not finite at t = 0"),
+    ],
+)
+def test_a_pole_within_the_horizon_is_told_with_its_time(entry: str, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        Expansion.of(VaryingSystem.of([[entry]], [[1]], 2.0, define={"abs1": 1}))
+
+
+def test_the_expansion_in_other_units_is_the_same_system() -> None:
+    d, m = 2, 1
+    states, time = np.array([4.0, 0.25]), 8.0
+    rate = time / states[:, None]
+    moved = TURNING.in_units(rate * states, np.full((d, m), 2.0) * rate, rate * np.ones(d), np.zeros(0), 1.0, time)
+    found = Expansion.of(moved).flow(np.array([0.0]), np.array([0.5]))
+    plain = Expansion.of(TURNING).flow(np.array([0.0]), np.array([4.0]))
+    np.testing.assert_allclose(found.state[0] * states[:, None] / states, plain.state[0], rtol=1e-14, atol=1e-15)
+    np.testing.assert_allclose(found.control[0] * states[:, None] / 2.0, plain.control[0], rtol=1e-14, atol=1e-15)
+
+
+def test_rows_at_any_time_are_those_of_the_states() -> None:
+    control = np.array([0.0, 0.7, 1.5, 3.0])
+    grid = merge_grids(control, np.array([0.0, 1.0, 3.0]), varying=True)
+    response = Response(FADING, grid, np.array([2.0]))
+    u = np.array([[1.0, -0.5, 0.25], [0.5, 2.0, -1.0]])
+    times = np.array([0.3, 0.7, 1.9, 3.0])
+    rows = response.weights(times, np.ones((4, 1)), np.zeros((4, 0)))
+    found = rows.free @ response.initial_state + np.einsum("klm,ml->k", rows.control, grid.inputs(u))
+    exact = []
+    for t in times:
+        x = 2.0
+        for k in range(3):
+            if control[k] < t:
+                step = fading(control[k : k + 1], np.minimum(control[k + 1 : k + 2], t))
+                x = float((step.state[0] * x + step.control[0] @ u[:, k])[0, 0])
+        exact.append(x)
+    np.testing.assert_allclose(found, exact, rtol=1e-13)
+    fine = Response(FADING, grid.refined(np.union1d(grid.breakpoints, times)), np.array([2.0]))
+    states = fine.states(u[:, grid.control_piece], np.zeros((1, 0)))[0, :, 0]
+    np.testing.assert_allclose(states[np.searchsorted(fine.grid.breakpoints, times)], exact, rtol=1e-13)

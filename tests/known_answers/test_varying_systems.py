@@ -1,0 +1,140 @@
+"""Guards known answers: known plants that change with time, against closed forms and independent linear programs, and
+what is refused of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sparserob_core as sr
+from sparserob_core.experiment.check.check import check
+from tests.known_answers.test_checks import pieces, verified
+from tests.support import tampering
+
+FADING: dict[str, Any] = {
+    "name": "linear",
+    "system": {"A": [["-1/(1 + t)"]], "B": [[1]]},
+    "horizon": 2.0,
+    "initial_state": [2.5],
+    "control": {"box": 1.0},
+    "terminal": [{"equals": [0]}],
+}
+
+
+def rendezvous(n: float, e: float, M: float, horizon: float, begin: list[float], end: list[float], bound: float) -> Any:
+    """Planar motion about a Kepler ellipse of mean motion ``n`` from the mean anomaly ``M`` on."""
+    root = float(np.sqrt(1 - e * e))
+    define = {
+        "E": f"kepler({n!r} * t + {M!r}, {e!r})",
+        "q": f"1 - {e!r} * cos(E)",
+        "k": f"{n * n!r} / q^3",
+        "w": f"{n * root!r} / q^2",
+        "dw": f"{-2 * e * n * n * root!r} * sin(E) / q^4",
+    }
+    A = [[0, 0, 1, 0], [0, 0, 0, 1], ["w^2 - k", "dw", 0, "2*w"], ["-dw", "w^2 + 2*k", "-2*w", 0]]
+    return {
+        "name": "linear",
+        "system": {"A": A, "B": [[0, 0], [0, 0], [1, 0], [0, 1]], "define": define},
+        "horizon": horizon,
+        "initial_state": begin,
+        "control": {"box": bound},
+        "terminal": [{"equals": end}],
+    }
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of the fading plant."""
+    directory = tmp_path_factory.mktemp("fading") / "run"
+    config = {"problem": FADING, "dictionaries": {"control": pieces(20)}, "observers": []}
+    sr.run(config, out=directory, figures=False)
+    return directory
+
+
+def test_a_fading_plant_is_pushed_late(tmp_path: Path) -> None:
+    # (1 + t) x' = ... : int (1 + t) u = -x(0), cheapest at the end: J = 1 + T - sqrt((1 + T)^2 - 2 x(0))
+    assert verified(tmp_path / "run", FADING, pieces(20))["cost"] == pytest.approx(1.0, rel=1e-9)
+
+
+def test_a_drift_in_time_is_an_input(tmp_path: Path) -> None:
+    # x' = u + t, from 1 to 0 in 2 with u between -4 and 0: int u = -1 - 2
+    config = {**FADING, "system": {"A": [[0]], "B": [[1]], "c": ["t"]}, "initial_state": [1], "control": {"box": 4.0}}
+    assert verified(tmp_path / "run", config, pieces(8))["cost"] == pytest.approx(3.0, rel=1e-9)
+
+
+def test_an_unreachable_end_is_proven_to_be_so(tmp_path: Path) -> None:
+    # |int (1 + t) u| <= 4 over [0, 2]
+    verified_infeasible = {**FADING, "initial_state": [4.1]}
+    out = tmp_path / "run"
+    sr.run({"problem": verified_infeasible, "dictionaries": {"control": pieces(8)}, "observers": []}, out=out)
+    found = check(out)
+    assert found.status == "verified"
+    assert {claim.name for claim in found.claims} >= {"infeasibility"}
+
+
+@pytest.mark.slow
+def test_the_transfer_of_atv_costs_what_is_listed(tmp_path: Path) -> None:
+    n = float(np.sqrt(3.986e14 / 6763e3**3))
+    config = rendezvous(n, 0.0052, 0.0, 7200.0, [-30e3, 500.0, 8.514, 0.0], [-100.0, 0.0, 0.0, 0.0], 0.05)
+    assert verified(tmp_path / "run", config, pieces(240))["cost"] == pytest.approx(10.920731, rel=1e-7)
+
+
+@pytest.mark.slow
+def test_the_transfer_of_simbol_x_costs_what_is_listed(tmp_path: Path) -> None:
+    n, e, nu = float(np.sqrt(3.986e14 / 106246975.3**3)), 0.798788, np.radians(135)
+    E = float(2 * np.arctan2(np.sqrt(1 - e) * np.sin(nu / 2), np.sqrt(1 + e) * np.cos(nu / 2)))
+    begin, end = [18309.5, -23764.7, -0.0542, -0.0418], [335.12, -371.1, 0.00155, 0.0014]
+    config = rendezvous(n, e, E - e * float(np.sin(E)), 49995.0, begin, end, 1e-3)
+    assert verified(tmp_path / "run", config, pieces(250))["cost"] == pytest.approx(1.813578, rel=3e-7)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        tampering.system(A=[["-1.00001/(1 + t)"]]),
+        tampering.system(A=[["-1/(1 + 1.00001*t)"]]),
+        tampering.system(B=[["1 + 1e-6*t"]]),
+        tampering.problem(initial_state=[2.50001]),
+    ],
+    ids=["A", "A in t", "B", "start"],
+)
+def test_a_system_that_is_changed_afterwards_is_found(change: tampering.Change, finished: Path, tmp_path: Path) -> None:
+    assert check(tampering.forged(finished, tmp_path / "copy", change, consistent=True)).status == "refuted"
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"disturbance": {"box": 0.1}}, "disturbance: expected none where the system changes with time"),
+        ({"disturbance": [{"set": {"box": 0.1}}]}, "disturbance: expected none where the system changes with time"),
+        ({"measurements": {"C": [[1]]}}, "measurements: expected none where the system changes with time"),
+        ({"path": [{"box": 5.0}]}, "path: expected none where the system changes with time"),
+        ({"terminal": [{"box": 0.1}]}, "terminal: expected none where the system changes with time"),
+        ({"initial_state": {"centre": [2.5], "box": 0.1}}, "initial_state: expected none where"),
+        ({"cost": {"final": {"Q": [[1]]}}}, r"cost\.final: expected none where"),
+        ({"system": {"A": [["t + p"]], "B": [[1]], "parameters": {"p": [0, 1]}}}, r"system\.parameters: expected none"),
+        ({"system": {"A": [["t"]], "B": [[1]], "delay": 0.1}}, r"system\.delay: expected none"),
+        ({"system": {"A": [["a"]], "B": [[1]], "define": {"a": "b*t", "b": "a"}}}, r"system\.define\.a: .*circle"),
+        ({"system": {"A": [["a"]], "B": [[1]], "define": {"a": "q*t"}}}, r"system\.define\.a: .*unknown name 'q'"),
+        ({"system": {"A": [["1/(t - 1)"]], "B": [[1]]}}, "A is not finite at t = 1"),
+    ],
+)
+def test_what_is_not_proven_yet_is_refused_by_name(changes: dict[str, Any], said: str, tmp_path: Path) -> None:
+    config = {"problem": {**FADING, **changes}, "dictionaries": {"control": pieces(8)}, "observers": []}
+    with pytest.raises(sr.InputError, match=said):
+        sr.run(config, out=tmp_path / "run", figures=False)
+
+
+def test_definitions_serve_uncertain_systems_too(tmp_path: Path) -> None:
+    problem = {
+        **FADING,
+        "system": {"A": [["-rate"]], "B": [[1]], "define": {"rate": "0.5 + 0.1*p"}, "parameters": {"p": [0, 1]}},
+        "terminal": [{"box": 0.5}],
+        "control": {"box": 2.0},
+    }
+    plain = {**problem, "system": {"A": [["-(0.5 + 0.1*p)"]], "B": [[1]], "parameters": {"p": [0, 1]}}}
+    costs = [verified(tmp_path / name, one, pieces(8))["cost"] for name, one in (("a", problem), ("b", plain))]
+    assert costs[0] == pytest.approx(costs[1], rel=1e-12)
