@@ -16,7 +16,7 @@ from flint import ctx
 import sparserob_core as sr
 from sparserob_core.checker.arithmetic.balls import balls
 from sparserob_core.checker.claims.case import Case
-from sparserob_core.checker.claims.feedback import FeedbackClaims, _chords
+from sparserob_core.checker.claims.feedback import FeedbackClaims, _chords, _fixed, _reach, _width
 from sparserob_core.checker.outcome import Broken, Unchecked
 from sparserob_core.control.policies.affine import AffinePolicy
 from sparserob_core.control.problem.system import LinearSystem
@@ -398,3 +398,21 @@ def test_a_policy_is_refused_where_the_checker_does_not_know_the_system():
     free = replace(judged.case, problem=replace(problem, disturbance_class="measurable"), policy=None)
     with pytest.raises(Unchecked):
         FeedbackClaims(free).loop  # noqa: B018
+
+
+def test_how_far_and_how_wide_a_set_is_along_a_channel():
+    for shape, wide, far in (
+        (Box([-1.0, 2.0], [3.0, 5.0]), (4.0, 3.0), (3.0, 5.0)),
+        (Box([-3.0, -5.0], [1.0, -2.0]), (4.0, 3.0), (3.0, 5.0)),
+        (NormBall(p=2.0, radius=2.0, centre=[0.5, -1.0]), (4.0, 4.0), (2.5, 3.0)),
+    ):
+        assert [float(_width(shape, c).mid()) for c in (0, 1)] == pytest.approx(wide)
+        assert [float(_reach(shape, c).mid()) for c in (0, 1)] == pytest.approx(far)
+
+
+def test_a_direction_of_a_fixed_state_is_that_state_alone_at_the_end():
+    case = claims(terminal=[Equality([0.6])]).case
+    assert [float(_fixed(case, np.array([c]), 2.0).mid()) for c in (1.0, -2.0)] == [0.6, -1.2]
+    for direction, time in (([0.0], 2.0), ([1.0], 1.9), ([1.0], 0.0)):
+        with pytest.raises(Broken, match="fixed final state"):
+            _fixed(case, np.array(direction), time)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sparserob_core.errors import InputError
 from tests.support.families import KINDS, program
 
 
@@ -56,6 +57,7 @@ def test_a_separation_is_no_less_than_what_samples_meet_and_is_met_where_it_says
         low, high = drawn(family, rng, 1.0, 24)
         found, top = family.worst(x), highest(family, x, low, high, rng, 20).max()
         assert found.violations[0] >= top - 1e-7, (kind, family.name)
+        assert found.bound >= max(top, found.violations[0]) - 1e-12, (kind, family.name)
         assert (np.diff(found.violations) <= 1e-9).all()
         few = slice(0, 3)
         real = family.violations(x, found.indices[few])
@@ -68,7 +70,14 @@ def test_rows_for_every_deviation_are_violated_by_what_the_family_says(kind):
     for family in made.families:
         x = rng.normal(size=made.n)
         low, high = family.cells
-        for index in (low + rng.uniform(0.1, 0.9, size=low.shape) * (high - low))[:6]:
+        inside = (low + rng.uniform(0.1, 0.9, size=low.shape) * (high - low))[:6]
+        jumps = inside[inside[:, 0] > 0.3].copy()  # a row on the control is one before a jump and another behind it
+        jumps[:, 0] = np.round(2.0 * jumps[:, 0]) / 2.0
+        if not family.name.startswith("mixed"):
+            jumps = jumps[:0]
+        for index in np.concatenate([inside, jumps]):
             rows = family.uncertain(index)
             assert rows.excess(x, made.spread) == pytest.approx(family.violations(x, index[None])[0], abs=1e-9)
             assert rows.h.size == rows.part.size == rows.factor.size
+        with pytest.raises(InputError, match="no row of the decision"):
+            family.rows(low[:1])
