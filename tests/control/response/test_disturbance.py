@@ -111,6 +111,16 @@ def test_the_worst_disturbance_attains_the_support_and_is_admissible(seed, kind)
             assert (np.einsum("...li,il->...", weights, other) <= model.support(weights) + 1e-9).all()
 
 
+@pytest.mark.parametrize("kind", ["l1_ball", "piecewise_constant", "measurable"])
+def test_no_disturbance_is_longer_than_its_radius_and_some_are_nearly_as_long(kind):
+    rng, bound = np.random.default_rng(5), Box([-0.2, -0.3], [0.2, 0.3])
+    uneven = Dictionary(np.linspace(0.0, HORIZON, 4), np.array([[1.0, 0.0, 0.5], [0.0, 3.0, -0.25]]))
+    model = model_of(kind, bound, uneven if kind == "l1_ball" else COARSE)
+    signal = model.worst(rng.normal(size=(200, model.grid.pieces, 2)))
+    longest = np.linalg.norm(signal, axis=1).max()
+    assert 0.99 * model.radius <= longest <= model.radius * (1 + 1e-12)
+
+
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 10**6), functions=st.integers(1, 4))
 def test_the_l1_ball_is_attained_at_one_of_its_vertices(seed, functions):
