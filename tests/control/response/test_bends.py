@@ -12,6 +12,7 @@ from scipy.linalg import expm
 from sparserob_core.control.enclosures.comparison import block_norms
 from sparserob_core.control.problem.system import LinearSystem
 from sparserob_core.control.response.disturbance_support import DisturbanceSupport
+from sparserob_core.control.response.initial_support import InitialSupport
 from sparserob_core.control.response.lifted import lift
 from sparserob_core.control.sets.sets import Ellipsoid
 from sparserob_core.sip.convex_set import Array, Box
@@ -98,3 +99,21 @@ def test_rows_are_nowhere_larger_than_is_said_between_the_ends_of_a_span(A: list
         bend, beyond = sizes[:, span] - outside, norms.max(axis=0) - outside
         nearest = max(nearest, float((beyond[bend > 1e-9] / bend[bend > 1e-9]).max(initial=0.0)))
     assert nearest >= 0.55  # of what is added to the ends so much is reached
+
+
+@pytest.mark.parametrize("uncertain", [False, True])
+@pytest.mark.parametrize("name", sorted(KNOWN))
+def test_what_an_initial_deviation_does_is_as_near_to_its_chord_as_is_said(name: str, uncertain: bool) -> None:
+    of_disturbances = support_of(name, "uneven", "box", uncertain)
+    sigma = InitialSupport(of_disturbances.lifted, BOUNDS["ellipsoid"], of_disturbances.rows)
+    tight = []
+    for left, right in itertools.pairwise(sigma.lifted.grid.breakpoints):
+        for width, start in ((right - left, left), (1e-4, left), (1e-4, right - 1e-4)):
+            share = np.linspace(0.0, 1.0, 17)[:, None, None, None]
+            blocks = sigma.blocks(start + width * share[:, 0, 0, 0])  # (k, r, M, d)
+            missed = blocks - (1.0 - share) * blocks[0] - share * blocks[-1]
+            truth = sigma.set.reach(missed).sum(axis=2).max(axis=0)
+            found = sigma.deviation(np.array([start]), np.array([width]))[0]
+            assert (truth <= found * (1 + 1e-9) + 1e-15).all()
+            tight += (found / truth).tolist() if width == 1e-4 else []
+    assert min(tight) <= 1.2
