@@ -10,7 +10,7 @@ import numpy as np
 
 import sparserob_core as sr
 from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
-from sparserob_core.control.problem.system import LinearSystem
+from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem
 from sparserob_core.control.sets.sets import Box, Ellipsoid, NormBall
 from sparserob_core.control.transcription.transcribe import prepare
 from tests.support.plants import uniform
@@ -42,6 +42,13 @@ def problem(kind):
             lambda p: np.array([[0.0 * p[0], 1.0 + 0.0 * p[0]], [-2.0 + p[0], -0.3 + 0.0 * p[0]]]),
             B, E, parameters=Box([-0.02], [0.02]),
         )  # fmt: skip
+    if kind == "taking turns":
+        first = LinearSystem(lambda p: A + p[0] * np.eye(2), B, E, parameters=Box([-0.02], [0.02]))
+        second = LinearSystem(lambda p: A.T * (1.0 + p[0]), B, E, parameters=Box([-0.02], [0.02]))
+        system, more["initial_set"] = (
+            SwitchedSystem([(0.9, first), (HORIZON, second)]),
+            Box([-0.05, -0.02], [0.05, 0.02]),
+        )
     if kind.endswith("measurable"):
         path, terminal = FLAT, terminal[:1]
         more["disturbance_class"] = "measurable"
@@ -59,7 +66,7 @@ def problem(kind):
     ), policy
 
 
-KINDS = ("known", "parametric", "measurable", "feedback", "feedback, measurable")
+KINDS = ("known", "parametric", "taking turns", "measurable", "feedback", "feedback, measurable")
 
 
 @cache
