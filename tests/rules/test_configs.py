@@ -14,6 +14,8 @@ from tests.support.places import CONFIGS
 
 # status, and the cost J where a closed form or an independent linear program knows it (relative tolerance beside it)
 EXPECTED: dict[str, tuple[str, float | None, float]] = {
+    "atv_transfer": ("certified", 10.920731, 1e-7),
+    "simbol_x_transfer": ("certified", 1.813578, 3e-7),
     "breakpoints": ("certified", None, 0.0),
     "cart_pendulum": ("certified", 0.3281469, 2e-7),
     "coupled_masses": ("certified", 1.057952, 5e-6),
@@ -61,6 +63,8 @@ EXPECTED: dict[str, tuple[str, float | None, float]] = {
 UNCHECKED = {("experiment1_scenario", "lower bound")}  # its constraints are samples
 ELSEWHERE = {"experiment1_paper"}  # what is found by it is tested in known_answers/test_paper.py
 SLOW = {  # every status, formulation and kind of uncertainty has a lighter config
+    "atv_transfer",
+    "simbol_x_transfer",
     "breakpoints",
     "experiment1_literal",
     "rendezvous",
