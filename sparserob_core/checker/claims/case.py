@@ -19,15 +19,20 @@ from sparserob_core.checker.outcome import Broken, Clock, Unchecked
 from sparserob_core.checker.reach.disturbance_support import Scene
 from sparserob_core.checker.reach.flow import stacked
 from sparserob_core.checker.reach.varying import VaryingFlow
+from sparserob_core.checker.sets.known import known
 from sparserob_core.control.policies.policy import Charge, Cost, Policy, WrittenPolicy, answers_of
 from sparserob_core.control.problem.dictionary import Dictionary
-from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem
+from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, Return
 from sparserob_core.control.problem.system import VaryingSystem
-from sparserob_core.control.sets.sets import ConvexSet, Equality
+from sparserob_core.control.sets.sets import Box, ConvexSet, Equality
 from sparserob_core.sip.convex_set import Array
 
 if TYPE_CHECKING:
     from flint import arb_mat
+
+RETURN = "return"
+INSIDE = 1e-8  # of the set of initial states, by which final ones are inside: ten times what counts as no violation, so
+# that none is handed on from period to period
 
 
 @final
@@ -69,7 +74,7 @@ class Case:
     @cached_property
     def windows(self) -> list[Window]:
         """The state constraints, under the names that the certificate uses."""
-        path = [entry for entry in self.problem.path if not isinstance(entry, ConvexSet)]
+        path = [entry for entry in self.problem.path if not isinstance(entry, ConvexSet | Return)]
         d = self.problem.system.states
         ends = [end for end in self.problem.terminal if not isinstance(end, Equality)]
         found = [
@@ -85,12 +90,40 @@ class Case:
             )
             for i, entry in enumerate(path)
         ]
+        found += [] if self.returned is None else [self.returned]
         return found + [
             Window(
                 f"terminal[{i}]" if len(ends) > 1 else "terminal", end, self.problem.horizon, self.problem.horizon, d
             )
             for i, end in enumerate(ends)
         ]
+
+    @cached_property
+    def returned(self) -> Window | None:
+        """Of a plan that repeats, that every final state is one of the initial states, and inside their set by more
+        than what counts as no violation; ``None`` where there is but one of each coordinate. Derived from the initial
+        states alone, whatever the problem's records say of it."""
+        bound, end = self.problem.initial_set, self.problem.horizon
+        if not self.problem.repeat or bound is None or len(self.single) == self.problem.system.states:
+            return None
+        free = np.isin(np.arange(bound.dimension), self.single)
+        if free.any():
+            if not isinstance(bound, Box):
+                raise Unchecked("of a flat set of initial states, the checker knows boxes only")
+            bound = Box(np.where(free, -np.inf, bound.lower), np.where(free, np.inf, bound.upper))
+        centre = np.asarray(self.problem.initial_state, dtype=float)
+        moved = np.column_stack([[0.0, end], np.vstack([centre, centre])])
+        return Window(RETURN, bound.scaled(1.0 - INSIDE), end, end, bound.dimension, moved if centre.any() else None)
+
+    @cached_property
+    def single(self) -> list[int]:
+        """The coordinates in which all initial states are alike."""
+        bound, d = self.problem.initial_set, self.problem.system.states
+        if bound is None:
+            return list(range(d))
+        axes = np.eye(d).tolist()
+        both = ((known(bound).support(balls(c)), known(bound).support(balls([-v for v in c]))) for c in axes)
+        return [i for i, (up, down) in enumerate(both) if (up + down).is_zero()]
 
     @property
     def equalities(self) -> list[tuple[int, float]]:

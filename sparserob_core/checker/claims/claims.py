@@ -66,6 +66,8 @@ def check(case: Case, gap_tolerance: float | None) -> list[Finding]:
         if case.equalities:
             claims.append(judged("equalities", lambda: _equalities(case)))
         claims += [judged(window.name, lambda window=window: _kept(case, window)) for window in case.windows]  # type: ignore[misc]
+        if case.problem.repeat or "repeat" in case.certificate:
+            claims.append(judged("repeat", lambda: _repeats(case, {one.name: one.verdict for one in claims})))
         return [*claims, judged("status", lambda: _status(case, str(status), gap_tolerance, claims))]
 
 
@@ -175,6 +177,51 @@ def _control(case: Case) -> str:
     return f"{case.control.pieces} pieces in their set" + (f", to {worst:.1e} of its own units" if worst > 0 else "")
 
 
+def _repeats(case: Case, verdicts: Mapping[str, str]) -> str:
+    """That all constraints hold in every period: every final state is an initial one again, and what holds on one
+    period, the return and the steps across the seam among it, holds."""
+    if case.certificate.get("repeat") is not True or not case.problem.repeat:
+        raise Broken("the certificate and the problem differ about whether the plan repeats")
+    if case.problem.system.delay > 0.0:
+        raise Broken("with a delay the last controls of a period act in the next one")
+    fixed, centre = dict(case.equalities), np.asarray(case.problem.initial_state, dtype=float)
+    for state in case.single:
+        if fixed.get(state) != float(centre[state]):
+            raise Broken(f"x{state + 1} begins at {float(centre[state])!r}, and does not end there")
+    if case.returned is not None:
+        _strictly(case, case.returned)
+    needed = [name for name, verdict in verdicts.items() if name not in (*ASIDE, "cost", "lower bound")]
+    for name in needed:
+        if verdicts[name] != "holds":
+            raise (Broken if verdicts[name] == "fails" else Unchecked)(f"it rests on {name}, which is {verdicts[name]}")
+    back = "every final state is one of the initial states"
+    if len(case.single) == centre.size:
+        back = "the final state is the initial one, to rounding"
+    elif case.single:
+        back += ", in " + ", ".join(f"x{state + 1}" for state in case.single) + " to rounding"
+    return f"{back}, so that all constraints hold in every period"
+
+
+def _strictly(case: Case, window: Window) -> None:
+    """That what the proof of the return allows is still in the set of initial states."""
+    from flint import arb
+
+    bound = case.problem.initial_set
+    assert bound is not None
+    mine, flat = window.seen.facets, known(bound).facets
+    if mine is None or flat is None:
+        return  # what is allowed there is a share of the whole set
+    kept = [(c, b) for c, b in flat if not set(np.flatnonzero(c).tolist()) <= {*case.single}]
+    if len(mine) != len(kept):
+        raise Unchecked("the sides of the set of initial states are not told apart")
+    for (c, within), (direction, b), unit in zip(mine, kept, case.units(window).rows.tolist(), strict=True):
+        if not np.array_equal(c, direction) or not within + arb(TOLERANCE) * arb(unit) <= b:
+            raise Unchecked(
+                f"a violation that counts as none leaves the set of initial states along {c.tolist()}: it is too thin"
+                " beside the numbers that are added up"
+            )
+
+
 def _changed(case: Case) -> str:
     return _steps(case) if case.policy is None else _feedback(case).steps()
 
@@ -187,7 +234,8 @@ def _steps(case: Case) -> str:
     for k in found:
         case.clock.check()
         last = balls(before(case.problem)) if k == 0 else case.pieces[k - 1].entries()
-        over, where = known(bound).excess([u - v for u, v in zip(case.pieces[k].entries(), last, strict=True)])
+        next_ = case.pieces[k % case.control.pieces].entries()  # after the last piece comes the first one
+        over, where = known(bound).excess([u - v for u, v in zip(next_, last, strict=True)])
         if over > TOLERANCE:
             where = "the change of the control" if where == "it" else f"the change of {where}"
             raise Broken(

@@ -73,10 +73,11 @@ class Duality:
             raise Broken(f"control_step: there is no step at t = {time!r}")
         (k,) = found
         slope = [[_exact(0.0)] * direction.size for _ in range(self.control.pieces)]
-        slope[k] = [_exact(c) for c in direction]
+        after = k % self.control.pieces  # after the last piece comes the first one
+        slope[after] = [_exact(c) for c in direction]
         constant = -known(self.problem.control_step).limit(direction)
         if k > 0:
-            slope[k - 1] = [-_exact(c) for c in direction]
+            slope[k - 1] = [a - _exact(c) for a, c in zip(slope[k - 1], direction, strict=True)]
         else:
             constant -= sum(
                 (_exact(c) * u for c, u in zip(direction, map(_exact, before(self.problem)), strict=True)), _exact(0.0)
@@ -275,8 +276,9 @@ class Duality:
 
 
 def steps(problem: OptimalControlProblem, control: Dictionary) -> range:
-    """The pieces of a control whose beginning is a step from what was before."""
-    return range(0 if problem.initial_control is not None else 1, control.pieces)
+    """The pieces of a control whose beginning is a step from what was before; of a plan that repeats the end of the
+    last piece too."""
+    return range(0 if problem.initial_control is not None else 1, control.pieces + bool(problem.repeat))
 
 
 def before(problem: OptimalControlProblem) -> list[float]:

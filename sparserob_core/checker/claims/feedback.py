@@ -161,7 +161,7 @@ class FeedbackClaims:
         rows = np.array([c for c, _ in shape.facets])
         for k in found:
             case.clock.check()
-            heights = loop.heights(self._change(k), rows)
+            heights = self._changes(k, rows)
             for (_, b), height, unit in zip(shape.facets, heights, shape.units, strict=True):
                 over = float((height - b).upper()) / (max(unit, RESOLVED * float((abs(height) + abs(b)).mid())) or 1.0)
                 if over > TOLERANCE:
@@ -171,6 +171,14 @@ class FeedbackClaims:
                     )
                 worst = max(worst, over)
         return f"{len(found)} steps in their set for every disturbance, to {worst:.1e} of its own units"
+
+    def _changes(self, k: int, rows: Array) -> list[arb]:
+        """The largest change along every row, at the beginning of piece ``k``. Across the seam of a plan that repeats
+        the last control of a period and the first one of the next are chosen apart: what each answers is another's."""
+        if k < self.case.control.pieces:
+            return self.loop.heights(self._change(k), rows)
+        first, last = self.loop.heights(self.loop.inputs(0), rows), self.loop.heights(self.loop.inputs(k - 1), -rows)
+        return [a + b for a, b in zip(first, last, strict=True)]
 
     def _change(self, k: int) -> arb_mat:
         """The change of the nominal control, and of its answers, to piece ``k``, ``(m, 1 + Q)``."""
@@ -370,9 +378,10 @@ class FeedbackClaims:
             )
         if name == STEP and case.problem.control_step is not None:
             sides = known(case.problem.control_step).facets
-            if sides is None or time not in loop.breakpoints[:-1]:
+            places = [k for k in steps(case.problem, case.control) if loop.breakpoints[k] == time]
+            if sides is None or not places:
                 raise Broken(f"there is no step at t = {time!r}")
-            found = loop.heights(self._change(loop.breakpoints.index(time)), np.array([c for c, _ in sides]))
+            found = self._changes(places[0], np.array([c for c, _ in sides]))
             slack = TOLERANCE * max(known(case.problem.control_step).units, default=1.0)
             return [float((height - b).mid()) for height, (_, b) in zip(found, sides, strict=True)], slack
         if name == EQUALS and case.equalities:
@@ -414,6 +423,8 @@ class FeedbackClaims:
             return over, EQUALITY * max(self._added(row) for row, _ in case.equalities)
         if window is None:
             assert held is not None
+            if name == STEP and time == loop.breakpoints[-1]:
+                raise Unchecked("a witness across the seam is not followed")
             k = int(np.clip(bisect_right(loop.breakpoints, time) - 1, 0, case.control.pieces - 1))
             acting = loop.inputs(k) if name == self.of_control else self._change(k)
             limit = known(held).limit(direction)
@@ -467,7 +478,7 @@ class FeedbackClaims:
         case = self.case
         K, m = case.control.pieces, case.problem.system.controls
         loop = self.loop_at_rest
-        rows = [_Row.of(case, self._told(entry), entry, case.charge) for entry in entries]
+        rows = [row for entry in entries for row in _Row.of(case, self._told(entry), entry, case.charge)]
         total = sum((row.multiplier * row.constant for row in rows), arb(0))
         slope = [[sum((r.multiplier * r.nominal[k][i] for r in rows if not r.nominal[k][i].is_zero()), arb(0))
                   for i in range(m)] for k in range(K)]  # fmt: skip
@@ -683,8 +694,9 @@ class _Row:
         self.innovations, self.peak, self.of_effort = innovations, peak, of_effort
 
     @staticmethod
-    def of(case: Case, loop: ClosedLoop, entry: object, cost: str) -> _Row:
-        """The constraint that an entry of the certificate names, which must be one of the problem's."""
+    def of(case: Case, loop: ClosedLoop, entry: object, cost: str) -> list[_Row]:
+        """The constraint that an entry of the certificate names, which must be one of the problem's; a step across the
+        seam is the sum of two, of the last control and of the first one, which answer what they see of two periods."""
         case.clock.check()
         if not isinstance(entry, Mapping):
             raise Broken("multipliers: expected a constraint, a time, a direction, a disturbance and a number each")
@@ -697,15 +709,21 @@ class _Row:
             raise Broken(f"{name}: a parameter is given of a known system")
         z = _deviations(case, loop, entry, name)
         if name in (feedback_of(case).of_control, PEAK):
-            return _Row._of_control(case, loop, (name, direction, time, y), z, cost == PEAK)
+            return [_Row._of_control(case, loop, (name, direction, time, y), z, cost == PEAK)]
         if name == EFFORT and cost == WORST:
-            return _Row._of_effort(case, loop, direction, y, z)
+            return [_Row._of_effort(case, loop, direction, y, z)]
         if name == STEP and case.problem.control_step is not None:
             if direction.shape != (case.problem.system.controls,):
                 raise Broken(f"{name}: {direction.size} numbers where {case.problem.system.controls} are expected")
             row = case.duality.step_row(direction, time)
-            return _Row(y, row.constant, row.slope, _seen(loop, z), None)
-        return _Row._of_state(case, loop, (name, direction, time, y), z, entry.get("piece"))
+            if time != loop.breakpoints[-1]:
+                return [_Row(y, row.constant, row.slope, _seen(loop, z), None)]
+            zero = [row.constant * 0] * direction.size
+            first = [balls(direction), *[zero] * (case.control.pieces - 1)]
+            last = [*[zero] * (case.control.pieces - 1), balls(-direction)]
+            begun = _seen(loop, [[x * 0 for x in block] for block in z[: loop.blocks]] + _following(case, entry, name))
+            return [_Row(y, row.constant, last, _seen(loop, z), None), _Row(y, row.constant * 0, first, begun, None)]
+        return [_Row._of_state(case, loop, (name, direction, time, y), z, entry.get("piece"))]
 
     @staticmethod
     def _of_state(
@@ -840,6 +858,20 @@ def _deviations(case: Case, loop: ClosedLoop, entry: Mapping[str, Any], name: st
         [arb(float(v)) - arb(float(c)) for v, c in zip(point, about, strict=True)]
         for point, (_, about) in zip(points, loop.sets, strict=True)
     ]
+
+
+def _following(case: Case, entry: Mapping[str, Any], name: str) -> list[list[arb]]:
+    """The deviation of the next period's initial state that an entry names, which must be in its set; none where there
+    is one initial state."""
+    from flint import arb
+
+    if case.problem.initial_set is None:
+        return []
+    point = numbers(entry.get("following"), f"{name}: following")
+    if point.shape != (case.problem.system.states,) or not known(case.problem.initial_set).contains(point):
+        raise Broken(f"{name}: the next deviation {point.tolist()} is not shown to be in its set")
+    about = feedback_of(case).loop_at_rest.sets[-1][1]
+    return [[arb(float(v)) - arb(float(c)) for v, c in zip(point, about, strict=True)]]
 
 
 def _dot(c: Array, x: list[arb]) -> arb:

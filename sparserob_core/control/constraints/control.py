@@ -64,14 +64,17 @@ class ControlConstraint:
         )
 
     @staticmethod
-    def of_steps(convex: ConvexSet, dictionary: Dictionary, before: Array | None) -> ControlConstraint:
-        """``u_{k+1} - u_k`` in the set at every step, and ``u_0 - before`` at time 0 unless ``before`` is ``None``."""
+    def of_steps(
+        convex: ConvexSet, dictionary: Dictionary, before: Array | None, seam: bool = False
+    ) -> ControlConstraint:
+        """``u_{k+1} - u_k`` in the set at every step, and ``u_0 - before`` at time 0 unless ``before`` is ``None``;
+        with a ``seam`` from the last piece to the first at the horizon."""
         first = 0 if before is not None else 1
-        steps = dictionary.breakpoints[first:-1]
+        steps = dictionary.breakpoints[first : dictionary.pieces + seam]
         offset = np.zeros((steps.size, convex.dimension))
         if before is not None:
             offset[0] = -before
-        values = dictionary.sparse @ differences(dictionary.pieces, before is not None)
+        values = dictionary.sparse @ differences(dictionary.pieces, before is not None, seam)
         return ControlConstraint(
             "control_step", convex, values, offset, steps, dictionary.horizon, steps, "the change of u at {}"
         )
@@ -140,10 +143,14 @@ class ControlConstraint:
         return np.clip(np.searchsorted(self.starts, times, side="right") - 1, 0, self.starts.size - 1)
 
 
-def differences(pieces: int, at_start: bool) -> csr_array:
+def differences(pieces: int, at_start: bool, seam: bool = False) -> csr_array:
     """The matrix ``(K, q)`` from values on pieces to their changes from one to the next; ``at_start``: from 0 before
-    the first too."""
-    from scipy.sparse import csr_array, eye_array
+    the first too, ``seam``: from the last to the first too, after the others."""
+    from scipy.sparse import csr_array, eye_array, hstack
 
     every = csr_array(eye_array(pieces) - eye_array(pieces, k=1))
-    return every if at_start else every[:, 1:]
+    every = every if at_start else every[:, 1:]
+    if not seam:
+        return every
+    around = csr_array(([1.0, -1.0], ([0, pieces - 1], [0, 0])), shape=(pieces, 1))
+    return csr_array(hstack([every, around]))

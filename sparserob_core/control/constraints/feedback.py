@@ -406,13 +406,15 @@ class FeedbackControl:
 @dataclass(frozen=True, eq=False)
 class FeedbackSteps:
     """``H (u_k - u_{k-1}) <= h`` at every breakpoint for every disturbance, from the control ``before (m,)`` time 0 on
-    where that is told. An index is the time of a step, or with the deviations ``(t, w)``."""
+    where that is told; with a ``seam`` from any last control to any first one of the next period, at the horizon. An
+    index is the time of a step, or with the deviations ``(t, w)``."""
 
     name: str
     loop: ClosedLoop
     H: Array
     h: Array
     before: Array | None
+    seam: bool = False
 
     def family(self) -> ConstraintFamily:
         """The constraint as a family."""
@@ -427,7 +429,8 @@ class FeedbackSteps:
     @property
     def times(self) -> Array:
         """When the steps are taken, ``(q,)``."""
-        return self.loop.functionals.dictionary.breakpoints[int(self.before is None) : -1]
+        points = self.loop.functionals.dictionary.breakpoints
+        return points[int(self.before is None) : points.size - (not self.seam)]
 
     def _steps(self, times: Array) -> np.ndarray:
         """The step that each time follows."""
@@ -440,6 +443,9 @@ class FeedbackSteps:
         if self.before is not None:
             first[0, :, 0] = self.before
             controls = np.concatenate([first, controls])
+        if self.seam:  # the first control again, which answers another initial state
+            again, at = self.loop.controls(x)[:1], self.loop.begins.shape[0]
+            controls = np.concatenate([controls, np.concatenate([again[..., :1], np.roll(again[..., 1:], -at, 2)], 2)])
         along = self.H @ np.diff(controls, axis=0)
         size = np.abs(self.H) @ (np.abs(controls[1:]) + np.abs(controls[:-1]))
         radii = np.concatenate([[1.0], self.loop.spread.radii])
@@ -453,6 +459,10 @@ class FeedbackSteps:
         """The rows of one step."""
         place = int(self._steps(index[:1])[0])
         piece = place + int(self.before is None)
+        last = self.loop.functionals.dictionary.pieces - 1
+        if piece > last:
+            rows = self.loop.control_rows(last, -self.H, self.h)
+            return self.loop.with_control(rows, self.H, np.zeros(self.h.size, dtype=int), following=self.loop.anew)
         rows = self.loop.control_rows(piece, self.H, self.h)
         if piece == 0 and self.before is not None:
             return replace(rows, h=rows.h + self.H @ self.before)
@@ -515,6 +525,7 @@ def told(said: TimedExplanation, loop: ClosedLoop, w: Array, controls: bool = Fa
         changes=changes,
         begun=problem.response.initial_state + deviation,
         deviation=deviation,
+        following=loop.following @ point if loop.anew else None,
         quantity="",
         noise=noises,
     )

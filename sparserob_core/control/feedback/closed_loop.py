@@ -37,7 +37,8 @@ class ClosedLoop:
     and then whatever else the program has. ``spread``: the deviations of the disturbance, block after block (of
     ``measurable`` ones what they make of the state at the end of every piece of the grid), of the noise of what is
     measured, breakpoint after breakpoint, and of the initial state where there is a set of them. ``observer``: what
-    makes innovations of outputs; they are those of the whole state where there is none.
+    makes innovations of outputs; they are those of the whole state where there is none. ``anew``: before those of the
+    initial state come those of the next period's, of a plan that repeats, which only the step across the seam sees.
     """
 
     functionals: WorstCase
@@ -46,6 +47,7 @@ class ClosedLoop:
     variables: int
     measurable: MeasurablePieces | None = None
     observer: Observer | None = None
+    anew: bool = False
     _paths: dict[bytes, tuple[Array, Array]] = field(default_factory=dict, repr=False)
 
     @property
@@ -103,7 +105,7 @@ class ClosedLoop:
     @property
     def noise(self) -> slice:
         """Which entries of the deviations are those of the noise; none where there is none."""
-        last = self.spread.size - int(self.begins.sum())
+        last = self.spread.size - int(self.begins.sum()) * (1 + self.anew)
         noisy = self.observer is not None and self.observer.noisy
         return slice(last - (self.answers.shape[0] * self.answers.shape[3] if noisy else 0), last)
 
@@ -119,6 +121,8 @@ class ClosedLoop:
         seen = innovations_seen(
             problem.response, problem.dictionary, problem.disturbance, begun > 0, pieces=self.measurable
         )
+        if self.anew:
+            seen = np.insert(seen, np.full(begun, seen.shape[2] - begun), 0.0, axis=2)
         if self.observer is None:
             return seen
         return self.observer.seen(seen, between(problem.response, problem.dictionary), begun)
@@ -127,6 +131,12 @@ class ClosedLoop:
     def expected(self) -> tuple[Array, Array]:
         """The least and the largest of every innovation, ``(K, p)`` each."""
         return -self.spread.support(-self.innovations), self.spread.support(self.innovations)
+
+    @cached_property
+    def following(self) -> Array:
+        """Which entries of the deviations are those of the next period's initial state, ``(d, Q)``."""
+        d = self.begins.shape[0]
+        return np.roll(self.begins, -d, axis=1) * self.anew
 
     @cached_property
     def start(self) -> Array:
@@ -304,9 +314,10 @@ class ClosedLoop:
                 offset[rows] += self.measurable.within(np.array([time]), H[rows], np.array([piece]))[0]
         return UncertainRows(csr_array(g), h - offset, part, factor, tuple(parts), d)
 
-    def with_control(self, rows: UncertainRows, G: Array, pieces: np.ndarray) -> UncertainRows:
+    def with_control(self, rows: UncertainRows, G: Array, pieces: np.ndarray, following: bool = False) -> UncertainRows:
         """The rows with ``G u_k`` added on the left, ``G (r, m)``, of the piece ``k`` of each, ``(r,)``; rows of one
-        part have the same direction of the control, times their factors, and the same piece."""
+        part have the same direction of the control, times their factors, and the same piece. ``following``: the first
+        control of the next period, which answers that one's initial state."""
         from scipy.sparse import csr_array
 
         K, Q = self.functionals.dictionary.pieces, self.spread.size
@@ -317,7 +328,8 @@ class ClosedLoop:
         for p, C in enumerate(rows.C):
             first = int(np.flatnonzero(rows.part == p)[0])
             at, which, value = self.of_piece(int(pieces[first]))
-            added = csr_array((G[first][at // Q] * value, (at % Q, self.nominal_size + which)), shape=C.shape)
+            seen = at % Q - following * self.begins.shape[0]
+            added = csr_array((G[first][at // Q] * value, (seen, self.nominal_size + which)), shape=C.shape)
             parts.append(csr_array(C + added))
         return replace(rows, g=g, C=tuple(parts))
 
@@ -384,8 +396,9 @@ def deviations_of(
     initial: ConvexSet | None = None,
     noise: ConvexSet | None = None,
     measured: int = 0,
+    periods: int = 1,
 ) -> Spread:
     """The deviations of a disturbance with values in ``bound``, ``blocks`` times, of a ``noise``, ``measured`` times,
-    and of the initial state where its own are in ``initial``."""
-    every = ((blocks, bound), (measured, noise), (1, initial))
+    and of the initial state where its own are in ``initial``, of so many ``periods``."""
+    every = ((blocks, bound), (measured, noise), (periods, initial))
     return Spread(tuple((count, one) for count, one in every if one is not None))

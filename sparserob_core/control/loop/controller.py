@@ -47,7 +47,21 @@ class Controller:
 
     No constraint is violated as long as the states that it is told are those of a system, a disturbance and an initial
     state of the problem. For any other state it still gives a control, within the set of controls, and says so:
-    `covered` is then false. Not to be shared by threads.
+    `covered` is then false. Of a problem that repeats the plan begins again at the horizon, and times go on: the step
+    after the last one of a period is that of the next one's first breakpoint. Not to be shared by threads.
+
+    What is not as it should be:
+
+    * *A measurement is missing*: ``step(time, None)``. The control is that of a state which is as it was predicted, an
+      innovation 0; nothing is solved anew at that step. `covered` is false from then on, until a plan is made of a
+      measured state, or a period of a problem that repeats begins in a state that is one of its initial ones.
+    * *A measurement that is none*, with NaN, infinity, or another shape; *a time* that is early, late, or told before:
+      `InputError`, and the controller is as it was, so that the same step can be made again, with ``None`` where there
+      is nothing better. A call that comes late is made with the time of its breakpoint; one that was left out is made
+      with ``None``, before the next.
+    * *A spike of a sensor*: the state is believed. `covered` is false where no disturbance of the problem leads there,
+      gains answer it as they answer any innovation, and the next measurement shows it again with the opposite sign;
+      a state that is not believed is told as ``None``.
     """
 
     def __init__(self, plan: Plan, resolving: Resolving | None = None) -> None:
@@ -67,8 +81,15 @@ class Controller:
         """Whether the proof covers every state that was measured since the last `reset`, or since the last plan that
         was made of a measured state. Exact where every state tells what the disturbance was, that is, one value on
         each piece of the control, which moves the states independently; else states are compared one by one, and it may
-        be true too long. Parameters are not told from a disturbance: with uncertain ones it is always true."""
+        be true too long. Parameters are not told from a disturbance: with uncertain ones it is true as long as no
+        measurement was missing."""
         return self._covered
+
+    @property
+    def ever_uncovered(self) -> bool:
+        """Whether a state since the last `reset` was missing, or one that the proof did not cover, a later plan or not:
+        then what acts on the system is more than the problem says."""
+        return self._ever
 
     @property
     def steps(self) -> tuple[Step, ...]:
@@ -84,19 +105,28 @@ class Controller:
         """Begin anew: the next step is that of time 0."""
         self._take(self._planned)
         self._next, self._covered, self._steps = 0, True, list[Step]()
+        self._period, self._ever = 0, False
         self._before: Array | None = None
         self._last: Array | None = None
         self._reach: tuple[Array, Array] | None = None
 
-    def step(self, time: float, state: npt.ArrayLike) -> Array:
+    def step(self, time: float, state: npt.ArrayLike | None) -> Array:
         """The control ``(m,)`` for the piece that begins at ``time``, a breakpoint, from the ``state (d,)`` measured
-        then, or of a problem with ``measurements`` from the outputs ``(p,)``. Breakpoints come one after another.
-        Raises `InputError` for a time or a state that is none, and is then as it was before."""
+        then, or of a problem with ``measurements`` from the outputs ``(p,)``; ``None`` where the measurement is
+        missing. Breakpoints come one after another. Raises `InputError` for a time or a state that is none, and is then
+        as it was before."""
         began = clock.perf_counter()
-        piece, measured = self._timed(time), self._measured(state)
-        covered = self._covered and self._within(measured)
+        period, piece = self._timed(time)
+        measured = None if state is None else self._measured(state)
+        if period > self._period:
+            self._begin(period)
+        anew = (
+            period > 0 and piece == 0 and self._observer is None
+        )  # from any of the initial states the proof holds for another period
+        covered = measured is not None and (self._covered or anew) and self._within(measured)
+        self._ever = self._ever or not covered
         answer = None
-        if self._resolving is not None:
+        if self._resolving is not None and measured is not None:
             answer = self._resolving.answer(self._plan, piece, measured, self._before, self._innovations(measured))
             if answer.plan is not None and (answer.cheaper or not covered):
                 self._go_on(answer.plan)
@@ -104,13 +134,22 @@ class Controller:
             else:
                 answer = None
         u = self._control(piece - self._plan.first, measured)
-        if self._observer is None:
-            self._reach = self._plan.reach(piece - self._plan.first, measured, u)
+        told = None if self._observer is not None else measured
+        self._reach = None if told is None else self._plan.reach(piece - self._plan.first, told, u)
         self._next, self._covered, self._before, self._last = piece + 1, covered, u, measured
-        at = float(self._planned.model.control.breakpoints[piece])
+        at = self._begins_at(period, piece)
         taken = (False, np.nan, np.nan) if answer is None else (answer.plan is not None, answer.cost, answer.lower)
         self._steps.append(Step(at, clock.perf_counter() - began, taken[0], covered, *taken[1:]))
         return u.copy()
+
+    def _begin(self, period: int) -> None:
+        """Apply the plan anew, in the next period."""
+        self._take(self._planned)
+        self._next, self._period = 0, period
+
+    def _begins_at(self, period: int, piece: int) -> float:
+        points = self._planned.model.control.breakpoints
+        return float(period * points[-1] + points[piece])
 
     def _take(self, plan: Plan) -> None:
         self._plan = plan
@@ -127,18 +166,21 @@ class Controller:
         self._plan, self._nominal = plan, plan.known.pieces(plan.decision)
         self._measuring = replace(self._measuring, nominal=self._nominal)
 
-    def _timed(self, time: object) -> int:
-        """The piece that begins at a time, which must be the next one."""
+    def _timed(self, time: object) -> tuple[int, int]:
+        """The period and the piece of it that begins at a time, which must be the next one."""
         points = self._planned.model.control.breakpoints
-        if self._next >= points.size - 1:
+        period, piece = self._period, self._next
+        if piece >= points.size - 1 and self._planned.model.problem.repeat:
+            period, piece = period + 1, 0
+        if piece >= points.size - 1:
             got = f"a step at {time!r}"
             raise InputError(path="time", expected=f"reset() first, since the horizon {points[-1]:g} is over", got=got)
-        expected = float(points[self._next])
+        expected = self._begins_at(period, piece)
         number = isinstance(time, int | float | np.number) and not isinstance(time, bool)
         if not number or not abs(float(time) - expected) <= SAME_BREAKPOINT * points[-1]:  # type: ignore[arg-type]
-            said = "0, since it begins there" if not self._next else f"{expected!r}, the next breakpoint"
+            said = "0, since it begins there" if not period + piece else f"{expected!r}, the next breakpoint"
             raise InputError(path="time", expected=said, got=f"{time!r}")
-        return self._next
+        return period, piece
 
     @property
     def _observer(self) -> Observer | None:
@@ -155,7 +197,8 @@ class Controller:
         except (TypeError, ValueError):
             measured = np.zeros(0)
         if measured.shape != (count,) or not np.isfinite(measured).all():
-            raise InputError(path="state", expected=f"{count} finite numbers, one per {one}", got=f"{state!r}")
+            expected = f"{count} finite numbers, one per {one}, or None where the measurement is missing"
+            raise InputError(path="state", expected=expected, got=f"{state!r}")
         return measured
 
     def _within(self, state: Array) -> bool:
@@ -171,7 +214,7 @@ class Controller:
                 return bool((np.abs(deviation) <= SEEN * np.maximum(size, size.max())).all())
             room = SEEN * float(problem.initial_set.reach(axes).max() + size.max())
             return float(problem.initial_set.violation(deviation)) <= room
-        if self._reach is None:
+        if self._reach is None or self._last is None:
             return True
         lower, upper = self._reach
         room = SEEN * max(float(np.abs(lower).max()), float(np.abs(upper).max()), np.finfo(float).tiny)
@@ -207,10 +250,12 @@ class Controller:
             return [np.zeros(state.size)]
         return self._measuring.seen(state)
 
-    def _control(self, piece: int, state: Array) -> Array:
+    def _control(self, piece: int, state: Array | None) -> Array:
         nominal = self._nominal[:, piece]
         if self._measuring is None:
             return nominal.copy()
-        for number in np.flatnonzero(self._measuring.commanded == piece).tolist():
-            self._measuring.after(number, lambda _: state[:, None])
+        numbers = np.flatnonzero(self._measuring.commanded == piece).tolist()
+        seen = self._measuring.predicted() if state is None else state[:, None]
+        for number in numbers:
+            self._measuring.after(number, lambda _: seen)
         return self._plan.drawn_in(self._measuring.command(piece)[:, 0], nominal)

@@ -33,6 +33,9 @@ def refuse_remaining(model: Transcription) -> None:
         "a policy that measures the whole state, not outputs": model.feedback is not None
         and problem.measurements is not None,
         "a system that stays the same with time, or has pieces": isinstance(problem.system, VaryingSystem),
+        "a control_step with flat sides, and no feedback beside it, where the plan repeats": bool(problem.repeat)
+        and problem.control_step is not None
+        and (problem.control_step.halfspaces() is None or model.feedback is not None),
     }
     for wanted, hindered in reasons.items():
         if hindered:
@@ -40,14 +43,20 @@ def refuse_remaining(model: Transcription) -> None:
 
 
 def remaining(
-    model: Transcription, piece: int, state: Array, before: Array | None, alone: bool = False
+    model: Transcription,
+    piece: int,
+    state: Array,
+    before: Array | None,
+    alone: bool = False,
+    again: Array | None = None,
 ) -> Transcription:
     """The problem that is left where piece ``piece`` of the control begins in ``state (d,)``, after the control
     ``before (m,)``, transcribed as the ``model`` was; its times begin at 0.
 
     The parameters may be any of their set, and every piece of the disturbance that is left may be any of its own, also
     what is left of one that has begun: no less than what can happen. ``alone``: the nominal control and state alone,
-    as if nothing disturbed them and nothing were answered.
+    as if nothing disturbed them and nothing were answered. ``again (m,)``: of a plan that repeats, the control with
+    which the next period begins, to which the last control takes a step of ``control_step``.
     """
     problem, begin = model.problem, float(model.control.breakpoints[piece])
     control = _rest(model.control, begin, problem.horizon)
@@ -61,7 +70,8 @@ def remaining(
         initial_state=state,
         initial_set=None,
         initial_control=before if problem.control_step is not None else None,
-        path=_windows(problem, begin, horizon),
+        path=[*_windows(problem, begin, horizon), *_seam(problem, control, again)],
+        repeat=False,  # the return is among the windows
     )
     left = replace(left, disturbance=None) if alone else left
     policy = None if alone or model.feedback is None else model.feedback.policy
@@ -91,6 +101,16 @@ def _windows(problem: OptimalControlProblem, begin: float, horizon: float) -> li
             moved = None if entry.relative_to is None else _moved(np.asarray(entry.relative_to, dtype=float), begin)
             found.append(replace(entry, name=name, relative_to=moved, start=start, stop=stop))
     return found
+
+
+def _seam(problem: OptimalControlProblem, control: Dictionary, again: Array | None) -> list[MixedConstraint]:
+    """The last control, from which the one that begins the next period is a step."""
+    flat = None if problem.control_step is None else problem.control_step.halfspaces()
+    if not problem.repeat or again is None or flat is None:
+        return []
+    (H, h), begin = flat, float(control.breakpoints[-2])
+    still = np.zeros((h.size, problem.system.states))
+    return [MixedConstraint(still, -H, h - H @ again, begin, control.horizon, name="seam")]
 
 
 def _moved(rows: Array, begin: float) -> Array:

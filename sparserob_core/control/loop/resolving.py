@@ -166,11 +166,13 @@ class Resolving:
         self._tracking: dict[int, Tracking | None] = {}
         self._retuning: list[Retuning] = []
         self._took, self._pieces = 0.0, model.control.pieces  # a whole program, and the pieces that it had
+        self._again: Array | None = None  # with what the next period begins, of a plan that repeats
         self._written = 0.0  # what it takes to write a whole program down, however few pieces are left
 
     def prepare(self, plan: Plan) -> None:
         """Make what steps with a limit are not to wait for, for the plan that loops begin with; nothing without a
         limit."""
+        self._again = plan.known.pieces(plan.decision)[:, 0]
         if self._seconds is None:
             return
         state, began = np.asarray(self._model.problem.initial_state, dtype=float), clock.perf_counter()
@@ -348,7 +350,7 @@ class Resolving:
     def _own(self, piece: int, state: Array, before: Array | None) -> tuple[Transcription, Transcription, Units]:
         """What is left, in the user's units and in its own."""
         if self._model.problem.control_step is not None:
-            model = remaining(self._model, piece, state, before)
+            model = remaining(self._model, piece, state, before, again=self._again)
             return (model, *in_own_units(model))
         model, own, units = self._prepared(piece, state)
         return from_state(model, state), from_state(own, state / units.states), units

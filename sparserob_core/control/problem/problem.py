@@ -5,8 +5,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from enum import Enum
 from functools import cached_property
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING, final, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -20,13 +21,17 @@ from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, 
 from sparserob_core.control.sets.sets import Equality, Polytope
 from sparserob_core.errors import InputError
 from sparserob_core.shapes import sealed
-from sparserob_core.sip.convex_set import Array, ConvexSet, as_bound
+from sparserob_core.sip.convex_set import Array, Box, ConvexSet, as_bound
 
 if TYPE_CHECKING:
     from sparserob_core.sip.program import SemiInfiniteProgram
 
 SHORTEST = 1e-12  # of the horizon: a delay that is not rounding
 SAME = 1e-12  # of the size of a set, what is rounding
+RETURN = "return"  # what the constraint that a plan which repeats ends where it may begin is called
+# The share of the set of initial states by which final ones stay inside it, ten times the tolerance of a proof, so that
+# no violation is handed on: a tenth of it would let one, ten times as much is seen in the cost.
+WITHIN = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +77,19 @@ class MixedConstraint:
         return Polytope(np.hstack([np.asarray(self.H), np.asarray(self.G)]), np.asarray(self.h))
 
 
+@final
+@dataclass(frozen=True, eq=False)
+class Return(PathConstraint):
+    """The state comes back to where a period may begin, of a plan that repeats: a window of one time, the horizon, and
+    the set of initial deviations about their centre. Made by `OptimalControlProblem`."""
+
+
+class Repeating(Enum):
+    """What `repeat` of a problem is whose constraints have the return among them."""
+
+    IMPOSED = "imposed"
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class OptimalControlProblem:
     """Minimise a `Cost`, ``sum_i weights_i int_0^T |u_i(t)| dt`` unless told otherwise, such that for every disturbance
@@ -100,12 +118,19 @@ class OptimalControlProblem:
     ``measurements``: what a policy that answers measurements sees; the whole state, without noise and at once, unless
     given. Of a control that answers nothing it changes nothing.
 
+    ``repeat``: at the horizon the plan begins again, for ever. Every final state is then one of the initial states,
+    from which all constraints hold for another period, so that they hold for all time; the steps from any last control
+    to any first one are in ``control_step`` too. No set has to be invariant in between. What changes with time has the
+    horizon as its period. Final states stay inside by `WITHIN` of the set, so that what is proven to a tolerance is
+    proven for ever; coordinates of which there is one value are fixed at the end, to rounding.
+
     ``weights``: a positive number, one for each control, or rows of a time and the weights from then on, which are not
     negative: prices, or a supply that is free for a while. The first time is 0.
 
     After construction ``weights`` is ``(m,)``, or ``(r, 1 + m)`` of rows, ``path`` and ``terminal`` are tuples, every
-    window has its ``stop``, and constraints that restrict nothing are gone. An initial state outside a path set is
-    legal: that problem is infeasible. Raises `InputError`.
+    window has its ``stop``, constraints that restrict nothing are gone, and of a problem that repeats the `Return` is
+    the last of the path, and what is fixed then the last of the terminal equalities. An initial state outside a path
+    set is legal: that problem is infeasible. Raises `InputError`.
     """
 
     system: System
@@ -125,6 +150,7 @@ class OptimalControlProblem:
     cost: Cost = Cost()  # noqa: RUF009  immutable
     disturbances: Sequence[Disturbance] = ()
     measurements: Measurements | None = None
+    repeat: bool | Repeating = False
 
     def __post_init__(self) -> None:
         if not isinstance(self.system, LinearSystem | SwitchedSystem | VaryingSystem):
@@ -166,6 +192,8 @@ class OptimalControlProblem:
         self._set("terminal", tuple(self._terminal()))
         if isinstance(self.system, VaryingSystem):
             self._check_varying(self.system)
+        if self.repeat is not Repeating.IMPOSED:
+            self._return()
         sealed(self)
 
     def _set(self, name: str, value: object) -> None:
@@ -342,6 +370,35 @@ class OptimalControlProblem:
             raise InputError(path=where, expected=expected, got=f"{moved[0, 0]:g} to {moved[-1, 0]:g}")
         return replace(item, start=start, stop=stop, relative_to=moved)
 
+    def _return(self) -> None:
+        """Have every final state among the initial ones, where the plan repeats."""
+        if not isinstance(self.repeat, bool | np.bool_):
+            raise InputError(path="repeat", expected="true or false", got=f"{self.repeat!r}")
+        if not self.repeat:
+            return
+        if isinstance(self.system, VaryingSystem):
+            raise InputError(
+                path="repeat",
+                expected="a system that stays the same with time, or has pieces, since no period of another is known",
+                got="one that changes with time",
+            )
+        if self.system.delay > 0.0:
+            raise InputError(
+                path="repeat",
+                expected="a control that acts at once: with system.delay the last controls of a period act in the next",
+                got=f"a delay of {self.system.delay:g}",
+            )
+        if any(entry.name == RETURN for entry in self.path if isinstance(entry, PathConstraint | MixedConstraint)):
+            raise InputError(path="repeat", expected=f"no path constraint named {RETURN}, which is that of repeat")
+        self._set("repeat", Repeating.IMPOSED)
+        bound, centre = returning(self.initial_set, np.asarray(self.initial_state, dtype=float))
+        if bound is not None:
+            moved = np.column_stack([[0.0, self.horizon], np.vstack([centre, centre])])
+            ends = (self.horizon, self.horizon, RETURN, moved if centre.any() else None)
+            self._set("path", (*self.path, Return(bound.scaled(1.0 - WITHIN), *ends)))
+        fixed = np.where(widths(self.initial_set, self.system.states) > 0.0, np.nan, centre)
+        self._set("terminal", (*self.terminal, *([] if np.isnan(fixed).all() else [Equality(fixed)])))
+
     def _terminal(self) -> list[ConvexSet | Equality]:
         kept: list[ConvexSet | Equality] = []
         for i, item in enumerate(_listed("terminal", self.terminal)):
@@ -357,6 +414,35 @@ class OptimalControlProblem:
                 )
             kept += [item] if item.fixed.size else []
         return kept
+
+
+def widths(bound: ConvexSet | None, states: int) -> Array:
+    """How long a set of deviations is along every axis, ``(d,)``; 0 without one."""
+    if bound is None:
+        return np.zeros(states)
+    axes = np.eye(states)
+    return np.asarray(bound.support(axes) + bound.support(-axes))
+
+
+def returning(bound: ConvexSet | None, centre: Array) -> tuple[ConvexSet | None, Array]:
+    """The set of initial deviations with its flat coordinates free, and its centre ``(d,)``; raises `InputError` for
+    one that is flat and no box."""
+    if bound is None:
+        return None, centre
+    free = widths(bound, centre.size) == 0.0
+    if bound.is_box and free.any():
+        box = bound.bounding_box()
+        return Box(np.where(free, -np.inf, box.lower), np.where(free, np.inf, box.upper)), centre
+    flat = bound.halfspaces()
+    if flat is not None:
+        room = flat[1] - flat[0] @ bound.interior_point()
+        if (room <= SAME * np.abs(flat[0]).max(axis=1) * float(bound.reach(np.eye(centre.size)).max())).any():
+            raise InputError(
+                path="repeat",
+                expected="a set of initial states with an interior, or a box",
+                got=f"a {bound.kind} without one",
+            )
+    return bound, centre
 
 
 class ProblemFactory(ABC):

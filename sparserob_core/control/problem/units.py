@@ -65,6 +65,7 @@ class Units:
             measurements=(
                 None if problem.measurements is None else problem.measurements.in_units(self.states, self.time)
             ),
+            repeat=problem.repeat,
         )
 
     def _window(self, entry: PathConstraint | MixedConstraint) -> PathConstraint | MixedConstraint:

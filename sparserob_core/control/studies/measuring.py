@@ -74,6 +74,11 @@ class Measuring:
             return self._predicted
         return np.asarray(self._predicted + observer.L[len(self._innovations) - 1] @ self._innovations[-1])
 
+    def predicted(self) -> Array:
+        """What is measured, ``(p, n)``, as the next piece begins where nothing is new in it."""
+        observer, state = self._loop().observer, self._observed()
+        return state if observer is None else np.asarray(observer.C @ state + observer.middle[:, None])
+
     def command(self, k: int) -> Array:
         """The control ``(m, n)`` on its piece ``k``, which has begun."""
         return self._commands[k]

@@ -66,7 +66,10 @@ def with_feedback(
         theirs_observed = observed.in_units(units.states, outputs)
         seen = observed.seen(seen, flows, begun.size)
         deviations = np.append(deviations, np.tile(outputs, own.control.pieces if observed.noisy else 0))
-    deviations = np.append(deviations, begun)
+    anew = _begins_anew(own)
+    deviations = np.concatenate([deviations, begun, *[begun] * anew])
+    if anew:  # nobody sees the next period's initial state in this one
+        seen = np.insert(seen, np.full(begun.size, seen.shape[2] - begun.size), 0.0, axis=2)
     seen = seen * (spread.chords > 0.0)  # what cannot deviate is not answered
     scaled = answers(seen, mask, own.problem.system.controls)
     known = _in_users(scaled, outputs, deviations)
@@ -174,6 +177,9 @@ def refuse(problem: OptimalControlProblem, control: Dictionary, disturbance: Dic
         and problem.system.delay > 0.0,
         "single linear system under measurable disturbances, without pieces": measurable
         and bool(problem.system.switches),
+        "whole state that is measured without noise where a plan with a control_step repeats": bool(problem.repeat)
+        and problem.control_step is not None
+        and problem.measurements is not None,
         "control_step with flat sides": problem.control_step is not None and problem.control_step.halfspaces() is None,
         "cost that is the L1 norm alone, without group": not problem.cost.is_linear,
     }
@@ -206,7 +212,7 @@ def _program(
     functionals, problem, pieces = model.functionals, model.problem, model.control.pieces
     nominal, first = functionals.variables, functionals.variables + known.variables
     size = first + {"nominal": 0, "peak": nominal, "worst": 1}[charge.cost]
-    loop = ClosedLoop(functionals, known, _spread(model, acting[0]), size, *acting)
+    loop = ClosedLoop(functionals, known, _spread(model, acting[0]), size, *acting, anew=_begins_anew(model))
     families = [of_state(constraint, loop).family() for constraint in model.constraints]
     settled: list[Callable[[Array], Array]] = []
     if fixed[1].size:
@@ -272,12 +278,18 @@ def _program(
 
 def _spread(model: Transcription, acting: MeasurablePieces | None) -> Spread:
     """The deviations of a problem's disturbance and of its initial state."""
-    problem, disturbance = model.problem, model.functionals.disturbance
+    problem, disturbance, periods = model.problem, model.functionals.disturbance, 1 + _begins_anew(model)
     if acting is not None:
-        return Spread((*acting.sets, *deviations_of(None, 0, problem.initial_set).sets), MISSED)
+        return Spread((*acting.sets, *deviations_of(None, 0, problem.initial_set, periods=periods).sets), MISSED)
     blocks = 0 if disturbance is None else disturbance.block_count
     noise = None if problem.measurements is None else problem.measurements.noise
-    return deviations_of(problem.disturbance, blocks, problem.initial_set, noise, model.control.pieces)
+    return deviations_of(problem.disturbance, blocks, problem.initial_set, noise, model.control.pieces, periods)
+
+
+def _begins_anew(model: Transcription) -> bool:
+    """Whether the initial state of the next period is seen in this one's program: by the step across the seam."""
+    problem = model.problem
+    return problem.control_step is not None and bool(problem.repeat) and problem.initial_set is not None
 
 
 def _told_by(
@@ -312,13 +324,13 @@ def _told_by(
 
 def _steps(problem: OptimalControlProblem, pieces: int, own: bool) -> Callable[[ClosedLoop], FeedbackSteps] | None:
     """The steps of the control, every row divided by its ``own`` unit where that is asked for; ``None`` for none."""
-    step, first = problem.control_step, before(problem)
+    step, first, around = problem.control_step, before(problem), bool(problem.repeat)
     flat = None if step is None else step.halfspaces()
-    if step is None or flat is None or (pieces == 1 and first is None):
+    if step is None or flat is None or (pieces == 1 and first is None and not around):
         return None
     (H, h), far = flat, 2.0 * np.abs(flat[0]) @ extent(problem.control)
     unit = units_of_sides(H, h, np.minimum(step.reach(H), far), far) if own else np.ones(h.size)
-    return lambda loop: FeedbackSteps(STEP, loop, H / unit[:, None], h / unit, first)
+    return lambda loop: FeedbackSteps(STEP, loop, H / unit[:, None], h / unit, first, around)
 
 
 def _shares(mine: Array, theirs: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, final
 
@@ -26,7 +26,8 @@ CLOSE = 1e-7  # of the control's range, a point that is as good as inside
 @dataclass(frozen=True, eq=False)
 class Steps:
     """``lower <= H (u_{k+1} - u_k) <= upper`` of a set with flat sides, ``H (r, m)``, for every step of a dictionary;
-    ``before (m,)``: the control from which the first piece is a step too, ``None`` where there is none.
+    ``before (m,)``: the control from which the first piece is a step too, ``None`` where there is none. ``seam``:
+    whether the first piece follows the last one, at the horizon, which is then the last of the steps.
 
     Opposite sides share a row; the image's entries are those of one row of ``H`` after another, ``(r q,)`` for ``q``
     steps.
@@ -37,21 +38,23 @@ class Steps:
     upper: Array
     dictionary: Dictionary
     before: Array | None
+    seam: bool = False
 
     @staticmethod
     def of(problem: OptimalControlProblem, dictionary: Dictionary) -> Steps:
         """Those of a problem: none where its steps are free, or their set is curved."""
         H, lower, upper = paired(problem.control_step, problem.system.controls)
-        return Steps(H, lower, upper, dictionary, before(problem))
+        return Steps(H, lower, upper, dictionary, before(problem), seam(problem, dictionary))
 
     def divided(self, units: Array) -> Steps:
         """The same with rows divided by ``units (r,)``."""
-        return Steps(self.H / units[:, None], self.lower / units, self.upper / units, self.dictionary, self.before)
+        return replace(self, H=self.H / units[:, None], lower=self.lower / units, upper=self.upper / units)
 
     @property
     def times(self) -> Array:
         """When the steps are taken, ``(q,)``."""
-        return self.dictionary.breakpoints[0 if self.before is not None else 1 : -1]
+        points = self.dictionary.breakpoints
+        return points[0 if self.before is not None else 1 : points.size - (not self.seam)]
 
     @property
     def count(self) -> int:
@@ -63,7 +66,7 @@ class Steps:
         """The entries as rows of the decision, ``(r q, m N)``."""
         from scipy.sparse import csc_array, kron
 
-        changes = self.dictionary.sparse @ differences(self.dictionary.pieces, self.before is not None)
+        changes = self.dictionary.sparse @ differences(self.dictionary.pieces, self.before is not None, self.seam)
         return csc_array(kron(csc_array(self.H), changes.T))
 
     def bounds(self) -> tuple[Array, Array]:
@@ -87,6 +90,11 @@ class Steps:
 def before(problem: OptimalControlProblem) -> Array | None:
     """The control ``(m,)`` before time 0, where it is told."""
     return None if problem.initial_control is None else np.asarray(problem.initial_control, dtype=float)
+
+
+def seam(problem: OptimalControlProblem, dictionary: Dictionary) -> bool:
+    """Whether the first piece of a control that answers nothing follows the last one, and is another."""
+    return bool(problem.repeat) and dictionary.pieces > 1
 
 
 def paired(convex: ConvexSet | None, dimension: int) -> tuple[Array, Array, Array]:

@@ -15,7 +15,7 @@ from sparserob_core.control.constraints.state import StateConstraint
 from sparserob_core.control.enclosures.taylor import TaylorSpace
 from sparserob_core.control.policies.policy import Policy, answers_of
 from sparserob_core.control.problem.dictionary import Dictionary
-from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint, Return
 from sparserob_core.control.problem.representable import require_representable
 from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.problem.units import Units, power_of_two
@@ -37,7 +37,7 @@ from sparserob_core.control.transcription.own_units import (
 )
 from sparserob_core.control.transcription.provable import hindrance
 from sparserob_core.control.transcription.record import RowUnits, Transcription
-from sparserob_core.control.transcription.steps import Steps, before, paired, refuse_without_steps
+from sparserob_core.control.transcription.steps import Steps, before, paired, refuse_without_steps, seam
 from sparserob_core.errors import InputError, NotEnclosable
 from sparserob_core.sip.convex_set import Array, ConvexSet
 from sparserob_core.sip.program import TOLERANCE, ConstraintFamily, Formulation, OwnUnits, SemiInfiniteProgram
@@ -185,7 +185,7 @@ def _assembled(
         families.append(ControlConstraint.of_values(problem.control, control, of_control(problem)).family())
     step, first = problem.control_step, before(problem)
     if step is not None and step.halfspaces() is None and (control.pieces > 1 or first is not None):
-        families.append(ControlConstraint.of_steps(step, control, first).family())
+        families.append(ControlConstraint.of_steps(step, control, first, seam(problem, control)).family())
     if formulation == "literal":
         families = [family.literal or family for family in families]
     program = SemiInfiniteProgram(
@@ -455,7 +455,8 @@ def _state_constraints(
 def path_names(problem: OptimalControlProblem) -> list[str]:
     """What the families of the path constraints are called: by their own name, or by their place."""
     path = [entry for entry in problem.path if not isinstance(entry, ConvexSet)]
-    return [entry.name or _name("path", i, len(path)) for i, entry in enumerate(path)]
+    own = sum(not isinstance(entry, Return) for entry in path)
+    return [entry.name or _name("path", i, own) for i, entry in enumerate(path)]
 
 
 def _name(kind: str, position: int, count: int) -> str:

@@ -550,6 +550,9 @@ class LinearProblem(LinearKeys):
     measurements: MeasurementOptions | None = None
     """What a policy measures and answers: ``{C: ..., noise: ..., latency: ...}``; all states, without noise and at
     once, unless given."""
+    repeat: bool = False
+    """Whether the plan begins again at the horizon, for ever: every final state is then one of the initial states, and
+    ``control_step`` holds from the last control to the first one too. Not with a delay."""
 
     def build(self) -> OptimalControlProblem:
         """The problem; raises `InputError` that begins with the key at fault."""
@@ -579,6 +582,7 @@ class LinearProblem(LinearKeys):
             ),
             names=self.names.build(),
             measurements=None if self.measurements is None else self.measurements.build(),
+            repeat=self.repeat,
         )
 
     def _control_before(self, controls: int) -> list[float] | None:

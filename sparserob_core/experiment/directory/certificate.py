@@ -48,7 +48,9 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
     last]`` from 0 on, every constraint with a multiplier is one at a ``disturbance`` (a measurable one jumps at its
     ``changes``), at a ``deviation`` of the initial state from its centre where there is a set of them, and at a
     ``noise (K, p)`` of the outputs, of which ``observer (K, d, p)`` makes innovations; ``causal`` is the bound against
-    every causal policy.
+    every causal policy. ``repeat``: the plan begins again at the horizon for ever; its steps across the seam are
+    constraints of ``control_step`` at the horizon, under feedback each at a deviation ``following`` of the next
+    period's initial state too.
     """
     if not isinstance(experiment, ControlExperiment) or result.status == "failed":
         return None
@@ -74,6 +76,7 @@ def certificate(experiment: Experiment, result: Result) -> dict[str, Any] | None
         "cost": result.cost,
         "lower_bound": result.lower_bound,
         "gap_tolerance": experiment.gap_tolerance,
+        **({"repeat": True} if experiment.transcription.problem.repeat else {}),
         "decision": theta,
         **answered,
         **_counted(experiment, result),
@@ -242,11 +245,14 @@ def _admissible(problem: OptimalControlProblem, said: TimedExplanation) -> Array
 
 
 def _deviation(problem: OptimalControlProblem, said: TimedExplanation) -> dict[str, Array]:
-    """The deviation of the initial state that a constraint is at, certainly in its set; nothing without one."""
+    """The deviation of the initial state that a constraint is at, and of the next period's, certainly in their set;
+    nothing without one."""
     bound = problem.initial_set
     if bound is None or said.deviation is None:
         return {}
-    return {"deviation": _inside(bound, said.deviation, bound.interior_point())}
+    said_of = {"deviation": said.deviation, "following": said.following}
+    middle = bound.interior_point()
+    return {name: _inside(bound, one, middle) for name, one in said_of.items() if one is not None}
 
 
 def _noise(problem: OptimalControlProblem, said: TimedExplanation) -> dict[str, Array]:

@@ -89,12 +89,13 @@ def draw_tube(ax: Axes, data: FigureData, component: int) -> None:
         ax.plot(data.times, edge, color=look.SKY, linewidth=0.8, zorder=2)
 
 
-def finish_panel(ax: Axes, data: FigureData, component: int, curves: tuple[Array, ...]) -> None:
-    """Limits around everything that is drawn, then the walls within them."""
+def finish_panel(ax: Axes, data: FigureData, component: int, curves: tuple[Array, ...], tube: bool = True) -> None:
+    """Limits around everything that is drawn, the ``tube`` or not, then the walls within them."""
     walls = [wall for wall in data.walls if wall.state == component]
     edges = [edge for wall in walls for edge in wall.edges]
-    low = min([*edges, float(data.tube_lower[component].min()), *(float(curve.min()) for curve in curves)])
-    high = max([*edges, float(data.tube_upper[component].max()), *(float(curve.max()) for curve in curves)])
+    drawn = [*curves, *([data.tube_lower[component], data.tube_upper[component]] if tube else [])]
+    low = min([*edges, *(float(curve.min()) for curve in drawn)])
+    high = max([*edges, *(float(curve.max()) for curve in drawn)])
     margin = 0.12 * max(high - low, 1e-9)
     ax.set_ylim(low - margin, high + margin)
     draw_walls(ax, walls)

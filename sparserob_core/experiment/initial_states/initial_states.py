@@ -67,6 +67,12 @@ def initial_states(
     if not isinstance(experiment, ControlExperiment):
         raise InputError("problem: expected a control problem, which has an initial state, got a semi-infinite program")
     model = experiment.transcription
+    if model.problem.repeat:
+        raise InputError(
+            path="problem.repeat",
+            expected="false, since a plan that repeats ends among its initial states, and not from elsewhere",
+            got="true",
+        )
     if about is not None:
         model = from_state(model, _about(about, model.problem))
     pair = check_states(states, model.problem.system.states)

@@ -40,17 +40,19 @@ def write_loops(file: Path, loops: ClosedLoops, finished: FinishedRun) -> None:
 
 
 def draw_loops(loops: ClosedLoops, data: FigureData) -> Figure:
-    """Every state of the first loops of every law, below the controls that were applied, and the plan's."""
+    """Every state of the first loops of every law in the tube of the plan, which what is solved anew may leave and has
+    none, below the controls that were applied, and the plan's; of a plan that repeats the first period."""
     states, channels = len(data.drawn_states), len(data.control)
     figure, axes = panels(states + channels, 1.7, extra=0.35)
     for component, ax in zip(data.drawn_states, axes[:states], strict=True):
-        draw_tube(ax, data, component)
+        if not loops.resolve:  # control that is solved anew may leave the tube of the first plan, and no wall
+            draw_tube(ax, data, component)
         named = set[str]()
         for law, path in loops.paths:
             label = None if law in named else f"{law}"
             named.add(law)
             ax.plot(loops.shown, path[component], color=COLOURS[law], linewidth=0.7, alpha=0.7, zorder=3, label=label)
-        finish_panel(ax, data, component, tuple(path[component] for _, path in loops.paths))
+        finish_panel(ax, data, component, tuple(path[component] for _, path in loops.paths), tube=not loops.resolve)
     for channel, ax in enumerate(axes[states:]):
         ax.axhline(0.0, color=look.GREY, linewidth=0.6, zorder=1)
         for law, control in loops.controls:

@@ -19,6 +19,7 @@ from sparserob_core.control.studies.laws import LawName, Uncertainty, noises
 from sparserob_core.control.studies.simulate import fine_times, finer, walk
 from sparserob_core.control.transcription.own_units import row_units
 from sparserob_core.control.transcription.record import Transcription
+from sparserob_core.errors import InputError
 from sparserob_core.experiment.directory.adversary import adversaries
 from sparserob_core.experiment.directory.artefacts import RunDirectory, require_room
 from sparserob_core.experiment.directory.finished import FinishedRun, read_finished
@@ -37,11 +38,11 @@ if TYPE_CHECKING:
 
 LOOPS, RESOLVED_LOOPS = 10, 1  # of every law, unless told
 SHOWN, DRAWN = 400, 3  # times, and loops of every law, that are drawn
-CONTROL = "control"
+CONTROL, STEP = "control", "control_step"
 ROUNDING = 1e-12  # of the size of the set of controls
 
-# law, disturbance (1, mw, M), parameter (1, nu), state (1, d), noise (K, p)
-Drawn = tuple[str, Array | None, Array, Array | None, Array | None]
+# law, disturbance (1, mw, M) of every period, parameter (1, nu), state (1, d), noise (K, p) of every period
+Drawn = tuple[str, list[Array | None], Array, Array | None, list[Array | None]]
 
 
 def loop(
@@ -51,6 +52,7 @@ def loop(
     seed: int = 0,
     *,
     seconds: float | None = None,
+    periods: int = 1,
     out: str | Path | None = None,
     plugins: Iterable[str | Path] = (),
     notify: Notify = ignore,
@@ -58,8 +60,9 @@ def loop(
     """Run the controller of a finished run (`as_run`) in closed loop: what ``sparserob loop RUN`` does.
 
     Every constraint's worst case is replayed once, and every law of `simulate` drives ``trajectories`` loops (10, or 1
-    where the remaining horizon is solved anew at every step: ``resolve``, ``seconds`` as for `controller`). The state
-    moves exactly, and is looked at inside the pieces too. The result is written to ``loop.json`` in the run's
+    where the remaining horizon is solved anew at every step: ``resolve``, ``seconds`` as for `controller`). A plan that
+    repeats runs for so many ``periods``: each law draws a disturbance for every one, and worst cases take turns. The
+    state moves exactly, and is looked at inside the pieces too. The result is written to ``loop.json`` in the run's
     directory, and drawn into the file ``out`` when given. Raises `InputError` for a directory that is no finished run
     with a proven control, or another argument at fault, before anything is written.
     """
@@ -68,14 +71,19 @@ def loop(
 
     count = (RESOLVED_LOOPS if resolve else LOOPS) if trajectories is None else whole("trajectories", trajectories, 1)
     whole("seed", seed, 0)
+    whole("periods", periods, 1)
     if out is not None:
         require_writable(Path(out))
     began = clock.perf_counter()
     directory, experiment = as_run(run)
     finished = read_finished(directory, plugins, experiment)
     require_room(finished.directory)
+    if periods > 1 and not finished.experiment.transcription.problem.repeat:
+        raise InputError(f"periods: expected 1 of a plan that ends at its horizon, or problem.repeat, got {periods}")
     acting = controller(run, resolve, seconds=seconds, plugins=plugins)
-    found = replace(_closed(finished, acting, resolve, count, seed, notify), seconds=clock.perf_counter() - began)
+    found = replace(
+        _closed(finished, acting, resolve, (count, periods), seed, notify), seconds=clock.perf_counter() - began
+    )
     RunDirectory(finished.directory).write_json("loop.json", found.summary())
     if out is not None and (missing := missing_matplotlib()):
         return replace(found, undrawn=missing)
@@ -85,9 +93,9 @@ def loop(
 
 
 def _closed(
-    finished: FinishedRun, acting: Controller, resolve: bool, count: int, seed: int, notify: Notify
+    finished: FinishedRun, acting: Controller, resolve: bool, counts: tuple[int, int], seed: int, notify: Notify
 ) -> ClosedLoops:
-    model = finished.experiment.transcription
+    periods, model = counts[1], finished.experiment.transcription
     worst = adversaries(finished.experiment, finished.decision)
     breaks = worst.get("breakpoints", model.response.grid.breakpoints)
     grid = model.response.grid.refined(breaks)
@@ -98,26 +106,33 @@ def _closed(
         np.concatenate([ends, worst.get("times", np.zeros(0))]),
     )
     shown = np.unique(np.linspace(0, times.size - 1, min(times.size, SHOWN)).round().astype(int))
-    drawn = [*_replayed(model, worst), *_sampled(model, worst, count, np.random.default_rng(seed))]
+    drawn = [*_replayed(worst, periods), *_sampled(model, worst, counts, np.random.default_rng(seed))]
     spent, paid, kept, laws = list[float](), list[float](), list[tuple[str, Array, Array]](), dict[str, int]()
     found = {one.name: -np.inf for one in model.constraints}
     limits = {one.name: TOLERANCE * float(row_units(one, model.problem.control).min()) for one in model.constraints}
-    resolved, uncovered, outside = 0, 0, -np.inf
-    for number, (law, disturbance, parameter, begun, noise) in enumerate(drawn):
+    resolved, uncovered, outside, stepped = 0, 0, -np.inf, -np.inf
+    for number, (law, disturbances, parameter, begun, seen) in enumerate(drawn):
         on = grid if law == ADVERSARY else model.response.grid
         fine = Response(model.response.system, finer(on, times), model.response.initial_state)
-        closing = _Closing(model, acting, on.control_piece if law == ADVERSARY else np.arange(on.pieces), noise)
-        states = np.stack(list(walk(fine, closing, parameter, disturbance, begun)))
         laws[law] = laws.get(law, 0) + 1
-        for name, largest in _violations(model, finished, states, times, closing.applied).items():
-            found[name] = max(found[name], largest)
-        outside = max(outside, float(model.problem.control.violation(closing.applied.T).max()))
+        acting.reset()
+        costs, before = list[float](), np.zeros((0, model.problem.system.controls))
+        for period, (disturbance, noise) in enumerate(zip(disturbances, seen, strict=True)):
+            which = on.control_piece if law == ADVERSARY else np.arange(on.pieces)
+            closing = _Closing(model, acting, which, noise, period * model.problem.horizon)
+            states = np.stack(list(walk(fine, closing, parameter, disturbance, begun)))
+            for name, largest in _violations(model, finished, states, times, closing.applied).items():
+                found[name] = max(found[name], largest)
+            outside = max(outside, float(model.problem.control.violation(closing.applied.T).max()))
+            stepped = max(stepped, _stepped(model, np.vstack([before, closing.applied.T])))
+            costs.append(_paid(model, closing.applied))
+            if laws[law] <= DRAWN and not period:
+                kept.append((law, states[shown, :, 0].T, closing.applied))
+            begun, before = states[-1].T, closing.applied[:, -1:].T
         spent += [1e3 * one.seconds for one in acting.steps]
         resolved += sum(one.resolved for one in acting.steps)
-        uncovered += sum(not one.covered for one in acting.steps)
-        paid.append(_paid(model, closing.applied))
-        if laws[law] <= DRAWN:
-            kept.append((law, states[shown, :, 0].T, closing.applied))
+        uncovered += max(sum(not one.covered for one in acting.steps), int(acting.ever_uncovered))
+        paid.append(float(np.mean(costs)))
         notify(StudyProgress(text=f"{number + 1} of {len(drawn)} loops", done=number + 1, total=len(drawn)))
     size = float(model.problem.control.reach(np.eye(model.problem.system.controls)).max())
     return ClosedLoops(
@@ -125,9 +140,14 @@ def _closed(
         directory=finished.directory,
         status=str(finished.summary["status"]),
         resolve=resolve,
+        periods=periods,
         seed=seed,
         laws=laws,
-        constraints={**{name: (found[name], limits[name]) for name in found}, CONTROL: (outside, TOLERANCE * size)},
+        constraints={
+            **{name: (found[name], limits[name]) for name in found},
+            CONTROL: (outside, TOLERANCE * size),
+            **({} if np.isinf(stepped) else {STEP: (stepped, TOLERANCE * size)}),
+        },
         milliseconds=np.array(spent),
         resolved=resolved,
         uncovered=uncovered,
@@ -141,19 +161,22 @@ def _closed(
         units={
             **{one.name: joined(one.measured).strip() for one in model.constraints},
             CONTROL: joined(model.problem.names.control_units).strip() if model.problem.control.halfspaces() else "",
+            STEP: joined(model.problem.names.control_units).strip() if model.problem.control.halfspaces() else "",
         },
     )
 
 
 class _Closing:
     """What drives a system: a controller, asked at the breakpoints of the control in the order in which they come.
-    ``which``: the pieces of the model's grid that are walked through; ``noise (K, p)``: that of measured outputs."""
+    ``which``: the pieces of the model's grid that are walked through; ``noise (K, p)``: that of measured outputs;
+    ``begins``: when, for the controller."""
 
-    def __init__(self, model: Transcription, acting: Controller, which: np.ndarray, noise: Array | None) -> None:
-        self.model, self.acting, self.which, self.noise = model, acting, which, noise
+    def __init__(
+        self, model: Transcription, acting: Controller, which: np.ndarray, noise: Array | None, begins: float
+    ) -> None:
+        self.model, self.acting, self.which, self.noise, self.begins = model, acting, which, noise, begins
         self.applied = np.zeros((model.problem.system.controls, model.control.pieces))
         self._asked = 0
-        acting.reset()
 
     def __call__(self, number: int, state: Array) -> Array:
         """The inputs ``(m + constants, 1)`` on a piece that begins in ``state (d, 1)``."""
@@ -161,7 +184,8 @@ class _Closing:
         grid = self.model.response.grid
         middle = (grid.breakpoints[piece] + grid.breakpoints[piece + 1]) / 2
         if self._asked < points.size - 1 and middle > points[self._asked]:
-            self.applied[:, self._asked] = self.acting.step(float(points[self._asked]), self._measured(state[:, 0]))
+            time = self.begins + float(points[self._asked])
+            self.applied[:, self._asked] = self.acting.step(time, self._measured(state[:, 0]))
             self._asked += 1
         return np.asarray(grid.inputs(self.applied)[:, piece, None])
 
@@ -174,32 +198,43 @@ class _Closing:
         return seen if self.noise is None else seen + self.noise[self._asked]
 
 
-def _replayed(model: Transcription, worst: Mapping[str, Array]) -> Iterator[Drawn]:
-    """The worst case of every constraint, under the plan."""
-    for row in range(worst["names"].size if worst else 0):
-        disturbance = worst["disturbances"][row : row + 1] if worst["disturbances"].shape[1] else None
-        noise = worst["noises"][row] if "noises" in worst else None
-        yield ADVERSARY, disturbance, worst["parameters"][row : row + 1], worst["initial_states"][row : row + 1], noise
+def _replayed(worst: Mapping[str, Array], periods: int) -> Iterator[Drawn]:
+    """The worst case of every constraint, under the plan; from period to period they take turns."""
+    count = worst["names"].size if worst else 0
+    for row in range(count):
+        turns = [(row + period) % count for period in range(periods)]
+        disturbances = [worst["disturbances"][at : at + 1] if worst["disturbances"].shape[1] else None for at in turns]
+        seen = [worst["noises"][at] if "noises" in worst else None for at in turns]
+        one = slice(row, row + 1)
+        yield ADVERSARY, disturbances, worst["parameters"][one], worst["initial_states"][one], seen
 
 
-def _sampled(model: Transcription, worst: Mapping[str, Array], count: int, rng: np.random.Generator) -> Iterator[Drawn]:
-    """``count`` loops of every law; one loop where nothing is uncertain."""
+def _sampled(
+    model: Transcription, worst: Mapping[str, Array], counts: tuple[int, int], rng: np.random.Generator
+) -> Iterator[Drawn]:
+    """So many loops of every law, of so many periods; one loop where nothing is uncertain."""
     functionals, parameters = model.functionals, model.parameters
     measured = None if model.feedback is None else model.problem.measurements
-    bound = None if measured is None else measured.noise
+    bound, (count, periods) = None if measured is None else measured.noise, counts
     if not functionals.disturbed and parameters.set is None and bound is None:
-        yield "iid", None, np.zeros((1, 0)), None, None
+        yield "iid", [None] * periods, np.zeros((1, 0)), None, [None] * periods
         return
     known = tuple(worst[name] for name in ("times", "directions", "parameters")) if worst else (np.zeros(0),) * 3
     uncertainty = Uncertainty(functionals, parameters, model.constraints, (known[0], known[1], known[2]))
     for law in (law for law in LAWS if law != ADVERSARY and (worst or law != "neighbours")):
-        disturbances, drawn, begun = uncertainty.draw(cast(LawName, law), count, rng)
-        seen = noises(bound, cast(LawName, law), count, model.control.pieces, rng)
+        disturbances, drawn, begun = uncertainty.draw(cast(LawName, law), count * periods, rng)
+        seen = noises(bound, cast(LawName, law), count * periods, model.control.pieces, rng)
         for row in range(count):
-            one = slice(row, row + 1)
-            signal = None if disturbances is None else disturbances[one]
-            noise = None if seen is None else seen[:, :, row]
-            yield law, signal, drawn[one], None if begun is None else begun[one], noise
+            one, turns = slice(row, row + 1), range(row, count * periods, count)
+            every = [None if disturbances is None else disturbances[p : p + 1] for p in turns]
+            heard = [None if seen is None else seen[:, :, p] for p in turns]
+            yield law, every, drawn[one], None if begun is None else begun[one], heard
+
+
+def _stepped(model: Transcription, applied: Array) -> float:
+    """By how much the steps of controls ``(k, m)`` that follow one another leave their set at most."""
+    step = model.problem.control_step
+    return -np.inf if step is None or len(applied) < 2 else float(step.violation(np.diff(applied, axis=0)).max())
 
 
 def _violations(

@@ -45,9 +45,11 @@ class ClosedLoops:
     controls: Sequence[tuple[str, Array]] = field(repr=False)
     units: Mapping[str, str] = field(default_factory=dict)
     undrawn: str = ""
+    """Why there is no figure, where one was asked for."""
+    periods: int = 1
+    """How often the plan was begun in every loop; costs are those of a period on average."""
 
     __repr__ = brief
-    """Why there is no figure, where one was asked for."""
 
     @property
     def steps(self) -> int:
@@ -78,6 +80,7 @@ class ClosedLoops:
             "status": self.status,
             "resolve": self.resolve,
             "seed": self.seed,
+            "periods": self.periods,
             "loops": dict(self.laws),
             "steps": self.steps,
             "resolved": self.resolved,
@@ -108,6 +111,7 @@ class ClosedLoops:
         time, cost = summary["milliseconds"], summary["cost"]
         rows = [
             ("loops", f"{sum(self.laws.values())} ({', '.join(f'{n} {law}' for law, n in self.laws.items())})"),
+            *([("periods of each", f"{self.periods}")] if self.periods > 1 else []),
             ("steps", f"{self.steps}" + (f", {self.resolved} of them solved anew and better" if self.resolve else "")),
             ("a step takes", f"{time['median']:.3g} ms (median), {time['99%']:.3g} ms (99 %)"),
             ("cost of the run", f"{cost['run']:.7g}"),

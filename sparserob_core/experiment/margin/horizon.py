@@ -210,6 +210,11 @@ def horizon_search(
 ) -> HorizonSearch:
     """The search of a margin of the horizon; raises `InputError` where nothing could be proven."""
     width = tolerance * problem.horizon
+    if problem.repeat:
+        raise InputError(
+            "of: horizon is the period of a plan that repeats, of which none excludes another; expected another thing"
+            " to vary"
+        )
     try:
         return HorizonSearch(title, problem, *dictionaries, method, tools, width, notify)
     except InputError as error:

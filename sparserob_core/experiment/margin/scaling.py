@@ -142,6 +142,11 @@ def _parameters(problem: OptimalControlProblem) -> Scaling:
 def _initial_state(problem: OptimalControlProblem) -> Scaling:
     """The set of deviations about the centre, where there is one; else the initial state itself."""
     bound = problem.initial_set
+    if problem.repeat:
+        raise InputError(
+            "of: initial_state is where a plan that repeats ends too, so that no factor is the largest; expected"
+            " another thing to vary"
+        )
     if bound is not None:
         one, far = np.ones(bound.dimension), float(bound.reach(np.eye(bound.dimension)).max())
         return Scaling(

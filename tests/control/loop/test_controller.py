@@ -251,7 +251,7 @@ def test_a_step_that_is_refused_changes_nothing(plans) -> None:
     first = controller.step(0.0, [-1, 1])
     with pytest.raises(sr.InputError, match=r"^time: expected 0.25, the next breakpoint, got 0.0$"):
         controller.step(0.0, [-1, 1])
-    for state in ([-0.7], [[1, 2]], [np.nan, 0], "here", None):
+    for state in ([-0.7], [[1, 2]], [np.nan, 0], [np.inf, 0], "here"):
         with pytest.raises(sr.InputError, match=r"^state: expected 2 finite numbers, one per state"):
             controller.step(0.25, state)
     for time in (None, "0.25", True, np.nan):
@@ -261,6 +261,60 @@ def test_a_step_that_is_refused_changes_nothing(plans) -> None:
     assert len(controller.steps) == 2
     controller.reset()
     assert np.array_equal(controller.step(0.0, [-1, 1]), first)
+
+
+@pytest.mark.parametrize("kind", ["open loop", "nominal", "peak"])
+def test_a_missing_measurement_is_an_innovation_of_0(plans, kind) -> None:
+    """Told nothing at all, the control is the nominal one; told nothing once, it is that of the state as predicted."""
+    controller = sr.controller(plans[kind])
+    points = controller.breakpoints[:-1]
+    applied = np.array([controller.step(t, None) for t in points]).T
+    nominal = plans[kind].control
+    assert applied == pytest.approx(nominal, abs=1e-12)
+    assert not controller.covered
+    assert controller.ever_uncovered
+    plant, told = Plant(plans[kind]), sr.controller(plans[kind])
+    controller.reset()
+    state = np.array([-1.0, 1.0])
+    length = points[1]
+    for k, t in enumerate(points[:6]):
+        seen = told.step(t, state)
+        assert controller.step(t, None if k == 3 else state) == pytest.approx(seen, abs=1e-12)
+        w = 0.05 * np.ones(2) if k != 2 else np.zeros(2)  # the state that is not told is as predicted
+        state = plant.moved(state, seen, w, length)[-1]
+    assert told.covered
+    assert not told.ever_uncovered
+    assert not controller.covered
+
+
+def test_what_is_not_covered_is_not_forgotten_where_a_new_plan_covers_the_rest(plans) -> None:
+    controller = sr.controller(plans["open loop"], resolve=True)
+    controller.step(0.0, [-1, 1])
+    assert not controller.ever_uncovered
+    controller.step(0.25, None)
+    assert not controller.steps[-1].resolved
+    assert not controller.covered
+    controller.step(0.5, [-0.45, 1.0])
+    assert controller.covered
+    assert controller.ever_uncovered
+    controller.reset()
+    assert not controller.ever_uncovered
+
+
+def test_a_spike_is_told_and_forgotten_by_the_state_after_it(plans) -> None:
+    """A spike ``s`` gives innovations ``s`` and ``-Phi s``; what is told as missing gives none."""
+    plant, state = Plant(plans["peak"]), np.array([-1.0, 1.0])
+    believed, missing = sr.controller(plans["peak"]), sr.controller(plans["peak"])
+    for t in believed.breakpoints[:4]:
+        spike = np.array([0.5, 0.0]) * (t == believed.breakpoints[2])
+        u = missing.step(t, None if spike.any() else state)
+        seen = believed.step(t, state + spike)
+        assert (np.abs(seen) <= 1.0).all()
+        assert believed.covered is bool(t < believed.breakpoints[2])
+        if not spike.any() and t < believed.breakpoints[2]:
+            assert seen == pytest.approx(u)
+        state = plant.moved(state, u, np.zeros(2), 0.25)[-1]
+    assert np.isfinite(u).all()
 
 
 def test_after_the_horizon_it_asks_for_a_reset(plans) -> None:

@@ -17,6 +17,7 @@ from sparserob_core.experiment.terminal.printing import EXIT, print_json, printa
 @click.option("--resolve", is_flag=True, help="Solve what is left of the horizon anew at every step.")
 @click.option("--seconds", type=float, help="With --resolve: about how long a step may take; no limit unless given.")
 @click.option("--trajectories", type=int, help="Loops of every law; 10 unless given, 1 with --resolve.")
+@click.option("--periods", type=int, default=1, help="Of a plan that repeats: for how many periods; 1 unless given.")
 @seed_option
 @json_option("loop.json")
 @click.option(
@@ -32,6 +33,7 @@ def loop(
     resolve: bool,
     seconds: float | None,
     trajectories: int | None,
+    periods: int,
     seed: int,
     as_json: bool,
     out: Path | None,
@@ -76,6 +78,7 @@ def loop(
             trajectories,
             seed,
             seconds=seconds,
+            periods=periods,
             out=picture,
             plugins=plugins,
             notify=line.receive,

@@ -15,7 +15,13 @@ from sparserob_core.control.policies.measurements import Measurements
 from sparserob_core.control.problem.cost import Cost, Quadratic
 from sparserob_core.control.problem.expression import ExpressionMatrix
 from sparserob_core.control.problem.names import Names
-from sparserob_core.control.problem.problem import MixedConstraint, OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.problem import (
+    MixedConstraint,
+    OptimalControlProblem,
+    PathConstraint,
+    Return,
+    widths,
+)
 from sparserob_core.control.problem.system import LinearSystem, SwitchedSystem, System, VaryingSystem
 from sparserob_core.control.problem.tracing import traced
 from sparserob_core.control.sets.sets import Box, Equality, Product, SetFactory
@@ -27,6 +33,7 @@ from sparserob_core.sip.convex_set import Array, ConvexSet
 WRITTEN = {
     "system", "horizon", "initial_state", "control", "initial_set", "weights", "disturbance", "disturbance_class",
     "path", "terminal", "title", "initial_control", "control_step", "names", "cost", "disturbances", "measurements",
+    "repeat",
 }  # fmt: skip
 """The fields of a problem that are written; one that is added and not named here is refused, not lost."""
 WRITTEN_OF_SYSTEM = {"A", "B", "E", "parameters", "names", "c", "delay"}
@@ -37,6 +44,9 @@ def problem_keys(problem: OptimalControlProblem) -> dict[str, Any]:
     unknown = {one.name for one in fields(problem)} - WRITTEN
     if unknown:
         raise InputError(path=sorted(unknown)[0], expected="a field that a config can say", got="another one")
+    path = [entry for entry in problem.path if not isinstance(entry, Return)]
+    fixed = bool(problem.repeat) and bool((widths(problem.initial_set, problem.system.states) == 0.0).any())
+    ends = problem.terminal[: len(problem.terminal) - fixed]  # what repeat adds is said by repeat
     keys: dict[str, Any] = {
         "name": "linear",
         "system": _system_keys(problem.system),
@@ -45,8 +55,8 @@ def problem_keys(problem: OptimalControlProblem) -> dict[str, Any]:
         "control": set_keys("control", problem.control),
         "weights": np.asarray(problem.weights).tolist(),
         "disturbance_class": problem.disturbance_class,
-        "path": [_path_keys(f"path.{i}", entry) for i, entry in enumerate(problem.path)],
-        "terminal": [_terminal_keys(f"terminal.{i}", entry) for i, entry in enumerate(problem.terminal)],
+        "path": [_path_keys(f"path.{i}", entry) for i, entry in enumerate(path)],
+        "terminal": [_terminal_keys(f"terminal.{i}", entry) for i, entry in enumerate(ends)],
         **_cost_keys(problem.cost),
         **_names_keys(problem.names),
     }
@@ -58,6 +68,8 @@ def problem_keys(problem: OptimalControlProblem) -> dict[str, Any]:
         keys["measurements"] = _measurement_keys(problem.measurements)
     if problem.initial_control is not None and (problem.control_step is not None or problem.system.delay > 0.0):
         keys["initial_control"] = np.asarray(problem.initial_control).tolist()
+    if problem.repeat:
+        keys["repeat"] = True
     return keys
 
 
