@@ -1,5 +1,5 @@
-"""Plans that repeat: values in closed form, the largest disturbances of independent linear programs, certificates, and
-loops that run through many periods."""
+"""Guards plans that repeat: values in closed form, the largest disturbances of independent linear programs,
+certificates, and loops that run through many periods."""
 
 from __future__ import annotations
 
