@@ -45,8 +45,8 @@ class TimedExplanation(Explanation):
     states are called. ``deviation (d,)`` is that of ``begun`` from the centre of the initial states. ``gain (m,)``: the
     part of the normal on the control, of a mixed constraint, and ``piece`` the piece of the control that it looks at.
     ``changes``: when each of the disturbance's pieces begins, where that depends on the constraint. ``noise (K, p)``:
-    the worst noise of what is measured at every breakpoint of the control, where there is any. ``following (d,)``: the deviation
-    of the next period's initial state, of a step across the seam of a plan that repeats.
+    the worst noise of what is measured at every breakpoint of the control, where there is any. ``following (d,)``: the
+    deviation of the next period's initial state, of a step across the seam of a plan that repeats.
     """
 
     decides: ClassVar[str] = "control"
