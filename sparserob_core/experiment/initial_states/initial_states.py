@@ -10,6 +10,7 @@ import numpy as np
 
 from sparserob_core.arguments import whole
 from sparserob_core.control.problem.problem import OptimalControlProblem, PathConstraint
+from sparserob_core.control.problem.system import VaryingSystem
 from sparserob_core.control.problem.units import Units
 from sparserob_core.control.response.reference import Reference
 from sparserob_core.control.sets.sets import Equality
@@ -73,6 +74,9 @@ def initial_states(
             expected="false, since a plan that repeats ends among its initial states, and not from elsewhere",
             got="true",
         )
+    if isinstance(model.problem.system, VaryingSystem):
+        expected = "a system that stays the same with time: of another one no set of initial states is proven yet"
+        raise InputError(path="problem.system", expected=expected, got="one in t")
     if about is not None:
         model = from_state(model, _about(about, model.problem))
     pair = check_states(states, model.problem.system.states)
