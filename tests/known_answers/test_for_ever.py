@@ -13,6 +13,7 @@ from scipy.linalg import expm
 
 import sparserob_core as sr
 from sparserob_core.checker.claims import case as cases
+from sparserob_core.control.loop.remaining import remaining
 from sparserob_core.control.problem.problem import WITHIN, Return
 
 MASS = {"A": [[0, 1], [-2, -0.5]], "B": [[0], [1]]}
@@ -59,6 +60,65 @@ def test_steps_across_the_seam_hold_for_all_first_and_all_last_controls(tmp_path
     found = _run(tmp_path / "run", _integrator(control_step={"box": step}))
     assert found.status == status
     assert set(_verdicts(tmp_path / "run").values()) == {"holds"}
+
+
+def test_a_gain_that_goes_around_too_far_is_found(tmp_path) -> None:
+    """``M`` from -0.25 to -0.3 still returns, and its control may change by 0.6 where 0.51 is allowed."""
+    _run(tmp_path / "run", _integrator(control_step={"box": 0.51}))
+    file = tmp_path / "run" / "certificate.json"
+    honest = json.loads(file.read_text())
+    file.write_text(json.dumps({**honest, "gains": (1.2 * np.array(honest["gains"])).tolist()}))
+    verdicts = _verdicts(tmp_path / "run")
+    assert verdicts["return"] == "holds"
+    assert verdicts["control_step"] == verdicts["repeat"] == "fails"
+
+
+def test_the_violation_across_the_seam_is_that_of_both_answers_apart(tmp_path) -> None:
+    model = _run(tmp_path / "run", _integrator(control_step={"box": 0.51})).experiment.transcription
+    family = next(one for one in model.program.families if one.name == "control_step")
+    decision = np.zeros(model.program.n)
+    decision[1] = -0.2
+    assert model.feedback.loop.gains(decision).ravel() == pytest.approx([-0.2])
+    at = np.array([[1.0]])
+    assert family.excess(decision, at) == pytest.approx(np.full((1, 2), 0.4 - 0.51))
+    assert family.enclosure(decision, at, at).bounds == pytest.approx([0.4 - 0.51])
+    assert family.uncertain(at[0]).excess(decision, model.program.spread) == pytest.approx(np.full(2, 0.4 - 0.51))
+
+
+def test_what_is_left_of_a_period_steps_to_the_control_that_begins_the_next(tmp_path) -> None:
+    keys = {"system": {"A": [[0]], "B": [[1]], "c": [-0.5]}, "horizon": 2.0, "initial_state": [0.7]}
+    config = _config(2, "open_loop", **keys, control_step={"box": 0.2})
+    model = _run(tmp_path / "run", config).experiment.transcription
+    left = remaining(model, 1, np.array([0.7]), np.array([0.5]), again=np.array([0.4])).problem
+    seam = next(one for one in left.path if one.name == "seam")
+    assert not left.repeat
+    assert (np.asarray(seam.G) @ [0.6] <= np.asarray(seam.h) + 1e-12).all()
+    assert (np.asarray(seam.G) @ [0.61] > np.asarray(seam.h)).any()
+    assert (np.asarray(seam.G) @ [0.19] > np.asarray(seam.h)).any()
+
+
+def test_twelve_masses_return_though_the_box_of_their_states_is_left_in_between(tmp_path) -> None:
+    """24 states: without control the box grows to 4.4 times its size before it shrinks, and no control that is fixed
+    beforehand brings it back under this disturbance."""
+    n = 12
+    stiffness = 4.0 * (2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1))
+    A = np.block([[np.zeros((n, n)), np.eye(n)], [-stiffness, -np.eye(n)]])
+    B, E = np.zeros((2 * n, 2)), np.zeros((2 * n, 1))
+    B[n, 0] = B[2 * n - 1, 1] = E[n + 5, 0] = 1.0
+    assert max(np.abs(expm(A * t)).sum(axis=1).max() for t in (0.5, 1.0, 1.5)) > 2.0
+    keys = {
+        "system": {"A": A.tolist(), "B": B.tolist(), "E": E.tolist()},
+        "horizon": 6.0,
+        "initial_state": {"centre": [0.0] * 2 * n, "box": 0.1},
+        "disturbance": {"box": 0.05},
+    }
+    assert _run(tmp_path / "fixed", _config(4, "open_loop", **keys)).status == "infeasible"
+    found = _run(tmp_path / "run", _config(4, cost="nominal", **keys))
+    assert found.status == "certified"
+    assert set(_verdicts(tmp_path / "run").values()) == {"holds"}
+    loops = sr.loop(found, periods=100, trajectories=1)
+    assert not loops.contradicts
+    assert loops.steps == 2000
 
 
 def test_a_seam_that_binds_has_a_cost_that_the_checker_derives(tmp_path) -> None:
@@ -256,6 +316,18 @@ def test_the_checker_finds_the_return_by_itself_whatever_the_records_say(tmp_pat
     monkeypatch.setattr(cases.Case, "windows", property(without))
     assert _verdicts(tmp_path / "run")["return"] == "holds"
     assert found.problem.repeat
+
+
+def test_a_state_that_is_alone_must_be_fixed_at_the_end(tmp_path, monkeypatch) -> None:
+    keys = {"system": {"A": [[0]], "B": [[1]], "c": [-0.5]}, "horizon": 2.0, "initial_state": [0.7]}
+    _run(tmp_path / "run", _config(2, "open_loop", **keys))
+    assert _verdicts(tmp_path / "run")["repeat"] == "holds"
+    monkeypatch.setattr(cases.Case, "equalities", property(lambda self: []))
+    assert _verdicts(tmp_path / "run")["repeat"] == "fails"
+
+
+def test_what_counts_as_no_violation_must_not_leave_the_initial_states(tmp_path, monkeypatch) -> None:
+    _run(tmp_path / "run", _integrator())
     monkeypatch.setattr(cases, "INSIDE", 1e-10)  # what counts as no violation is then outside of the initial states
     assert _verdicts(tmp_path / "run")["repeat"] == "not checked"
 
