@@ -194,10 +194,12 @@ def test_rows_at_the_corners_of_a_cell_of_directions_stand_for_all_of_it(name):
             assert halves[0].high[axis] == halves[1].low[axis] == (low[axis] + high[axis]) / 2
             assert (halves[0].low == low).all() and (halves[1].high == high).all()
             low, high = halves[depth % 2].low, halves[depth % 2].high
-        # a point of directions is a row with its true limit, nearly, and has no middle of its own
+        # a point of directions is a row with its true limit, nearly, and its own middle
         point = Sides.cell(curved, high, high)
-        assert point.centre is None and len(point.rows) == 1
+        assert cell.is_wide and not point.is_wide and len(point.rows) == 1
+        assert point.centre is not None and (point.centre.z == high).all()
         true = source.support((high @ curved.normals)[None])[0]
+        assert true - 1e-14 * (1 + abs(true)) <= point.centre.limit <= true + 1e-15
         assert true - 1e-14 * (1 + abs(true)) <= point.rows[0].limit <= true
         with pytest.raises(Unchecked):
             Sides.cell(curved, high, np.where(np.arange(d) == 1, np.nextafter(high, np.inf), high)).halves()
