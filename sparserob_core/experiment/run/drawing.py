@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
@@ -151,7 +152,14 @@ def plot(experiment: Experiment, result: Result, name: str) -> Figure:
         figure = known[name]()
     if figure is None:
         raise InputError(f"name: there is no {name} to draw: nothing can move in it")
+    figure._repr_png_ = partial(_png, figure)  # type: ignore[attr-defined]  # shown by notebooks without pyplot too
     return figure
+
+
+def _png(figure: Figure) -> bytes:
+    stream = BytesIO()
+    figure.savefig(stream, format="png", dpi=PAGE)
+    return stream.getvalue()
 
 
 def picture(experiment: Experiment, result: Result) -> bytes | None:
@@ -160,13 +168,10 @@ def picture(experiment: Experiment, result: Result) -> bytes | None:
 
     if missing_matplotlib():
         return None
-    stream = BytesIO()
     try:
-        figure = plot(experiment, result, "clash" if result.status == "infeasible" else "control")
+        return _png(plot(experiment, result, "clash" if result.status == "infeasible" else "control"))
     except InputError:
         return None
-    figure.savefig(stream, format="png", dpi=PAGE)
-    return stream.getvalue()
 
 
 def _active(experiment: ControlExperiment, result: Result) -> Array:

@@ -124,6 +124,12 @@ def test_an_infeasible_result_is_saved_with_its_reason(tmp_path: Path) -> None:
     assert "<img" in result._repr_html_()
 
 
+def test_a_notebook_shows_a_figure_without_pyplot(solved: sr.SolvedProblem) -> None:
+    pytest.importorskip("matplotlib")
+    shown: Any = solved.plot("control")
+    assert shown._repr_png_().startswith(b"\x89PNG")
+
+
 def test_a_notebook_shows_the_table_and_the_control(solved: sr.SolvedProblem) -> None:
     page = solved._repr_html_()
     assert "<strong>Cart</strong>" in page and "lower bound" in page
